@@ -1,0 +1,75 @@
+# Everything a person does here, one target each. `make help` lists them.
+# Needed beforehand: Python 3.11 or later with venv and pip, make, and a package registry that pip can reach.
+
+PYTHON ?= python3
+WORKERS ?= 2
+OUT ?= out
+
+VENV := .venv
+BIN := $(VENV)/bin
+RUN := $(BIN)/python -m
+INSTALL := $(RUN) pip install --quiet --disable-pip-version-check --no-deps
+LOCKED := $(VENV)/.locked
+READY := $(VENV)/.ready
+
+# Compiled JAX functions, shared by the test workers and kept between runs.
+export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help install demo test lint types format docs soak bench lock clean
+
+help:  ## List the targets
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1 \t\2/p' $(MAKEFILE_LIST)
+
+install: $(READY)  ## Make the virtual environment .venv and install the locked packages and dirax in it
+
+demo: $(READY)  ## Reproduce the papers: figures and a table in out/
+	$(BIN)/dirax reproduce all --out $(OUT)
+
+test: lint types  ## The whole test suite: style, types, import order, tests
+	$(RUN) pytest -n $(WORKERS) --dist worksteal
+
+lint: $(READY)  ## Check style with ruff
+	$(RUN) ruff check
+	$(RUN) ruff format --check
+
+types: $(READY)  ## Check types with basedpyright
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
+
+format: $(READY)  ## Repair style with ruff
+	$(RUN) ruff check --fix
+	$(RUN) ruff format
+
+docs: $(READY)  ## Build the documentation in site/, every warning an error
+	$(RUN) mkdocs build --strict --quiet
+
+soak: $(READY)  ## The long tests that `make test` leaves out
+	$(RUN) pytest -m soak
+
+bench: $(READY)  ## Measure speed
+	$(BIN)/dirax bench
+
+lock:  ## Write requirements.lock anew from pyproject.toml (UPGRADE=--upgrade takes the newest versions)
+	$(PYTHON) -m venv --clear $(VENV)-lock
+	$(VENV)-lock/bin/python -m pip install --quiet --disable-pip-version-check uv
+	$(VENV)-lock/bin/uv pip compile --quiet --group dev pyproject.toml --output-file requirements.lock $(UPGRADE)
+	rm -rf $(VENV)-lock
+
+clean:  ## Remove everything that the other targets made
+	rm -rf $(VENV) $(VENV)-lock $(OUT) site dist .jax_cache .pytest_cache .ruff_cache .hypothesis .benchmarks
+	find src tests docs benchmarks -name __pycache__ -prune -exec rm -rf {} +
+
+# The lock names every package, pip itself included, with its exact version and hashes, so pip resolves nothing.
+# Byte code is left to the first import: most of what is installed is never imported by a test run.
+$(LOCKED): requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "dirax needs Python 3.11 or later: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@echo "Installing the locked packages in $(VENV): about a minute."
+	$(PYTHON) -m venv --clear $(VENV)
+	$(INSTALL) --no-compile --require-hashes --only-binary :all: --requirement requirements.lock
+	@touch $@
+
+$(READY): $(LOCKED) pyproject.toml
+	$(INSTALL) --no-build-isolation --editable .
+	@touch $@
