@@ -8,7 +8,7 @@ OUT ?= out
 VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m
-INSTALL := $(RUN) pip install --quiet --disable-pip-version-check --no-deps
+INSTALL := $(RUN) pip install -qq --disable-pip-version-check --no-deps
 LOCKED := $(VENV)/.locked
 READY := $(VENV)/.ready
 
@@ -42,7 +42,7 @@ format: $(READY)  ## Repair style with ruff
 	$(RUN) ruff format
 
 docs: $(READY)  ## Build the documentation in site/, every warning an error
-	$(RUN) mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict --quiet
 
 soak: $(READY)  ## The long tests that `make test` leaves out
 	$(RUN) pytest -m soak
@@ -52,7 +52,7 @@ bench: $(READY)  ## Measure speed
 
 lock:  ## Write requirements.lock anew from pyproject.toml (UPGRADE=--upgrade takes the newest versions)
 	$(PYTHON) -m venv --clear $(VENV)-lock
-	$(VENV)-lock/bin/python -m pip install --quiet --disable-pip-version-check uv
+	$(VENV)-lock/bin/python -m pip install -qq --disable-pip-version-check uv
 	$(VENV)-lock/bin/uv pip compile --quiet --group dev pyproject.toml --output-file requirements.lock $(UPGRADE)
 	rm -rf $(VENV)-lock
 
