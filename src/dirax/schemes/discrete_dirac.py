@@ -1,0 +1,142 @@
+"""Discrete Dirac systems by discretization maps ([BLM] §5): one scheme for Hamiltonian, Lagrangian and port systems."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
+from dirax.schemes.discretized import stepping
+from dirax.schemes.lagrangian_methods import discretized_lagrangian, resolved_lagrangian, resolved_nonholonomic
+from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
+from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.nonholonomic import NonholonomicMechanics
+from dirax.systems.phase_space import PhaseSpaceLagrangian
+from dirax.systems.port_hamiltonian import PortHamiltonian
+
+CONSTRAINTS = ("discretize", "resolve")
+
+
+class DiscreteDirac(AbstractScheme):
+    """The discrete Dirac system S_d^h of a discretization map ([BLM] §5.1):
+
+        (R_d⁻¹(x_k, x_{k+1})/h, α_x) ∈ D_x,   x the base point of R_d⁻¹(x_k, x_{k+1}).
+
+    `map`: any discretization map; on T*Q of a Lagrangian system a map on Q is lifted. `constraints`:
+    "discretize" ([BLM] Method 1) discretizes the implicit system S_0 as it stands; "resolve" ([BLM] Method 2) runs the
+    constraint algorithm first and discretizes on M_f, so that its constraints hold at the nodes to roundoff.
+
+    Takes DiracSystem, PortHamiltonian, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian systems; raises
+    `TypeError` for others and `ValueError` for maps that do not fit the system's space.
+    """
+
+    map: AbstractDiscretizationMap
+    constraints: str
+
+    def __init__(self, map: AbstractDiscretizationMap | None = None, constraints: str = "discretize"):
+        if map is not None and not isinstance(map, AbstractDiscretizationMap):
+            raise TypeError(f"map must be a discretization map such as dx.Midpoint(), but {map!r} was given.")
+        if constraints not in CONSTRAINTS:
+            raise ValueError(f'constraints must be "discretize" or "resolve", but {constraints!r} was given.')
+        self.map = Midpoint() if map is None else map
+        self.constraints = constraints
+
+    def step_equation(self, system: Any, shape: Shape) -> StepEquation:
+        resolve = self.constraints == "resolve"
+        if isinstance(system, DiracSystem | PortHamiltonian):
+            return discretized_relation(system, shape, self.map)
+        if isinstance(system, PhaseSpaceLagrangian):
+            if resolve:
+                return _on_graph(system, shape, self.map)
+            return discretized_lagrangian(system.lagrange_dirac(), shape, _theta_of(self.map))
+        if isinstance(system, NonholonomicMechanics):
+            if resolve:
+                return resolved_nonholonomic(system, shape, _theta_of(self.map))
+            return discretized_lagrangian(system.lagrange_dirac(), shape, _theta_of(self.map))
+        if isinstance(system, LagrangeDirac):
+            method = resolved_lagrangian if resolve and shape.m else discretized_lagrangian
+            return method(system, shape, _theta_of(self.map))
+        raise TypeError(
+            "dx.DiscreteDirac discretizes DiracSystem, PortHamiltonian, LagrangeDirac, NonholonomicMechanics and "
+            f"PhaseSpaceLagrangian systems, but a {type(system).__name__} was given."
+        )
+
+
+def discretized_relation(system: DiracSystem | PortHamiltonian, shape: Shape, map: AbstractDiscretizationMap) -> StepEquation:
+    """The relation between (x, ẋ) of a system on M, discretized by a map on M: state x, unknowns (ẋ, multipliers)."""
+    size, m = shape.n, shape.m
+    step = stepping(map, size)
+    d = step.dimension
+
+    def residual(u, state, t, h, params):
+        x, velocity, _ = step.move(state, u[:d], h)
+        r = system.relation(x, velocity, u[d:], t + h / 2, params)
+        if step.tangent is None:
+            return r
+        return jnp.concatenate([step.tangent(state, x) @ r[:size], r[size:]])
+
+    def advance(u, state, t, h, params):
+        return step.move(state, u[:d], h)[2]
+
+    def unpack(state, u, t, h, params):
+        return {"x": state, "multipliers": u[d:]} if m else {"x": state}
+
+    def start(data, h, params):
+        if "x" not in data:
+            raise ValueError("this scheme starts from x= (or q=, p= for a system on T*Q).")
+        return data["x"], jnp.concatenate([step.initial(data["x"], data["velocity"]), jnp.zeros(m)])
+
+    fields = {"x": Field((size,))}
+    if m:
+        fields["multipliers"] = Field((m,), "step", ("port",), "inputs of the closed ports")
+    return StepEquation(
+        start=start,
+        residual=residual,
+        advance=advance,
+        unpack=unpack,
+        state_size=size,
+        unknowns=d + m,
+        fields=fields,
+        labels=tuple(f"component {i} of the Dirac condition" for i in range(d)) + tuple(f"output y[{a}]" for a in range(m)),
+        canonical=isinstance(system, DiracSystem) and is_canonical(system),
+    )
+
+
+def is_canonical(system: DiracSystem) -> bool:
+    """Whether the structure is the canonical symplectic one of T*Q in (q, p)."""
+    return system.structure.representation == "two_form" and getattr(system.structure.evaluate, "one_forms", 0) is None
+
+
+def _on_graph(system: PhaseSpaceLagrangian, shape: Shape, map: AbstractDiscretizationMap) -> StepEquation:
+    """Method 2 on M_f = graph α: the Dirac system (dα, H) on Q ([BLM] (14)); p = α(q) is saved beside q."""
+    inner = discretized_relation(system.dirac_system(), Shape(shape.n), map)
+
+    def start(data, h, params):
+        if "q" not in data:
+            raise ValueError("Method 2 is a one-step method on Q: start it from q= (v= or p= are then determined).")
+        return inner.start({"x": data["q"], "velocity": data["v"]}, h, params)
+
+    def unpack(state, u, t, h, params):
+        return {"q": state, "p": system.one_form(state, params)}
+
+    return StepEquation(
+        start=start,
+        residual=inner.residual,
+        advance=inner.advance,
+        unpack=unpack,
+        state_size=shape.n,
+        unknowns=inner.unknowns,
+        fields={"q": Field((shape.n,)), "p": Field((shape.n,))},
+        labels=inner.labels,
+    )
+
+
+def _theta_of(map: AbstractDiscretizationMap) -> float:
+    """θ of a θ map (or of its lift): the Lagrangian methods are written for vector spaces."""
+    base = getattr(map, "map", map)
+    if not isinstance(base, Theta):
+        raise ValueError(
+            f"a Lagrangian system is discretized by a θ map on its coordinates, but {type(map).__name__} was given: state "
+            "the system on its manifold as a dx.DiracSystem on T*Q, with dx.cotangent_lift(map)."
+        )
+    return base.theta

@@ -1,0 +1,66 @@
+"""A discretization map as a way to step: from a point and unknown velocity to the base point, velocity and end point."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from dirax.geometry.cotangent_lift import CotangentLift
+from dirax.geometry.manifolds import Euclidean
+from dirax.geometry.maps import AbstractDiscretizationMap, Theta
+
+
+class Stepping(NamedTuple):
+    """`move(x0, u, h) -> (x, v, x1)` with map(x, h v) = (x0, x1), for `dimension` unknowns u ≈ v; `tangent(x0, x)` (d, N)
+    spans the tangent space at x, by rows, and pairs a residual with it; `initial(x0, v)` is a first guess of u."""
+
+    dimension: int
+    move: Callable
+    tangent: Callable | None
+    initial: Callable
+
+
+def stepping(map: AbstractDiscretizationMap, size: int) -> Stepping:
+    """The Stepping of a map for points of length `size`; raises `ValueError` where the map's manifold has another size.
+
+    For the θ maps and their lifts q_1 = q_0 + h v is used as it stands, so that v keeps the digits that a difference of
+    the points would lose; else x1 is found in a local parametrization at x0, and stays on the manifold to roundoff.
+    """
+    manifold = map.manifold(size)
+    theta = _theta(map)
+    if theta is not None:
+        return Stepping(size, lambda x0, u, h: (x0 + _weights(theta, size) * h * u, u, x0 + h * u), None, lambda x0, v: v)
+    if isinstance(manifold, Euclidean):
+
+        def move(x0, u, h):
+            x1 = x0 + h * u
+            x, w = map.backward(x0, x1)
+            return x, w / h, x1
+
+        return Stepping(size, move, None, lambda x0, v: v)
+
+    def move_on_manifold(x0, u, h):
+        x1 = manifold.local_parametrization(x0)(h * u)
+        x, w = map.backward(x0, x1)
+        return x, w / h, x1
+
+    def tangent(x0, x):
+        # fixed vectors, projected at x: their span is the tangent space and its dependence on x is differentiable
+        fixed = jax.lax.stop_gradient(manifold.frame(x0))
+        return jax.vmap(lambda f: manifold.projection(x, f))(fixed.T)
+
+    return Stepping(manifold.dimension, move_on_manifold, tangent, lambda x0, v: manifold.coordinates(x0, v))
+
+
+def _theta(map) -> tuple[float, ...] | None:
+    """The fraction of the step at which the base point lies: one for all coordinates, or for q and for p of a lift."""
+    if isinstance(map, Theta):
+        return (map.theta,)
+    if isinstance(map, CotangentLift) and isinstance(map.map, Theta):
+        return (map.map.theta, 1.0 - map.map.theta)
+    return None
+
+
+def _weights(theta: tuple[float, ...], size: int):
+    return theta[0] if len(set(theta)) == 1 else jnp.repeat(jnp.array(theta), size // 2)

@@ -1,0 +1,79 @@
+"""Phase-space Lagrangians L = ⟨α(q), q̇⟩ − H(q): point vortices, Lotka–Volterra, guiding centres."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jaxtyping import Array, Float
+
+from dirax.functions import UserFunction
+from dirax.geometry.structures import DiracStructure
+from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.system import AbstractSystem, no_constraint
+
+
+class PhaseSpaceLagrangian(AbstractSystem):
+    """L(q, q̇) = ⟨α(q), q̇⟩ − H(q), degenerate, of first order: (∂_j α_i − ∂_i α_j) q̇^j = −∂_i H ([BLM] §6).
+
+    `one_form(q[, params])` is α of shape (n,); `hamiltonian(q[, params])` returns a scalar. Where the matrix of dα is
+    invertible the constraint algorithm stops at the graph p = α(q), a symplectic manifold with the form dα.
+    """
+
+    one_form: UserFunction
+    hamiltonian: UserFunction
+
+    def __init__(self, one_form: Callable, hamiltonian: Callable):
+        self.one_form = UserFunction(one_form, "one_form", ("q",))
+        self.hamiltonian = UserFunction(hamiltonian, "hamiltonian", ("q",))
+
+    def lagrangian(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None) -> Float[Array, ""]:
+        """⟨α(q), v⟩ − H(q)."""
+        return self.one_form(q, params) @ v - self.hamiltonian(q, params)
+
+    def lagrange_dirac(self) -> LagrangeDirac:
+        """The same system as a degenerate Lagrangian on TQ, for schemes on Q × Q and Method 1."""
+        return LagrangeDirac(self.lagrangian)
+
+    def two_form(self, q: Float[Array, " n"], params: Any = None) -> Float[Array, "n n"]:
+        """The matrix of dα: (dα)_ij = ∂_i α_j − ∂_j α_i."""
+        derivative = jax.jacfwd(lambda q: self.one_form(q, params))(q)
+        return derivative.T - derivative
+
+    def dirac_system(self) -> DiracSystem:
+        """The system on M_f ≅ Q: the graph of the two-form −dα with H, so that −dα(·, q̇)-convention gives i_q̇ ω = dH."""
+        return DiracSystem(
+            DiracStructure.from_two_form(lambda q, params: -self.two_form(q, params)),
+            lambda q, params: self.hamiltonian(q, params),
+        )
+
+    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+        q = data["q"] if "q" in data else data["q0"]
+        form, energy = self.one_form.shape(q, params), self.hamiltonian.shape(q, params)
+        if form.shape != q.shape:
+            raise ValueError(f"one_form must return shape {q.shape} like q, but it returned shape {form.shape}.")
+        if energy.shape != ():
+            raise ValueError(f"hamiltonian must return a scalar, but it returned shape {energy.shape}.")
+        return q.shape[0], 0
+
+    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+        if "q0" in data:
+            return dict(data)
+        q, p = data["q"], self.one_form(data["q"], params)
+        dirac = self.dirac_system().complete({"x": q}, params, False)
+        given = data.get("p", p)
+        return {"q": q, "v": dirac["velocity"], "p": p if project else given, "defect": given - p}
+
+    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " n"]:
+        """p − α(q): the primary constraints."""
+        if "q0" in data:
+            return no_constraint()
+        return data["p"] - self.one_form(data["q"], params)
+
+    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+        """H(q)."""
+        return self.hamiltonian(row["q"], params)
+
+    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " n"]:
+        """p − α(q), zero on M_f."""
+        return row["p"] - self.one_form(row["q"], params)

@@ -1,0 +1,172 @@
+"""Port-Hamiltonian systems: open, closed, with dissipation, and interconnected."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dirax.functions import UserFunction, is_traced
+from dirax.systems.system import AbstractSystem, no_constraint
+
+SKEW_TOLERANCE = 1e-10
+
+
+class PortHamiltonian(AbstractSystem):
+    """ẋ = (J(x) − R(x)) dH(x) + B(x) u, y = B(x)ᵀ dH(x) ([BLM] (20)).
+
+    `hamiltonian(x[, params])` a scalar; `J(x[, params])` (N, N) skew; `B(x[, params])` (N, m), no ports by default;
+    `R(x[, params])` (N, N) symmetric, positive semidefinite, no dissipation by default. J, B and R may be constant arrays.
+    Open (default): u = `inputs(t, x[, params])` (m,), zero without it. Closed: u is the multiplier that keeps y = 0
+    ([BLM] (23), a Dirac system).
+
+    Raises `ValueError` at the start of a run where J is not skew or R not symmetric positive semidefinite, with the defect.
+    """
+
+    hamiltonian: UserFunction
+    J: UserFunction
+    B: UserFunction | None
+    R: UserFunction | None
+    inputs: UserFunction | None
+    closed: bool
+
+    def __init__(
+        self,
+        hamiltonian: Callable,
+        J: Callable | Any,
+        B: Callable | Any = None,
+        R: Callable | Any = None,
+        closed: bool = False,
+        inputs: Callable | None = None,
+    ):
+        self.hamiltonian = UserFunction(hamiltonian, "hamiltonian", ("x",))
+        self.J = _matrix_function(J, "J")
+        self.B = None if B is None else _matrix_function(B, "B")
+        self.R = None if R is None else _matrix_function(R, "R")
+        self.inputs = None if inputs is None else UserFunction(inputs, "inputs", ("t", "x"))
+        self.closed = closed
+        if closed and B is None:
+            raise ValueError("a closed port-Hamiltonian system needs B: its columns are the ports that are closed.")
+        if closed and inputs is not None:
+            raise ValueError("a closed port-Hamiltonian system takes no inputs: u is determined by y = 0.")
+
+    def with_inputs(self, inputs: Callable) -> "PortHamiltonian":
+        """The same open system driven by u = inputs(t, x[, params])."""
+        return PortHamiltonian(self.hamiltonian.function, self.J.function, _function(self.B), _function(self.R), False, inputs)
+
+    def differential(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+        """dH(x)."""
+        return jax.grad(lambda x: self.hamiltonian(x, params))(x)
+
+    def input_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N m"]:
+        """B(x); (N, 0) without ports."""
+        return jnp.zeros((x.shape[0], 0)) if self.B is None else self.B(x, params)
+
+    def flow_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N N"]:
+        """J(x) − R(x)."""
+        return self.J(x, params) if self.R is None else self.J(x, params) - self.R(x, params)
+
+    def input(self, t: Any, x: Float[Array, " N"], params: Any = None) -> Float[Array, " m"]:
+        """u(t, x) of an open system, zero without inputs."""
+        if self.inputs is None:
+            return jnp.zeros(self.input_matrix(x, params).shape[1])
+        return jnp.asarray(self.inputs(t, x, params))
+
+    def output(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " m"]:
+        """y = B(x)ᵀ dH(x)."""
+        return self.input_matrix(x, params).T @ self.differential(x, params)
+
+    def relation(
+        self,
+        x: Float[Array, " N"],
+        velocity: Float[Array, " N"],
+        multipliers: Float[Array, " m"],
+        t: Any,
+        params: Any = None,
+        differential: Float[Array, " N"] | None = None,
+    ) -> Float[Array, " k"]:
+        """ẋ − (J − R) dH − B u, and y for a closed system, whose u are `multipliers`; `differential` replaces dH(x)."""
+        dh = self.differential(x, params) if differential is None else differential
+        b = self.input_matrix(x, params)
+        u = multipliers if self.closed else self.input(t, x, params)
+        balance = velocity - self.flow_matrix(x, params) @ dh - b @ u
+        return jnp.concatenate([balance, b.T @ dh]) if self.closed else balance
+
+    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+        if "x" not in data:
+            raise ValueError(f"a PortHamiltonian starts from x=, but {', '.join(data)} were given.")
+        x = data["x"]
+        size = x.shape[0]
+        if self.hamiltonian.shape(x, params).shape != ():
+            raise ValueError(f"hamiltonian must return a scalar, not shape {self.hamiltonian.shape(x, params).shape}.")
+        for function in (self.J, self.R):
+            if function is not None and function.shape(x, params).shape != (size, size):
+                raise ValueError(
+                    f"{function.name} must have shape ({size}, {size}) for x of shape ({size},), but its shape is "
+                    f"{function.shape(x, params).shape}."
+                )
+        ports = 0
+        if self.B is not None:
+            shape = self.B.shape(x, params).shape
+            if len(shape) != 2 or shape[0] != size:
+                raise ValueError(f"B must have shape ({size}, m), one column a port, but its shape is {shape}.")
+            ports = shape[1]
+        if self.inputs is not None and self.inputs.shape(jnp.array(0.0), x, params).shape != (ports,):
+            raise ValueError(
+                f"inputs must return shape ({ports},), one number a port, not {self.inputs.shape(jnp.array(0.0), x, params).shape}."
+            )
+        if not is_traced(x, params):
+            self._check_structure(x, params)
+        return size, ports if self.closed else 0
+
+    def _check_structure(self, x, params) -> None:
+        J = np.asarray(self.J(x, params))
+        skewness = np.max(np.abs(J + J.T), initial=0.0)
+        if skewness > SKEW_TOLERANCE * max(np.max(np.abs(J), initial=0.0), 1e-300):
+            raise ValueError(f"J is not skew at the initial point: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
+        if self.R is None:
+            return
+        R = np.asarray(self.R(x, params))
+        scale = max(np.max(np.abs(R), initial=0.0), 1e-300)
+        if np.max(np.abs(R - R.T)) > SKEW_TOLERANCE * scale:
+            raise ValueError(f"R is not symmetric at the initial point: max |R − Rᵀ| = {np.max(np.abs(R - R.T)):.3g}.")
+        lowest = np.linalg.eigvalsh(R)[0]
+        if lowest < -SKEW_TOLERANCE * scale:
+            raise ValueError(
+                f"R is not positive semidefinite at the initial point: its lowest eigenvalue is {lowest:.3g}; dissipation "
+                "must not create energy."
+            )
+
+    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+        x = data["x"]
+        velocity = self.flow_matrix(x, params) @ self.differential(x, params)
+        if not self.closed:
+            velocity = velocity + self.input_matrix(x, params) @ self.input(0.0, x, params)
+        return {"x": x, "velocity": velocity}
+
+    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
+        """y = Bᵀ dH for a closed system: zero on M_0."""
+        return self.output(data["x"], params) if self.closed else no_constraint()
+
+    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+        """H(x)."""
+        return self.hamiltonian(row["x"], params)
+
+    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
+        return self.initial_defect({"x": row["x"]}, params)
+
+
+def _matrix_function(value: Any, name: str) -> UserFunction:
+    """The user's function of x, or a constant array as one."""
+    if isinstance(value, UserFunction):
+        return value
+    if callable(value):
+        return UserFunction(value, name, ("x",))
+    constant = np.asarray(value, dtype=float)
+    return UserFunction(lambda x: jnp.asarray(constant), name, ("x",))
+
+
+def _function(function: UserFunction | None):
+    return None if function is None else function.function
