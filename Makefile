@@ -57,7 +57,7 @@ lock:  ## Write requirements.lock anew from pyproject.toml (UPGRADE=--upgrade ta
 	rm -rf $(VENV)-lock
 
 clean:  ## Remove everything that the other targets made
-	rm -rf $(VENV) $(VENV)-lock $(OUT) site dist .jax_cache .pytest_cache .ruff_cache .hypothesis .benchmarks
+	rm -rf $(VENV) $(VENV)-lock out site dist .jax_cache .pytest_cache .ruff_cache .hypothesis .benchmarks
 	find src tests docs benchmarks -name __pycache__ -prune -exec rm -rf {} +
 
 # The lock names every package, pip itself included, with its exact version and hashes, so pip resolves nothing.
