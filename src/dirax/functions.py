@@ -8,8 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import checkify
+from jax.extend.core import jaxprs_in_params
 
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+INDEXING = ("dynamic_slice", "gather")
+"""What JAX turns an index into when it is not known to be inside the array."""
 
 
 class UserFunction(eqx.Module):
@@ -28,29 +32,70 @@ class UserFunction(eqx.Module):
         expected = f"{name}({', '.join(arguments)}[, params])"
         if not callable(function):
             raise TypeError(
-                f"{name} must be a function {expected}, but a {type(function).__name__} was given: "
+                f"{name} must be a function {expected}, but {function!r:.80} was given: "
                 "wrap the value in a function, e.g. a lambda."
             )
-        self.function, self.name, self.arguments = function, name, tuple(arguments)
         self.takes_params = _takes_params(function, name, expected, len(arguments))
+        self.function, self.name, self.arguments = _hashable(function), name, tuple(arguments)
 
     def __call__(self, *values: Any):
         *args, params = values
         return self.function(*args, params) if self.takes_params else self.function(*args)
 
+    @property
+    def signature(self) -> str:
+        """The function's own name with the arguments it is called with, e.g. `pendulum(q, v, params)`."""
+        own = getattr(self.function, "__name__", type(self.function).__name__).replace("<lambda>", "lambda")
+        return f"{own}({', '.join((*self.arguments, 'params') if self.takes_params else self.arguments)})"
+
     def shape(self, *values: Any) -> jax.ShapeDtypeStruct:
-        """Shape and dtype of the result, by abstract evaluation; `TypeError` if it is not one array of real numbers."""
+        """Shape and dtype of the result, by abstract evaluation on `(*arguments, params)`.
+
+        Raises `TypeError` if the function cannot be traced or does not return one array of float64, and `ValueError` if
+        it reads an entry that its arguments do not have (JAX itself would silently read another one).
+        """
+        call = f"{self.name}({', '.join(self.arguments)})"
+        shapes = ", ".join(str(jnp.shape(v)) for v in values[:-1])
         try:
-            out = jax.eval_shape(lambda *v: self(*v), *values)
+            jaxpr, out = jax.make_jaxpr(lambda *v: self(*v), return_shape=True)(*values)
         except Exception as error:
             raise TypeError(
-                f"{self.name}({', '.join(self.arguments)}) could not be traced by JAX on float64 arrays of shapes "
-                f"{[jnp.shape(v) for v in values[:-1]]}: {type(error).__name__}: {str(error).splitlines()[0]}"
+                f"{call} could not be traced by JAX on float64 arrays of shapes {shapes}{self._without_params(values)}: "
+                f"{type(error).__name__}: {_first_line(error)}{_way_out(error)}"
             ) from error
-        if not hasattr(out, "shape") or not jnp.issubdtype(out.dtype, jnp.floating):
-            what = f"dtype {out.dtype}" if hasattr(out, "dtype") else f"a {type(out).__name__}"
-            raise TypeError(f"{self.name} must return one array of real numbers (float64), but it returned {what}.")
+        if not isinstance(out, jax.ShapeDtypeStruct) or out.dtype != jnp.float64:
+            what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
+            raise TypeError(f"{call} must return one array of real numbers (float64), but it returned {what}.")
+        if _indexes(jaxpr.jaxpr) and not is_traced(values, jaxpr.consts):
+            outside = checkify.checkify(lambda *v: self(*v), errors=checkify.index_checks)(*values)[0].get()
+            if outside:
+                raise ValueError(
+                    f"{call} reads an entry that its arguments, of shapes {shapes}, do not have "
+                    f"({_first_line(outside)}): check the length of the initial data and the indices."
+                )
         return out
+
+    def returning(self, shape: tuple[int, ...]) -> Callable:
+        """The same function, which raises `ValueError` when it is traced and its result does not have this shape."""
+
+        def checked(*values):
+            result = self(*values)
+            if jnp.shape(result) != shape:
+                what = "a scalar" if shape == () else f"an array of shape {shape}"
+                raise ValueError(
+                    f"{self.name}({', '.join(self.arguments)}) must return {what}, but it returned shape "
+                    f"{jnp.shape(result)}{': sum or index its result' if shape == () else ''}."
+                )
+            return result
+
+        return checked
+
+    def __repr__(self) -> str:
+        return self.signature
+
+    def _without_params(self, values) -> str:
+        missing = self.takes_params and values[-1] is None
+        return " and params=None (it takes params, which were not given: pass params=…)" if missing else ""
 
 
 def _takes_params(function: Callable, name: str, expected: str, count: int) -> bool:
@@ -61,16 +106,45 @@ def _takes_params(function: Callable, name: str, expected: str, count: int) -> b
     if any(p.kind is p.VAR_POSITIONAL for p in parameters):
         return False
     positional = [p for p in parameters if p.kind in POSITIONAL]
-    required = [p for p in positional if p.default is p.empty]
-    if len(required) == count + 1:
-        return True
-    if len(required) <= count <= len(positional):
-        return len(positional) > count and positional[count].name == "params"
+    keywords = [p for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is p.empty]
+    required = [p for p in positional if p.default is p.empty] + keywords
+    if not keywords:
+        if len(required) == count + 1:
+            return True
+        if len(required) <= count <= len(positional):
+            return len(positional) > count and positional[count].name == "params"
     raise TypeError(
         f"{name} must have the signature {expected}, but {getattr(function, '__name__', 'it')} takes "
         f"{len(required)} argument{'s' if len(required) != 1 else ''}"
         f" ({', '.join(p.name for p in required) or 'none'})."
     )
+
+
+def _hashable(function: Callable) -> Callable:
+    """The function, under another identity if it has no hash (an object that holds arrays, say)."""
+    try:
+        hash(function)
+    except TypeError:
+        return lambda *values: function(*values)
+    return function
+
+
+def _indexes(jaxpr) -> bool:
+    """Whether an index occurs that JAX could not see to be inside its array."""
+    inner = [sub for equation in jaxpr.eqns for sub in jaxprs_in_params(equation.params)]
+    return any(e.primitive.name in INDEXING for e in jaxpr.eqns) or any(map(_indexes, inner))
+
+
+def _first_line(message: Any) -> str:
+    return (str(message).splitlines() or ["no message"])[0].split(" (`")[0].rstrip(". ")
+
+
+def _way_out(error: Exception) -> str:
+    if isinstance(error, jax.errors.TracerArrayConversionError):
+        return "; write it with jax.numpy instead of numpy."
+    if isinstance(error, jax.errors.ConcretizationTypeError):
+        return "; write it without Python's if and float(), e.g. with jnp.where."
+    return "."
 
 
 def is_traced(*trees: Any) -> bool:
@@ -79,14 +153,14 @@ def is_traced(*trees: Any) -> bool:
 
 
 def check_finite(name: str, value: Any) -> None:
-    """Raise `ValueError` when a concrete numerical leaf of `value` holds NaN or infinity."""
-    for leaf in jax.tree.leaves(value):
+    """Raise `ValueError`, naming the entry, when a concrete numerical leaf of `value` holds NaN or infinity."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(value):
         if is_traced(leaf) or not np.issubdtype(np.asarray(leaf).dtype, np.number):
             continue
         array = np.asarray(leaf)
         if not np.all(np.isfinite(array)):
-            where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+            index = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
+            entry = f"{name}{jax.tree_util.keystr(path)}{index if index else ''}"
             raise ValueError(
-                f"{name} must be finite, but it holds {array[where]} at index {where}: "
-                "remove or replace the entry before the run."
+                f"{name} must be finite, but {entry} is {array[tuple(index)]}: remove or replace the entry before the run."
             )

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,145 +11,200 @@ from dirax.functions import check_finite, is_traced
 
 KINDS = ({"q", "v"}, {"q", "p"}, {"q0", "q1"}, {"x"})
 OFF_CONSTRAINT = 1e-9
-"""Largest admissible |W v| relative to |W|·|v| for initial data that are to satisfy the constraint."""
+"""Largest admissible |W v|, relative to |v| where that is above 1, for initial data that are to satisfy the constraint."""
 
 
 class Start(NamedTuple):
-    """Where a run begins: first state and guess, the given row 0 of a two-point start, and how far off the constraint."""
+    """Where a run begins, each entry with a leading batch axis in a batch.
+
+    First state and the first guess of every stage; the given row 0 of a two-point start; how far the data are off the
+    constraint, and the size of the velocity; the constraint matrix at the data, if the system has one; the residual and
+    the Jacobian of the first step.
+    """
 
     state: Any
-    guess: Any
+    guess: tuple
     row0: dict | None
     first_step: int
     defect: Any
     size: Any
+    one_forms: Any
+    residual: Any
+    jacobian: Any
 
 
 def initial_data(given: dict[str, Any]) -> tuple[dict[str, jax.Array], int | None]:
     """The initial data as float64 arrays of shape (n,) or (B, n), and B (None for one trajectory)."""
     if set(given) not in KINDS:
+        came = ", ".join(f"{name}=" for name in sorted(given)) + (" alone" if len(given) == 1 else "")
         raise ValueError(
-            "initial data must be one of q=, v= · q=, p= · q0=, q1= · x=, but "
-            f"{', '.join(sorted(given)) + '=' if given else 'none'} was given."
+            f"initial data must be one of q=, v= · q=, p= · q0=, q1= · x=, but {came if given else 'none'} was given."
         )
-    arrays = {}
-    for name, value in given.items():
-        array = value if is_traced(value) else np.asarray(value)
-        if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-            raise TypeError(f"{name} must hold real numbers, but its dtype is {array.dtype}.")
-        if array.ndim not in (1, 2) or 0 in array.shape:
-            raise ValueError(
-                f"{name} must have shape (n,), or (B, n) for a batch of B trajectories, but its shape is {array.shape}."
-            )
-        check_finite(name, array)
-        arrays[name] = jnp.asarray(array, dtype=jnp.float64)
+    arrays = {name: _real_array(name, value) for name, value in given.items()}
     shapes = {name: array.shape for name, array in arrays.items()}
     if len({shape[-1] for shape in shapes.values()}) > 1:
         a, b = shapes
         raise ValueError(f"{a} and {b} must have the same length n, but their shapes are {shapes[a]} and {shapes[b]}.")
     batches = {shape[0] for shape in shapes.values() if len(shape) == 2}
     if len(batches) > 1:
-        raise ValueError(f"the initial data have different batch sizes: {shapes}.")
+        a, b = shapes
+        raise ValueError(
+            f"{a} and {b} must hold the same number of trajectories, but their shapes are {shapes[a]} and {shapes[b]}."
+        )
     batch = batches.pop() if batches else None
     if batch is not None:
         arrays = {name: jnp.broadcast_to(a, (batch, a.shape[-1])) for name, a in arrays.items()}
     return arrays, batch
 
 
-def prepared(system, equation, data, params, h, batch, batch_params: bool, project: bool) -> Start:
+def _real_array(name: str, value: Any) -> jax.Array:
+    try:
+        array = jnp.asarray(value) if is_traced(value) else np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name} must be an array of numbers, but it could not be made one: {error}") from error
+    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+        raise TypeError(f"{name} must hold real numbers, but its dtype is {array.dtype}.")
+    if array.ndim not in (1, 2) or 0 in array.shape:
+        raise ValueError(f"{name} must have shape (n,), or (B, n) for a batch of B trajectories, but its shape is {array.shape}.")
+    check_finite(name, array)
+    return jnp.asarray(array, dtype=jnp.float64)
+
+
+def prepared(system, equation, data, params, h, t0, batch, batch_params: bool, project: bool) -> Start:
     """The Start of every trajectory."""
+    if "q0" in data and len(equation.stages) > 1:
+        raise ValueError("a composition cannot start from q0= and q1=, which belong to one step: give q= with v= or p=.")
+    axes = None if batch is None else (0, 0 if batch_params else None, None, None)
+    start = _begin(system, equation, data, params, h, t0, axes, project)
+    if start.row0 is not None:
+        row0 = {k: (a if batch is not None else a[None]) for k, a in start.row0.items()}
+        start = start._replace(row0=row0 if is_traced(row0) else {k: np.asarray(a) for k, a in row0.items()})
+    return start
+
+
+@eqx.filter_jit
+def _begin(system, equation, data, params, h, t0, axes, project: bool) -> Start:
+    """One compiled function for all of it, reused by later runs of the same system and scheme."""
     stage, fraction = equation.stages[0]
     two_points = "q0" in data
-    if two_points and len(equation.stages) > 1:
-        raise ValueError(
-            "a composition cannot start from q0= and q1=, which belong to one step: give q= with v= or p=."
-        )
 
-    def one(data, params):
+    def one(data, params, h, t0):
         complete = system.complete(data, params, project)
         defect, size = system.initial_defect(complete, params), jnp.array(1.0)
         state, u = stage.start(complete, fraction * h, params)
+        guess = (u, *(other.start(complete, part * h, params)[1] for other, part in equation.stages[1:]))
         row0 = None
         if two_points:
-            t = jnp.array(0.0)
-            row0 = stage.unpack(state, u, t, h, params)
+            row0 = stage.unpack(state, u, t0, h, params)
             defect = row0.get("constraint", defect)
-            state = stage.advance(u, state, t, h, params)
-        if "v" in complete or two_points:
-            v = complete["v"] if "v" in complete else (data["q1"] - data["q0"]) / h
-            size = jnp.max(jnp.abs(v))
-        return state, u, row0, defect, size
+            state = stage.advance(u, state, t0, h, params)
+            size = jnp.max(jnp.abs(data["q1"] - data["q0"])) / h
+        elif "v" in complete:
+            size = jnp.max(jnp.abs(complete["v"]))
+        matrix = getattr(system, "constraint_matrix", None)
+        points = [data[name] for name in ("q", "q0") if name in data]
+        one_forms = matrix(points[0], params) if matrix and points else None
+        t = t0 + int(two_points) * h
+        first_step = lambda u: stage.residual(u, state, t, fraction * h, params)
+        residual, jacobian = (first_step(u), jax.jacfwd(first_step)(u)) if stage.unknowns else (None, None)
+        return Start(state, guess, row0, 0, defect, size, one_forms, residual, jacobian)
 
-    if batch is not None:
-        data = {k: jnp.broadcast_to(a, (batch, a.shape[-1])) for k, a in data.items()}
-        one = jax.vmap(one, in_axes=(0, 0 if batch_params else None))
-    state, u, row0, defect, size = jax.jit(one)(data, params)
-    if row0 is not None:
-        row0 = {k: (a if batch is not None else a[None]) for k, a in row0.items()}
-        if not is_traced(row0):
-            row0 = {k: np.asarray(a) for k, a in row0.items()}
-    return Start(state, u, row0, int(two_points), defect, size)
+    start = (one if axes is None else jax.vmap(one, in_axes=axes))(data, params, h, t0)
+    return start._replace(first_step=int(two_points))
 
 
-def refuse_off_constraint(start: Start, projected: bool) -> None:
-    """Raise `ValueError` with the residual for initial data off the constraint."""
-    defect = np.atleast_2d(np.asarray(start.defect))
-    if defect.size == 0:
+def refuse_bad_start(start: Start, labels: tuple[str, ...], check_constraint: bool) -> None:
+    """Raise `ValueError` for dependent one-forms, data off the constraint (with the residual), functions that are not
+    finite there, and a first step that has no unique solution (with the rank of the matrix (21) of [PY]). `labels` are
+    those of the equations of the first step."""
+    _refuse_dependent_one_forms(start)
+    if check_constraint:
+        _refuse_off_constraint(start)
+    if start.jacobian is not None:
+        _refuse_singular_step(start, labels)
+
+
+def _refuse_dependent_one_forms(start: Start) -> None:
+    if start.one_forms is None or not np.size(start.one_forms):
         return
-    size = np.atleast_1d(np.asarray(start.size))
+    matrices = _lanes(start.one_forms, 2)
+    finite = np.all(np.isfinite(matrices), axis=(1, 2))
+    if not np.all(finite):
+        raise ValueError(
+            f"one_forms is not finite at the initial data{_which(~finite)}: the data lie outside its domain, or on its edge."
+        )
+    ranks, _ = numerical_rank(matrices)
+    m = matrices.shape[1]
+    if np.any(ranks < m):
+        raise ValueError(
+            f"one_forms must be independent, but W(q) of shape {matrices.shape[1:]} has rank {np.min(ranks)} at the initial "
+            f"data{_which(ranks < m)}: leave out the one-forms that follow from the others."
+        )
+
+
+def _refuse_off_constraint(start: Start) -> None:
+    defect = _lanes(start.defect, 1)
+    if not defect.size:
+        return
     worst = np.max(np.abs(defect), axis=-1)
-    bad = worst > OFF_CONSTRAINT * np.maximum(size, 1.0)
+    bad = ~(worst <= OFF_CONSTRAINT * np.maximum(_lanes(start.size, 0), 1.0))
     if np.any(bad):
         lane = int(np.argmax(bad))
-        which = f" of trajectory {lane}" if len(worst) > 1 else ""
         way = (
-            "for q0=, q1= choose q1 on the discrete constraint, or pass check_initial=False to take the points as they are"
+            "choose q1 on the discrete constraint, or pass check_initial=False to take the points as they are"
             if start.first_step
             else "pass project=True to project them, or check_initial=False to take them as they are"
         )
         raise ValueError(
-            f"the initial data{which} are off the constraint: its residual is {np.array2string(defect[lane], precision=4)} "
-            f"(largest {worst[lane]:.3g}); {way}."
+            f"the initial data{_which(bad)} are off the constraint, whose residual is "
+            f"{np.array2string(defect[lane], precision=4)} (largest {worst[lane]:.3g}); {way}."
         )
 
 
-def refuse_singular_start(equation, start: Start, h, t0, params, batch, batch_params: bool) -> None:
-    """Raise `ValueError` with the rank where the Jacobian of the first step is singular ([PY] (21))."""
-    stage, fraction = equation.stages[0]
-    if stage.unknowns == 0:
-        return
-    first = (lambda a: a[0]) if batch is not None else (lambda a: a)
-    state, u = first(start.state), first(start.guess)
-    one_params = jax.tree.map(lambda a: a[0], params) if batch_params else params
-    args = (state, jnp.asarray(t0 + start.first_step * h), fraction * h, one_params)
-    residual = np.asarray(stage.residual(u, *args))
-    jacobian = np.asarray(jax.jacfwd(stage.residual)(u, *args))
-    if not np.all(np.isfinite(residual)) or not np.all(np.isfinite(jacobian)):
-        rows = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
+def _refuse_singular_step(start: Start, labels: tuple[str, ...]) -> None:
+    residual, jacobian = _lanes(start.residual, 1), _lanes(start.jacobian, 2)
+    rows = np.isfinite(residual) & np.all(np.isfinite(jacobian), axis=2)
+    finite = np.all(rows, axis=1)
+    if not np.all(finite):
+        row = int(np.argmin(rows[np.argmin(finite)]))
         raise ValueError(
-            f"the equations are not finite at the initial data ({stage.labels[int(np.argmax(rows))]}): the data lie "
-            "outside the domain of the system's functions, or on its edge."
+            f"the first step is not finite at the initial data{_which(~finite)} (in {labels[row]}): the data lie outside the "
+            "domain of the system's functions, or on its edge."
         )
-    rank, direction = numerical_rank(jacobian)
-    if rank < stage.unknowns:
+    ranks, directions = numerical_rank(jacobian)
+    unknowns = jacobian.shape[1]
+    if np.any(ranks < unknowns):
+        lane = int(np.argmax(ranks < unknowns))
         raise ValueError(
-            f"the step cannot be solved: the matrix (21) of the discrete equations has rank {rank} of {stage.unknowns} at "
-            f"the initial data (free direction {np.array2string(direction, precision=2, suppress_small=True)} in the "
-            "unknowns); the Lagrangian is singular together with its constraints, or the one-forms are dependent: remove "
-            "the redundant coordinates or one-forms, or choose another discrete Lagrangian."
+            f"the first step has no unique solution: its matrix ([PY] (21)) has rank {ranks[lane]} of {unknowns} at the "
+            f"initial data{_which(ranks < unknowns)}, and leaves the direction "
+            f"{np.array2string(directions[lane], precision=2, suppress_small=True)} of the unknowns free. The Lagrangian is "
+            "singular together with its constraints: remove the coordinates that it does not determine, or choose another "
+            "discrete Lagrangian."
         )
 
 
-def numerical_rank(matrix: np.ndarray, relative: float = 1e-12) -> tuple[int, np.ndarray]:
-    """The rank of a matrix after scaling its rows and columns to unit size, and the direction nearest to its kernel."""
-    scaled = np.array(matrix, dtype=float)
-    columns = np.ones(scaled.shape[1])
+def _lanes(values: Any, ndim: int) -> np.ndarray:
+    """With a batch axis in any case."""
+    array = np.asarray(values)
+    return array if array.ndim > ndim else array[None]
+
+
+def _which(bad: np.ndarray) -> str:
+    return f" of trajectory {int(np.argmax(bad))}" if len(bad) > 1 else ""
+
+
+def numerical_rank(matrices: np.ndarray, relative: float = 1e-12) -> tuple[np.ndarray, np.ndarray]:
+    """The ranks of matrices (B, k, l) with rows and columns scaled to unit size, and directions nearest to their kernels."""
+    scaled = np.array(matrices, dtype=float)
+    columns = np.ones((len(scaled), 1, scaled.shape[2]))
     for _ in range(3):
-        rows = np.max(np.abs(scaled), axis=1, keepdims=True)
-        scaled = scaled / np.where(rows > 0, rows, 1.0)
-        sizes = np.max(np.abs(scaled), axis=0)
+        rows = np.max(np.abs(scaled), axis=2, keepdims=True)
+        scaled /= np.where(rows > 0, rows, 1.0)
+        sizes = np.max(np.abs(scaled), axis=1, keepdims=True)
         sizes = np.where(sizes > 0, sizes, 1.0)
         scaled, columns = scaled / sizes, columns / sizes
     _, values, vt = np.linalg.svd(scaled)
-    direction = vt[-1] * columns
-    return int(np.sum(values > relative * max(values[0], 1e-300))), direction / np.max(np.abs(direction))
+    directions = vt[:, -1] * columns[:, 0]
+    directions /= np.max(np.abs(directions), axis=1, keepdims=True)
+    return np.sum(values > relative * np.maximum(values[:, :1], 1e-300), axis=1), directions

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines import xla
-from dirax.engines.result import OK, Outcome, Problem, saved_steps
+from dirax.engines.result import Outcome, Problem, saved_steps
 from dirax.failures import explain
 from dirax.functions import check_finite, is_traced
-from dirax.initial import initial_data, prepared, refuse_off_constraint, refuse_singular_start
+from dirax.initial import Start, initial_data, prepared, refuse_bad_start
 from dirax.progress import reporting
 from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
 from dirax.solution import Solution
@@ -31,6 +31,7 @@ def simulate(
     q0: Any = None,
     q1: Any = None,
     x: Any = None,
+    inputs: Any = None,
     params: Any = None,
     batch_params: bool = False,
     save_every: int = 1,
@@ -46,37 +47,40 @@ def simulate(
     Initial data: `q=, v=` · `q=, p=` · `q0=, q1=` (rows 0 and 1 as they are) · `x=`; each of shape (n,), or (B, n) for a
     batch of B trajectories. `params` is handed to user functions that take it; with `batch_params` its leaves have the
     batch axis too. Rows are saved every `save_every` steps, the last one always. `step` and `t` have the user's unit of
-    time. `progress`: True for a bar, or a function of (steps done, steps in all). `project` moves initial data onto the
-    constraint; `check_initial=False` accepts data off it as they are.
+    time, and `t0` is the time of the first row. `inputs(t, x[, params])` drives an open port-Hamiltonian system.
+    `progress`: True for a bar, or a function of (steps done, steps in all). `project` moves initial data onto the
+    constraint; `check_initial=False` accepts data off it as they are. `max_iterations` bounds Newton's iterations a step.
 
     Under `jax.grad`, `jit` or `vmap` the run is one differentiable scan, and values are not checked.
 
     Raises `ValueError` or `TypeError`, naming the argument, for wrong shapes, dtypes and arities, values that are not
     finite, `step` ≤ 0, `steps` < 1, data off the constraint, dependent one-forms, and a Lagrangian singular together with
-    its constraints ([PY] (21)). A run that fails midway raises nothing: see `Solution.ok` and `.message`.
+    its constraints ([PY] (21)). A run that fails midway, or is stopped by Ctrl-C, raises nothing: what was computed is
+    kept, and `Solution.ok` and `.message` say what happened.
     """
     _check_kinds(system, scheme, engine)
     h, steps, save_every = _positive(step, "step"), _count(steps, "steps"), _count(save_every, "save_every")
+    t0, max_iterations = _finite(t0, "t0"), _count(max_iterations, "max_iterations")
     given = {"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}
     data, batch = initial_data({k: a for k, a in given.items() if a is not None})
-    params = jax.tree.map(lambda leaf: jnp.asarray(leaf) if _is_number(leaf) else leaf, params)
+    params = jax.tree.map(_array_if_number, params)
     check_finite("params", params)
     batch = _batch_size(batch, params, batch_params)
-    traced = is_traced(data, params, step)
+    system = system if inputs is None else _driven(system, inputs)
 
     one = {k: a[0] if a.ndim == 2 else a for k, a in data.items()}
     one_params = jax.tree.map(lambda leaf: leaf[0], params) if batch_params else params
     shape = Shape(*system.sizes(one, one_params))
     equation = make_step_equation(scheme, system, shape)
-    start = prepared(system, equation, data, params, h, batch, batch_params, project)
+    start = prepared(system, equation, data, params, h, t0, batch, batch_params, project)
+    # user functions that close over a traced value make the start traced although nothing that was passed is
+    traced = is_traced(data, params, h, t0, start)
     if not traced:
-        if check_initial:
-            refuse_off_constraint(start, project)
-        refuse_singular_start(equation, start, h, t0, params, batch, batch_params)
+        refuse_bad_start(start, equation.stages[0][0].labels, check_initial)
     problem = Problem(
         equation=equation,
         state=start.state,
-        guess=(start.guess,) * len(equation.stages),
+        guess=start.guess,
         h=h,
         t0=t0,
         steps=steps - start.first_step,
@@ -95,48 +99,44 @@ def simulate(
     return _solution(system, scheme, problem, outcome, start, data, traced)
 
 
-def _solution(system, scheme, problem: Problem, outcome: Outcome, start, data, traced: bool) -> Solution:
-    p = problem
-    info = p.equation.stages[0][0].fields
-    fields, numbers = dict(outcome.fields), saved_steps(p)
-    ok, message = True, ""
-    if not traced:
+def _solution(system, scheme, problem: Problem, outcome: Outcome, start: Start, data, traced: bool) -> Solution:
+    p, first = problem, problem.first_step
+    info, numbers = p.equation.stages[0][0].fields, saved_steps(p)
+    fields, closing = outcome.fields, outcome.closing
+    if traced:
+        ok, message = outcome.completed == p.steps, ""
+        fields = {k: _blanked(a, info[k], closing[k], numbers, outcome.completed, jnp.where) for k, a in fields.items()}
+        ok = ok if p.batch is not None else ok[0]
+    else:
         good = np.asarray(outcome.completed)
-        failed = np.asarray(outcome.status) != OK
-        messages = [
-            explain(p, outcome, lane) if failed[lane] or outcome.interrupted else "" for lane in range(len(good))
-        ]
-        incomplete = good < p.steps
+        ended = [lane for lane in range(len(good)) if good[lane] < p.steps]
+        last_row = numbers[np.searchsorted(numbers, good, side="right") - 1] if p.batch is not None else good
+        message = [""] * len(good)
+        for lane in ended:
+            message[lane] = explain(p, outcome, lane, kept=int(last_row[lane]))
+        ok = good == p.steps
         if p.batch is None:
-            ok, message = not incomplete[0], messages[0]
-            if incomplete[0]:
-                fields, numbers = _truncated(fields, outcome.closing, info, numbers, int(good[0]))
-        else:
-            ok, message = ~incomplete, messages
-            _blank(fields, info, numbers, good)
-    numbers = numbers + p.first_step
+            ok, message = bool(ok[0]), message[0]
+            if ended:
+                fields, numbers = _truncated(fields, closing, info, numbers, int(good[0]))
+        elif ended:
+            for k, a in fields.items():
+                a[ended] = _blanked(a[ended], info[k], closing[k][ended], numbers, good[ended], np.where)
+    numbers = numbers + first
     if start.row0 is not None:  # a two-point start: row 0 is given, not computed
-        fields = {k: _prepend(a, start.row0[k], traced) for k, a in fields.items()}
+        join = jnp.concatenate if traced else np.concatenate
+        for k in list(fields):  # one after the other, so that only one array is in memory twice
+            fields[k] = join([start.row0[k][:, None], fields.pop(k)], axis=1)
         numbers = np.concatenate([[0], numbers])
     if p.batch is None:
         fields = {k: a[0] for k, a in fields.items()}
-    array = jnp.asarray if is_traced(p.h) else np.asarray
-    stats = {
-        "engine": outcome.engine,
-        "steps": p.steps + p.first_step,
-        "newton_iterations": _reduced(outcome.iterations, jnp.sum, traced),
-        "max_residual": _reduced(outcome.max_residual, jnp.max, traced),
-        "compile_seconds": outcome.compile_seconds,
-        "run_seconds": outcome.run_seconds,
-        **outcome.notes,
-    }
     return Solution(
-        t=p.t0 + array(numbers * p.h),
-        fields=fields,
+        t=p.t0 + numbers * p.h,
+        fields={k: fields[k] for k in info},
         field_info=info,
         step=p.h,
         save_every=p.save_every,
-        stats=stats,
+        stats=_stats(p, outcome, traced),
         ok=ok,
         message=message,
         system=system,
@@ -150,56 +150,69 @@ def _solution(system, scheme, problem: Problem, outcome: Outcome, start, data, t
 
 def _truncated(fields, closing, info, numbers, completed: int):
     """One trajectory cut after its last good step, which is added as a row if it was not to be saved."""
-    rows = int(np.searchsorted(numbers, completed, side="right"))
-    off_grid = numbers[rows - 1] != completed
+    rows = int(np.searchsorted(numbers, completed, side="left"))  # rows before the last good step
     cut = {}
     for name, values in fields.items():
-        node = info[name].place == "node"
-        kept = values[:, : rows if node or off_grid else rows - 1]
-        if node and not off_grid:
-            kept = np.concatenate([kept[:, :-1], closing[name][:, None]], axis=1)
-        elif node:
-            kept = np.concatenate([kept, closing[name][:, None]], axis=1)
-        cut[name] = kept
-    return cut, np.append(numbers[:rows], completed) if off_grid else numbers[:rows]
+        kept = values[:, :rows]
+        cut[name] = np.concatenate([kept, closing[name][:, None]], axis=1) if info[name].place == "node" else kept
+    return cut, np.append(numbers[:rows], completed)
 
 
-def _blank(fields, info, numbers, completed) -> None:
-    """NaN in the rows of a batch that lie after a trajectory's last good step."""
-    for name, values in fields.items():
-        reached = numbers if info[name].place == "node" else numbers[1:]
-        values[completed[:, None] < reached[None, :]] = np.nan
+def _blanked(values, info, closing, numbers, completed, where):
+    """Rows (B, rows, …) of a batch with NaN after each trajectory's last good step, and its closing row there."""
+    at = numbers if info.place == "node" else numbers[:-1]
+    column = (slice(None), slice(None), *(None,) * (values.ndim - 2))
+    if info.place != "node":
+        return where((at[None, :] < completed[:, None])[column], values, np.nan)
+    kept = where((at[None, :] == completed[:, None])[column], closing[:, None], values)
+    return where((at[None, :] <= completed[:, None])[column], kept, np.nan)
 
 
-def _prepend(values, first, traced: bool):
-    join = jnp.concatenate if traced else np.concatenate
-    return join([first[:, None], values], axis=1)
-
-
-def _reduced(values, reduce, traced: bool):
-    return reduce(values) if traced else float(reduce(np.asarray(values))) if reduce is jnp.max else int(np.sum(values))
+def _stats(p: Problem, outcome: Outcome, traced: bool) -> dict[str, Any]:
+    total, worst = jnp.sum(outcome.iterations), jnp.max(outcome.max_residual)
+    return {
+        "engine": outcome.engine,
+        "steps": p.steps + p.first_step,
+        "newton_iterations": total if traced else int(total),
+        "max_residual": worst if traced else float(worst),
+        "compile_seconds": outcome.compile_seconds,
+        "run_seconds": outcome.run_seconds,
+        **outcome.notes,
+    }
 
 
 def _check_kinds(system, scheme, engine) -> None:
-    if not isinstance(system, AbstractSystem):
-        raise TypeError(
-            f"system must be a dirax system such as dx.LagrangeDirac(…), but a {type(system).__name__} was given."
-        )
-    if not isinstance(scheme, AbstractScheme):
-        hint = " (a class, not an instance: add parentheses)" if isinstance(scheme, type) else ""
-        raise TypeError(
-            f"scheme must be a dirax scheme such as dx.PlusLagrangeDirac(), but {scheme!r} was given{hint}."
-        )
+    for value, kind, name, example in (
+        (system, AbstractSystem, "system", "dx.LagrangeDirac(…)"),
+        (scheme, AbstractScheme, "scheme", "dx.PlusLagrangeDirac()"),
+    ):
+        if not isinstance(value, kind):
+            came = f"the class {value.__name__}, not an instance of it," if isinstance(value, type) else f"{value!r:.80}"
+            raise TypeError(f"{name} must be a dirax {name} such as {example}, but {came} was given.")
     if engine not in ENGINES:
         raise ValueError(f"engine must be one of {', '.join(map(repr, ENGINES))}, but {engine!r} was given.")
 
 
-def _positive(value, name: str):
+def _driven(system, inputs):
+    if not hasattr(system, "with_inputs"):
+        raise TypeError(
+            f"inputs= drives an open dx.PortHamiltonian system, but the system is a {type(system).__name__}: leave it out."
+        )
+    return system.with_inputs(inputs)
+
+
+def _finite(value, name: str):
     if is_traced(value):
         return value
-    if not _is_number(value) or np.ndim(value) != 0 or not np.isfinite(value) or value <= 0:
-        raise ValueError(f"{name} must be a positive finite number, but {value!r} was given.")
+    if not _is_number(value) or np.ndim(value) != 0 or not np.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, but {value!r} was given.")
     return float(value)
+
+
+def _positive(value, name: str):
+    if not is_traced(value) and (not _is_number(value) or np.ndim(value) != 0 or not 0 < value < np.inf):
+        raise ValueError(f"{name} must be a positive finite number, but {value!r} was given.")
+    return value if is_traced(value) else float(value)
 
 
 def _count(value, name: str) -> int:
@@ -209,19 +222,24 @@ def _count(value, name: str) -> int:
 
 
 def _is_number(leaf) -> bool:
-    return isinstance(leaf, int | float | np.ndarray | np.generic | jax.Array) and not isinstance(leaf, bool)
+    array = isinstance(leaf, int | float | np.ndarray | np.generic | jax.Array) and not isinstance(leaf, bool)
+    return array and np.issubdtype(np.result_type(leaf), np.number)
+
+
+def _array_if_number(leaf):
+    return jnp.asarray(leaf) if _is_number(leaf) else leaf
 
 
 def _batch_size(batch: int | None, params, batch_params: bool) -> int | None:
     if not batch_params:
         return batch
-    sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(params)}
-    if len(sizes) != 1 or sizes == {()}:
+    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(params)]
+    if not shapes or () in shapes or len({shape[0] for shape in shapes}) > 1:
         raise ValueError(
-            "with batch_params=True every leaf of params needs the same leading batch axis, but their shapes are "
-            f"{[np.shape(leaf) for leaf in jax.tree.leaves(params)]}."
+            "with batch_params=True every leaf of params needs the same leading batch axis, but "
+            + (f"their shapes are {', '.join(map(str, shapes))}." if shapes else "params has no leaves.")
         )
-    (size,) = sizes.pop()
+    size = shapes[0][0]
     if batch not in (None, size):
         raise ValueError(
             f"the initial data are a batch of {batch} and the leaves of params a batch of {size}: they must be equal."

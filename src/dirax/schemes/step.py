@@ -9,6 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.representation import counted, html_table, module_html, module_text
+
 
 class Field(eqx.Module):
     """One named array of a trajectory: its shape in a row and whether it belongs to nodes or to steps.
@@ -35,8 +37,8 @@ class StepEquation(eqx.Module):
       step leaving it.
 
     An explicit method has `unknowns = 0`. `scale` (k,) is the unit of each unknown, for the stopping test of Newton's
-    method only. `labels` names each row of the residual for messages. With `needs_leaving_step` the node fields depend on `u`, and an
-    engine solves one more step to fill the last row.
+    method only. `labels` names each row of the residual for messages. With `needs_leaving_step` the node fields depend on
+    `u`, and an engine solves one more step to fill the last row.
     """
 
     start: Callable = eqx.field(static=True)
@@ -86,6 +88,20 @@ class StepEquation(eqx.Module):
         """The equations solved one after the other in a step, each with its fraction of h (here: one, the whole)."""
         return ((self, 1.0),)
 
+    def _summary(self) -> dict[str, str]:
+        saved = (f"{name}{list(field.shape)}" + " per step" * (field.place == "step") for name, field in self.fields.items())
+        return {
+            "solves": counted(self.unknowns, "unknown") if self.unknowns else "nothing (explicit)",
+            "state": counted(self.state_size, "number") + ", (q, p) on T*Q" * self.canonical,
+            "saves": ", ".join(saved),
+        }
+
+    def __repr__(self) -> str:
+        return f"StepEquation({'; '.join(f'{name} {text}' for name, text in self._summary().items())})"
+
+    def _repr_html_(self) -> str:
+        return html_table("StepEquation", self._summary() | {"equations": ", ".join(self.labels)})
+
 
 class StepSequence(eqx.Module):
     """Several StepEquations solved one after the other, each with its own fraction of h: a composition."""
@@ -95,6 +111,10 @@ class StepSequence(eqx.Module):
     @property
     def first(self) -> StepEquation:
         return self.stages[0][0]
+
+    def __repr__(self) -> str:
+        fractions = ", ".join(f"{fraction:.6g}" for _, fraction in self.stages)
+        return f"StepSequence({counted(len(self.stages), 'stage')} of h·({fractions}); first {self.first!r})"
 
 
 class Shape(eqx.Module):
@@ -106,6 +126,12 @@ class Shape(eqx.Module):
 
 class AbstractScheme(eqx.Module):
     """How time is cut: turns a system of known sizes into a StepEquation."""
+
+    def __repr__(self) -> str:
+        return module_text(self)
+
+    def _repr_html_(self) -> str:
+        return module_html(self)
 
     @abstractmethod
     def step_equation(self, system: Any, shape: Shape) -> StepEquation | StepSequence:

@@ -7,12 +7,20 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.representation import module_html, module_text
+
 
 class AbstractSystem(eqx.Module):
     """A mechanical system as the user states it; no time step in here.
 
     All methods act on one trajectory (no batch axis) and are traceable.
     """
+
+    def __repr__(self) -> str:
+        return module_text(self)
+
+    def _repr_html_(self) -> str:
+        return module_html(self)
 
     @abstractmethod
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:

@@ -1,0 +1,57 @@
+"""How systems, schemes and equations show themselves: one readable line in a terminal, a small table in a notebook."""
+
+import dataclasses
+import html
+from typing import Any
+
+import numpy as np
+
+LINE = 100
+"""Longest representation that stays on one line."""
+
+
+def module_fields(module: Any) -> dict[str, Any]:
+    """The fields of a frozen record by name, in the order of its class."""
+    return {field.name: getattr(module, field.name) for field in dataclasses.fields(module)}
+
+
+def module_text(module: Any) -> str:
+    """`Name(field=value, …)`, on several lines where one would be too long."""
+    parts = [f"{name}={value_text(value)}" for name, value in module_fields(module).items()]
+    name = type(module).__name__
+    line = f"{name}({', '.join(parts)})"
+    if len(line) <= LINE and "\n" not in line:
+        return line
+    inside = ",\n".join(parts).replace("\n", "\n  ")
+    return f"{name}(\n  {inside},\n)"
+
+
+def module_html(module: Any) -> str:
+    """The fields of a record as a table."""
+    return html_table(type(module).__name__, {k: value_text(v) for k, v in module_fields(module).items()})
+
+
+def value_text(value: Any) -> str:
+    """One value: arrays by their entries if there are few and by their shape otherwise, functions by their name."""
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        small = np.size(value) <= 6 and isinstance(value, np.ndarray | np.generic)
+        return np.array2string(np.asarray(value), separator=", ") if small else f"{value.dtype}{list(np.shape(value))}"
+    if callable(value) and hasattr(value, "__name__"):
+        return "a lambda" if value.__name__ == "<lambda>" else value.__name__
+    if isinstance(value, tuple) and len(value) > 8:
+        return f"({', '.join(map(value_text, value[:3]))}, … {len(value)} in all)"
+    return repr(value)
+
+
+def html_table(title: str, rows: dict[str, str]) -> str:
+    """A captioned table of two columns, everything escaped."""
+    body = "".join(
+        f"<tr><th style='text-align:left'>{html.escape(name)}</th><td style='text-align:left'>{html.escape(text)}</td></tr>"
+        for name, text in rows.items()
+    )
+    return f"<table><caption><b>{html.escape(title)}</b></caption><tbody>{body}</tbody></table>"
+
+
+def counted(number: int, noun: str) -> str:
+    """`1 step`, `50 000 steps`: a number with its noun, thousands set apart."""
+    return f"{number:,}".replace(",", " ") + f" {noun}" + ("" if number == 1 else "s")
