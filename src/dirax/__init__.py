@@ -7,25 +7,45 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from dirax.geometry.linear import LinearDirac
+from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
+from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
+from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
 from dirax.simulate import simulate
 from dirax.solution import Solution
+from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.nonholonomic import NonholonomicMechanics
+from dirax.systems.phase_space import PhaseSpaceLagrangian
+from dirax.systems.port_hamiltonian import PortHamiltonian
 
 __version__ = "0.1.0"
 
 __all__ = [
     "AbstractScheme",
+    "Adjoint",
+    "Composition",
+    "DiracStructure",
+    "DiracSystem",
+    "DiscreteDirac",
     "Field",
     "LagrangeDAlembert",
     "LagrangeDirac",
+    "LinearDirac",
     "MinusLagrangeDirac",
+    "NonholonomicMechanics",
+    "PhaseSpaceLagrangian",
     "PlusLagrangeDirac",
+    "PortHamiltonian",
     "Shape",
     "Solution",
     "StepEquation",
     "StepSequence",
+    "SymmetricComposition",
+    "canonical_two_form",
+    "induced_dirac",
     "make_step_equation",
     "simulate",
 ]

@@ -89,7 +89,8 @@ class Composition(AbstractScheme):
         if isinstance(coefficients, str):
             if coefficients not in COEFFICIENTS:
                 raise ValueError(
-                    f"coefficients must be one of {', '.join(map(repr, COEFFICIENTS))} or numbers, but {coefficients!r} was given."
+                    f"coefficients must be one of {', '.join(map(repr, COEFFICIENTS))} or numbers, "
+                    f"but {coefficients!r} was given."
                 )
             coefficients = COEFFICIENTS[coefficients]
         numbers = tuple(float(c) for c in coefficients)

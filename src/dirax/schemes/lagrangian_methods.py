@@ -44,7 +44,7 @@ def discretized_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) ->
         return jnp.concatenate([balance, system.constraint_matrix(q, params) @ v]) if m else balance
 
     def advance(u, state, t, h, params):
-        q0, p0, v = state[:n], state[n:], u[:n]
+        q0, v = state[:n], u[:n]
         rate, momentum = force(q0 + theta * h * v, v, u, params)
         # p1 = p0 + h ṗ, written from the base point so that p keeps to the image of the Legendre transform
         return jnp.concatenate([q0 + h * v, momentum + theta * h * rate])

@@ -62,7 +62,7 @@ class DiracSystem(AbstractSystem):
         out = self.hamiltonian.shape(x, params)
         if out.shape != ():
             raise ValueError(f"hamiltonian must return a scalar, but for x of shape {x.shape} it returned shape {out.shape}.")
-        F, E = jax.eval_shape(lambda x: self.structure.kernel(x, params), x)
+        F, _ = jax.eval_shape(lambda x: self.structure.kernel(x, params), x)
         if F.shape != (x.size, x.size):
             raise ValueError(
                 f"the Dirac structure has dimension {F.shape[0]}, but x has {x.size} entries"

@@ -41,7 +41,7 @@ class PhaseSpaceLagrangian(AbstractSystem):
         return derivative.T - derivative
 
     def dirac_system(self) -> DiracSystem:
-        """The system on M_f ≅ Q: the graph of the two-form −dα with H, so that −dα(·, q̇)-convention gives i_q̇ ω = dH."""
+        """The system on M_f ≅ Q: (dα)_ij q̇^j = ∂_i H is q̇ ⊕ dH ∈ graph of the two-form with matrix −dα (α = ωᵀv)."""
         return DiracSystem(
             DiracStructure.from_two_form(lambda q, params: -self.two_form(q, params)),
             lambda q, params: self.hamiltonian(q, params),

@@ -113,10 +113,10 @@ class PortHamiltonian(AbstractSystem):
             if len(shape) != 2 or shape[0] != size:
                 raise ValueError(f"B must have shape ({size}, m), one column a port, but its shape is {shape}.")
             ports = shape[1]
-        if self.inputs is not None and self.inputs.shape(jnp.array(0.0), x, params).shape != (ports,):
-            raise ValueError(
-                f"inputs must return shape ({ports},), one number a port, not {self.inputs.shape(jnp.array(0.0), x, params).shape}."
-            )
+        if self.inputs is not None:
+            shape = self.inputs.shape(jnp.array(0.0), x, params).shape
+            if shape != (ports,):
+                raise ValueError(f"inputs must return shape ({ports},), one number a port, but it returned shape {shape}.")
         if not is_traced(x, params):
             self._check_structure(x, params)
         return size, ports if self.closed else 0

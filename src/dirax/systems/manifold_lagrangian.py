@@ -1,0 +1,80 @@
+"""Lagrangians on a manifold, in ambient coordinates: no angles, no poles."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from dirax.functions import UserFunction
+from dirax.geometry.manifolds import AbstractManifold
+from dirax.systems.system import AbstractSystem, no_constraint
+
+
+class ManifoldLagrangian(AbstractSystem):
+    """A Lagrangian on TQ for a manifold Q ⊂ R^N: q is a point of Q, v a tangent vector, both (N,).
+
+    `lagrangian(q, v[, params])` returns a scalar and is used for points and tangent vectors only; `manifold` is a dirax
+    manifold such as `dx.Product(dx.Sphere(3), dx.Sphere(3))`. Momenta are covectors, given as the tangent vectors that
+    represent them in R^N. It must be regular on Q. Stepped by `dx.InCharts`.
+    """
+
+    lagrangian: UserFunction
+    manifold: AbstractManifold
+
+    def __init__(self, lagrangian: Callable, manifold: AbstractManifold):
+        if not isinstance(manifold, AbstractManifold):
+            raise TypeError(f"manifold must be a dirax manifold such as dx.Sphere(3), but {manifold!r} was given.")
+        self.lagrangian = UserFunction(lagrangian, "lagrangian", ("q", "v"))
+        self.manifold = manifold
+
+    def legendre(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+        """The covector ∂L/∂v restricted to the tangent space at q."""
+        return self.manifold.projection(q, jax.grad(lambda v: self.lagrangian(q, v, params))(v))
+
+    def inverse_legendre(self, q: Float[Array, " N"], p: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+        """The tangent vector v at q with legendre(q, v) = p."""
+        frame = self.manifold.frame(q)
+
+        def defect(s, _):
+            return frame.T @ (jax.grad(lambda v: self.lagrangian(q, v, params))(frame @ s) - p)
+
+        solver = optx.Newton(rtol=1e-14, atol=1e-14, cauchy_termination=False)
+        zero = jnp.zeros(self.manifold.dimension)
+        return frame @ optx.root_find(defect, solver, zero, max_steps=60, throw=False).value
+
+    def energy(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None) -> Float[Array, ""]:
+        """⟨∂L/∂v, v⟩ − L."""
+        value, derivative = jax.value_and_grad(lambda v: self.lagrangian(q, v, params))(v)
+        return derivative @ v - value
+
+    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+        if "q" not in data:
+            raise ValueError(f"a system on a manifold starts from q= with v= or p=, but {', '.join(data)} were given.")
+        q = data["q"]
+        self.manifold.check_point(q, "q")
+        for name in ("v", "p"):
+            if name in data:
+                self.manifold.check_tangent(q, data[name], name)
+        if self.lagrangian.shape(q, q, params).shape != ():
+            raise ValueError(f"lagrangian must return a scalar, not shape {self.lagrangian.shape(q, q, params).shape}.")
+        return q.shape[0], 0
+
+    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+        q = data["q"]
+        if "p" in data:
+            return {"q": q, "p": data["p"], "v": self.inverse_legendre(q, data["p"], params)}
+        return {"q": q, "v": data["v"], "p": self.legendre(q, data["v"], params)}
+
+    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, "0"]:
+        return no_constraint()
+
+    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+        """The energy at the saved point and momentum."""
+        return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params), params)
+
+    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+        """How far the point is from the manifold."""
+        return self.manifold.defect(row["q"])[None]
