@@ -1,0 +1,199 @@
+"""Discretization-map schemes: the papers' numbers, closed forms, scipy at tight tolerance, conservation laws."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dirax as dx
+from dirax.geometry.manifolds import Sphere
+from dirax.geometry.maps import Midpoint, RiemannianExp, SphereProjection, Theta
+
+GAMMA = np.array([1.0, 1.0, -1.0, -1.0])
+FOUR_VORTICES = np.array([-1.0, 1.0, -1.0, 1.0, 2.0, 2.0, -2.0, -2.0])
+
+
+def vortex_hamiltonian(z):
+    x, y = z[:4], z[4:]
+    pairs = [(i, j) for i in range(4) for j in range(i)]
+    terms = [GAMMA[i] * GAMMA[j] * jnp.log((x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2) for i, j in pairs]
+    return sum(terms) / (4 * jnp.pi)
+
+
+def linear_gauge(z):
+    return jnp.concatenate([-GAMMA * z[4:], GAMMA * z[:4]]) / 2
+
+
+def vortex_velocity(z):
+    """The vector field of [BLM] (10), written out by hand."""
+    x, y = z[:4], z[4:]
+    dx_, dy = x[:, None] - x[None, :], y[:, None] - y[None, :]
+    distance = dx_**2 + dy**2 + np.eye(4)
+    return np.concatenate([-(GAMMA * dy / distance).sum(1), (GAMMA * dx_ / distance).sum(1)]) / (2 * np.pi)
+
+
+vortices = dx.PhaseSpaceLagrangian(linear_gauge, vortex_hamiltonian)
+
+
+def test_four_vortices_by_method_2_give_the_paper_values():
+    sol = dx.simulate(vortices, dx.DiscreteDirac(constraints="resolve"), q=FOUR_VORTICES, v=np.zeros(8), step=1.0, steps=500)
+    error = sol.energy() - sol.energy()[0]
+    assert sol.energy()[0] == pytest.approx(-0.6974211996686913, abs=1e-14)
+    assert error.min() == pytest.approx(0.0, abs=1e-12)
+    assert error.max() == pytest.approx(1.599e-4, abs=5e-8)
+    assert sol.q[300, [0, 4]] == pytest.approx([24.47060879109539, 2.17719294656308], abs=1e-9)
+    # (15), checked on the output with the hand-written vector field
+    mean = (sol.q[1:] + sol.q[:-1]) / 2
+    assert np.abs(np.diff(sol.q, axis=0) - np.array([vortex_velocity(z) for z in mean])).max() < 1e-12
+
+
+def test_four_vortices_by_method_1_give_the_paper_values():
+    q1 = FOUR_VORTICES + vortex_velocity(FOUR_VORTICES + vortex_velocity(FOUR_VORTICES) / 2)
+    sol = dx.simulate(vortices, dx.DiscreteDirac(), q0=FOUR_VORTICES, q1=q1, step=1.0, steps=500)
+    error = sol.energy() - sol.energy()[0]
+    assert error.min() == pytest.approx(-1.95e-6, abs=5e-9)
+    assert error.max() == pytest.approx(1.921e-4, abs=5e-8)
+    assert sol.q[300, [0, 4]] == pytest.approx([24.470654872552494, 2.1769853988531884], abs=1e-9)
+    halves = np.array([vortex_velocity(z) for z in (sol.q[1:] + sol.q[:-1]) / 2])
+    assert np.abs(sol.q[2:] - sol.q[:-2] - halves[1:] - halves[:-1]).max() < 1e-12  # (13)
+
+
+disk = dx.NonholonomicMechanics(
+    metric=lambda q: jnp.diag(jnp.array([1.0, 1.0, 0.25, 0.5])),
+    potential=lambda q: 10 * jnp.sin(q[2]),
+    one_forms=lambda q: jnp.array([[1.0, 0, -jnp.cos(q[3]), 0], [0, 1.0, -jnp.sin(q[3]), 0]]),
+)
+PHI0, TURN = np.pi / 3, 1.00005
+DISK_START = {"q": [0, 0, 0, PHI0], "v": [10 * np.cos(PHI0), 10 * np.sin(PHI0), 10, TURN], "project": True}
+
+
+@pytest.fixture(scope="module")
+def disk_reference():
+    def field(t, y):
+        theta, rate, _, _ = y
+        phi = PHI0 + TURN * t
+        return [rate, -10 * np.cos(theta) / 1.25, np.cos(phi) * rate, np.sin(phi) * rate]
+
+    return solve_ivp(field, (0, 10), [0, 10, 0, 0], method="DOP853", rtol=1e-13, atol=1e-13, dense_output=True).sol
+
+
+def disk_error(sol, reference):
+    return np.abs(sol.q[:, [2, 0, 1]] - reference(sol.t)[[0, 2, 3]].T).max()
+
+
+@pytest.mark.parametrize("constraints, errors", [("discretize", (4.208e-3, 1.0527e-3)), ("resolve", (4.207e-3, 1.0527e-3))])
+def test_rolling_disk_errors_of_methods_1_and_2(constraints, errors, disk_reference):
+    scheme = dx.DiscreteDirac(constraints=constraints)
+    for h, expected in zip((0.02, 0.01), errors, strict=True):
+        sol = dx.simulate(disk, scheme, **DISK_START, step=h, steps=round(10 / h))
+        assert disk_error(sol, disk_reference) == pytest.approx(expected, rel=3e-4)
+    largest = np.abs(sol.constraint_residual()).max()
+    assert largest <= 5e-15 if constraints == "resolve" else 1e-5 < largest < 1e-2
+
+
+def test_method_2_of_a_general_lagrangian_is_that_of_nonholonomic_mechanics(disk_reference):
+    lagrangian = dx.LagrangeDirac(
+        lambda q, v: (v[0] ** 2 + v[1] ** 2 + 0.25 * v[2] ** 2 + 0.5 * v[3] ** 2) / 2 - 10 * jnp.sin(q[2]),
+        lambda q: jnp.array([[1.0, 0, -jnp.cos(q[3]), 0], [0, 1.0, -jnp.sin(q[3]), 0]]),
+    )
+    scheme = dx.DiscreteDirac(constraints="resolve")
+    general = dx.simulate(lagrangian, scheme, **DISK_START, step=0.02, steps=100)
+    special = dx.simulate(disk, scheme, **DISK_START, step=0.02, steps=100)
+    assert np.abs(general.q - special.q).max() < 1e-12
+    assert np.abs(general.p - special.p).max() < 1e-12
+    assert np.abs(general.multipliers - special.multipliers).max() < 1e-11
+
+
+INERTIA = np.array([1.0, 2.0, 3.0])
+so3 = dx.DiracStructure.from_bivector(lambda x: jnp.cross(x, jnp.eye(3), axisb=0, axisc=0))
+rigid_body = dx.DiracSystem(so3, lambda x: x @ (x / INERTIA) / 2)
+BODY = np.array([0.3, 0.5, np.sqrt(1 - 0.34)])
+
+
+@pytest.mark.parametrize("map", [SphereProjection(), RiemannianExp(Sphere(3), 0.5)], ids=["projection", "exponential"])
+def test_rigid_body_on_the_sphere(map):
+    field = lambda t, x: np.cross(x, x / INERTIA)
+    reference = solve_ivp(field, (0, 10), BODY, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    errors = []
+    for steps in (50, 100, 200):
+        sol = dx.simulate(rigid_body, dx.DiscreteDirac(map=map), x=BODY, step=10 / steps, steps=steps)
+        assert np.abs(np.linalg.norm(sol.x, axis=1) - 1).max() < 5e-16
+        errors.append(np.abs(sol.x[-1] - reference).max())
+    orders = -np.diff(np.log2(errors))
+    assert orders == pytest.approx([2.0, 2.0], abs=0.05)
+
+
+def test_rigid_body_projection_is_equation_4_of_the_paper():
+    sol = dx.simulate(rigid_body, dx.DiscreteDirac(map=SphereProjection()), x=BODY, step=0.1, steps=50)
+    total = sol.x[1:] + sol.x[:-1]
+    right = np.cross(total / 2, total / np.linalg.norm(total, axis=1, keepdims=True) / INERTIA)
+    assert np.abs(np.diff(sol.x, axis=0) / 0.1 - right).max() < 1e-14
+
+
+def test_midpoint_of_the_oscillator_is_its_cayley_map():
+    system = dx.DiracSystem(dx.induced_dirac(None, 1), lambda x: x @ x / 2)
+    sol = dx.simulate(system, dx.DiscreteDirac(map=Midpoint()), q=[1.0], p=[0.0], step=0.1, steps=20)
+    generator = 0.05 * np.array([[0.0, 1.0], [-1.0, 0.0]])
+    cayley = np.linalg.solve(np.eye(2) - generator, np.eye(2) + generator)
+    assert sol.x[-1] == pytest.approx(np.linalg.matrix_power(cayley, 20) @ [1.0, 0.0], abs=1e-14)
+
+
+def test_open_port_hamiltonian_follows_the_driven_oscillator():
+    system = dx.PortHamiltonian(
+        lambda x: x @ x / 2, J=[[0.0, 1.0], [-1.0, 0.0]], R=[[0.0, 0.0], [0.0, 0.1]], B=[[0.0], [1.0]],
+        inputs=lambda t, x: jnp.sin(2 * t)[None],
+    )  # fmt: skip
+    field = lambda t, x: [x[1], -x[0] - 0.1 * x[1] + np.sin(2 * t)]
+    exact = solve_ivp(field, (0, 5), [1.0, 0.0], rtol=1e-12, atol=1e-12).y[:, -1]
+    errors = []
+    for steps in (50, 100, 200):
+        sol = dx.simulate(system, dx.DiscreteDirac(), x=[1.0, 0.0], step=5 / steps, steps=steps)
+        errors.append(np.abs(sol.x[-1] - exact).max())
+    assert -np.diff(np.log2(errors)) == pytest.approx([2.0, 2.0], abs=0.05)
+
+
+def test_closed_port_hamiltonian_is_the_nonholonomic_system():
+    """A knife edge as a closed port-Hamiltonian system, against Method 1 of the same mechanics."""
+    forms = lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
+    port = dx.PortHamiltonian(
+        lambda x: x[3:] @ x[3:] / 2 + 0.3 * x[0], J=dx.canonical_two_form(3), closed=True,
+        B=lambda x: jnp.concatenate([jnp.zeros((3, 1)), forms(x[:3]).T]),
+    )  # fmt: skip
+    mechanics = dx.NonholonomicMechanics(lambda q: jnp.eye(3), lambda q: 0.3 * q[0], forms)
+    q, v = np.array([0.0, 0.0, 0.4]), np.array([np.cos(0.4), np.sin(0.4), 1.0])
+    one = dx.simulate(port, dx.DiscreteDirac(), x=np.concatenate([q, v]), step=0.05, steps=40)
+    other = dx.simulate(mechanics, dx.DiscreteDirac(), q=q, v=v, step=0.05, steps=40)
+    assert np.abs(one.x - np.concatenate([other.q, other.p], axis=1)).max() < 1e-13
+    assert np.abs(one.multipliers - other.multipliers).max() < 1e-11
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: dx.DiscreteDirac(constraints="solve"), '"discretize" or "resolve"'),
+        (lambda: dx.DiscreteDirac(map=0.5), "must be a discretization map"),
+        (lambda: dx.PortHamiltonian(lambda x: x @ x, J=np.eye(2), closed=True), "needs B"),
+        (lambda: dx.DiracSystem(np.eye(2), lambda x: x @ x), "must be a dx.DiracStructure"),
+    ],
+)
+def test_mistakes_in_the_statement(make, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    "J, R, message",
+    [(np.eye(2), None, "J is not skew"), (np.zeros((2, 2)), np.diag([1.0, -1.0]), "lowest eigenvalue is -1")],
+)
+def test_structure_matrices_are_checked_at_the_start(J, R, message):
+    with pytest.raises(ValueError, match=message):
+        dx.simulate(dx.PortHamiltonian(lambda x: x @ x, J=J, R=R), dx.DiscreteDirac(), x=[1.0, 0.0], step=0.1, steps=2)
+
+
+def test_theta_maps_of_a_lagrangian_are_the_lifted_ones():
+    """θ = 0 and 1 are the symplectic Euler methods in closed form."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    for theta, matrix in ((0.0, [[1.0 - 0.01, 0.1], [-0.1, 1.0]]), (1.0, [[1.0, 0.1], [-0.1, 1.0 - 0.01]])):
+        sol = dx.simulate(system, dx.DiscreteDirac(map=Theta(theta)), q=[1.0], p=[0.5], step=0.1, steps=10)
+        expected = np.linalg.matrix_power(np.array(matrix), 10) @ [1.0, 0.5]
+        assert [sol.q[-1, 0], sol.p[-1, 0]] == pytest.approx(expected, abs=1e-14)
