@@ -42,7 +42,7 @@ format: $(READY)  ## Repair style with ruff
 	$(RUN) ruff format
 
 docs: $(READY)  ## Build the documentation in site/, every warning an error
-	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict
 
 soak: $(READY)  ## The long tests that `make test` leaves out
 	$(RUN) pytest -m soak
