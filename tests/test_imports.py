@@ -17,7 +17,7 @@ ROOMS = (
     ("reduction",),
     ("schemes",),
     ("engines",),
-    ("simulate", "initial", "failures", "progress", "solution", "storage", "plotting"),
+    ("simulate", "initial", "failures", "progress", "solution", "storage", "plotting", "reconstruction"),
     ("diagnostics",),
     ("gallery",),
     ("__init__",),

@@ -9,6 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
+from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.discrete_lagrangian import (
     CONSTRAINTS,
     RULES,
@@ -17,6 +18,7 @@ from dirax.schemes.discrete_lagrangian import (
     discrete_lagrangian,
     slot_derivatives,
 )
+from dirax.schemes.reduced import lagrange_poincare_dirac
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
@@ -75,6 +77,8 @@ class PlusLagrangeDirac(AbstractScheme):
         self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian", LD_ARGUMENTS)
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
+        if isinstance(system, ReducedLagrangeDirac):
+            return lagrange_poincare_dirac(system, shape, self.discrete_lagrangian, +1)
         return discrete_lagrange_dalembert(system, shape, self.discrete_lagrangian, "right", "incoming")
 
 
@@ -94,6 +98,8 @@ class MinusLagrangeDirac(AbstractScheme):
         self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian", LD_ARGUMENTS)
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
+        if isinstance(system, ReducedLagrangeDirac):
+            return lagrange_poincare_dirac(system, shape, self.discrete_lagrangian, -1)
         return discrete_lagrange_dalembert(system, shape, self.discrete_lagrangian, "left", "incoming")
 
 
