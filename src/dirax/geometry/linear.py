@@ -29,14 +29,24 @@ from dirax.geometry.representations import (
 from dirax.geometry.subspaces import (
     RANK_TOLERANCE,
     STRUCTURE_TOLERANCE,
+    AnyArray,
     PontryaginSubspace,
     UndecidableRank,
     as_matrix,
     decide_rank,
+    known,
     matrix_transpose,
+    namespace,
+    pairing_defect,
     pseudo_inverse,
     uniform_rank,
 )
+
+TRANSVERSALITY_TOLERANCE = 1e-12
+"""Relative singular value below which a pull-back, push-forward or composition counts as not transversal.
+
+Smaller than RANK_TOLERANCE, since such a singular value may be the square of the angle at which two subspaces meet.
+"""
 
 
 class LinearDirac(eqx.Module):
@@ -45,16 +55,17 @@ class LinearDirac(eqx.Module):
     `scattering` (..., n, n) is the orthogonal matrix O with D = {(v, α) : v + α = O (v − α)}; leading axes are a batch.
     Use the constructors `from_…`; they work under jit, vmap and grad, where checks of values are skipped.
 
-    Ranks are decided on singular values relative to the unit length of an orthonormal basis of D (to the largest one in
-    `pull_back`, `push_forward` and `compose`): below `tolerance` (1e-10 by default) they are zero, and one within a
-    factor 100 of `tolerance` raises `UndecidableRank`, naming the values. Under tracing there is only the threshold.
+    Ranks are decided on singular values relative to the unit length of an orthonormal basis of D: below `tolerance`
+    (1e-10) they are zero, and one within a factor 100 of `tolerance` raises `UndecidableRank`, naming the values. In
+    `pull_back`, `push_forward` and `compose` they are relative to the largest one and `tolerance` is 1e-12; roundoff is
+    divided by the smallest nonzero one. Under tracing there is only the threshold.
     So state two-forms, bivectors and maps in units that make their entries of order one.
 
         D = LinearDirac.from_two_form([[0.0, 1.0], [-1.0, 0.0]])
         D.contains([1.0, 2.0], [-2.0, 1.0])  # (−ṗ, q̇) for (q̇, ṗ) = (1, 2): True
     """
 
-    scattering: Float[Array, "*batch n n"]
+    scattering: Float[Array, "*batch n n"] = eqx.field(converter=jnp.asarray)
 
     # Constructors
 
@@ -131,19 +142,19 @@ class LinearDirac(eqx.Module):
         """Dimension of V."""
         return self.scattering.shape[-1]
 
-    def kernel(self) -> tuple[Float[Array, "*batch n n"], Float[Array, "*batch n n"]]:
+    def kernel(self) -> KernelPair:
         """(F, E) with D = {F v + E α = 0} and F Fᵀ + E Eᵀ = I."""
-        identity = jnp.eye(self.n)
-        return (identity - self.scattering) / 2, (identity + self.scattering) / 2
+        F, E = _kernel(self)
+        return jnp.asarray(F), jnp.asarray(E)
 
     def image(self) -> tuple[Float[Array, "*batch n n"], Float[Array, "*batch n n"]]:
         """(A, B) with D = {(A s, B s)} and AᵀA + BᵀB = I."""
-        identity = jnp.eye(self.n)
-        return (self.scattering + identity) / 2, (self.scattering - identity) / 2
+        A, B = _image(self)
+        return jnp.asarray(A), jnp.asarray(B)
 
     def subspace(self) -> PontryaginSubspace:
         """D as a subspace of V ⊕ V*."""
-        return PontryaginSubspace(jnp.concatenate(self.image(), axis=-2))
+        return PontryaginSubspace(namespace(self.scattering).concatenate(_image(self), axis=-2))
 
     def distribution(self, rank: int | None = None, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n k"]:
         """Orthonormal basis, by columns, of F_D, the projection of D on V ([BLM] Proposition 2.3).
@@ -151,72 +162,75 @@ class LinearDirac(eqx.Module):
         Raises `UndecidableRank` where k is unclear, ValueError where it varies over the batch; with `rank` given it is
         not asked for, as is necessary under tracing.
         """
-        return _range_basis(self.image()[0], "the projection of D on V", rank, tolerance)
+        return _range_basis(_image(self)[0], "the projection of D on V", rank, tolerance)
 
     def two_form(self, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n n"]:
         """ω_D, the two-form on F_D given by ω_D(u, v) = α(v) for (u, α) ∈ D ([BLM] Proposition 2.3).
 
-        Returned on all of V, extended by zero on the Euclidean complement of F_D; with
-        `distribution()` it determines D. Raises `UndecidableRank` where the dimension of F_D is unclear.
+        Returned on all of V, extended by zero on the Euclidean complement of F_D; `distribution()` and it
+        determine D. Raises `UndecidableRank` where the dimension of F_D is unclear.
         """
-        A, B = self.image()
-        return matrix_transpose(B @ _inverse_on_range(A, "the projection of D on V", tolerance))
+        A, B = _image(self)
+        flat = B @ _inverse_on_range(A, "the projection of D on V", tolerance)
+        return jnp.asarray((matrix_transpose(flat) - flat) / 2)
 
     def codistribution(self, rank: int | None = None, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n k"]:
         """Orthonormal basis, by columns, of F*_D, the projection of D on V* ([BLM] Theorem 2.5).
 
         Raises as `distribution` does.
         """
-        return _range_basis(self.image()[1], "the projection of D on V*", rank, tolerance)
+        return _range_basis(_image(self)[1], "the projection of D on V*", rank, tolerance)
 
     def bivector(self, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n n"]:
         """Λ_D on F*_D, given by Λ_D(β, α) = β(v) for (v, α) ∈ D ([BLM] Theorem 2.5).
 
-        Returned on all of V*, extended by zero on the Euclidean complement; with
-        `codistribution()` it determines D. Raises `UndecidableRank` where the dimension of F*_D is unclear.
+        Returned on all of V*, extended by zero on the Euclidean complement; `codistribution()` and it determine D.
+        Raises `UndecidableRank` where the dimension of F*_D is unclear.
         """
-        A, B = self.image()
-        return A @ _inverse_on_range(B, "the projection of D on V*", tolerance)
+        A, B = _image(self)
+        sharp = A @ _inverse_on_range(B, "the projection of D on V*", tolerance)
+        return jnp.asarray((sharp - matrix_transpose(sharp)) / 2)
 
     # Tests
 
-    def contains(self, v: ArrayLike, covector: ArrayLike, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[Array, "*batch"]:
+    def contains(self, v: ArrayLike, covector: ArrayLike, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
         """Whether (v, α) ∈ D: its distance from D is at most `tolerance` times its length; v and α (..., n)."""
-        v, covector = jnp.asarray(v, dtype=float), jnp.asarray(covector, dtype=float)
-        if v.shape[-1:] != (self.n,) or covector.shape[-1:] != (self.n,):
-            raise ValueError(f"v has shape {v.shape} and covector {covector.shape}; both must be (..., {self.n}).")
-        F, E = self.kernel()
-        distance = jnp.linalg.norm(jnp.einsum("...ij,...j", F, v) + jnp.einsum("...ij,...j", E, covector), axis=-1)
-        return distance <= tolerance * jnp.sqrt(jnp.sum(v**2, axis=-1) + jnp.sum(covector**2, axis=-1))
+        vector, one_form = known(v).astype(float), known(covector).astype(float)
+        if vector.shape[-1:] != (self.n,) or one_form.shape[-1:] != (self.n,):
+            raise ValueError(f"v has shape {vector.shape} and covector {one_form.shape}; both must be (..., {self.n}).")
+        F, E = _kernel(self)
+        residual = (F @ vector[..., None] + E @ one_form[..., None])[..., 0]
+        size = ((vector**2).sum(axis=-1) + (one_form**2).sum(axis=-1)) ** 0.5
+        return (residual**2).sum(axis=-1) ** 0.5 <= tolerance * size
 
     def orthogonal(self) -> "LinearDirac":
         """D^⊥ with respect to the pairing; it is D itself when D is Dirac ([BLM] Definition 2.1)."""
         # ⟨s, O d⟩ = ⟨d', d⟩ for all d says d' = Oᵀ s.
-        return LinearDirac(jnp.linalg.inv(matrix_transpose(self.scattering)))
+        O = known(self.scattering)
+        return LinearDirac(namespace(O).linalg.inv(matrix_transpose(O)))
 
-    def isotropy_defect(self) -> Float[Array, "*batch"]:
+    def isotropy_defect(self) -> Float[AnyArray, "*batch"]:
         """Largest pairing between two members of the basis `image()`, max |AᵀB + BᵀA|."""
-        A, B = self.image()
-        product = matrix_transpose(A) @ B
-        return jnp.max(jnp.abs(product + matrix_transpose(product)), axis=(-1, -2), initial=0.0)
+        return pairing_defect(*_image(self))
 
-    def is_isotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[Array, "*batch"]:
+    def is_isotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
         """Whether D ⊆ D^⊥."""
         return self.isotropy_defect() <= tolerance
 
-    def is_coisotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[Array, "*batch"]:
+    def is_coisotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
         """Whether D^⊥ ⊆ D."""
         return self.orthogonal().is_isotropic(tolerance)
 
-    def is_dirac(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[Array, "*batch"]:
+    def is_dirac(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
         """Whether D = D^⊥ ([BLM] Definition 2.1); False where unchecked input under tracing was not Dirac."""
         return self.is_isotropic(tolerance) & self.is_coisotropic(tolerance)
 
-    def distance(self, other: "LinearDirac") -> Float[Array, "*batch"]:
+    def distance(self, other: "LinearDirac") -> Float[AnyArray, "*batch"]:
         """Sine of the largest angle between the two subspaces, in [0, 1]."""
-        return jnp.linalg.norm(self.scattering - other.scattering, ord=2, axis=(-2, -1)) / 2
+        difference = known(self.scattering) - known(other.scattering)
+        return namespace(difference).linalg.norm(difference, ord=2, axis=(-2, -1)) / 2
 
-    def equals(self, other: "LinearDirac", tolerance: float = STRUCTURE_TOLERANCE) -> Bool[Array, "*batch"]:
+    def equals(self, other: "LinearDirac", tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
         """Whether both are the same subspace, up to a distance of `tolerance`."""
         return self.distance(other) <= tolerance
 
@@ -224,32 +238,32 @@ class LinearDirac(eqx.Module):
 
     def direct_sum(self, other: "LinearDirac") -> "LinearDirac":
         """D ⊕ D' on V ⊕ V', coordinates of V first."""
-        return LinearDirac(block_diagonal(self.scattering, other.scattering))
+        return LinearDirac(block_diagonal(known(self.scattering), known(other.scattering)))
 
-    def pull_back(self, linear_map: ArrayLike, tolerance: float = RANK_TOLERANCE) -> "LinearDirac":
+    def pull_back(self, linear_map: ArrayLike, tolerance: float = TRANSVERSALITY_TOLERANCE) -> "LinearDirac":
         """φ*D = {(w, φᵀβ) : (φ w, β) ∈ D} on W, for φ: W → V given as a matrix (..., n, dim W), of any rank.
 
         φ should be scaled to entries of order one. Raises `UndecidableRank` where the result hangs on roundoff.
         """
         phi = self._map_matrix(linear_map, axis=-2)
-        F, E = self.kernel()
-        # F φ w + E β = 0, α − φᵀβ = 0.
+        F, E = _kernel(self)
+        # F φ w + E β = 0 and α − φᵀβ = 0, β internal.
         width = phi.shape[-1]
-        vectors = _rows(F @ phi, jnp.zeros((width, width)))
-        covectors = _rows(jnp.zeros((self.n, width)), jnp.eye(width))
+        vectors = _rows(F @ phi, np.zeros((width, width)))
+        covectors = _rows(np.zeros((self.n, width)), np.eye(width))
         return _eliminate(vectors, covectors, _rows(E, -matrix_transpose(phi)), "the pull-back", tolerance)
 
-    def push_forward(self, linear_map: ArrayLike, tolerance: float = RANK_TOLERANCE) -> "LinearDirac":
+    def push_forward(self, linear_map: ArrayLike, tolerance: float = TRANSVERSALITY_TOLERANCE) -> "LinearDirac":
         """φ_*D = {(φ v, β) : (v, φᵀβ) ∈ D} on W, for φ: V → W given as a matrix (..., dim W, n), of any rank.
 
         φ should be scaled to entries of order one. Raises `UndecidableRank` where the result hangs on roundoff.
         """
         phi = self._map_matrix(linear_map, axis=-1)
-        F, E = self.kernel()
-        # F v + E φᵀβ = 0, w − φ v = 0.
+        F, E = _kernel(self)
+        # F v + E φᵀβ = 0 and w − φ v = 0, v internal.
         height = phi.shape[-2]
-        vectors = _rows(jnp.zeros((self.n, height)), jnp.eye(height))
-        covectors = _rows(E @ matrix_transpose(phi), jnp.zeros((height, height)))
+        vectors = _rows(np.zeros((self.n, height)), np.eye(height))
+        covectors = _rows(E @ matrix_transpose(phi), np.zeros((height, height)))
         return _eliminate(vectors, covectors, _rows(F, -phi), "the push-forward", tolerance)
 
     def compose(
@@ -258,7 +272,7 @@ class LinearDirac(eqx.Module):
         ports: Sequence[int],
         other_ports: Sequence[int] | None = None,
         common: Literal["covectors", "vectors"] = "covectors",
-        tolerance: float = RANK_TOLERANCE,
+        tolerance: float = TRANSVERSALITY_TOLERANCE,
     ) -> "LinearDirac":
         """Interconnection of two Dirac structures over shared ports, again a Dirac structure, transversal or not.
 
@@ -273,15 +287,17 @@ class LinearDirac(eqx.Module):
             raise ValueError(f"{len(ports)} ports cannot be joined to {len(other_ports)} other_ports.")
         if common not in ("covectors", "vectors"):
             raise ValueError(f"common is {common!r}; 'covectors' or 'vectors' was expected.")
-        F, E = self.direct_sum(other).kernel()
+        F, E = _kernel(self.direct_sum(other))
         first = np.array(ports, dtype=int)
         second = self.n + np.array(other_ports, dtype=int)
         kept = np.setdiff1d(np.arange(self.n + other.n), np.concatenate([first, second]))
         sign = -1.0 if common == "covectors" else 1.0
-        internal = jnp.concatenate([F[..., first] + sign * F[..., second], E[..., first] - sign * E[..., second]], axis=-1)
+        vectors = F[..., first] + sign * F[..., second]
+        covectors = E[..., first] - sign * E[..., second]
+        internal = namespace(F).concatenate([vectors, covectors], axis=-1)
         return _eliminate(F[..., kept], E[..., kept], internal, "the composition", tolerance)
 
-    def _map_matrix(self, linear_map: ArrayLike, axis: int) -> Float[Array, "*batch i j"]:
+    def _map_matrix(self, linear_map: ArrayLike, axis: int) -> Float[AnyArray, "*batch i j"]:
         matrix = as_matrix("linear_map", linear_map)
         if matrix.shape[axis] != self.n:
             expected = f"(..., {self.n}, dim W)" if axis == -2 else f"(..., dim W, {self.n})"
@@ -289,25 +305,33 @@ class LinearDirac(eqx.Module):
         return matrix
 
 
-def block_diagonal(first: Float[Array, "*batch i j"], second: Float[Array, "*batch k l"]) -> Float[Array, "*batch m n"]:
+def block_diagonal(first: Float[AnyArray, "*batch i j"], second: Float[AnyArray, "*batch k l"]) -> Float[AnyArray, "*batch m n"]:
     """[[first, 0], [0, second]] over broadcast leading axes."""
-    batch = jnp.broadcast_shapes(first.shape[:-2], second.shape[:-2])
-    first = jnp.broadcast_to(first, (*batch, *first.shape[-2:]))
-    second = jnp.broadcast_to(second, (*batch, *second.shape[-2:]))
-    upper = jnp.zeros((*batch, first.shape[-2], second.shape[-1]))
-    lower = jnp.zeros((*batch, second.shape[-2], first.shape[-1]))
-    return jnp.concatenate([jnp.concatenate([first, upper], axis=-1), jnp.concatenate([lower, second], axis=-1)], axis=-2)
+    upper = np.zeros((*first.shape[:-1], second.shape[-1]))
+    lower = np.zeros((*second.shape[:-1], first.shape[-1]))
+    xp = namespace(first, second)
+    return _rows(xp.concatenate([first, upper], axis=-1), xp.concatenate([lower, second], axis=-1))
 
 
-def scattering_matrix(pair: KernelPair) -> Float[Array, "*batch n n"]:
+def scattering_matrix(pair: KernelPair) -> Float[AnyArray, "*batch n n"]:
     """The orthogonal matrix O of D = {F v + E α = 0}, smooth in the pair."""
-    # F v + E α = 0 with v = (s + d)/2 and α = (s − d)/2 reads (F + E) s = (E − F) d; on a Dirac structure F + E has the
-    # singular values of [F E], so this is as well conditioned as the pair itself.
+    # With v = (s + d)/2 and α = (s − d)/2 this reads (F + E) s = (E − F) d; on a Dirac structure F + E has the singular
+    # values of [F E], so it is as well conditioned as the pair itself.
     F, E = pair
-    return _nearest_orthogonal(jnp.linalg.solve(F + E, E - F))
+    return _nearest_orthogonal(namespace(F, E).linalg.solve(F + E, E - F))
 
 
-def _nearest_orthogonal(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+def _kernel(structure: LinearDirac) -> KernelPair:
+    O, identity = known(structure.scattering), np.eye(structure.n)
+    return (identity - O) / 2, (identity + O) / 2
+
+
+def _image(structure: LinearDirac) -> tuple[Float[AnyArray, "*batch n n"], Float[AnyArray, "*batch n n"]]:
+    O, identity = known(structure.scattering), np.eye(structure.n)
+    return (O + identity) / 2, (O - identity) / 2
+
+
+def _nearest_orthogonal(matrix: Float[AnyArray, "*batch n n"]) -> Float[AnyArray, "*batch n n"]:
     # Two Newton–Schulz steps for the polar factor: a defect of roundoff size, magnified by an ill-conditioned solve, is
     # removed (ε → ε⁴), and a matrix far from orthogonal stays so and can be told by is_dirac().
     for _ in range(2):
@@ -316,53 +340,66 @@ def _nearest_orthogonal(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*ba
 
 
 def _eliminate(
-    F: Float[Array, "*batch m n"],
-    E: Float[Array, "*batch m n"],
-    internal: Float[Array, "*batch m l"],
+    F: Float[AnyArray, "*batch m n"],
+    E: Float[AnyArray, "*batch m n"],
+    internal: Float[AnyArray, "*batch m l"],
     what: str,
     tolerance: float,
 ) -> LinearDirac:
-    """The Dirac structure {(v, α) : F v + E α + G z = 0 for some z}, with m = n + l equations.
+    """The Dirac structure {(v, α) : F v + E α + G z = 0 for some z}, from m = n + l equations with G = `internal`.
 
-    The wave s is unique for every d even where z is not: d = 0 makes v = α, and a structure without power through its
-    internal ports has ⟨α, v⟩ = 0. So a least-squares solution of low rank gives the non-transversal case as well.
+    With v = (s + d)/2 and α = (s − d)/2 the unknowns are the wave s and z. The wave is unique for every d even where z
+    is not: d = 0 makes v = α, and no power through the internal ports makes ⟨α, v⟩ = 0. So a least-squares solution of
+    low rank gives the case that is not transversal as well. Roundoff is divided by its smallest nonzero singular value.
     """
-    n = F.shape[-1]
-    batch = jnp.broadcast_shapes(F.shape[:-2], E.shape[:-2], internal.shape[:-2])
-    internal = jnp.broadcast_to(internal, (*batch, *internal.shape[-2:]))
-    waves = jnp.broadcast_to(F + E, (*batch, *F.shape[-2:]))
-    matrix = jnp.concatenate([waves, internal], axis=-1)
+    xp, n = namespace(F, E, internal), F.shape[-1]
+    batch = np.broadcast_shapes(F.shape[:-2], E.shape[:-2], internal.shape[:-2])
+    blocks = [xp.broadcast_to(block, (*batch, *block.shape[-2:])) for block in (F + E, internal)]
+    matrix = xp.concatenate(blocks, axis=-1)
     if not is_traced(matrix):
-        decide_rank(np.linalg.svd(np.asarray(matrix), compute_uv=False), what, tolerance)
+        _require_decided(matrix, blocks[1], what, tolerance)
     scattering = (pseudo_inverse(matrix, tolerance) @ (E - F))[..., :n, :]
-    if not is_traced(scattering) and n:
-        product = np.swapaxes(scattering, -1, -2) @ np.asarray(scattering)
-        defect = np.max(np.abs(product - np.eye(n)))
-        if defect > np.sqrt(STRUCTURE_TOLERANCE):
-            raise UndecidableRank(
-                f"The rank of {what} is undecidable: dropping singular values below {tolerance:.0e} leaves a defect of "
-                f"{defect:.3e} in D = D^⊥. Rescale the map to entries of order one, or give another tolerance."
-            )
     return LinearDirac(_nearest_orthogonal(scattering))
 
 
-def _rows(upper: Float[Array, "*batch i k"], lower: Float[Array, "*batch j k"]) -> Float[Array, "*batch m k"]:
-    batch = jnp.broadcast_shapes(upper.shape[:-2], lower.shape[:-2])
-    return jnp.concatenate([jnp.broadcast_to(part, (*batch, *part.shape[-2:])) for part in (upper, lower)], axis=-2)
+def _require_decided(matrix: np.ndarray, internal: np.ndarray, what: str, tolerance: float) -> None:
+    """Raise where the elimination is closer to a degenerate one than roundoff lets us see.
+
+    The kernel of G and that of the whole matrix are the same space of (0, z) ∈ D. Next to a degenerate case the singular
+    values of G measure the angle, those of the matrix possibly its square, so they may disagree.
+    """
+    values = np.linalg.svd(matrix, compute_uv=False)
+    scale = values.max(axis=-1, keepdims=True, initial=0.0)
+    values, angles = values / scale, np.linalg.svd(internal, compute_uv=False) / scale
+    nullity = values.shape[-1] - decide_rank(values, what, tolerance, scale=1.0)
+    hidden = nullity != angles.shape[-1] - decide_rank(angles, what, tolerance, scale=1.0)
+    if np.any(hidden):
+        raise UndecidableRank(
+            f"The rank of {what} is undecidable: a relative singular value of {values[hidden].min():.1e} counts as zero at "
+            f"the tolerance {tolerance:.0e}, but comes from an angle of {angles[hidden].min():.1e}, which does not."
+        )
 
 
-def _range_basis(matrix: Float[Array, "*batch n n"], what: str, rank: int | None, tolerance: float) -> Float[Array, "*batch n k"]:
-    left, values, _ = jnp.linalg.svd(matrix)
+def _rows(upper: Float[AnyArray, "*batch i k"], lower: Float[AnyArray, "*batch j k"]) -> Float[AnyArray, "*batch m k"]:
+    xp = namespace(upper, lower)
+    batch = np.broadcast_shapes(upper.shape[:-2], lower.shape[:-2])
+    return xp.concatenate([xp.broadcast_to(part, (*batch, *part.shape[-2:])) for part in (upper, lower)], axis=-2)
+
+
+def _range_basis(
+    matrix: Float[AnyArray, "*batch n n"], what: str, rank: int | None, tolerance: float
+) -> Float[Array, "*batch n k"]:
+    left, values, _ = namespace(matrix).linalg.svd(matrix)
     if rank is None:
         if is_traced(matrix):
             raise ValueError(f"The dimension of {what} must be given as `rank` under jit, vmap or grad.")
-        rank = uniform_rank(decide_rank(np.asarray(values), what, tolerance, scale=1.0), what)
-    return left[..., :rank]
+        rank = uniform_rank(decide_rank(values, what, tolerance, scale=1.0), what)
+    return jnp.asarray(left[..., :rank])
 
 
-def _inverse_on_range(matrix: Float[Array, "*batch n n"], what: str, tolerance: float) -> Float[Array, "*batch n n"]:
+def _inverse_on_range(matrix: Float[AnyArray, "*batch n n"], what: str, tolerance: float) -> Float[AnyArray, "*batch n n"]:
     if not is_traced(matrix):
-        decide_rank(np.linalg.svd(np.asarray(matrix), compute_uv=False), what, tolerance, scale=1.0)
+        decide_rank(np.linalg.svd(matrix, compute_uv=False), what, tolerance, scale=1.0)
     return pseudo_inverse(matrix, tolerance, 1.0)
 
 

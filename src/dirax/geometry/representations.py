@@ -10,20 +10,23 @@ one-forms by their rows.
 
 from collections.abc import Callable
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike, Float
 
 from dirax.functions import is_traced
 from dirax.geometry.subspaces import (
     STRUCTURE_TOLERANCE,
+    AnyArray,
     as_matrix,
     decide_rank,
     matrix_transpose,
+    namespace,
     require_full_rank,
 )
 
-KernelPair = tuple[Float[Array, "*batch n n"], Float[Array, "*batch n n"]]
+ROUNDOFF = 1e-14  # a product of matrices of order one that should vanish has entries of this size
+
+KernelPair = tuple[Float[AnyArray, "*batch n n"], Float[AnyArray, "*batch n n"]]
 
 
 def two_form_pair(two_form: ArrayLike) -> KernelPair:
@@ -106,44 +109,45 @@ KERNEL_PAIRS: dict[str, Callable[..., KernelPair]] = {
 """Kernel pair of each representation, by the name that follows `from_` in the constructors."""
 
 
-def _distribution_pair(onto: Float[Array, "*batch n n"], two_form: Float[Array, "*batch n n"] | None) -> KernelPair:
+def _distribution_pair(onto: Float[AnyArray, "*batch n n"], two_form: Float[AnyArray, "*batch n n"] | None) -> KernelPair:
     # The ranges of P and I − P are complementary, so the n equations (I − P) v + P (ω♭v − α) = 0 say both at once.
     F = _identity_like(onto) - onto
     return (F if two_form is None else F + onto @ matrix_transpose(two_form)), -onto
 
 
-def _projector(rows: Float[Array, "*batch k n"]) -> Float[Array, "*batch n n"]:
+def _projector(rows: Float[AnyArray, "*batch k n"]) -> Float[AnyArray, "*batch n n"]:
     """Orthogonal projector onto the span of independent rows, by Gram–Schmidt with one reorthogonalisation.
 
     Written out in elementary operations: it is smooth in the rows, and cheap inside a compiled step.
     """
     n = rows.shape[-1]
-    projector = jnp.zeros((*rows.shape[:-2], n, n))
+    projector = np.zeros((*rows.shape[:-2], n, n))
     for i in range(rows.shape[-2]):
         row = rows[..., i, :]
         for _ in range(2):
-            row = row - jnp.einsum("...ij,...j->...i", projector, row)
-        projector = projector + row[..., :, None] * (row / jnp.sum(row**2, axis=-1, keepdims=True))[..., None, :]
+            row = row - (projector @ row[..., None])[..., 0]
+        unit = row / (row**2).sum(axis=-1, keepdims=True)
+        projector = projector + row[..., :, None] * unit[..., None, :]
     return projector
 
 
-def _identity_like(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
-    return jnp.broadcast_to(jnp.eye(matrix.shape[-1]), matrix.shape)
+def _identity_like(matrix: Float[AnyArray, "*batch n n"]) -> Float[AnyArray, "*batch n n"]:
+    return namespace(matrix).broadcast_to(np.eye(matrix.shape[-1]), matrix.shape)
 
 
-def _square(name: str, value: ArrayLike) -> Float[Array, "*batch n n"]:
+def _square(name: str, value: ArrayLike) -> Float[AnyArray, "*batch n n"]:
     matrix = as_matrix(name, value)
     if matrix.shape[-1] != matrix.shape[-2]:
         raise ValueError(f"{name} has shape {matrix.shape}; a square matrix (..., n, n) was expected.")
     return matrix
 
 
-def _skew(name: str, value: ArrayLike) -> Float[Array, "*batch n n"]:
+def _skew(name: str, value: ArrayLike) -> Float[AnyArray, "*batch n n"]:
     matrix = _square(name, value)
     if not is_traced(matrix):
         defect = np.max(np.abs(matrix + matrix_transpose(matrix)), axis=(-1, -2), initial=0.0)
         size = np.max(np.abs(matrix), axis=(-1, -2), initial=0.0)
-        if np.any(defect > STRUCTURE_TOLERANCE * size):
+        if np.any(defect > STRUCTURE_TOLERANCE * size + ROUNDOFF):
             raise ValueError(
                 f"{name} is not skew: max |M + Mᵀ| = {np.max(defect):.3e} for entries up to {np.max(size):.3e}. "
                 f"Use (M − Mᵀ)/2 if its skew part is meant."
@@ -151,7 +155,7 @@ def _skew(name: str, value: ArrayLike) -> Float[Array, "*batch n n"]:
     return matrix
 
 
-def _require_same_space(name: str, dimension: int, other_name: str, other: Float[Array, "*batch n n"]) -> None:
+def _require_same_space(name: str, dimension: int, other_name: str, other: Float[AnyArray, "*batch n n"]) -> None:
     if dimension != other.shape[-1]:
         raise ValueError(
             f"{name} lies in dimension {dimension} but {other_name} has shape {other.shape}; "
@@ -159,7 +163,7 @@ def _require_same_space(name: str, dimension: int, other_name: str, other: Float
         )
 
 
-def _require_isotropic(who: str, product: str, F: Float[Array, "*batch n n"], E: Float[Array, "*batch n n"]) -> None:
+def _require_isotropic(who: str, product: str, F: Float[AnyArray, "*batch n n"], E: Float[AnyArray, "*batch n n"]) -> None:
     """Raise unless the rows of [F E] span a Dirac structure, with the defect of an orthonormal basis of these rows."""
     if is_traced(F, E):
         return

@@ -15,8 +15,9 @@ from jaxtyping import Array, Float
 from dirax.functions import UserFunction
 from dirax.geometry.linear import LinearDirac, block_diagonal, scattering_matrix
 from dirax.geometry.representations import KERNEL_PAIRS, KernelPair
+from dirax.geometry.subspaces import AnyArray, known
 
-Matrices = tuple[Float[Array, "rows columns"], ...]
+Matrices = tuple[Float[AnyArray, "rows columns"], ...]
 
 
 class DiracStructure(eqx.Module):
@@ -101,7 +102,8 @@ class DiracStructure(eqx.Module):
 
         Raises as the `LinearDirac` constructor does where the matrices at x are bad; for a batch of points use vmap.
         """
-        return LinearDirac(scattering_matrix(self.kernel(x, params)))
+        F, E = self.kernel(x, params)
+        return LinearDirac(scattering_matrix((known(F), known(E))))
 
     def kernel(self, x: Float[Array, " n"], params: Any = None) -> KernelPair:
         """(F, E), smooth in x, with D(x) = {(v, α) : F v + E α = 0}: (ωᵀ, −I) for a two-form, (I, −Λ) for a bivector.
@@ -117,7 +119,7 @@ class DiracStructure(eqx.Module):
                 f"The Dirac structure's {self.representation} matrices are for dimension {F.shape[-1]}, but x has "
                 f"{x.shape[0]} coordinates and there are {self.ports} ports."
             )
-        return F, E
+        return jnp.asarray(F), jnp.asarray(E)
 
     # Integrability
 
@@ -129,15 +131,9 @@ class DiracStructure(eqx.Module):
         if self.ports:
             raise ValueError("Integrability is a property of structures on TM ⊕ T*M; this one has ports.")
 
-        def scattering(x):
-            return scattering_matrix(self.kernel(x, params))
-
         x = jnp.asarray(x, dtype=float)
-        X, alpha = LinearDirac(scattering(x)).image()
-        derivative = jax.jacfwd(scattering)(x) / 2  # ∂_l of X[a, i] and of α[a, i] alike, indexed [a, i, l]
-        # ⟨L_X α, Y⟩ = X^l ∂_l α_a Y^a + α_l ∂_a X^l Y^a
-        lie = jnp.einsum("li,ajl,ak->ijk", X, derivative, X) + jnp.einsum("lj,lia,ak->ijk", alpha, derivative, X)
-        return lie + jnp.transpose(lie, (2, 0, 1)) + jnp.transpose(lie, (1, 2, 0))
+        self.kernel(x, params)  # checks, which are skipped in the compiled function
+        return _courant_tensor(self, x, params)
 
     def integrability_defect(self, x: Float[Array, " n"], params: Any = None) -> Float[Array, ""]:
         """Length of the Courant tensor at x: 0 iff D is integrable there ([BLM] §2.2), whatever the frame.
@@ -196,10 +192,22 @@ def induced_dirac(one_forms: Callable | None, n: int) -> DiracStructure:
     return DiracStructure(_Induced(function, n), "two_form" if function is None else "annihilator", 2 * n)
 
 
+@eqx.filter_jit
+def _courant_tensor(structure: DiracStructure, x: Float[Array, " n"], params: Any) -> Float[Array, "n n n"]:
+    def scattering(x):
+        return scattering_matrix(structure.kernel(x, params))
+
+    X, alpha = LinearDirac(scattering(x)).image()
+    derivative = jax.jacfwd(scattering)(x) / 2  # ∂_l of X[a, i] and of α[a, i] alike, indexed [a, i, l]
+    # ⟨L_X α, Y⟩ = X^l ∂_l α_a Y^a + α_l ∂_a X^l Y^a
+    lie = jnp.einsum("li,ajl,ak->ijk", X, derivative, X) + jnp.einsum("lj,lia,ak->ijk", alpha, derivative, X)
+    return lie + jnp.transpose(lie, (2, 0, 1)) + jnp.transpose(lie, (1, 2, 0))
+
+
 def canonical_two_form(n: int) -> Float[Array, "2*n 2*n"]:
     """ω = [[0, I], [−I, 0]] on R^{2n}: ω♭(q̇, ṗ) = (−ṗ, q̇)."""
-    zero, identity = jnp.zeros((n, n)), jnp.eye(n)
-    return jnp.block([[zero, identity], [-identity, zero]])
+    zero, identity = np.zeros((n, n)), np.eye(n)
+    return jnp.asarray(np.block([[zero, identity], [-identity, zero]]))
 
 
 class _Functions(eqx.Module):
@@ -236,7 +244,7 @@ class _PullBack(eqx.Module):
             return jnp.asarray(self.point_map(y, params), dtype=float)
 
         x = position(y)
-        jacobian = block_diagonal(jax.jacfwd(position)(y), jnp.eye(self.structure.ports))
+        jacobian = block_diagonal(jax.jacfwd(position)(y), np.eye(self.structure.ports))
         if self.structure.representation == "two_form":
             (form,) = self.structure.evaluate(x, params)
             return (jacobian.T @ form @ jacobian,)

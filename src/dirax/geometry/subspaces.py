@@ -5,6 +5,7 @@ Dirac according to how it lies in its orthogonal U^⊥; `LinearDirac` (linear.py
 """
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,6 +14,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from dirax.functions import is_traced
+
+AnyArray = Array | np.ndarray
+"""Numbers that are known (numpy) or traced (JAX)."""
 
 RANK_TOLERANCE = 1e-10
 """Singular values below this fraction of the scale of a matrix count as zero."""
@@ -26,11 +30,26 @@ class UndecidableRank(ValueError):
     """The singular values of a matrix do not separate into zero and nonzero ones."""
 
 
-def as_matrix(name: str, value: ArrayLike) -> Float[Array, "*batch rows columns"]:
+def known(array: Any) -> Any:
+    """The numbers of an array as a numpy array where there are any, the array itself under tracing.
+
+    What is known is computed with numpy, so that nothing is compiled for one structure of one dimension; the same code
+    is traced by jit, vmap and grad.
+    """
+    return array if is_traced(array) else np.asarray(array)
+
+
+def namespace(*arrays: Any) -> Any:
+    """`jax.numpy` if any array is traced, else numpy."""
+    return jnp if is_traced(*arrays) else np
+
+
+def as_matrix(name: str, value: ArrayLike) -> Float[AnyArray, "*batch rows columns"]:
     """`value` as a float64 array with at least two axes and, where it can be looked at, finite entries."""
-    if not is_traced(value) and np.iscomplexobj(np.asarray(value)):
+    matrix = known(value)
+    if np.issubdtype(matrix.dtype, np.complexfloating):
         raise TypeError(f"{name} is complex; linear Dirac structures here are over the reals.")
-    matrix = jnp.asarray(value, dtype=float)
+    matrix = matrix.astype(float)
     if matrix.ndim < 2:
         raise ValueError(f"{name} has shape {matrix.shape}; a matrix with shape (..., rows, columns) was expected.")
     if not is_traced(matrix) and not np.all(np.isfinite(matrix)):
@@ -38,13 +57,19 @@ def as_matrix(name: str, value: ArrayLike) -> Float[Array, "*batch rows columns"
     return matrix
 
 
-def matrix_transpose(matrix: Float[Array, "*batch i j"]) -> Float[Array, "*batch j i"]:
+def matrix_transpose(matrix: Float[AnyArray, "*batch i j"]) -> Float[AnyArray, "*batch j i"]:
     """The transpose of the last two axes."""
-    return jnp.swapaxes(matrix, -1, -2)
+    return matrix.swapaxes(-1, -2)
+
+
+def pairing_defect(A: Float[AnyArray, "*batch n k"], B: Float[AnyArray, "*batch n k"]) -> Float[AnyArray, "*batch"]:
+    """Largest pairing between two columns of [A; B], max |AᵀB + BᵀA|."""
+    product = matrix_transpose(A) @ B
+    return abs(product + matrix_transpose(product)).max(axis=(-1, -2), initial=0.0)
 
 
 def decide_rank(
-    singular_values: np.ndarray, what: str, tolerance: float = RANK_TOLERANCE, scale: float | None = None
+    singular_values: ArrayLike, what: str, tolerance: float = RANK_TOLERANCE, scale: float | None = None
 ) -> np.ndarray:
     """Number of singular values above `tolerance * scale`, along the last axis; `scale` is the largest one by default.
 
@@ -65,7 +90,7 @@ def decide_rank(
     return np.sum(relative > tolerance, axis=-1)
 
 
-def require_full_rank(name: str, matrix: Float[Array, "*batch rows columns"]) -> None:
+def require_full_rank(name: str, matrix: Float[AnyArray, "*batch rows columns"]) -> None:
     """Raise unless the columns, each divided by its length, are linearly independent; nothing under tracing."""
     if is_traced(matrix):
         return
@@ -85,32 +110,39 @@ def require_full_rank(name: str, matrix: Float[Array, "*batch rows columns"]) ->
         )
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
 def pseudo_inverse(
-    matrix: Float[Array, "*batch i j"], tolerance: float = RANK_TOLERANCE, scale: float | None = None
-) -> Float[Array, "*batch j i"]:
+    matrix: Float[AnyArray, "*batch i j"], tolerance: float = RANK_TOLERANCE, scale: float | None = None
+) -> Float[AnyArray, "*batch j i"]:
     """Moore–Penrose inverse with singular values up to `tolerance * scale` (largest one by default) taken as zero.
 
     Differentiable, under the assumption that the rank does not change.
     """
-    left, values, right = jnp.linalg.svd(matrix, full_matrices=False)
-    reference = jnp.max(values, axis=-1, keepdims=True, initial=0.0) if scale is None else scale
+    return _pseudo_inverse(matrix, tolerance, scale) if is_traced(matrix) else _invert(np, matrix, tolerance, scale)
+
+
+def _invert(xp, matrix, tolerance, scale):
+    left, values, right = xp.linalg.svd(matrix, full_matrices=False)
+    reference = values.max(axis=-1, keepdims=True, initial=0.0) if scale is None else scale
     kept = values > tolerance * reference
-    inverse = jnp.where(kept, 1.0 / jnp.where(kept, values, 1.0), 0.0)
+    inverse = xp.where(kept, 1.0 / xp.where(kept, values, 1.0), 0.0)
     return matrix_transpose(left * inverse[..., None, :] @ right)
 
 
-@pseudo_inverse.defjvp
-def _pseudo_inverse_jvp(tolerance: float, scale: float | None, primals, tangents):
+@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def _pseudo_inverse(matrix, tolerance, scale):
+    return _invert(jnp, matrix, tolerance, scale)
+
+
+@_pseudo_inverse.defjvp
+def _pseudo_inverse_jvp(tolerance, scale, primals, tangents):
     # Golub and Pereyra (1973), constant rank.
     (matrix,), (tangent,) = primals, tangents
-    inverse = pseudo_inverse(matrix, tolerance, scale)
+    inverse = _pseudo_inverse(matrix, tolerance, scale)
     inverse_t, tangent_t = matrix_transpose(inverse), matrix_transpose(tangent)
-    off_range = jnp.eye(matrix.shape[-2]) - matrix @ inverse
-    off_corange = jnp.eye(matrix.shape[-1]) - inverse @ matrix
-    return inverse, (
-        -inverse @ tangent @ inverse + inverse @ inverse_t @ tangent_t @ off_range + off_corange @ tangent_t @ inverse_t @ inverse
-    )
+    within = -inverse @ tangent @ inverse
+    off_range = inverse @ inverse_t @ tangent_t @ (np.eye(matrix.shape[-2]) - matrix @ inverse)
+    off_corange = (np.eye(matrix.shape[-1]) - inverse @ matrix) @ tangent_t @ inverse_t @ inverse
+    return inverse, within + off_range + off_corange
 
 
 class PontryaginSubspace(eqx.Module):
@@ -119,7 +151,7 @@ class PontryaginSubspace(eqx.Module):
     The open port-Hamiltonian set of [BLM] (22) is one that is coisotropic without being Dirac.
     """
 
-    basis: Float[Array, "*batch 2*n k"]
+    basis: Float[Array, "*batch 2*n k"] = eqx.field(converter=jnp.asarray)
 
     @classmethod
     def from_image(cls, A: ArrayLike, B: ArrayLike, tolerance: float = RANK_TOLERANCE) -> "PontryaginSubspace":
@@ -131,11 +163,11 @@ class PontryaginSubspace(eqx.Module):
         A, B = as_matrix("A", A), as_matrix("B", B)
         if A.shape != B.shape:
             raise ValueError(f"A has shape {A.shape} and B {B.shape}; both must be (..., n, k).")
-        stacked = jnp.concatenate([A, B], axis=-2)
+        stacked = namespace(A, B).concatenate([A, B], axis=-2)
         if is_traced(stacked):
             return cls(jnp.linalg.qr(stacked)[0])
-        left, values, _ = jnp.linalg.svd(stacked, full_matrices=False)
-        return cls(left[..., : uniform_rank(decide_rank(np.asarray(values), "[A; B]", tolerance), "[A; B]")])
+        left, values, _ = np.linalg.svd(stacked, full_matrices=False)
+        return cls(left[..., : uniform_rank(decide_rank(values, "[A; B]", tolerance), "[A; B]")])
 
     @property
     def n(self) -> int:
@@ -149,37 +181,41 @@ class PontryaginSubspace(eqx.Module):
 
     def image(self) -> tuple[Float[Array, "*batch n k"], Float[Array, "*batch n k"]]:
         """(A, B) with U = {(A s, B s)} and AᵀA + BᵀB = I."""
-        return self.basis[..., : self.n, :], self.basis[..., self.n :, :]
+        A, B = self._halves()
+        return jnp.asarray(A), jnp.asarray(B)
 
-    def contains(self, v: ArrayLike, covector: ArrayLike, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[Array, "*batch"]:
+    def _halves(self) -> tuple[Float[AnyArray, "*batch n k"], Float[AnyArray, "*batch n k"]]:
+        basis = known(self.basis)
+        return basis[..., : self.n, :], basis[..., self.n :, :]
+
+    def contains(self, v: ArrayLike, covector: ArrayLike, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
         """Whether the distance of (v, α) from U is at most `tolerance` times its length."""
-        element = jnp.concatenate([jnp.asarray(v, dtype=float), jnp.asarray(covector, dtype=float)], axis=-1)
-        components = jnp.einsum("...ik,...i->...k", self.basis, element)
-        residual = element - jnp.einsum("...ik,...k->...i", self.basis, components)
-        return jnp.linalg.norm(residual, axis=-1) <= tolerance * jnp.linalg.norm(element, axis=-1)
+        vector, one_form, basis = known(v).astype(float), known(covector).astype(float), known(self.basis)
+        element = namespace(vector, one_form).concatenate([vector, one_form], axis=-1)[..., None]
+        residual = element - basis @ (matrix_transpose(basis) @ element)
+        return (residual**2).sum(axis=(-1, -2)) ** 0.5 <= tolerance * (element**2).sum(axis=(-1, -2)) ** 0.5
 
     def orthogonal(self) -> "PontryaginSubspace":
         """U^⊥ with respect to the pairing, of dimension 2n − k ([BLM] §2.1)."""
-        A, B = self.image()
+        A, B = self._halves()
+        xp = namespace(A)
         # ⟪(v, α), (w, β)⟫ is the Euclidean product of (α, v) with (w, β).
-        left, _, _ = jnp.linalg.svd(jnp.concatenate([B, A], axis=-2), full_matrices=True)
+        left, _, _ = xp.linalg.svd(xp.concatenate([B, A], axis=-2), full_matrices=True)
         return PontryaginSubspace(left[..., self.dimension :])
 
-    def isotropy_defect(self) -> Float[Array, "*batch"]:
-        """Largest pairing between two elements of the orthonormal basis, max |AᵀB + BᵀA|."""
-        A, B = self.image()
-        product = matrix_transpose(A) @ B
-        return jnp.max(jnp.abs(product + matrix_transpose(product)), axis=(-1, -2), initial=0.0)
+    def isotropy_defect(self) -> Float[AnyArray, "*batch"]:
+        """Largest pairing between two members of the orthonormal basis, max |AᵀB + BᵀA|."""
+        return pairing_defect(*self._halves())
 
-    def is_isotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[Array, "*batch"]:
+    def is_isotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
         """Whether U ⊆ U^⊥ ([BLM] §2.1)."""
         return self.isotropy_defect() <= tolerance
 
-    def is_coisotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[Array, "*batch"]:
+    def is_coisotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
         """Whether U^⊥ ⊆ U ([BLM] §2.1), which is U^⊥ being isotropic, for U^⊥⊥ = U."""
         return self.orthogonal().is_isotropic(tolerance)
 
-    def is_dirac(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[Array, "*batch"]:
+    def is_dirac(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
         """Whether U = U^⊥: isotropic and of dimension n ([BLM] Definition 2.1)."""
         return self.is_isotropic(tolerance) & (self.dimension == self.n)
 
