@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.experimental import checkify
 from jax.extend.core import jaxprs_in_params
 
@@ -149,7 +150,7 @@ def _way_out(error: Exception) -> str:
 
 def is_traced(*trees: Any) -> bool:
     """Whether any leaf is a JAX tracer: then values cannot be inspected and value checks are skipped."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def check_finite(name: str, value: Any) -> None:

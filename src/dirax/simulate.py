@@ -102,7 +102,8 @@ def simulate(
 def _solution(system, scheme, problem: Problem, outcome: Outcome, start: Start, data, traced: bool) -> Solution:
     p, first = problem, problem.first_step
     info, numbers = p.equation.stages[0][0].fields, saved_steps(p)
-    fields, closing = outcome.fields, outcome.closing
+    fields: dict[str, Any] = outcome.fields
+    closing = outcome.closing
     if traced:
         ok, message = outcome.completed == p.steps, ""
         fields = {k: _blanked(a, info[k], closing[k], numbers, outcome.completed, jnp.where) for k, a in fields.items()}

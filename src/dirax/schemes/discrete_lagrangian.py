@@ -30,7 +30,8 @@ def checked_rule(rule, names: tuple[str, ...], argument: str, user_arguments: tu
 def discrete_lagrangian(lagrangian: UserFunction, rule) -> Callable:
     """L_d as a function (q0, v, h, params) ↦ L_d(q0, q0 + h v)."""
     if isinstance(rule, UserFunction):
-        return lambda q, v, h, params: rule(q, q + h * v, h, params)
+        scalar = rule.returning(())
+        return lambda q, v, h, params: scalar(q, q + h * v, h, params)
     rules = {
         "left": lambda q, v, h, params: h * lagrangian(q, v, params),
         "right": lambda q, v, h, params: h * lagrangian(q + h * v, v, params),
@@ -40,10 +41,11 @@ def discrete_lagrangian(lagrangian: UserFunction, rule) -> Callable:
     return rules[rule]
 
 
-def discrete_constraint(constraint_matrix: Callable, rule) -> Callable:
+def discrete_constraint(constraint_matrix: Callable, rule, m: int | None = None) -> Callable:
     """w_d as a function (q0, v, h, params) ↦ (m,): W v at the base point that the rule names, or the user's w_d."""
     if isinstance(rule, UserFunction):
-        return lambda q, v, h, params: rule(q, q + h * v, h, params)
+        vector = rule if m is None else rule.returning((m,))
+        return lambda q, v, h, params: vector(q, q + h * v, h, params)
     base = {"left": 0.0, "right": 1.0, "midpoint": 0.5}[rule]
     return lambda q, v, h, params: constraint_matrix(q + base * h * v, params) @ v
 

@@ -5,11 +5,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
 from dirax.reduction.reduced import ReducedLagrangeDirac
+from dirax.roots import nearest_root
 from dirax.schemes.discrete_lagrangian import (
     CONSTRAINTS,
     RULES,
@@ -111,8 +111,13 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
             f"{type(system).__name__} was given: use dx.DiscreteDirac for the others."
         )
     n, m = shape.n, shape.m
+    if isinstance(constraint, UserFunction) and not m:
+        raise ValueError(
+            "constraint is a function w_d(q0, q1, h), but the system has no one_forms, whose forces would impose it: "
+            "give the system one_forms=, or leave constraint out."
+        )
     ld = discrete_lagrangian(system.lagrangian, rule)
-    wd = discrete_constraint(system.constraint_matrix, constraint)
+    wd = discrete_constraint(system.constraint_matrix, constraint, m)
     share = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}[momentum] if m else 0.0
 
     def residual(u, state, t, h, params):
@@ -168,9 +173,7 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
 
 def _start_from_saved_momentum(residual, constraint_matrix, share: float, n: int, state, u, h, params):
     """The incoming momentum whose saved momentum p − share·Wᵀμ is the given one: solve the first step once for μ."""
-    solver = optx.Newton(rtol=1e-13, atol=1e-13, cauchy_termination=False)
-    fn = lambda u, args: residual(u, args[0], 0.0, args[1], args[2])
-    first = optx.root_find(fn, solver, u, (state, h, params), max_steps=50, throw=False).value
+    first = nearest_root(lambda u: residual(u, state, 0.0, h, params), u)
     jump: Float[Array, " n"] = constraint_matrix(state[:n], params).T @ first[n:]
     # with incoming p + s/(1−s) j the multiplier is μ/(1−s), and its share is taken off again; at s = 1 nothing is added
     factor = share / (1.0 - share) if share < 1.0 else 0.0

@@ -5,11 +5,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
+from dirax.roots import nearest_root, scaled_pseudo_inverse
 from dirax.systems.system import AbstractSystem, no_constraint
 
 
@@ -50,10 +49,7 @@ class LagrangeDirac(AbstractSystem):
     ) -> Float[Array, " n"]:
         """A velocity v with ∂L/∂v (q, v) = p; where L is degenerate the one nearest to `guess` (zero by default)."""
         v0 = jnp.zeros_like(q) if guess is None else guess
-        solver = optx.Newton(rtol=1e-14, atol=1e-14, linear_solver=lx.SVD(), cauchy_termination=False)
-        adjoint = optx.ImplicitAdjoint(linear_solver=lx.SVD())
-        defect = lambda v, _: self.legendre(q, v, params) - p
-        return optx.root_find(defect, solver, v0, max_steps=60, throw=False, adjoint=adjoint).value
+        return nearest_root(lambda v: self.legendre(q, v, params) - p, v0)
 
     def energy(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None) -> Float[Array, ""]:
         """The energy E(q, v) = ⟨∂L/∂v, v⟩ − L(q, v); it is `generalized_energy` on the image of the Legendre transform."""
@@ -68,12 +64,14 @@ class LagrangeDirac(AbstractSystem):
     # ------------------------------------------------------------------ AbstractSystem
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+        if "x" in data:
+            raise ValueError("a LagrangeDirac system starts from q=, v= · q=, p= · q0=, q1=, but x= was given.")
         q = data["q"] if "q" in data else data["q0"]
         n = q.shape[0]
         out = self.lagrangian.shape(q, q, params)
         if out.shape != ():
             raise ValueError(
-                f"lagrangian must return a scalar, but for q and v of shape ({n},) it returned shape {out.shape}: "
+                f"lagrangian(q, v) must return a scalar, but for q and v of shape ({n},) it returned shape {out.shape}: "
                 "sum or index its result."
             )
         if self.one_forms is None:
@@ -81,8 +79,8 @@ class LagrangeDirac(AbstractSystem):
         out = self.one_forms.shape(q, params)
         if len(out.shape) != 2 or out.shape[1] != n or out.shape[0] > n:
             raise ValueError(
-                f"one_forms must return an array of shape (m, n) = (m, {n}) with m ≤ n, one row a one-form, but it "
-                f"returned shape {out.shape}."
+                f"one_forms(q) must return an array of shape (m, n) = (m, {n}) with m ≤ {n}, one row a one-form, but it "
+                f"returned shape {out.shape}{': put it in another pair of brackets' if len(out.shape) == 1 else ''}."
             )
         return n, out.shape[0]
 
@@ -93,6 +91,8 @@ class LagrangeDirac(AbstractSystem):
         if "p" in data:
             p = data["p"]
             v = self.inverse_legendre(q, p, params)
+            if self.one_forms is not None:
+                v = v - jax.lax.stop_gradient(self._undetermined_part(q, v, params))
             if project and self.one_forms is not None:
                 v = self.project_velocity(q, v, params)
                 p = self.legendre(q, v, params)
@@ -100,6 +100,14 @@ class LagrangeDirac(AbstractSystem):
             v = self.project_velocity(q, data["v"], params) if project and self.one_forms is not None else data["v"]
             p = self.legendre(q, v, params)
         return {"q": q, "v": v, "p": p}
+
+    def _undetermined_part(self, q, v, params):
+        """What to take from v to satisfy W v = 0 without changing ∂L/∂v: nothing where L is regular."""
+        hessian = jax.hessian(lambda v: self.lagrangian(q, v, params))(v)
+        kernel = jnp.eye(q.shape[0]) - scaled_pseudo_inverse(hessian)[0] @ hessian
+        kernel = jnp.where(jnp.trace(kernel) > 0.5, kernel, 0.0)  # its trace is the number of undetermined directions
+        w = self.constraint_matrix(q, params)
+        return kernel @ (scaled_pseudo_inverse(w @ kernel)[0] @ (w @ v))
 
     def project_velocity(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None) -> Float[Array, " n"]:
         """The velocity in Δ_Q(q) = ker W(q) nearest to v, in the metric ∂²L/∂v² where it is positive definite and the

@@ -5,11 +5,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
 from dirax.geometry.manifolds import AbstractManifold
+from dirax.roots import nearest_root
 from dirax.systems.system import AbstractSystem, no_constraint
 
 
@@ -38,12 +38,10 @@ class ManifoldLagrangian(AbstractSystem):
         """The tangent vector v at q with legendre(q, v) = p."""
         frame = self.manifold.frame(q)
 
-        def defect(s, _):
+        def defect(s):
             return frame.T @ (jax.grad(lambda v: self.lagrangian(q, v, params))(frame @ s) - p)
 
-        solver = optx.Newton(rtol=1e-14, atol=1e-14, cauchy_termination=False)
-        zero = jnp.zeros(self.manifold.dimension)
-        return frame @ optx.root_find(defect, solver, zero, max_steps=60, throw=False).value
+        return frame @ nearest_root(defect, jnp.zeros(self.manifold.dimension))
 
     def energy(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None) -> Float[Array, ""]:
         """⟨∂L/∂v, v⟩ − L."""

@@ -1,0 +1,65 @@
+"""Roots of small systems of equations, regular or not: damped Newton with a pseudo-inverse, run to the roundoff floor."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+EPSILON = 2.220446049250313e-16
+RANK_TOLERANCE = 1e-12
+"""Singular values below this, relative to the largest of the equilibrated matrix, count as zero."""
+SHORTEST = 2.0**-30
+"""Smallest fraction of a Newton step that is tried."""
+
+
+def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int = 100) -> Float[Array, " k"]:
+    """A root of `residual` (k,) → (k,) near `guess`; where it has several, that of the least changes from the guess.
+
+    A step is halved until the next one would be shorter, so that the units of the equations and of the unknowns do not
+    matter and the domain of `residual` is not left. Where there is no root, the last point that was an improvement comes
+    back, so check the residual if that can happen. Differentiable any number of times, by the implicit function theorem.
+    """
+
+    def solve(residual, guess):
+        def step(carry):
+            u, _, count = carry
+            inverse, unit = scaled_pseudo_inverse(jax.jacfwd(residual)(u))
+            change = inverse @ residual(u)
+            size = lambda v: jnp.max(jnp.abs(v) / unit)
+            here = size(change)
+            at_floor = here <= 4.0 * EPSILON * size(u)
+
+            def shorter(fraction):
+                following = inverse @ residual(u - fraction * change)
+                # not left to the comparison: XLA's vectorized maximum of NaNs can be −∞ on a CPU
+                return jnp.all(jnp.isfinite(following)) & (size(following) <= (1.0 - fraction / 4.0) * here)
+
+            def halve(carry):
+                fraction = carry[0] / 2.0
+                return fraction, shorter(fraction)
+
+            fraction, better = lax.while_loop(lambda c: ~c[1] & (c[0] > SHORTEST), halve, (jnp.ones(()), shorter(1.0) | at_floor))
+            return jnp.where(better, u - fraction * change, u), ~better | at_floor, count + 1
+
+        unfinished = lambda carry: ~carry[1] & (carry[2] < max_steps)
+        return lax.while_loop(unfinished, step, (guess, jnp.array(False), 0))[0]
+
+    def tangent_solve(linear: Callable, right: Any):
+        inverse, _ = scaled_pseudo_inverse(jax.jacfwd(linear)(jnp.zeros_like(right)))
+        return inverse @ right
+
+    return lax.custom_root(residual, guess, solve, tangent_solve)
+
+
+def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> tuple[Float[Array, "l k"], Float[Array, " l"]]:
+    """The pseudo-inverse of a matrix with rows and columns scaled to unit size, and the units that this gives the columns."""
+    scaled, rows, columns = matrix, jnp.ones(matrix.shape[0]), jnp.ones(matrix.shape[1])
+    fitting = lambda sizes: jnp.where(sizes > 0.0, sizes, 1.0)
+    for _ in range(3):
+        row, column = (fitting(jnp.sqrt(jnp.max(jnp.abs(scaled), axis=axis))) for axis in (1, 0))
+        scaled = scaled / row[:, None] / column[None, :]
+        rows, columns = rows * row, columns * column
+    return jnp.linalg.pinv(scaled, rtol=RANK_TOLERANCE) / columns[:, None] / rows[None, :], 1.0 / columns
