@@ -1,0 +1,262 @@
+"""Scalar expressions, each built once: constants folded, zeros and ones simplified away, equal expressions shared."""
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from dirax.engines.native.operations import BOOLEAN, COMMUTATIVE, OPERATIONS, evaluate_one
+
+MAX_POWER = 64
+"""Largest whole exponent written out as multiplications."""
+
+
+class GraphTooLarge(Exception):
+    """More nodes than the limit of the graph."""
+
+
+class Graph:
+    """A hash-consed expression graph over float64 and bool scalars.
+
+    A node is a number; `op[i]` names its operation, `args[i]` its operands (smaller numbers), `value[i]` holds the value
+    of a constant or the name of an input. Division a/b is a·recip(b), so that reciprocals are shared.
+    Raises `GraphTooLarge` when `limit` nodes are not enough.
+    """
+
+    def __init__(self, limit: int = 1_000_000):
+        self.op: list[str] = []
+        self.args: list[tuple[int, ...]] = []
+        self.value: dict[int, float | bool | str] = {}
+        self.limit = limit
+        self._known: dict[tuple, int] = {}
+        self.zero, self.one = self.constant(0.0), self.constant(1.0)
+        self.false, self.true = self.constant(False), self.constant(True)
+
+    def __len__(self) -> int:
+        return len(self.op)
+
+    # ------------------------------------------------------------------ leaves
+
+    def constant(self, value) -> int:
+        """The node of a float64 or a bool."""
+        if isinstance(value, bool | np.bool_):
+            return self._intern("bool", (), bool(value), ("bool", bool(value)))
+        number = float(value)
+        return self._intern("const", (), number, ("const", np.float64(number).tobytes()))
+
+    def input(self, name: str) -> int:
+        """The node of a named scalar that is known at run time."""
+        return self._intern("input", (), name, ("input", name))
+
+    def is_constant(self, node: int) -> bool:
+        return self.op[node] in ("const", "bool")
+
+    def is_boolean(self, node: int) -> bool:
+        return self.op[node] in BOOLEAN
+
+    def number(self, node: int) -> float | None:
+        """The value of a float64 constant, None for any other node."""
+        return self.value[node] if self.op[node] == "const" else None  # type: ignore[return-value]
+
+    def _intern(self, op: str, args: tuple[int, ...], value, key: tuple) -> int:
+        node = self._known.get(key)
+        if node is None:
+            node = len(self.op)
+            if node >= self.limit:
+                raise GraphTooLarge(f"more than {self.limit} scalar operations")
+            self.op.append(op)
+            self.args.append(args)
+            if value is not None:
+                self.value[node] = value
+            self._known[key] = node
+        return node
+
+    def make(self, op: str, *args: int) -> int:
+        """The node op(args), simplified."""
+        if all(self.is_constant(a) for a in args):
+            return self.constant(evaluate_one(op, *(self.value[a] for a in args)))
+        special = getattr(self, f"_{op}", None)
+        return special(*args) if special else self._plain(op, *args)
+
+    def _plain(self, op: str, *args: int) -> int:
+        if op in COMMUTATIVE and args[1] < args[0]:
+            args = args[::-1]
+        return self._intern(op, args, None, (op, *args))
+
+    # ------------------------------------------------------------------ arithmetic
+
+    def add(self, a: int, b: int) -> int:
+        return self.make("add", a, b)
+
+    def sub(self, a: int, b: int) -> int:
+        return self.make("sub", a, b)
+
+    def mul(self, a: int, b: int) -> int:
+        return self.make("mul", a, b)
+
+    def neg(self, a: int) -> int:
+        return self.make("neg", a)
+
+    def recip(self, a: int) -> int:
+        return self.make("recip", a)
+
+    def div(self, a: int, b: int) -> int:
+        return self.one if a == b else self.mul(a, self.recip(b))
+
+    def select(self, condition: int, yes: int, no: int) -> int:
+        return self.make("select", condition, yes, no)
+
+    def negated(self, a: int) -> int | None:
+        """x where a is −x."""
+        return self.args[a][0] if self.op[a] == "neg" else None
+
+    def _add(self, a: int, b: int) -> int:
+        if a == self.zero or b == self.zero:
+            return b if a == self.zero else a
+        if (x := self.negated(b)) is not None:
+            return self.sub(a, x)
+        if (x := self.negated(a)) is not None:
+            return self.sub(b, x)
+        return self.mul(self.constant(2.0), a) if a == b else self._plain("add", a, b)
+
+    def _sub(self, a: int, b: int) -> int:
+        if b == self.zero:
+            return a
+        if a == self.zero:
+            return self.neg(b)
+        if a == b:
+            return self.zero
+        if (x := self.negated(b)) is not None:
+            return self.add(a, x)
+        if (x := self.negated(a)) is not None:
+            return self.neg(self.add(x, b))
+        return self._plain("sub", a, b)
+
+    def _neg(self, a: int) -> int:
+        if (x := self.negated(a)) is not None:
+            return x
+        if self.op[a] == "sub":
+            return self.sub(*self.args[a][::-1])
+        if self.op[a] == "mul" and (c := self.number(self.args[a][0])) is not None:
+            return self.mul(self.constant(-c), self.args[a][1])
+        return self._plain("neg", a)
+
+    def _mul(self, a: int, b: int) -> int:
+        if self.is_constant(b):
+            a, b = b, a
+        c = self.number(a)
+        if c is not None:
+            if c in (0.0, 1.0, -1.0):
+                return self.zero if c == 0 else b if c == 1 else self.neg(b)
+            if (x := self.negated(b)) is not None:
+                return self.mul(self.constant(-c), x)
+            if self.op[b] == "mul" and (d := self.number(self.args[b][0])) is not None and _plain_number(c * d):
+                return self.mul(self.constant(c * d), self.args[b][1])
+            return self._intern("mul", (a, b), None, ("mul", a, b))
+        if (x := self.negated(a)) is not None:
+            return self.neg(self.mul(x, b))
+        if (x := self.negated(b)) is not None:
+            return self.neg(self.mul(a, x))
+        for x, y in ((a, b), (b, a)):  # constants come out in front
+            if self.op[x] == "mul" and self.is_constant(self.args[x][0]):
+                return self.mul(self.args[x][0], self.mul(self.args[x][1], y))
+            if self.op[x] == "select" and self.args[x][1:] == (self.one, self.zero):
+                return self.select(self.args[x][0], y, self.zero)
+        return self._plain("mul", a, b)
+
+    def _recip(self, a: int) -> int:
+        if self.op[a] == "recip":
+            return self.args[a][0]
+        if (x := self.negated(a)) is not None:
+            return self.neg(self.recip(x))
+        if self.op[a] == "mul" and (c := self.number(self.args[a][0])) is not None and _plain_number(1 / c):
+            return self.mul(self.constant(1 / c), self.recip(self.args[a][1]))
+        return self._plain("recip", a)
+
+    def power(self, x: int, n: int) -> int:
+        """x to a whole power, by squaring."""
+        if n < 0:
+            return self.recip(self.power(x, -n))
+        result = None
+        while n:
+            if n & 1:
+                result = x if result is None else self.mul(result, x)
+            n >>= 1
+            x = self.mul(x, x) if n else x
+        return self.one if result is None else result
+
+    def _pow(self, x: int, y: int) -> int:
+        c = self.number(y)
+        if c is not None and abs(c) <= MAX_POWER and float(c).is_integer():
+            return self.power(x, int(c))
+        if c is not None and abs(c) <= MAX_POWER and float(2 * c).is_integer():
+            whole = math.floor(c)
+            return self.mul(self.power(x, whole), self.make("sqrt", x))
+        return self._plain("pow", x, y)
+
+    # ------------------------------------------------------------------ logic
+
+    def _select(self, condition: int, yes: int, no: int) -> int:
+        if self.is_constant(condition):
+            return yes if self.value[condition] else no
+        if yes == no:
+            return yes
+        if self.op[condition] == "not":
+            return self.select(self.args[condition][0], no, yes)
+        if self.is_boolean(yes) or self.is_boolean(no):
+            opposite = self.make("not", condition)
+            return self.make("or", self.make("and", condition, yes), self.make("and", opposite, no))
+        return self._plain("select", condition, yes, no)
+
+    def _and(self, a: int, b: int) -> int:
+        if self.false in (a, b):
+            return self.false
+        if self.true in (a, b):
+            return b if a == self.true else a
+        return a if a == b else self._plain("and", a, b)
+
+    def _or(self, a: int, b: int) -> int:
+        if self.true in (a, b):
+            return self.true
+        if self.false in (a, b):
+            return b if a == self.false else a
+        return a if a == b else self._plain("or", a, b)
+
+    def _not(self, a: int) -> int:
+        return self.args[a][0] if self.op[a] == "not" else self._plain("not", a)
+
+    def _max(self, a: int, b: int) -> int:
+        return a if a == b else self._plain("max", a, b)
+
+    def _min(self, a: int, b: int) -> int:
+        return a if a == b else self._plain("min", a, b)
+
+    # ------------------------------------------------------------------ the whole
+
+    def reachable(self, outputs: Iterable[int]) -> list[int]:
+        """Every node that the outputs need, operands first."""
+        seen, stack = set(), list(outputs)
+        while stack:
+            node = stack.pop()
+            if node not in seen:
+                seen.add(node)
+                stack.extend(self.args[node])
+        return sorted(seen)
+
+    def evaluate(self, outputs: Sequence[int], inputs: dict[str, np.ndarray], table: dict | None = None) -> list:
+        """The outputs for given inputs; NumPy by default, any array library whose functions are in `table`."""
+        functions = table or OPERATIONS
+        values: dict[int, object] = {}
+        for node in self.reachable(outputs):
+            op = self.op[node]
+            if op == "input":
+                values[node] = inputs[self.value[node]]  # type: ignore[index]
+            elif self.is_constant(node):
+                values[node] = self.value[node]
+            else:
+                values[node] = functions[op](*(values[a] for a in self.args[node]))
+        return [values[node] for node in outputs]
+
+
+def _plain_number(x: float) -> bool:
+    return math.isfinite(x) and abs(x) > 1e-290
