@@ -214,7 +214,15 @@ class _Functions(eqx.Module):
     functions: tuple[UserFunction, ...]
 
     def __call__(self, x, params):
-        return tuple(jnp.asarray(function(x, params), dtype=float) for function in self.functions)
+        return tuple(_value(function, x, params) for function in self.functions)
+
+
+def _value(function: UserFunction, x: Float[Array, " n"], params: Any) -> Float[Array, "rows columns"]:
+    try:
+        return jnp.asarray(function(x, params), dtype=float)
+    except Exception:
+        function.shape(x, params)  # says which function failed, on what shapes
+        raise
 
 
 def _functions(**functions: Callable) -> _Functions:
@@ -229,7 +237,7 @@ class _Induced(eqx.Module):
         form = canonical_two_form(self.n)
         if self.one_forms is None:
             return (form,)
-        W = jnp.asarray(self.one_forms(x[: self.n], params), dtype=float)
+        W = _value(self.one_forms, x[: self.n], params)
         if W.ndim != 2 or W.shape[1] != self.n:
             raise ValueError(f"one_forms returned shape {W.shape}; (m, {self.n}), one one-form a row, was expected.")
         return jnp.concatenate([W, jnp.zeros_like(W)], axis=1), form
@@ -241,7 +249,7 @@ class _PullBack(eqx.Module):
 
     def __call__(self, y, params):
         def position(y):
-            return jnp.asarray(self.point_map(y, params), dtype=float)
+            return _value(self.point_map, y, params)
 
         x = position(y)
         jacobian = block_diagonal(jax.jacfwd(position)(y), np.eye(self.structure.ports))
