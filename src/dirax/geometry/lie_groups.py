@@ -1,0 +1,289 @@
+"""The rotation and rigid-motion groups SO(2), SE(2), SO(3), SE(3) as manifolds, with jaxlie's representations.
+
+Coordinates, their order and the conversions to and from matrices are jaxlie's. Products are written here because an
+integrator's inner loop holds them; exponentials and logarithms because it differentiates them twice at the identity, so
+they are made of functions that are smooth in the squared angle.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Float
+
+from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
+from dirax.geometry.numerics import Scalar, arc_over_sine, norm, radial
+
+Algebra: TypeAlias = Float[Array, " d"]
+
+
+class AbstractLieGroup(AbstractGeodesicManifold):
+    """A Lie group of rotations and translations; an element is a unit complex number or quaternion, and a translation.
+
+    Algebra vectors ξ (d,), ordered (translation, rotation) as in jaxlie, are left-trivialized (body) velocities,
+    v = g ξ; a covector p at g has the body momentum Π (d,) with ⟨p, g ξ⟩ = Π·ξ. `exp(g, v)` = g exp(g⁻¹v) follows the
+    one-parameter subgroups, which are geodesics of a metric only where the group is `bi_invariant`; `transport` is left
+    translation. A metric's `distance` combines the angle of the relative rotation with the distance of the translations.
+    """
+
+    rotation_product: eqx.AbstractClassVar[np.ndarray]  # (k, k, k): (r s)_i = Σ rotation_product[i, j, l] r_j s_l
+    rotation_basis: eqx.AbstractClassVar[np.ndarray]  # (k, d'): the derivative of exp at 0, on rotations
+    translations: eqx.AbstractClassVar[int]
+    bi_invariant: eqx.AbstractClassVar[bool]
+    double_cover: eqx.AbstractClassVar[bool]
+    jaxlie_group: eqx.AbstractClassVar[type[jaxlie.MatrixLieGroup]]
+
+    @abstractmethod
+    def group_exp(self, xi: Algebra) -> Vector:
+        """The exponential exp(ξ) of an algebra vector ξ (d,); the angle is in radians."""
+
+    @abstractmethod
+    def group_log(self, g: Vector) -> Algebra:
+        """The algebra vector ξ (d,) with exp(ξ) = g and angle at most π."""
+
+    # ------------------------------------------------------------------ the group
+
+    def identity(self) -> Vector:
+        """The neutral element."""
+        return jnp.asarray(np.eye(self.ambient_dimension)[0])
+
+    def multiply(self, g: Vector, h: Vector) -> Vector:
+        """The product g h."""
+        (rotation, shift), (other, other_shift) = self._split(g), self._split(h)
+        product = self._product(rotation, other)
+        return self._join(product, lambda: shift + self._rotate(rotation, other_shift))
+
+    def inverse(self, g: Vector) -> Vector:
+        """The inverse g⁻¹."""
+        rotation, shift = self._split(g)
+        back = self._conjugate(rotation)
+        return self._join(back, lambda: -self._rotate(back, shift))
+
+    def adjoint(self, g: Vector) -> Float[Array, "d d"]:
+        """The matrix Ad_g: g exp(ξ) g⁻¹ = exp(Ad_g ξ)."""
+        return self._as_jaxlie(g).adjoint()
+
+    def matrix(self, g: Vector) -> Float[Array, "k k"]:
+        """The element as a matrix: 2×2 or 3×3 rotations, homogeneous 3×3 or 4×4 rigid motions."""
+        return self._as_jaxlie(g).as_matrix()
+
+    def from_matrix(self, matrix: Float[Array, "k k"]) -> Vector:
+        """The element with the given matrix."""
+        return self.jaxlie_group.from_matrix(jnp.asarray(matrix)).parameters()
+
+    def left_translate(self, g: Vector, xi: Algebra) -> Vector:
+        """The tangent vector v = g ξ at g."""
+        rotation, _ = self._split(g)
+        spin = self._product(rotation, jnp.asarray(self.rotation_basis @ xi[self.translations :]))
+        return self._join(spin, lambda: self._rotate(rotation, xi[: self.translations]))
+
+    def to_algebra(self, g: Vector, v: Vector) -> Algebra:
+        """The body velocity ξ = g⁻¹v of a tangent vector v at g."""
+        (rotation, _), (spin, shift) = self._split(g), self._split(v)
+        back = self._conjugate(rotation)
+        angular = self._spin_lengths(self._product(back, spin))
+        return jnp.concatenate([self._rotate(back, shift), angular]) if self.translations else angular
+
+    def body_momentum(self, g: Vector, p: Vector) -> Algebra:
+        """The body momentum Π (d,) of a covector p at g: Π·ξ = ⟨p, g ξ⟩."""
+        return jax.linear_transpose(lambda xi: self.left_translate(g, xi), jnp.zeros(self.dimension))(p)[0]
+
+    def covector(self, g: Vector, momentum: Algebra) -> Vector:
+        """The covector at g, as a tangent vector in ambient coordinates, with the body momentum Π (d,)."""
+        # The left-invariant frame is orthogonal in the ambient inner product; its rotations have one length.
+        angular = momentum[self.translations :] / np.sum(self.rotation_basis[:, 0] ** 2)
+        return self.left_translate(g, jnp.concatenate([momentum[: self.translations], angular]))
+
+    def _as_jaxlie(self, g: Vector) -> jaxlie.MatrixLieGroup:
+        return self.jaxlie_group(g)
+
+    def _split(self, x: Vector) -> tuple[Vector, Vector]:
+        return x[: self.rotation_product.shape[0]], x[self.rotation_product.shape[0] :]
+
+    def _join(self, rotation: Vector, translation: Callable[[], Vector]) -> Vector:
+        return jnp.concatenate([rotation, translation()]) if self.translations else rotation
+
+    def _product(self, rotation: Vector, other: Vector) -> Vector:
+        return jnp.sum(self.rotation_product * (rotation[:, None] * other[None, :]), axis=(1, 2))
+
+    def _conjugate(self, rotation: Vector) -> Vector:
+        return rotation * np.array([1.0] + [-1.0] * (rotation.shape[0] - 1))
+
+    def _rotate(self, rotation: Vector, v: Vector) -> Vector:
+        if self.translations == 2:
+            return self._product(rotation, v)
+        spin = self._product(rotation, jnp.concatenate([jnp.zeros(1), v]))
+        return self._product(spin, self._conjugate(rotation))[1:]
+
+    def _spin_lengths(self, spin: Vector) -> Vector:
+        return spin[1:] / self.rotation_basis[-1, -1]
+
+    # ------------------------------------------------------------------ the manifold
+
+    def defect(self, x):
+        return jnp.abs(norm(self._split(x)[0]) - 1.0)
+
+    def nearest(self, x):
+        rotation, translation = self._split(x)
+        return self._join(rotation / norm(rotation), lambda: translation)
+
+    def projection(self, x, v):
+        (rotation, _), (spin, shift) = self._split(x), self._split(v)
+        return self._join(spin - rotation * jnp.dot(rotation, spin), lambda: shift)
+
+    def representative(self, x, near):
+        if not self.double_cover:
+            return x
+        rotation, translation = self._split(x)
+        sign = jnp.where(jnp.dot(rotation, self._split(near)[0]) < 0.0, -1.0, 1.0)
+        return self._join(sign * rotation, lambda: translation)
+
+    def local_parametrization(self, x):
+        return lambda r: self.nearest(self.multiply(x, self.group_exp(r)))
+
+    def frame(self, x):
+        return jax.vmap(lambda xi: self.left_translate(x, xi), out_axes=1)(jnp.eye(self.dimension))
+
+    def coordinates(self, x, v):
+        return self.to_algebra(x, v)
+
+    def exp(self, x, v):
+        return self.multiply(x, self.group_exp(self.to_algebra(x, v)))
+
+    def log(self, x, y):
+        return self.left_translate(x, self.group_log(self.multiply(self.inverse(x), y)))
+
+    def distance(self, x, y):
+        relative = self.group_log(self.multiply(self.inverse(x), y))
+        return norm(jnp.append(self._split(x)[1] - self._split(y)[1], self._angle(relative)))
+
+    def transport(self, x, v, y):
+        return self.left_translate(y, self.to_algebra(x, v))
+
+    def retraction(self, x, v):
+        return self.exp(x, v)
+
+    def inverse_retraction(self, x, y):
+        return self.log(x, y)
+
+    def exp_reach(self, x, v):
+        return self._angle(self.to_algebra(x, v)) / jnp.pi
+
+    def retraction_reach(self, x, v):
+        return self.exp_reach(x, v)
+
+    def _angle(self, xi: Algebra) -> Scalar:
+        return norm(xi[self.translations :])
+
+
+_COMPLEX_PRODUCT = np.array([[[1.0, 0], [0, -1]], [[0, 1], [1, 0]]])
+_QUATERNION_PRODUCT = np.array(
+    [
+        np.diag([1.0, -1, -1, -1]),
+        [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
+        [[0, 0, 1, 0], [0, 0, 0, -1], [1, 0, 0, 0], [0, 1, 0, 0]],
+        [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [1, 0, 0, 0]],
+    ]
+)
+_TURN_OF_PLANE = np.array([[0.0], [1.0]])
+_TURN_OF_SPACE = np.vstack([np.zeros(3), np.eye(3) / 2.0])
+
+
+class SO2(AbstractLieGroup):
+    """The rotations of the plane; an element is (cos, sin), an algebra vector is the angular velocity (1,)."""
+
+    dimension, ambient_dimension, translations = 1, 2, 0
+    rotation_product, rotation_basis = _COMPLEX_PRODUCT, _TURN_OF_PLANE
+    bi_invariant, double_cover = True, False
+    jaxlie_group = jaxlie.SO2
+
+    def group_exp(self, xi):
+        return jnp.concatenate([jnp.cos(xi), jnp.sin(xi)])
+
+    def group_log(self, g):
+        return jnp.arctan2(g[1:2], g[0:1])
+
+
+class SE2(AbstractLieGroup):
+    """The rigid motions of the plane; an element is (cos, sin, x, y), an algebra vector (velocity, angle rate)."""
+
+    dimension, ambient_dimension, translations = 3, 4, 2
+    rotation_product, rotation_basis = _COMPLEX_PRODUCT, _TURN_OF_PLANE
+    bi_invariant, double_cover = False, False
+    jaxlie_group = jaxlie.SE2
+
+    def group_exp(self, xi):
+        velocity, angle = xi[:2], xi[2]
+        along, across = radial(1, angle**2), angle / 2.0 * radial(1, angle**2 / 4.0) ** 2
+        rotation = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        return jnp.concatenate([rotation, along * velocity + across * _quarter_turn(velocity)])
+
+    def group_log(self, g):
+        angle, translation = jnp.arctan2(g[1], g[0]), g[2:]
+        s = angle**2 / 4.0
+        velocity = radial(0, s) / radial(1, s) * translation - angle / 2.0 * _quarter_turn(translation)
+        return jnp.concatenate([velocity, angle[None]])
+
+
+class SO3(AbstractLieGroup):
+    """The rotations of space; an element is a unit quaternion (w, x, y, z), q and −q being one rotation.
+
+    Algebra vectors are body angular velocities ω (3,), with q̇ = ½ q ω; the distance is the angle of the rotation.
+    """
+
+    dimension, ambient_dimension, translations = 3, 4, 0
+    rotation_product, rotation_basis = _QUATERNION_PRODUCT, _TURN_OF_SPACE
+    bi_invariant, double_cover = True, True
+    jaxlie_group = jaxlie.SO3
+
+    def group_exp(self, xi):
+        return _quaternion_exp(xi)
+
+    def group_log(self, g):
+        return _quaternion_log(g)
+
+
+class SE3(AbstractLieGroup):
+    """The rigid motions of space; an element is (quaternion, translation) (7,), an algebra vector (velocity, ω)."""
+
+    dimension, ambient_dimension, translations = 6, 7, 3
+    rotation_product, rotation_basis = _QUATERNION_PRODUCT, _TURN_OF_SPACE
+    bi_invariant, double_cover = False, True
+    jaxlie_group = jaxlie.SE3
+
+    def group_exp(self, xi):
+        velocity, omega = xi[:3], xi[3:]
+        s = jnp.dot(omega, omega) / 4.0
+        sinc = radial(1, s)
+        # (1 − cos θ)/θ² and (θ − sin θ)/θ³ by half angles, without the cancellation.
+        second, third = sinc**2 / 2.0, (sinc**2 - radial(0, s) * radial(2, s)) / 4.0
+        once = jnp.cross(omega, velocity)
+        return jnp.concatenate([_quaternion_exp(omega), velocity + second * once + third * jnp.cross(omega, once)])
+
+    def group_log(self, g):
+        omega, translation = _quaternion_log(g[:4]), g[4:]
+        s = jnp.dot(omega, omega) / 4.0
+        once = jnp.cross(omega, translation)
+        velocity = translation - once / 2.0 + radial(2, s) / (4.0 * radial(1, s)) * jnp.cross(omega, once)
+        return jnp.concatenate([velocity, omega])
+
+
+def _quaternion_exp(omega: Float[Array, " 3"]) -> Float[Array, " 4"]:
+    s = jnp.dot(omega, omega) / 4.0
+    return jnp.concatenate([radial(0, s)[None], 0.5 * radial(1, s) * omega])
+
+
+def _quaternion_log(q: Float[Array, " 4"]) -> Float[Array, " 3"]:
+    # Of q and −q, the one with angle at most π; half the angle is an arc of the unit sphere from (1, 0, 0, 0).
+    q = jnp.where(q[0] < 0.0, -q, q)
+    sine_squared, cosine = jnp.dot(q[1:], q[1:]), q[0]
+    return 2.0 * arc_over_sine(0, sine_squared / (2.0 * (1.0 + cosine)), (1.0 + cosine) / 2.0) * q[1:]
+
+
+def _quarter_turn(v: Float[Array, " 2"]) -> Float[Array, " 2"]:
+    return jnp.stack([-v[1], v[0]])

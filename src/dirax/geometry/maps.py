@@ -1,0 +1,383 @@
+"""Discretization maps R_d: TM → M × M ([BLM] Definition 4.5): how a velocity becomes a pair of points, and back.
+
+(D1) R_d(x, 0) = (x, x), and (D2) D_v R_d²(x, 0) − D_v R_d¹(x, 0) = id, so that R_d is invertible near v = 0
+([BLM] Proposition 4.6). A map knows the manifold it lives on as `map.manifold(N)`, N the length of x.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dirax.functions import is_traced
+from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold, Euclidean, Product, Sphere, Vector
+from dirax.geometry.numerics import Scalar, newton_root, norm
+
+Pair = tuple[Vector, Vector]
+
+
+class AbstractDiscretizationMap(eqx.Module):
+    """A discretization map: `map(x, v) -> (x0, x1)` and `map.inverse(x0, x1) -> (x, v)`, all vectors (N,).
+
+    Both raise `ValueError` for concrete arguments that are not on the manifold or not tangent to it, with the defect,
+    and for velocities outside the injectivity radius; traced arguments are not looked at. `forward` and `backward` are
+    the same functions without any check.
+    """
+
+    @abstractmethod
+    def manifold(self, ambient_dimension: int) -> AbstractManifold:
+        """The manifold M of the map, for points of length `ambient_dimension`; `ValueError` if it has another one."""
+
+    @abstractmethod
+    def forward(self, x: Vector, v: Vector) -> Pair:
+        """R_d(x, v)."""
+
+    @abstractmethod
+    def backward(self, x0: Vector, x1: Vector) -> Pair:
+        """R_d⁻¹(x0, x1)."""
+
+    @abstractmethod
+    def reach(self, x: Vector, v: Vector) -> Scalar:
+        """‖v‖ in units of the injectivity radius at x: the map and its inverse are used where this is below 1."""
+
+    def __call__(self, x: Vector, v: Vector) -> Pair:
+        x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
+        manifold = self.manifold(x.shape[-1])
+        manifold.check_point(x, "x")
+        manifold.check_tangent(x, v, "v")
+        self._check_reach(x, v, "Take a smaller v (a smaller step).")
+        return self.forward(x, v)
+
+    def inverse(self, x0: Vector, x1: Vector) -> Pair:
+        """The point x and tangent vector v with map(x, v) = (x0, x1)."""
+        x0, x1 = jnp.asarray(x0, dtype=float), jnp.asarray(x1, dtype=float)
+        manifold = self.manifold(x0.shape[-1])
+        manifold.check_point(x0, "x0")
+        manifold.check_point(x1, "x1")
+        x, v = self.backward(x0, x1)
+        self._check_reach(x, v, "The two points are too far apart: take a smaller step.")
+        return x, v
+
+    def _check_reach(self, x: Vector, v: Vector, way_out: str) -> None:
+        if is_traced(x, v, self):
+            return
+        length, reach = float(norm(v)), float(self.reach(x, v))
+        if not (np.isfinite(length) and reach < 1.0 - 1e-9):
+            raise ValueError(
+                f"{type(self).__name__} is used outside its injectivity radius: v has norm {length:.6g}, "
+                f"which is {reach:.6g} of the radius and must be less than 1. {way_out}"
+            )
+
+
+class Theta(AbstractDiscretizationMap):
+    """R_d(x, v) = (x − θv, x + (1 − θ)v) on R^n, 0 ≤ θ ≤ 1 ([BLM] Example 4.8); θ = ½ is the midpoint rule.
+
+    θ = 0 gives the explicit Euler method, θ = 1 the implicit one. Raises `ValueError` for another θ.
+    """
+
+    theta: float = eqx.field(static=True)
+
+    def __check_init__(self):
+        _check_theta(self.theta)
+
+    def manifold(self, ambient_dimension):
+        return Euclidean(ambient_dimension)
+
+    def forward(self, x, v):
+        return x - self.theta * v, x + (1.0 - self.theta) * v
+
+    def backward(self, x0, x1):
+        return (1.0 - self.theta) * x0 + self.theta * x1, x1 - x0
+
+    def reach(self, x, v):
+        return jnp.zeros(())
+
+
+def Midpoint() -> Theta:
+    """R_d(x, v) = (x − v/2, x + v/2) on R^n: `Theta(0.5)`."""
+    return Theta(0.5)
+
+
+class RiemannianExp(AbstractDiscretizationMap):
+    """R_d(x, v) = (exp_x(−θv), exp_x((1 − θ)v)) on a Riemannian manifold ([BLM] Example 4.9).
+
+    Raises `TypeError` for a group without a bi-invariant metric, SE(2) and SE(3): `LieGroupExp` is for these.
+    """
+
+    space: AbstractGeodesicManifold
+    theta: float = eqx.field(static=True, default=0.5)
+
+    def __check_init__(self):
+        _check_theta(self.theta)
+        for factor in self.space.factors if isinstance(self.space, Product) else (self.space,):
+            if not isinstance(factor, AbstractGeodesicManifold):
+                raise TypeError(f"RiemannianExp needs a manifold such as Sphere(3), but {factor!r} came.")
+            if isinstance(factor, AbstractLieGroup) and not factor.bi_invariant:
+                raise TypeError(
+                    f"{type(factor).__name__} has no bi-invariant metric, so its one-parameter subgroups are not "
+                    f"geodesics: use LieGroupExp({type(factor).__name__}(), theta)."
+                )
+
+    def manifold(self, ambient_dimension):
+        return _same_size(self.space, ambient_dimension)
+
+    def forward(self, x, v):
+        return self.space.exp(x, -self.theta * v), self.space.exp(x, (1.0 - self.theta) * v)
+
+    def backward(self, x0, x1):
+        # One geodesic t ↦ exp(x0, t log(x0, x1)): x and v are its point and its velocity at t = θ.
+        direction = self.space.log(x0, x1)
+        time = jnp.asarray(self.theta)
+        return jax.jvp(lambda t: self.space.exp(x0, t * direction), (time,), (jnp.ones_like(time),))
+
+    def reach(self, x, v):
+        return self.space.exp_reach(x, v)
+
+
+class LieGroupExp(AbstractDiscretizationMap):
+    """R_d(g, v) = (g exp(−θ g⁻¹v), g exp((1 − θ) g⁻¹v)) on a Lie group ([BLM] Example 4.10).
+
+    Raises `TypeError` for something that is not a Lie group.
+    """
+
+    group: AbstractLieGroup
+    theta: float = eqx.field(static=True, default=0.5)
+
+    def __check_init__(self):
+        _check_theta(self.theta)
+        if not isinstance(self.group, AbstractLieGroup):
+            raise TypeError(f"LieGroupExp needs a group such as SO3(), but {self.group!r} came.")
+
+    def manifold(self, ambient_dimension):
+        return _same_size(self.group, ambient_dimension)
+
+    def forward(self, x, v):
+        xi = self.group.to_algebra(x, v)
+        move = lambda factor: self.group.multiply(x, self.group.group_exp(factor * xi))
+        return move(-self.theta), move(1.0 - self.theta)
+
+    def backward(self, x0, x1):
+        xi = self.group.group_log(self.group.multiply(self.group.inverse(x0), x1))
+        x = self.group.multiply(x0, self.group.group_exp(self.theta * xi))
+        return x, self.group.left_translate(x, xi)
+
+    def reach(self, x, v):
+        return self.group.exp_reach(x, v)
+
+
+class SphereProjection(AbstractDiscretizationMap):
+    """R_d(x, v) = ((x − v/2)/‖x − v/2‖, (x + v/2)/‖x + v/2‖) on the unit sphere of R^n ([BLM] (2)).
+
+    Its inverse is (x0, x1) ↦ ((x0 + x1)/‖x0 + x1‖, 2(x1 − x0)/‖x0 + x1‖); every pair but antipodes is reached.
+    """
+
+    def manifold(self, ambient_dimension):
+        return Sphere(ambient_dimension)
+
+    def forward(self, x, v):
+        back, ahead = x - v / 2.0, x + v / 2.0
+        return back / norm(back), ahead / norm(ahead)
+
+    def backward(self, x0, x1):
+        length = norm(x0 + x1)
+        return (x0 + x1) / length, 2.0 * (x1 - x0) / length
+
+    def reach(self, x, v):
+        return jnp.arctan(norm(v) / 2.0) * (2.0 / jnp.pi)
+
+
+class ProductMap(AbstractDiscretizationMap):
+    """Several maps side by side, on the product of their manifolds: `ProductMap((map, N), (map, N), …)`.
+
+    Each map comes with the ambient dimension N of its block:
+
+        pendulum = dx.ProductMap((dx.SphereProjection(), 3), (dx.SphereProjection(), 3))   # on S² × S²
+    """
+
+    maps: tuple[AbstractDiscretizationMap, ...]
+    sizes: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, *blocks: tuple[AbstractDiscretizationMap, int]):
+        self.maps = tuple(map for map, _ in blocks)
+        self.sizes = tuple(int(size) for _, size in blocks)
+
+    def manifold(self, ambient_dimension):
+        factors = [map.manifold(size) for map, size in zip(self.maps, self.sizes, strict=True)]
+        return _same_size(Product(*factors), ambient_dimension)  # pyright: ignore[reportArgumentType]
+
+    def forward(self, x, v):
+        return self._joined("forward", x, v)
+
+    def backward(self, x0, x1):
+        return self._joined("backward", x0, x1)
+
+    def reach(self, x, v):
+        return jnp.max(jnp.stack([map.reach(*block) for map, *block in self._blocks(x, v)]))
+
+    def _blocks(self, a: Vector, b: Vector):
+        ends = np.cumsum(self.sizes)[:-1].tolist()
+        return zip(self.maps, jnp.split(a, ends), jnp.split(b, ends), strict=True)
+
+    def _joined(self, method: str, a: Vector, b: Vector) -> Pair:
+        firsts, seconds = zip(*(getattr(map, method)(*block) for map, *block in self._blocks(a, b)), strict=True)
+        return jnp.concatenate(firsts), jnp.concatenate(seconds)
+
+
+class Submanifold(AbstractManifold):
+    """The image M0 of a smooth projector P: R^N → R^N, P ∘ P = P, defined near M0; `projector(x)` (N,) → (N,).
+
+    P may be oblique: `projection` is the orthogonal one to the tangent space, which is the image of DP. Without
+    `dimension` it is the trace of DP, taken at P of some point of R^N; raises `ValueError` if that is no whole number.
+    """
+
+    projector: Callable = eqx.field(static=True)
+    ambient_dimension: int = eqx.field(static=True)
+    dimension: int = eqx.field(static=True)
+
+    def __init__(self, projector: Callable, ambient_dimension: int, dimension: int | None = None):
+        self.projector, self.ambient_dimension = projector, ambient_dimension
+        self.dimension = self._dimension() if dimension is None else dimension
+
+    def _dimension(self) -> int:
+        with jax.ensure_compile_time_eval():
+            x = self.projector(jnp.cos(1.0 + jnp.arange(self.ambient_dimension)))
+            trace = float(jnp.trace(jax.jacfwd(self.projector)(x)))
+        if not abs(trace - round(trace)) < 1e-6:
+            raise ValueError(
+                f"The projector's derivative has trace {trace:.6g} at a point of its image, where a projector has a "
+                "whole number: P(P(x)) = P(x) must hold, and P be defined at that point; otherwise give dimension=."
+            )
+        return round(trace)
+
+    def defect(self, x):
+        return norm(self.projector(x) - x)
+
+    def nearest(self, x):
+        return self.projector(x)
+
+    def projection(self, x, v):
+        # A the projection DP(x), oblique: the orthogonal projection with the same image is A (A + Aᵀ − 1)⁻¹.
+        oblique = jax.jacfwd(self.projector)(x)
+        return oblique @ jnp.linalg.solve(oblique + oblique.T - jnp.eye(self.ambient_dimension), v)
+
+    def representative(self, x, near):
+        return x
+
+    def local_parametrization(self, x):
+        basis = self.frame(x)
+        return lambda r: self.projector(x + basis @ r)
+
+    def frame(self, x):
+        # A choice of coordinates, held fixed under differentiation: singular vectors have no derivative here.
+        oblique = jax.jacfwd(self.projector)(jax.lax.stop_gradient(x))
+        return jax.lax.stop_gradient(jnp.linalg.svd(oblique)[0][:, : self.dimension])
+
+    def coordinates(self, x, v):
+        return self.frame(x).T @ v
+
+
+class ProjectedMap(AbstractDiscretizationMap):
+    """(P × P) ∘ R_d on the image M0 of a projector P, from a map R_d on the space around it ([BLM] Proposition 7.3).
+
+    `projector(x)` takes and returns (N,), with P(P(x)) = P(x). The inverse is found by Newton's method, and is
+    differentiable; where Newton does not converge it is NaN, and an error for concrete points. `dimension` of M0 is
+    found from P if not given.
+    """
+
+    map: AbstractDiscretizationMap
+    projector: Callable = eqx.field(static=True)
+    dimension: int | None = eqx.field(static=True, default=None)
+
+    def manifold(self, ambient_dimension):
+        return Submanifold(self.projector, ambient_dimension, self.dimension)
+
+    def forward(self, x, v):
+        x0, x1 = self.map.forward(x, v)
+        return self.projector(x0), self.projector(x1)
+
+    def backward(self, x0, x1):
+        n = x0.shape[0]
+
+        def tangent(z):
+            """(y, w) ∈ R^2N to a tangent vector of M0."""
+            x = self.projector(z[:n])
+            return x, jax.jvp(self.projector, (x,), (z[n:],))[1]
+
+        def residual(z):
+            # 2N equations: the two points, and in the directions normal to M0 that y and w are on it and tangent.
+            x, v = tangent(z)
+            y0, y1 = self.forward(x, v)
+            return jnp.concatenate([y0 - x0 + z[:n] - x, y1 - x1 + z[n:] - v])
+
+        return tangent(newton_root(residual, jnp.concatenate(self.map.backward(x0, x1))))
+
+    def reach(self, x, v):
+        return self.map.reach(x, v)
+
+
+class DiscretizationMapReport(eqx.Module):
+    """What `check_discretization_map` found; all numbers are 0 for an exact map but the condition number."""
+
+    point_defect: Float[Array, ""]
+    """(D1): largest component of R_d(x, 0) − (x, x)."""
+    derivative_defect: Float[Array, ""]
+    """(D2): largest component of (D_v R_d² − D_v R_d¹)(x, 0)·e − e, over the frame vectors e of the tangent space."""
+    inverse_defect: Float[Array, ""]
+    """Largest component of R_d⁻¹(R_d(x, v)) − (x, v)."""
+    condition_number: Float[Array, ""]
+    """Condition number of D R_d(x, v) in the manifold's frames: the map is invertible near (x, v) if it is finite."""
+
+
+def check_discretization_map(map: AbstractDiscretizationMap, x: Vector, v: Vector) -> DiscretizationMapReport:
+    """How far (D1), (D2) and invertibility ([BLM] Definition 4.5, Proposition 4.6) fail at the tangent vector v at x."""
+    x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
+    manifold = map.manifold(x.shape[0])
+    d = manifold.dimension
+
+    def with_derivative(v):
+        """The two points at (x, v), and their derivatives (N, 2d) in coordinates of TM."""
+        tangent, here = tangent_coordinates(manifold, x, v)
+        push = lambda direction: jax.jvp(lambda z: map.forward(*tangent(z)), (here,), (direction,))
+        return jax.vmap(push, out_axes=(None, -1))(jnp.eye(2 * d))
+
+    (starts, ends), (start_derivatives, end_derivatives) = jax.vmap(with_derivative)(jnp.stack([jnp.zeros_like(v), v]))
+    difference_in_v = (end_derivatives - start_derivatives)[0, :, d:]
+    components = jax.vmap(jax.vmap(manifold.coordinates, (None, 1), 1))
+    jacobian = components(jnp.stack([starts[1], ends[1]]), jnp.stack([start_derivatives[1], end_derivatives[1]]))
+    found, velocity = map.backward(starts[1], ends[1])
+    return DiscretizationMapReport(
+        point_defect=_largest(starts[0] - x, ends[0] - x),
+        derivative_defect=_largest(difference_in_v - manifold.frame(x)),
+        inverse_defect=_largest(found - x, velocity - v),
+        condition_number=jnp.linalg.cond(jacobian.reshape(2 * d, 2 * d)),
+    )
+
+
+def tangent_coordinates(manifold: AbstractManifold, x: Vector, v: Vector) -> tuple[Callable, Float[Array, " 2d"]]:
+    """Coordinates (r, ṙ) of TM near the tangent vector v at x: the map to (point, vector), and its argument at (x, v)."""
+    point = manifold.local_parametrization(x)
+    here = jnp.concatenate([jnp.zeros(manifold.dimension), manifold.coordinates(x, v)])
+    return lambda z: jax.jvp(point, (z[: manifold.dimension],), (z[manifold.dimension :],)), here
+
+
+def _largest(*arrays: Array) -> Float[Array, ""]:
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(array)) for array in arrays]))
+
+
+def _check_theta(theta: float) -> None:
+    if not 0.0 <= theta <= 1.0:
+        raise ValueError(f"theta must be in [0, 1], but {theta} came; ½ is the midpoint rule.")
+
+
+def _same_size(manifold: AbstractManifold, ambient_dimension: int) -> AbstractManifold:
+    if manifold.ambient_dimension != ambient_dimension:
+        raise ValueError(
+            f"The map is on {manifold}, whose points have {manifold.ambient_dimension} components, "
+            f"but points with {ambient_dimension} came."
+        )
+    return manifold
