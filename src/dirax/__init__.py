@@ -7,7 +7,21 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from dirax.diagnostics.verify import verify
+from dirax.geometry.charts import Atlas, chart_at, check_chart
+from dirax.geometry.cotangent_lift import cotangent_lift, symplecticity_defect
+from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.geometry.linear import LinearDirac
+from dirax.geometry.manifolds import Circle, Euclidean, Product, Sphere, Torus
+from dirax.geometry.maps import (
+    LieGroupExp,
+    Midpoint,
+    ProjectedMap,
+    RiemannianExp,
+    SphereProjection,
+    Theta,
+    check_discretization_map,
+)
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
 from dirax.reconstruction import reconstruct
 from dirax.reduction.connection import LinearConnection
@@ -29,34 +43,56 @@ from dirax.systems.port_hamiltonian import PortHamiltonian
 __version__ = "0.1.0"
 
 __all__ = [
+    "SE2",
+    "SE3",
+    "SO2",
+    "SO3",
     "AbstractScheme",
     "Adjoint",
+    "Atlas",
+    "Circle",
     "Composition",
     "DiracStructure",
     "DiracSystem",
     "DiscreteDirac",
+    "Euclidean",
     "Field",
     "InCharts",
     "LagrangeDAlembert",
     "LagrangeDirac",
+    "LieGroupExp",
     "LinearConnection",
     "LinearDirac",
     "ManifoldLagrangian",
+    "Midpoint",
     "MinusLagrangeDirac",
     "NonholonomicMechanics",
     "PhaseSpaceLagrangian",
     "PlusLagrangeDirac",
     "PortHamiltonian",
+    "Product",
+    "ProjectedMap",
     "ReducedLagrangeDirac",
+    "RiemannianExp",
     "Shape",
     "Solution",
+    "Sphere",
+    "SphereProjection",
     "StepEquation",
     "StepSequence",
     "SymmetricComposition",
+    "Theta",
+    "Torus",
     "canonical_two_form",
+    "chart_at",
+    "check_chart",
+    "check_discretization_map",
+    "cotangent_lift",
     "induced_dirac",
     "make_step_equation",
     "reconstruct",
     "reduce",
     "simulate",
+    "symplecticity_defect",
+    "verify",
 ]
