@@ -1,0 +1,138 @@
+"""A step compiled: traced once per equation, kernels by width, in memory and on disk."""
+
+import ctypes
+import functools
+import hashlib
+import json
+import time
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dirax.engines.native import compile as llvm
+from dirax.engines.native.graph import Graph, GraphTooLarge
+from dirax.engines.native.interpret import UnsupportedPrimitive
+from dirax.engines.native.newton_step import newton_correction
+from dirax.engines.native.step_loop import Plan, kernel_module
+from dirax.engines.native.trace import NODE_LIMIT, Inputs, Parameters, TracedEquation, inputs, parameters, trace
+
+KEPT = 128
+"""Programs kept in memory."""
+
+SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 5)
+
+
+@dataclass
+class Program:
+    """A step as nodes, and the kernels compiled from it so far, by width."""
+
+    graph: Graph
+    shared: Inputs
+    equations: list[TracedEquation]
+    stages: list[tuple[int, float]]
+    parameters: Parameters
+    compensated: bool
+    digest: str
+    plan: Plan | None = None
+    operations: int = 0
+    kernels: dict[int, tuple[Any, Any]] = field(default_factory=dict)
+
+    @property
+    def bare(self) -> Plan:
+        """The plan without corrections: sizes and names only."""
+        return self.plan or Plan(self.graph, self.shared, self.equations, [], self.stages, self.compensated)
+
+    def kernel(self, width: int) -> tuple[Any, bool]:
+        """The compiled `run` for a width, and whether it came from a cache."""
+        if width in self.kernels:
+            return self.kernels[width][1], True
+        key = llvm.kernel_key(self.digest, width)
+        stored = llvm.read_cached(key)
+        if stored is not None:
+            size = int.from_bytes(stored[:4], "little")
+            self.operations, code = json.loads(stored[4 : 4 + size])["operations"], stored[4 + size :]
+        else:
+            code = llvm.object_code(kernel_module(self._planned(), width, llvm.has_fma()))
+            header = json.dumps({"operations": self.operations}).encode()
+            llvm.write_cached(key, len(header).to_bytes(4, "little") + header + code)
+        library = llvm.load(code, ("run",))
+        self.kernels[width] = library, SIGNATURE(library["run"])
+        return self.kernels[width][1], stored is not None
+
+    def _planned(self) -> Plan:
+        if self.plan is None:
+            plan = self.bare
+            try:
+                plan.corrections = [newton_correction(self.graph, e) for e in self.equations]
+            except GraphTooLarge as error:
+                raise too_large(error) from None
+            self.plan, self.operations = plan, count_operations(plan)
+        return self.plan
+
+
+def too_large(error: GraphTooLarge) -> UnsupportedPrimitive:
+    return UnsupportedPrimitive("the step as a whole", f"has {error}", "a larger system than the native engine is for")
+
+
+def count_operations(plan: Plan) -> int:
+    """Scalar operations of a step with one Newton iteration a stage."""
+    total = 0
+    for index, _ in plan.stages:
+        e, c = plan.equations[index], plan.corrections[index]
+        needed = plan.graph.reachable([*e.guess, *e.residual, *e.advance, *c.change, c.stable])
+        total += sum(1 for node in needed if plan.graph.args[node])
+    return total
+
+
+@functools.cache
+def source_digest() -> str:
+    """A digest of the engine's own source: kernels made by another version of it are not reused."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+_programs: OrderedDict[tuple, tuple[Any, Program]] = OrderedDict()
+
+
+def program(equation: Any, params: Any, batch_params: bool, compensated: bool = False) -> tuple[Program, float]:
+    """The program of a step, and the seconds that tracing took (0 when it was known). Raises `UnsupportedPrimitive`."""
+    p = parameters(params, batch_params)
+    fixed = tuple((a.dtype.str, a.shape, a.tobytes()) if isinstance(a, np.ndarray) else id(a) for a in p.fixed)
+    key = (id(equation), p.treedef, p.shapes, fixed, compensated)
+    if key in _programs:
+        _programs.move_to_end(key)
+        return _programs[key][1], 0.0
+    started = time.perf_counter()
+    graph = Graph(NODE_LIMIT)
+    shared = inputs(graph, p.size)
+    distinct: list[Any] = []
+    stages = []
+    for stage, fraction in equation.stages:
+        index = next((i for i, other in enumerate(distinct) if other is stage), len(distinct))
+        distinct += [stage] if index == len(distinct) else []
+        stages.append((index, float(fraction)))
+    equations = [trace(graph, shared, stage, p) for stage in distinct]
+    made = Program(graph, shared, equations, stages, p, compensated, "")
+    made.digest = _digest(made)
+    _programs[key] = (equation, p.fixed), made  # the equation is kept alive, so that its id stays its own
+    if len(_programs) > KEPT:
+        _programs.popitem(last=False)
+    return made, time.perf_counter() - started
+
+
+def _digest(made: Program) -> str:
+    g = made.graph
+    digest = hashlib.sha256(source_digest().encode())
+    outputs = [
+        (e.state, e.unknowns, e.previous, e.guess, e.residual, e.advance, e.scale)
+        + tuple((name, nodes.shape, nodes.ravel().tolist()) for name, nodes in sorted(e.rows.items()))
+        for e in made.equations
+    ]
+    for part in (g.op, g.args, sorted(g.value.items()), outputs, made.stages, made.shared, made.compensated):
+        digest.update(repr(part).encode() + b"\0")
+    return digest.hexdigest()

@@ -1,0 +1,133 @@
+"""From a StepEquation to the scalar graph: its functions traced at the flat sizes, interpreted, with the Jacobian."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.engines.native import (
+    control,  # noqa: F401  (these five register their rules)
+    elementwise,  # noqa: F401
+    linear_algebra,  # noqa: F401
+    movement,  # noqa: F401
+    reductions,  # noqa: F401
+)
+from dirax.engines.native.graph import Graph, GraphTooLarge
+from dirax.engines.native.interpret import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
+
+NODE_LIMIT = 60_000
+"""Most scalar operations of one step; beyond it an array program is faster to compile, and to run."""
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """How a params pytree becomes scalar inputs: floating leaves in order; other leaves are part of the program."""
+
+    shapes: tuple[tuple[int, ...], ...]
+    fixed: tuple[Any, ...]
+    treedef: Any
+    dynamic: tuple[bool, ...]
+
+    @property
+    def size(self) -> int:
+        return sum(int(np.prod(s)) for s in self.shapes)
+
+    def rebuild(self, leaves) -> Any:
+        leaves, fixed = iter(leaves), iter(self.fixed)
+        return jax.tree.unflatten(self.treedef, [next(leaves) if d else next(fixed) for d in self.dynamic])
+
+    def flatten(self, params: Any, batch: int | None) -> np.ndarray:
+        """The floating leaves as (size,), or (B, size) with their batch axis."""
+        leaves = [leaf for leaf, d in zip(jax.tree.leaves(params), self.dynamic, strict=True) if d]
+        lead = () if batch is None else (batch,)
+        columns = [np.asarray(leaf, dtype=np.float64).reshape(*lead, -1) for leaf in leaves]
+        return np.concatenate(columns, axis=-1) if columns else np.zeros((*lead, 0))
+
+
+def parameters(params: Any, batched: bool) -> Parameters:
+    """Which leaves of `params` are inputs of the kernel."""
+    leaves, treedef = jax.tree.flatten(params)
+    dynamic, shapes, fixed = [], [], []
+    for leaf in leaves:
+        number = isinstance(leaf, int | float | np.ndarray | np.generic | jax.Array) and not isinstance(leaf, bool)
+        moves = number and (batched or np.issubdtype(np.asarray(leaf).dtype, np.floating))
+        dynamic.append(bool(moves))
+        if moves:
+            shapes.append(np.shape(leaf)[1:] if batched else np.shape(leaf))
+        else:
+            fixed.append(np.asarray(leaf) if number else leaf)
+    return Parameters(tuple(shapes), tuple(fixed), treedef, tuple(dynamic))
+
+
+@dataclass
+class TracedEquation:
+    """One StepEquation as nodes: inputs and outputs of its functions."""
+
+    state: list[int]
+    unknowns: list[int]
+    previous: list[int]
+    guess: list[int]
+    residual: list[int]
+    advance: list[int]
+    rows: dict[str, Nodes]
+    scale: tuple[float, ...]
+
+
+@dataclass
+class Inputs:
+    """The scalars that every equation of a step shares."""
+
+    t: int
+    h: int
+    params: list[int]
+
+
+def inputs(g: Graph, size: int) -> Inputs:
+    return Inputs(g.input("t"), g.input("h"), [g.input(f"param{i}") for i in range(size)])
+
+
+def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquation:
+    """The nodes of one equation. Raises `UnsupportedPrimitive`."""
+    s, k = equation.state_size, equation.unknowns
+    scalar, vector = jax.ShapeDtypeStruct((), jnp.float64), lambda n: jax.ShapeDtypeStruct((n,), jnp.float64)
+    leaf_shapes = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in p.shapes]
+
+    def everything(u, state, previous, t, h, leaves):
+        params = p.rebuild(leaves)
+        row = equation.unpack(state, u, t, h, params)
+        return (
+            equation.guess(state, previous, h, params),
+            equation.residual(u, state, t, h, params),
+            equation.advance(u, state, t, h, params),
+            [jnp.asarray(row[name]) for name in sorted(row)],
+        )
+
+    closed = jax.make_jaxpr(everything)(vector(k), vector(s), vector(k), scalar, scalar, leaf_shapes)
+    names = sorted(equation.fields)
+    state = [g.input(f"state{i}") for i in range(s)]
+    unknowns = [g.input(f"u{i}") for i in range(k)]
+    previous = [g.input(f"previous{i}") for i in range(k)]
+    ids = lambda nodes, shape=None: np.array(nodes, dtype=np.int64).reshape((len(nodes),) if shape is None else shape)
+    leaves, at = [], 0
+    for shape in p.shapes:
+        count = int(np.prod(shape))
+        leaves.append(ids(shared.params[at : at + count], shape))
+        at += count
+    try:
+        outputs = Interpreter(g).run(
+            closed, ids(unknowns), ids(state), ids(previous), ids(shared.t, ()), ids(shared.h, ()), *leaves
+        )
+    except GraphTooLarge as error:
+        raise UnsupportedPrimitive("the step as a whole", f"has {error}", "see docs/native-engine.md") from None
+    for output in outputs:
+        if isinstance(output, Unavailable):
+            raise output.error
+    guess, residual, advance, *rows = outputs
+    if len(rows) != len(names):
+        raise UnsupportedPrimitive("unpack", f"returns {len(rows)} arrays for {len(names)} fields", "the scheme")
+    return TracedEquation(
+        state, unknowns, previous, guess.tolist(), residual.tolist(), advance.tolist(),
+        dict(zip(names, rows, strict=True)), tuple(equation.scale),
+    )  # fmt: skip
