@@ -17,7 +17,7 @@ ROOMS = (
     ("reduction",),
     ("schemes",),
     ("engines",),
-    ("simulate", "initial", "failures", "progress", "solution", "storage", "plotting", "reconstruction"),
+    ("simulate", "initial", "failures", "progress", "solution", "records", "dataset", "storage", "plotting", "reconstruction"),
     ("diagnostics",),
     ("gallery",),
     ("__init__",),

@@ -52,6 +52,6 @@ def html_table(title: str, rows: dict[str, str]) -> str:
     return f"<table><caption><b>{html.escape(title)}</b></caption><tbody>{body}</tbody></table>"
 
 
-def counted(number: int, noun: str) -> str:
+def counted(number: int, noun: str, plural: str | None = None) -> str:
     """`1 step`, `50 000 steps`: a number with its noun, thousands set apart."""
-    return f"{number:,}".replace(",", " ") + f" {noun}" + ("" if number == 1 else "s")
+    return f"{number:,}".replace(",", " ") + " " + (noun if number == 1 else plural or f"{noun}s")
