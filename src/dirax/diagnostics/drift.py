@@ -1,66 +1,104 @@
-"""Does a quantity drift, or is it bounded? Windowed means of a series, a regression, and a robust standard error."""
+"""Does a series drift, or does it stay in a band? For the energy of a long run, where the eye is easily deceived.
+
+The series is cut into equal windows, each averaged with the weight exp(−1/(s(1 − s))), 0 < s < 1, under which an
+oscillation disappears faster than any power of the window's length (weighted Birkhoff averages; Das, Sander, Yorke 2017).
+If it is bounded, these means scatter inside the band that every window shows; if not, one of two things happens:
+
+- trend: a line through the means has a slope of more than SIGNIFICANT standard errors (the larger of the ordinary and the
+  Newey–West one), the means of the four quarters of the run do not turn back by more than TURNING_BACK of their way, and
+  the way is longer than the band of a typical window. Slow modulations are narrower than the band, or turn back;
+- departure: the means spread wider than the band of any window. This finds jumps, random walks and explosive growth.
+
+Each is asked for three numbers of windows, and must hold for all, so that no oscillation in step with the windows passes.
+A series is judged only after the motion has gone through a few oscillations: before, nothing can tell a drift from one.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-WINDOWS = 16
-BLOCKS = 4
+WINDOW_COUNTS = (24, 32, 40)
+SMALLEST_SERIES = 8 * max(WINDOW_COUNTS)
+"""Rows that a series needs: eight a window."""
+
 SIGNIFICANT = 5.0
-SMALLEST_SERIES = 8 * WINDOWS
+TURNING_BACK = 0.1
+OSCILLATIONS_FOR_TREND = 3
+OSCILLATIONS_FOR_DEPARTURE = 10
+MOVING = 1e-9
+"""Relative range below which a component of the motion counts as constant."""
 
 
 @dataclass(frozen=True)
 class Trend:
-    """The trend of a series: `slope` per unit of time, its standard error, the drift slope·duration, and the band.
+    """What a series does: `slope` per unit of time and its standard error, and how far it went.
 
-    `band` is the width (largest − smallest) of the series about the trend. `significant`: the slope exceeds
-    SIGNIFICANT standard errors and has the same sign in every block of the run.
+    `drift`: the change of level over the whole run, by the means of its first and last quarter; `band`: the range of
+    the series in a typical window; `trend`, `departure`: the two signs of a drift, see above.
     """
 
     slope: float
     standard_error: float
     drift: float
     band: float
-    significant: bool
+    trend: bool
+    departure: bool
 
 
-def trend(t: Float[np.ndarray, " N"], series: Float[np.ndarray, " N"]) -> Trend:
-    """The trend of `series` at the times `t`, by regression of windowed means on time."""
-    times, means = windowed_means(t, series)
-    slope, error = regression(times, means)
-    duration = float(t[-1] - t[0])
-    residual = series - slope * (t - t[0])
-    blocks = [regression(*part)[0] for part in zip(np.split(times, BLOCKS), np.split(means, BLOCKS), strict=True)]
-    consistent = bool(np.all(np.sign(blocks) == np.sign(slope)))
+def analyse(t: Float[np.ndarray, " N"], series: Float[np.ndarray, " N"]) -> Trend:
+    """The Trend of `series` at the times `t`; needs SMALLEST_SERIES rows (`ValueError` with fewer)."""
+    if len(series) < SMALLEST_SERIES:
+        raise ValueError(f"a trend needs {SMALLEST_SERIES} rows, but there are {len(series)}.")
+    found = [_analyse(t, series, count) for count in WINDOW_COUNTS]
+    least = min(found, key=lambda f: abs(f.slope) / max(f.standard_error, np.finfo(float).tiny))
     return Trend(
-        slope=slope,
-        standard_error=error,
-        drift=slope * duration,
-        band=float(np.ptp(residual)),
-        significant=consistent and abs(slope) > SIGNIFICANT * error,
+        slope=least.slope,
+        standard_error=least.standard_error,
+        drift=min((f.drift for f in found), key=abs),
+        band=max(f.band for f in found),
+        trend=all(f.trend for f in found),
+        departure=all(f.departure for f in found),
     )
 
 
-def windowed_means(t, series) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted means over WINDOWS equal pieces, with the weight exp(−1/(s(1 − s))): a quasi-periodic oscillation
-    averages out faster than any power of the window's length (weighted Birkhoff averages)."""
-    size = len(series) // WINDOWS
+def _analyse(t, series, count: int) -> Trend:
+    times, means, bands = windows(t, series, count)
+    slope, error = regression(times, means)
+    quarters = np.array([part.mean() for part in np.split(means, 4)])
+    way = quarters[-1] - quarters[0]
+    back = np.min(np.diff(quarters) * np.sign(way))
+    drift, band = 4 / 3 * way, float(np.median(bands))  # the quarters' centres are three quarters of the run apart
+    steady = back >= -TURNING_BACK * abs(way)
+    return Trend(
+        slope=slope,
+        standard_error=error,
+        drift=float(drift),
+        band=band,
+        trend=bool(abs(slope) > SIGNIFICANT * error and steady and abs(drift) > band),
+        departure=bool(np.ptp(means) > np.max(bands)),
+    )
+
+
+def windows(t, series, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(times, weighted means, ranges) of `count` equal windows; a remainder at the end is left out."""
+    size = len(series) // count
     s = (np.arange(size) + 0.5) / size
     weight = np.exp(-1.0 / (s * (1.0 - s)))
     weight /= weight.sum()
-    pieces = np.asarray(series)[: size * WINDOWS].reshape(WINDOWS, size)
-    start = np.asarray(t)[: size * WINDOWS].reshape(WINDOWS, size)
-    return start @ weight, pieces @ weight
+    pieces = np.asarray(series)[: size * count].reshape(count, size)
+    times = np.asarray(t)[: size * count].reshape(count, size)
+    level = pieces[:1, :1]  # taken off and added again, so that a constant has exactly equal means
+    return times @ weight, (pieces - level) @ weight + level[0, 0], np.ptp(pieces, axis=1)
 
 
-def regression(times, means) -> tuple[float, float]:
-    """(slope, standard error): least squares, the larger of the ordinary and the Newey–West standard error."""
+def regression(times: np.ndarray, means: np.ndarray) -> tuple[float, float]:
+    """(slope, standard error) by least squares, with the larger of the ordinary and the Newey–West standard error."""
     x = times - times.mean()
+    y = means - means.mean()
     sxx = x @ x
-    slope = x @ means / sxx
-    residual = means - means.mean() - slope * x
+    slope = x @ y / sxx
+    residual = y - slope * x
     count = len(x)
     score = x * residual
     lags = int(np.ceil(count ** (1 / 3)))
@@ -70,3 +108,21 @@ def regression(times, means) -> tuple[float, float]:
     robust = np.sqrt(max(variance, 0.0) * count / (count - 2)) / sxx
     ordinary = np.sqrt(residual @ residual / (count - 2) / sxx)
     return float(slope), float(max(robust, ordinary))
+
+
+def oscillations(motion: Float[np.ndarray, "N d"]) -> float:
+    """How many oscillations a motion goes through: half the crossings of its linear trend, median over the components.
+
+    Components that are constant, or linear in time, to a relative MOVING do not count; 0 if none moves.
+    """
+    count = len(motion)
+    if count < 3:
+        return 0.0
+    x = np.linspace(-1.0, 1.0, count)
+    centred = motion - motion.mean(axis=0)
+    residual = centred - np.outer(x, x @ centred / (x @ x))
+    moving = np.ptp(residual, axis=0) > MOVING * np.max(np.abs(motion), axis=0)
+    if not np.any(moving):
+        return 0.0
+    above = residual[:, moving] > 0
+    return float(np.median(np.sum(above[1:] != above[:-1], axis=0)) / 2)

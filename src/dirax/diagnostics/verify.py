@@ -1,102 +1,84 @@
 """verify(): is the structure that a scheme promises really there, in the trajectory that came out?"""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.drift import SMALLEST_SERIES, trend
+from dirax.diagnostics.drift import (
+    OSCILLATIONS_FOR_DEPARTURE,
+    OSCILLATIONS_FOR_TREND,
+    SMALLEST_SERIES,
+    analyse,
+    oscillations,
+)
+from dirax.diagnostics.one_step import (
+    DiscreteSystem,
+    discrete_system,
+    membership_defect,
+    structural_defect,
+    symplecticity_defect,
+)
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, OK, VIOLATED, Line, Report
-from dirax.diagnostics.symplecticity import begin, structural_defect, symplecticity_defect
-from dirax.functions import UserFunction
-from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector
-from dirax.geometry.tulczyjew import minus_dirac_differential, plus_dirac_differential, slot_derivatives
-from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_lagrangian
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.solution import Solution
-from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.port_hamiltonian import PortHamiltonian
 
 EPSILON = 2.0**-52
 ROUNDINGS = 32
-"""Roundings, each of half a unit in the last place, that one step is allowed to commit in any of its equations."""
+"""Roundings, each of half a unit in the last place, that the equations of one step are allowed, and their safety factor."""
 
 SAMPLED_STEPS = 8
-CHUNK = 2048
+"""Steps of a trajectory at which the derivative of the step is taken."""
+
+SAMPLED_ROWS = 64
+"""Rows at which natural scales are taken."""
+
+CHUNK = 4096
 
 Symmetries = Mapping[str, Callable] | Sequence[int] | None
 
 
 def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None = None) -> Report:
-    """Measure the structure of a solution: a Report with one line a quantity, each with a tolerance and a verdict.
+    """Measure the structure of a solution: a `Report` with one line a quantity, each with a tolerance and a verdict.
 
-    `symmetries`: {name: generator(q) -> (n,)}, whose momentum maps ⟨p, ξ_Q(q)⟩ should be conserved, or a list of indices
-    of cyclic coordinates. `tolerance` replaces the relative tolerances below.
+    `symmetries`: {name: generator(q) -> (n,)}, whose momentum maps ⟨p, ξ_Q(q)⟩ should be conserved, or a list of the
+    numbers of cyclic coordinates. `tolerance`: one relative tolerance in place of the first four below.
 
-    Every measured value is relative to its natural scale, so that 2⁻⁵² = ε is one rounding; the natural scale is the sum
-    of the absolute values of the terms that should cancel, plus their change when each saved number is changed by itself
-    (the absolute Jacobian times |q|). Tolerances:
+    Measured values are relative to the natural scale of the quantity, so that one rounding is 2⁻⁵³ = ε/2: the sum of the
+    absolute values of the terms that should cancel, and of their change when every saved number is changed by itself
+    (absolute Jacobian times |q|). The tolerances are roundoff's:
 
-    - discrete Dirac structure, constraint, saved momenta: 32 ε, because they hold step by step;
-    - momentum maps: 32 ε · steps, the most that 32 roundings a step add up to (a random walk gives √steps);
-    - symplecticity, structural relation: 32 ε · 2n · (condition number of the step's equations);
-    - energy: see `dirax.diagnostics.drift`; a drift below 32 ε · steps is roundoff.
+    - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8): 32 ε, because it holds step by step;
+    - constraint: 32 ε, for the same reason;
+    - momentum maps: 32 ε · steps, the most that 32 roundings a step add up to (a random walk gives √steps of that);
+    - symplecticity of one step, and φ*Ω = Ω + dβ where there are constraints ([PY] §3.2): 32 ε · 2n · the condition
+      number of the step's equations, at a few steps of the run;
+    - energy: "bounded" or "drifts", told apart by windowed means (`dirax.diagnostics.drift`); a drift below
+      32 ε · steps · (|E| + |∂E| |row|) is roundoff. The tolerance shown is the drift that could have been told.
 
-    What cannot be checked says so, and why. Raises `TypeError` or `ValueError` for something that is not a Solution and
-    for symmetries that are not functions of q or coordinate numbers.
+    A batch is judged by its worst trajectory, a failed run by the part that was computed, and what cannot be checked says
+    so, and why: membership needs every step saved, a loaded solution its system (`dx.load(path, system=…)`).
+
+    Raises `TypeError` or `ValueError` for something that is not a Solution and for symmetries that are neither functions
+    of q nor coordinate numbers.
+
+        print(dx.verify(sol, symmetries={"rotation": lambda q: jnp.array([-q[1], q[0]])}))
     """
     if not isinstance(sol, Solution):
         raise TypeError(f"sol must be a dirax Solution (from dx.simulate or dx.load), but a {type(sol).__name__} was given.")
     generators = _generators(sol, symmetries)
     lines = [
         _completion(sol),
-        *_membership(sol, tolerance),
-        *_constraint(sol, tolerance),
-        _energy(sol, tolerance),
+        _membership(sol, tolerance),
+        _constraint(sol, tolerance),
+        _energy(sol),
         *(_momentum(sol, name, generator, tolerance) for name, generator in generators.items()),
         _symplecticity(sol, tolerance),
     ]
-    return Report(_title(sol), tuple(lines))
-
-
-# ---------------------------------------------------------------------------------------------- the steps themselves
-
-
-class DiscreteSystem(NamedTuple):
-    """What a discrete Lagrange–d'Alembert scheme makes of a system, as functions of two points and `params`."""
-
-    lagrangian: Callable  # L_d(q0, q1, params)
-    constraint: Callable  # w_d(q0, q1, params)
-    one_forms: Callable  # W(q, params)
-    sign: str | None  # "+", "-", or None for a general constraint
-
-
-def discrete_system(sol: Solution) -> DiscreteSystem | str:
-    """L_d, w_d and W of a solution's scheme, or the reason why there are none."""
-    system, scheme, h = sol.system, sol.scheme, sol.step
-    if system is None or scheme is None:
-        return "the solution was loaded without its system"
-    if not isinstance(scheme, (PlusLagrangeDirac, MinusLagrangeDirac, LagrangeDAlembert)):
-        return f"{type(scheme).__name__} has no discrete Lagrangian on Q × Q"
-    if not isinstance(system, LagrangeDirac):
-        return f"{type(system).__name__} is not a Lagrange–Dirac system"
-    rule, sign = "midpoint", None
-    if isinstance(scheme, LagrangeDAlembert):
-        rule = scheme.constraint
-    elif isinstance(scheme, PlusLagrangeDirac):
-        rule, sign = "right", "+"
-    else:
-        rule, sign = "left", "-"
-    ld = discrete_lagrangian(system.lagrangian, scheme.discrete_lagrangian)
-    wd = discrete_constraint(system.constraint_matrix, rule)
-    return DiscreteSystem(
-        lambda q0, q1, params: ld(q0, (q1 - q0) / h, h, params),
-        lambda q0, q1, params: wd(q0, (q1 - q0) / h, h, params),
-        system.constraint_matrix,
-        sign,
-    )
+    return Report(_title(sol), tuple(line for line in lines if line is not None))
 
 
 def _completion(sol: Solution) -> Line:
@@ -106,164 +88,170 @@ def _completion(sol: Solution) -> Line:
         return Line("steps solved", residual, None, OK, f"every step was solved, up to t = {float(sol.t[-1]):.6g}")
     failed = np.flatnonzero(~ok)
     which = f"trajectory {failed[0]}: " if sol.batch is not None else ""
-    more = f" (and {len(failed) - 1} others)" if len(failed) > 1 else ""
+    more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
     return Line("steps solved", residual, None, VIOLATED, f"{which}{messages[failed[0]]}{more}")
 
 
-def _membership(sol: Solution, tolerance: float | None) -> list[Line]:
-    found = discrete_system(sol)
-    sign = "" if isinstance(found, str) or found.sign is None else {"+": "(+)-", "-": "(−)-"}[found.sign]
-    name = f"{sign}discrete Dirac structure"
+def _membership(sol: Solution, tolerance: float | None) -> Line:
+    found = discrete_system(sol.system, sol.scheme, sol.step)
     if isinstance(found, str):
-        return [Line(name, None, None, NOT_CHECKED, found)]
+        return Line("discrete Dirac structure", None, None, NOT_CHECKED, found)
+    name = {"+": "(+)-", "-": "(−)-", None: ""}[found.sign] + "discrete Dirac structure"
     if sol.save_every != 1:
-        return [Line(name, None, None, NOT_CHECKED, f"needs every step, but save_every = {sol.save_every}")]
+        return Line(name, None, None, NOT_CHECKED, f"needs every step, but save_every = {sol.save_every}")
     if sol.rows < 3:
-        return [Line(name, None, None, NOT_CHECKED, "needs three points, but fewer were saved")]
-    h = sol.step
-
-    def element(z, params):
-        """(W q̂ or w_d, γ − q̂, force outside Δ°) at three points z = (q0, q1, q2), of the pairs (q0, q1) and (q1, q2)."""
-        q0, q1, q2 = jnp.split(z, 3)
-        ld = lambda a, b: found.lagrangian(a, b, params)
-        p1, p2 = slot_derivatives(ld, q0, q1)[1], slot_derivatives(ld, q1, q2)[1]
-        minus_p0, minus_p1 = slot_derivatives(ld, q0, q1)[0], slot_derivatives(ld, q1, q2)[0]
-        forms = UserFunction(lambda q, params: found.one_forms(q, params), "one_forms", ("q",))
-        if found.sign == "+":
-            structure = InducedFiniteDifferenceDirac(forms, step=h, sign="+")
-            _, (beta, gamma) = plus_dirac_differential(ld, q0, q1, q2, h)
-            c, r, f = structure.membership_defect(q0, q1, (p1, p2), beta, gamma, params)
-        elif found.sign == "-":
-            structure = InducedFiniteDifferenceDirac(forms, step=h, sign="-")
-            _, (beta, gamma) = minus_dirac_differential(ld, q0, q1, q2, h)
-            c, r, f = structure.membership_defect(q1, q2, (-minus_p0, -minus_p1), beta, gamma, params)
-        else:
-            onto = annihilator_projector(found.one_forms(q1, params))
-            force = (p1 + minus_p1) / h
-            c, r, f = found.constraint(q1, q2, params), jnp.zeros_like(q1), force - onto @ force
-        return c, jnp.concatenate([r, f]), (jnp.abs(p1) + jnp.abs(p2) + jnp.abs(minus_p1)) / h
-
-    def defects(z, params):
-        size = jnp.abs(z) + jnp.tile(jnp.max(jnp.abs(jnp.diff(z.reshape(3, -1), axis=0)), axis=0) + h, 3)
-        c, f, terms = element(z, params)
-        jc, jf, _ = jax.jacfwd(element)(z, params)
-        constraint = jnp.max(jnp.abs(c) / _nonzero(jnp.abs(jc) @ size), initial=0.0)
-        force = jnp.max(jnp.abs(f)) / _nonzero(jnp.max(jnp.abs(jf) @ size) + jnp.max(terms))
-        return jnp.stack([constraint, force])
-
+        return Line(name, None, None, NOT_CHECKED, f"needs three points, but only {sol.rows} were saved")
     q = jnp.asarray(sol.q)
-    triples = jnp.concatenate([q[..., :-2, :], q[..., 1:-1, :], q[..., 2:, :]], axis=-1)
-    values = _over_rows(defects, sol, triples)
+    values = _over_rows(_Membership(found), sol, (q[..., :-2, :], q[..., 1:-1, :], q[..., 2:, :]))
     if "q0" in sol.initial and found.sign == "+":
         values[:, 0, 0] = 0.0  # the first pair was given, not computed
-    limit = ROUNDINGS * EPSILON if tolerance is None else tolerance
     lane, row = _worst(np.max(values, axis=-1))
-    worst = values[lane, row]
-    parts = "W q̂, γ = q̂ and β + p̂ ∈ Δ°" if found.sign else "w_d = 0 and D2L_d + D1L_d ∈ Δ°"
-    at = f"worst at t = {float(sol.t[row + 1]):.6g}{_lane(sol, lane)}"
-    text = f"{parts}, from q alone, in units of their scale; {at}: constraint {worst[0]:.2g}, force {worst[1]:.2g}"
-    return [_judged(sol, name, np.max(values, axis=(1, 2)), limit, text)]
+    constraint, force = values[lane, row]
+    parts = "q̂ ∈ Δ, β + p̂ ∈ Δ°" if found.sign else "w_d = 0, D₂L_d + D₁L_d ∈ Δ°"
+    text = (
+        f"{parts} at every step, from q alone; worst at t = {float(sol.t[row + 1]):.6g}{_lane(sol, lane)}: "
+        f"constraint {constraint:.2g}, force {force:.2g}"
+    )
+    return _judged(sol, name, np.nanmax(values, axis=(1, 2)), _limit(tolerance, 1), text)
 
 
-def _constraint(sol: Solution, tolerance: float | None) -> list[Line]:
+def _constraint(sol: Solution, tolerance: float | None) -> Line | None:
     name = "constraint"
     try:
         residual = np.asarray(sol.constraint_residual())
-    except (ValueError, KeyError, AttributeError) as error:
-        return [Line(name, None, None, NOT_CHECKED, str(error))]
+    except ValueError as error:
+        return Line(name, None, None, NOT_CHECKED, str(error))
     if residual.shape[-1] == 0:
-        return []
-    residual = residual.reshape((-1, *residual.shape[-2:]))
-    per_step = "constraint" in sol.fields
-    scale = _constraint_scale(sol, per_step)
-    given = int(per_step and "q0" in sol.initial)  # the first pair was given, not computed
-    values = np.max(np.abs(residual), axis=-1)[:, given:] / scale
-    limit = ROUNDINGS * EPSILON if tolerance is None else tolerance
+        return None
+    residual = np.max(np.abs(residual.reshape((-1, *residual.shape[-2:]))), axis=-1)
+    steps = "constraint" in sol.fields
+    given = int(steps and "q0" in sol.initial)  # the first pair was given, not computed
+    if residual.shape[1] <= given:
+        return Line(name, None, None, NOT_CHECKED, "no step was computed")
+    values = residual[:, given:] / _constraint_scale(sol)
     lane, row = _worst(values)
-    kind = "discrete constraint of each step" if per_step else "constraint at each row"
-    largest = float(np.nanmax(np.abs(residual[:, given:])))
-    text = f"{kind}, relative to |W||v|; largest {largest:.2g}, at t = {float(sol.t[row + given]):.6g}{_lane(sol, lane)}"
+    kind = "discrete constraint of each step" if steps else "constraint at each row"
+    text = (
+        f"{kind}, relative to |W||v|; at most {np.nanmax(residual[:, given:]):.2g}, at t = {float(sol.t[row + given]):.6g}"
+        f"{_lane(sol, lane)}"
+    )
     if given:
-        text += f"; the pair given at the start is off by {float(np.nanmax(np.abs(residual[:, 0]))):.2g}"
-    return [_judged(sol, name, np.nanmax(values, axis=1), limit, text)]
+        text += f"; the pair given at the start is off by {np.nanmax(residual[:, 0]):.2g}"
+    return _judged(sol, name, np.nanmax(values, axis=1), _limit(tolerance, 1), text)
 
 
-def _constraint_scale(sol: Solution, per_step: bool) -> float:
-    """The size of the terms of the constraint: |W||v| where W is known, else the largest |Δq|/h or |x|."""
-    if isinstance(sol.system, LagrangeDirac) and "q" in sol.fields:
+def _constraint_scale(sol: Solution) -> float:
+    """The size of the constraint's terms: |W||v|, where W is known; else the largest saved number."""
+    found = discrete_system(sol.system, sol.scheme, sol.step)
+    if isinstance(found, DiscreteSystem):
         q = np.asarray(sol.q)
-        speed = np.nanmax(np.abs(np.diff(q, axis=-2)), axis=tuple(range(q.ndim - 1))) / (sol.step * sol.save_every)
-        system = sol.system
-        forms = np.asarray(sol.map_rows(lambda row, params: jnp.abs(system.constraint_matrix(row["q"], params))))
-        forms = np.nanmax(forms, axis=tuple(range(forms.ndim - 2)))
-        return float(np.max(forms @ np.maximum(speed, 1.0)))
+        speed = np.abs(np.diff(q, axis=-2)) / (sol.step * sol.save_every)
+        speed = np.nanmax(speed, axis=tuple(range(speed.ndim - 1)), initial=0.0) + 1.0
+        sizes = _over_rows(_Forms(found), sol, q[..., _spread(sol.rows, SAMPLED_ROWS), :])
+        return float(np.max(np.nanmax(sizes, axis=(0, 1)) @ speed, initial=0.0)) or 1.0
     nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
-    return float(max([1.0, *(np.nanmax(np.abs(a)) for a in nodes)]))
+    return float(max(1.0, *(np.nanmax(np.abs(a)) for a in nodes)))
 
 
-# ------------------------------------------------------------------------------------------------- along the trajectory
+# ---------------------------------------------------------------------------------------------- along the trajectory
 
 
-def _energy(sol: Solution, tolerance: float | None) -> Line:
+def _energy(sol: Solution) -> Line:
     name = "energy"
     try:
-        energy = np.atleast_2d(np.asarray(sol.energy()))
-    except (ValueError, KeyError, AttributeError) as error:
+        energy = np.asarray(sol.energy())
+    except ValueError as error:
         return Line(name, None, None, NOT_CHECKED, str(error))
-    t, roundoff = np.asarray(sol.t), _energy_roundoff(sol, energy, tolerance)
-    results = []
-    for series in energy:
-        good = np.isfinite(series)
-        results.append(trend(t[good], series[good]) if good.sum() >= SMALLEST_SERIES else None)
-    if not any(results):
-        return Line(name, None, None, NOT_CHECKED, f"needs {SMALLEST_SERIES} rows to tell a drift, but has {sol.rows}")
-    drifting = [r is not None and r.significant and abs(r.drift) > roundoff for r in results]
-    size = [abs(r.drift) * (1 + 1e6 * d) if r else -1.0 for r, d in zip(results, drifting, strict=True)]
-    lane = int(np.argmax(size))
-    worst = results[lane]
-    assert worst is not None
-    text = (
-        f"slope {worst.slope:.2g} ± {worst.standard_error:.1g} per unit of time: {worst.drift:.2g} over the run, "
-        f"in a band of {worst.band:.2g}{_lane(sol, lane)}"
-    )
-    details = {
-        "slope": worst.slope,
-        "standard_error": worst.standard_error,
-        "drift": worst.drift,
-        "band": worst.band,
-        "roundoff": roundoff,
-    }
+    energy = energy.reshape(-1, energy.shape[-1])
+    roundoff = ROUNDINGS * EPSILON * _steps(sol) * _energy_scale(sol, energy)
+    system = sol.system
+    if isinstance(system, PortHamiltonian) and (system.R is not None or system.inputs is not None):
+        change = float(np.nanmax(np.abs(energy - energy[:, :1])))
+        return Line(name, change, None, NOT_CHECKED, f"the system does not conserve it; it changed by {change:.3g}")
+    found = [_EnergyTrend(sol, lane, series, roundoff) for lane, series in enumerate(energy)]
+    worst = max(found, key=lambda f: (f.rank, abs(f.drift)))
+    details: dict[str, Any] = {**worst.details, "roundoff": roundoff}
     if sol.batch is not None:
-        details["per_trajectory"] = [None if r is None else r.drift for r in results]
-    return Line(name, abs(worst.drift), roundoff, DRIFTS if any(drifting) else BOUNDED, text, details)
+        details["per_trajectory"] = [f.drift for f in found]
+        details["verdicts"] = [f.verdict for f in found]
+    text = worst.text + _lane(sol, worst.lane)
+    return Line(name, abs(worst.drift), max(roundoff, worst.told), worst.verdict, text, details)
 
 
-def _energy_roundoff(sol: Solution, energy, tolerance: float | None) -> float:
-    """What 32 roundings a step can add to the energy: 32 ε · steps · (|E| + |∂E||row|)."""
+class _EnergyTrend:
+    """The verdict on the energy of one trajectory."""
 
-    def size(row, params):
-        grads = jax.grad(lambda row: sol.system.energy_at(row, params))(row)
-        return sum(jnp.sum(jnp.abs(grads[k] * row[k])) for k in row)
+    def __init__(self, sol: Solution, lane: int, energy: np.ndarray, roundoff: float):
+        good = np.isfinite(energy)
+        t, energy = np.asarray(sol.t)[good], energy[good]
+        band = float(np.ptp(energy)) if len(energy) else np.nan
+        self.lane, self.drift, self.told, self.details = lane, band, 0.0, {"band": band}
+        if len(energy) < 2:
+            self.verdict, self.text = NOT_CHECKED, "fewer than two rows were computed"
+        elif band <= roundoff:
+            self.verdict, self.text = BOUNDED, f"constant up to roundoff: all of it within {band:.2g}"
+        elif len(energy) < SMALLEST_SERIES:
+            self.verdict = NOT_CHECKED
+            self.text = f"{len(energy)} rows are too few to tell a drift ({SMALLEST_SERIES} are needed); it moved by {band:.2g}"
+        else:
+            self._judge(t, energy, oscillations(_motion(sol, lane)[good]), roundoff)
+        self.rank = (NOT_CHECKED, BOUNDED, DRIFTS).index(self.verdict)
 
+    def _judge(self, t, energy, turns: float, roundoff: float):
+        found = analyse(t, energy)
+        duration = float(t[-1] - t[0])
+        self.drift = found.drift
+        self.told = max(found.band, 5 * found.standard_error * duration)
+        self.details = {
+            "slope": found.slope,
+            "standard_error": found.standard_error,
+            "band": found.band,
+            "drift": found.drift,
+            "oscillations": turns,
+        }
+        rate = f"{found.slope:.2g} ± {found.standard_error:.1g} per unit of time"
+        moving = abs(found.drift) > roundoff or found.departure
+        trend, departure = found.trend and moving, found.departure
+        if trend and turns >= OSCILLATIONS_FOR_TREND:
+            self.verdict, self.text = DRIFTS, f"steady trend of {rate}, out of a band of {found.band:.2g}"
+        elif departure and turns >= OSCILLATIONS_FOR_DEPARTURE:
+            self.verdict, self.text = DRIFTS, f"leaves its band of {found.band:.2g} for good; mean rate {rate}"
+        elif trend or departure:
+            self.verdict = NOT_CHECKED
+            self.text = f"moved by {np.ptp(energy):.2g}, but {turns:.3g} oscillations are too few to call it a drift"
+        else:
+            self.verdict, self.text = BOUNDED, f"slope {rate}, in a band of {found.band:.2g}"
+
+
+def _motion(sol: Solution, lane: int) -> np.ndarray:
+    """All node fields of one trajectory side by side, (rows, d)."""
+    nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
+    rows = [a if sol.batch is None else a[lane] for a in nodes]
+    return np.concatenate([a.reshape(len(a), -1) for a in rows], axis=1)
+
+
+def _energy_scale(sol: Solution, energy: np.ndarray) -> float:
+    """|E| + |∂E/∂row| |row|, the largest: what roundings of the rows do to the energy, in units of ε."""
     scale = float(np.nanmax(np.abs(energy)))
-    if sol.system is not None:
-        scale += float(np.nanmax(np.asarray(sol.map_rows(size))))
-    relative = ROUNDINGS * EPSILON * _steps(sol) if tolerance is None else tolerance
-    return relative * scale
+    if sol.system is None:
+        return scale
+    rows = _spread(sol.rows, SAMPLED_ROWS)
+    lead = (slice(None),) * (sol.batch is not None)
+    nodes = {k: np.asarray(a)[(*lead, rows)] for k, a in sol.fields.items() if sol.field_info[k].place == "node"}
+    return scale + float(np.nanmax(_over_rows(_EnergySensitivity(sol.system), sol, nodes)))
 
 
 def _momentum(sol: Solution, name: str, generator: Callable, tolerance: float | None) -> Line:
-    title = f"momentum map: {name}"
+    title = f"momentum map {name}"
     if "p" not in sol.fields or "q" not in sol.fields:
         return Line(title, None, None, NOT_CHECKED, "the solution has no q and p")
-    values = np.atleast_2d(np.asarray(sol.momentum_map(generator)))
-    scale = np.nanmax(np.atleast_2d(sol.map_rows(lambda row, _: jnp.sum(jnp.abs(row["p"] * generator(row["q"]))))), axis=1)
-    change = np.nanmax(np.abs(values - values[:, :1]), axis=1)
-    relative = np.where(change > 0, change / np.where(scale > 0, scale, 1.0), 0.0)
-    limit = ROUNDINGS * EPSILON * _steps(sol) if tolerance is None else tolerance
+    values = _over_rows(_MomentumMap(generator), sol, (jnp.asarray(sol.q), jnp.asarray(sol.p)))
+    change = np.nanmax(np.abs(values[..., 0] - values[:, :1, 0]), axis=1)
+    scale = np.nanmax(values[..., 1], axis=1)
+    relative = np.divide(change, scale, out=np.zeros_like(change), where=scale > 0)
     lane = int(np.argmax(relative))
-    text = f"largest change {change[lane]:.2g} of ⟨p, ξ⟩ = {values[lane, 0]:.6g}{_lane(sol, lane)}"
-    return _judged(sol, title, relative, limit, text)
+    text = f"⟨p, ξ⟩ = {values[lane, 0, 0]:.6g} changed by at most {change[lane]:.2g}{_lane(sol, lane)}"
+    return _judged(sol, title, relative, _limit(tolerance, _steps(sol)), text)
 
 
 def _generators(sol: Solution, symmetries: Symmetries) -> dict[str, Callable]:
@@ -275,97 +263,83 @@ def _generators(sol: Solution, symmetries: Symmetries) -> dict[str, Callable]:
                 raise TypeError(
                     f"symmetries[{name!r}] must be a function generator(q) -> (n,), but a {type(generator).__name__} was given."
                 )
+            if "q" in sol.fields:
+                _check_generator(name, generator, np.shape(sol.q)[-1])
         return {str(name): generator for name, generator in symmetries.items()}
+    if isinstance(symmetries, (str, bytes)) or not isinstance(symmetries, Sequence | np.ndarray):
+        raise TypeError(
+            "symmetries must be a dict {name: generator(q)} or a list of coordinate numbers, but a "
+            f"{type(symmetries).__name__} was given."
+        )
     if "q" not in sol.fields:
-        raise ValueError("symmetries need a solution with q and p, but this one holds " + ", ".join(sol.fields) + ".")
+        raise ValueError(f"symmetries need a solution with q and p, but this one holds {', '.join(sol.fields)}.")
     n, found = np.shape(sol.q)[-1], {}
     for index in symmetries:
-        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not -n <= index < n:
+        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
             raise ValueError(f"symmetries must name coordinates by whole numbers from 0 to {n - 1}, but {index!r} was given.")
-        found[f"p[{int(index)}]"] = lambda q, index=int(index): jnp.zeros_like(q).at[index].set(1.0)
+        found[f"p[{int(index)}]"] = _Translation(int(index))
     return found
 
 
-# ------------------------------------------------------------------------------------------------------------ one step
+def _check_generator(name: str, generator: Callable, n: int) -> None:
+    try:
+        out = jax.eval_shape(generator, jax.ShapeDtypeStruct((n,), jnp.float64))
+    except Exception as error:
+        raise TypeError(
+            f"symmetries[{name!r}](q) could not be traced by JAX for q of shape ({n},): "
+            f"{type(error).__name__}: {str(error).splitlines()[0]}"
+        ) from error
+    if getattr(out, "shape", None) != (n,):
+        raise ValueError(f"symmetries[{name!r}](q) must return shape ({n},), but it returned {getattr(out, 'shape', out)}.")
+
+
+# --------------------------------------------------------------------------------------------------------- one step
 
 
 def _symplecticity(sol: Solution, tolerance: float | None) -> Line:
-    found = discrete_system(sol)
-    constrained = any(name == "multipliers" for name in sol.fields)
+    constrained = any(info.place == "step" and name == "multipliers" for name, info in sol.field_info.items())
     name = "structural relation φ*Ω = Ω + dβ" if constrained else "symplecticity of one step"
     if sol.equation is None or sol.system is None:
         return Line(name, None, None, NOT_CHECKED, "the solution was loaded without its system")
-    if not all(stage.canonical for stage, _ in sol.equation.stages):
-        return Line(name, None, None, NOT_CHECKED, "the state is not (q, p) on T*Q")
+    stages = sol.equation.stages
+    if not all(stage.canonical for stage, _ in stages):
+        return Line(name, None, None, NOT_CHECKED, "the state of this scheme is not (q, p) on T*Q")
+    found = discrete_system(sol.system, sol.scheme, sol.step)
     if constrained and isinstance(found, str):
         return Line(name, None, None, NOT_CHECKED, found)
     if constrained and sol.save_every != 1:
         return Line(name, None, None, NOT_CHECKED, f"needs every step, but save_every = {sol.save_every}")
+    rows = _sampled(sol)
+    if len(rows) == 0:
+        return Line(name, None, None, NOT_CHECKED, "no two rows were computed")
     if constrained:
-        values = _structural(sol, found)
-        lane, row = _worst(values[..., 0])
-        text = f"one step on the pairs with w_d = 0; without dβ it would be off by {values[lane, row, 1]:.2g}{_lane(sol, lane)}"
+        assert isinstance(found, DiscreteSystem)
+        q = jnp.asarray(sol.q)
+        items = (q[..., rows, :], q[..., rows + 1, :], _times(sol, rows + 1))
+        values = _over_rows(_Structural(found, sol.equation), sol, items)
     else:
-        values = _symplectic(sol)
-        text = f"‖JᵀΩJ − Ω‖ relative to ‖JᵀΩJ‖, worst of {values.shape[1]} steps{_lane(sol, _worst(values[..., 0])[0])}"
-    if not np.any(np.isfinite(values[..., 0])):
+        data = {k: jnp.asarray(sol.fields[k])[..., rows, :] for k in (("x",) if "x" in sol.fields else ("q", "p"))}
+        items = (data, _times(sol, rows))
+        values = _over_rows(_Symplectic(sol.system, sol.equation, sol.step), sol, items)
+    defect, condition = values[..., 0], float(np.max(values[..., -1], where=np.isfinite(values[..., -1]), initial=1.0))
+    if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")
-    n = sol.equation.stages[0][0].state_size // 2
-    condition = float(np.nanmax(values[..., -1]))
-    limit = ROUNDINGS * EPSILON * 2 * n * condition if tolerance is None else tolerance
-    line = _judged(sol, name, np.nanmax(values[..., 0], axis=1), limit, text)
+    lane, row = _worst(defect)
+    at = f"worst of {len(rows)} steps at t = {float(sol.t[rows[row]]):.6g}{_lane(sol, lane)}"
+    text = f"‖JᵀΩJ − Ω‖/‖JᵀΩJ‖, {at}"
+    if constrained:
+        text = f"on the pairs with w_d = 0, {at}; without dβ it would be off by {values[lane, row, 1]:.2g}"
+    limit = _limit(tolerance, stages[0][0].state_size * condition)
+    line = _judged(sol, name, np.nanmax(np.where(np.isfinite(defect), defect, -1.0), axis=1), limit, text)
     line.details["condition"] = condition
     return line
 
 
-def _symplectic(sol: Solution) -> np.ndarray:
-    rows = _sampled(sol)
-    keys = ("x",) if "x" in sol.fields else ("q", "p")
-    data = {k: jnp.asarray(sol.fields[k])[..., rows, :] for k in keys}
-
-    def one(item, params):
-        row, t = item
-        return jnp.stack(symplecticity_defect(sol.system, sol.equation, row, t, sol.step, params))
-
-    return _over_rows(one, sol, (data, _times(sol, rows)))
-
-
-def _structural(sol: Solution, found: DiscreteSystem) -> np.ndarray:
-    rows = _sampled(sol)
-    q = jnp.asarray(sol.q)
-    h = sol.step
-
-    def one(item, params):
-        q0, q1, t = item
-        ld = lambda a, b: found.lagrangian(a, b, params)
-        _, p = slot_derivatives(ld, q0, q1)
-        _, guess = begin(sol.system, sol.equation, {"q": q1, "p": p}, h, params)
-        guess = guess.at[: q0.shape[0]].set((q1 - q0) / h)
-        return jnp.stack(
-            structural_defect(
-                ld,
-                lambda a, b: found.constraint(a, b, params),
-                lambda a: annihilator_projector(found.one_forms(a, params)),
-                sol.equation,
-                guess,
-                q0,
-                q1,
-                t,
-                h,
-                params,
-            )
-        )
-
-    return _over_rows(one, sol, (q[..., rows, :], q[..., rows + 1, :], _times(sol, rows + 1)))
-
-
 def _sampled(sol: Solution) -> np.ndarray:
-    """Row numbers of a few steps, spread over the part that every trajectory has reached."""
-    name = "q" if "q" in sol.fields else "x"
-    values = np.asarray(sol.fields[name])
+    """Numbers of a few rows that have a successor, spread over the part that every trajectory has reached."""
+    values = np.asarray(sol.fields["q" if "q" in sol.fields else "x"])
     finite = np.all(np.isfinite(values), axis=tuple(i for i in range(values.ndim) if i != values.ndim - 2))
-    last = max(int(np.sum(finite)) - 2, 0)
-    return np.unique(np.linspace(0, last, SAMPLED_STEPS).astype(int))
+    return _spread(int(np.sum(finite)) - 1, SAMPLED_STEPS)
 
 
 def _times(sol: Solution, rows: np.ndarray):
@@ -373,27 +347,92 @@ def _times(sol: Solution, rows: np.ndarray):
     return t if sol.batch is None else jnp.broadcast_to(t, (sol.batch, len(rows)))
 
 
-# -------------------------------------------------------------------------------------------------------------- helpers
+# ------------------------------------------------------------------- functions of one row, hashable so that they compile once
+
+
+class _Membership(eqx.Module):
+    discrete: DiscreteSystem
+
+    def __call__(self, item, params):
+        q0, q1, q2 = item
+        return membership_defect(self.discrete, q0, q1, q2, params)
+
+
+class _Forms(eqx.Module):
+    discrete: DiscreteSystem
+
+    def __call__(self, q, params):
+        return jnp.abs(self.discrete.system.constraint_matrix(q, params))
+
+
+class _EnergySensitivity(eqx.Module):
+    system: Any
+
+    def __call__(self, row, params):
+        gradient = jax.grad(lambda row: self.system.energy_at(row, params))(row)
+        return sum(jnp.sum(jnp.abs(gradient[name] * row[name])) for name in row)
+
+
+class _MomentumMap(eqx.Module):
+    generator: Callable
+
+    def __call__(self, item, params):
+        q, p = item
+        terms = p * self.generator(q)
+        return jnp.stack([jnp.sum(terms), jnp.sum(jnp.abs(terms))])
+
+
+class _Translation(eqx.Module):
+    index: int = eqx.field(static=True)
+
+    def __call__(self, q):
+        return jnp.zeros_like(q).at[self.index].set(1.0)
+
+
+class _Symplectic(eqx.Module):
+    system: Any
+    equation: Any
+    step: Any
+
+    def __call__(self, item, params):
+        data, t = item
+        return symplecticity_defect(self.system, self.equation, data, t, self.step, params)
+
+
+class _Structural(eqx.Module):
+    discrete: DiscreteSystem
+    equation: Any
+
+    def __call__(self, item, params):
+        q0, q1, t = item
+        return structural_defect(self.discrete, self.equation, q0, q1, t, params)
 
 
 def _over_rows(function: Callable, sol: Solution, items: Any) -> np.ndarray:
-    """function(item, params) for every row of `items`, (B, rows, …), B = 1 without a batch; in pieces of CHUNK rows."""
-    items = jax.tree.map(jnp.asarray, items)
+    """function(item, params) for every row of `items`, whose leaves have the shape (rows, …) or (B, rows, …).
+
+    The result is (B, rows, …), with B = 1 for one trajectory. Rows go through in pieces, so that memory stays bounded.
+    """
     if sol.batch is None:
         items = jax.tree.map(lambda a: a[None], items)
-    params = sol.params if sol.batch_params else jax.tree.map(lambda a: a, sol.params)
-    return np.array(_mapped(function, items, params, sol.batch_params))
+    rows = jax.tree.leaves(items)[0].shape[1]
+    size = max(1, CHUNK // (sol.batch or 1)) if rows * (sol.batch or 1) > CHUNK else rows
+    axis = 0 if sol.batch_params and sol.params is not None else None
+    found = []
+    for start in range(0, rows, size):
+        numbers = np.minimum(np.arange(start, start + size), rows - 1)  # the last piece repeats its last row
+        piece = jax.tree.map(lambda a, numbers=numbers: jnp.asarray(a[:, numbers]), items)
+        found.append(np.asarray(_piece(function, piece, sol.params, axis))[:, : rows - start])
+    return np.concatenate(found, axis=1)
 
 
 @eqx.filter_jit
-def _mapped(function, items, params, batch_params: bool):
-    def lane(pair):
-        rows, params = pair
-        return jax.lax.map(lambda item: function(item, params), rows, batch_size=CHUNK)
+def _piece(function, items, params, axis):
+    lane = jax.vmap(function, in_axes=(0, None))
+    return jax.vmap(lane, in_axes=(0, axis))(items, params)
 
-    if batch_params:
-        return jax.lax.map(lane, (items, params))
-    return jax.lax.map(lambda rows: lane((rows, params)), items)
+
+# ---------------------------------------------------------------------------------------------------------- small things
 
 
 def _judged(sol: Solution, name: str, per_trajectory: np.ndarray, limit: float, text: str) -> Line:
@@ -402,10 +441,19 @@ def _judged(sol: Solution, name: str, per_trajectory: np.ndarray, limit: float, 
     return Line(name, worst, limit, OK if worst <= limit else VIOLATED, text, details)
 
 
+def _limit(tolerance: float | None, growth: float) -> float:
+    return ROUNDINGS * EPSILON * growth if tolerance is None else float(tolerance)
+
+
 def _worst(values: np.ndarray) -> tuple[int, int]:
     """(trajectory, row) of the largest value; NaN, in rows that were not reached, does not count."""
-    lane, row = np.unravel_index(int(np.argmax(np.nan_to_num(values, nan=-1.0))), values.shape)
+    lane, row = np.unravel_index(int(np.argmax(np.where(np.isfinite(values), values, -1.0))), values.shape)
     return int(lane), int(row)
+
+
+def _spread(count: int, most: int) -> np.ndarray:
+    """At most `most` different whole numbers from 0 to count − 1, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, most).astype(int)) if count > 0 else np.zeros(0, int)
 
 
 def _lane(sol: Solution, lane: int) -> str:
@@ -416,13 +464,7 @@ def _steps(sol: Solution) -> int:
     return max(1, round(float(sol.t[-1] - sol.t[0]) / float(sol.step)))
 
 
-def _nonzero(values):
-    return jnp.where(values > 0, values, 1.0)
-
-
 def _title(sol: Solution) -> str:
-    def name(thing):
-        return type(thing).__name__ if thing is not None else "unknown"
-
+    scheme, system = (type(part).__name__ if part is not None else "unknown" for part in (sol.scheme, sol.system))
     batch = f", {sol.batch} trajectories" if sol.batch is not None else ""
-    return f"{name(sol.scheme)} on {name(sol.system)}: {_steps(sol)} steps of {float(sol.step):.6g}{batch}"
+    return f"{scheme} on {system}: {_steps(sol)} steps of {float(sol.step):.6g}{batch}"

@@ -10,12 +10,12 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from dirax.functions import UserFunction, is_traced
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.structures import canonical_two_form
-from dirax.geometry.subspaces import STRUCTURE_TOLERANCE
+from dirax.geometry.subspaces import STRUCTURE_TOLERANCE, AnyArray
 
 Vector = Float[Array, " n"]
 Covector = Float[Array, " n"]
@@ -26,15 +26,14 @@ DEPENDENT = 1e-12
 
 
 def annihilator_projector(one_forms: Float[Array, "m n"]) -> Float[Array, "n n"]:
-    """The orthogonal projector of V* onto Δ° = image Wᵀ, Δ = ker W, from the singular vectors of W.
+    """The orthogonal projector of V* onto Δ° = image Wᵀ, Δ = ker W: W⁺W, by singular values.
 
-    One-forms that depend on the others do not count, so that W of any rank is accepted.
+    One-forms that depend on the others do not count, so that W of any rank is accepted; differentiable where the rank
+    is constant.
     """
     if one_forms.shape[0] == 0:
         return jnp.zeros((one_forms.shape[1], one_forms.shape[1]))
-    _, values, right = jnp.linalg.svd(one_forms, full_matrices=False)
-    spanning = jnp.where((values > DEPENDENT * values[0])[:, None], right, 0.0)
-    return spanning.T @ spanning
+    return jnp.linalg.pinv(one_forms, rtol=DEPENDENT) @ one_forms
 
 
 class FiniteDifferenceDirac(eqx.Module):
@@ -98,7 +97,7 @@ class FiniteDifferenceDirac(eqx.Module):
 
     def contains(
         self, x0: Vector, x1: Vector, covector: Covector, params: Any = None, tolerance: float = STRUCTURE_TOLERANCE
-    ) -> Float[Array, ""]:
+    ) -> Bool[AnyArray, ""]:
         """Whether ((x0, x1), α) ∈ D^{d±} ([PY] Theorem 5.7): its distance is at most `tolerance` of its length."""
         vector = self.velocity(x0, x1)
         return self.at(self.base_point(x0, x1), params).contains(vector, covector, tolerance)
@@ -215,7 +214,7 @@ class InducedFiniteDifferenceDirac(eqx.Module):
         gamma: Vector,
         params: Any = None,
         tolerance: float = STRUCTURE_TOLERANCE,
-    ) -> Float[Array, ""]:
+    ) -> Bool[AnyArray, ""]:
         """Whether the element is in D^{d±} ([PY] Proposition 5.17): its distance is at most `tolerance` of its length."""
         base, _ = self.base_point(q0, q1, momenta)
         vector = jnp.concatenate(self.velocity(q0, q1, momenta))

@@ -1,0 +1,220 @@
+"""What one step must satisfy: membership in the discrete Dirac structure, symplecticity, φ*Ω = Ω + dβ under constraints.
+
+All are functions of saved rows, traceable, and independent of how the step was solved; the last two differentiate the
+step map through the engine's solve. Each defect is relative to the size of what should cancel in it.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dirax.engines.xla import first_lane, take_step
+from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector
+from dirax.geometry.structures import canonical_two_form
+from dirax.geometry.tulczyjew import minus_dirac_differential, plus_dirac_differential, slot_derivatives
+from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_lagrangian
+from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
+from dirax.systems.lagrange_dirac import LagrangeDirac
+
+MAX_ITERATIONS = 50
+
+Vector = Float[Array, " n"]
+Scalar = Float[Array, ""]
+
+
+class DiscreteSystem(eqx.Module):
+    """A Lagrangian system as a discrete Lagrange–d'Alembert scheme sees it: L_d and w_d on Q × Q, W on Q.
+
+    `sign` is "+" or "-" for the schemes of [PY], None for a general discrete constraint.
+    """
+
+    system: LagrangeDirac
+    rule: Any
+    constraint_rule: Any
+    step: Any
+    sign: str | None = eqx.field(static=True)
+
+    def lagrangian(self, q0: Vector, q1: Vector, params: Any) -> Scalar:
+        """L_d(q0, q1)."""
+        ld = discrete_lagrangian(self.system.lagrangian, self.rule)
+        return ld(q0, (q1 - q0) / self.step, self.step, params)
+
+    def constraint(self, q0: Vector, q1: Vector, params: Any) -> Float[Array, " m"]:
+        """w_d(q0, q1)."""
+        if self.system.one_forms is None:
+            return jnp.zeros((0,))
+        wd = discrete_constraint(self.system.constraint_matrix, self.constraint_rule)
+        return wd(q0, (q1 - q0) / self.step, self.step, params)
+
+    def annihilator(self, q: Vector, params: Any) -> Float[Array, "n n"]:
+        """The projector onto Δ°_Q(q)."""
+        return annihilator_projector(self.system.constraint_matrix(q, params))
+
+
+def discrete_system(system: Any, scheme: Any, step: Any) -> DiscreteSystem | str:
+    """The DiscreteSystem of a scheme on a system, or the reason why there is none."""
+    if system is None or scheme is None:
+        return "the solution was loaded without its system"
+    if not isinstance(scheme, (PlusLagrangeDirac, MinusLagrangeDirac, LagrangeDAlembert)):
+        return f"{type(scheme).__name__} has no discrete Lagrangian on Q × Q"
+    if not isinstance(system, LagrangeDirac):
+        return f"the points of a {type(system).__name__} are not those of a Lagrangian on Q × Q"
+    rule = scheme.discrete_lagrangian
+    if isinstance(scheme, LagrangeDAlembert):
+        return DiscreteSystem(system, rule, scheme.constraint, step, None)
+    if isinstance(scheme, PlusLagrangeDirac):
+        return DiscreteSystem(system, rule, "right", step, "+")
+    return DiscreteSystem(system, rule, "left", step, "-")
+
+
+def membership_defect(discrete: DiscreteSystem, q0: Vector, q1: Vector, q2: Vector, params: Any) -> Float[Array, "2"]:
+    """(constraint, force): by how much three points in a row miss the discrete Dirac structure, relative to roundoff.
+
+    (+) and (−): the element (X^{d±}, d_D^±L_d) at q1 of the induced structure ([PY] Definition 6.7, Proposition 5.17),
+    with the Legendre momenta F⁺L_d or F⁻L_d; the constraint is W q̂ of the pair (q0, q1) or (q1, q2). Otherwise
+    w_d(q1, q2) = 0 and D2 L_d(q0, q1) + D1 L_d(q1, q2) ∈ Δ°(q1). Δ° is taken from the singular vectors of W.
+
+    Each is divided by the sum of its terms' absolute values and by what it changes when every coordinate is changed by
+    itself (its absolute Jacobian times |q| + |Δq| + h): a perfect step that was rounded gives a few 2⁻⁵³.
+    """
+    h, n = discrete.step, q0.shape[0]
+    ld = lambda a, b: discrete.lagrangian(a, b, params)
+    (before0, p1), (before1, p2) = slot_derivatives(ld, q0, q1), slot_derivatives(ld, q1, q2)
+    onto = discrete.annihilator(q1, params)
+    if discrete.sign is None:
+        constraint, force = discrete.constraint(q1, q2, params), (p1 + before1) / h
+        force = force - onto @ force
+    else:
+        forms = discrete.system.one_forms
+        structure = InducedFiniteDifferenceDirac(forms, step=h, sign=discrete.sign)
+        if discrete.sign == "+":
+            momenta, (_, (beta, gamma)) = (p1, p2), plus_dirac_differential(ld, q0, q1, q2, h)
+            pair = (q0, q1)
+        else:
+            momenta, (_, (beta, gamma)) = (-before0, -before1), minus_dirac_differential(ld, q0, q1, q2, h)
+            pair = (q1, q2)
+        constraint, second_order, force = structure.membership_defect(*pair, momenta, beta, gamma, params)
+        force = jnp.concatenate([second_order, force])
+
+    matrix = discrete.system.constraint_matrix(q1, params)
+    multipliers = jnp.linalg.pinv(matrix).T @ (p1 + before1) if matrix.shape[0] else jnp.zeros(0)
+
+    def force_of(z):
+        a, b, c = jnp.split(z, 3)
+        return slot_derivatives(ld, a, b)[1] + slot_derivatives(ld, b, c)[0]
+
+    def reaction_of(q):
+        return discrete.system.constraint_matrix(q, params).T @ multipliers
+
+    def constraint_of(z):
+        a, b, c = jnp.split(z, 3)
+        return discrete.constraint(*((a, b) if discrete.sign == "+" else (b, c)), params)
+
+    z = jnp.concatenate([q0, q1, q2])
+    moved = jnp.maximum(jnp.abs(q1 - q0), jnp.abs(q2 - q1)) + h
+    size = jnp.abs(z) + jnp.tile(moved, 3)
+    terms = jnp.abs(p1) + jnp.abs(p2) + jnp.abs(before0) + jnp.abs(before1)
+    force_scale = terms + jnp.abs(jax.jacfwd(force_of)(z)) @ size + jnp.abs(jax.jacfwd(reaction_of)(q1)) @ size[n : 2 * n]
+    relative_force = jnp.max(jnp.abs(force)) * h / nonzero(jnp.max(force_scale))
+    if constraint.shape[0] == 0:
+        return jnp.stack([jnp.zeros(()), relative_force])
+    constraint_scale = jnp.abs(jax.jacfwd(constraint_of)(z)) @ size
+    return jnp.stack([jnp.max(jnp.abs(constraint) / nonzero(constraint_scale)), relative_force])
+
+
+def step_map(equation: Any, state, guess, t, h, params):
+    """The state after one step, through the engine's solve, and the unknowns of its first stage; differentiable."""
+    lane = first_lane(state, (guess,) * len(equation.stages))
+    after, unknowns = take_step(equation, lane, t, h, params, MAX_ITERATIONS)
+    return jnp.where(after.completed > 0, after.state, jnp.nan), unknowns[0]
+
+
+def condition_number(equation: Any, unknowns, state, t, h, params) -> Scalar:
+    """Condition number of the Jacobian of the step's equations, after scaling rows and columns to unit size; ≥ 1."""
+    stage, fraction = equation.stages[0]
+    if stage.unknowns == 0:
+        return jnp.ones(())
+    matrix = jax.jacfwd(stage.residual)(unknowns, state, t, fraction * h, params)
+    for _ in range(3):
+        matrix = matrix / nonzero(jnp.max(jnp.abs(matrix), axis=1, keepdims=True))
+        matrix = matrix / nonzero(jnp.max(jnp.abs(matrix), axis=0, keepdims=True))
+    values = jnp.linalg.svd(matrix, compute_uv=False)
+    return values[0] / values[-1]
+
+
+def symplecticity_defect(system: Any, equation: Any, data: dict, t, h, params) -> Float[Array, "2"]:
+    """(‖JᵀΩJ − Ω‖ relative to ‖|J|ᵀ|Ω||J|‖, condition number) of the step from saved data, J = ∂(q', p')/∂(q, p).
+
+    Entries are the largest ones after q and p were brought to balanced units, q → q√s, p → p/√s.
+    """
+    stage, fraction = equation.stages[0]
+    state, guess = stage.start(system.complete(data, params, False), fraction * h, params)
+
+    def step(state):
+        return step_map(equation, state, guess, t, h, params)
+
+    jacobian, unknowns = jax.jacfwd(step, has_aux=True)(state)
+    n = state.shape[0] // 2
+    form = canonical_two_form(n)
+    by_momentum, by_position = jnp.max(jnp.abs(jacobian[:n, n:])), jnp.max(jnp.abs(jacobian[n:, :n]))
+    both = (by_momentum > 0) & (by_position > 0)
+    unit = jnp.where(both, (nonzero(by_position) / nonzero(by_momentum)) ** 0.25, 1.0)
+    units = jnp.concatenate([jnp.full(n, unit), jnp.full(n, 1 / unit)])
+    jacobian = jacobian * units[:, None] / units[None, :]
+    defect = jnp.max(jnp.abs(jacobian.T @ form @ jacobian - form))
+    size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(form) @ jnp.abs(jacobian))
+    return jnp.stack([defect / size, condition_number(equation, unknowns, state, t, h, params)])
+
+
+def structural_defect(discrete: DiscreteSystem, equation: Any, q0: Vector, q1: Vector, t, params) -> Float[Array, "3"]:
+    """(defect of φ*Ω = Ω + dβ, ‖φ*Ω − Ω‖, both relative; condition number) at a pair (q0, q1) with w_d(q0, q1) = 0.
+
+    φ(q0, q1) = (q1, q2) is the discrete Lagrange–d'Alembert map, Ω = −d(−D1 L_d dq0) = F⁻L_d*(dq ∧ dp), and
+    β = ⟨F, dq1⟩ with F the part in Δ°(q1) of D2 L_d(q0, q1) + D1 L_d(q1, q2) ([PY] §3.2). There β_d is printed as a
+    pull-back from the first point; the variation (11) puts the force at q1, the first point of φ(q0, q1), and only this
+    makes the relation true. Both sides are restricted to the vectors tangent to {w_d = 0}.
+    """
+    n, h = q0.shape[0], discrete.step
+    ld = lambda a, b: discrete.lagrangian(a, b, params)
+    d1 = lambda a, b: slot_derivatives(ld, a, b)[0]
+    d2 = lambda a, b: slot_derivatives(ld, a, b)[1]
+    m = equation.stages[0][0].unknowns - n
+    guess = jnp.concatenate([(q1 - q0) / h, jnp.zeros(m)])
+
+    def forms(z):
+        """φ(z) and β(z) side by side, so that the step is solved and differentiated once."""
+        a, b = z[:n], z[n:]
+        p = d2(a, b)
+        after, unknowns = step_map(equation, jnp.concatenate([b, p]), guess, t, h, params)
+        c = after[:n]
+        beta = jnp.concatenate([jnp.zeros(n), discrete.annihilator(b, params) @ (p + d1(b, c))])
+        shifted = jnp.concatenate([b, c])
+        return (shifted, beta), (shifted, unknowns)
+
+    def lagrangian_two_form(z):
+        """−dΘ of Θ = −D1 L_d dq0: dq0 ∧ dq1 with the coefficients −D1 D2 L_d, and nothing else (D1 D1 L_d is symmetric)."""
+        mixed = -jax.jacfwd(lambda b: d1(z[:n], b))(z[n:])  # ∂p0_i/∂q1_j
+        zero = jnp.zeros((n, n))
+        return jnp.block([[zero, mixed], [-mixed.T, zero]])
+
+    z = jnp.concatenate([q0, q1])
+    (jacobian, force), (after, unknowns) = jax.jacfwd(forms, has_aux=True)(z)
+    two_form, two_form_after = lagrangian_two_form(z), lagrangian_two_form(after)
+    change = jacobian.T @ two_form_after @ jacobian - two_form
+    dbeta = force.T - force  # (dβ)_ij = ∂_i β_j − ∂_j β_i
+    constraint_matrix = jax.jacfwd(lambda z: discrete.constraint(z[:n], z[n:], params))(z)
+    _, _, right = jnp.linalg.svd(constraint_matrix, full_matrices=True)
+    tangent = right[constraint_matrix.shape[0] :].T
+    restricted = lambda form: jnp.max(jnp.abs(tangent.T @ form @ tangent))
+    size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(two_form_after) @ jnp.abs(jacobian)) + jnp.max(jnp.abs(force))
+    state = jnp.concatenate([q1, d2(q0, q1)])
+    condition = condition_number(equation, unknowns, state, t, h, params)
+    return jnp.stack([restricted(change - dbeta) / size, restricted(change) / size, condition])
+
+
+def nonzero(values):
+    """The values, with 1 in the place of 0, to divide by."""
+    return jnp.where(values > 0, values, 1.0)
