@@ -12,6 +12,8 @@ from jax.core import Tracer
 from jax.experimental import checkify
 from jax.extend.core import jaxprs_in_params
 
+from dirax.representation import value_text
+
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 INDEXING = ("dynamic_slice", "gather")
 """What JAX turns an index into when it is not known to be inside the array."""
@@ -33,7 +35,7 @@ class UserFunction(eqx.Module):
         expected = f"{name}({', '.join(arguments)}[, params])"
         if not callable(function):
             raise TypeError(
-                f"{name} must be a function {expected}, but {function!r:.80} was given: "
+                f"{name} must be a function {expected}, but {value_text(function)} was given: "
                 "wrap the value in a function, e.g. a lambda."
             )
         self.takes_params = _takes_params(function, name, expected, len(arguments))

@@ -61,7 +61,8 @@ def _real_array(name: str, value: Any) -> jax.Array:
     try:
         array = jnp.asarray(value) if is_traced(value) else np.asarray(value)
     except ValueError as error:
-        raise ValueError(f"{name} must be an array of numbers, but it could not be made one: {error}") from error
+        reason = str(error).split(". ")[0].rstrip(".")
+        raise ValueError(f"{name} must be an array of numbers, but it could not be made one: {reason}.") from error
     if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
         raise TypeError(f"{name} must hold real numbers, but its dtype is {array.dtype}.")
     if array.ndim not in (1, 2) or 0 in array.shape:

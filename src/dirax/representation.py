@@ -35,7 +35,7 @@ def value_text(value: Any) -> str:
     """One value: arrays by their entries if there are few and by their shape otherwise, functions by their name."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         small = np.size(value) <= 6 and isinstance(value, np.ndarray | np.generic)
-        return np.array2string(np.asarray(value), separator=", ") if small else f"{value.dtype}{list(np.shape(value))}"
+        return str(np.asarray(value).tolist()) if small else f"{value.dtype}{list(np.shape(value))}"
     if callable(value) and hasattr(value, "__name__"):
         return "a lambda" if value.__name__ == "<lambda>" else value.__name__
     if isinstance(value, tuple) and len(value) > 8:

@@ -63,7 +63,7 @@ def simulate(
     t0, max_iterations = _finite(t0, "t0"), _count(max_iterations, "max_iterations")
     given = {"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}
     data, batch = initial_data({k: a for k, a in given.items() if a is not None})
-    params = jax.tree.map(_array_if_number, params)
+    params = _arrays(params)
     check_finite("params", params)
     batch = _batch_size(batch, params, batch_params)
     system = system if inputs is None else _driven(system, inputs)
@@ -223,12 +223,20 @@ def _count(value, name: str) -> int:
 
 
 def _is_number(leaf) -> bool:
-    array = isinstance(leaf, int | float | np.ndarray | np.generic | jax.Array) and not isinstance(leaf, bool)
-    return array and np.issubdtype(np.result_type(leaf), np.number)
+    if isinstance(leaf, np.ndarray | np.generic | jax.Array):
+        return jnp.issubdtype(leaf.dtype, jnp.number)
+    return isinstance(leaf, int | float) and not isinstance(leaf, bool)
 
 
-def _array_if_number(leaf):
-    return jnp.asarray(leaf) if _is_number(leaf) else leaf
+def _arrays(params):
+    """The pytree with arrays for its leaves."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if not _is_number(leaf) and getattr(leaf, "dtype", type(leaf)) != bool:
+            raise TypeError(
+                f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {leaf!r:.60}: "
+                "use such a value in the system's functions directly."
+            )
+    return jax.tree.map(jnp.asarray, params)
 
 
 def _batch_size(batch: int | None, params, batch_params: bool) -> int | None:

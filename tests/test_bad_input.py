@@ -1,0 +1,387 @@
+"""Bad input gets one or two sentences that name the argument, what came, what was expected and the way out; nothing is lost."""
+
+import os
+import re
+import signal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+
+OSCILLATOR = dx.LagrangeDirac(lambda q, v: (v @ v - q @ q) / 2)
+SKATE = dx.LagrangeDirac(
+    lambda q, v: v @ v / 2, lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
+)  # q = (x, y, direction)
+PLUS = dx.PlusLagrangeDirac()
+GOOD = {"q": [1.0, 0.0], "v": [0.0, 1.0], "step": 0.1, "steps": 3}
+
+
+def complaint(kind, *words, system=OSCILLATOR, scheme=PLUS, **arguments) -> str:
+    """The message of the error that a run with these arguments raises; every one of `words` must be in it."""
+    return complaint_of(lambda: dx.simulate(system, scheme, **(GOOD | arguments)), kind, *words)
+
+
+def complaint_of(action, kind, *words) -> str:
+    with pytest.raises(kind) as caught:
+        action()
+    assert caught.type is kind
+    text = str(caught.value)
+    missing = [word for word in words if word not in text]
+    assert not missing, f"{missing} not in: {text}"
+    assert "\n" not in text and text.endswith((".", "?")) and len(text) < 600
+    assert len(re.findall(r"[.?](?: |$)", re.sub(r"\S*\d\.\s|\[[^]]*\]", "", text))) <= 2, f"more than two sentences: {text}"
+    return text
+
+
+# ------------------------------------------------------------------------------------------ shapes, dtypes and arities
+
+
+def test_shapes_of_initial_data():
+    complaint(ValueError, "q must have shape (n,), or (B, n)", "(2, 2, 1)", q=np.zeros((2, 2, 1)), v=np.zeros((2, 2, 1)))
+    complaint(ValueError, "q must have shape (n,)", "shape is ()", q=1.0)
+    complaint(ValueError, "q must have shape", "(0,)", q=[], v=[])
+    complaint(ValueError, "q and v must have the same length n", "(2,)", "(3,)", v=[0.0, 1.0, 2.0])
+    complaint(
+        ValueError, "q and v must hold the same number of trajectories", "(3, 2)", "(4, 2)", q=np.ones((3, 2)), v=np.ones((4, 2))
+    )
+    complaint(ValueError, "q must be an array of numbers", q=[[1.0], [1.0, 2.0]])
+
+
+def test_combinations_of_initial_data():
+    choices = "one of q=, v= · q=, p= · q0=, q1= · x="
+    complaint(ValueError, choices, "q= alone was given", v=None)
+    complaint(ValueError, choices, "p=, q=, v= was given", p=[0.0, 0.0])
+    complaint(ValueError, choices, "none was given", q=None, v=None)
+    complaint(ValueError, "starts from q=, v= · q=, p= · q0=, q1=", "x= was given", q=None, v=None, x=[0.0, 1.0])
+    composition = dx.Composition(dx.LagrangeDAlembert(), "yoshida4")
+    complaint(
+        ValueError, "composition", "q0= and q1=", "give q= with v= or p=",
+        scheme=composition, q=None, v=None, q0=[0.0], q1=[0.1],
+    )  # fmt: skip
+
+
+def test_dtypes_of_initial_data():
+    complaint(TypeError, "q must hold real numbers", "complex128", q=[1j, 0.0])
+    complaint(TypeError, "v must hold real numbers", "bool", v=[True, False])
+    complaint(TypeError, "q must hold real numbers", "<U1", q=["a", "b"])
+
+
+def test_shapes_of_user_functions():
+    vector = dx.LagrangeDirac(lambda q, v: v * v)
+    complaint(ValueError, "lagrangian(q, v) must return a scalar", "shape (2,)", "sum or index", system=vector)
+    row = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.ones(2))
+    complaint(ValueError, "one_forms(q) must return", "(m, n) = (m, 2)", "shape (2,)", "pair of brackets", system=row)
+    wide = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.ones((1, 3)))
+    complaint(ValueError, "(m, n) = (m, 2) with m ≤ 2", "shape (1, 3)", system=wide)
+    many = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.ones((3, 2)))
+    complaint(ValueError, "m ≤ 2", "shape (3, 2)", system=many)
+    pair = dx.LagrangeDirac(lambda q, v: (v @ v, q @ q))
+    complaint(TypeError, "lagrangian(q, v) must return one array", "returned tuple", system=pair)
+    nothing = dx.LagrangeDirac(lambda q, v: None)
+    complaint(TypeError, "lagrangian(q, v) must return one array", "NoneType", system=nothing)
+
+
+def test_dtypes_of_user_functions():
+    whole = dx.LagrangeDirac(lambda q, v: 0)
+    complaint(TypeError, "lagrangian(q, v)", "float64", "int64", ".astype(float)", system=whole)
+    single = dx.LagrangeDirac(lambda q, v: (v @ v).astype(jnp.float32))
+    complaint(TypeError, "lagrangian(q, v)", "float64", "float32", system=single)
+    integer = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[0, 1]]))
+    complaint(TypeError, "one_forms(q)", "float64", "int64", ".astype(float)", system=integer)
+
+
+def test_user_functions_that_do_not_trace():
+    numpy = dx.LagrangeDirac(lambda q, v: np.sum(np.array(v)))
+    complaint(TypeError, "lagrangian(q, v) could not be traced", "(2,), (2,)", "jax.numpy instead of numpy", system=numpy)
+    branch = dx.LagrangeDirac(lambda q, v: v @ v if q[0] > 0 else q @ q)
+    complaint(TypeError, "lagrangian(q, v) could not be traced", "jnp.where", system=branch)
+    unpack = dx.LagrangeDirac(lambda q, v: sum((lambda a, b, c: (a, b, c))(*q)))
+    complaint(TypeError, "lagrangian(q, v) could not be traced", "1 required positional argument", system=unpack)
+
+
+def test_an_index_outside_the_data_is_not_clamped():
+    """JAX clamps it silently, so that a coordinate that was forgotten would become another one."""
+    three = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[2])
+    complaint(ValueError, "lagrangian(q, v) reads an entry", "(2,), (2,)", "index 2 is out of bounds", system=three)
+    listed = dx.LagrangeDirac(lambda q, v: jnp.sum(v[jnp.array([0, 5])] ** 2))
+    complaint(ValueError, "lagrangian(q, v) reads an entry", "index 5", system=listed)
+    form = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.stack([jnp.stack([q[7], q[0]])]))
+    complaint(ValueError, "one_forms(q) reads an entry", "index 7", system=form)
+
+
+def test_arities_of_user_functions():
+    take = "must have the signature lagrangian(q, v[, params])"
+    complaint_of(lambda: dx.LagrangeDirac(lambda q: q @ q), TypeError, take, "1 argument (q)")
+    complaint_of(lambda: dx.LagrangeDirac(lambda q, v, a, b: 0.0), TypeError, take, "4 arguments (q, v, a, b)")
+    complaint_of(lambda: dx.LagrangeDirac(lambda q, v, *, m: 0.0), TypeError, take, "3 arguments (q, v, m)")
+    complaint_of(lambda: dx.LagrangeDirac(3.0), TypeError, "a function lagrangian(q, v[, params])", "3.0", "lambda")
+    complaint_of(lambda: dx.LagrangeDirac(lambda q, v: 0.0, jnp.eye(2)), TypeError, "one_forms(q[, params])", "float64[2, 2]")
+    complaint_of(lambda: dx.LagrangeDirac(lambda q, v: 0.0, lambda: 0), TypeError, "one_forms(q[, params])", "none")
+    complaint_of(lambda: dx.PlusLagrangeDirac(lambda q0, q1: 0.0), TypeError, "discrete_lagrangian(q0, q1, h[, params])", "2 arg")
+    complaint_of(lambda: dx.LagrangeDAlembert("left", lambda q: q), TypeError, "constraint(q0, q1, h[, params])", "1 argument")
+
+
+def test_user_given_discrete_functions_of_wrong_shape():
+    complaint(
+        ValueError, "discrete_lagrangian(q0, q1, h) must return a scalar", "shape (2,)", "sum or index",
+        scheme=dx.PlusLagrangeDirac(lambda q0, q1, h: q1 - q0),
+    )  # fmt: skip
+    complaint(
+        ValueError, "constraint(q0, q1, h) must return an array of shape (1,)", "shape ()",
+        system=SKATE, scheme=dx.LagrangeDAlembert("left", lambda q0, q1, h: q1[0] - q0[0]), q=[0.0] * 3, v=[1.0, 0.0, 0.0],
+    )  # fmt: skip
+    complaint(
+        ValueError, "constraint is a function w_d", "no one_forms",
+        scheme=dx.LagrangeDAlembert("left", lambda q0, q1, h: q1 - q0),
+    )  # fmt: skip
+
+
+def test_params():
+    massive = dx.LagrangeDirac(lambda q, v, params: params["m"] * v @ v / 2)
+    complaint(TypeError, "params=None", "pass params=", system=massive)
+    complaint(TypeError, "params must be a pytree of numbers", "params['m'] is 'heavy'", system=massive, params={"m": "heavy"})
+    batch = "with batch_params=True every leaf of params needs the same leading batch axis"
+    complaint(ValueError, batch, "(2,), (3,)", params=[np.ones(2), np.ones(3)], batch_params=True)
+    complaint(ValueError, batch, "()", params=1.0, batch_params=True)
+    complaint(ValueError, batch, "no leaves", batch_params=True)
+    complaint(
+        ValueError, "initial data are a batch of 3", "params a batch of 2", "equal",
+        q=np.ones((3, 2)), v=np.ones((3, 2)), params=np.ones(2), batch_params=True,
+    )  # fmt: skip
+
+
+def test_systems_schemes_and_engines():
+    complaint(TypeError, "system must be a dirax system such as dx.LagrangeDirac(…)", "'disk'", system="disk")
+    complaint(TypeError, "scheme must be a dirax scheme", "the class PlusLagrangeDirac", "instance", scheme=dx.PlusLagrangeDirac)
+    complaint(ValueError, "engine must be one of 'auto', 'xla'", "'fortran'", engine="fortran")
+    complaint(TypeError, "inputs=", "dx.PortHamiltonian", "LagrangeDirac", inputs=lambda t, x: x)
+    rule = "discrete_lagrangian must be one of 'left', 'right', 'midpoint', 'trapezoidal' or a function of (q0, q1, h[, params])"
+    complaint_of(lambda: dx.PlusLagrangeDirac("simpson"), ValueError, rule, "'simpson'")
+    complaint_of(
+        lambda: dx.LagrangeDAlembert("left", "trapezoidal"), ValueError, "constraint must be one of 'left', 'right', 'mid"
+    )
+    complaint_of(lambda: dx.LagrangeDAlembert(momentum="both"), ValueError, "momentum must be one of", "'outgoing'", "'both'")
+
+
+def test_a_scheme_that_does_not_fit_the_system():
+    structure = dx.DiracStructure.from_bivector(lambda x: jnp.array([[0.0, 1.0], [-1.0, 0.0]]))
+    system = dx.DiracSystem(structure, lambda x: x @ x / 2)
+    complaint(TypeError, "dx.LagrangeDirac", "DiracSystem", "use dx.DiscreteDirac", system=system, q=None, v=None, x=[1.0, 0.0])
+
+
+# ----------------------------------------------------------------------------------------------------- values of numbers
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite(bad):
+    complaint(ValueError, "q must be finite", f"q[1] is {bad}", q=[1.0, bad])
+    complaint(ValueError, "v must be finite", f"v[1, 0] is {bad}", q=np.ones((3, 2)), v=[[1.0, 0.0], [bad, 0.0], [0.0, 0.0]])
+    complaint(ValueError, "p must be finite", f"p[0] is {bad}", p=[bad, 0.0], v=None)
+    complaint(ValueError, "q1 must be finite", f"q1[0] is {bad}", q=None, v=None, q0=[0.0], q1=[bad])
+    complaint(ValueError, "params must be finite", f"params['m'][1] is {bad}", params={"m": [1.0, np.array(bad)]})
+    complaint(ValueError, "step must be a positive finite number", str(bad), step=bad)
+    complaint(ValueError, "t0 must be a finite number", str(bad), t0=bad)
+
+
+@pytest.mark.parametrize("bad", [0, -0.1, "0.1", True, np.ones(2), None])
+def test_steps_sizes(bad):
+    complaint(ValueError, "step must be a positive finite number", f"{bad!r} was given", step=bad)
+
+
+@pytest.mark.parametrize("name", ["steps", "save_every", "max_iterations"])
+@pytest.mark.parametrize("bad", [0, -3, 2.0, "2", True])
+def test_counts(name, bad):
+    complaint(ValueError, f"{name} must be a whole number ≥ 1", f"{bad!r} was given", **{name: bad})
+
+
+def test_functions_that_are_not_finite_at_the_initial_data():
+    pole = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 1 / jnp.linalg.norm(q))
+    text = complaint(ValueError, "not finite at the initial data", "outside the domain", system=pole, q=[0.0, 0.0])
+    assert "discrete Lagrange–d'Alembert equation 0" in text
+    text = complaint(ValueError, "of trajectory 1", system=pole, q=[[1.0, 0.0], [0.0, 0.0]])
+    form = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.stack([jnp.sqrt(q)]))
+    complaint(ValueError, "one_forms is not finite at the initial data", "outside its domain", system=form, q=[-1.0, 1.0])
+
+
+# -------------------------------------------------------------------------------------------- constraints and solvability
+
+
+def test_initial_data_off_the_constraint():
+    skid = {"system": SKATE, "q": [0.0, 0.0, 0.0], "v": [1.0, 0.25, 0.0]}
+    complaint(ValueError, "off the constraint", "[-0.25]", "largest 0.25", "project=True", "check_initial=False", **skid)
+    complaint(ValueError, "off the constraint", "[-0.25]", **(skid | {"v": None, "p": skid["v"]}))
+    batch = {"q": np.zeros((3, 3)), "v": [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.5, 0.0]]}
+    complaint(ValueError, "of trajectory 2 are off the constraint", "[-0.5]", **(skid | batch))
+    points = {"q": None, "v": None, "q0": [0.0, 0.0, 0.0], "q1": [0.1, 0.025, 0.0]}
+    complaint(ValueError, "off the constraint", "[-0.25]", "choose q1 on the discrete constraint", **(skid | points))
+
+
+def test_both_ways_out_of_data_off_the_constraint():
+    q, v = [0.0, 0.0, 0.0], [1.0, 0.25, 0.0]
+    projected = dx.simulate(SKATE, PLUS, q=q, v=v, step=0.1, steps=3, project=True)
+    np.testing.assert_allclose(projected.q[-1], [0.3, 0.0, 0.0], atol=1e-15)
+    accepted = dx.simulate(SKATE, PLUS, q=q, v=v, step=0.1, steps=3, check_initial=False)
+    np.testing.assert_array_equal(accepted.p[0], v)
+
+
+def test_dependent_one_forms():
+    twice = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[1.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
+    words = ("one_forms must be independent", "shape (2, 3) has rank 1", "leave out")
+    complaint(ValueError, *words, system=twice, q=[0.0] * 3, v=[0.0, 1.0, 0.0])
+    complaint(ValueError, *words, system=twice, q=[0.0] * 3, v=[1.0, 1.0, 0.0], project=True)
+    sometimes = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.stack([jnp.stack([q[0], q[1], q[0]])]))
+    batch = {"q": [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], "v": np.zeros((2, 3))}
+    complaint(ValueError, "shape (1, 3) has rank 0", "of trajectory 1", system=sometimes, **batch)
+
+
+def test_a_lagrangian_singular_together_with_its_constraints():
+    """[PY] (21): q1 occurs neither in L's velocities nor in the constraint."""
+    loose = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - q[1] * q[0])
+    complaint(ValueError, "no unique solution", "(21)", "rank 1 of 2", "[0. 1.]", "singular together with", system=loose)
+    held = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2, lambda q: jnp.array([[1.0, 0.0, 0.0]]))
+    words = ("rank 2 of 4", "remove the coordinates that it does not determine")
+    complaint(ValueError, *words, system=held, q=[0.0] * 3, v=[0.0, 1.0, 0.0])
+    bound = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2, lambda q: jnp.array([[0.0, 1.0]]))
+    assert dx.simulate(bound, PLUS, q=[0.0, 1.0], v=[1.0, 0.0], step=0.1, steps=2).ok  # the constraint makes it regular
+
+
+def test_singular_only_in_one_trajectory_of_a_batch():
+    stiff = dx.LagrangeDirac(lambda q, v, params: v[0] ** 2 / 2 + params * v[1] ** 2 / 2)
+    batch = {"q": np.zeros((3, 2)), "v": np.ones((3, 2)), "params": np.array([1.0, 1.0, 0.0]), "batch_params": True}
+    complaint(ValueError, "rank 1 of 2", "of trajectory 2", system=stiff, **batch)
+
+
+def test_small_units_are_not_singular():
+    """Masses of 1e-30 and 1e30 together are regular."""
+    odd = dx.LagrangeDirac(lambda q, v: (1e-30 * v[0] ** 2 + 1e30 * v[1] ** 2) / 2)
+    sol = dx.simulate(odd, PLUS, q=[0.0, 0.0], v=[1.0, 2.0], step=0.5, steps=4)
+    np.testing.assert_allclose(sol.q[-1], [2.0, 4.0], rtol=1e-14)
+
+
+# ------------------------------------------------------------------------------------------------------------- in the run
+
+HALF_LINE = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.log(q[0]))
+"""q̈ = −1/q falls into q = 0, beyond which L is not defined, although its derivatives are."""
+
+
+def explicit_half_line(q, v, h, steps):
+    """The left rule written out: p_{k+1} = p_k − h/q_k, q_{k+1} = q_k + h p_{k+1}; up to the step before L_d is undefined."""
+    rows, p = [q], v
+    for _ in range(steps):
+        if q <= 0:
+            break
+        p = p - h / q
+        q = q + h * p
+        rows.append(q)
+    return np.array(rows)
+
+
+def test_leaving_the_domain_keeps_what_was_computed():
+    rows = explicit_half_line(1.0, 0.0, 0.01, 1000)
+    last = len(rows) - 1
+    assert 50 < last < 200
+    sol = dx.simulate(HALF_LINE, PLUS, q=[1.0], v=[0.0], step=0.01, steps=1000, t0=2.0)
+    assert sol.ok is False
+    np.testing.assert_allclose(sol.q[:, 0], rows, rtol=1e-10)
+    assert len(sol.t) == len(sol.q) == len(sol.p) == last + 1
+    assert sol.t[-1] == pytest.approx(2.0 + 0.01 * last)
+    time = f"{2.0 + 0.01 * last:.6g}"
+    assert sol.message.startswith(f"step {last + 1} (from t = {time}) failed: ")
+    assert "domain of the system's functions" in sol.message
+    assert sol.message.endswith(f"kept up to step {last} (t = {time}).")
+
+
+def test_the_last_good_step_is_kept_between_saved_rows():
+    every = explicit_half_line(1.0, 0.0, 0.01, 1000)
+    sol = dx.simulate(HALF_LINE, PLUS, q=[1.0], v=[0.0], step=0.01, steps=1000, save_every=64)
+    last = len(every) - 1
+    assert last % 64
+    np.testing.assert_allclose(sol.q[:, 0], np.append(every[:last:64], every[last]), rtol=1e-10)
+    np.testing.assert_allclose(sol.t, 0.01 * np.append(np.arange(0, last, 64), last))
+
+
+def test_the_rest_of_a_batch_goes_on():
+    q, v = np.array([[1.0], [1.0], [0.5]]), np.array([[0.0], [40.0], [0.0]])
+    sol = dx.simulate(HALF_LINE, PLUS, q=q, v=v, step=0.01, steps=200)
+    assert sol.ok.tolist() == [False, True, False]
+    for lane in (0, 2):
+        rows = explicit_half_line(q[lane, 0], v[lane, 0], 0.01, 200)
+        np.testing.assert_allclose(sol.q[lane, : len(rows), 0], rows, rtol=1e-10)
+        assert np.all(np.isnan(sol.q[lane, len(rows) :])) and np.all(np.isnan(sol.p[lane, len(rows) :]))
+        assert f"kept up to step {len(rows) - 1} " in sol.message[lane]
+    np.testing.assert_allclose(sol.q[1, :, 0], explicit_half_line(1.0, 40.0, 0.01, 200), rtol=1e-12)
+    assert sol.message[1] == ""
+
+
+def test_a_failed_run_inside_a_transformation_is_nan_not_silence():
+    def run(v):
+        sol = dx.simulate(HALF_LINE, PLUS, q=[0.1], v=jnp.stack([v]), step=0.01, steps=60)
+        return sol.q[:, 0], sol.ok
+
+    q, ok = jax.jit(run)(0.0)
+    rows = explicit_half_line(0.1, 0.0, 0.01, 60)
+    assert not ok and len(rows) < 60
+    np.testing.assert_allclose(q[: len(rows)], rows, rtol=1e-9)
+    assert np.all(np.isnan(q[len(rows) :]))
+
+
+def test_newton_that_does_not_converge():
+    sol = dx.simulate(OSCILLATOR, dx.PlusLagrangeDirac("midpoint"), q=[1.0], v=[0.0], step=0.1, steps=9, max_iterations=1)
+    assert not sol.ok and sol.q.shape == (1, 1)
+    assert "step 1 (from t = 0) failed: Newton did not converge in 1 iterations" in sol.message
+    assert "condition number 1" in sol.message and "smaller step may help" in sol.message
+
+
+def test_a_step_that_becomes_singular():
+    """The mass 1 − q1 of q0 is zero when q1 = k/8 arrives at 1."""
+    fading = dx.LagrangeDirac(lambda q, v: (1 - q[1]) * v[0] ** 2 / 2 + v[1] ** 2 / 2)
+    sol = dx.simulate(fading, PLUS, q=[0.0, 0.0], v=[0.0, 1.0], step=0.125, steps=20)
+    assert not sol.ok
+    np.testing.assert_array_equal(sol.q, np.stack([np.zeros(9), np.arange(9) / 8], axis=1))
+    assert "step 9 (from t = 1) failed: the Jacobian of the step is singular (condition number inf)" in sol.message
+    assert sol.message.endswith("kept up to step 8 (t = 1).")
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_ctrl_c_keeps_what_was_computed(batch):
+    """The signal itself, sent while the run reports its progress."""
+    seen = []
+
+    def stop(done, total):
+        seen.append((done, total))
+        if len(seen) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    shape = (3, 1) if batch else (1,)
+    q, v = np.ones(shape), np.zeros(shape)
+    sol = dx.simulate(OSCILLATOR, PLUS, q=q, v=v, step=1e-3, steps=10_000_000, progress=stop, save_every=5)
+    done = seen[-1][0]
+    assert seen[-1][1] == 10_000_000 and 0 < done < 10_000_000
+    row = sol.q[0] if batch else sol.q
+    message = sol.message[2] if batch else sol.message
+    assert not np.any(sol.ok)
+    assert message == f"interrupted by the user; kept up to step {done} (t = {done * 1e-3:.6g})."
+    kept = row[: done // 5 + 1, 0]
+    assert np.all(np.isfinite(kept)) and (batch or len(row) == len(kept))
+    angle = 2 * np.arcsin(1e-3 / 2)  # of the symplectic Euler method, q_k = cos((k + ½) θ)/cos(θ/2) from p_0 = 0
+    k = 5.0 * np.arange(len(kept))
+    np.testing.assert_allclose(kept, np.cos((k + 0.5) * angle) / np.cos(angle / 2), atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------------- names and files
+
+
+def test_unknown_gallery_names():
+    gallery = pytest.importorskip("dirax.gallery")
+    with pytest.raises(ValueError, match=r"no system 'rolling-disc' in the gallery: did you mean 'rolling-disk'\?"):
+        gallery.get("rolling-disc")
+
+
+def test_unreadable_files(tmp_path):
+    """More in test_storage.py."""
+    (tmp_path / "notes.nc").write_text("not a trajectory")
+    complaint_of(lambda: dx.load(tmp_path / "notes.nc"), ValueError, "notes.nc cannot be loaded")
+    complaint_of(lambda: dx.load(tmp_path / "nothing.nc"), FileNotFoundError, "there is no file", "check the path")
