@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines import xla
+from dirax.engines.choice import ENGINES, run_on
 from dirax.engines.result import Outcome, Problem, saved_steps
 from dirax.failures import explain
 from dirax.functions import check_finite, is_traced
@@ -15,8 +16,6 @@ from dirax.progress import reporting
 from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
 from dirax.solution import Solution
 from dirax.systems.system import AbstractSystem
-
-ENGINES = ("auto", "xla")
 
 
 def simulate(
@@ -95,7 +94,7 @@ def simulate(
         outcome = xla.run_traced(problem)
     else:
         with reporting(progress, steps) as report:
-            outcome = xla.run(problem, report)
+            outcome = run_on(engine, problem, report)
     return _solution(system, scheme, problem, outcome, start, data, traced)
 
 
@@ -228,10 +227,14 @@ def _is_number(leaf) -> bool:
     return isinstance(leaf, int | float) and not isinstance(leaf, bool)
 
 
+def _is_boolean(leaf) -> bool:
+    return isinstance(leaf, bool) or jnp.issubdtype(getattr(leaf, "dtype", object), jnp.bool_)
+
+
 def _arrays(params):
     """The pytree with arrays for its leaves."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
-        if not _is_number(leaf) and getattr(leaf, "dtype", type(leaf)) != bool:
+        if not _is_number(leaf) and not _is_boolean(leaf):
             raise TypeError(
                 f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {leaf!r:.60}: "
                 "use such a value in the system's functions directly."

@@ -1,0 +1,41 @@
+"""Which engine runs a problem: native for small systems on a CPU, xla for everything."""
+
+import jax
+
+from dirax.engines import xla
+from dirax.engines.result import Outcome, Problem, Progress
+
+ENGINES = ("auto", "xla", "native")
+
+LARGEST_NATIVE = 32
+"""Unknowns of a stage, or entries of the state, up to which "auto" takes the native engine."""
+
+
+def run_on(engine: str, problem: Problem, progress: Progress | None = None) -> Outcome:
+    """Run `problem` on the named engine; "auto" takes native where it can, and notes why where it cannot.
+
+    Raises `UnsupportedPrimitive` for `engine="native"` and a step that it cannot compile.
+    """
+    if engine == "xla":
+        return xla.run(problem, progress)
+    from dirax.engines import native  # the compiler is imported when it is used
+
+    if engine == "native":
+        return native.run(problem, progress)
+    reason = _too_large(problem) or _other_device() or native.supported(problem)
+    if reason is None:
+        return native.run(problem, progress)
+    outcome = xla.run(problem, progress)
+    outcome.notes["not_native"] = reason
+    return outcome
+
+
+def _too_large(problem: Problem) -> str | None:
+    size = max(max(stage.unknowns, stage.state_size) for stage, _ in problem.equation.stages)
+    return None if size <= LARGEST_NATIVE else f"{size} numbers a step, more than {LARGEST_NATIVE}"
+
+
+def _other_device() -> str | None:
+    device = jax.config.jax_default_device
+    platform = device.platform if hasattr(device, "platform") else device or jax.default_backend()
+    return None if platform == "cpu" else f"JAX computes on {platform}"
