@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 
 import dirax as dx
+from dirax import storage
 
 ENDINGS = (".zarr", ".nc")
 
@@ -235,14 +236,14 @@ def test_an_interrupted_save_leaves_the_old_file(moment, ending, tmp_path, batch
 
         monkeypatch.setattr(xr.Dataset, name, interrupted)
     else:
-        replace = dx.storage.os.rename if ending == ".zarr" else dx.storage.os.replace
+        replace = storage.os.rename if ending == ".zarr" else storage.os.replace
 
-        def interrupted(source, target):
+        def stopped(source, target):
             if str(target) == str(path) and "-old" not in str(source):
                 raise KeyboardInterrupt
             replace(source, target)
 
-        monkeypatch.setattr(dx.storage.os, "rename" if ending == ".zarr" else "replace", interrupted)
+        monkeypatch.setattr(storage.os, "rename" if ending == ".zarr" else "replace", stopped)
     with pytest.raises(KeyboardInterrupt):
         batch.save(path, overwrite=True)
     monkeypatch.undo()

@@ -76,7 +76,7 @@ def prepared(system, equation, data, params, h, t0, batch, batch_params: bool, p
     if "q0" in data and len(equation.stages) > 1:
         raise ValueError("a composition cannot start from q0= and q1=, which belong to one step: give q= with v= or p=.")
     axes = None if batch is None else (0, 0 if batch_params else None, None, None)
-    start = _begin(system, equation, data, params, h, t0, axes, project)
+    start = _begin(system, equation, data, params, jnp.asarray(h, float), jnp.asarray(t0, float), axes, project)
     if start.row0 is not None:
         row0 = {k: (a if batch is not None else a[None]) for k, a in start.row0.items()}
         start = start._replace(row0=row0 if is_traced(row0) else {k: np.asarray(a) for k, a in row0.items()})
