@@ -33,6 +33,7 @@ from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, 
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
 from dirax.simulate import simulate
 from dirax.solution import Solution
+from dirax.storage import load
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
@@ -89,6 +90,7 @@ __all__ = [
     "check_discretization_map",
     "cotangent_lift",
     "induced_dirac",
+    "load",
     "make_step_equation",
     "reconstruct",
     "reduce",

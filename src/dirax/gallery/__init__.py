@@ -1,0 +1,40 @@
+"""Ready-made systems with their sources' data: `names()`, `get(name)`, and the papers' figures drawn again."""
+
+import difflib
+from importlib import import_module
+
+from dirax.gallery.example import Coordinate, Example
+
+__all__ = ["Coordinate", "Example", "get", "names"]
+
+_MODULES = {
+    "rolling-disk": "rolling_disk",
+    "heisenberg": "heisenberg",
+    "kepler": "kepler",
+    "double-pendulum": "double_pendulum",
+    "henon-heiles": "henon_heiles",
+    "pendulum": "pendulum",
+    "rigid-body": "rigid_body",
+    "heavy-top": "heavy_top",
+    "kirchhoff": "kirchhoff",
+    "spherical-pendulums": "spherical_pendulums",
+}
+"""Name → the module here that defines `EXAMPLE`; a new system is a file and a line."""
+
+
+def names() -> tuple[str, ...]:
+    """The names of the gallery's systems."""
+    return tuple(_MODULES)
+
+
+def get(name: str) -> Example:
+    """The example of that name; capitals, spaces and underscores do not matter.
+
+    Raises `ValueError`, with the nearest name, for a name that is not in the gallery.
+    """
+    wanted = str(name).strip().lower().replace("_", "-").replace(" ", "-").replace("é", "e").replace("–", "-")
+    if wanted not in _MODULES:
+        near = difflib.get_close_matches(wanted, _MODULES, n=1, cutoff=0.4)
+        hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(_MODULES)}."
+        raise ValueError(f"no system {name!r} in the gallery: {hint}")
+    return import_module(f"dirax.gallery.{_MODULES[wanted]}").EXAMPLE

@@ -1,0 +1,41 @@
+"""The picture of the README: what a scheme does to a disk that rolls for a while."""
+
+from typing import Any
+
+import numpy as np
+
+from dirax.gallery.rolling_disk import EXAMPLE
+from dirax.plotting import BLUE, ENERGY_ERROR, GREEN, INK, VERMILION, new_figure, plot_error, save_figure, style
+from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
+
+SCHEMES = {
+    "(+) Lagrange–Dirac": (PlusLagrangeDirac(), VERMILION),
+    "(−) Lagrange–Dirac": (MinusLagrangeDirac(), BLUE),
+    "midpoint Lagrange–d’Alembert": (LagrangeDAlembert("midpoint", "midpoint"), GREEN),
+}
+
+
+def picture(path: Any, step: float = 0.01, end: float = 60.0) -> None:
+    """Draw the rolling disk's path and energy error by three schemes, with the exact path, into a file.
+
+    `path`: any format that matplotlib writes, by its ending; `step` and `end` in the disk's unit of time.
+    """
+    save_figure(draw(step, end), path)
+
+
+@style()
+def draw(step: float, end: float) -> Any:
+    """The picture as a matplotlib Figure."""
+    figure, (left, right) = new_figure(1, 2, size=(9.6, 4.4), width_ratios=(1, 1.15))
+    for name, (scheme, colour) in SCHEMES.items():
+        sol = EXAMPLE.simulate(scheme, step=step, steps=round(end / step))
+        left.plot(sol.q[:, 0], sol.q[:, 1], color=colour, lw=0.7, label=name)
+        plot_error(right, sol.t, sol.energy(), color=colour, lw=1.3, label=name)
+    exact = EXAMPLE.exact(np.arange(0, end, 0.02), **EXAMPLE.initial) if EXAMPLE.exact else None
+    assert exact is not None
+    left.plot(exact[:, 0], exact[:, 1], color=INK, lw=0.7, ls=(0, (3, 3)), label="exact")
+    left.set(xlabel="$x$", ylabel="$y$", title="Path of a rolling disk")
+    left.set_aspect("equal", adjustable="datalim")
+    right.set(xlabel="$t$", ylabel=ENERGY_ERROR, title=f"Error of its energy, h = {step:g}", xlim=(0, end))
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
