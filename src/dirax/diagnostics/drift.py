@@ -7,16 +7,19 @@ If it is bounded, these means scatter inside the band that every window shows; i
 - trend: a line through the means has a slope of more than SIGNIFICANT standard errors (the larger of the ordinary and the
   Newey–West one), the means of the four quarters of the run do not turn back by more than TURNING_BACK of their way, and
   the way is longer than the band of a typical window. Slow modulations are narrower than the band, or turn back;
-- departure: the means spread wider than the band of any window. This finds jumps, random walks and explosive growth.
+- departure: the means spread wider than the band of any window, and GROWTH times wider over the run than over a typical
+  quarter of it (a random walk: twice as wide; waves: not). This finds random walks and explosive growth.
 
 Each is asked for three numbers of windows, and must hold for all, so that no oscillation in step with the windows passes.
 A series is judged only after the motion has gone through a few oscillations: before, nothing can tell a drift from one.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
+
+from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED
 
 WINDOW_COUNTS = (24, 32, 40)
 SMALLEST_SERIES = 8 * max(WINDOW_COUNTS)
@@ -24,10 +27,60 @@ SMALLEST_SERIES = 8 * max(WINDOW_COUNTS)
 
 SIGNIFICANT = 5.0
 TURNING_BACK = 0.1
+GROWTH = 1.5
 OSCILLATIONS_FOR_TREND = 3
 OSCILLATIONS_FOR_DEPARTURE = 10
 MOVING = 1e-9
 """Relative range below which a component of the motion counts as constant."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict on a series: "bounded", "drifts" or "not checked", why, how far it went, and what could be told.
+
+    `drift` is the change of level over the run (the range of a series that could not be judged), `told` the smallest
+    drift that would have been noticed, `details` the numbers behind it by name.
+    """
+
+    verdict: str
+    text: str
+    drift: float
+    told: float
+    details: dict[str, float] = field(default_factory=dict)
+
+
+def judge(
+    t: Float[np.ndarray, " N"], series: Float[np.ndarray, " N"], motion: Float[np.ndarray, "N d"], roundoff: float
+) -> Judgement:
+    """The Judgement of `series` at the times `t`, of a system that moves as `motion`; changes below `roundoff` are none."""
+    if len(series) < 2:
+        return Judgement(NOT_CHECKED, "fewer than two rows were computed", 0.0, roundoff)
+    width = float(np.ptp(series))
+    if width <= roundoff:
+        return Judgement(BOUNDED, f"constant up to roundoff, within {width:.2g}", width, roundoff, {"band": width})
+    if len(series) < SMALLEST_SERIES:
+        text = f"it moved by {width:.2g}; {len(series)} rows are too few to tell a drift ({SMALLEST_SERIES} needed)"
+        return Judgement(NOT_CHECKED, text, width, roundoff, {"band": width})
+    found, turns = analyse(t, series), oscillations(motion)
+    told = max(roundoff, found.band, SIGNIFICANT * found.standard_error * float(t[-1] - t[0]))
+    rate = f"{found.slope:.2g} ± {found.standard_error:.1g} per unit of time"
+    trend = found.trend and abs(found.drift) > roundoff
+    if trend and turns >= OSCILLATIONS_FOR_TREND:
+        verdict, text = DRIFTS, f"steady trend of {rate}, out of a band of {found.band:.2g}"
+    elif found.departure and turns >= OSCILLATIONS_FOR_DEPARTURE:
+        verdict, text = DRIFTS, f"leaves its band of {found.band:.2g}; mean rate {rate}"
+    elif trend or found.departure:
+        verdict = NOT_CHECKED
+        text = f"it moved by {width:.2g}, but {turns:.3g} oscillations are too few to call that a drift"
+    else:
+        verdict, text = BOUNDED, f"slope {rate}, in a band of {found.band:.2g}"
+    details = {
+        "slope": found.slope,
+        "standard_error": found.standard_error,
+        "band": found.band,
+        "oscillations": turns,
+    }
+    return Judgement(verdict, text, found.drift, told, details)
 
 
 @dataclass(frozen=True)
@@ -65,7 +118,9 @@ def analyse(t: Float[np.ndarray, " N"], series: Float[np.ndarray, " N"]) -> Tren
 def _analyse(t, series, count: int) -> Trend:
     times, means, bands = windows(t, series, count)
     slope, error = regression(times, means)
-    quarters = np.array([part.mean() for part in np.split(means, 4)])
+    parts = np.split(means, 4)
+    quarters = np.array([part.mean() for part in parts])
+    spread, usual = float(np.ptp(means)), float(np.median([np.ptp(part) for part in parts]))
     way = quarters[-1] - quarters[0]
     back = np.min(np.diff(quarters) * np.sign(way))
     drift, band = 4 / 3 * way, float(np.median(bands))  # the quarters' centres are three quarters of the run apart
@@ -76,7 +131,7 @@ def _analyse(t, series, count: int) -> Trend:
         drift=float(drift),
         band=band,
         trend=bool(abs(slope) > SIGNIFICANT * error and steady and abs(drift) > band),
-        departure=bool(np.ptp(means) > np.max(bands)),
+        departure=spread > max(np.max(bands), GROWTH * usual),
     )
 
 

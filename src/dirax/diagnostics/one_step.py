@@ -4,11 +4,13 @@ All are functions of saved rows, traceable, and independent of how the step was 
 step map through the engine's solve. Each defect is relative to the size of what should cancel in it.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.engines.xla import first_lane, take_step
@@ -17,9 +19,13 @@ from dirax.geometry.structures import canonical_two_form
 from dirax.geometry.tulczyjew import minus_dirac_differential, plus_dirac_differential, slot_derivatives
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_lagrangian
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
+from dirax.solution import Solution
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 MAX_ITERATIONS = 50
+
+CHUNK = 4096
+"""Rows that go through a function at once."""
 
 Vector = Float[Array, " n"]
 Scalar = Float[Array, ""]
@@ -145,7 +151,7 @@ def condition_number(equation: Any, unknowns, state, t, h, params) -> Scalar:
     return values[0] / values[-1]
 
 
-def symplecticity_defect(system: Any, equation: Any, data: dict, t, h, params) -> Float[Array, "2"]:
+def symplecticity_defect(system: Any, equation: Any, h, data: dict, t, params) -> Float[Array, "2"]:
     """(‖JᵀΩJ − Ω‖ relative to ‖|J|ᵀ|Ω||J|‖, condition number) of the step from saved data, J = ∂(q', p')/∂(q, p).
 
     Entries are the largest ones after q and p were brought to balanced units, q → q√s, p → p/√s.
@@ -213,6 +219,31 @@ def structural_defect(discrete: DiscreteSystem, equation: Any, q0: Vector, q1: V
     state = jnp.concatenate([q1, d2(q0, q1)])
     condition = condition_number(equation, unknowns, state, t, h, params)
     return jnp.stack([restricted(change - dbeta) / size, restricted(change) / size, condition])
+
+
+def over_rows(function: Callable, sol: Solution, items: tuple) -> np.ndarray:
+    """function(*item, params) for every row of `items`, whose leaves have the shape (rows, …) or (B, rows, …).
+
+    The result is (B, rows, …), with B = 1 for one trajectory. Rows go through in pieces, so that memory stays bounded;
+    an `eqx.Partial` of a function of the module is compiled once.
+    """
+    if sol.batch is None:
+        items = jax.tree.map(lambda a: a[None], items)
+    rows = jax.tree.leaves(items)[0].shape[1]
+    size = max(1, CHUNK // (sol.batch or 1)) if rows * (sol.batch or 1) > CHUNK else rows
+    axis = 0 if sol.batch_params and sol.params is not None else None
+    found = []
+    for start in range(0, rows, size):
+        numbers = np.minimum(np.arange(start, start + size), rows - 1)  # the last piece repeats its last row
+        piece = jax.tree.map(lambda a, numbers=numbers: jnp.asarray(a[:, numbers]), items)
+        found.append(np.asarray(_piece(function, piece, sol.params, axis))[:, : rows - start])
+    return np.concatenate(found, axis=1)
+
+
+@eqx.filter_jit
+def _piece(function, items, params, axis):
+    lane = jax.vmap(lambda item, params: function(*item, params), in_axes=(0, None))
+    return jax.vmap(lane, in_axes=(0, axis))(items, params)
 
 
 def nonzero(values):

@@ -8,21 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.drift import (
-    OSCILLATIONS_FOR_DEPARTURE,
-    OSCILLATIONS_FOR_TREND,
-    SMALLEST_SERIES,
-    analyse,
-    oscillations,
-)
+from dirax.diagnostics.drift import judge
 from dirax.diagnostics.one_step import (
     DiscreteSystem,
     discrete_system,
     membership_defect,
+    over_rows,
     structural_defect,
     symplecticity_defect,
 )
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, OK, VIOLATED, Line, Report
+from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.solution import Solution
 from dirax.systems.port_hamiltonian import PortHamiltonian
 
@@ -35,8 +31,6 @@ SAMPLED_STEPS = 8
 
 SAMPLED_ROWS = 64
 """Rows at which natural scales are taken."""
-
-CHUNK = 4096
 
 Symmetries = Mapping[str, Callable] | Sequence[int] | None
 
@@ -102,7 +96,7 @@ def _membership(sol: Solution, tolerance: float | None) -> Line:
     if sol.rows < 3:
         return Line(name, None, None, NOT_CHECKED, f"needs three points, but only {sol.rows} were saved")
     q = jnp.asarray(sol.q)
-    values = _over_rows(_Membership(found), sol, (q[..., :-2, :], q[..., 1:-1, :], q[..., 2:, :]))
+    values = over_rows(eqx.Partial(membership_defect, found), sol, (q[..., :-2, :], q[..., 1:-1, :], q[..., 2:, :]))
     if "q0" in sol.initial and found.sign == "+":
         values[:, 0, 0] = 0.0  # the first pair was given, not computed
     lane, row = _worst(np.max(values, axis=-1))
@@ -137,20 +131,28 @@ def _constraint(sol: Solution, tolerance: float | None) -> Line | None:
     )
     if given:
         text += f"; the pair given at the start is off by {np.nanmax(residual[:, 0]):.2g}"
+    if not steps and isinstance(sol.scheme, DiscreteDirac) and sol.scheme.constraints == "discretize":
+        text = f"Method 1 imposes it inside each step; at the rows it is off by {np.nanmax(residual):.2g}"
+        return Line(name, float(np.nanmax(values)), None, NOT_CHECKED, text)
     return _judged(sol, name, np.nanmax(values, axis=1), _limit(tolerance, 1), text)
 
 
 def _constraint_scale(sol: Solution) -> float:
-    """The size of the constraint's terms: |W||v|, where W is known; else the largest saved number."""
+    """The size of the constraint's terms: |W||v|, where W is known; else the largest saved number, or term of dE."""
     found = discrete_system(sol.system, sol.scheme, sol.step)
     if isinstance(found, DiscreteSystem):
         q = np.asarray(sol.q)
         speed = np.abs(np.diff(q, axis=-2)) / (sol.step * sol.save_every)
         speed = np.nanmax(speed, axis=tuple(range(speed.ndim - 1)), initial=0.0) + 1.0
-        sizes = _over_rows(_Forms(found), sol, q[..., _spread(sol.rows, SAMPLED_ROWS), :])
+        sizes = over_rows(eqx.Partial(_size_of_forms, found), sol, (q[..., _spread(sol.rows, SAMPLED_ROWS), :],))
         return float(np.max(np.nanmax(sizes, axis=(0, 1)) @ speed, initial=0.0)) or 1.0
     nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
-    return float(max(1.0, *(np.nanmax(np.abs(a)) for a in nodes)))
+    terms = 0.0 if sol.system is None else float(np.nanmax(_sensitivities(sol)))
+    return float(max(1.0, terms, *(np.nanmax(np.abs(a)) for a in nodes)))
+
+
+def _size_of_forms(discrete: DiscreteSystem, q, params: Any):
+    return jnp.abs(discrete.system.constraint_matrix(q, params))
 
 
 # ---------------------------------------------------------------------------------------------- along the trajectory
@@ -168,59 +170,18 @@ def _energy(sol: Solution) -> Line:
     if isinstance(system, PortHamiltonian) and (system.R is not None or system.inputs is not None):
         change = float(np.nanmax(np.abs(energy - energy[:, :1])))
         return Line(name, change, None, NOT_CHECKED, f"the system does not conserve it; it changed by {change:.3g}")
-    found = [_EnergyTrend(sol, lane, series, roundoff) for lane, series in enumerate(energy)]
-    worst = max(found, key=lambda f: (f.rank, abs(f.drift)))
+    t, found = np.asarray(sol.t), []
+    for lane, series in enumerate(energy):
+        good = np.isfinite(series)
+        found.append(judge(t[good], series[good], _motion(sol, lane)[good], roundoff))
+    order = (NOT_CHECKED, BOUNDED, DRIFTS)
+    lane = max(range(len(found)), key=lambda i: (order.index(found[i].verdict), abs(found[i].drift)))
+    worst = found[lane]
     details: dict[str, Any] = {**worst.details, "roundoff": roundoff}
     if sol.batch is not None:
         details["per_trajectory"] = [f.drift for f in found]
         details["verdicts"] = [f.verdict for f in found]
-    text = worst.text + _lane(sol, worst.lane)
-    return Line(name, abs(worst.drift), max(roundoff, worst.told), worst.verdict, text, details)
-
-
-class _EnergyTrend:
-    """The verdict on the energy of one trajectory."""
-
-    def __init__(self, sol: Solution, lane: int, energy: np.ndarray, roundoff: float):
-        good = np.isfinite(energy)
-        t, energy = np.asarray(sol.t)[good], energy[good]
-        band = float(np.ptp(energy)) if len(energy) else np.nan
-        self.lane, self.drift, self.told, self.details = lane, band, 0.0, {"band": band}
-        if len(energy) < 2:
-            self.verdict, self.text = NOT_CHECKED, "fewer than two rows were computed"
-        elif band <= roundoff:
-            self.verdict, self.text = BOUNDED, f"constant up to roundoff: all of it within {band:.2g}"
-        elif len(energy) < SMALLEST_SERIES:
-            self.verdict = NOT_CHECKED
-            self.text = f"{len(energy)} rows are too few to tell a drift ({SMALLEST_SERIES} are needed); it moved by {band:.2g}"
-        else:
-            self._judge(t, energy, oscillations(_motion(sol, lane)[good]), roundoff)
-        self.rank = (NOT_CHECKED, BOUNDED, DRIFTS).index(self.verdict)
-
-    def _judge(self, t, energy, turns: float, roundoff: float):
-        found = analyse(t, energy)
-        duration = float(t[-1] - t[0])
-        self.drift = found.drift
-        self.told = max(found.band, 5 * found.standard_error * duration)
-        self.details = {
-            "slope": found.slope,
-            "standard_error": found.standard_error,
-            "band": found.band,
-            "drift": found.drift,
-            "oscillations": turns,
-        }
-        rate = f"{found.slope:.2g} ± {found.standard_error:.1g} per unit of time"
-        moving = abs(found.drift) > roundoff or found.departure
-        trend, departure = found.trend and moving, found.departure
-        if trend and turns >= OSCILLATIONS_FOR_TREND:
-            self.verdict, self.text = DRIFTS, f"steady trend of {rate}, out of a band of {found.band:.2g}"
-        elif departure and turns >= OSCILLATIONS_FOR_DEPARTURE:
-            self.verdict, self.text = DRIFTS, f"leaves its band of {found.band:.2g} for good; mean rate {rate}"
-        elif trend or departure:
-            self.verdict = NOT_CHECKED
-            self.text = f"moved by {np.ptp(energy):.2g}, but {turns:.3g} oscillations are too few to call it a drift"
-        else:
-            self.verdict, self.text = BOUNDED, f"slope {rate}, in a band of {found.band:.2g}"
+    return Line(name, abs(worst.drift), worst.told, worst.verdict, worst.text + _lane(sol, lane), details)
 
 
 def _motion(sol: Solution, lane: int) -> np.ndarray:
@@ -233,25 +194,38 @@ def _motion(sol: Solution, lane: int) -> np.ndarray:
 def _energy_scale(sol: Solution, energy: np.ndarray) -> float:
     """|E| + |∂E/∂row| |row|, the largest: what roundings of the rows do to the energy, in units of ε."""
     scale = float(np.nanmax(np.abs(energy)))
-    if sol.system is None:
-        return scale
+    return scale if sol.system is None else scale + float(np.nanmax(_sensitivities(sol)))
+
+
+def _sensitivities(sol: Solution) -> np.ndarray:
+    """Σ |∂E/∂row_i| |row_i| at a few rows."""
     rows = _spread(sol.rows, SAMPLED_ROWS)
     lead = (slice(None),) * (sol.batch is not None)
     nodes = {k: np.asarray(a)[(*lead, rows)] for k, a in sol.fields.items() if sol.field_info[k].place == "node"}
-    return scale + float(np.nanmax(_over_rows(_EnergySensitivity(sol.system), sol, nodes)))
+    return over_rows(eqx.Partial(_energy_terms, sol.system), sol, (nodes,))
+
+
+def _energy_terms(system: Any, row: dict, params: Any):
+    gradient = jax.grad(lambda row: system.energy_at(row, params))(row)
+    return sum(jnp.sum(jnp.abs(gradient[name] * row[name])) for name in row)
 
 
 def _momentum(sol: Solution, name: str, generator: Callable, tolerance: float | None) -> Line:
     title = f"momentum map {name}"
     if "p" not in sol.fields or "q" not in sol.fields:
         return Line(title, None, None, NOT_CHECKED, "the solution has no q and p")
-    values = _over_rows(_MomentumMap(generator), sol, (jnp.asarray(sol.q), jnp.asarray(sol.p)))
+    values = over_rows(eqx.Partial(_momentum_terms, generator), sol, (jnp.asarray(sol.q), jnp.asarray(sol.p)))
     change = np.nanmax(np.abs(values[..., 0] - values[:, :1, 0]), axis=1)
     scale = np.nanmax(values[..., 1], axis=1)
     relative = np.divide(change, scale, out=np.zeros_like(change), where=scale > 0)
     lane = int(np.argmax(relative))
     text = f"⟨p, ξ⟩ = {values[lane, 0, 0]:.6g} changed by at most {change[lane]:.2g}{_lane(sol, lane)}"
     return _judged(sol, title, relative, _limit(tolerance, _steps(sol)), text)
+
+
+def _momentum_terms(generator: Callable, q, p, params: Any):
+    terms = p * generator(q)
+    return jnp.stack([jnp.sum(terms), jnp.sum(jnp.abs(terms))])
 
 
 def _generators(sol: Solution, symmetries: Symmetries) -> dict[str, Callable]:
@@ -277,8 +251,12 @@ def _generators(sol: Solution, symmetries: Symmetries) -> dict[str, Callable]:
     for index in symmetries:
         if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
             raise ValueError(f"symmetries must name coordinates by whole numbers from 0 to {n - 1}, but {index!r} was given.")
-        found[f"p[{int(index)}]"] = _Translation(int(index))
+        found[f"p[{int(index)}]"] = eqx.Partial(_translation, int(index))
     return found
+
+
+def _translation(index: int, q):
+    return jnp.zeros_like(q).at[index].set(1.0)
 
 
 def _check_generator(name: str, generator: Callable, n: int) -> None:
@@ -316,11 +294,14 @@ def _symplecticity(sol: Solution, tolerance: float | None) -> Line:
         assert isinstance(found, DiscreteSystem)
         q = jnp.asarray(sol.q)
         items = (q[..., rows, :], q[..., rows + 1, :], _times(sol, rows + 1))
-        values = _over_rows(_Structural(found, sol.equation), sol, items)
+        values = over_rows(eqx.Partial(structural_defect, found, sol.equation), sol, items)
     else:
         data = {k: jnp.asarray(sol.fields[k])[..., rows, :] for k in (("x",) if "x" in sol.fields else ("q", "p"))}
         items = (data, _times(sol, rows))
-        values = _over_rows(_Symplectic(sol.system, sol.equation, sol.step), sol, items)
+        try:
+            values = over_rows(eqx.Partial(symplecticity_defect, sol.system, sol.equation, sol.step), sol, items)
+        except (KeyError, TypeError, ValueError) as error:  # a user's `start` that takes other data than the saved ones
+            return Line(name, None, None, NOT_CHECKED, f"the scheme cannot start from a saved row: {error}")
     defect, condition = values[..., 0], float(np.max(values[..., -1], where=np.isfinite(values[..., -1]), initial=1.0))
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")
@@ -345,91 +326,6 @@ def _sampled(sol: Solution) -> np.ndarray:
 def _times(sol: Solution, rows: np.ndarray):
     t = jnp.asarray(sol.t)[rows]
     return t if sol.batch is None else jnp.broadcast_to(t, (sol.batch, len(rows)))
-
-
-# ------------------------------------------------------------------- functions of one row, hashable so that they compile once
-
-
-class _Membership(eqx.Module):
-    discrete: DiscreteSystem
-
-    def __call__(self, item, params):
-        q0, q1, q2 = item
-        return membership_defect(self.discrete, q0, q1, q2, params)
-
-
-class _Forms(eqx.Module):
-    discrete: DiscreteSystem
-
-    def __call__(self, q, params):
-        return jnp.abs(self.discrete.system.constraint_matrix(q, params))
-
-
-class _EnergySensitivity(eqx.Module):
-    system: Any
-
-    def __call__(self, row, params):
-        gradient = jax.grad(lambda row: self.system.energy_at(row, params))(row)
-        return sum(jnp.sum(jnp.abs(gradient[name] * row[name])) for name in row)
-
-
-class _MomentumMap(eqx.Module):
-    generator: Callable
-
-    def __call__(self, item, params):
-        q, p = item
-        terms = p * self.generator(q)
-        return jnp.stack([jnp.sum(terms), jnp.sum(jnp.abs(terms))])
-
-
-class _Translation(eqx.Module):
-    index: int = eqx.field(static=True)
-
-    def __call__(self, q):
-        return jnp.zeros_like(q).at[self.index].set(1.0)
-
-
-class _Symplectic(eqx.Module):
-    system: Any
-    equation: Any
-    step: Any
-
-    def __call__(self, item, params):
-        data, t = item
-        return symplecticity_defect(self.system, self.equation, data, t, self.step, params)
-
-
-class _Structural(eqx.Module):
-    discrete: DiscreteSystem
-    equation: Any
-
-    def __call__(self, item, params):
-        q0, q1, t = item
-        return structural_defect(self.discrete, self.equation, q0, q1, t, params)
-
-
-def _over_rows(function: Callable, sol: Solution, items: Any) -> np.ndarray:
-    """function(item, params) for every row of `items`, whose leaves have the shape (rows, …) or (B, rows, …).
-
-    The result is (B, rows, …), with B = 1 for one trajectory. Rows go through in pieces, so that memory stays bounded.
-    """
-    if sol.batch is None:
-        items = jax.tree.map(lambda a: a[None], items)
-    rows = jax.tree.leaves(items)[0].shape[1]
-    size = max(1, CHUNK // (sol.batch or 1)) if rows * (sol.batch or 1) > CHUNK else rows
-    axis = 0 if sol.batch_params and sol.params is not None else None
-    found = []
-    for start in range(0, rows, size):
-        numbers = np.minimum(np.arange(start, start + size), rows - 1)  # the last piece repeats its last row
-        piece = jax.tree.map(lambda a, numbers=numbers: jnp.asarray(a[:, numbers]), items)
-        found.append(np.asarray(_piece(function, piece, sol.params, axis))[:, : rows - start])
-    return np.concatenate(found, axis=1)
-
-
-@eqx.filter_jit
-def _piece(function, items, params, axis):
-    lane = jax.vmap(function, in_axes=(0, None))
-    return jax.vmap(lane, in_axes=(0, axis))(items, params)
 
 
 # ---------------------------------------------------------------------------------------------------------- small things

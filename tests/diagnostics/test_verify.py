@@ -1,0 +1,470 @@
+"""verify(): what holds is called ok, what is broken on purpose is found, and drift is told from bounded oscillation."""
+
+import json
+
+import equinox as eqx
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+import dirax as dx
+from dirax.diagnostics.drift import SMALLEST_SERIES, judge, oscillations
+from dirax.diagnostics.one_step import discrete_system, membership_defect, structural_defect
+from dirax.diagnostics.report import Line, Report
+from dirax.diagnostics.verify import EPSILON, ROUNDINGS, verify
+from dirax.schemes.step import explicit_step
+
+MASSES = np.array([1.0, 1.0, 0.25, 0.5])
+
+
+def disk_lagrangian(q, v):
+    return v @ (jnp.asarray(MASSES) * v) / 2 - 10 * jnp.sin(q[2])
+
+
+def disk_forms(q):
+    c, s = jnp.cos(q[3]), jnp.sin(q[3])
+    return jnp.array([[1.0, 0.0, -c, 0.0], [0.0, 1.0, -s, 0.0]])
+
+
+DISK = dx.LagrangeDirac(disk_lagrangian, disk_forms)
+KEPLER = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 1 / jnp.sqrt(q @ q))
+KEPLER_START = {"q": [0.4, 0.0], "v": [0.0, 2.0]}
+ROTATION = {"rotation": lambda q: jnp.array([-q[1], q[0]])}
+
+
+def double_pendulum(q, v):
+    kinetic = v[0] ** 2 + v[1] ** 2 / 2 + v[0] * v[1] * jnp.cos(q[0] - q[1])
+    return kinetic + 9.81 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+
+
+def run_disk(scheme, steps=50_000):
+    """The vertical rolling disk with the data printed in [PY] §8.1."""
+    points = {"q0": [0.0, 0.0, 0.0, np.pi / 3], "q1": [0.005, 0.0086603, 0.01, 1.0481976]}
+    return dx.simulate(DISK, scheme, step=1e-3, steps=steps, check_initial=False, **points)
+
+
+class OneStep(dx.AbstractScheme):
+    """A user's explicit scheme on T*Q for L = m v²/2 − V(q): `kind` "euler" or "verlet"."""
+
+    kind: str = eqx.field(static=True)
+    mass: float = eqx.field(static=True, default=1.0)
+
+    def step_equation(self, system, shape):
+        n = shape.n
+
+        def force(q):
+            return jax.grad(lambda q: system.lagrangian(q, jnp.zeros(n), None))(q)
+
+        def advance(u, state, t, h, params):
+            q, p = state[:n], state[n:]
+            if self.kind == "euler":
+                return jnp.concatenate([q + h * p / self.mass, p + h * force(q)])
+            half = p + h / 2 * force(q)
+            q = q + h * half / self.mass
+            return jnp.concatenate([q, half + h / 2 * force(q)])
+
+        return dx.StepEquation(
+            start=lambda data, h, params: (jnp.concatenate([data["q"], data["p"]]), jnp.zeros(0)),
+            residual=explicit_step,
+            advance=advance,
+            unpack=lambda state, u, t, h, params: {"q": state[:n], "p": state[n:]},
+            state_size=2 * n,
+            unknowns=0,
+            fields={"q": dx.Field((n,)), "p": dx.Field((n,))},
+            canonical=True,
+        )
+
+
+def changed(sol, **changes):
+    """The same solution with some of its attributes replaced."""
+    run = "t fields field_info step save_every stats ok message".split()  # noqa: SIM905
+    given = "system scheme equation params batch_params initial".split()  # noqa: SIM905
+    return dx.Solution(**({name: getattr(sol, name) for name in run + given} | changes))
+
+
+@pytest.fixture(scope="module")
+def plus_disk():
+    return run_disk(dx.PlusLagrangeDirac())
+
+
+@pytest.fixture(scope="module")
+def minus_disk():
+    return run_disk(dx.MinusLagrangeDirac())
+
+
+@pytest.fixture(scope="module")
+def kepler():
+    return dx.simulate(KEPLER, dx.PlusLagrangeDirac("midpoint"), step=0.02, steps=8000, **KEPLER_START)
+
+
+# ------------------------------------------------------------------------------------------ the rolling disk of [PY] §8.1
+
+
+@pytest.mark.parametrize(("name", "direction"), [("plus_disk", 1), ("minus_disk", -1)])
+def test_the_energy_of_the_one_sided_schemes_on_the_disk_drifts(request, name, direction):
+    sol = request.getfixturevalue(name)
+    report = verify(sol, [3])
+    energy = np.asarray(sol.energy())
+    line = report["energy"]
+    assert line.verdict == "drifts"
+    assert not report.ok
+    # theory.md: E − E0 reaches 2.62 for (+) and −2.42 for (−), in 50 units of time
+    assert line.details["slope"] == pytest.approx((energy[-5000:].mean() - energy[:5000].mean()) / 45, rel=0.02)
+    assert np.sign(line.details["slope"]) == direction
+    assert line.details["standard_error"] < 0.02 * abs(line.details["slope"])
+
+
+@pytest.mark.parametrize("name", ["plus_disk", "minus_disk"])
+def test_everything_else_holds_on_the_disk(request, name):
+    report = verify(request.getfixturevalue(name), [3])
+    sign = "(+)" if name == "plus_disk" else "(−)"
+    others = [line for line in report.lines if line.quantity != "energy"]
+    assert [line.quantity for line in others] == [
+        "steps solved",
+        f"{sign}-discrete Dirac structure",
+        "constraint",
+        "momentum map p[3]",
+        "structural relation φ*Ω = Ω + dβ",
+    ]
+    assert {line.verdict for line in others} == {"ok"}
+    assert "the pair given at the start is off by" in report["constraint"].explanation
+
+
+def test_the_midpoint_scheme_on_the_disk_is_bounded():
+    report = verify(run_disk(dx.LagrangeDAlembert()))
+    assert report["energy"].verdict == "bounded"
+    assert report.ok, report
+
+
+def test_a_trajectory_of_the_other_sign_is_not_a_member(plus_disk):
+    report = verify(changed(plus_disk, scheme=dx.MinusLagrangeDirac()))
+    assert report["(−)-discrete Dirac structure"].verdict == "VIOLATED"
+
+
+@pytest.mark.parametrize(("coordinate", "row"), [(0, 700), (2, 1), (3, 40_000)])
+def test_a_point_moved_by_a_millionth_is_found(plus_disk, coordinate, row):
+    q = np.array(plus_disk.q)
+    q[row, coordinate] += 1e-6
+    line = verify(changed(plus_disk, fields=plus_disk.fields | {"q": q}))["(+)-discrete Dirac structure"]
+    assert line.verdict == "VIOLATED"
+    worst = float(line.explanation.split("t = ")[1].split(":")[0])
+    assert abs(worst - row * 1e-3) < 2.5e-3
+
+
+def test_membership_is_that_of_the_printed_formulas(plus_disk):
+    """[PY] §8.1: the simplified equations of the disk, which have neither momenta nor multipliers."""
+    q = np.asarray(plus_disk.q)[200:203]
+    h, acceleration = 1e-3, MASSES * (q[0] - 2 * q[1] + q[2]) / 1e-3
+    force = acceleration + h * np.array([0.0, 0.0, 10 * np.cos(q[1, 2]), 0.0])
+    matrix = np.asarray(disk_forms(q[1]))
+    residual = force - matrix.T @ np.linalg.lstsq(matrix.T, force, rcond=None)[0]
+    assert np.max(np.abs(residual)) < 1e-11 < 1e-3 < np.max(np.abs(force))
+    discrete = discrete_system(DISK, dx.PlusLagrangeDirac(), h)
+    assert np.max(eqx.filter_jit(membership_defect)(discrete, *q, None)) < EPSILON
+
+
+# -------------------------------------------------------------------------------------- the structural relation φ*Ω = Ω + dβ
+
+
+def disk_map(z, h):
+    """(q1, q2, F) of the (−) scheme for z = (q0, q1): a linear system, so that complex steps differentiate it."""
+    q0, q1 = z[:4], z[4:]
+    c, s = np.cos(q1[3]), np.sin(q1[3])
+    w = np.array([[1, 0, -c, 0], [0, 1, -s, 0]])
+    mass = np.diag(MASSES)
+    p = mass @ (q1 - q0) / h
+    gradient = np.array([0, 0, 10 * np.cos(q1[2]), 0])
+    system = np.block([[mass, w.T], [w, np.zeros((2, 2))]])
+    solved = np.linalg.solve(system, np.concatenate([p - h * gradient, np.zeros(2)]))
+    return np.concatenate([q1, q1 + h * solved[:4]]), w.T @ solved[4:]
+
+
+def complex_step(function, z):
+    columns = [np.imag(function(z + 1e-100j * e)) / 1e-100 for e in np.eye(len(z))]
+    return np.stack(columns, axis=1)
+
+
+def test_the_structural_relation_agrees_with_an_independent_computation(minus_disk):
+    h, (q0, q1) = 1e-3, np.asarray(minus_disk.q)[5000:5002]
+    z = np.concatenate([q0, q1])
+    jacobian = complex_step(lambda z: disk_map(z, h)[0], z)
+    form = np.block([[np.zeros((4, 4)), np.diag(MASSES) / h], [-np.diag(MASSES) / h, np.zeros((4, 4))]])
+    change = jacobian.T @ form @ jacobian - form
+    derivative = complex_step(lambda z: disk_map(z, h)[1], z)
+    over_second = np.concatenate([np.zeros((4, 8)), derivative])
+    over_first = np.concatenate([derivative, np.zeros((4, 8))])
+    w_d = np.concatenate([-np.asarray(disk_forms(q0)), np.asarray(disk_forms(q0))], axis=1)
+    w_d[:, 3] += np.array([np.sin(q0[3]), -np.cos(q0[3])]) * (q1 - q0)[2]
+    tangent = np.linalg.svd(w_d)[2][2:].T
+    restrict = lambda form: np.max(np.abs(tangent.T @ form @ tangent))
+    assert restrict(change - (over_second.T - over_second)) < 1e-11 * np.max(form)
+    # printed with β over the first point of the pair, the relation is wrong (by h|v| of the force's part, for small h)
+    assert restrict(change - (over_first.T - over_first)) > 1e-2 * restrict(change) > 1e-5 * np.max(form)
+
+    discrete = discrete_system(DISK, dx.MinusLagrangeDirac(), h)
+    measured = eqx.filter_jit(structural_defect)(discrete, minus_disk.equation, q0, q1, 0.0, None)
+    size = np.max(np.abs(jacobian).T @ np.abs(form) @ np.abs(jacobian)) + np.max(np.abs(derivative))
+    assert measured[0] < 1e-14
+    assert measured[1] == pytest.approx(restrict(change) / size, rel=1e-9)
+
+
+def test_a_force_outside_the_annihilator_breaks_the_structural_relation():
+    """The Heisenberg system, judged by constraint forces of other one-forms than those that act."""
+    free = lambda q, v: v @ v / 2
+    heisenberg = dx.LagrangeDirac(free, lambda q: jnp.array([[-q[1], q[0], 1.0]]))
+    scheme = dx.MinusLagrangeDirac()
+    equation = dx.make_step_equation(scheme, heisenberg, dx.Shape(3, 1))
+    measure = eqx.filter_jit(structural_defect)
+    q0, q1 = np.array([1.0, 0.2, 0.1]), np.array([1.05, 0.3, 0.01])
+    assert measure(discrete_system(heisenberg, scheme, 0.01), equation, q0, q1, 0.0, None)[0] < 1e-14
+    other = dx.LagrangeDirac(free, lambda q: jnp.array([[-q[1], q[0], 1.1]]))
+    assert measure(discrete_system(other, scheme, 0.01), equation, q0, q1, 0.0, None)[0] > 1e-5
+
+
+# ---------------------------------------------------------------------------------------------------- symplecticity, momenta
+
+
+def test_an_unconstrained_solution_passes_in_every_line(kepler):
+    report = verify(kepler, ROTATION)
+    assert report.ok, report
+    assert [line.verdict for line in report.lines] == ["ok", "ok", "bounded", "ok", "ok"]
+    assert report["symplecticity of one step"].value < 1e-14
+    assert report["momentum map rotation"].value < 1e-12
+
+
+def test_a_users_scheme_is_judged_by_its_step_alone():
+    start = {"q": [0.4, 0.0], "p": [0.0, 2.0]}
+    verlet = verify(dx.simulate(KEPLER, OneStep("verlet"), step=0.01, steps=6000, **start), ROTATION)
+    assert verlet.ok, verlet
+    assert verlet["discrete Dirac structure"].verdict == "not checked"
+    euler = verify(dx.simulate(KEPLER, OneStep("euler"), step=0.0005, steps=60_000, save_every=5, **start), ROTATION)
+    assert euler["symplecticity of one step"].verdict == "VIOLATED"
+    assert euler["momentum map rotation"].verdict == "VIOLATED"
+    assert euler["energy"].verdict == "drifts"
+
+
+def test_the_symplecticity_defect_of_the_explicit_euler_method_is_its_closed_form():
+    oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    report = verify(dx.simulate(oscillator, OneStep("euler"), step=0.1, steps=4, q=[1.0], p=[0.0]))
+    # J = [[1, h], [−h, 1]]: JᵀΩJ − Ω = h² Ω, and |J|ᵀ|Ω||J| has the entries 2h and 1 + h²
+    assert report["symplecticity of one step"].value == pytest.approx(0.01 / 1.01, rel=1e-12)
+
+
+def test_a_composition_is_symplectic_in_unbalanced_units():
+    heavy = dx.LagrangeDirac(lambda q, v: 1e6 * (v @ v) / 2 - 1e6 * jnp.sum(q**4))
+    scheme = dx.Composition(OneStep("verlet", mass=1e6), "yoshida4")
+    report = verify(dx.simulate(heavy, scheme, step=0.1, steps=400, q=[1e-3], v=[0.0]))
+    assert report["symplecticity of one step"].verdict == "ok", report
+    assert report["discrete Dirac structure"].verdict == "not checked"
+
+
+def test_a_momentum_map_of_no_symmetry_is_violated(kepler):
+    report = verify(kepler, [0])
+    assert report["momentum map p[0]"].verdict == "VIOLATED"
+    assert not report.ok
+
+
+@pytest.mark.parametrize(
+    ("symmetries", "error", "words"),
+    [
+        ([2], ValueError, "from 0 to 1"),
+        ([0.5], ValueError, "whole numbers"),
+        ("rotation", TypeError, "dict"),
+        ({"r": 3.0}, TypeError, r"symmetries\['r'\] must be a function"),
+        ({"r": lambda q: q[:1]}, ValueError, r"must return shape \(2,\)"),
+        ({"r": lambda q: q @ jnp.eye(3)}, TypeError, "could not be traced"),
+    ],
+)
+def test_bad_symmetries_are_refused(kepler, symmetries, error, words):
+    with pytest.raises(error, match=words):
+        verify(kepler, symmetries)
+
+
+def test_something_else_than_a_solution_is_refused():
+    with pytest.raises(TypeError, match="Solution"):
+        verify(np.zeros(3))
+
+
+# ------------------------------------------------------------------------------ what there is to check, and what there is not
+
+
+def test_a_batch_is_judged_by_its_worst_trajectory():
+    v = np.array([[0.0, 2.0], [0.0, 1.9], [0.0, 1.8]])
+    sol = dx.simulate(KEPLER, dx.MinusLagrangeDirac(), step=0.02, steps=400, q=np.tile([0.4, 0.0], (3, 1)), v=v)
+    q = np.array(sol.q)
+    q[1, 200] += 1e-6
+    report = verify(changed(sol, fields=sol.fields | {"q": q}), ROTATION)
+    line = report["(−)-discrete Dirac structure"]
+    assert "(trajectory 1)" in line.explanation
+    each = np.array(line.details["per_trajectory"])
+    assert each[1] > 1e-8 > ROUNDINGS * EPSILON > max(each[0], each[2])
+    assert len(report["momentum map rotation"].details["per_trajectory"]) == 3
+
+
+def test_params_of_a_batch_reach_the_checks():
+    spring = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params * (q @ q) / 2)
+    start = {"q": np.ones((2, 1)), "v": np.zeros((2, 1)), "params": np.array([1.0, 25.0]), "batch_params": True}
+    sol = dx.simulate(spring, dx.PlusLagrangeDirac("midpoint"), step=0.1, steps=400, **start)
+    report = verify(sol)
+    assert report.ok, report
+    assert verify(changed(sol, params=np.array([1.0, 25.1])))["(+)-discrete Dirac structure"].verdict == "VIOLATED"
+
+
+def test_a_failed_run_is_checked_as_far_as_it_got():
+    falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(jnp.sqrt(q)))
+    sol = dx.simulate(falling, dx.PlusLagrangeDirac(), step=0.05, steps=100, q=[1.0], v=[0.0])
+    report = verify(sol)
+    assert not report.ok
+    assert report["steps solved"].verdict == "VIOLATED"
+    assert sol.message in report["steps solved"].explanation
+    assert report["(+)-discrete Dirac structure"].verdict == "ok"
+    both = dx.simulate(falling, dx.PlusLagrangeDirac(), step=0.05, steps=100, q=[[1.0], [1e4]], v=[[0.0], [0.0]])
+    report = verify(both)
+    assert report["steps solved"].explanation.startswith("trajectory 0")
+    assert report["(+)-discrete Dirac structure"].verdict == "ok"
+    assert report["symplecticity of one step"].verdict == "ok"
+
+
+def test_rows_that_are_not_saved_cannot_be_checked():
+    sol = dx.simulate(DISK, dx.PlusLagrangeDirac(), step=0.01, steps=20, save_every=4, q=np.zeros(4), v=[1.0, 0.0, 1.0, 0.5])
+    report = verify(sol)
+    assert "save_every = 4" in report["(+)-discrete Dirac structure"].explanation
+    assert "save_every = 4" in report["structural relation φ*Ω = Ω + dβ"].explanation
+    assert report["constraint"].verdict == "ok"
+    assert report.ok
+
+
+def test_a_loaded_solution_is_checked_without_its_system(kepler, tmp_path):
+    kepler.save(tmp_path / "kepler.zarr")
+    report = verify(dx.load(tmp_path / "kepler.zarr"), ROTATION)
+    assert {line.quantity: line.verdict for line in report.lines} == {
+        "steps solved": "ok",
+        "discrete Dirac structure": "not checked",
+        "constraint": "not checked",
+        "energy": "bounded",
+        "momentum map rotation": "ok",
+        "symplecticity of one step": "not checked",
+    }
+    assert "loaded without its system" in report["symplecticity of one step"].explanation
+    complete = verify(dx.load(tmp_path / "kepler.zarr", system=KEPLER))
+    assert complete["(+)-discrete Dirac structure"].verdict == "ok"
+
+
+def test_the_tolerance_can_be_set(kepler):
+    assert verify(kepler, tolerance=1e-30)["symplecticity of one step"].verdict == "VIOLATED"
+    assert verify(kepler, [0], tolerance=2.0)["momentum map p[0]"].verdict == "ok"
+
+
+def test_method_one_is_not_blamed_for_its_rows():
+    forms = lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
+    skate = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] ** 2, forms)
+    sol = dx.simulate(skate, dx.DiscreteDirac(), step=0.1, steps=20, q=np.zeros(3), v=[1.0, 0.0, 1.0])
+    line = verify(sol)["constraint"]
+    assert line.verdict == "not checked"
+    assert line.value > 1e-9
+
+
+def test_a_dissipative_system_may_lose_energy():
+    system = dx.PortHamiltonian(lambda x: x @ x / 2, np.array([[0.0, 1.0], [-1.0, 0.0]]), R=np.diag([0.0, 0.1]))
+    line = verify(dx.simulate(system, dx.DiscreteDirac(), step=0.1, steps=400, x=[1.0, 0.0]))["energy"]
+    assert line.verdict == "not checked"
+    assert "does not conserve" in line.explanation
+
+
+# -------------------------------------------------------------------------------------------------------- bounded or drifting
+
+
+def test_double_pendulums_are_bounded_chaotic_or_not():
+    q = np.array([[0.3, 0.2], [1.0, 1.5], [2.0, 1.0], [3.0, 0.5]])
+    system = dx.LagrangeDirac(double_pendulum)
+    sol = dx.simulate(system, dx.PlusLagrangeDirac(), step=0.01, steps=20_000, q=q, v=0 * q)
+    line = verify(sol)["energy"]
+    assert line.verdict == "bounded", line
+    assert line.details["verdicts"] == ["bounded"] * 4
+
+
+MOTION = np.stack([np.sin(np.linspace(0, 200, 4000)), np.cos(np.linspace(0, 200, 4000))], axis=1)
+TIMES = np.linspace(0.0, 100.0, 4000)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    cycles=st.one_of(st.tuples(st.floats(3.0, 300.0)), st.lists(st.floats(40.0, 300.0), min_size=2, max_size=4)),
+    amplitudes=st.lists(st.floats(0.01, 10.0), min_size=4, max_size=4),
+    phases=st.lists(st.floats(0.0, 6.3), min_size=4, max_size=4),
+)
+def test_no_quasi_periodic_series_drifts(cycles, amplitudes, phases):
+    waves = zip(cycles, amplitudes, phases, strict=False)
+    series = sum(a * np.sin(2 * np.pi * c * TIMES / 100 + p) for c, a, p in waves)
+    assert judge(TIMES, series, MOTION, 1e-12).verdict == "bounded"
+
+
+@settings(max_examples=100, deadline=None)
+@given(cycles=st.floats(10.0, 300.0), phase=st.floats(0.0, 6.3), way=st.floats(1.5, 1e3), power=st.floats(0.5, 3.0))
+def test_a_trend_wider_than_the_oscillation_drifts(cycles, phase, way, power):
+    series = np.sin(2 * np.pi * cycles * TIMES / 100 + phase) + 2 * way * (TIMES / 100) ** power
+    found = judge(TIMES, series, MOTION, 1e-12)
+    assert found.verdict == "drifts"
+    mirrored = judge(TIMES, -1e-3 * series + 7.0, MOTION, 1e-12)
+    assert mirrored.verdict == "drifts"
+    assert mirrored.drift == pytest.approx(-1e-3 * found.drift, rel=1e-6)
+
+
+def test_a_linear_trend_is_measured_inside_its_error():
+    noise = np.random.default_rng(3).normal(size=4000)
+    found = judge(TIMES, 1e-2 * noise + 0.004 * TIMES, MOTION, 1e-12)
+    assert found.verdict == "drifts"
+    assert abs(found.details["slope"] - 0.004) < 5 * found.details["standard_error"] < 2e-4
+
+
+def test_random_walks_leave_their_band_unless_they_are_roundoff():
+    walks = np.cumsum(np.random.default_rng(4).normal(size=(100, 4000)), axis=1)
+    verdicts = [judge(TIMES, walk, MOTION, 1e-12).verdict for walk in walks]
+    assert verdicts.count("drifts") >= 88
+    assert judge(TIMES, 1e-16 * walks[0], MOTION, 1e-13).verdict == "bounded"
+
+
+def test_too_few_rows_or_oscillations_are_not_judged():
+    assert judge(TIMES[:100], TIMES[:100], MOTION[:100], 1e-12).verdict == "not checked"
+    slow = np.stack([TIMES, np.sin(np.linspace(0, 9, 4000))], axis=1)
+    found = judge(TIMES, TIMES**2, slow, 1e-12)
+    assert found.verdict == "not checked"
+    assert "oscillations are too few" in found.text
+    assert len(TIMES) > SMALLEST_SERIES
+
+
+@given(turns=st.floats(3.0, 100.0), phase=st.floats(0.0, 6.3), slope=st.floats(-3.0, 3.0))
+def test_oscillations_are_counted(turns, phase, slope):
+    s = np.linspace(0.0, 1.0, 5000)
+    wave = np.sin(2 * np.pi * turns * s + phase) + slope * s
+    assert oscillations(np.stack([wave, np.full_like(s, 3.0), 1.0 + 2.0 * s], axis=1)) == pytest.approx(turns, abs=1.0)
+
+
+# ------------------------------------------------------------------------------------------------------------------- reports
+
+
+def test_a_report_reads_as_text_html_and_json(plus_disk):
+    report = verify(plus_disk)
+    rows = str(report).splitlines()
+    assert repr(report) == str(report)
+    assert rows[0].startswith("PlusLagrangeDirac on LagrangeDirac: 50000 steps of 0.001")
+    column = rows[1].index("verdict")
+    assert [row[column:].split("  ")[0] for row in rows[3:]] == [line.verdict for line in report.lines]
+    again = json.loads(json.dumps(report.to_dict()))
+    assert again["ok"] is False
+    assert [line["verdict"] for line in again["lines"]] == [line.verdict for line in report.lines]
+    page = report._repr_html_()
+    assert "<b>drifts</b>" in page
+    assert page.count("<tr>") == len(rows) - 2
+
+
+def test_a_report_escapes_html_and_knows_its_lines():
+    report = Report("a < b", (Line("x & y", float("nan"), None, "ok", "<script>"),))
+    assert "<script>" not in report._repr_html_()
+    assert "a &lt; b" in report._repr_html_()
+    assert report.to_dict()["lines"][0]["value"] is None
+    with pytest.raises(KeyError, match="x & y"):
+        report["energy"]
