@@ -1,12 +1,18 @@
-"""Shared test configuration: 64-bit, strict promotion, a persistent compilation cache."""
+"""Shared test configuration: a compilation cache, reproducible examples, strict promotion, figures without a screen."""
 
 import os
 import tempfile
 
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", os.path.join(tempfile.gettempdir(), "dirax-jax-cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("MPLBACKEND", "Agg")
 
+import hypothesis
 import jax
 
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_platforms", "cpu")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+hypothesis.settings.register_profile("dirax", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("dirax")

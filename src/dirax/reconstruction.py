@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 
+from dirax.functions import is_traced
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.step import Field
 from dirax.solution import Solution
@@ -24,7 +25,7 @@ def reconstruct(solution: Solution) -> Solution:
     n = lifted["q"].shape[-1]
     return Solution(
         t=solution.t,
-        fields={name: np.asarray(a) if not isinstance(a, jax.core.Tracer) else a for name, a in lifted.items()},
+        fields={name: np.asarray(a) if not is_traced(a) else a for name, a in lifted.items()},
         field_info={"q": Field((n,)), "p": Field((n,))},
         step=solution.step,
         save_every=solution.save_every,

@@ -79,9 +79,10 @@ def dot_general(interpreter: Interpreter, equation: Any, a, b):
     free_a = [i for i in range(a.ndim) if i not in (*ca, *ba)]
     free_b = [i for i in range(b.ndim) if i not in (*cb, *bb)]
     batch = tuple(a.shape[i] for i in ba)
-    count, length = int(np.prod(batch)), int(np.prod([a.shape[i] for i in ca]))
-    rows = np.transpose(a, (*ba, *free_a, *ca)).reshape(count, -1, length)
-    columns = np.transpose(b, (*bb, *free_b, *cb)).reshape(count, -1, length)
+    size = lambda array, axes: int(np.prod([array.shape[i] for i in axes]))
+    count, length = int(np.prod(batch)), size(a, ca)
+    rows = np.transpose(a, (*ba, *free_a, *ca)).reshape(count, size(a, free_a), length)
+    columns = np.transpose(b, (*bb, *free_b, *cb)).reshape(count, size(b, free_b), length)
     out = [
         fold(interpreter, "add", [g.mul(x, y) for x, y in zip(row, column, strict=True)])
         for one, other in zip(rows.tolist(), columns.tolist(), strict=True)
