@@ -7,6 +7,7 @@ they are made of functions that are smooth in the squared angle.
 
 from abc import abstractmethod
 from collections.abc import Callable
+from contextlib import contextmanager
 from typing import TypeAlias
 
 import equinox as eqx
@@ -20,6 +21,13 @@ from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import Scalar, arc_over_sine, norm, radial
 
 Algebra: TypeAlias = Float[Array, " d"]
+
+
+@contextmanager
+def _loose_promotion():
+    # jaxlie multiplies float by integer constants, which a program with strict promotion refuses.
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
 
 
 class AbstractLieGroup(AbstractGeodesicManifold):
@@ -66,15 +74,18 @@ class AbstractLieGroup(AbstractGeodesicManifold):
 
     def adjoint(self, g: Vector) -> Float[Array, "d d"]:
         """The matrix Ad_g: g exp(ξ) g⁻¹ = exp(Ad_g ξ)."""
-        return self._as_jaxlie(g).adjoint()
+        with _loose_promotion():
+            return self._as_jaxlie(g).adjoint()
 
     def matrix(self, g: Vector) -> Float[Array, "k k"]:
         """The element as a matrix: 2×2 or 3×3 rotations, homogeneous 3×3 or 4×4 rigid motions."""
-        return self._as_jaxlie(g).as_matrix()
+        with _loose_promotion():
+            return self._as_jaxlie(g).as_matrix()
 
     def from_matrix(self, matrix: Float[Array, "k k"]) -> Vector:
         """The element with the given matrix."""
-        return self.jaxlie_group.from_matrix(jnp.asarray(matrix)).parameters()
+        with _loose_promotion():
+            return self.jaxlie_group.from_matrix(jnp.asarray(matrix)).parameters()
 
     def left_translate(self, g: Vector, xi: Algebra) -> Vector:
         """The tangent vector v = g ξ at g."""
@@ -109,7 +120,7 @@ class AbstractLieGroup(AbstractGeodesicManifold):
         return jnp.concatenate([rotation, translation()]) if self.translations else rotation
 
     def _product(self, rotation: Vector, other: Vector) -> Vector:
-        return jnp.sum(self.rotation_product * (rotation[:, None] * other[None, :]), axis=(1, 2))
+        return jnp.sum(self.rotation_product * (rotation[None, :, None] * other[None, None, :]), axis=(1, 2))
 
     def _conjugate(self, rotation: Vector) -> Vector:
         return rotation * np.array([1.0] + [-1.0] * (rotation.shape[0] - 1))
@@ -190,6 +201,7 @@ _QUATERNION_PRODUCT = np.array(
         [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [1, 0, 0, 0]],
     ]
 )
+_LEVI_CIVITA = _QUATERNION_PRODUCT[1:, 1:, 1:]
 _TURN_OF_PLANE = np.array([[0.0], [1.0]])
 _TURN_OF_SPACE = np.vstack([np.zeros(3), np.eye(3) / 2.0])
 
@@ -262,14 +274,14 @@ class SE3(AbstractLieGroup):
         sinc = radial(1, s)
         # (1 − cos θ)/θ² and (θ − sin θ)/θ³ by half angles, without the cancellation.
         second, third = sinc**2 / 2.0, (sinc**2 - radial(0, s) * radial(2, s)) / 4.0
-        once = jnp.cross(omega, velocity)
-        return jnp.concatenate([_quaternion_exp(omega), velocity + second * once + third * jnp.cross(omega, once)])
+        once = _cross(omega, velocity)
+        return jnp.concatenate([_quaternion_exp(omega), velocity + second * once + third * _cross(omega, once)])
 
     def group_log(self, g):
         omega, translation = _quaternion_log(g[:4]), g[4:]
         s = jnp.dot(omega, omega) / 4.0
-        once = jnp.cross(omega, translation)
-        velocity = translation - once / 2.0 + radial(2, s) / (4.0 * radial(1, s)) * jnp.cross(omega, once)
+        once = _cross(omega, translation)
+        velocity = translation - once / 2.0 + radial(2, s) / (4.0 * radial(1, s)) * _cross(omega, once)
         return jnp.concatenate([velocity, omega])
 
 
@@ -287,3 +299,7 @@ def _quaternion_log(q: Float[Array, " 4"]) -> Float[Array, " 3"]:
 
 def _quarter_turn(v: Float[Array, " 2"]) -> Float[Array, " 2"]:
     return jnp.stack([-v[1], v[0]])
+
+
+def _cross(a: Float[Array, " 3"], b: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    return jnp.sum(_LEVI_CIVITA * (a[None, :, None] * b[None, None, :]), axis=(1, 2))

@@ -69,23 +69,28 @@ class AbstractManifold(eqx.Module):
     def check_point(self, x: Vector, name: str = "x", tolerance: float = 1e-8) -> None:
         """Raise `ValueError` for a wrong shape, and for a concrete x off the manifold, with the defect."""
         self._check_shape(x, name)
-        if is_traced(x, self):
+        if is_traced(x):
             return
-        defect = float(self.defect(x))
-        if not defect <= tolerance:
+        defect = self.defect(x)
+        if is_traced(defect):  # a constant inside a traced function
+            return
+        if not float(defect) <= tolerance:
             raise ValueError(
-                f"{name} is not on {self}: its defect is {defect:.3g}, more than {tolerance:.1g}. Use `nearest` to put it there."
+                f"{name} is not on {self}: its defect is {float(defect):.3g}, more than {tolerance:.1g}. "
+                "Use `nearest` to put it there."
             )
 
     def check_tangent(self, x: Vector, v: Vector, name: str = "v", tolerance: float = 1e-8) -> None:
         """Raise `ValueError` for a wrong shape, and for a concrete v that is not tangent at x, with the defect."""
         self._check_shape(v, name)
-        if is_traced(x, v, self):
+        if is_traced(x, v):
             return
-        defect = float(self.tangent_defect(x, v))
-        if not defect <= tolerance * (1.0 + float(norm(jnp.asarray(v)))):
+        defect, size = self.tangent_defect(x, v), norm(v)
+        if is_traced(defect, size):
+            return
+        if not float(defect) <= tolerance * (1.0 + float(size)):
             raise ValueError(
-                f"{name} is not tangent to {self} at the given point: the normal part has norm {defect:.3g}. "
+                f"{name} is not tangent to {self} at the given point: its normal part has norm {float(defect):.3g}. "
                 "Use `projection` to take it away."
             )
 

@@ -64,10 +64,12 @@ class AbstractDiscretizationMap(eqx.Module):
         return x, v
 
     def _check_reach(self, x: Vector, v: Vector, way_out: str) -> None:
-        if is_traced(x, v, self):
+        if is_traced(x, v):
             return
-        length, reach = float(norm(v)), float(self.reach(x, v))
-        if not (np.isfinite(length) and reach < 1.0 - 1e-9):
+        length, reach = norm(v), self.reach(x, v)
+        if is_traced(length, reach):  # constants, inside a traced function
+            return
+        if not (jnp.isfinite(length) and reach < 1.0 - 1e-9):
             raise ValueError(
                 f"{type(self).__name__} is used outside its injectivity radius: v has norm {length:.6g}, "
                 f"which is {reach:.6g} of the radius and must be less than 1. {way_out}"
@@ -127,7 +129,7 @@ class RiemannianExp(AbstractDiscretizationMap):
         return _same_size(self.space, ambient_dimension)
 
     def forward(self, x, v):
-        return self.space.exp(x, -self.theta * v), self.space.exp(x, (1.0 - self.theta) * v)
+        return tuple(jax.vmap(lambda time: self.space.exp(x, time * v))(_times(self.theta)))
 
     def backward(self, x0, x1):
         # One geodesic t ↦ exp(x0, t log(x0, x1)): x and v are its point and its velocity at t = θ.
@@ -158,8 +160,8 @@ class LieGroupExp(AbstractDiscretizationMap):
 
     def forward(self, x, v):
         xi = self.group.to_algebra(x, v)
-        move = lambda factor: self.group.multiply(x, self.group.group_exp(factor * xi))
-        return move(-self.theta), move(1.0 - self.theta)
+        move = lambda time: self.group.multiply(x, self.group.group_exp(time * xi))
+        return tuple(jax.vmap(move)(_times(self.theta)))
 
     def backward(self, x0, x1):
         xi = self.group.group_log(self.group.multiply(self.group.inverse(x0), x1))
@@ -245,7 +247,7 @@ class Submanifold(AbstractManifold):
 
     def _dimension(self) -> int:
         with jax.ensure_compile_time_eval():
-            x = self.projector(jnp.cos(1.0 + jnp.arange(self.ambient_dimension)))
+            x = self.projector(jnp.cos(1.0 + jnp.arange(self.ambient_dimension, dtype=float)))
             trace = float(jnp.trace(jax.jacfwd(self.projector)(x)))
         if not abs(trace - round(trace)) < 1e-6:
             raise ValueError(
@@ -367,6 +369,10 @@ def tangent_coordinates(manifold: AbstractManifold, x: Vector, v: Vector) -> tup
 
 def _largest(*arrays: Array) -> Float[Array, ""]:
     return jnp.max(jnp.stack([jnp.max(jnp.abs(array)) for array in arrays]))
+
+
+def _times(theta: float) -> Float[Array, " 2"]:
+    return jnp.array([-theta, 1.0 - theta])
 
 
 def _check_theta(theta: float) -> None:
