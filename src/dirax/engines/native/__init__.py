@@ -3,10 +3,10 @@
 trace.py, interpret.py and the rules   StepEquation → jaxpr → graph.py
 newton_step.py                         Jacobian and elimination on the graph
 step_loop.py, lower.py, emitter.py     graph → LLVM IR; the elementary functions in IR
-compile.py, program.py, run.py         IR → machine code, caches, calls
+compile.py, program.py, driver.py        IR → machine code, caches, calls
 """
 
 from dirax.engines.native.interpret import UnsupportedPrimitive
-from dirax.engines.native.run import run, supported
+from dirax.engines.native.driver import run, supported
 
 __all__ = ["UnsupportedPrimitive", "run", "supported"]

@@ -19,7 +19,7 @@ def closed(jaxpr: Any) -> ClosedJaxpr:
     return jaxpr if hasattr(jaxpr, "consts") else ClosedJaxpr(jaxpr, ())
 
 
-@rule("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "remat2", "custom_lin", lazy=True)
+@rule("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "remat2", "composite", lazy=True)
 def call(interpreter: Interpreter, equation: Any, *operands):
     p = equation.params
     return interpreter.run(closed(p["jaxpr"] if "jaxpr" in p else p["call_jaxpr"]), *operands)

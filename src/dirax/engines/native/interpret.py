@@ -61,6 +61,7 @@ class Interpreter:
 
     def __init__(self, graph: Graph):
         self.graph = graph
+        self._lines: list[str] = []
 
     def run(self, closed: ClosedJaxpr, *operands: Any) -> list[Any]:
         """The results of a closed jaxpr; each a Nodes array or Unavailable."""
@@ -92,14 +93,18 @@ class Interpreter:
         lost = next((o for o in operands if isinstance(o, Unavailable)), None)
         if lost is not None and name not in LAZY:
             return [lost] * len(equation.outvars)
+        # equations inside a library's jitted functions have no line of the user's: the calling equation has it
+        self._lines.append(source_line(equation) or (self._lines[-1] if self._lines else "unknown line"))
         try:
             if name not in RULES:
                 raise Unsupported("is not supported")
             check_dtypes(equation)
             return RULES[name](self, equation, *operands)
         except Unsupported as error:
-            failure = UnsupportedPrimitive(name, str(error), source_line(equation))
+            failure = UnsupportedPrimitive(name, str(error), self._lines[-1])
             return [Unavailable(failure)] * len(equation.outvars)
+        finally:
+            self._lines.pop()
 
 
 def check_dtypes(equation: Any) -> None:

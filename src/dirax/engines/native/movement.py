@@ -40,6 +40,22 @@ def concatenate(interpreter: Interpreter, equation: Any, *parts):
     return [np.concatenate(parts, axis=equation.params["dimension"])]
 
 
+@rule("stack")
+def stack(interpreter: Interpreter, equation: Any, *parts):
+    return [np.stack(parts, axis=equation.params["axis"])]
+
+
+@rule("unstack")
+def unstack(interpreter: Interpreter, equation: Any, x):
+    axis = equation.params["axis"]
+    return [np.take(x, i, axis=axis) for i in range(x.shape[axis])]
+
+
+@rule("tile")
+def tile(interpreter: Interpreter, equation: Any, x):
+    return [np.tile(x, equation.params["reps"])]
+
+
 @rule("split")
 def split(interpreter: Interpreter, equation: Any, x):
     return np.split(x, np.cumsum(equation.params["sizes"])[:-1], axis=equation.params["axis"])
@@ -184,7 +200,7 @@ def _starts(interpreter: Interpreter, indices, batch, index_map, rank: int) -> l
     return starts
 
 
-@rule("scatter", "scatter-add", "scatter-mul", "scatter-min", "scatter-max", "scatter_add", "scatter_mul")
+@rule("scatter", "scatter-add", "scatter-mul", "scatter-min", "scatter-max", "scatter-sub")
 def scatter(interpreter: Interpreter, equation: Any, x, indices, updates):
     g, d = interpreter.graph, equation.params["dimension_numbers"]
     kind = equation.primitive.name[8:]

@@ -19,22 +19,32 @@ SAMPLES = 7
 
 @dataclass
 class Correction:
-    """change = J⁻¹ residual; `stable` says at run time whether the fixed pivots were large enough."""
+    """change = J⁻¹ residual; `stable` says at run time whether the fixed pivots were large enough.
+
+    `again` is J⁻¹ applied to another right-hand side, the inputs `right`, from the same `factors`.
+    """
 
     jacobian: list[list[int]]
     change: list[int]
     stable: int
     order: list[tuple[int, int]]
+    right: list[int]
+    again: list[int]
+    factors: list[int]
 
 
 def newton_correction(g: Graph, equation: TracedEquation) -> Correction:
     """The correction of one Newton iteration of an equation."""
     k = len(equation.unknowns)
+    if k == 0:
+        return Correction([], [], g.true, [], [], [], [])
     rows = jacobian(g, equation.residual, equation.unknowns)
     matrix = [[row.get(j, g.zero) for j in range(k)] for row in rows]
     order = pivot_order(g, matrix)
-    change, stable = eliminate(g, matrix, equation.residual, order)
-    return Correction(matrix, change, stable, order)
+    factors = Factors(g, matrix, order)
+    right = [g.input(f"right{i}") for i in range(k)]
+    again = factors.solve(g, right)
+    return Correction(matrix, factors.solve(g, equation.residual), factors.stable, order, right, again, sorted(factors.nodes))
 
 
 def pivot_order(g: Graph, matrix: list[list[int]]) -> list[tuple[int, int]]:
@@ -93,34 +103,48 @@ def _samples(g: Graph, matrix: list[list[int]]) -> np.ndarray:
     return np.stack([np.broadcast_to(np.asarray(c, dtype=float), SAMPLES) for c in columns], axis=1).reshape(SAMPLES, k, k)
 
 
-def eliminate(g: Graph, matrix: list[list[int]], right: list[int], order) -> tuple[list[int], int]:
-    """Solution and guard of matrix x = right by elimination in the given pivot order."""
-    a = [{j: entry for j, entry in enumerate(row) if entry != g.zero} for row in matrix]
-    b, stable, inverses = list(right), g.true, {}
-    remaining = set(range(len(matrix)))
-    guard = g.constant(GUARD)
-    for i, j in order:
-        remaining.discard(i)
-        pivot = a[i].get(j, g.zero)
-        inverses[i] = inverse = g.recip(pivot)
-        size = g.make("abs", pivot)
-        for other in sorted(remaining):
-            entry = a[other].pop(j, None)
-            if entry is None:
-                continue
-            small = g.make("le", g.mul(guard, g.make("abs", entry)), size)
-            stable = g.make("and", stable, small)
-            factor = g.mul(entry, inverse)
-            for c, upper in a[i].items():
+class Factors:
+    """Elimination of a matrix in a given pivot order: multipliers, upper rows, reciprocal pivots and the guard."""
+
+    def __init__(self, g: Graph, matrix: list[list[int]], order: list[tuple[int, int]]):
+        self.order = order
+        self.upper = [{j: entry for j, entry in enumerate(row) if entry != g.zero} for row in matrix]
+        self.multipliers: list[tuple[int, int, int]] = []
+        self.inverses: dict[int, int] = {}
+        self.stable, guard = g.true, g.constant(GUARD)
+        a, remaining = self.upper, set(range(len(matrix)))
+        for i, j in order:
+            remaining.discard(i)
+            pivot = a[i].get(j, g.zero)
+            self.inverses[i] = g.recip(pivot)
+            for other in sorted(remaining):
+                entry = a[other].pop(j, None)
+                if entry is None:
+                    continue
+                small = g.make("le", g.mul(guard, g.make("abs", entry)), g.make("abs", pivot))
+                self.stable = g.make("and", self.stable, small)
+                factor = g.mul(entry, self.inverses[i])
+                self.multipliers.append((other, i, factor))
+                for c, upper in a[i].items():
+                    if c != j:
+                        a[other][c] = g.sub(a[other].get(c, g.zero), g.mul(factor, upper))
+
+    @property
+    def nodes(self) -> set[int]:
+        """What has to be kept for another right-hand side."""
+        kept = {factor for *_, factor in self.multipliers} | set(self.inverses.values())
+        return kept | {entry for i, j in self.order for c, entry in self.upper[i].items() if c != j}
+
+    def solve(self, g: Graph, right: list[int]) -> list[int]:
+        """The solution for a right-hand side."""
+        b = list(right)
+        for row, pivot_row, factor in self.multipliers:
+            b[row] = g.sub(b[row], g.mul(factor, b[pivot_row]))
+        x: dict[int, int] = {}
+        for i, j in reversed(self.order):
+            total = b[i]
+            for c, upper in sorted(self.upper[i].items()):
                 if c != j:
-                    total = g.sub(a[other].get(c, g.zero), g.mul(factor, upper))
-                    a[other][c] = total
-            b[other] = g.sub(b[other], g.mul(factor, b[i]))
-    x: dict[int, int] = {}
-    for i, j in reversed(order):
-        total = b[i]
-        for c, upper in sorted(a[i].items()):
-            if c != j:
-                total = g.sub(total, g.mul(upper, x[c]))
-        x[j] = g.mul(total, inverses[i])
-    return [x[j] for j in range(len(matrix))], stable
+                    total = g.sub(total, g.mul(upper, x[c]))
+            x[j] = g.mul(total, self.inverses[i])
+        return [x[j] for j in range(len(right))]

@@ -78,11 +78,11 @@ def too_large(error: GraphTooLarge) -> UnsupportedPrimitive:
 
 
 def count_operations(plan: Plan) -> int:
-    """Scalar operations of a step with one Newton iteration a stage."""
+    """Scalar operations of a step with two Newton updates a stage, one of either kind."""
     total = 0
     for index, _ in plan.stages:
         e, c = plan.equations[index], plan.corrections[index]
-        needed = plan.graph.reachable([*e.guess, *e.residual, *e.advance, *c.change, c.stable])
+        needed = plan.graph.reachable([*e.guess, *e.residual, *e.advance, *c.change, *c.again, c.stable])
         total += sum(1 for node in needed if plan.graph.args[node])
     return total
 

@@ -1,7 +1,8 @@
 """The kernel: rows, steps, stages and Newton iterations of `width` trajectories side by side, as LLVM IR.
 
 Every quantity of a lane is a double; counters too. A lane's record is, for each quantity, `width` doubles:
-state · unknowns of each stage · those of the step before · steps done · status · iterations · largest residual.
+state · for each stage the unknowns of the step before, their first differences, their second · steps done · status ·
+updates of Newton's method · largest residual.
 """
 
 from collections.abc import Iterable
@@ -11,12 +12,12 @@ from dirax.engines.native.dense import add_dense_solve
 from dirax.engines.native.emitter import Body, Emitter, Module
 from dirax.engines.native.graph import Graph
 from dirax.engines.native.lower import Region
+from dirax.engines.native.newton_loop import NewtonLoop
 from dirax.engines.native.newton_step import Correction
 from dirax.engines.native.trace import Inputs, TracedEquation
 from dirax.engines.native.trigonometric import add_far_reduction
 from dirax.engines.result import NOT_CONVERGED, NOT_FINITE, OK
 
-EPSILON = 2.220446049250313e-16
 RUN, STEP, NEWTON = 1, 2, 3
 """When a node's value is known: once a run, once a step, once an iteration."""
 
@@ -47,7 +48,7 @@ class Plan:
     @property
     def record(self) -> int:
         """Quantities of a lane."""
-        return self.state_size + 2 * len(self.stages) * self.history + 4
+        return self.state_size + 3 * len(self.stages) * self.history + 4
 
     @property
     def fields(self) -> list[tuple[str, list[int]]]:
@@ -103,6 +104,7 @@ class Kernel:
         g, plan = self.g, self.plan
         of_input = {node: STEP for e in plan.equations for node in (*e.state, *e.previous)}
         of_input |= {node: NEWTON for e in plan.equations for node in e.unknowns}
+        of_input |= {node: NEWTON for c in plan.corrections for node in c.right}
         of_input |= dict.fromkeys(plan.shared.params, RUN)
         of_input |= {plan.shared.t: STEP, plan.shared.h: STEP if len(plan.stages) > 1 else RUN}
         level = {}
@@ -133,14 +135,16 @@ class Kernel:
         self.state = self._variables(s)
         self.kept = self._variables(s)
         self.unknowns = b.alloca(e.real, max(1, stages * k))
-        self.older = b.alloca(e.real, max(1, stages * k))
+        self.slopes = b.alloca(e.real, max(1, stages * k))
+        self.bends = b.alloca(e.real, max(1, stages * k))
         self.fresh = b.alloca(e.real, max(1, stages * k))
         self.done, self.status, self.iterations, self.worst = (b.alloca(e.real) for _ in range(4))
         record = self._slots("%lanes", plan.record)
         memory = [
             *self.state,
             *self._slots(self.unknowns, stages * k),
-            *self._slots(self.older, stages * k),
+            *self._slots(self.slopes, stages * k),
+            *self._slots(self.bends, stages * k),
             *(self.done, self.status, self.iterations, self.worst),
         ]
         self._stores(self._loads(record), memory)
@@ -159,7 +163,8 @@ class Kernel:
     def _all_outputs(self) -> list[int]:
         out = []
         for equation, correction in zip(self.plan.equations, self.plan.corrections, strict=True):
-            out += [*equation.guess, *equation.residual, *equation.advance, *correction.change, correction.stable]
+            out += [*equation.guess, *equation.residual, *equation.advance]
+            out += [*correction.change, *correction.factors, correction.stable]
         return out + [node for _, nodes in self.plan.fields for node in nodes]
 
     def _steps(self, memory: list[str], record: list[str]) -> None:
@@ -234,16 +239,20 @@ class Kernel:
         for node, value in zip(equation.state, self._loads(self.state), strict=True):
             region.bind(node, value)
         last = self._loads(self._slots(self.unknowns, k, offset))
-        older = self._loads(self._slots(self.older, k, offset))
-        for node, new, old in zip(equation.previous, last, older, strict=True):
-            region.bind(node, e.add(new, e.sub(new, old)))
-        hoisted = frontier(g, self.level, [*equation.residual, *correction.change, correction.stable], STEP)
+        slopes = self._loads(self._slots(self.slopes, k, offset))
+        bends = self._loads(self._slots(self.bends, k, offset))
+        for node, value, slope, bend in zip(equation.previous, last, slopes, bends, strict=True):
+            region.bind(node, e.add(e.add(value, slope), bend))
+        hoisted = frontier(g, self.level, [*correction.change, *correction.factors, correction.stable], STEP)
         region.require([*equation.guess, *hoisted])
         unknowns = self._variables(k)
         self._stores([region.value(n) for n in equation.guess], unknowns)
-        converged, residual = e.true, e.const(0.0)
+        converged = e.true
         if k:
-            converged, residual = self._newton(equation, correction, region, unknowns, active)
+            newton = NewtonLoop(equation, correction, region, unknowns)
+            newton.emit(active)
+            converged = newton.converged
+            b.store(e.real, e.add(b.load(e.real, self.iterations), newton.count), self.iterations)
         solution = self._loads(unknowns)
         after = Region(e, g, region)
         for node, value in zip(equation.unknowns, solution, strict=True):
@@ -251,8 +260,11 @@ class Kernel:
         if saves is not None:
             with b.when(saves):
                 self._save(equation, region, solution, last, number)
-        after.require(equation.advance)
+        after.require([*equation.advance, *equation.residual])
         new = [after.value(n) for n in equation.advance]
+        residual = e.const(0.0)
+        for node in equation.residual:
+            residual = e.max(e.abs(after.value(node)), residual)
         self._judge(active, converged, residual, solution, new)
         good = self._running()
         state = self._loads(self.state)
@@ -291,10 +303,13 @@ class Kernel:
 
     def _commit_unknown(self, good: str, i: int | str) -> None:
         b, e = self.body, self.e
-        fresh, last, older = (b.at(e.real, base, i) for base in (self.fresh, self.unknowns, self.older))
-        new, current, before = self._loads((fresh, last, older))
-        b.store(e.real, e.select(good, current, before), older)
-        b.store(e.real, e.select(good, new, current), last)
+        places = [b.at(e.real, base, i) for base in (self.unknowns, self.slopes, self.bends)]
+        old = self._loads(places)
+        new = b.load(e.real, b.at(e.real, self.fresh, i))
+        done, zero = b.load(e.real, self.done), e.const(0.0)
+        slope = e.select(e.compare("oge", done, e.const(1.0)), e.sub(new, old[0]), zero)
+        bend = e.select(e.compare("oge", done, e.const(2.0)), e.sub(slope, old[1]), zero)
+        self._stores([e.select(good, a, c) for a, c in zip((new, slope, bend), old, strict=True)], places)
 
     def _save(self, equation, region: Region, solution: list[str], last: list[str], number: str) -> None:
         """Write the saved arrays of a row; unknowns that are not finite are replaced by those of the step before."""
@@ -317,100 +332,3 @@ class Kernel:
                     if self.g.is_boolean(node):
                         value = e.select(value, e.const(1.0), e.const(0.0))
                     b.store("double", e.extract(value, lane), b.at("double", target, j))
-
-    # ------------------------------------------------------------------ Newton's method
-
-    def _newton(self, equation, correction, region: Region, unknowns: list[str], active: str) -> tuple[str, str]:
-        """Iterate to the roundoff floor: the lanes that got there (or broke down), and their largest residuals."""
-        b, e = self.body, self.e
-        going, previous, count, worst = (b.alloca(kind) for kind in (e.bool, e.real, e.real, e.real))
-        turn = b.alloca("i64")
-        b.store(e.bool, active, going, 1)
-        b.store(e.real, e.const(float("inf")), previous)
-        b.store(e.real, e.const(0.0), count)
-        b.store(e.real, e.const(0.0), worst)
-        b.store("i64", "0", turn)
-        head, inside, out = b.fresh(), b.fresh(), b.fresh()
-        b.branch(head)
-        b.label(head)
-        now = b.load(e.bool, going, 1)
-        number = b.load("i64", turn)
-        below = b.put(f"icmp slt i64 {number}, %cap")
-        b.branch_if(b.put(f"and i1 {e.any(now)}, {below}"), inside, out)
-        b.label(inside)
-        self._iteration(equation, correction, region, unknowns, now, going, previous, worst)
-        counted = b.load(e.real, count)
-        b.store(e.real, e.select(now, e.add(counted, e.const(1.0)), counted), count)
-        b.store("i64", b.put(f"add i64 {number}, 1"), turn)
-        b.branch(head)
-        b.label(out)
-        total = b.load(e.real, self.iterations)
-        b.store(e.real, e.add(total, b.load(e.real, count)), self.iterations)
-        return e.invert(b.load(e.bool, going, 1)), b.load(e.real, worst)
-
-    def _iteration(self, equation, correction, region, unknowns, now, going, previous, worst) -> None:
-        b, e, g = self.body, self.e, self.g
-        inner = Region(e, g, region)
-        old = self._loads(unknowns)
-        for node, value in zip(equation.unknowns, old, strict=True):
-            inner.bind(node, value)
-        inner.require([*equation.residual, *correction.change, correction.stable])
-        change = [inner.value(n) for n in correction.change]
-        if correction.stable != g.true:
-            change = self._guarded(equation, correction, inner, change, now)
-        new = [e.sub(a, d) for a, d in zip(old, change, strict=True)]
-        update, total = None, None
-        for a, d, scale in zip(new, change, equation.scale, strict=True):
-            share = e.div(e.abs(d), e.add(e.abs(a), e.const(scale)))
-            update = share if update is None else e.max(share, update)
-            total = d if total is None else e.add(total, d)
-        assert update is not None and total is not None
-        update = e.select(e.compare("uno", total, total), e.const(float("nan")), update)
-        size = None
-        for node in equation.residual:
-            here = e.abs(inner.value(node))
-            size = here if size is None else e.max(here, size)
-        assert size is not None
-        self._stores([e.select(now, a, c) for a, c in zip(new, old, strict=True)], unknowns)
-        b.store(e.real, e.select(now, size, b.load(e.real, worst)), worst)
-        before = b.load(e.real, previous)
-        b.store(e.real, update, previous)
-        more = e.both(e.invert(self._at_floor(update, before)), e.compare("ord", update, update))
-        b.store(e.bool, e.both(now, more), going, 1)
-
-    def _at_floor(self, update: str, previous: str) -> str:
-        """`dirax.engines.newton.at_floor`: updates stopped shrinking, or the next one is far below roundoff."""
-        e = self.e
-        shrinks = e.compare("olt", update, e.mul(previous, e.const(0.5)))
-        stalled = e.both(e.invert(shrinks), e.compare("olt", update, e.const(1e-9)))
-        zero = e.compare("oeq", update, e.const(0.0))
-        ratio = e.div(update, previous)
-        next_one = e.mul(update, e.mul(ratio, ratio))
-        negligible = e.both(
-            e.compare("olt", next_one, e.const(1e-6 * EPSILON)), e.compare("olt", previous, e.const(float("inf")))
-        )
-        negligible = e.both(negligible, e.compare("olt", update, e.const(1e-5)))
-        return e.either(e.either(stalled, zero), negligible)
-
-    def _guarded(self, equation, correction, inner: Region, change: list[str], now: str) -> list[str]:
-        """Where a pivot was too small, the correction by partial pivoting, lane by lane."""
-        b, e, k, w = self.body, self.e, len(change), self.width
-        memory = b.alloca(e.real, k)
-        slots = self._slots(memory, k)
-        self._stores(change, slots)
-        weak = e.both(e.invert(inner.value(correction.stable)), now)
-        with b.when(e.any(weak)):
-            entries = [node for row in correction.jacobian for node in row]
-            cold = Region(e, self.g, inner)
-            cold.require(entries)
-            matrix, right = b.alloca(e.real, k * k), b.alloca(e.real, k)
-            self._stores([cold.value(n) for n in entries], self._slots(matrix, k * k))
-            self._stores([cold.value(n) for n in equation.residual], self._slots(right, k))
-            scratch = b.alloca("double", k * (k + 1))
-            for lane in range(w):
-                flag = e.extract(weak, lane, e.bool)
-                with b.when(flag):
-                    here = [b.at("double", m, lane) for m in (matrix, right, memory)]
-                    pointers = ", ".join(f"ptr {p}" for p in (*here, scratch))
-                    b.line(f"call void @dense_solve({pointers}, i64 {k}, i64 {w})")
-        return self._loads(slots)

@@ -1,5 +1,6 @@
 """The native engine's `run`: the same Problem and Outcome as the xla engine's."""
 
+import itertools
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -118,8 +119,7 @@ class Lanes:
         table[:, :s] = np.asarray(p.state).reshape(self.lanes, s)
         for stage, guess in enumerate(p.guess):
             values = np.asarray(guess).reshape(self.lanes, -1)
-            for copy in (stage, len(p.guess) + stage):
-                table[:, s + copy * k : s + copy * k + values.shape[1]] = values
+            table[:, s + stage * k : s + stage * k + values.shape[1]] = values
         self.records = self._blocked(table)
         leaves = made.parameters.flatten(p.params, p.batch if p.batch_params else None)
         self.params = self._blocked(np.broadcast_to(leaves, (self.lanes, leaves.shape[-1])))
@@ -178,5 +178,5 @@ class Lanes:
             return
         bounds = np.linspace(0, self.blocks, self.threads + 1).astype(int).tolist()
         with ThreadPoolExecutor(self.threads) as pool:
-            for future in [pool.submit(part, a, b) for a, b in zip(bounds, bounds[1:], strict=False)]:
+            for future in [pool.submit(part, a, b) for a, b in itertools.pairwise(bounds)]:
                 future.result()

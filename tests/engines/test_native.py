@@ -1,0 +1,343 @@
+"""The native engine against the xla engine, and its own promises: determinism, failures, caches."""
+
+import dataclasses
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import dirax as dx
+from dirax.engines import native, xla
+from dirax.engines.native import compile as llvm
+from dirax.engines.native.program import program
+from dirax.engines.native.step_loop import kernel_module
+from dirax.engines.result import NOT_CONVERGED, NOT_FINITE, OK, Problem
+from dirax.schemes.step import Field, Shape, StepEquation, StepSequence, make_step_equation
+
+
+@pytest.fixture(autouse=True)
+def _kernels_in_a_folder_of_their_own(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("DIRAX_CACHE", str(tmp_path_factory.getbasetemp() / "kernels"))
+
+
+def planar_pendulums(q, v):
+    cross = v[0] * v[1] * jnp.cos(q[0] - q[1])
+    return v[0] ** 2 + v[1] ** 2 / 2 + cross + 2 * 9.81 * jnp.cos(q[0]) + 9.81 * jnp.cos(q[1])
+
+
+def rolling_disk(q, v):
+    return (v[0] ** 2 + v[1] ** 2) / 2 + v[2] ** 2 / 8 + v[3] ** 2 / 4 - 10 * jnp.sin(q[2])
+
+
+def rolling(q):
+    return jnp.array([[1.0, 0.0, -jnp.cos(q[3]), 0.0], [0.0, 1.0, -jnp.sin(q[3]), 0.0]])
+
+
+MIDPOINT = dx.LagrangeDAlembert()
+DISK = ([0.0, 0.0, 0.0, np.pi / 3], [5.0, 75**0.5, 10.0, 1.0])
+SYSTEMS = {  # name: Lagrangian, one-forms, scheme, q, v, h, steps, growth of roundoff
+    "harmonic oscillator": (lambda q, v: (v @ v - q @ q) / 2, None, MIDPOINT, [1.0, 0.0], [0.0, 0.5], 0.01, 1000, 1e-12),
+    "planar double pendulum": (planar_pendulums, None, MIDPOINT, [1.0, 0.5], [0.0, 0.5], 0.005, 400, 1e-11),
+    "Kepler": (lambda q, v: v @ v / 2 + 1 / jnp.sqrt(q @ q), None, MIDPOINT, [1.0, 0.0], [0.0, 1.1], 0.01, 1000, 1e-11),
+    "Hénon–Heiles": (
+        lambda q, v: (v @ v - q @ q) / 2 - q[0] ** 2 * q[1] + q[1] ** 3 / 3,
+        None, dx.LagrangeDAlembert("trapezoidal"), [0.1, 0.1], [0.3, 0.1], 0.05, 1000, 1e-11,
+    ),
+    "rolling disk, plus": (rolling_disk, rolling, dx.PlusLagrangeDirac(), *DISK, 0.001, 600, 1e-11),
+    "rolling disk, minus": (rolling_disk, rolling, dx.MinusLagrangeDirac(), *DISK, 0.001, 600, 1e-11),
+    "rolling disk, midpoint": (rolling_disk, rolling, MIDPOINT, *DISK, 0.001, 600, 1e-11),
+    "Heisenberg": (
+        lambda q, v: v @ v / 2, lambda q: jnp.array([[-q[1], q[0], 1.0]]),
+        dx.PlusLagrangeDirac(), [1.0, 0.0, 0.1], [5.0, 10.0, -10.0], 0.01, 600, 1e-10,
+    ),
+}  # fmt: skip
+
+
+def problem(name: str, **changes) -> Problem:
+    lagrangian, one_forms, scheme, q, v, h, steps, _ = SYSTEMS[name]
+    q, v = jnp.asarray(q), jnp.asarray(v)
+    m = 0 if one_forms is None else one_forms(q).shape[0]
+    equation = make_step_equation(scheme, dx.LagrangeDirac(lagrangian, one_forms), Shape(len(q), m))
+    p = jax.grad(lagrangian, argnums=1)(q, v)
+    state, guess = np.concatenate([q, p]), np.concatenate([v, np.zeros(m)])
+    return dataclasses.replace(Problem(equation, state, (guess,), h, 0.0, steps, save_every=7), **changes)
+
+
+def spread(p: Problem, size: int) -> Problem:
+    """A batch around the initial state."""
+    rng = np.random.default_rng(5)
+    state = np.asarray(p.state) * (1 + 0.01 * rng.standard_normal((size, len(p.state))))
+    guesses = tuple(np.tile(np.asarray(g), (size, 1)) for g in p.guess)
+    return dataclasses.replace(p, state=state, guess=guesses, batch=size)
+
+
+def assert_close(a, b, tolerance: float) -> None:
+    assert a.fields.keys() == b.fields.keys()
+    for name, values in a.fields.items():
+        other = np.asarray(b.fields[name])
+        assert values.shape == other.shape, name
+        np.testing.assert_allclose(values, other, rtol=tolerance, atol=tolerance * max(1.0, np.nanmax(np.abs(other), initial=0)))
+
+
+def assert_same_bits(a, b, rows_a=slice(None), rows_b=slice(None)) -> None:
+    for mine, other in ((a.fields, b.fields), (a.closing, b.closing)):
+        for name in mine:
+            assert mine[name][rows_a].tobytes() == other[name][rows_b].tobytes(), name
+    for name in ("completed", "status", "iterations", "max_residual", "last_state", "last_unknowns"):
+        assert getattr(a, name)[rows_a].tobytes() == getattr(b, name)[rows_b].tobytes(), name
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_both_engines_agree_to_roundoff_growth(name):
+    p, growth = problem(name), SYSTEMS[name][-1]
+    mine, theirs = native.run(p), xla.run(p)
+    assert_close(mine, theirs, growth)
+    assert mine.status[0] == OK and mine.completed[0] == p.steps
+    assert abs(int(mine.iterations[0]) - int(theirs.iterations[0])) <= 0.02 * p.steps
+    np.testing.assert_allclose(mine.last_state, theirs.last_state, rtol=growth, atol=growth)
+    assert mine.engine == "native" and mine.notes["unknowns"] == p.equation.unknowns and mine.notes["operations"] > 10
+
+
+@pytest.mark.parametrize("name", ["planar double pendulum", "rolling disk, midpoint"])
+def test_bits_do_not_depend_on_batch_lane_width_threads_or_repetition(name, monkeypatch):
+    batch = spread(problem(name, steps=60), 11)
+    whole = native.run(batch)
+    assert np.all(whole.status == OK)
+    assert_same_bits(whole, native.run(batch))
+    for threads in ("1", "3"):
+        monkeypatch.setenv("DIRAX_THREADS", threads)
+        assert_same_bits(whole, native.run(batch))
+    part = lambda lanes: dataclasses.replace(
+        batch, state=batch.state[lanes], guess=(batch.guess[0][lanes],), batch=len(batch.state[lanes])
+    )
+    order = np.random.default_rng(1).permutation(11)
+    assert_same_bits(native.run(part(order)), whole, rows_b=order)
+    for lanes in (slice(0, 1), slice(3, 5), slice(2, 6), slice(0, 8)):  # 1, 2, 4 and 8 wide where the processor is
+        assert_same_bits(native.run(part(lanes)), whole, rows_b=lanes)
+    alone = dataclasses.replace(batch, state=batch.state[4], guess=(batch.guess[0][4],), batch=None)
+    assert_same_bits(native.run(alone), whole, rows_b=slice(4, 5))
+
+
+def test_a_chunk_boundary_leaves_no_trace(monkeypatch):
+    from dirax.engines.native import driver
+
+    p = problem("planar double pendulum")
+    whole = native.run(p)
+    monkeypatch.setattr(driver, "FIRST_CHUNK", 1)
+    monkeypatch.setattr(driver, "CHUNK_SECONDS", 1e-9)
+    calls = []
+    assert_same_bits(native.run(p, lambda done, total: calls.append((done, total))), whole)
+    assert calls == [(i + 1, p.steps) for i in range(p.steps)]
+
+
+def implicit(residual, advance=lambda u, state, t, h, params: u, size=1, **more) -> StepEquation:
+    return StepEquation(
+        start=lambda data, h, params: (data["x"], data["x"]),
+        residual=residual,
+        advance=advance,
+        unpack=lambda state, u, t, h, params: {"x": state},
+        state_size=size,
+        unknowns=size,
+        fields={"x": Field((size,))},
+        **more,
+    )
+
+
+def small(equation, state, h=0.1, steps=20, **more) -> Problem:
+    state = np.asarray(state, dtype=float)
+    guess = tuple(state[..., : stage.unknowns] for stage, _ in equation.stages)
+    return Problem(equation, state, guess, h, 0.0, steps, batch=len(state) if state.ndim == 2 else None, **more)
+
+
+def test_failing_lanes_stop_at_their_last_good_step_and_the_others_go_on():
+    # backward Euler of ẋ = √(1 − x) + drift: NaN beyond 1
+    equation = implicit(lambda u, x, t, h, params: u - x - h * (0.2 + jnp.sqrt(1 - u)))
+    p = small(equation, [[-9.0], [0.2], [-20.0], [0.8], [-15.0]], save_every=3)
+    mine, theirs = native.run(p), xla.run(p)
+    assert mine.status.tolist() == np.asarray(theirs.status).tolist()
+    assert set(mine.status.tolist()) == {OK, NOT_FINITE}
+    assert mine.completed.tolist() == np.asarray(theirs.completed).tolist()
+    np.testing.assert_allclose(mine.last_state, theirs.last_state, rtol=1e-13)
+    np.testing.assert_allclose(mine.closing["x"], theirs.closing["x"], rtol=1e-13)
+    reached = mine.completed[:, None] >= np.minimum(np.arange(p.rows) * p.save_every, p.steps)
+    np.testing.assert_allclose(mine.fields["x"][reached], np.asarray(theirs.fields["x"])[reached], rtol=1e-13)
+    alone = native.run(dataclasses.replace(p, state=p.state[1], guess=(p.guess[0][1],), batch=None))
+    assert alone.completed[0] == mine.completed[1] and alone.last_state.tobytes() == mine.last_state[1:2].tobytes()
+
+
+def test_iteration_cap_and_singular_jacobian():
+    no_root = implicit(lambda u, x, t, h, params: u**2 + 1 + x)
+    outcome = native.run(small(no_root, [0.3]))
+    assert outcome.status[0] == NOT_CONVERGED and outcome.completed[0] == 0 and outcome.iterations[0] == 50
+    assert outcome.fields["x"][0, 0, 0] == 0.3
+    singular = implicit(lambda u, x, t, h, params: jnp.stack([u[0] + u[1], u[0] + u[1]]) - x, size=2)
+    outcome = native.run(small(singular, [1.0, 2.0]))
+    assert outcome.status[0] == NOT_FINITE and outcome.completed[0] == 0
+
+
+def test_small_pivots_are_exchanged_at_run_time():
+    """A fixed order cannot be right for both lanes: the matrix is [[s, 1], [1, s]] with s = 1e-20 and 1e20."""
+
+    def residual(u, x, t, h, params):
+        s = jnp.exp(params)
+        return jnp.stack([s * u[0] + u[1] + u[0] ** 3 * 1e-3, u[0] + s * u[1]]) - x
+
+    s = np.log([1e-20, 1e20, 1.5])
+    p = small(implicit(residual, size=2), [[1.0, 2.0]] * 3, steps=1, params=s, batch_params=True)
+    outcome = native.run(p)
+    assert np.all(outcome.status == OK)
+    for lane in range(3):
+        u = outcome.fields["x"][lane, 1]
+        scale = np.exp(s[lane])
+        matrix = np.array([[scale, 1.0], [1.0, scale]])
+        left = matrix @ u + [u[0] ** 3 * 1e-3, 0.0] - [1.0, 2.0]
+        assert np.all(np.abs(left) <= 1e-14 * (np.abs(matrix) @ np.abs(u) + 3))
+
+
+def test_explicit_methods_time_and_parameters():
+    """Explicit midpoint of ẋ = a cos(ω t) x against the closed form."""
+
+    def advance(u, x, t, h, params):
+        slope = lambda x, t: params["a"] * jnp.cos(params["w"] * t) * x
+        return x + h * slope(x + h / 2 * slope(x, t), t + h / 2)
+
+    equation = StepEquation(
+        start=lambda data, h, params: (data["x"], jnp.zeros(0)),
+        residual=lambda u, x, t, h, params: jnp.zeros(0),
+        advance=advance,
+        unpack=lambda x, u, t, h, params: {"x": x, "t": t},
+        state_size=1,
+        unknowns=0,
+        fields={"x": Field((1,)), "t": Field(())},
+    )
+    params = {"a": np.array([0.5, 1.0, -0.3]), "w": np.array([1.0, 2.0, 3.0]), "whole": np.array([1, 2, 3])}
+    p = Problem(
+        equation, np.ones((3, 1)), (np.zeros((3, 0)),), 1e-3, 0.5, 2000, 100, first_step=1,
+        params=params, batch=3, batch_params=True,
+    )  # fmt: skip
+    outcome = native.run(p)
+    t = 0.5 + 1e-3 * (1 + np.minimum(np.arange(p.rows) * 100, 2000))
+    np.testing.assert_allclose(outcome.fields["t"], np.tile(t, (3, 1)), rtol=1e-14)
+    a, w = params["a"][:, None], params["w"][:, None]
+    exact = np.exp(a / w * (np.sin(w * t) - np.sin(w * t[0])))
+    np.testing.assert_allclose(outcome.fields["x"][..., 0], exact, atol=2e-6)
+    one = dataclasses.replace(
+        p, state=p.state[1], guess=(p.guess[0][1],), params={k: v[1] for k, v in params.items()}, batch=None, batch_params=False
+    )
+    assert native.run(one).fields["x"].tobytes() == outcome.fields["x"][1:2].tobytes()
+
+
+def test_sequences_of_equations_agree_with_xla():
+    """Euler forward and backward in turn, and Suzuki's five stages of one equation."""
+    force = lambda x, t: jnp.stack([x[1], -jnp.sin(x[0]) + 0.1 * jnp.cos(t)])
+    backward = implicit(lambda u, x, t, h, params: u - x - h * force(u, t + h), size=2)
+    forward = StepEquation(
+        start=lambda data, h, params: (data["x"], jnp.zeros(0)),
+        residual=lambda u, x, t, h, params: jnp.zeros(0),
+        advance=lambda u, x, t, h, params: x + h * force(x, t),
+        unpack=lambda x, u, t, h, params: {"x": x},
+        state_size=2, unknowns=0, fields={"x": Field((2,))},
+    )  # fmt: skip
+    middle = implicit(lambda u, x, t, h, params: u - x - h * force((u + x) / 2, t + h / 2), size=2, scale=(2.0, 1.0))
+    s = 1 / (4 - 4 ** (1 / 3))
+    for equation in (
+        StepSequence(((forward, 0.5), (backward, 0.5))),
+        StepSequence(tuple((middle, f) for f in (s, s, 1 - 4 * s, s, s))),
+    ):
+        p = small(equation, [[0.3, 0.0], [1.0, 0.5], [2.0, -0.1]], steps=50, save_every=4)
+        mine, theirs = native.run(p), xla.run(p)
+        assert_close(mine, theirs, 1e-12)
+        assert np.all(mine.status == OK)
+        alone = dataclasses.replace(p, state=p.state[2], guess=tuple(g[2] for g in p.guess), batch=None)
+        assert_same_bits(native.run(alone), mine, rows_b=slice(2, 3))
+
+
+@settings(max_examples=3, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5))
+def test_random_equations_agree_with_xla(seed, size):
+    rng = np.random.default_rng(seed)
+    a, b, c = rng.standard_normal((3, size, size)) / np.sqrt(size)
+    kinds = rng.integers(0, 4, size)
+    functions = (jnp.sin, jnp.tanh, lambda x: x / (1 + x * x), lambda x: jnp.where(x > 0, x, jnp.expm1(x)))
+
+    def field(x, t):
+        y = b @ x + jnp.cos(t)
+        return a @ jnp.stack([functions[k](y[i]) for i, k in enumerate(kinds)]) + 0.1 * (c @ x)
+
+    equation = implicit(lambda u, x, t, h, params: u - x - h * field((u + x) / 2, t + h / 2), size=size)
+    p = small(equation, rng.standard_normal((2, size)), steps=30)
+    mine, theirs = native.run(p), xla.run(p)
+    assert mine.status.tolist() == [OK, OK]
+    assert_close(mine, theirs, 1e-11)
+
+
+def test_an_interruption_keeps_what_was_computed(monkeypatch):
+    from dirax.engines.native import driver
+
+    monkeypatch.setattr(driver, "FIRST_CHUNK", 100)
+
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    p = problem("Kepler")
+    outcome, whole = native.run(p, interrupt), native.run(p)
+    assert outcome.interrupted and outcome.completed.tolist() == [100] and outcome.status.tolist() == [OK]
+    rows = 100 // p.save_every + 1
+    assert outcome.fields["q"][:, :rows].tobytes() == whole.fields["q"][:, :rows].tobytes()
+    assert np.all(np.isnan(outcome.fields["q"][:, rows:]))
+    np.testing.assert_array_equal(outcome.closing["q"], outcome.last_state[:, :2])
+
+
+def test_kernels_are_cached_on_disk_and_damaged_entries_are_made_again(tmp_path, monkeypatch):
+    from dirax.engines.native import program as programs
+
+    monkeypatch.setenv("DIRAX_CACHE", str(tmp_path))
+    p = problem("Hénon–Heiles", steps=30)
+    forget = lambda: programs._programs.clear()
+    forget()
+    first = native.run(p)
+    assert not first.notes["kernel_cached"] and native.run(p).notes["kernel_cached"]
+    (entry,) = (tmp_path / "kernels").iterdir()
+    forget()
+    again = native.run(p)
+    assert again.notes["kernel_cached"] and again.notes["operations"] == first.notes["operations"]
+    assert_same_bits(again, first)
+    good = entry.read_bytes()
+    for damaged in (good[:-1], good[:40] + b"\0" + good[41:], b""):
+        entry.write_bytes(damaged)
+        forget()
+        redone = native.run(p)
+        assert not redone.notes["kernel_cached"] and entry.read_bytes() == good
+        assert_same_bits(redone, first)
+    monkeypatch.setenv("DIRAX_CACHE", "off")
+    forget()
+    assert not native.run(p).notes["kernel_cached"]
+    monkeypatch.delenv("DIRAX_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
+    assert llvm.cache_folder() == llvm.Path("/somewhere/dirax/kernels")
+
+
+def test_what_cannot_be_compiled_is_named_with_its_line():
+    def residual(u, x, t, h, params):
+        roots = jnp.linalg.eigvalsh(jnp.outer(u, u))  # the line that the message names
+        return u - x - h * roots
+
+    p = small(implicit(residual, size=2), [1.0, 2.0])
+    reason = native.supported(p)
+    assert reason is not None and "eigh" in reason and f"{os.path.basename(__file__)}:" in reason
+    with pytest.raises(native.UnsupportedPrimitive, match="eigh"):
+        native.run(p)
+    assert native.supported(problem("Kepler")) is None
+
+
+def test_the_kernel_compiles_for_aarch64():
+    p = problem("rolling disk, plus")
+    plan = program(p.equation, None, False)[0]._planned()
+    for width in (1, 2):
+        text = llvm.object_code(kernel_module(plan, width, fma=True), ("aarch64-unknown-linux-gnu", "generic", ""), assembly=True)
+        assert "fmadd" in text if width == 1 else "fmla" in text or "fmls" in text
+        assert "\nrun:" in text
