@@ -1,0 +1,162 @@
+"""compare(): several schemes on one system, in one table: order, error, energy, constraint, cost."""
+
+import time as clock
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dirax.diagnostics.convergence import convergence
+from dirax.diagnostics.drift import judge
+from dirax.diagnostics.table import html_table, number, plain, text_table
+from dirax.schemes.step import AbstractScheme
+from dirax.simulate import simulate
+from dirax.solution import Solution
+from dirax.systems.system import AbstractSystem
+
+HEADER = ("scheme", "order", "error", "energy band", "energy", "slope", "constraint", "µs/step", "Newton/step", "ended")
+ORDER_STEPS = 64
+"""The order is measured over so many steps of the run's size (fewer if the run is shorter), halved twice."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One scheme's row. `error` is at the end of the stretch over which the order was measured; None is not known.
+
+    `drift` is the verdict on the energy ("bounded", "drifts", "not checked"), `slope` its least-squares slope per unit of time.
+    """
+
+    scheme: str
+    order: float | None
+    error: float | None
+    energy_band: float | None
+    drift: str
+    slope: float | None
+    constraint: float | None
+    microseconds_per_step: float
+    newton_per_step: float
+    ended: str
+    note: str = ""
+
+    def cells(self) -> tuple[str, ...]:
+        """The row as text."""
+        numbers = (self.energy_band, self.slope, self.constraint, self.microseconds_per_step, self.newton_per_step)
+        band, slope, constraint, cost, newton = (number(value) for value in numbers)
+        order = "" if self.order is None else f"{self.order:.2f}"
+        return (self.scheme, order, number(self.error), band, self.drift, slope, constraint, cost, newton, self.ended)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The rows of `dx.compare`; prints as a table. `comparison[name]` is the row of a scheme."""
+
+    title: str
+    entries: tuple[Entry, ...]
+
+    def __getitem__(self, scheme: str) -> Entry:
+        for entry in self.entries:
+            if entry.scheme == scheme:
+                return entry
+        raise KeyError(f"no scheme {scheme!r}; there are {', '.join(repr(e.scheme) for e in self.entries)}.")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The table as plain Python values, fit for JSON."""
+        return plain({"title": self.title, "schemes": [vars(entry) for entry in self.entries]})
+
+    def __str__(self) -> str:
+        notes = [f"{entry.scheme}: {entry.note}" for entry in self.entries if entry.note]
+        return "\n".join([text_table(HEADER, [entry.cells() for entry in self.entries], self.title), *notes])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return html_table(HEADER, [entry.cells() for entry in self.entries], self.title)
+
+
+def compare(
+    system: AbstractSystem,
+    schemes: Mapping[str, AbstractScheme] | Sequence[AbstractScheme],
+    *,
+    step: float,
+    steps: int,
+    reference: Callable | AbstractScheme | None = None,
+    repeats: int = 3,
+    **run: Any,
+) -> Comparison:
+    """Run every scheme on one system with the same data and tabulate what it costs and what it keeps.
+
+    `schemes`: a dict by name, or a list (named by class). `reference` as in `dx.convergence`; without it each scheme is
+    compared with the refinement of the one whose measured order is highest. `run`: initial data and the other keywords
+    of `dx.simulate`, one trajectory. Times are medians of `repeats` interleaved runs of compiled code, saving included.
+
+    Raises what `dx.simulate` raises for bad data; a scheme that fails midway has that in its row.
+    """
+    named = dict(schemes) if isinstance(schemes, Mapping) else _named(schemes)
+    if not named:
+        raise ValueError("schemes must name at least one scheme, but it is empty.")
+    sols = {name: simulate(system, scheme, step=step, steps=steps, **run) for name, scheme in named.items()}
+    seconds = {name: [] for name in named}
+    for _ in range(repeats):
+        for name, scheme in named.items():
+            tick = clock.perf_counter()
+            sol = simulate(system, scheme, step=step, steps=steps, **run)
+            seconds[name].append(sol.stats.get("run_seconds", clock.perf_counter() - tick))
+    orders = {name: _order(system, scheme, step, steps, reference, run) for name, scheme in named.items()}
+    best = max((name for name in named if orders[name][0] is not None), key=lambda n: orders[n][0], default=None)
+    target = reference if reference is not None else named[best] if best is not None else None
+    entries = []
+    for name, sol in sols.items():
+        order, error, note = orders[name]
+        if target is not None and order is not None and name != best and reference is None:
+            _, error, note = _order(system, named[name], step, steps, target, run)
+        entries.append(_entry(name, sol, order, error, note, float(np.median(seconds[name]))))
+    return Comparison(f"{type(system).__name__}: {steps} steps of {step:g}", tuple(entries))
+
+
+def _named(schemes: Sequence[AbstractScheme]) -> dict[str, AbstractScheme]:
+    named: dict[str, AbstractScheme] = {}
+    for scheme in schemes:
+        name, count = type(scheme).__name__, 2
+        while name in named:
+            name, count = f"{type(scheme).__name__} {count}", count + 1
+        named[name] = scheme
+    return named
+
+
+def _order(system, scheme, step, steps, reference, run) -> tuple[float | None, float | None, str]:
+    """(order, error at the given step, note); None where it could not be measured, with the reason as note."""
+    stretch = min(steps, ORDER_STEPS)
+    sizes = [step / 2**i for i in range(4)]
+    try:
+        found = convergence(system, scheme, step_sizes=sizes, time=stretch * step, reference=reference, **run)
+    except ValueError as reason:
+        return None, None, str(reason)
+    first = next(iter(found.slopes.values()))
+    return first.order, float(first.errors[0]), ""
+
+
+def _entry(name: str, sol: Solution, order, error, note: str, seconds: float) -> Entry:
+    steps = max(1, (sol.rows - 1) * sol.save_every)
+    energy, band, drift, slope = None, None, "not checked", None
+    if sol.rows > 1:
+        energy = np.asarray(sol.energy())
+        band = float(np.ptp(energy))
+        slope = float(np.polyfit(sol.t - sol.t.mean(), energy, 1)[0])
+        motion = np.asarray(sol.fields["q"] if "q" in sol.fields else sol.fields["x"])
+        roundoff = np.finfo(float).eps * max(1.0, float(np.max(np.abs(energy)))) * 8 * np.sqrt(steps)
+        drift = judge(sol.t, energy, motion, roundoff).verdict
+    constraint = np.asarray(sol.constraint_residual())
+    return Entry(
+        scheme=name,
+        order=order,
+        error=error,
+        energy_band=band,
+        drift=drift,
+        slope=slope,
+        constraint=float(np.max(np.abs(constraint))) if constraint.size else None,
+        microseconds_per_step=1e6 * seconds / steps,
+        newton_per_step=float(sol.stats["newton_iterations"]) / steps,
+        ended="ok" if np.all(sol.ok) else f"stopped at t = {sol.t[-1]:g}",
+        note=note or ("" if np.all(sol.ok) else str(sol.message)),
+    )

@@ -1,0 +1,204 @@
+"""convergence(): the order of a scheme, measured: errors over several step sizes, and the slope above roundoff."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dirax.diagnostics.table import html_table, number, plain, text_table
+from dirax.schemes.step import AbstractScheme
+from dirax.simulate import simulate
+from dirax.solution import Solution
+from dirax.systems.system import AbstractSystem
+
+REFINEMENT = 16
+"""A refined reference has so many times smaller steps than the smallest measured ones."""
+
+PLATEAU = 100.0
+"""Errors below so many units of roundoff growth, ε·max|y|·√steps, are not used."""
+
+STILL_FALLING = 0.9
+"""A smaller step must bring the error below this fraction of that before, or the plateau has begun."""
+
+USABLE = 3
+"""Step sizes that a slope needs."""
+
+
+@dataclass(frozen=True)
+class Slope:
+    """The measured order of one quantity: the slope of log(error) over log(h), its standard error, and what it rests on.
+
+    `errors` holds the largest error over the common times for each step size, `used` says which ones the slope rests on.
+    """
+
+    order: float
+    standard_error: float
+    errors: np.ndarray
+    used: np.ndarray
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """What `dx.convergence` measured; prints as a table. `order` is that of q (or x); `orders` has all by name."""
+
+    title: str
+    step_sizes: np.ndarray
+    slopes: dict[str, Slope]
+    reference: str
+    notes: tuple[str, ...] = field(default_factory=tuple)
+
+    @property
+    def orders(self) -> dict[str, float]:
+        """The measured order of each quantity."""
+        return {name: slope.order for name, slope in self.slopes.items()}
+
+    @property
+    def order(self) -> float:
+        """The measured order of the positions: q, or x where there is no q."""
+        return next(iter(self.slopes.values())).order
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain Python values, fit for JSON."""
+        slopes = {name: vars(slope) for name, slope in self.slopes.items()}
+        head = {"title": self.title, "step_sizes": self.step_sizes, "reference": self.reference}
+        return plain({**head, "quantities": slopes, "notes": self.notes})
+
+    def _table(self):
+        header = ("step", *(f"error of {name}" for name in self.slopes))
+        rows = []
+        for i, h in enumerate(self.step_sizes):
+            cells = [number(s.errors[i]) + ("" if s.used[i] else " (not used)") for s in self.slopes.values()]
+            rows.append((number(h, 6), *cells))
+        rows.append(("order", *(f"{s.order:.3f} ± {s.standard_error:.1g}" for s in self.slopes.values())))
+        return header, rows, f"{self.title}, against {self.reference}"
+
+    def __str__(self) -> str:
+        header, rows, title = self._table()
+        return "\n".join([text_table(header, rows, title), *self.notes])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        header, rows, title = self._table()
+        return html_table(header, rows, title)
+
+
+def convergence(
+    system: AbstractSystem,
+    scheme: AbstractScheme,
+    *,
+    step_sizes: Sequence[float],
+    time: float,
+    reference: Callable | AbstractScheme | None = None,
+    quantities: Sequence[str] | None = None,
+    **run: Any,
+) -> Convergence:
+    """Measure the order of `scheme` on `system` over runs to `time` with the given step sizes (at least three).
+
+    `run`: initial data, `params` and the other keywords of `dx.simulate`, without step and steps. Every step size must
+    divide the largest, and the largest `time`; errors are the largest over the common times. `reference`: a function
+    t (rows,) -> q (rows, n), or -> a dict of such arrays by name; a scheme, run with 16 times smaller steps than the
+    smallest; or None for `scheme` itself so refined (the slope then allows for the reference's own error).
+    `quantities`: names of saved fields, by default all of q, p, x that the reference has, and the multipliers of discrete
+    Lagrange–d'Alembert schemes, compared as μ_k/h at their nodes from the second on.
+
+    The slope is a regression over the step sizes above the roundoff plateau. Raises `ValueError` for step sizes that do
+    not fit, a run that fails, or fewer than three step sizes that can be used.
+    """
+    h = _checked(step_sizes, time)
+    exact = reference if callable(reference) and not isinstance(reference, AbstractScheme) else None
+    stride = np.round(h[0] / h).astype(int)
+    runs = [_run(system, scheme, size, time, int(every), run) for size, every in zip(h, stride, strict=True)]
+    common = runs[0].t
+    if exact is not None:
+        expected, label, finest = _evaluated(exact, common), "the exact solution", None
+    else:
+        by = reference if isinstance(reference, AbstractScheme) else scheme
+        finest = h[-1] / REFINEMENT if by is scheme else None
+        refined = _run(system, by, h[-1] / REFINEMENT, time, int(stride[-1]) * REFINEMENT, run)
+        expected = _quantities(refined)
+        label = f"{type(by).__name__} with steps of {h[-1] / REFINEMENT:.3g}"
+    measured = [_quantities(sol) for sol in runs]
+    names = list(quantities) if quantities is not None else [name for name in measured[0] if name in expected]
+    missing = [name for name in names if name not in measured[0] or name not in expected]
+    if missing or not names:
+        raise ValueError(
+            f"quantities {missing or names} are not in both the run ({', '.join(measured[0])}) and the reference "
+            f"({', '.join(expected)}): choose among those in both."
+        )
+    slopes, notes = {}, []
+    for name in names:
+        errors = np.array([np.max(np.abs(m[name] - expected[name])) for m in measured])
+        size = max(float(np.max(np.abs(expected[name]))), np.finfo(float).tiny)
+        used = _above_plateau(errors, np.finfo(float).eps * size * np.sqrt(time / h) * PLATEAU)
+        if np.sum(used) < USABLE:
+            if name != names[0]:
+                notes.append(f"{name}: too few errors above roundoff for an order ({', '.join(number(e) for e in errors)}).")
+                continue
+            raise ValueError(
+                f"only {int(np.sum(used))} of the step sizes give errors of {name} that fall and lie above roundoff, and an "
+                f"order needs {USABLE}: errors {', '.join(number(e) for e in errors)} for steps "
+                f"{', '.join(number(s) for s in h)}; take larger steps, or more of them."
+            )
+        slopes[name] = Slope(*_slope(h[used], errors[used], finest), errors, used)
+    return Convergence(f"{type(scheme).__name__} on {type(system).__name__}, t ≤ {time:g}", h, slopes, label, tuple(notes))
+
+
+def _checked(step_sizes, time: float) -> np.ndarray:
+    h = np.sort(np.unique(np.asarray(step_sizes, dtype=float)))[::-1]
+    if len(h) < USABLE or not np.all(np.isfinite(h)) or h[-1] <= 0:
+        raise ValueError(f"step_sizes must be at least {USABLE} different positive numbers, but {step_sizes!r} was given.")
+    ratios = np.append(h[0] / h, time / h[0])
+    off = np.abs(ratios - np.round(ratios)) > 1e-9 * ratios
+    if np.any(off) or round(time / h[0]) < 1:
+        raise ValueError(
+            f"every step size must divide the largest, {h[0]:g}, and that must divide time = {time:g}, so that there are "
+            f"common times: {', '.join(number(s, 6) for s in h)} do not; take {h[0]:g}/2, {h[0]:g}/4, … for instance."
+        )
+    return h
+
+
+def _run(system, scheme, h: float, time: float, every: int, run: Mapping[str, Any]) -> Solution:
+    sol = simulate(system, scheme, step=h, steps=round(time / h), save_every=every, **run)
+    if not np.all(sol.ok):
+        message = sol.message if isinstance(sol.message, str) else next(m for m in sol.message if m)
+        raise ValueError(f"the run with steps of {h:g} failed, so no order can be measured: {message}")
+    return sol
+
+
+def _quantities(sol: Solution) -> dict[str, np.ndarray]:
+    """The node fields, rows first, and multipliers of discrete Lagrange–d'Alembert schemes as μ/h."""
+    found = {name: np.asarray(sol.fields[name]) for name in ("q", "x", "p") if name in sol.fields}
+    if "multipliers" in sol.fields and "constraint" in sol.fields and sol.rows > 2:
+        found["multipliers"] = np.asarray(sol.fields["multipliers"])[..., 1:, :] / sol.step
+    return found
+
+
+def _evaluated(exact: Callable, t: np.ndarray) -> dict[str, np.ndarray]:
+    values = exact(t)
+    named = values if isinstance(values, Mapping) else {"q": values, "x": values}
+    return {name: np.asarray(value) for name, value in named.items()}
+
+
+def _above_plateau(errors: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """Which errors lie above roundoff and before the first that no longer falls; `errors` by falling step size."""
+    used = np.isfinite(errors) & (errors > floor)
+    for i in range(1, len(errors)):
+        if used[i] and not (used[i - 1] and errors[i] < STILL_FALLING * errors[i - 1]):
+            used[i:] = False
+    return used
+
+
+def _slope(h: np.ndarray, errors: np.ndarray, finest: float | None) -> tuple[float, float]:
+    """(order, standard error); against the scheme's own refinement e(h) = C (h^p − h_ref^p), solved by iteration for p."""
+    corrected, order, error = errors, 0.0, 0.0
+    for _ in range(1 if finest is None else 10):
+        x, y = np.log(h), np.log(corrected)
+        order, offset = np.polyfit(x, y, 1)
+        residual = y - order * x - offset
+        spread = np.sum((x - x.mean()) ** 2)
+        error = float(np.sqrt(np.sum(residual**2) / max(len(h) - 2, 1) / spread))
+        if finest is not None and order > 0:
+            corrected = errors / (1.0 - (finest / h) ** order)
+    return float(order), error
