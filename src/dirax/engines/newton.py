@@ -1,101 +1,159 @@
-"""Newton's method run to the roundoff floor, as an optimistix root finder with the implicit adjoint."""
+"""Newton's method run to the roundoff floor, differentiable by the implicit function theorem."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
-from jaxtyping import Array, Float
+import numpy as np
+from jax.scipy.linalg import lu_factor, lu_solve
+from jaxtyping import Array, Bool, Float, Int
 
-UNROLLED = 6
-"""Largest number of unknowns whose elimination is written out in scalars; beyond it LAPACK is faster."""
+LARGEST_INVERSE = 8
+"""Largest number of unknowns for which the inverse is written out in array operations; beyond it LAPACK is faster."""
 
 EPSILON = 2.220446049250313e-16
+FLOOR = 8 * EPSILON
+"""A relative update of this size is roundoff: the unknowns cannot be known better."""
+
+NEGLIGIBLE = 1e-5 * EPSILON
+"""Error left by the last update that even 10¹⁰ steps do not add up to more than their roundoff."""
+
+STALLED = 1e-9
+"""Updates below this that no longer shrink have reached the floor of an ill-conditioned equation."""
+
+NEAR, CONTRACTING = 1e-3, 1e-2
+"""The Jacobian is used again after a first update below NEAR, and as long as updates shrink by the factor CONTRACTING."""
 
 
-def small_solve(a: Float[Array, "k k"], b: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Solve a x = b: elimination with partial pivoting, unrolled into scalars for small k (XLA fuses it into one kernel)."""
-    k = b.shape[0]
-    if k > UNROLLED:
-        return jnp.linalg.solve(a, b)
-    rows = [[a[i, j] for j in range(k)] + [b[i]] for i in range(k)]
+class Search(NamedTuple):
+    """Where the iteration stands: the unknowns, and (the size of the last update relative to |u_i| + scale_i, its ratio to
+    the update before, the number of updates) as one array, which costs XLA one kernel and not three."""
+
+    u: Float[Array, " k"]
+    measures: Float[Array, "3"]
+
+    @property
+    def update(self) -> Float[Array, ""]:
+        """inf before the first update."""
+        return self.measures[0]
+
+    @property
+    def ratio(self) -> Float[Array, ""]:
+        """nan after the first update."""
+        return self.measures[1]
+
+    @property
+    def count(self) -> Float[Array, ""]:
+        """A whole number."""
+        return self.measures[2]
+
+
+def solve(
+    residual: Callable[..., Float[Array, " k"]],
+    scale: tuple[float, ...],
+    guess: Float[Array, " k"],
+    args: tuple[Any, ...],
+    max_iterations: int,
+    running: Any = True,
+    differentiable: bool = True,
+) -> tuple[Float[Array, " k"], Int[Array, ""], Bool[Array, ""]]:
+    """(u, number of updates, converged) of residual(u, *args) = 0; differentiable in args, not in the guess.
+
+    `scale` (k,) is the unit of each unknown, relative to which updates are measured. The guess comes back where `running`
+    is false. Without `differentiable` there is less to trace.
+    """
+    if guess.shape[0] == 0:
+        return guess, jnp.zeros((), jnp.int64), jnp.array(True)
+
+    def search(equation, guess):
+        return newton(equation, jnp.asarray(scale), guess, max_iterations, running)
+
+    def tangent_solve(linear, right_hand_side):
+        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(guess.shape[0]))
+        return factorised(matrix)(right_hand_side)
+
+    equation = lambda u: residual(u, *args)
+    if differentiable:
+        found = Search(*jax.lax.custom_root(equation, guess, search, tangent_solve, has_aux=True))
+    else:
+        found = search(equation, guess)
+    return found.u, found.count.astype(int), at_floor(found)
+
+
+def newton(equation: Callable, scale: Float[Array, " k"], guess: Float[Array, " k"], max_iterations: int, running: Any) -> Search:
+    """Newton's method in which a Jacobian serves several updates while they contract quickly, and is renewed otherwise."""
+
+    def updated(s: Search, solver: Callable) -> Search:
+        change = solver(equation(s.u))
+        u = s.u - change
+        update = jnp.max(jnp.abs(change) / (jnp.abs(u) + scale))
+        ratio = jnp.where(s.count > 0, update / s.update, jnp.nan)
+        return Search(u, jnp.stack([update, ratio, s.count + 1]))
+
+    def unfinished(s: Search):
+        return running & ~at_floor(s) & ~jnp.isnan(s.update) & (s.count < max_iterations)
+
+    def contracting(s: Search):
+        return unfinished(s) & ((s.ratio < CONTRACTING) | (jnp.isnan(s.ratio) & (s.update < NEAR)))
+
+    def with_new_jacobian(s: Search) -> Search:
+        solver = factorised(jax.jacfwd(equation)(s.u))
+        return jax.lax.while_loop(contracting, lambda s: updated(s, solver), updated(s, solver))
+
+    start = Search(guess, jnp.array([jnp.inf, jnp.nan, 0.0]))
+    return jax.lax.while_loop(unfinished, with_new_jacobian, start)
+
+
+def at_floor(s: Search) -> Bool[Array, ""]:
+    """Whether another update would gain nothing.
+
+    With a Jacobian from a distance e of the root the error shrinks by 2Ce in an update, C the curvature, and Ce is the
+    ratio of the first two updates: what the last update leaves is at most 2·ratio·update.
+    """
+    left = 2 * s.ratio * s.update
+    stalled = (s.ratio >= 0.5) & (s.update < STALLED)
+    return (s.update <= FLOOR) | (left <= NEGLIGIBLE) | stalled
+
+
+def factorised(matrix: Float[Array, "k k"]) -> Callable[[Float[Array, " k"]], Float[Array, " k"]]:
+    """b ↦ the solution x of matrix·x = b; the elimination is done once."""
+    k = matrix.shape[0]
+    if k > LARGEST_INVERSE:
+        factors = lu_factor(matrix)
+        return lambda b: lu_solve(factors, b)
+    if k > 3:
+        inverse, order = _gauss_jordan_inverse(matrix)
+        return lambda b: jnp.sum(inverse * b[order][None, :], axis=1)
+    inverse = _cofactor_inverse(matrix)
+    return lambda b: jnp.sum(inverse * b[None, :], axis=1)
+
+
+def _cofactor_inverse(matrix):
+    """The inverse of a 1×1, 2×2 or 3×3 matrix by its cofactors, which fuses into one kernel."""
+    if matrix.shape[0] == 1:
+        return 1.0 / matrix
+    if matrix.shape[0] == 2:
+        (a, b), (c, d) = matrix
+        return jnp.array([[d, -b], [-c, a]]) / (a * d - b * c)
+    x, y, z = matrix
+    columns = jnp.stack([jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)], axis=1)
+    return columns / jnp.sum(x * columns[:, 0])
+
+
+def _gauss_jordan_inverse(matrix):
+    """The inverse of the matrix with its rows in `order`, and that order: elimination in place with partial pivoting, a few
+    array operations a column."""
+    k = matrix.shape[0]
+    row, column = np.arange(k)[:, None], np.arange(k + 1)[None, :]
+    # the last column says which row of the matrix stands here
+    table = jnp.concatenate([matrix, jnp.arange(k, dtype=matrix.dtype)[:, None]], axis=1)
     for c in range(k):
-        for i in range(c + 1, k):  # bubble the largest entry of column c up to row c
-            swap = jnp.abs(rows[i][c]) > jnp.abs(rows[c][c])
-            for j in range(c, k + 1):
-                upper, lower = rows[c][j], rows[i][j]
-                rows[c][j], rows[i][j] = jnp.where(swap, lower, upper), jnp.where(swap, upper, lower)
-        for i in range(c + 1, k):
-            factor = rows[i][c] / rows[c][c]
-            for j in range(c + 1, k + 1):
-                rows[i][j] = rows[i][j] - factor * rows[c][j]
-    x: list[Any] = [None] * k
-    for i in reversed(range(k)):
-        total = rows[i][k]
-        for j in range(i + 1, k):
-            total = total - rows[i][j] * x[j]
-        x[i] = total / rows[i][i]
-    return jnp.stack(x)
-
-
-class _State(eqx.Module):
-    update: Float[Array, ""]
-    previous_update: Float[Array, ""]
-    residual: Float[Array, ""]
-
-
-class NewtonToFloor(optx.AbstractRootFinder):
-    """Newton's method that stops when its updates no longer shrink, or when the next one is certain to be below roundoff.
-
-    Updates are measured relative to |u_i| + scale_i, `scale` the unit of each unknown.
-    """
-
-    scale: tuple[float, ...] = eqx.field(static=True)
-    rtol: float = eqx.field(static=True, default=0.0)
-    atol: float = eqx.field(static=True, default=0.0)
-    norm: Callable = eqx.field(static=True, default=optx.max_norm)
-
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        # an update of zero ends the iteration before it begins: a trajectory that has stopped costs nothing
-        first = jnp.where(options["running"], jnp.inf, 0.0)
-        return _State(first, jnp.array(jnp.inf), jnp.array(jnp.inf))
-
-    def step(self, fn, y, args, options, state, tags):
-        r, aux = fn(y, args)
-        jacobian = jax.jacfwd(lambda y: fn(y, args)[0])(y)
-        change = small_solve(jacobian, r)
-        new = y - change
-        update = jnp.max(jnp.abs(change) / (jnp.abs(new) + jnp.asarray(self.scale)))
-        return new, _State(update, state.update, jnp.max(jnp.abs(r))), aux
-
-    def terminate(self, fn, y, args, options, state, tags):
-        return at_floor(state.update, state.previous_update), optx.RESULTS.successful
-
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        return y, aux, {}
-
-
-def at_floor(update, previous):
-    """Whether Newton has nothing left to gain, from its last two relative updates (inf before there were any).
-
-    Either the updates stopped shrinking far down, or quadratic convergence, next ≈ update·(update/previous)², puts the
-    next one far below roundoff.
-    """
-    stalled = (update >= 0.5 * previous) & (update < 1e-9)
-    negligible = update * (update / previous) ** 2 < 1e-6 * EPSILON
-    return stalled | (update == 0.0) | (negligible & jnp.isfinite(previous) & (update < 1e-5))
-
-
-def solve(residual: Callable, scale: tuple[float, ...], u, args, max_iterations: int, running=True):
-    """(u, iterations, residual norm, converged) of residual(u, args) = 0 from the guess u; differentiable in args.
-
-    The guess comes back where `running` is false.
-    """
-    if u.shape[0] == 0:
-        return u, jnp.array(0), jnp.array(0.0), jnp.array(True)
-    options = {"running": jnp.asarray(running)}
-    solution = optx.root_find(residual, NewtonToFloor(scale), u, args, options, max_steps=max_iterations, throw=False)
-    converged = solution.result == optx.RESULTS.successful
-    return solution.value, solution.stats["num_steps"], solution.state.residual, converged
+        if c < k - 1:
+            pivot = c + jnp.argmax(jnp.abs(table[c:, c]))
+            upper, lower = table[c : c + 1], jax.lax.dynamic_slice_in_dim(table, pivot, 1)
+            table = jnp.where(row == c, lower, jnp.where(row == pivot, upper, table))
+        scaled = jnp.where(column == c, 1.0, table[c : c + 1]) / table[c, c]
+        reduced = jnp.where(column == c, 0.0, table) - table[:, c : c + 1] * scaled
+        table = jnp.where(column == k, table, jnp.where(row == c, scaled, reduced))
+    return table[:, :k], table[:, k].astype(int)

@@ -8,181 +8,125 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.newton import solve
-from dirax.engines.result import NOT_CONVERGED, NOT_FINITE, OK, Outcome, Problem, Progress
+from dirax.engines.lane import Lane, first_lane, packed_row, take_step, time_of, unpacked_row
+from dirax.engines.result import OK, Outcome, Problem, Progress
+
+__all__ = ["first_lane", "run", "run_traced", "take_step"]
 
 CHUNK_BYTES = 32 * 2**20
 """Largest buffer of saved rows on the device; longer runs go through it several times."""
 
 CHUNK_ROWS = 4096
+FIRST_CHUNK = 64
+"""Steps of the first chunk; those after it are as many as take CHUNK_SECONDS."""
+
 CHUNK_SECONDS = 0.25
 
 
-class Lane(eqx.Module):
-    """What is carried from step to step of one trajectory."""
+class Clock(eqx.Module):
+    """The numbers of a chunk of steps, all of them traced, so that one compiled function serves every run of an equation.
 
-    state: Any
-    unknowns: Any  # per stage, of the step before
-    older: Any  # per stage, of the step before that
-    completed: Any
-    status: Any
-    iterations: Any
-    max_residual: Any
+    Steps are counted from the run's first state, which is at t0 + first_step·h.
+    """
 
-
-def first_lane(state, guess) -> Lane:
-    """The lane at the initial state, with one guess per stage."""
-    zero = jnp.zeros((), jnp.int64)  # a strong type, so that the next chunk has the same signature
-    return Lane(state, guess, guess, zero, zero + OK, zero, jnp.zeros(()))
+    t0: Any
+    h: Any
+    first_step: Any
+    every: Any  # steps between saved rows
+    start: Any  # first step of the chunk
+    stop: Any  # one past its last
+    closing: Any  # whether it is the step leaving the last row, taken even if every trajectory has ended
 
 
-def take_step(equation, lane: Lane, t, h, params, max_iterations: int, active=True) -> tuple[Lane, Any]:
-    """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns."""
-    state, unknowns = lane.state, []
-    status, iterations, worst = lane.status, lane.iterations, lane.max_residual
-    running = (lane.status == OK) & active
-    for (stage, fraction), last, older in zip(equation.stages, lane.unknowns, lane.older, strict=True):
-        step = fraction * h
-        guess = stage.guess(state, last + (last - older), step, params)
-        u, count, residual, converged = solve(
-            lambda u, a, stage=stage: stage.residual(u, *a),
-            stage.scale,
-            guess,
-            (state, t, step, params),
-            max_iterations,
-            running & (status == OK),
-        )
-        new = stage.advance(u, state, t, step, params)
-        finite = jnp.all(jnp.isfinite(new)) & jnp.all(jnp.isfinite(u))
-        failure = jnp.where(finite, jnp.where(converged, OK, NOT_CONVERGED), NOT_FINITE)
-        status = jnp.where(running & (status == OK), failure, status)
-        iterations = iterations + jnp.where(running, count, 0)
-        worst = jnp.where(running & (status == OK), jnp.maximum(worst, residual), worst)
-        good = running & (status == OK)
-        state = jnp.where(good, new, state)
-        unknowns.append(u)
-        t = t + step
-    good = running & (status == OK)
-    kept = jnp.where(good, state, lane.state)
-    freeze = lambda a, b: jax.tree.map(lambda x, y: jnp.where(good, x, y), a, b)
-    after = Lane(
-        kept,
-        freeze(tuple(unknowns), lane.unknowns),
-        freeze(lane.unknowns, lane.older),
-        lane.completed + good,
-        status,
-        iterations,
-        worst,
-    )
-    return after, tuple(unknowns)
+def make_step(equation, axes, max_iterations: int, differentiable: bool):
+    """(lanes, params, clock) ↦ (lanes after a step, packed rows that they left), over the batch if there is one."""
+
+    def one(lane, params, clock):
+        t = time_of(lane, clock.t0, clock.h, clock.first_step)
+        after, unknowns = take_step(equation, lane, t, clock.h, params, max_iterations, differentiable)
+        return after, packed_row(lane, unknowns)
+
+    return one if axes is None else jax.vmap(one, in_axes=(0, axes, None))
 
 
-def row_of(equation, lane: Lane, unknowns, t, h, params) -> dict:
-    """The named arrays of the row that `lane` is at, `unknowns` being those of the step leaving it."""
-    stage, fraction = equation.stages[0]
-    finite = jax.tree.map(lambda new, old: jnp.where(jnp.isfinite(new), new, old), unknowns[0], lane.unknowns[0])
-    return stage.unpack(lane.state, finite, t, fraction * h, params)
-
-
-def advance_to_next_row(equation, lane: Lane, start, stop, t0, h, params, max_iterations: int) -> tuple[Lane, dict]:
-    """Steps `start` to `stop` (numbers counted from t0): the lane after them and the row saved at the first."""
-    t = t0 + start * h
-    after, unknowns = take_step(equation, lane, t, h, params, max_iterations)
-    row = row_of(equation, lane, unknowns, t, h, params)
-
-    def more(k, lane):
-        return take_step(equation, lane, t0 + k * h, h, params, max_iterations)[0]
-
-    return jax.lax.fori_loop(start + 1, stop, more, after), row
+def unpack_rows(equation, axes, packed, params, clock: Clock) -> dict:
+    """The named arrays of packed rows (rows, …)."""
+    one = lambda row, params: unpacked_row(equation, row, clock.t0, clock.h, clock.first_step, params)
+    lanes = one if axes is None else jax.vmap(one, in_axes=(0, axes))
+    return jax.vmap(lanes, in_axes=(0, None))(packed, params)
 
 
 @eqx.filter_jit
-def _chunk(equation, lanes, params, t0, h, first, first_step, steps, every, count, capacity, axes, max_iterations):
-    """`count` rows (at most `capacity`, static) from row number `first` on."""
+def _chunk(equation, lanes: Lane, params, clock: Clock, capacity: int, axes, max_iterations: int) -> tuple[Lane, dict]:
+    """The steps from clock.start to clock.stop: the lanes after them, and the at most `capacity` rows saved on the way."""
+    step = make_step(equation, axes, max_iterations, differentiable=False)
+    row = jax.eval_shape(step, lanes, params, clock)[1]
+    first_row = _next_row(clock.start, clock.every)
 
-    def one_row(lane, params, start, stop):
-        return advance_to_next_row(equation, lane, start, stop, t0, h, params, max_iterations)
-
-    move = one_row if axes is None else jax.vmap(one_row, in_axes=(0, axes, None, None))
-    shapes = jax.eval_shape(move, lanes, params, 0, 1)[1]
-    buffers = jax.tree.map(lambda s: jnp.zeros((capacity, *s.shape), s.dtype), shapes)
+    def going(carry):
+        k, lanes, _ = carry
+        return (k < clock.stop) & (clock.closing | jnp.any(lanes.status == OK))
 
     def body(carry):
-        i, lanes, buffers = carry
-        start = (first + i) * every
-        stop = jnp.minimum(start + every, steps)
-        lanes, row = move(lanes, params, first_step + start, first_step + stop)
-        buffers = jax.tree.map(lambda b, r: jax.lax.dynamic_update_index_in_dim(b, r, i, 0), buffers, row)
-        return i + 1, lanes, buffers
+        k, lanes, rows = carry
+        lanes, row = step(lanes, params, clock)
+        # the last slot is for the rows that are not saved
+        slot = jnp.where(jax.lax.rem(k, clock.every) == 0, jax.lax.div(k, clock.every) - first_row, capacity)
+        return k + 1, lanes, jax.lax.dynamic_update_index_in_dim(rows, row, slot, 0)
 
-    _, lanes, buffers = jax.lax.while_loop(lambda c: c[0] < count, body, (jnp.int64(0), lanes, buffers))
-    return lanes, buffers
-
-
-@eqx.filter_jit
-def _closing_row(equation, lanes, params, t, h, axes, max_iterations):
-    """The row at the end: with the unknowns of one more step where the saved fields depend on them."""
-
-    def one(lane, params, t):
-        unknowns = lane.unknowns
-        if equation.stages[0][0].needs_leaving_step:
-            _, unknowns = take_step(equation, lane, t, h, params, max_iterations)
-        return row_of(equation, lane, unknowns, t, h, params)
-
-    return (one if axes is None else jax.vmap(one, in_axes=(0, axes, 0)))(lanes, params, t)
+    rows = jnp.zeros((capacity + 1, *row.shape))
+    _, lanes, rows = jax.lax.while_loop(going, body, (clock.start, lanes, rows))
+    return lanes, unpack_rows(equation, axes, rows[:capacity], params, clock)
 
 
 def run(problem: Problem, progress: Progress | None = None) -> Outcome:
     """Run `problem`, saving into host arrays; Ctrl-C and failing steps keep what was computed."""
     p, started = problem, time.perf_counter()
-    lanes = _start(p)
-    batched, axes = p.batch is not None, _axes(p)
-    shapes = _closing_shapes(p, lanes, axes)
-    row_bytes = sum(8 * int(np.prod(s.shape)) for s in jax.tree.leaves(shapes))
-    capacity = max(1, min(CHUNK_ROWS, CHUNK_BYTES // max(row_bytes, 1)))
-    h, t0 = jnp.float64(p.h), jnp.float64(p.t0)
-    fixed = (p.first_step, p.steps, p.save_every)
-    call = lambda lanes, first, count: _chunk(
-        p.equation, lanes, p.params, t0, h, *map(jnp.int64, (first, *fixed, count)), capacity, axes, p.max_iterations
-    )
-    jax.block_until_ready(call(lanes, 0, 0))  # compile (an empty chunk)
+    axes, capacity = _axes(p), _capacity(p)
+    lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np)
+
+    def call(lanes, start, stop, closing=False):
+        reals, integers = map(np.float64, (p.t0, p.h, p.first_step)), map(np.int64, (p.save_every, start, stop))
+        clock = Clock(*reals, *integers, np.bool_(closing))
+        after, rows = _chunk(p.equation, lanes, p.params, clock, capacity, axes, p.max_iterations)
+        return after, {name: _by_lane(np.asarray(values), p.batch, np) for name, values in rows.items()}
+
+    _, empty = call(lanes, 0, 0)  # compile
     compile_seconds, started = time.perf_counter() - started, time.perf_counter()
 
-    fields = _host_arrays(p, shapes)
-    done, count, interrupted = 0, min(64, capacity), False
-    total_rows = p.rows - 1
+    fields = _host_arrays(p, empty)
+    done, count, interrupted = 0, FIRST_CHUNK, False
     try:
-        while done < total_rows and not _all_failed(lanes):
-            count = min(count, total_rows - done)
+        while done < p.steps and not np.all(np.asarray(lanes.counts)[..., 1] != OK):
+            first = _next_row(done, p.save_every)
+            stop = min(done + count, (first + capacity) * p.save_every, p.steps)
             tick = time.perf_counter()
-            lanes, buffers = call(lanes, done, count)
-            for name, buffer in buffers.items():
-                rows = np.asarray(buffer[:count])
-                target = fields[name]
-                target[:, done : done + count] = np.moveaxis(rows, 0, 1) if batched else rows[None]
-            done += count
-            rate = count / max(time.perf_counter() - tick, 1e-9)
-            count = int(min(capacity, max(1, rate * CHUNK_SECONDS)))
+            after, rows = call(lanes, done, stop)
+            last = _next_row(stop, p.save_every)
+            for name, values in rows.items():
+                fields[name][:, first:last] = values[:, : last - first]
+            rate = (stop - done) / max(time.perf_counter() - tick, 1e-9)
+            lanes, done = after, stop
+            count = max(1, int(rate * CHUNK_SECONDS))
             if progress:
-                progress(min(done * p.save_every, p.steps), p.steps)
+                progress(done, p.steps)
     except KeyboardInterrupt:
         interrupted = True
-    ends = t0 + h * (p.first_step + lanes.completed)
-    last = _closing_row(p.equation, lanes, p.params, ends, h, axes, p.max_iterations)
-    closing = {name: np.asarray(value) if batched else np.asarray(value)[None] for name, value in last.items()}
+    _, rows = call(lanes, 0, 1, closing=True)
+    closing = {name: values[:, 0] for name, values in rows.items()}  # at each trajectory's last good step
     for name, value in closing.items():
-        if done == total_rows and _field(p, name).place == "node":
-            fields[name][:, done] = value
-    squeeze = (lambda a: np.asarray(a)) if batched else (lambda a: np.asarray(a)[None])
+        if done == p.steps and _is_node(p, name):
+            fields[name][:, -1] = value
+    lanes = jax.tree.map(lambda a: np.asarray(a) if p.batch is not None else np.asarray(a)[None], lanes)
     return Outcome(
         fields=fields,
         closing=closing,
-        completed=squeeze(lanes.completed),
-        status=squeeze(lanes.status),
-        iterations=squeeze(lanes.iterations),
-        max_residual=squeeze(lanes.max_residual),
-        last_state=squeeze(lanes.state),
-        last_unknowns=squeeze(lanes.unknowns[0]),
+        completed=lanes.completed,
+        status=lanes.status,
+        iterations=lanes.iterations,
+        max_residual=lanes.max_residual,
+        last_state=lanes.state,
+        last_unknowns=lanes.unknowns[0],
         interrupted=interrupted,
         compile_seconds=compile_seconds,
         run_seconds=time.perf_counter() - started,
@@ -193,58 +137,53 @@ def run_traced(problem: Problem, checkpoint_rows: int | None = None) -> Outcome:
     """The same run as one scan, for `jax.grad`, `jit` and `vmap` around it; segments of about √rows are recomputed in
     reverse mode instead of being stored."""
     p = problem
-    lanes, axes = _start(p), _axes(p)
-    rows = p.rows - 1
-    segment = checkpoint_rows or max(1, int(np.sqrt(rows)))
+    axes = _axes(p)
+    lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)))
+    clock = Clock(p.t0, p.h, float(p.first_step), p.save_every, 0, p.steps, False)
+    step = make_step(p.equation, axes, p.max_iterations, differentiable=True)
 
-    def one_row(lane, params, start, stop):
-        t = p.t0 + start * p.h
-        after, unknowns = take_step(p.equation, lane, t, p.h, params, p.max_iterations)
-        row = row_of(p.equation, lane, unknowns, t, p.h, params)
+    def to_next_row(lanes, start):
+        """The lanes after `save_every` steps from `start` on, and the row they left; steps past the last are undone."""
 
-        def more(lane, k):
-            # steps past `stop` are masked, so that the number of iterations is static and reverse mode works
-            return take_step(p.equation, lane, p.t0 + k * p.h, p.h, params, p.max_iterations, k < stop)[0], None
+        def one(carry, k):
+            lanes, row = carry
+            after, left = step(lanes, p.params, clock)
+            after = jax.tree.map(lambda a, b: jnp.where(k < p.steps, a, b), after, lanes)
+            return (after, jnp.where(k == start, left, row)), None
 
-        if p.save_every > 1:
-            after, _ = jax.lax.scan(more, after, start + 1 + jnp.arange(p.save_every - 1))
-        return after, row
-
-    move = one_row if axes is None else jax.vmap(one_row, in_axes=(0, axes, None, None))
-
-    def body(lanes, i):
-        start = i * p.save_every
-        stop = jnp.minimum(start + p.save_every, p.steps)
-        return move(lanes, p.params, p.first_step + start, p.first_step + stop)
+        row = jnp.zeros(jax.eval_shape(step, lanes, p.params, clock)[1].shape)
+        return jax.lax.scan(one, (lanes, row), start + jnp.arange(p.save_every))[0]
 
     @jax.checkpoint
-    def piece(lanes, numbers):
-        return jax.lax.scan(body, lanes, numbers)
+    def segment(lanes, starts):
+        return jax.lax.scan(to_next_row, lanes, starts)
 
-    whole = rows // segment * segment
-    lanes, saved = jax.lax.scan(piece, lanes, jnp.arange(whole).reshape(-1, segment))
-    saved = jax.tree.map(lambda a: a.reshape(whole, *a.shape[2:]), saved)
-    if whole < rows:
-        lanes, rest = piece(lanes, jnp.arange(whole, rows))
-        saved = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), saved, rest)
-    ends = p.t0 + p.h * (p.first_step + lanes.completed)
-    last = _closing_row(p.equation, lanes, p.params, ends, p.h, axes, p.max_iterations)
-    fields = {}
-    for name, value in saved.items():
-        if _field(p, name).place == "node":
-            value = jnp.concatenate([value, last[name][None]])
-        fields[name] = jnp.moveaxis(value, 0, 1) if p.batch is not None else value[None]
-    lift = (lambda a: a) if p.batch is not None else (lambda a: jnp.asarray(a)[None])
+    length = checkpoint_rows or max(1, int(np.sqrt(p.rows)))
+    starts = jnp.arange(-(-p.rows // length) * length).reshape(-1, length) * p.save_every
+    lanes, packed = jax.lax.scan(segment, lanes, starts)
+    packed = packed.reshape(-1, *packed.shape[2:])[: p.rows]
+    rows = {name: _by_lane(a, p.batch, jnp) for name, a in unpack_rows(p.equation, axes, packed, p.params, clock).items()}
+    lanes = lanes if p.batch is not None else jax.tree.map(lambda a: a[None], lanes)
     return Outcome(
-        fields=fields,
-        closing={name: lift(value) for name, value in last.items()},
-        completed=lift(lanes.completed),
-        status=lift(lanes.status),
-        iterations=lift(lanes.iterations),
-        max_residual=lift(lanes.max_residual),
-        last_state=lift(lanes.state),
-        last_unknowns=lift(lanes.unknowns[0]),
+        fields={name: values if _is_node(p, name) else values[:, :-1] for name, values in rows.items()},
+        closing={name: values[:, -1] for name, values in rows.items()},
+        completed=lanes.completed,
+        status=lanes.status,
+        iterations=lanes.iterations,
+        max_residual=lanes.max_residual,
+        last_state=lanes.state,
+        last_unknowns=lanes.unknowns[0],
     )
+
+
+def _next_row(step, every):
+    """Number of the first row saved at `step` or later."""
+    return -(-step // every)
+
+
+def _by_lane(values, batch: int | None, xp):
+    """(B, rows, …) from (rows, B, …) or, without a batch, from (rows, …)."""
+    return values[None] if batch is None else xp.moveaxis(values, 0, 1)
 
 
 def _axes(p: Problem):
@@ -254,28 +193,18 @@ def _axes(p: Problem):
     return jax.tree.map(lambda _: 0 if p.batch_params else None, p.params) if p.params is not None else 0
 
 
-def _start(p: Problem) -> Lane:
-    make = first_lane if p.batch is None else jax.vmap(first_lane)
-    return make(jnp.asarray(p.state), jax.tree.map(jnp.asarray, tuple(p.guess)))
+def _capacity(p: Problem) -> int:
+    """Rows of a chunk."""
+    stage = p.equation.stages[0][0]
+    row_bytes = 8 * (p.batch or 1) * (stage.state_size + stage.unknowns + 1)
+    return max(1, min(CHUNK_ROWS, CHUNK_BYTES // row_bytes))
 
 
-def _closing_shapes(p: Problem, lanes: Lane, axes):
-    one = lambda lane, params: row_of(p.equation, lane, lane.unknowns, 0.0, p.h, params)
-    return jax.eval_shape(one if axes is None else jax.vmap(one, in_axes=(0, axes)), lanes, p.params)
+def _is_node(p: Problem, name: str) -> bool:
+    return p.equation.stages[0][0].fields[name].place == "node"
 
 
-def _field(p: Problem, name: str):
-    return p.equation.stages[0][0].fields[name]
-
-
-def _host_arrays(p: Problem, shapes) -> dict:
-    arrays = {}
-    for name, shape in shapes.items():
-        rows = p.rows - (_field(p, name).place == "step")
-        inner = shape.shape[1:] if p.batch is not None else shape.shape
-        arrays[name] = np.full((p.batch or 1, rows, *inner), np.nan)
-    return arrays
-
-
-def _all_failed(lanes: Lane) -> bool:
-    return bool(np.all(np.asarray(lanes.status) != OK))
+def _host_arrays(p: Problem, rows: dict) -> dict:
+    """Empty arrays for the whole run, given the arrays of a chunk."""
+    shapes = {name: (len(values), p.rows - (not _is_node(p, name)), *values.shape[2:]) for name, values in rows.items()}
+    return {name: np.full(shape, np.nan) for name, shape in shapes.items()}

@@ -1,0 +1,105 @@
+"""One step of one trajectory: solve every stage, advance, and judge; what an engine carries from step to step."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from dirax.engines.newton import solve
+from dirax.engines.result import NOT_CONVERGED, NOT_FINITE, OK
+
+
+class Lane(eqx.Module):
+    """What is carried from step to step of one trajectory, in few arrays, because every array costs XLA kernels and copies.
+
+    `history` holds for each stage the unknowns of the step before and their first and second differences over the steps
+    before, (3, k); `counts` (3,) the good steps, the outcome, and Newton's updates. `max_residual` is the largest entry of
+    the residual that was left at the unknowns of any good step.
+    """
+
+    state: Any
+    history: tuple
+    counts: Any
+    max_residual: Any
+
+    @property
+    def unknowns(self) -> tuple:
+        """Those of the step before, per stage."""
+        return tuple(stage[..., 0, :] for stage in self.history)
+
+    @property
+    def completed(self):
+        """Number of good steps."""
+        return self.counts[..., 0]
+
+    @property
+    def status(self):
+        """The outcome of the last attempted step."""
+        return self.counts[..., 1]
+
+    @property
+    def iterations(self):
+        """Updates of Newton's method so far."""
+        return self.counts[..., 2]
+
+
+def first_lane(state, guess: tuple, xp=jnp) -> Lane:
+    """The lane at the initial state, with one guess per stage; a leading batch axis is kept. `xp`: numpy or jax.numpy."""
+    batch = state.shape[:-1]
+    history = tuple(xp.stack([u, xp.zeros_like(u), xp.zeros_like(u)], axis=-2) for u in guess)
+    return Lane(state, history, xp.full((*batch, 3), OK), xp.zeros(batch))
+
+
+def take_step(equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True) -> tuple[Lane, tuple]:
+    """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns."""
+    state, history, unknowns = lane.state, [], []
+    status, updates, worst = lane.status, 0, lane.max_residual
+    for (stage, fraction), before in zip(equation.stages, lane.history, strict=True):
+        running = status == OK
+        args = (state, t, fraction * h, params)
+        guess = stage.guess(state, jnp.sum(before, axis=0), fraction * h, params)
+        u, count, converged = solve(stage.residual, stage.scale, guess, args, max_iterations, running, differentiable)
+        new = stage.advance(u, *args)
+        # 0·new is nan where new is not finite: one reduction finds that as well
+        left = jnp.max(jnp.abs(jnp.concatenate([stage.residual(u, *args), 0.0 * new])))
+        outcome = jnp.where(jnp.isfinite(left), jnp.where(converged, OK, NOT_CONVERGED), NOT_FINITE)
+        status = jnp.where(running, outcome, status)
+        updates = updates + jnp.where(running, count, 0)
+        worst = jnp.where(status == OK, jnp.maximum(worst, left), worst)
+        state = jnp.where(status == OK, new, state)
+        history.append(_remembered(u, before, lane.completed))
+        unknowns.append(u)
+        t = t + fraction * h
+    good = status == OK
+    after = Lane(
+        jnp.where(good, state, lane.state),
+        tuple(jnp.where(good, new, old) for new, old in zip(history, lane.history, strict=True)),
+        jnp.stack([lane.completed + good.astype(int), status, lane.iterations + updates]),
+        worst,
+    )
+    return after, tuple(unknowns)
+
+
+def _remembered(u, before, completed):
+    """The unknowns with their differences, which are zero until there are enough steps: the first guess is none of them."""
+    slope = jnp.where(completed >= 1, u - before[0], 0.0)
+    bend = jnp.where(completed >= 2, slope - before[1], 0.0)
+    return jnp.stack([u, slope, bend])
+
+
+def time_of(lane: Lane, t0, h, first_step):
+    """The time that the lane is at."""
+    return t0 + (first_step + lane.completed.astype(jnp.float64)) * h
+
+
+def packed_row(lane: Lane, unknowns) -> Any:
+    """All that the row at `lane` depends on as one array (s + k + 1,), `unknowns` being those of the step leaving it."""
+    finite = jnp.where(jnp.isfinite(unknowns[0]), unknowns[0], lane.unknowns[0])
+    return jnp.concatenate([lane.state, finite, lane.counts[:1].astype(lane.state.dtype)])
+
+
+def unpacked_row(equation, packed, t0, h, first_step, params) -> dict:
+    """The named arrays of the row."""
+    stage, fraction = equation.stages[0]
+    state, unknowns, completed = jnp.split(packed, [stage.state_size, stage.state_size + stage.unknowns])
+    return stage.unpack(state, unknowns, t0 + (first_step + completed[0]) * h, fraction * h, params)
