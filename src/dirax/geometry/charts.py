@@ -7,7 +7,7 @@ leaves the domain. Everything here is traceable, so a chart may be changed insid
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import Scalar
@@ -89,7 +89,7 @@ class RetractionChart(eqx.Module):
 
 
 def chart_at(
-    manifold: AbstractGeodesicManifold, m: Vector, exponential: bool = False, frame: Float[Array, "N d"] | None = None
+    manifold: AbstractGeodesicManifold, m: ArrayLike, exponential: bool = False, frame: Float[Array, "N d"] | None = None
 ) -> RetractionChart:
     """The chart at m (N,) compatible with the manifold's retraction, or its exponential ([RL] Definition 6.2).
 
@@ -124,7 +124,7 @@ class Atlas(eqx.Module):
     leave_at: float = eqx.field(static=True, default=0.5)
     centres: Float[Array, "k N"] | None = None
 
-    def chart_at(self, x: Vector) -> RetractionChart:
+    def chart_at(self, x: ArrayLike) -> RetractionChart:
         """The chart centred at x, or at the centre nearest to x; raises `ValueError` for a point off the manifold."""
         x = jnp.asarray(x, dtype=float)
         self.manifold.check_point(x)

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from dirax.geometry.manifolds import AbstractManifold, Euclidean, Vector
 from dirax.geometry.maps import AbstractDiscretizationMap, tangent_coordinates
@@ -130,7 +130,7 @@ def moving_with(base: AbstractManifold, q: Vector, p: Vector, q_dot: Vector) -> 
     return jax.jvp(lambda q: base.projection(q, p), (q,), (q_dot,))[1]
 
 
-def symplecticity_defect(lift: AbstractDiscretizationMap, x: Vector, v: Vector) -> Float[Array, ""]:
+def symplecticity_defect(lift: AbstractDiscretizationMap, x: ArrayLike, v: ArrayLike) -> Float[Array, ""]:
     """Largest entry of the difference of the two symplectic forms of [BLM] Corollary 4.12 at the tangent vector v at x.
 
     Ω12 = dp1∧dq1 − dp0∧dq0, pulled back by the map, against d_Tω = dṗ∧dq + dp∧dq̇, both on the coordinates of T(T*Q);

@@ -214,6 +214,8 @@ class SO2(AbstractLieGroup):
     bi_invariant, double_cover = True, False
     jaxlie_group = jaxlie.SO2
 
+    def __init__(self): ...
+
     def group_exp(self, xi):
         return jnp.concatenate([jnp.cos(xi), jnp.sin(xi)])
 
@@ -228,6 +230,8 @@ class SE2(AbstractLieGroup):
     rotation_product, rotation_basis = _COMPLEX_PRODUCT, _TURN_OF_PLANE
     bi_invariant, double_cover = False, False
     jaxlie_group = jaxlie.SE2
+
+    def __init__(self): ...
 
     def group_exp(self, xi):
         velocity, angle = xi[:2], xi[2]
@@ -253,6 +257,8 @@ class SO3(AbstractLieGroup):
     bi_invariant, double_cover = True, True
     jaxlie_group = jaxlie.SO3
 
+    def __init__(self): ...
+
     def group_exp(self, xi):
         return _quaternion_exp(xi)
 
@@ -267,6 +273,8 @@ class SE3(AbstractLieGroup):
     rotation_product, rotation_basis = _QUATERNION_PRODUCT, _TURN_OF_SPACE
     bi_invariant, double_cover = False, True
     jaxlie_group = jaxlie.SE3
+
+    def __init__(self): ...
 
     def group_exp(self, xi):
         velocity, omega = xi[:3], xi[3:]

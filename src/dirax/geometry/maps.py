@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from dirax.functions import is_traced
 from dirax.geometry.lie_groups import AbstractLieGroup
@@ -45,7 +45,7 @@ class AbstractDiscretizationMap(eqx.Module):
     def reach(self, x: Vector, v: Vector) -> Scalar:
         """‖v‖ in units of the injectivity radius at x: the map and its inverse are used where this is below 1."""
 
-    def __call__(self, x: Vector, v: Vector) -> Pair:
+    def __call__(self, x: ArrayLike, v: ArrayLike) -> Pair:
         x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
         manifold = self.manifold(x.shape[-1])
         manifold.check_point(x, "x")
@@ -53,7 +53,7 @@ class AbstractDiscretizationMap(eqx.Module):
         self._check_reach(x, v, "Take a smaller v (a smaller step).")
         return self.forward(x, v)
 
-    def inverse(self, x0: Vector, x1: Vector) -> Pair:
+    def inverse(self, x0: ArrayLike, x1: ArrayLike) -> Pair:
         """The point x and tangent vector v with map(x, v) = (x0, x1)."""
         x0, x1 = jnp.asarray(x0, dtype=float), jnp.asarray(x1, dtype=float)
         manifold = self.manifold(x0.shape[-1])
@@ -335,7 +335,7 @@ class DiscretizationMapReport(eqx.Module):
     """Condition number of D R_d(x, v) in the manifold's frames: the map is invertible near (x, v) if it is finite."""
 
 
-def check_discretization_map(map: AbstractDiscretizationMap, x: Vector, v: Vector) -> DiscretizationMapReport:
+def check_discretization_map(map: AbstractDiscretizationMap, x: ArrayLike, v: ArrayLike) -> DiscretizationMapReport:
     """How far (D1), (D2) and invertibility ([BLM] Definition 4.5, Proposition 4.6) fail at the tangent vector v at x."""
     x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
     manifold = map.manifold(x.shape[0])

@@ -56,7 +56,7 @@ def arc_over_sine(order: int, near: Scalar, far: Scalar) -> Scalar:
     """F = φ/sin φ for an arc 0 ≤ φ < π, as a function of near = sin²(φ/2) (its derivative F^(order)); far = cos²(φ/2).
 
     For points of a unit sphere near and far are |y − x|²/4 and |y + x|²/4, each accurate at its own end of the arc.
-    F is the hypergeometric function F(1, 1; 3/2; near). Finite up to φ = π − 10⁻¹⁵, and 1 beyond.
+    F is the hypergeometric function F(1, 1; 3/2; near). Right up to φ = π − 10⁻¹⁵, and some finite number beyond.
     """
     far = jnp.where(far < TINY, 1.0, far)
 
