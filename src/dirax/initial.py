@@ -76,6 +76,8 @@ def prepared(system, equation, data, params, h, t0, batch, batch_params: bool, p
     if "q0" in data and len(equation.stages) > 1:
         raise ValueError("a composition cannot start from q0= and q1=, which belong to one step: give q= with v= or p=.")
     axes = None if batch is None else (0, 0 if batch_params else None, None, None)
+    if batch is not None:  # the batch axis can be that of the parameters alone
+        data = {name: jnp.broadcast_to(a, (batch, a.shape[-1])) for name, a in data.items()}
     start = _begin(system, equation, data, params, jnp.asarray(h, float), jnp.asarray(t0, float), axes, project)
     if start.row0 is not None:
         row0 = {k: (a if batch is not None else a[None]) for k, a in start.row0.items()}
