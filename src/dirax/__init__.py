@@ -7,6 +7,8 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from dirax.diagnostics.compare import compare
+from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.verify import verify
 from dirax.geometry.charts import Atlas, chart_at, check_chart
 from dirax.geometry.cotangent_lift import cotangent_lift, symplecticity_defect
@@ -29,12 +31,17 @@ from dirax.reduction.reduced import ReducedLagrangeDirac, reduce
 from dirax.schemes.charted import InCharts
 from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.schemes.discrete_gradient import DiscreteGradient
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
 from dirax.simulate import simulate
 from dirax.solution import Solution
 from dirax.storage import load
+from dirax.systems.constraint_algorithm import constraint_algorithm
+from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.implicit_system import ImplicitSystem
+from dirax.systems.interconnection import interconnect
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 from dirax.systems.nonholonomic import NonholonomicMechanics
@@ -53,11 +60,14 @@ __all__ = [
     "Atlas",
     "Circle",
     "Composition",
+    "ConstraintChain",
     "DiracStructure",
     "DiracSystem",
     "DiscreteDirac",
+    "DiscreteGradient",
     "Euclidean",
     "Field",
+    "ImplicitSystem",
     "InCharts",
     "LagrangeDAlembert",
     "LagrangeDirac",
@@ -88,8 +98,12 @@ __all__ = [
     "chart_at",
     "check_chart",
     "check_discretization_map",
+    "compare",
+    "constraint_algorithm",
+    "convergence",
     "cotangent_lift",
     "induced_dirac",
+    "interconnect",
     "load",
     "make_step_equation",
     "reconstruct",

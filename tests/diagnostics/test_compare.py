@@ -1,0 +1,33 @@
+"""Several schemes in one table: each number against what is known of the scheme."""
+
+import jax.numpy as jnp
+import pytest
+
+import dirax as dx
+from dirax import gallery
+
+
+def test_the_disk_by_three_schemes():
+    disk = gallery.get("rolling-disk")
+    schemes = {"plus": dx.PlusLagrangeDirac(), "minus": dx.MinusLagrangeDirac(), "midpoint": dx.LagrangeDAlembert()}
+    found = dx.compare(disk.system, schemes, step=0.01, steps=4000, repeats=1, params=disk.params, **disk.initial)
+    assert [found[name].order for name in schemes] == pytest.approx([1, 1, 2], abs=0.05)
+    assert [found[name].drift for name in schemes] == ["drifts", "drifts", "bounded"]
+    assert found["plus"].slope > 0 > found["minus"].slope
+    assert found["midpoint"].error < found["plus"].error / 50
+    assert all(entry.constraint < 1e-13 and entry.microseconds_per_step > 0 for entry in found.entries)
+    text = str(found)
+    assert "midpoint" in text and "µs/step" in text and "<table" in found._repr_html_()
+    assert found.to_dict()["schemes"][2]["scheme"] == "midpoint"
+
+
+def test_a_list_is_named_by_class_and_failures_have_a_row():
+    falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sqrt(q[0]) - 2 * q[0])
+    schemes = [dx.PlusLagrangeDirac(), dx.PlusLagrangeDirac("right")]
+    found = dx.compare(falling, schemes, step=0.01, steps=100, repeats=1, q=[0.1], v=[-1.0])
+    assert [entry.scheme for entry in found.entries] == ["PlusLagrangeDirac", "PlusLagrangeDirac 2"]
+    assert found["PlusLagrangeDirac"].ended.startswith("stopped at t = 0.1")
+    with pytest.raises(KeyError, match="there are"):
+        found["minus"]
+    with pytest.raises(ValueError, match="at least one scheme"):
+        dx.compare(falling, {}, step=0.01, steps=100, q=[0.1], v=[-1.0])

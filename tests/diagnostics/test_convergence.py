@@ -1,0 +1,109 @@
+"""Measured orders against the known ones, with closed forms and DOP853 as references."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dirax as dx
+from dirax import gallery
+
+STEPS = (0.02, 0.01, 0.005, 0.0025)
+
+
+def slope_by_hand(h, errors):
+    return np.polyfit(np.log(h), np.log(errors), 1)[0]
+
+
+@pytest.mark.parametrize(
+    "scheme, order", [(dx.PlusLagrangeDirac(), 1), (dx.MinusLagrangeDirac(), 1), (dx.LagrangeDAlembert(), 2)]
+)
+def test_orders_on_the_rolling_disk_in_q_p_and_multipliers(scheme, order):
+    disk = gallery.get("rolling-disk")
+    found = dx.convergence(
+        disk.system, scheme, step_sizes=[0.02, 0.01, 0.005, 0.0025], time=1.0, params=disk.params, **disk.initial
+    )
+    assert set(found.orders) == {"q", "p", "multipliers"}
+    assert list(found.orders.values()) == pytest.approx([order] * 3, abs=0.03)
+
+
+@pytest.mark.parametrize("rule", ["midpoint", "trapezoidal"])
+@pytest.mark.parametrize("name", ["kepler", "double-pendulum"])
+def test_second_order_against_an_independent_solution(rule, name):
+    example = gallery.get(name)
+    system, n = example.system, len(example.coordinates)
+    # the continuous Euler–Lagrange equations, solved by scipy
+    import jax
+
+    lagrangian = lambda q, v: system.lagrangian(q, v, example.params)
+
+    @jax.jit
+    def field(y):
+        q, v = y[:n], y[n:]
+        mass = jax.hessian(lagrangian, 1)(q, v)
+        mixed = jax.jacfwd(jax.grad(lagrangian, 1), 0)(q, v)
+        return jnp.concatenate([v, jnp.linalg.solve(mass, jax.grad(lagrangian)(q, v) - mixed @ v)])
+
+    start = np.concatenate([example.initial["q"], example.initial["v"]])
+    solved = solve_ivp(
+        lambda t, y: np.asarray(field(y)), (0, 1.2), start, method="DOP853", rtol=1e-12, atol=1e-12, dense_output=True
+    )
+    momentum = jax.jit(jax.vmap(jax.grad(lagrangian, 1)))
+
+    def exact(t):
+        y = solved.sol(t).T
+        return {"q": y[:, :n], "p": momentum(y[:, :n], y[:, n:])}
+
+    found = dx.convergence(
+        system, dx.LagrangeDAlembert(rule), step_sizes=STEPS, time=1.2, reference=exact, params=example.params, **example.initial
+    )
+    assert found.orders["q"] == pytest.approx(2.0, abs=0.05)
+    assert found.orders["p"] == pytest.approx(2.0, abs=0.05)
+    assert found.order == pytest.approx(slope_by_hand(found.step_sizes, found.slopes["q"].errors), abs=1e-12)
+
+
+oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+START = {"q": [1.0], "v": [0.0]}
+
+
+def test_the_roundoff_plateau_is_left_out():
+    scheme = dx.Composition(dx.LagrangeDAlembert(), "kahan-li8")
+    exact = lambda t: {"q": np.cos(t)[:, None], "p": -np.sin(t)[:, None]}
+    sizes = [1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125]
+    found = dx.convergence(oscillator, scheme, step_sizes=sizes, time=4.0, reference=exact, **START)
+    used = found.slopes["q"].used
+    assert used[:3].all() and not used[-1]
+    assert found.order == pytest.approx(8.0, abs=0.4)
+    assert "not used" in str(found) and "order" in found._repr_html_()
+    assert found.to_dict()["quantities"]["q"]["used"] == used.tolist()
+
+
+def test_a_refined_reference_does_not_bias_the_order():
+    """Against itself refined and against cos t the same order comes out."""
+    exact = lambda t: np.cos(t)[:, None]
+    run = {"step_sizes": [0.2, 0.1, 0.05], "time": 2.0, **START}
+    by_itself = dx.convergence(oscillator, dx.PlusLagrangeDirac(), **run)
+    by_cosine = dx.convergence(oscillator, dx.PlusLagrangeDirac(), reference=exact, **run)
+    assert by_itself.order == pytest.approx(by_cosine.order, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"step_sizes": [0.1, 0.05]}, "at least 3 different"),
+        ({"step_sizes": [0.1, 0.05, 0.03]}, "must divide the largest"),
+        ({"time": 0.05}, "must divide time"),
+        ({"quantities": ["multipliers"]}, "are not in both"),
+        ({"reference": lambda t: np.cos(t)[:, None] + 1}, "take larger steps"),
+    ],
+)
+def test_mistakes(changes, message):
+    run = {"step_sizes": [0.1, 0.05, 0.025], "time": 1.0, **START, **changes}
+    with pytest.raises(ValueError, match=message):
+        dx.convergence(oscillator, dx.LagrangeDAlembert(), **run)
+
+
+def test_a_failed_run_is_named():
+    falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sqrt(q[0]) - 2 * q[0])
+    with pytest.raises(ValueError, match=r"the run with steps of 0\.1 failed"):
+        dx.convergence(falling, dx.PlusLagrangeDirac(), step_sizes=[0.1, 0.05, 0.025], time=1.0, q=[0.1], v=[-1.0])
