@@ -44,7 +44,7 @@ class Search(NamedTuple):
         return self.measures[1]
 
     @property
-    def count(self) -> Float[Array, ""]:
+    def updates(self) -> Float[Array, ""]:
         """A whole number."""
         return self.measures[2]
 
@@ -78,7 +78,7 @@ def solve(
         found = Search(*jax.lax.custom_root(equation, guess, search, tangent_solve, has_aux=True))
     else:
         found = search(equation, guess)
-    return found.u, found.count.astype(int), at_floor(found)
+    return found.u, found.updates.astype(int), at_floor(found)
 
 
 def newton(equation: Callable, scale: Float[Array, " k"], guess: Float[Array, " k"], max_iterations: int, running: Any) -> Search:
@@ -88,11 +88,11 @@ def newton(equation: Callable, scale: Float[Array, " k"], guess: Float[Array, " 
         change = solver(equation(s.u))
         u = s.u - change
         update = jnp.max(jnp.abs(change) / (jnp.abs(u) + scale))
-        ratio = jnp.where(s.count > 0, update / s.update, jnp.nan)
-        return Search(u, jnp.stack([update, ratio, s.count + 1]))
+        ratio = jnp.where(s.updates > 0, update / s.update, jnp.nan)
+        return Search(u, jnp.stack([update, ratio, s.updates + 1]))
 
     def unfinished(s: Search):
-        return running & ~at_floor(s) & ~jnp.isnan(s.update) & (s.count < max_iterations)
+        return running & ~at_floor(s) & ~jnp.isnan(s.update) & (s.updates < max_iterations)
 
     def contracting(s: Search):
         return unfinished(s) & ((s.ratio < CONTRACTING) | (jnp.isnan(s.ratio) & (s.update < NEAR)))

@@ -86,8 +86,9 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
     lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np)
 
     def call(lanes, start, stop, closing=False):
-        reals, integers = map(np.float64, (p.t0, p.h, p.first_step)), map(np.int64, (p.save_every, start, stop))
-        clock = Clock(*reals, *integers, np.bool_(closing))
+        t0, h, first_step = map(np.float64, (p.t0, p.h, p.first_step))
+        every, start, stop = map(np.int64, (p.save_every, start, stop))
+        clock = Clock(t0, h, first_step, every, start, stop, np.bool_(closing))
         after, rows = _chunk(p.equation, lanes, p.params, clock, capacity, axes, p.max_iterations)
         return after, {name: _by_lane(np.asarray(values), p.batch, np) for name, values in rows.items()}
 
