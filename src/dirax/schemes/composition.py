@@ -1,11 +1,14 @@
 """Compositions of a scheme with itself, or with its adjoint, to higher order."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
 
+from dirax.functions import UserFunction
+from dirax.schemes.lagrange_dirac import LD_ARGUMENTS, LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation, StepSequence, make_step_equation
+from dirax.systems.lagrange_dirac import LagrangeDirac
 
 
 def _symmetric(half: Sequence[float], middle: float | None = None) -> tuple[float, ...]:
@@ -106,16 +109,16 @@ class Composition(AbstractScheme):
 class Adjoint(AbstractScheme):
     """The adjoint Φ*_h = (Φ_{−h})⁻¹ of a scheme: x1 = Φ*_h(x0) iff x0 = Φ_{−h}(x1).
 
-    A scheme is self-adjoint where it equals its adjoint. The unknowns are the scheme's own and the increment of the state.
+    A scheme is self-adjoint where it equals its adjoint. A discrete Lagrange–d'Alembert scheme has one of the same family,
+    with L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h): with constraints its p matters only
+    modulo the forces Wᵀμ, so that the inverse as a map of (q, p) does not exist. The unknowns of any other scheme are its
+    own and the increment of the state.
     """
 
     scheme: AbstractScheme
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        inner = make_step_equation(self.scheme, system, shape)
-        if not isinstance(inner, StepEquation):
-            raise TypeError("Adjoint takes a one-stage scheme: compose the adjoints of the parts instead.")
-        return adjoint_equation(inner)
+        return _adjoint_of(self.scheme, system, shape, "Adjoint takes a one-stage scheme: compose the parts' adjoints instead.")
 
 
 class SymmetricComposition(AbstractScheme):
@@ -124,10 +127,39 @@ class SymmetricComposition(AbstractScheme):
     scheme: AbstractScheme
 
     def step_equation(self, system: Any, shape: Shape) -> StepSequence:
-        inner = make_step_equation(self.scheme, system, shape)
-        if not isinstance(inner, StepEquation):
-            raise TypeError("SymmetricComposition takes a one-stage scheme.")
-        return StepSequence(((adjoint_equation(inner), 0.5), (inner, 0.5)))
+        adjoint = _adjoint_of(self.scheme, system, shape, "SymmetricComposition takes a one-stage scheme.")
+        return StepSequence(((adjoint, 0.5), (make_step_equation(self.scheme, system, shape), 0.5)))
+
+
+def _adjoint_of(scheme: AbstractScheme, system: Any, shape: Shape, several_stages: str) -> StepEquation:
+    if isinstance(system, LagrangeDirac) and isinstance(scheme, FAMILY):
+        return make_step_equation(adjoint_scheme(scheme), system, shape)
+    inner = make_step_equation(scheme, system, shape)
+    if not isinstance(inner, StepEquation):
+        raise TypeError(several_stages)
+    return adjoint_equation(inner)
+
+
+FAMILY = (LagrangeDAlembert, PlusLagrangeDirac, MinusLagrangeDirac)
+MIRRORED = {"left": "right", "right": "left", "midpoint": "midpoint", "trapezoidal": "trapezoidal"}
+
+
+def adjoint_scheme(scheme: AbstractScheme) -> LagrangeDAlembert:
+    """The adjoint of a discrete Lagrange–d'Alembert scheme within the family."""
+    if isinstance(scheme, LagrangeDAlembert):
+        rule, constraint = scheme.discrete_lagrangian, scheme.constraint
+    elif isinstance(scheme, PlusLagrangeDirac | MinusLagrangeDirac):
+        rule, constraint = scheme.discrete_lagrangian, "right" if isinstance(scheme, PlusLagrangeDirac) else "left"
+    else:
+        raise TypeError(f"adjoint_scheme takes a discrete Lagrange–d'Alembert scheme, but {scheme!r} was given.")
+    return LagrangeDAlembert(_mirror(rule, -1.0), _mirror(constraint, 1.0), "incoming")
+
+
+def _mirror(rule: str | UserFunction, sign: float) -> str | Callable:
+    """sign·f(q1, q0, −h) of a function f(q0, q1, h), or the rule of that name's mirror image."""
+    if isinstance(rule, str):
+        return MIRRORED[rule]
+    return UserFunction(lambda q0, q1, h, params: sign * rule(q1, q0, -h, params), f"adjoint of {rule.name}", LD_ARGUMENTS)
 
 
 def adjoint_equation(inner: StepEquation) -> StepEquation:

@@ -7,8 +7,11 @@ import jax.numpy as jnp
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
 from dirax.schemes.discretized import stepping
 from dirax.schemes.lagrangian_methods import discretized_lagrangian, resolved_lagrangian, resolved_nonholonomic
+from dirax.schemes.resolved import projected_field
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
+from dirax.systems.constraint_chain import ResolvedSystem
 from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import NonholonomicMechanics
 from dirax.systems.phase_space import PhaseSpaceLagrangian
@@ -26,8 +29,9 @@ class DiscreteDirac(AbstractScheme):
     "discretize" ([BLM] Method 1) discretizes the implicit system S_0 as it stands; "resolve" ([BLM] Method 2) runs the
     constraint algorithm first and discretizes on M_f, so that its constraints hold at the nodes to roundoff.
 
-    Takes DiracSystem, PortHamiltonian, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian systems; raises
-    `TypeError` for others and `ValueError` for maps that do not fit the system's space.
+    Takes DiracSystem, PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian
+    systems, and what `ConstraintChain.resolved` returns, on which it is Method 2 for any system; raises `TypeError` for
+    others and `ValueError` for maps that do not fit the system's space.
     """
 
     map: AbstractDiscretizationMap
@@ -43,7 +47,14 @@ class DiscreteDirac(AbstractScheme):
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         resolve = self.constraints == "resolve"
-        if isinstance(system, DiracSystem | PortHamiltonian):
+        if isinstance(system, ResolvedSystem):
+            return projected_field(system, shape, _theta_of(self.map))
+        if isinstance(system, PortHamiltonian | ImplicitSystem) and shape.m and resolve:
+            raise ValueError(
+                f"Method 2 of a {type(system).__name__} with multipliers needs its final manifold: simulate "
+                "dx.constraint_algorithm(system, near=x).resolved() instead of the system."
+            )
+        if isinstance(system, DiracSystem | PortHamiltonian | ImplicitSystem):
             return discretized_relation(system, shape, self.map)
         if isinstance(system, PhaseSpaceLagrangian):
             if resolve:
@@ -57,12 +68,14 @@ class DiscreteDirac(AbstractScheme):
             method = resolved_lagrangian if resolve and shape.m else discretized_lagrangian
             return method(system, shape, _theta_of(self.map))
         raise TypeError(
-            "dx.DiscreteDirac discretizes DiracSystem, PortHamiltonian, LagrangeDirac, NonholonomicMechanics and "
+            "dx.DiscreteDirac discretizes DiracSystem, PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and "
             f"PhaseSpaceLagrangian systems, but a {type(system).__name__} was given."
         )
 
 
-def discretized_relation(system: DiracSystem | PortHamiltonian, shape: Shape, map: AbstractDiscretizationMap) -> StepEquation:
+def discretized_relation(
+    system: DiracSystem | PortHamiltonian | ImplicitSystem, shape: Shape, map: AbstractDiscretizationMap
+) -> StepEquation:
     """The relation between (x, ẋ) of a system on M, discretized by a map on M: state x, unknowns (ẋ, multipliers)."""
     size, m = shape.n, shape.m
     step = stepping(map, size)
@@ -79,16 +92,23 @@ def discretized_relation(system: DiracSystem | PortHamiltonian, shape: Shape, ma
         return step.move(state, u[:d], h)[2]
 
     def unpack(state, u, t, h, params):
-        return {"x": state, "multipliers": u[d:]} if m else {"x": state}
+        row = {"x": state, "multipliers": u[d:]} if m else {"x": state}
+        if ported:
+            x, velocity, _ = step.move(state, u[:d], h)
+            row["power"] = power_of(system, x, velocity, t + h / 2, params)
+        return row
 
     def start(data, h, params):
         if "x" not in data:
             raise ValueError("this scheme starts from x= (or q=, p= for a system on T*Q).")
         return data["x"], jnp.concatenate([step.initial(data["x"], data["velocity"]), jnp.zeros(m)])
 
+    ported = isinstance(system, PortHamiltonian)
     fields = {"x": Field((size,))}
     if m:
-        fields["multipliers"] = Field((m,), "step", ("port",), "inputs of the closed ports")
+        fields["multipliers"] = Field((m,), "step", ("closed_port",), "multipliers at the base point")
+    if ported:
+        fields["power"] = Field((3,), "step", ("power",), "power stored ⟨dH, ẋ⟩, supplied and dissipated at the base point")
     return StepEquation(
         start=start,
         residual=residual,
@@ -100,6 +120,14 @@ def discretized_relation(system: DiracSystem | PortHamiltonian, shape: Shape, ma
         labels=tuple(f"component {i} of the Dirac condition" for i in range(d)) + tuple(f"output y[{a}]" for a in range(m)),
         canonical=isinstance(system, DiracSystem) and is_canonical(system),
     )
+
+
+def power_of(system: PortHamiltonian, x, velocity, t, params):
+    """(⟨dH, ẋ⟩, ⟨y, u⟩ of the open ports, ⟨dH, R dH⟩) at a base point; the first is the second less the third ([BLM] §7.1)."""
+    dh = system.differential(x, params)
+    supplied = system.input(t, x, params) @ (system.open_matrix(x, params).T @ dh)
+    dissipated = jnp.zeros(()) if system.R is None else dh @ system.R(x, params) @ dh
+    return jnp.stack([dh @ velocity, supplied, dissipated])
 
 
 def is_canonical(system: DiracSystem) -> bool:

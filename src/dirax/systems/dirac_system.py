@@ -50,10 +50,11 @@ class DiracSystem(AbstractSystem):
         multipliers: Float[Array, "0"],
         t: Any,
         params: Any = None,
+        differential: Float[Array, " N"] | None = None,
     ) -> Float[Array, " N"]:
-        """F(x) ẋ + E(x) dH(x), zero iff (ẋ, dH(x)) ∈ D_x."""
+        """F(x) ẋ + E(x) dH(x), zero iff (ẋ, dH(x)) ∈ D_x; `differential` replaces dH(x)."""
         F, E = self.structure.kernel(x, params)
-        return F @ velocity + E @ self.differential(x, params)
+        return F @ velocity + E @ (self.differential(x, params) if differential is None else differential)
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
         x = data["x"] if "x" in data else jnp.concatenate([data["q"], data["p"]]) if "p" in data else None

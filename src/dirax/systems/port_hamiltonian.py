@@ -1,6 +1,6 @@
 """Port-Hamiltonian systems: open, closed, with dissipation, and interconnected."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -20,7 +20,7 @@ class PortHamiltonian(AbstractSystem):
     `hamiltonian(x[, params])` a scalar; `J(x[, params])` (N, N) skew; `B(x[, params])` (N, m), no ports by default;
     `R(x[, params])` (N, N) symmetric, positive semidefinite, no dissipation by default. J, B and R may be constant arrays.
     Open (default): u = `inputs(t, x[, params])` (m,), zero without it. Closed: u is the multiplier that keeps y = 0
-    ([BLM] (23), a Dirac system).
+    ([BLM] (23), a Dirac system); `closed` may also name the columns of B that are closed, the others stay open.
 
     Raises `ValueError` at the start of a run where J is not skew or R not symmetric positive semidefinite, with the defect.
     """
@@ -30,7 +30,7 @@ class PortHamiltonian(AbstractSystem):
     B: UserFunction | None
     R: UserFunction | None
     inputs: UserFunction | None
-    closed: bool
+    closed: bool | tuple[int, ...]
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class PortHamiltonian(AbstractSystem):
         J: Callable | Any,
         B: Callable | Any = None,
         R: Callable | Any = None,
-        closed: bool = False,
+        closed: bool | Sequence[int] = False,
         inputs: Callable | None = None,
     ):
         self.hamiltonian = UserFunction(hamiltonian, "hamiltonian", ("x",))
@@ -46,15 +46,16 @@ class PortHamiltonian(AbstractSystem):
         self.B = None if B is None else _matrix_function(B, "B")
         self.R = None if R is None else _matrix_function(R, "R")
         self.inputs = None if inputs is None else UserFunction(inputs, "inputs", ("t", "x"))
-        self.closed = closed
-        if closed and B is None:
+        self.closed = closed if isinstance(closed, bool) else tuple(int(port) for port in closed)
+        if self.closed and B is None:
             raise ValueError("a closed port-Hamiltonian system needs B: its columns are the ports that are closed.")
-        if closed and inputs is not None:
+        if self.closed is True and inputs is not None:
             raise ValueError("a closed port-Hamiltonian system takes no inputs: u is determined by y = 0.")
 
     def with_inputs(self, inputs: Callable) -> "PortHamiltonian":
         """The same open system driven by u = inputs(t, x[, params])."""
-        return PortHamiltonian(self.hamiltonian.function, self.J.function, _function(self.B), _function(self.R), False, inputs)
+        matrices = (self.J.function, _function(self.B), _function(self.R))
+        return PortHamiltonian(self.hamiltonian.function, *matrices, self.closed, inputs)
 
     def differential(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
         """dH(x)."""
@@ -64,14 +65,28 @@ class PortHamiltonian(AbstractSystem):
         """B(x); (N, 0) without ports."""
         return jnp.zeros((x.shape[0], 0)) if self.B is None else self.B(x, params)
 
+    def closed_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N k"]:
+        """The columns of B(x) whose ports are closed."""
+        b = self.input_matrix(x, params)
+        return b[:, list(self._split(b.shape[1])[0])]
+
+    def open_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N k"]:
+        """The columns of B(x) whose ports are open."""
+        b = self.input_matrix(x, params)
+        return b[:, list(self._split(b.shape[1])[1])]
+
+    def _split(self, ports: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        closed = (tuple(range(ports)) if self.closed else ()) if isinstance(self.closed, bool) else self.closed
+        return closed, tuple(port for port in range(ports) if port not in closed)
+
     def flow_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N N"]:
         """J(x) − R(x)."""
         return self.J(x, params) if self.R is None else self.J(x, params) - self.R(x, params)
 
     def input(self, t: Any, x: Float[Array, " N"], params: Any = None) -> Float[Array, " m"]:
-        """u(t, x) of an open system, zero without inputs."""
+        """u(t, x) of the open ports, zero without inputs."""
         if self.inputs is None:
-            return jnp.zeros(self.input_matrix(x, params).shape[1])
+            return jnp.zeros(self.open_matrix(x, params).shape[1])
         return jnp.asarray(self.inputs(t, x, params))
 
     def output(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " m"]:
@@ -87,12 +102,13 @@ class PortHamiltonian(AbstractSystem):
         params: Any = None,
         differential: Float[Array, " N"] | None = None,
     ) -> Float[Array, " k"]:
-        """ẋ − (J − R) dH − B u, and y for a closed system, whose u are `multipliers`; `differential` replaces dH(x)."""
+        """ẋ − (J − R) dH − B u, and y of the closed ports, whose u are `multipliers`; `differential` replaces dH(x)."""
         dh = self.differential(x, params) if differential is None else differential
-        b = self.input_matrix(x, params)
-        u = multipliers if self.closed else self.input(t, x, params)
-        balance = velocity - self.flow_matrix(x, params) @ dh - b @ u
-        return jnp.concatenate([balance, b.T @ dh]) if self.closed else balance
+        closed = self.closed_matrix(x, params)
+        balance = velocity - self.flow_matrix(x, params) @ dh - closed @ multipliers
+        if self.inputs is not None:
+            balance = balance - self.open_matrix(x, params) @ self.input(t, x, params)
+        return jnp.concatenate([balance, closed.T @ dh]) if self.closed else balance
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
         if "x" not in data:
@@ -113,13 +129,18 @@ class PortHamiltonian(AbstractSystem):
             if len(shape) != 2 or shape[0] != size:
                 raise ValueError(f"B must have shape ({size}, m), one column a port, but its shape is {shape}.")
             ports = shape[1]
+        closed, unclosed = self._split(ports)
+        if any(not 0 <= port < ports for port in closed) or len(set(closed)) < len(closed):
+            raise ValueError(f"closed must name different columns of B, which has {ports}, but {closed} were given.")
         if self.inputs is not None:
             shape = self.inputs.shape(jnp.array(0.0), x, params).shape
-            if shape != (ports,):
-                raise ValueError(f"inputs must return shape ({ports},), one number a port, but it returned shape {shape}.")
+            if shape != (len(unclosed),):
+                raise ValueError(
+                    f"inputs must return shape ({len(unclosed)},), one number an open port, but it returned shape {shape}."
+                )
         if not is_traced(x, params):
             self._check_structure(x, params)
-        return size, ports if self.closed else 0
+        return size, len(closed)
 
     def _check_structure(self, x, params) -> None:
         J = np.asarray(self.J(x, params))
@@ -142,13 +163,15 @@ class PortHamiltonian(AbstractSystem):
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
         x = data["x"]
         velocity = self.flow_matrix(x, params) @ self.differential(x, params)
-        if not self.closed:
-            velocity = velocity + self.input_matrix(x, params) @ self.input(0.0, x, params)
+        if self.inputs is not None:
+            velocity = velocity + self.open_matrix(x, params) @ self.input(0.0, x, params)
         return {"x": x, "velocity": velocity}
 
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
-        """y = Bᵀ dH for a closed system: zero on M_0."""
-        return self.output(data["x"], params) if self.closed else no_constraint()
+        """y = Bᵀ dH of the closed ports: zero on M_0."""
+        if not self.closed:
+            return no_constraint()
+        return self.closed_matrix(data["x"], params).T @ self.differential(data["x"], params)
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """H(x)."""

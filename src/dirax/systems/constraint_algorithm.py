@@ -1,0 +1,304 @@
+"""The constraint algorithm: M_k = τ(S_k), S_{k+1} = S_k ∩ TM_k, until it repeats or nothing is left ([BLM] §3).
+
+S_0 is A_0(x)(ẋ, u) = b_0(x). A left null vector of A_0 gives a condition on x; all of them, M_0. The derivatives of these
+conditions are appended as rows, which gives A_1, and so on. With bases Z, N of the left and right kernels of A_k at one
+point of M_{k−1}, the bordered equations
+
+    A_k w + Z s = b_k,   Nᵀ w = 0
+
+are regular around it, smooth in x, and s(x) = 0 is the condition b_k ∈ im A_k wherever A_k keeps its rank.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.functions import check_finite, is_traced
+from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
+from dirax.systems.implicit_system import ImplicitForm, implicit_form
+from dirax.systems.system import AbstractSystem
+
+RANK_TOLERANCE = 1e-8
+ZERO = 1e-10
+"""A condition below this, relative to the right-hand side and the point, counts as satisfied."""
+SAMPLES = 6
+
+
+def constraint_algorithm(system: AbstractSystem, near: Any, params: Any = None, radius: float = 0.02) -> ConstraintChain:
+    """The chain of constraint manifolds of an implicit system around the point `near`.
+
+    `near`: a point x (N,), not necessarily on the constraints, or initial data {"q": …, "v": …} of a Lagrangian system;
+    `radius`: size of the neighbourhood, relative to 1 + |x|, in which ranks are checked to be constant.
+
+        chain = dx.constraint_algorithm(system, near=x)
+        print(chain)
+
+    Raises `ValueError` and `TypeError` as `implicit_form` does; what the algorithm finds is never an exception but the
+    `verdict` and `explanation` of the chain: an inconsistent system ends empty, one whose rank changes ends irregular.
+    """
+    if is_traced(near, params):
+        raise TypeError("constraint_algorithm inspects values: call it outside jax.jit, and use the chain's functions inside.")
+    if not 0 < radius < 1:
+        raise ValueError(f"radius must lie between 0 and 1, but {radius!r} was given.")
+    check_finite("near", near)
+    return _Search(implicit_form(system, near, params), params, radius).run()
+
+
+def rank_of(matrix: np.ndarray, reference: np.ndarray | None = None) -> int:
+    """The numerical rank, rows scaled to unit size, or to the sizes `reference` (rows,)."""
+    if not matrix.size:
+        return 0
+    rows = np.abs(matrix).max(axis=1) if reference is None else reference
+    values = np.linalg.svd(matrix / np.where(rows > 0, rows, 1.0)[:, None], compute_uv=False)
+    return int(np.sum(values > RANK_TOLERANCE * max(1.0, values[0])))
+
+
+class _Search:
+    """The state of the algorithm between levels."""
+
+    def __init__(self, form: ImplicitForm, params, radius: float):
+        self.form, self.params = form, params
+        self.x = np.array(form.point)
+        self.size, self.unknowns = self.x.size, self.x.size + len(form.multipliers)
+        self.radius = radius * (1.0 + np.abs(self.x).max())
+        self.rng = np.random.default_rng(0)
+        self.singular = False
+        self.parts: list[Callable] = []
+        self.levels: list[ConstraintLevel] = []
+        self.phi_and_slope: Callable = lambda x: (np.zeros(0), np.zeros((0, self.size)))
+        compiled = jax.jit(form.equations)
+        self.given = lambda x: tuple(np.asarray(a) for a in compiled(jnp.asarray(x), params))
+
+    # ------------------------------------------------------------------ functions of the current level
+
+    def constraints(self) -> Callable:
+        parts = tuple(self.parts)
+        if not parts:
+            return lambda x, params: jnp.zeros(0)
+        return lambda x, params: jnp.concatenate([part(x, params) for part in parts])
+
+    def equations(self) -> Callable:
+        """(A_k, b_k), traceable: S_0 and the tangency to all constraints so far."""
+        phi, form, free = self.constraints(), self.form, self.unknowns - self.size
+        if not self.parts:
+            return form.equations
+
+        def stacked(x, params):
+            matrix, right = form.equations(x, params)
+            slope = jax.jacfwd(lambda x: phi(x, params))(x)
+            rows = jnp.concatenate([slope, jnp.zeros((slope.shape[0], free))], axis=1)
+            return jnp.concatenate([matrix, rows]), jnp.concatenate([right, jnp.zeros(slope.shape[0])])
+
+        return stacked
+
+    def matrix(self, x: np.ndarray) -> np.ndarray:
+        """A_k at a point."""
+        slope = self.phi_and_slope(x)[1]
+        return np.concatenate([self.given(x)[0], np.pad(slope, ((0, 0), (0, self.unknowns - self.size)))])
+
+    def with_conditions(self, conditions: Callable) -> Callable:
+        """x ↦ (φ, Dφ) of the constraints so far and the conditions after them, as numpy arrays."""
+        phi = self.constraints()
+        both = lambda x, params: jnp.concatenate([phi(x, params), conditions(x, params)])
+        compiled = jax.jit(lambda x, params: (both(x, params), jax.jacfwd(lambda x: both(x, params))(x)))
+        return lambda x: tuple(np.asarray(a) for a in compiled(jnp.asarray(x), self.params))
+
+    # ------------------------------------------------------------------ points
+
+    def onto(self, function: Callable, x: np.ndarray) -> np.ndarray | None:
+        """The zero of `function` (x ↦ value, slope) near x by Gauss–Newton, run to the floor; None where there is none."""
+        start, first, self.singular = x, 0.0, False
+        for _ in range(80):
+            value, slope = function(x)
+            if not value.size:
+                return x
+            if not (np.all(np.isfinite(value)) and np.all(np.isfinite(slope))):
+                self.singular = True
+                return None
+            first = max(first, np.abs(slope).max())
+            change = np.linalg.lstsq(slope, value, rcond=1e-12)[0]
+            x = x - change
+            if np.linalg.norm(x - start) > 1e3 * (1.0 + np.linalg.norm(start)):
+                return None
+            if np.abs(change).max() <= 1e-15 * (1.0 + np.abs(x).max()):
+                break
+        value, _ = function(x)
+        return x if np.abs(value).max() <= ZERO * max(first, 1e-300) * (1.0 + np.abs(x).max()) else None
+
+    def around(self, function: Callable | None = None) -> list[np.ndarray]:
+        """The point and samples around it, put on the zeros of `function` if it is given."""
+        points = [self.x]
+        for _ in range(SAMPLES):
+            sample = self.x + self.radius * self.rng.normal(size=self.size)
+            sample = sample if function is None else self.onto(function, sample)
+            if sample is not None:
+                points.append(sample)
+        return points
+
+    # ------------------------------------------------------------------ the loop
+
+    def run(self) -> ConstraintChain:
+        while True:
+            number = len(self.levels)
+            points = self.around(self.phi_and_slope if self.parts else None)
+            matrices = [self.matrix(x) for x in points]
+            if not all(np.all(np.isfinite(a)) for a in matrices):
+                return self.end(IRREGULAR, "the equations are not finite around the point: it is at the edge of their domain.")
+            ranks = [rank_of(a) for a in matrices]
+            place = f"M_{number - 1}" if number else "the whole space"
+            if len(set(ranks)) > 1:
+                return self.end(
+                    IRREGULAR,
+                    f"the rank of the equations of (ẋ, u) is {ranks[0]} at the point and {sorted(set(ranks[1:]))} around it on "
+                    f"{place}: it is not constant, and the algorithm does not apply across such a point. Give another `near`.",
+                )
+            matrix, rank = matrices[0], ranks[0]
+            left, _, right = np.linalg.svd(matrix)
+            solve = _bordered(self.equations(), left[:, rank:], right[rank:].T)
+            if rank == matrix.shape[0]:
+                return self.finish(solve, right[rank:].T, rank)
+            conditions = lambda x, params, solve=solve: solve(x, params)[self.unknowns :]
+            function = self.with_conditions(conditions)
+            values = np.array([function(x)[0] for x in points])
+            size = 1.0 + np.abs(self.given(self.x)[1]).max(initial=0.0) + np.abs(self.x).max()
+            if np.all(np.abs(values) <= ZERO * size):
+                return self.finish(solve, right[rank:].T, rank)
+            outcome = self.add(conditions, function, points, rank, self._off_manifold(rank, place))
+            if outcome is not None:
+                return outcome
+
+    def _off_manifold(self, rank: int, place: str) -> str:
+        """A remark where conditions exist on the manifold only, because the rank is larger off it."""
+        if not self.parts:
+            return ""
+        off = min(rank_of(self.matrix(self.x + self.radius * self.rng.normal(size=self.size))) for _ in range(2))
+        return f"appears only on {place}: off it the rank is {off}" if off > rank else ""
+
+    def add(self, conditions: Callable, function: Callable, points, rank: int, note: str) -> ConstraintChain | None:
+        """Take the independent ones of the conditions as the constraints of a new level; the chain where that ends it."""
+        number, old = len(self.levels), sum(level.count for level in self.levels)
+        slopes = [function(x)[1] for x in points]
+        reference = np.max([np.abs(slope).max(axis=1) for slope in slopes], axis=0)
+        x = self.onto(function, self.x)
+        if x is None and self.singular:
+            return self.end(
+                IRREGULAR,
+                f"the rank of the equations of (ẋ, u) changes where the conditions of level {number} vanish, so that others "
+                "hold only there: state these as equations of their own (rows of zeros in E), or give another `near`.",
+            )
+        if x is None:
+            value = np.abs(function(self.x)[0][old:]).max()
+            varies = any(rank_of(a, reference) > rank_of(a[:old], reference[:old]) for a in slopes)
+            why = "have no common zero near the point" if varies else "do not vary" + f" on M_{number - 1}" * (number > 0)
+            return self.end(
+                EMPTY,
+                f"the conditions of level {number} {why}, where they are up to {value:.3g}: the system is inconsistent, and no "
+                "point here has a velocity.",
+            )
+        before, self.x = self.x, x
+        slope = function(x)[1]
+        new = rank_of(slope, reference) - rank_of(slope[:old], reference[:old])
+        if not new:
+            self.x = before
+            return self.end(
+                IRREGULAR,
+                f"the conditions of level {number} vanish with their derivative (as y² = 0 does): M_{number} is not their "
+                "regular zero set. State such a constraint by a function whose derivative does not vanish.",
+            )
+        select = _independent(slope[old:], slope[:old], reference[old:], new)
+        part = lambda x, params: jnp.asarray(select) @ conditions(x, params)
+
+        def constraints_of_level(x):
+            value, slope = function(x)
+            combine = lambda a: np.concatenate([a[:old], select @ a[old:]])
+            return combine(value), combine(slope)
+
+        self.phi_and_slope = constraints_of_level
+        samples = self.around(constraints_of_level)
+        rest = max(np.abs(function(y)[0]).max() for y in samples)
+        ranks = {rank_of(constraints_of_level(y)[1]) for y in samples}
+        self.parts.append(part)
+        self.levels.append(ConstraintLevel(number, self.size - old - new, new, rank, part, note))
+        if rest > 1e-7 * max(reference.max(), 1e-300) * (1.0 + np.abs(x).max()) or len(ranks) > 1:
+            return self.end(
+                IRREGULAR,
+                f"the derivatives of the conditions of level {number} have rank {sorted(ranks)} on M_{number} and leave some of "
+                f"them at {rest:.3g}: their rank is not constant around the point.",
+            )
+        return None
+
+    # ------------------------------------------------------------------ ends
+
+    def finish(self, solve: "_bordered", null: np.ndarray, rank: int) -> ConstraintChain:
+        n = self.size
+        freedom = rank_of(null[:n].T, np.ones(null.shape[1])) if null.size else 0
+        redundant = null.shape[1] - freedom
+        if not self.levels:
+            none = lambda x, params: jnp.zeros(0)
+            self.levels.append(ConstraintLevel(0, n, 0, rank, none, "every point has a velocity"))
+            index = 0
+        else:
+            index = len(self.levels)
+            last = self.levels[-1]
+            self.levels.append(ConstraintLevel(index, last.dimension, 0, rank, lambda x, params: jnp.zeros(0), "repeats: M_f"))
+        words = [f"M_f has dimension {self.levels[-1].dimension} of {n} ({self.form.about})"]
+        words.append(f"{freedom} direction{'s' * (freedom > 1)} of ẋ undetermined" if freedom else "ẋ is determined")
+        if redundant:
+            words.append(f"{redundant} multiplier{'s' * (redundant > 1)} undetermined: constraints are redundant, consistently")
+        rows = self.unknowns
+        solution = lambda x, params: solve(x, params)[:rows]
+        kernel = lambda x, params: solve.kernel(x, params)
+        return self.end(GAUGE if freedom else DETERMINED, "; ".join(words) + ".", index, freedom, redundant, solution, kernel)
+
+    def end(self, verdict, explanation, index=None, freedom=0, redundant=0, solution=None, kernel=None) -> ConstraintChain:
+        return ConstraintChain(
+            levels=tuple(self.levels),
+            point=self.x,
+            index=len(self.levels) if index is None else index,
+            verdict=verdict,
+            explanation=explanation,
+            freedom=freedom,
+            redundant=redundant,
+            coordinates=self.form.coordinates,
+            multiplier_names=self.form.multipliers,
+            params=self.params,
+            _constraints=eqx.filter_jit(self.constraints()),
+            _solution=None if solution is None else eqx.filter_jit(solution),
+            _kernel=None if kernel is None else eqx.filter_jit(kernel),
+            _energy=self.form.energy,
+        )
+
+
+class _bordered:
+    """(x, params) ↦ (w, s) of the bordered equations, and the smooth kernel basis of A that they give."""
+
+    def __init__(self, equations: Callable, left: np.ndarray, right: np.ndarray):
+        self.equations, self.left, self.right = equations, jnp.asarray(left), jnp.asarray(right)
+
+    def _matrix(self, matrix):
+        corner = jnp.zeros((self.right.shape[1], self.left.shape[1]))
+        return jnp.block([[matrix, self.left], [self.right.T, corner]])
+
+    def __call__(self, x, params):
+        matrix, right = self.equations(x, params)
+        return jnp.linalg.solve(self._matrix(matrix), jnp.concatenate([right, jnp.zeros(self.right.shape[1])]))
+
+    def kernel(self, x, params):
+        matrix, right = self.equations(x, params)
+        free = self.right.shape[1]
+        sides = jnp.concatenate([jnp.zeros((right.shape[0], free)), jnp.eye(free)])
+        return jnp.linalg.solve(self._matrix(matrix), sides)[: matrix.shape[1]]
+
+
+def _independent(slope: np.ndarray, old: np.ndarray, reference: np.ndarray, count: int) -> np.ndarray:
+    """(count, conditions): combinations whose derivatives are independent of one another and of the `old` ones."""
+    unit = np.where(reference > 0, reference, 1.0)
+    rest = slope / unit[:, None]
+    if old.size:
+        rest = rest - rest @ np.linalg.pinv(old, rcond=1e-10) @ old
+    left = np.linalg.svd(rest)[0][:, :count]
+    return (left / unit[:, None]).T

@@ -1,0 +1,201 @@
+"""ConstraintChain: what the constraint algorithm found, as functions; and the resolved system on the final manifold."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dirax.functions import is_traced
+from dirax.roots import nearest_root
+from dirax.systems.system import AbstractSystem
+
+DETERMINED, GAUGE, EMPTY, IRREGULAR = "determined", "gauge freedom", "empty", "irregular"
+OFF = 1e-8
+"""Largest value of a constraint, relative to the sizes of its derivative and of the point, at a point that counts as on M_k."""
+
+
+@dataclass(frozen=True)
+class ConstraintLevel:
+    """One manifold M_k of the chain: its dimension, its new constraints `constraints(x, params) -> (count,)`, and remarks."""
+
+    number: int
+    dimension: int
+    count: int
+    rank: int
+    constraints: Callable = field(repr=False)
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintChain:
+    """The chain M_0 ⊃ M_1 ⊃ … ⊃ M_f of an implicit system around a point ([BLM] §3); prints as a table.
+
+    - `levels`: the manifolds M_k; `dimension`: that of M_f; `point` (N,): a point of M_f (of the last level reached).
+    - `index`: how often constraints are differentiated until (ẋ, u) is determined, or as far as it ever is.
+    - `verdict`: "determined", "gauge freedom", "empty" or "irregular", and `explanation` in words.
+    - `freedom`: the number of undetermined directions of ẋ; `redundant`: that of undetermined multipliers.
+
+    The functions are smooth around `point`, where their bases were chosen, and traceable.
+    """
+
+    levels: tuple[ConstraintLevel, ...]
+    point: np.ndarray
+    index: int
+    verdict: str
+    explanation: str
+    freedom: int
+    redundant: int
+    coordinates: tuple[str, ...]
+    multiplier_names: tuple[str, ...]
+    params: Any = field(repr=False)
+    _constraints: Callable = field(repr=False)
+    _solution: Callable | None = field(repr=False)
+    _kernel: Callable | None = field(repr=False)
+    _energy: Callable = field(repr=False)
+
+    # ------------------------------------------------------------------ the final manifold
+
+    @property
+    def dimension(self) -> int:
+        """The dimension of M_f; −1 where it is empty."""
+        return -1 if self.verdict == EMPTY else self.levels[-1].dimension
+
+    @property
+    def empty(self) -> bool:
+        """Whether no point near the given one has a velocity that stays."""
+        return self.verdict == EMPTY
+
+    def constraints(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " c"]:
+        """All constraint functions of M_f at x, level by level."""
+        return self._constraints(x, self._with(params))
+
+    def field(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+        """The tangent field ẋ on M_f; where it is not unique, the one whose undetermined part was zero at `point`.
+
+        Raises `ValueError` for a chain that ended empty or irregular.
+        """
+        return self._solved()(x, self._with(params))[: len(self.coordinates)]
+
+    def multipliers(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " m"]:
+        """The multipliers u that keep x on M_f, in the order of `multiplier_names`. Raises as `field`."""
+        return self._solved()(x, self._with(params))[len(self.coordinates) :]
+
+    def gauge(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N freedom"]:
+        """A basis, by columns, of the directions of ẋ that the equations leave free. Raises as `field`."""
+        if self._kernel is None:
+            raise ValueError(f"this constraint chain has no final manifold: {self.explanation}")
+        kernel = self._kernel(x, self._with(params))[: len(self.coordinates)]
+        return _span(kernel, self.freedom)
+
+    def project(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+        """The point y of M_f nearest to x: y + Dφ(y)ᵀσ = x, φ(y) = 0. Differentiable."""
+        self._solved()
+        multipliers = jnp.zeros(sum(level.count for level in self.levels))
+        return _nearest(self._constraints, jnp.asarray(x, dtype=float), multipliers, self._with(params))
+
+    def check(self, x: Float[Array, " N"], params: Any = None) -> None:
+        """Raise `ValueError` for a point off M_f, with the first level it is off, the values, and its projection."""
+        x, params = jnp.asarray(x, dtype=float), self._with(params)
+        if is_traced(x, params):
+            return
+        if x.shape != (len(self.coordinates),):
+            raise ValueError(f"x must have shape ({len(self.coordinates)},) = {self.coordinates}, but it has shape {x.shape}.")
+        for level in self.levels:
+            value = np.asarray(level.constraints(x, params))
+            slope = np.abs(_slope(level.constraints, x, params)).max(initial=0.0)
+            if np.abs(value).max(initial=0.0) > OFF * slope * (1.0 + np.abs(np.asarray(x)).max()):
+                where = np.asarray(self.project(x, params))
+                raise ValueError(
+                    f"x is off M_{level.number}: its {level.count} new constraint{'s' * (level.count > 1)} there "
+                    f"{'have the values' if level.count > 1 else 'has the value'} {np.array2string(value, precision=4)}. "
+                    f"The nearest point of M_f is {np.array2string(where, precision=6)}, at distance "
+                    f"{np.linalg.norm(where - np.asarray(x)):.3g}: start from chain.project(x)."
+                )
+
+    def resolved(self) -> "ResolvedSystem":
+        """The system ẋ = field(x) on M_f, for Method 2: `dx.simulate(chain.resolved(), dx.DiscreteDirac(), x=…)`.
+
+        Raises as `field`; with gauge freedom it is the field that `field` chooses.
+        """
+        self._solved()
+        return ResolvedSystem(self)
+
+    def _solved(self) -> Callable:
+        if self._solution is None:
+            raise ValueError(f"this constraint chain has no final manifold: {self.explanation}")
+        return self._solution
+
+    def _with(self, params):
+        return self.params if params is None else params
+
+    # ------------------------------------------------------------------ how it shows itself
+
+    def to_dict(self) -> dict[str, Any]:
+        """The table as plain Python values."""
+        keys = ("number", "count", "dimension", "rank", "note")
+        rows = [{key: getattr(level, key) for key in keys} for level in self.levels]
+        keys = ("index", "verdict", "explanation", "freedom", "redundant", "dimension")
+        return {"levels": rows, **{key: getattr(self, key) for key in keys}}
+
+    def __str__(self) -> str:
+        header = ("level", "new constraints", "dim M_k", "rank of the equations of (ẋ, u)", "")
+        rows = [(f"M_{v.number}", str(v.count), str(v.dimension), str(v.rank), v.note) for v in self.levels]
+        widths = [max(len(row[i]) for row in (header, *rows)) for i in range(4)]
+        cells = lambda row: (*(cell.ljust(w) for cell, w in zip(row, widths, strict=False)), row[4])
+        lines = ["  ".join(cells(row)).rstrip() for row in (header, *rows)]
+        end = f"{self.verdict}, index {self.index}: {self.explanation}"
+        return "\n".join([lines[0], "─" * (sum(widths) + 6), *lines[1:], end])
+
+
+@eqx.filter_jit
+def _nearest(constraints: Callable, x, multipliers, params):
+    size = x.shape[0]
+
+    def residual(u):
+        phi, pull = jax.vjp(lambda y: constraints(y, params), u[:size])
+        return jnp.concatenate([u[:size] + pull(u[size:])[0] - x, phi])
+
+    return nearest_root(residual, jnp.concatenate([x, multipliers]))[:size]
+
+
+@eqx.filter_jit
+def _span(kernel, count: int):
+    """An orthonormal basis (N, count) of the columns of `kernel`."""
+    return jnp.linalg.svd(kernel, full_matrices=False)[0][:, :count]
+
+
+@eqx.filter_jit
+def _slope(constraints: Callable, x, params):
+    return jax.jacfwd(lambda x: constraints(x, params))(x)
+
+
+class ResolvedSystem(AbstractSystem):
+    """ẋ = X(x) on the final manifold M_f = {φ = 0} of a constraint chain; made by `ConstraintChain.resolved`."""
+
+    chain: ConstraintChain = eqx.field(static=True)
+
+    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+        size = len(self.chain.coordinates)
+        if "x" not in data or data["x"].shape != (size,):
+            raise ValueError(f"the resolved system starts from x= of shape ({size},) = {', '.join(self.chain.coordinates)}.")
+        return size, sum(level.count for level in self.chain.levels)
+
+    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+        x = self.chain.project(data["x"], params) if project else data["x"]
+        return {"x": x, "velocity": self.chain.field(x, params)}
+
+    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
+        """φ(x); `ConstraintChain.check` says more."""
+        return self.chain.constraints(data["x"], params)
+
+    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+        """The energy of the system that the chain came from."""
+        return self.chain._energy(row["x"], self.chain._with(params))
+
+    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
+        return self.chain.constraints(row["x"], params)

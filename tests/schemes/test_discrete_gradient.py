@@ -1,0 +1,109 @@
+"""Discrete gradients: exact energy balance, order 2, and their Dirac and closed forms."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dirax as dx
+from dirax.schemes.discrete_gradient import DiscreteGradient
+
+KINDS = ("gonzalez", "mean-value")
+J, B, R = [[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]], [[0.0, 0.0], [0.0, 0.05]]
+hamiltonian = lambda x: x[1] ** 2 / 2 - jnp.cos(x[0]) + x[0] ** 4 / 8
+drive = lambda t, x: jnp.sin(1.3 * t)[None]
+driven = dx.PortHamiltonian(hamiltonian, J=J, R=R, B=B, inputs=drive)
+START = np.array([1.0, 0.3])
+
+
+def by_hand(x):
+    """H in numpy."""
+    return x[..., 1] ** 2 / 2 - np.cos(x[..., 0]) + x[..., 0] ** 4 / 8
+
+
+def balance(sol):
+    """H_N − H_0 − supplied + dissipated, relative to what went through."""
+    energy, work = by_hand(sol.x), sol.work
+    return np.abs(energy - energy[0] - work[:, 0] + work[:, 1]).max() / np.abs(work).max()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_energy_balance_is_exact(kind):
+    sol = dx.simulate(driven, DiscreteGradient(kind), x=START, step=0.1, steps=2000)
+    assert balance(sol) < 1e-14
+    stored, supplied, dissipated = sol.power.T
+    assert np.abs(stored - supplied + dissipated).max() < 1e-12
+    assert np.abs(np.diff(by_hand(sol.x)) - 0.1 * stored).max() < 1e-13
+    # the powers are what the definitions say: u at the middle of the step, y = ∇̄H_2 = ẋ_1
+    rate = np.diff(sol.x, axis=0) / 0.1
+    assert np.abs(supplied - np.sin(1.3 * (sol.t[:-1] + 0.05)) * rate[:, 0]).max() < 1e-12
+    assert np.abs(dissipated - 0.05 * rate[:, 0] ** 2).max() < 1e-12
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("kind", KINDS)
+def test_energy_balance_over_a_million_steps(kind):
+    sol = dx.simulate(driven, DiscreteGradient(kind), x=START, step=0.05, steps=1_000_000, save_every=1000)
+    assert sol.ok and balance(sol) < 1e-12
+    free = dx.PortHamiltonian(hamiltonian, J=J)
+    sol = dx.simulate(free, DiscreteGradient(kind), x=START, step=0.05, steps=1_000_000, save_every=1000)
+    energy = by_hand(sol.x)
+    assert np.abs(energy / energy[0] - 1).max() < 1e-12
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_second_order(kind):
+    field = lambda t, x: [x[1], -np.sin(x[0]) - x[0] ** 3 / 2 - 0.05 * x[1] + np.sin(1.3 * t)]
+    exact = solve_ivp(field, (0, 3), START, rtol=1e-12, atol=1e-12).y[:, -1]
+    errors = []
+    for steps in (30, 60, 120):
+        sol = dx.simulate(driven, DiscreteGradient(kind), x=START, step=3 / steps, steps=steps)
+        errors.append(np.abs(sol.x[-1] - exact).max())
+    assert -np.diff(np.log2(errors)) == pytest.approx([2.0, 2.0], abs=0.1)
+
+
+def test_the_two_are_equal_for_quadratic_and_differ_for_other_hamiltonians():
+    oscillator = dx.PortHamiltonian(lambda x: x @ x / 2, J=J)
+    ends = [dx.simulate(oscillator, DiscreteGradient(kind), x=START, step=0.2, steps=50).x[-1] for kind in KINDS]
+    generator = 0.1 * np.array(J)
+    cayley = np.linalg.solve(np.eye(2) - generator, np.eye(2) + generator)  # both are the midpoint rule there
+    for end in ends:
+        assert end == pytest.approx(np.linalg.matrix_power(cayley, 50) @ START, abs=1e-13)
+    ends = [dx.simulate(driven, DiscreteGradient(kind), x=START, step=0.2, steps=50).x[-1] for kind in KINDS]
+    assert np.abs(ends[0] - ends[1]).max() > 1e-4
+
+
+def test_a_rigid_body_keeps_energy_and_casimir():
+    inertia = jnp.array([1.0, 2.0, 3.0])
+    so3 = dx.DiracStructure.from_bivector(lambda x: jnp.cross(x, jnp.eye(3), axisb=0, axisc=0))
+    body = dx.DiracSystem(so3, lambda x: x @ (x / inertia) / 2 + x[0] ** 4 / 4)
+    sol = dx.simulate(body, DiscreteGradient(), x=[0.3, 0.5, 0.8], step=0.1, steps=500)
+    energy = sol.x**2 @ (1 / np.array([1.0, 2.0, 3.0])) / 2 + sol.x[:, 0] ** 4 / 4
+    assert np.ptp(energy) < 5e-16
+    assert np.ptp(np.linalg.norm(sol.x, axis=1)) < 1e-13  # ⟨x̄, ẋ_d⟩ = 0
+
+
+def test_closed_ports_keep_the_energy_and_the_discrete_output_zero():
+    """Two masses with different springs and a rigid joint."""
+    mass = lambda k: dx.PortHamiltonian(lambda x: x[1] ** 2 / 2 + k * x[0] ** 4 / 4, J=J, B=B)
+    pair = dx.interconnect(mass(1.0), mass(2.0), [0], [0], sizes=(2, 2), kind="joint")
+    sol = dx.simulate(pair, DiscreteGradient(), x=[0.5, 0.1, 0.5, 0.1], step=0.02, steps=1000)
+    assert np.ptp(sol.energy()) < 2e-16
+    # the joint holds the two together: one mass of 2 on the sum of the springs
+    assert np.abs(sol.x[:, 0] - sol.x[:, 2]).max() < 1e-13
+    exact = solve_ivp(lambda t, y: [y[1], -1.5 * y[0] ** 3], (0, 20), [0.5, 0.1], rtol=1e-12, atol=1e-12).y[0, -1]
+    assert sol.x[-1, 0] == pytest.approx(exact, abs=2e-4)
+
+
+def test_a_system_that_comes_to_rest_is_not_pushed_by_roundoff():
+    damped = dx.PortHamiltonian(lambda x: x @ x / 2 + 5.0, J=J, R=[[0.0, 0.0], [0.0, 1.0]])
+    sol = dx.simulate(damped, DiscreteGradient(), x=START, step=0.1, steps=2000)
+    assert sol.ok and np.abs(sol.x[-1]).max() < 1e-7
+    assert np.all(np.diff(sol.work[:, 1]) >= 0)
+
+
+def test_other_systems_and_kinds_are_refused():
+    with pytest.raises(ValueError, match="'gonzalez', 'mean-value'"):
+        DiscreteGradient("average")
+    with pytest.raises(TypeError, match="which have a Hamiltonian of x"):
+        dx.simulate(dx.LagrangeDirac(lambda q, v: v @ v), DiscreteGradient(), q=[0.0], v=[1.0], step=0.1, steps=1)

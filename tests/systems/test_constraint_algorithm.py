@@ -1,0 +1,196 @@
+"""The constraint algorithm on systems whose chains are known by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dirax as dx
+from dirax.systems.constraint_algorithm import constraint_algorithm
+from dirax.systems.implicit_system import ImplicitSystem
+
+
+def dimensions(chain):
+    return [level.dimension for level in chain.levels]
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """The planar pendulum as |q| = 1 with its tension as multiplier: q̇ = p, ṗ = −e_y + q u."""
+    system = ImplicitSystem(
+        E=lambda x: jnp.eye(5)[:, :4],
+        f=lambda x: jnp.array([x[2], x[3], 0.0, -1.0, (x[0] ** 2 + x[1] ** 2 - 1.0) / 2]),
+        B=lambda x: jnp.concatenate([jnp.zeros(2), x[:2], jnp.zeros(1)])[:, None],
+        hamiltonian=lambda x: x[2:] @ x[2:] / 2 + x[1],
+    )
+    return constraint_algorithm(system, np.array([0.6, -0.81, 0.3, 0.2]))
+
+
+def test_pendulum_has_a_hidden_constraint_and_its_tension(pendulum):
+    assert (dimensions(pendulum), pendulum.index, pendulum.verdict) == ([3, 2, 2], 2, "determined")
+    x = pendulum.point
+    q, p = x[:2], x[2:]
+    assert [q @ q, q @ p] == pytest.approx([1.0, 0.0], abs=1e-14)
+    # q·p = 0 differentiated: |p|² − q_y + u = 0
+    tension = q[1] - p @ p
+    assert pendulum.multipliers(x)[0] == pytest.approx(tension, abs=1e-12)
+    expected = np.concatenate([p, [0.0, -1.0] + tension * q])
+    assert pendulum.field(x) == pytest.approx(expected, abs=1e-12)
+    y = pendulum.project(x + np.array([0.02, 0.01, -0.03, 0.02]))
+    assert [y[:2] @ y[:2], y[:2] @ y[2:]] == pytest.approx([1.0, 0.0], abs=1e-14)
+    assert str(pendulum).startswith("level  new constraints") and "M_2" in str(pendulum)
+    assert [row["count"] for row in pendulum.to_dict()["levels"]] == [1, 1, 0]
+
+
+def test_points_off_the_final_manifold_are_refused_with_level_and_projection(pendulum):
+    pendulum.check(pendulum.point)
+    with pytest.raises(ValueError, match=r"off M_0.*nearest point of M_f.*chain.project"):
+        pendulum.check(np.array([0.61, -0.8, 0.0, 0.0]))
+    with pytest.raises(ValueError, match=r"off M_1"):
+        pendulum.check(np.array([0.6, -0.8, 0.3, 0.2]))
+    with pytest.raises(ValueError, match=r"must have shape \(4,\)"):
+        pendulum.check(np.zeros(3))
+
+
+def test_method_2_on_a_chain_follows_the_pendulum_and_keeps_both_constraints(pendulum):
+    start = np.array([0.6, -0.8, 0.0, 0.0])
+
+    def swing(t, y):
+        return [y[1], -np.sin(y[0])]
+
+    angle = solve_ivp(swing, (0, 2), [np.arctan2(0.6, 0.8), 0.0], rtol=1e-12, atol=1e-12).y[0, -1]
+    errors = []
+    for steps in (20, 40, 80):
+        sol = dx.simulate(pendulum.resolved(), dx.DiscreteDirac(), x=start, step=2 / steps, steps=steps)
+        assert np.abs(sol.constraint_residual()).max() < 2e-15
+        errors.append(np.abs(sol.x[-1, :2] - [np.sin(angle), -np.cos(angle)]).max())
+    assert -np.diff(np.log2(errors)) == pytest.approx([2.0, 2.0], abs=0.1)
+    assert np.ptp(sol.energy()) < 1e-3
+
+
+def test_rolling_disk_as_nonholonomic_mechanics():
+    system = dx.NonholonomicMechanics(
+        lambda q: jnp.diag(jnp.array([1.0, 1.0, 0.25, 0.5])),
+        lambda q: 10 * jnp.sin(q[2]),
+        lambda q: jnp.array([[1.0, 0, -jnp.cos(q[3]), 0], [0, 1.0, -jnp.sin(q[3]), 0]]),
+    )
+    q = np.array([0, 0, 0.3, np.pi / 3])
+    chain = constraint_algorithm(system, {"q": q, "v": [5.0, 5 * np.sqrt(3), 10, 1.0]})
+    assert (dimensions(chain), chain.index, chain.verdict) == ([6, 6], 1, "determined")
+    # 1.25 θ̈ = −10 cos θ, ẍ = d/dt(cos φ θ̇) is the first multiplier
+    acceleration = -8 * np.cos(0.3)
+    expected = acceleration * np.array([np.cos(q[3]), np.sin(q[3])]) + 10 * np.array([-np.sin(q[3]), np.cos(q[3])])
+    assert chain.multipliers(chain.point) == pytest.approx(expected, abs=1e-11)
+    assert chain.field(chain.point)[4:] == pytest.approx([*expected, acceleration / 4, 0.0], abs=1e-11)
+
+
+def test_phase_space_lagrangian_stops_at_the_graph_of_its_one_form():
+    """L = p q̇ − H in the gauge α = (y + y³/3, 0): ẋ (1 + y²) = ∂H/∂y, ẏ (1 + y²) = −∂H/∂x."""
+    system = dx.PhaseSpaceLagrangian(lambda q: jnp.array([q[1] + q[1] ** 3 / 3, 0.0]), lambda q: q @ q / 2)
+    chain = constraint_algorithm(system, {"q": [0.4, 0.7]})
+    assert (dimensions(chain), chain.index, chain.verdict) == ([2, 2], 1, "determined")
+    assert chain.multiplier_names == ("u0", "u1")
+    assert chain.field(chain.point)[:2] == pytest.approx([0.7 / 1.49, -0.4 / 1.49], abs=1e-12)
+
+
+def test_an_undetermined_coordinate_is_gauge_freedom():
+    """L = (q̇_0 − q_1)²/2: p_1 = 0, then p_0 = 0, and q_1 is arbitrary."""
+    chain = constraint_algorithm(dx.LagrangeDirac(lambda q, v: (v[0] - q[1]) ** 2 / 2), {"q": [0.1, 0.2], "v": [0.3, 0.4]})
+    assert (dimensions(chain), chain.verdict, chain.freedom) == ([3, 2, 2], "gauge freedom", 1)
+    assert chain.point[2:] == pytest.approx([0.0, 0.0], abs=1e-14)
+    assert np.abs(chain.gauge(chain.point)[:, 0]) == pytest.approx([0.0, 1.0, 0.0, 0.0], abs=1e-12)
+
+
+def test_momenta_not_affine_in_velocities_go_to_the_pontryagin_bundle():
+    """L = √(1 − v_0²) + q_1 v_0 − q_1²/2: q_1 = v_0 by its own equation, then d/dt of p_0 = q_1 − v_0/√… = 0."""
+    system = dx.LagrangeDirac(lambda q, v: jnp.sqrt(1 - v[0] ** 2) + q[1] * v[0] - q[1] ** 2 / 2)
+    chain = constraint_algorithm(system, {"q": [0.1, 0.2], "v": [0.3, 0.0]})
+    q, v, p = np.split(chain.point, 3)
+    assert len(chain.coordinates) == 6 and chain.verdict == "determined"
+    assert [p[1], p[0], q[1]] == pytest.approx([0.0, q[1] - v[0] / np.sqrt(1 - v[0] ** 2), v[0]], abs=1e-13)
+    assert chain.dimension == 2  # q_0 and v_0; the others follow
+    assert np.asarray(chain.field(chain.point))[[1, 2]] == pytest.approx([0.0, 0.0], abs=1e-12)
+
+
+def test_closed_ports_and_dirac_systems():
+    """A mass tied to rest by its closed port has u = −force; the induced structure of a knife edge gives index 1."""
+    port = dx.PortHamiltonian(
+        lambda x: x @ x / 2, J=dx.canonical_two_form(2), B=[[0.0], [0.0], [1.0], [0.0]], closed=True
+    )  # fmt: skip
+    chain = constraint_algorithm(port, np.array([0.3, 0.1, 0.0, 0.5]))
+    assert dimensions(chain) == [3, 3]
+    assert chain.multipliers(chain.point) == pytest.approx([0.3], abs=1e-13)
+    forms = lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
+    edge = dx.DiracSystem(dx.induced_dirac(forms, 3), lambda x: x[3:] @ x[3:] / 2)
+    chain = constraint_algorithm(edge, np.array([0.0, 0.0, 0.3, np.cos(0.3), np.sin(0.3), 1.0]))
+    assert dimensions(chain) == [5, 5]
+    rate = np.array([np.cos(0.3), np.sin(0.3), 1.0, -np.sin(0.3), np.cos(0.3), 0.0])
+    assert chain.field(chain.point) == pytest.approx(rate, abs=1e-12)
+
+
+def test_redundant_constraints_leave_a_multiplier_free_and_nothing_else():
+    """A free fall on the line x = 0, said twice."""
+    system = ImplicitSystem(
+        E=lambda x: jnp.eye(6)[:, :4],
+        f=lambda x: jnp.array([x[2], x[3], 0.0, -1.0, x[0], 2 * x[0]]),
+        B=lambda x: jnp.zeros((6, 2)).at[2].set(jnp.array([1.0, 2.0])),
+    )
+    chain = constraint_algorithm(system, np.array([0.1, 0.1, 0.2, 0.3]))
+    assert (dimensions(chain), chain.verdict, chain.redundant) == ([3, 2, 2], "determined", 1)
+    assert chain.field(chain.point) == pytest.approx([0.0, 0.3, 0.0, -1.0], abs=1e-13)
+
+
+@pytest.mark.parametrize(
+    "E, f, near, verdict, words",
+    [
+        (lambda x: jnp.diag(jnp.array([1.0, 0.0])), lambda x: jnp.ones(2), [0.0, 0.1], "empty", "do not vary"),
+        (lambda x: jnp.diag(jnp.array([1.0, 0.0])), lambda x: jnp.array([1.0, x[0]]), [0.0, 0.1], "empty", "inconsistent"),
+        (lambda x: jnp.diag(jnp.array([1.0, 0.0])), lambda x: 1 + x**2, [0.3, 0.1], "empty", "no common zero"),
+        (lambda x: jnp.diag(jnp.stack([x[0], 1.0])), lambda x: x + 1, [0.0, 1.0], "irregular", "not constant"),
+        (lambda x: jnp.diag(jnp.array([1.0, 0.0])), lambda x: x**2, [0.0, 0.1], "irregular", "vanish with their derivative"),
+    ],
+    ids=["0 = 1", "hidden 0 = 1", "no real zero", "singular point", "double zero"],
+)  # fmt: skip
+def test_what_goes_wrong_is_explained(E, f, near, verdict, words):
+    chain = constraint_algorithm(ImplicitSystem(E, f), np.array(near))
+    assert chain.verdict == verdict and words in chain.explanation
+    with pytest.raises(ValueError, match="no final manifold"):
+        chain.field(np.array(near))
+
+
+def test_secondary_constraints_that_exist_only_on_the_manifold():
+    """ẋ_1 + x_1 ẋ_2 = x_0 − x_2 determines ẋ_2 off x_1 = 0; on it, where ẋ_1 = 0, it is the condition x_0 = x_2."""
+    system = ImplicitSystem(
+        E=lambda x: jnp.array([[1.0, 0, 0], [0, 0, 0], [0, 1.0, 0]]).at[2, 2].set(x[1]),
+        f=lambda x: jnp.array([1.0, x[1], x[0] - x[2]]),
+    )
+    chain = constraint_algorithm(system, np.array([0.5, 0.2, 0.3]))
+    assert (dimensions(chain), chain.verdict) == ([2, 1, 1], "determined")
+    assert "appears only on M_0: off it the rank is 3" in str(chain)
+    assert chain.field(chain.point) == pytest.approx([1.0, 0.0, 1.0], abs=1e-13)
+    # the same by a rank of E that drops where the first condition vanishes: refused, with the way out
+    dropping = ImplicitSystem(
+        E=lambda x: jnp.diag(jnp.stack([1.0, 0.0, x[1]])), f=lambda x: jnp.array([1.0, x[1], x[0] - x[2]])
+    )  # fmt: skip
+    chain = constraint_algorithm(dropping, np.array([0.5, 0.2, 0.3]))
+    assert chain.verdict == "irregular" and "hold only there" in chain.explanation
+
+
+def test_inputs_are_checked():
+    with pytest.raises(TypeError, match=r"state it as dx\.ImplicitSystem"):
+        constraint_algorithm(dx.ManifoldLagrangian, np.zeros(2))  # ty: ignore
+    with pytest.raises(ValueError, match="E must have shape"):
+        constraint_algorithm(ImplicitSystem(lambda x: x, lambda x: x), np.ones(2))
+    with pytest.raises(ValueError, match="near must be finite"):
+        constraint_algorithm(ImplicitSystem(lambda x: jnp.eye(2), lambda x: x), np.array([np.nan, 0.0]))
+
+
+def test_functions_of_the_chain_are_traceable_and_differentiable(pendulum):
+    x = jnp.asarray(pendulum.point)
+    derivative = jax.jit(jax.jacfwd(lambda x: pendulum.project(x)))(x)
+    # the orthogonal projector onto T M_f
+    normal = np.asarray(jax.jacfwd(pendulum.constraints)(x))
+    projector = np.eye(4) - np.linalg.pinv(normal) @ normal
+    assert np.abs(derivative - projector).max() < 1e-10
+    assert np.abs(normal @ np.asarray(pendulum.field(x))).max() < 1e-12
