@@ -7,6 +7,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from dirax.configure import configure
 from dirax.diagnostics.compare import compare
 from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.verify import verify
@@ -99,6 +100,7 @@ __all__ = [
     "check_chart",
     "check_discretization_map",
     "compare",
+    "configure",
     "constraint_algorithm",
     "convergence",
     "cotangent_lift",
