@@ -24,7 +24,7 @@ MANY = 12
 ENVELOPE = 1000
 """On a logarithmic scale, longer series are drawn by their largest value in each of this many pieces of time."""
 
-ENERGY_ERROR = "$|E - E(0)| \\,/\\, |E(0)|$"
+ENERGY_ERROR = "$|E - E_0| \\,/\\, |E_0|$"
 
 STYLE = {
     "font.size": 9.5,
@@ -38,7 +38,6 @@ STYLE = {
     "axes.grid": True,
     "axes.axisbelow": True,
     "axes.formatter.use_mathtext": True,
-    "mathtext.default": "it",
     "grid.color": "#e6e6e6",
     "grid.linewidth": 0.6,
     "lines.linewidth": 1.1,
@@ -66,7 +65,7 @@ def style() -> Iterator[None]:
         yield
 
 
-def new_figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (5.6, 3.6), **grid: Any):
+def new_figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (5.6, 3.6), **grid: Any) -> "tuple[Figure, Any]":
     """A Figure in the style of dirax, and its Axes: one, or an array of shape (rows, columns) squeezed; size in inches."""
     from matplotlib.figure import Figure
 
@@ -134,7 +133,7 @@ def plot_energy(sol: Any, *, figure: "Figure | None" = None, **line: Any) -> "Fi
     relative = bool(np.all(energies[:, 0] != 0))
     unit = sol.metadata.get("units", {}).get("energy", "")
     left.set(xlabel=_time_label(sol), ylabel=_label("energy $E$", unit))
-    right.set(xlabel=_time_label(sol), ylabel=ENERGY_ERROR if relative else _label("$|E - E(0)|$", unit))
+    right.set(xlabel=_time_label(sol), ylabel=ENERGY_ERROR if relative else _label("$|E - E_0|$", unit))
     return figure
 
 
@@ -150,7 +149,9 @@ def plot_phase(sol: Any, i: int | str = 0, *, ax: "Axes | None" = None, **line: 
     """The path in the phase plane (q_i, p_i). Raises `ValueError` for an unknown coordinate or a solution without p."""
     index = _index(sol, i)
     if "q" not in sol.fields or "p" not in sol.fields:
-        raise ValueError(f"a phase plane needs q and p, but this solution holds {', '.join(sol.fields)}: plot_trajectory shows x.")
+        raise ValueError(
+            f"a phase plane needs q and p, but this solution holds {', '.join(sol.fields)}: plot_trajectory shows x."
+        )
     ax = ax if ax is not None else new_figure()[1]
     lanes_q, lanes_p = _lanes(sol, np.asarray(sol.q)), _lanes(sol, np.asarray(sol.p))
     for q, p, kwargs in zip(lanes_q, lanes_p, _lines(len(lanes_q), line), strict=True):
@@ -179,9 +180,8 @@ def plot_constraint(sol: Any, *, ax: "Axes | None" = None, **line: Any) -> "Axes
 
 
 def _plot_log(ax: "Axes", t: np.ndarray, values: np.ndarray, **line: Any) -> None:
-    size = -(-len(values) // ENVELOPE)
-    if size > 1:
-        starts = np.arange(0, len(values), size)
+    if len(values) > 2 * ENVELOPE:
+        starts = np.linspace(0, len(values), ENVELOPE, endpoint=False).astype(int)
         values, t = np.fmax.reduceat(values, starts), t[starts]
     ax.set_yscale("log")
     ax.plot(t, np.where(values > 0, values, np.nan), **line)

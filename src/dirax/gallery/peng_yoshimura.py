@@ -33,20 +33,20 @@ def reproduction(progress: Progress = lambda fraction, text: None) -> Reproducti
 
     disks, lines = {}, {}
     for number, sign in enumerate(SCHEMES):
-        progress(0.12 * number, f"rolling disk, {SIGN[sign]}, h = .001 to t = {AXIS_END}")
+        progress(0.04 * number, f"rolling disk, {SIGN[sign]}, h = .001 to t = {AXIS_END}")
         disks[sign] = disk_run(sign, DISK.step, AXIS_END)
     for number, sign in enumerate(SCHEMES):
-        progress(0.24 + 0.12 * number, f"Heisenberg system, {SIGN[sign]}, h = .01 to t = 1000")
+        progress(0.08 + 0.02 * number, f"Heisenberg system, {SIGN[sign]}, h = .01 to t = 1000")
         lines[sign] = HEISENBERG.simulate(SCHEMES[sign], **heisenberg.TWO_POINTS)
     rows: list[Row] = []
     for number, sign in enumerate(SCHEMES):
-        progress(0.48 + 0.12 * number, f"rolling disk, {SIGN[sign]}: verification, h = .01 to t = 1000")
+        progress(0.12 + 0.25 * number, f"rolling disk, {SIGN[sign]}: verification, h = .01 to t = 1000")
         rows += disk_rows(sign, disks[sign])
-    progress(0.72, "rolling disk: continuous solution, midpoint scheme")
+    progress(0.62, "rolling disk: continuous solution, midpoint scheme")
     rows += continuous_rows(disks)
-    progress(0.84, "Heisenberg system: verification")
+    progress(0.75, "Heisenberg system: energy, momentum, constraint")
     rows += heisenberg_rows(lines)
-    progress(0.92, "figures")
+    progress(0.8, "figures")
     figures = {**disk_figures("+", disks["+"]), **disk_figures("-", disks["-"]), **heisenberg_figures(lines["+"])}
     return Reproduction("PY", TITLE, tuple(rows), figures)
 
@@ -108,7 +108,7 @@ def disk_rows(sign: str, sol: Solution) -> list[Row]:
         for symbol, i in (("θ", 2), ("x", 0), ("y", 1))
     ]
     report = verify(sol, symmetries=DISK.symmetries)
-    constraint, momentum = report["constraint"], report["momentum map: p_φ"]
+    constraint, momentum = report["constraint"], report["momentum map p_φ"]
     largest = np.max(np.abs(sol.constraint_residual()[1:]))
     point = "q_{k+1}" if sign == "+" else "q_k"
     rows.append(
@@ -142,14 +142,14 @@ def energy_rows(sign: str, sol: Solution, line: Any) -> list[Row]:
     shown = generalized_energy(sol, sign)
     change = float(np.ptp(shown))
     note = (
-        f"Figs. 10 and 14 draw E_d ≈ h·E = {shown[0]:.4f} on an axis from −1 to 1. There the drift moves the curve by "
-        f"{change:.3f} by t = {AXIS_END}, less than the width of the line; the logarithmic panels beside them show it."
+        f"Figs. 10 and 14 draw E_d ≈ h·E ≈ {shown[0]:.3f} on an axis from −1 to 1, where the drift moves the curve by "
+        f"{change:.3f} up to t = {AXIS_END}: less than the width of the line. The logarithmic panels beside them show it."
     )
     rows = [
         Row(
             f"disk {name}: energy",
             f"“good” (Fig. {figure})",
-            f"{line.verdict}: {drift['slope']:+.4f} ± {drift['standard_error']:.4f} per unit of time",
+            f"{line.verdict}: {drift.get('slope', 0.0):+.4f} ± {drift.get('standard_error', 0.0):.4f} per unit of time",
             WRONG if line.verdict == "drifts" else DIFFERS,
             note,
             {"verify": line.verdict, **drift},
@@ -185,7 +185,7 @@ def continuous_rows(disks: dict[str, Solution]) -> list[Row]:
     exact = rolling_disk.exact([TEXT_END], **DISK.initial)[0]
     midpoint = DISK.simulate(LagrangeDAlembert("midpoint", "midpoint"), steps=TEXT_END * 1000)
     energy = np.asarray(midpoint.energy())
-    trend = verify(midpoint)["energy"]
+    change = energy - energy[0]
     solutions = {f"{SIGN[sign]} scheme": sol for sign, sol in disks.items()} | {"midpoint scheme": midpoint}
     errors = {name: np.abs(sol.q[TEXT_END * 1000] - exact)[:3].max() for name, sol in solutions.items()}
     values = ", ".join(f"{value:.8f}" for value in exact[[2, 0, 1]])
@@ -202,12 +202,12 @@ def continuous_rows(disks: dict[str, Solution]) -> list[Row]:
     rows += [Row(f"disk, {k}: error at t = {TEXT_END}", "—", f"{e:.3g}", NEW, numbers={"error": e}) for k, e in errors.items()]
     rows.append(
         Row(
-            "disk, midpoint scheme: energy",
+            f"disk, midpoint scheme: E − E(0) for t ≤ {TEXT_END}",
             "—",
-            f"{trend.verdict}, band {np.ptp(energy):.2g}",
+            f"[{change.min():.1e}, {change.max():.1e}]",
             NEW,
-            "The same system at the same step: the drift belongs to the one-sided constraint.",
-            {"verify": trend.verdict, **trend.details},
+            "The same system at the same step: the drift belongs to the one-sided constraints.",
+            {"smallest": change.min(), "largest": change.max()},
         )
     )
     rows.append(
@@ -244,7 +244,8 @@ def heisenberg_rows(lines: dict[str, Solution]) -> list[Row]:
     drift = np.max(np.abs(energy / expected - 1))
     momentum = np.max(np.abs(np.asarray(sol.p)[1:] - velocity))
     apart = np.max(np.abs(np.asarray(lines["-"].q) - np.asarray(sol.q)))
-    constraint = verify(sol)["constraint"]
+    residual = np.max(np.abs(np.asarray(sol.constraint_residual())))
+    roundoff = 32 * np.finfo(float).eps * 2 * np.max(np.abs(sol.q)) * np.max(np.abs(velocity))  # of its terms, y ẋ and x ẏ
     return [
         *rows,
         Row(
@@ -266,9 +267,10 @@ def heisenberg_rows(lines: dict[str, Solution]) -> list[Row]:
         Row(
             "Heisenberg: constraint",
             "holds at every step",
-            f"residual ≤ {np.max(np.abs(sol.constraint_residual())):.1e}",
-            AGREES if constraint.verdict == "ok" else DIFFERS,
-            numbers={"relative": constraint.value, "tolerance": constraint.tolerance},
+            f"residual ≤ {residual:.1e}",
+            AGREES if residual <= roundoff else DIFFERS,
+            "A difference of terms as large as 10⁵.",
+            {"largest": residual, "tolerance": roundoff},
         ),
         Row(
             "Heisenberg: (+) and (−)",

@@ -75,7 +75,7 @@ def _energy_figure(sol: Solution, shown: np.ndarray, measured: np.ndarray, title
     left.plot(t, shown, color=BLUE)
     left.set(xlabel="$t$", ylabel=ylabel, title=title)
     plot_error(right, t, measured, color=VERMILION)
-    right.set(xlabel="$t$", ylabel=ENERGY_ERROR, xlim=(0, round(t[-1])), title="Its error")
+    right.set(xlabel="$t$", ylabel=ENERGY_ERROR, xlim=(0, round(t[-1])), title="Error of the energy")
     return figure
 
 
@@ -83,7 +83,7 @@ def _components(t: np.ndarray, values: np.ndarray, ylabel: str, title: str, name
     figure, ax = new_figure(size=(5.4, 3.5))
     styles = ("-", "-", (0, (5, 2)))
     for k, (name, colour) in enumerate(zip(names, (BLUE, VERMILION, GREEN), strict=True)):
-        ax.plot(t, values[:, k], color=colour, ls=styles[k], label=name, lw=1.5)
+        ax.plot(t[::50], values[::50, k], color=colour, ls=styles[k], label=name, lw=1.5)
     ax.set(xlabel="$t$", ylabel=ylabel, title=title, xlim=(0, 1000))
     ax.legend(ncols=3, loc="upper left")
     return figure

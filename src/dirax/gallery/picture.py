@@ -4,14 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from dirax.gallery.rolling_disk import EXAMPLE
+from dirax.gallery.rolling_disk import EXAMPLE, exact
 from dirax.plotting import BLUE, ENERGY_ERROR, GREEN, INK, VERMILION, new_figure, plot_error, save_figure, style
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 
 SCHEMES = {
-    "(+) Lagrange–Dirac": (PlusLagrangeDirac(), VERMILION),
-    "(−) Lagrange–Dirac": (MinusLagrangeDirac(), BLUE),
-    "midpoint Lagrange–d’Alembert": (LagrangeDAlembert("midpoint", "midpoint"), GREEN),
+    "(+) Lagrange–Dirac": (PlusLagrangeDirac(), VERMILION, 0.7),
+    "(−) Lagrange–Dirac": (MinusLagrangeDirac(), BLUE, 0.7),
+    "midpoint Lagrange–d’Alembert": (LagrangeDAlembert("midpoint", "midpoint"), GREEN, 2.6),
 }
 
 
@@ -27,15 +27,14 @@ def picture(path: Any, step: float = 0.01, end: float = 60.0) -> None:
 def draw(step: float, end: float) -> Any:
     """The picture as a matplotlib Figure."""
     figure, (left, right) = new_figure(1, 2, size=(9.6, 4.4), width_ratios=(1, 1.15))
-    for name, (scheme, colour) in SCHEMES.items():
+    for name, (scheme, colour, width) in SCHEMES.items():
         sol = EXAMPLE.simulate(scheme, step=step, steps=round(end / step))
-        left.plot(sol.q[:, 0], sol.q[:, 1], color=colour, lw=0.7, label=name)
+        left.plot(sol.q[:, 0], sol.q[:, 1], color=colour, lw=width, label=name)
         plot_error(right, sol.t, sol.energy(), color=colour, lw=1.3, label=name)
-    exact = EXAMPLE.exact(np.arange(0, end, 0.02), **EXAMPLE.initial) if EXAMPLE.exact else None
-    assert exact is not None
-    left.plot(exact[:, 0], exact[:, 1], color=INK, lw=0.7, ls=(0, (3, 3)), label="exact")
-    left.set(xlabel="$x$", ylabel="$y$", title="Path of a rolling disk")
+    path = exact(np.arange(0, 2 * np.pi, 0.01), **EXAMPLE.initial)  # once round; every turn is nearly the same
+    left.plot(path[:, 0], path[:, 1], color=INK, lw=0.9, ls=(0, (4, 3)), label="exact")
+    left.set(xlabel="$x$", ylabel="$y$", title=f"Path of a rolling disk, h = {step:g}")
     left.set_aspect("equal", adjustable="datalim")
-    right.set(xlabel="$t$", ylabel=ENERGY_ERROR, title=f"Error of its energy, h = {step:g}", xlim=(0, end))
+    right.set(xlabel="$t$", ylabel=ENERGY_ERROR, title="Error of its energy", xlim=(0, end))
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure

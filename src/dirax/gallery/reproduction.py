@@ -5,10 +5,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 AGREES, DIFFERS, WRONG, NEW = "agrees", "DIFFERS", "paper is wrong", "not in paper"
 """Verdicts. DIFFERS is the one that must not occur: dirax does not reproduce what it should."""
+
+NOTE_WIDTH = 120
 
 HEADER = ("quantity", "paper", "computed", "verdict")
 
@@ -62,6 +65,7 @@ class Reproduction:
         text = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) for line in lines]
         text = [text[0].rstrip(), "  ".join("─" * w for w in widths), *text[1:]]
         text[2:] = [f"{line} {mark}".rstrip() for line, mark in zip(text[2:], marks, strict=True)]
+        notes = [fill(note, NOTE_WIDTH, subsequent_indent="    ") for note in notes]
         return "\n".join([f"[{self.paper}] {self.title}", "", *text, "", *notes])
 
     def notes(self) -> tuple[list[str], list[str]]:
