@@ -21,7 +21,7 @@ ROOMS = (
     ("diagnostics",),
     ("gallery",),
     ("__init__",),
-    ("cli", "__main__"),
+    ("cli", "cli_input", "__main__"),
 )
 RANK = {name: rank for rank, room in enumerate(ROOMS) for name in room}
 LOADED_ON_DEMAND = ("matplotlib", "xarray", "zarr", "h5netcdf", "pandas", "typer", "rich")
