@@ -58,6 +58,14 @@ def _lost(*operands: Any) -> Unavailable | None:
     return next((o for o in operands if isinstance(o, Unavailable)), None)
 
 
+@rule("platform_index")
+def platform_index(interpreter: Interpreter, equation: Any, *_):
+    """Which branch of `jax.lax.platform_dependent` is meant for a CPU."""
+    platforms = list(equation.params["platforms"])
+    named = [i for i, names in enumerate(platforms) if names is not None and "cpu" in names]
+    return [interpreter.constants(np.int64(named[0] if named else platforms.index(None)))]
+
+
 @rule("scan", lazy=True)
 def scan(interpreter: Interpreter, equation: Any, *operands):
     p = equation.params

@@ -6,6 +6,9 @@ from dirax.engines.native import coefficients as c
 from dirax.engines.native.emitter import Emitter
 from dirax.engines.native.trigonometric import MAGIC
 
+LARGEST = 710.5
+"""The hyperbolic functions overflow before this."""
+
 
 @dataclass(frozen=True)
 class Parts:
@@ -84,7 +87,7 @@ def expm1(e: Emitter, x: str) -> str:
 
 def _hyperbolic(e: Emitter, x: str):
     """For |x|: a = 2^(n−2), b = 2^(−n−2) and p, and w = p/(1 + p) in two doubles: e^x/4 = a(1 + p), e^−x/4 = b(1 − w)."""
-    size = clamp(e, e.abs(x), 0.0, 720.0)
+    size = clamp(e, e.abs(x), 0.0, LARGEST)
     p = split(e, size)
     a = power_of_two(e, e.sub(p.n, e.const(2.0)))
     b = power_of_two(e, e.sub(e.const(-2.0), e.select(e.compare("ogt", p.n, e.const(1000.0)), e.const(1000.0), p.n)))
@@ -92,6 +95,10 @@ def _hyperbolic(e: Emitter, x: str):
     w = e.div(p.high, below)
     error = e.sub(e.product_minus(w, below, p.high), e.sub(p.low, e.mul(w, e.add(below_low, p.low))))
     return a, b, p, w, e.neg(e.div(error, below))
+
+
+def _or_infinite(e: Emitter, x: str, value: str) -> str:
+    return e.select(e.compare("ogt", e.abs(x), e.const(LARGEST)), e.const(float("inf")), value)
 
 
 def sinh(e: Emitter, x: str) -> str:
@@ -102,7 +109,7 @@ def sinh(e: Emitter, x: str) -> str:
     low = e.add(e.add(error, lost), e.fma(a, p.low, e.mul(b, w_low)))
     low = e.add(low, e.sub(e.sub(a, e.sub(a, b)), b))
     half = e.add(total, low)
-    return e.copysign(e.add(half, half), x)
+    return e.copysign(_or_infinite(e, x, e.add(half, half)), x)
 
 
 def cosh(e: Emitter, x: str) -> str:
@@ -113,7 +120,7 @@ def cosh(e: Emitter, x: str) -> str:
     total, error = e.two_sum(base, first)
     low = e.add(e.add(error, e.add(lost, base_low)), e.sub(e.mul(a, p.low), e.mul(b, w_low)))
     half = e.add(total, low)
-    return e.add(half, half)
+    return _or_infinite(e, x, e.add(half, half))
 
 
 def tanh(e: Emitter, x: str) -> str:

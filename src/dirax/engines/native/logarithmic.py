@@ -153,7 +153,8 @@ def acosh(e: Emitter, x: str) -> str:
     large = e.compare("ogt", x, e.const(1e8))
     t = e.sub(e.select(large, e.const(2.0), x), e.const(1.0))
     near = log1p(e, e.add(t, e.sqrt(e.mul(t, e.add(t, e.const(2.0))))))
-    return e.select(large, e.add(log(e, x), e.const(0.6931471805599453)), near)
+    value = e.select(large, e.add(log(e, x), e.const(0.6931471805599453)), near)
+    return e.select(e.compare("olt", x, e.const(1.0)), e.const(float("nan")), value)
 
 
 def atanh(e: Emitter, x: str) -> str:

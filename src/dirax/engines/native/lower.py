@@ -75,7 +75,7 @@ class Region:
         missing = self._missing(outputs)
         g, uses = self.graph, Counter(outputs)
         for node in missing:
-            uses.update(set(g.args[node]) if g.op[node] == "mul" else g.args[node])
+            uses.update(g.args[node])
         single = lambda node, op: g.op[node] == op and uses[node] == 1 and self.known(node) is None
         divisions, fused = {}, set()
         for node in missing:
