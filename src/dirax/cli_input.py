@@ -96,7 +96,8 @@ def changed(example: Example, settings: dict[str, Any]) -> dict[str, Any]:
             initial[name] = np.asarray(value, dtype=float)
             keywords.update(initial)
         elif name in params:
-            keywords.setdefault("params", {})[name] = value
+            number = isinstance(params[name], float) and isinstance(value, int)  # --set k=1 of a parameter that is 4.0
+            keywords.setdefault("params", {})[name] = float(value) if number else value
         else:
             known = [*SETTINGS, *INITIAL, *params]
             near = difflib.get_close_matches(name, known, n=1)
@@ -134,7 +135,8 @@ def find_example(target: str) -> Example:
     for needed in ("system", "initial"):
         if needed not in names:
             raise InputError(
-                f"{target} must define `system` (a dirax system) and `initial` (a dict such as dict(q=…, v=…)), but it has no `{needed}`."
+                f"{target} must define `system` (a dirax system) and `initial` (a dict such as dict(q=…, v=…)), "
+                f"but it has no `{needed}`."
             )
     initial = {name: np.asarray(value, dtype=float) for name, value in dict(names["initial"]).items()}
     optional = {"scheme": names["scheme"]} if "scheme" in names else {}
