@@ -125,7 +125,7 @@ def lift_report_of(name):
     return quick_jit(jax.vmap(report, (0, 0, None)))
 
 
-@pytest.mark.parametrize("name", sorted(set(MAPS) - {"projected midpoint", "implicit Euler"}))
+@pytest.mark.parametrize("name", sorted(set(MAPS) - {"projected midpoint", "SE2"}))
 @examples
 @given(seed=seeds, scale=st.floats(1e-8, 0.8))
 def test_lifts_are_symplectic_discretization_maps(name, seed, scale):
@@ -221,7 +221,7 @@ def test_projected_midpoint_on_the_sphere_is_the_sphere_projection():
     projected, closed = ProjectedMap(Midpoint(), normalize), SphereProjection()
     x, v = random_tangent(closed, *random_arrays(5, 2, 3), 1.0)
     np.testing.assert_allclose(projected(x, v), closed(x, v), atol=1e-15)
-    np.testing.assert_allclose(projected.inverse(*closed(x, v)), (x, v), atol=1e-14)
+    np.testing.assert_allclose(quick_jit(projected.inverse)(*closed(x, v)), (x, v), atol=1e-14)
     assert projected.manifold(3).dimension == 2
 
 
