@@ -141,8 +141,9 @@ def test_higher_compositions_of_method_2_keep_the_constraint(name, steps, disk_a
     q, p, largest = disk_errors(scheme, steps, disk_at_end)
     order = int(name[-1])
     for errors in (q, p):
-        # 125 stages are at roundoff before the order of suzuki8 settles: from 1.8e-6 to 7.7e-11 it is 9.2
-        assert -np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(order, abs=1.5 if name == "suzuki8" else 0.6)
+        slope = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
+        # the 125 stages of suzuki8 reach roundoff before the leading term rules: from 1.8e-6 to 7.7e-11 its slope is 9 to 10
+        assert slope > 7.5 if name == "suzuki8" else slope == pytest.approx(order, abs=0.6)
     assert largest <= 1e-14
 
 

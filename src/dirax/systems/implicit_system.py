@@ -155,16 +155,13 @@ def _port_hamiltonian(system: PortHamiltonian, near, params) -> ImplicitForm:
 
 
 def _lagrangian(system: LagrangeDirac, stated, near, params) -> ImplicitForm:
-    data = {k: jnp.asarray(v, float) for k, v in near.items()} if isinstance(near, dict) else None
+    data: Any = {k: jnp.asarray(v, float) for k, v in near.items()} if isinstance(near, dict) else None
     if data is not None and set(data) not in ({"q", "v"}, {"q", "p"}, {"q"}):
         raise ValueError(f"near must hold q with v or p for a Lagrangian system, but it holds {', '.join(data)}.")
     x = None if data is not None else np.asarray(near, float)
     if x is not None and (x.ndim != 1 or (x.size % 2 and x.size % 3)):
         raise ValueError(f"near must be x = (q, p), or {{'q': q, 'v': v}}, but an array of shape {x.shape} was given.")
-    if data is not None:
-        q = data["q"]
-    else:
-        q = jnp.asarray(np.asarray(near, float)[: np.size(near) // (2 if np.size(near) % 2 == 0 else 3)])
+    q = jnp.asarray(x[: x.size // (2 if x.size % 2 == 0 else 3)]) if x is not None else data["q"]
     zero = jnp.zeros_like(q)
     stated.sizes({"q": q, "v": zero}, params)
     affine, hessian = _momenta(system, q, data.get("v", zero) if data is not None else zero, params)
