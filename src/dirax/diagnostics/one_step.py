@@ -1,11 +1,11 @@
 """What one step must satisfy: membership in the discrete Dirac structure, symplecticity, φ*Ω = Ω + dβ under constraints.
 
-All are functions of saved rows, traceable, and independent of how the step was solved; the last two differentiate the
-step map through the engine's solve. Each defect is relative to the size of what should cancel in it.
+All are functions of saved rows, traceable; the first does not use how the step was solved, the last two differentiate the
+step map at the engine's solution. Each defect is relative to the size of what should cancel in it.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.engines.xla import first_lane, take_step
+from dirax.engines.lane import first_lane, take_step
 from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector
 from dirax.geometry.structures import canonical_two_form
-from dirax.geometry.tulczyjew import minus_dirac_differential, plus_dirac_differential, slot_derivatives
+from dirax.geometry.tulczyjew import FiniteDifferenceTriple, slot_derivatives
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_lagrangian
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.solution import Solution
@@ -96,12 +96,8 @@ def membership_defect(discrete: DiscreteSystem, q0: Vector, q1: Vector, q2: Vect
     else:
         forms = discrete.system.one_forms
         structure = InducedFiniteDifferenceDirac(forms, step=h, sign=discrete.sign)
-        if discrete.sign == "+":
-            momenta, (_, (beta, gamma)) = (p1, p2), plus_dirac_differential(ld, q0, q1, q2, h)
-            pair = (q0, q1)
-        else:
-            momenta, (_, (beta, gamma)) = (-before0, -before1), minus_dirac_differential(ld, q0, q1, q2, h)
-            pair = (q1, q2)
+        _, _, beta, gamma = FiniteDifferenceTriple(step=h, sign=discrete.sign).dirac_differential(ld, q0, q1, q2)
+        pair, momenta = ((q0, q1), (p1, p2)) if discrete.sign == "+" else ((q1, q2), (-before0, -before1))
         constraint, second_order, force = structure.membership_defect(*pair, momenta, beta, gamma, params)
         force = jnp.concatenate([second_order, force])
 
@@ -131,19 +127,40 @@ def membership_defect(discrete: DiscreteSystem, q0: Vector, q1: Vector, q2: Vect
     return jnp.stack([jnp.max(jnp.abs(constraint) / nonzero(constraint_scale)), relative_force])
 
 
-def step_map(equation: Any, state, guess, t, h, params):
-    """The state after one step, through the engine's solve, and the unknowns of its first stage; differentiable."""
+class DifferentiatedStep(NamedTuple):
+    """A step with its derivative ∂(new state)/∂(state), and how well its equations are conditioned (≥ 1)."""
+
+    state: Float[Array, " s"]
+    jacobian: Float[Array, "s s"]
+    condition: Scalar
+
+
+def differentiated_step(equation: Any, state, guess, t, h, params) -> DifferentiatedStep:
+    """One step solved by the engine's Newton method, differentiated by the implicit function theorem; NaN where it fails.
+
+    With r(u, x) = 0 and x' = a(u, x) of each stage, ∂x'/∂x = ∂_x a − ∂_u a (∂_u r)⁻¹ ∂_x r.
+    """
     lane = first_lane(state, (guess,) * len(equation.stages))
-    after, unknowns = take_step(equation, lane, t, h, params, MAX_ITERATIONS)
-    return jnp.where(after.completed > 0, after.state, jnp.nan), unknowns[0]
+    after, unknowns = take_step(equation, lane, t, h, params, MAX_ITERATIONS, differentiable=False)
+    jacobian, condition = jnp.eye(state.shape[0]), jnp.ones(())
+    for (stage, fraction), u in zip(equation.stages, unknowns, strict=True):
+
+        def both(u, x, stage=stage, at=(t, fraction * h, params)):
+            return stage.residual(u, x, *at), stage.advance(u, x, *at)
+
+        (residual_u, residual_x), (advance_u, advance_x) = jax.jacfwd(both, argnums=(0, 1))(u, state)
+        if stage.unknowns:
+            advance_x = advance_x - advance_u @ jnp.linalg.solve(residual_u, residual_x)
+            condition = jnp.maximum(condition, equilibrated_condition(residual_u))
+        jacobian = advance_x @ jacobian
+        state = stage.advance(u, state, t, fraction * h, params)
+        t = t + fraction * h
+    good = after.completed > 0
+    return DifferentiatedStep(jnp.where(good, state, jnp.nan), jnp.where(good, jacobian, jnp.nan), condition)
 
 
-def condition_number(equation: Any, unknowns, state, t, h, params) -> Scalar:
-    """Condition number of the Jacobian of the step's equations, after scaling rows and columns to unit size; ≥ 1."""
-    stage, fraction = equation.stages[0]
-    if stage.unknowns == 0:
-        return jnp.ones(())
-    matrix = jax.jacfwd(stage.residual)(unknowns, state, t, fraction * h, params)
+def equilibrated_condition(matrix: Float[Array, "k k"]) -> Scalar:
+    """The condition number of a matrix after scaling its rows and columns to unit size."""
     for _ in range(3):
         matrix = matrix / nonzero(jnp.max(jnp.abs(matrix), axis=1, keepdims=True))
         matrix = matrix / nonzero(jnp.max(jnp.abs(matrix), axis=0, keepdims=True))
@@ -158,11 +175,7 @@ def symplecticity_defect(system: Any, equation: Any, h, data: dict, t, params) -
     """
     stage, fraction = equation.stages[0]
     state, guess = stage.start(system.complete(data, params, False), fraction * h, params)
-
-    def step(state):
-        return step_map(equation, state, guess, t, h, params)
-
-    jacobian, unknowns = jax.jacfwd(step, has_aux=True)(state)
+    _, jacobian, condition = differentiated_step(equation, state, guess, t, h, params)
     n = state.shape[0] // 2
     form = canonical_two_form(n)
     by_momentum, by_position = jnp.max(jnp.abs(jacobian[:n, n:])), jnp.max(jnp.abs(jacobian[n:, :n]))
@@ -172,7 +185,7 @@ def symplecticity_defect(system: Any, equation: Any, h, data: dict, t, params) -
     jacobian = jacobian * units[:, None] / units[None, :]
     defect = jnp.max(jnp.abs(jacobian.T @ form @ jacobian - form))
     size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(form) @ jnp.abs(jacobian))
-    return jnp.stack([defect / size, condition_number(equation, unknowns, state, t, h, params)])
+    return jnp.stack([defect / size, condition])
 
 
 def structural_defect(discrete: DiscreteSystem, equation: Any, q0: Vector, q1: Vector, t, params) -> Float[Array, "3"]:
@@ -180,8 +193,8 @@ def structural_defect(discrete: DiscreteSystem, equation: Any, q0: Vector, q1: V
 
     φ(q0, q1) = (q1, q2) is the discrete Lagrange–d'Alembert map, Ω = −d(−D1 L_d dq0) = F⁻L_d*(dq ∧ dp), and
     β = ⟨F, dq1⟩ with F the part in Δ°(q1) of D2 L_d(q0, q1) + D1 L_d(q1, q2) ([PY] §3.2). There β_d is printed as a
-    pull-back from the first point; the variation (11) puts the force at q1, the first point of φ(q0, q1), and only this
-    makes the relation true. Both sides are restricted to the vectors tangent to {w_d = 0}.
+    pull-back from the first point of the pair; the variation (11) puts the force at q1, the first point of φ(q0, q1), and
+    only this makes the relation true. Both sides are restricted to the vectors tangent to {w_d = 0}.
     """
     n, h = q0.shape[0], discrete.step
     ld = lambda a, b: discrete.lagrangian(a, b, params)
@@ -190,15 +203,11 @@ def structural_defect(discrete: DiscreteSystem, equation: Any, q0: Vector, q1: V
     m = equation.stages[0][0].unknowns - n
     guess = jnp.concatenate([(q1 - q0) / h, jnp.zeros(m)])
 
-    def forms(z):
-        """φ(z) and β(z) side by side, so that the step is solved and differentiated once."""
-        a, b = z[:n], z[n:]
-        p = d2(a, b)
-        after, unknowns = step_map(equation, jnp.concatenate([b, p]), guess, t, h, params)
-        c = after[:n]
-        beta = jnp.concatenate([jnp.zeros(n), discrete.annihilator(b, params) @ (p + d1(b, c))])
-        shifted = jnp.concatenate([b, c])
-        return (shifted, beta), (shifted, unknowns)
+    def state_of(z):
+        return jnp.concatenate([z[n:], d2(z[:n], z[n:])])
+
+    def force(z, c):
+        return discrete.annihilator(z[n:], params) @ (d2(z[:n], z[n:]) + d1(z[n:], c))
 
     def lagrangian_two_form(z):
         """−dΘ of Θ = −D1 L_d dq0: dq0 ∧ dq1 with the coefficients −D1 D2 L_d, and nothing else (D1 D1 L_d is symmetric)."""
@@ -207,17 +216,20 @@ def structural_defect(discrete: DiscreteSystem, equation: Any, q0: Vector, q1: V
         return jnp.block([[zero, mixed], [-mixed.T, zero]])
 
     z = jnp.concatenate([q0, q1])
-    (jacobian, force), (after, unknowns) = jax.jacfwd(forms, has_aux=True)(z)
-    two_form, two_form_after = lagrangian_two_form(z), lagrangian_two_form(after)
+    state, of_pair = state_of(z), jax.jacfwd(state_of)(z)
+    after, of_state, condition = differentiated_step(equation, state, guess, t, h, params)
+    q2, q2_of_pair = after[:n], of_state[:n] @ of_pair
+    jacobian = jnp.concatenate([jnp.eye(2 * n)[n:], q2_of_pair])  # of φ
+    force_z, force_q2 = jax.jacfwd(force, argnums=(0, 1))(z, q2)
+    beta = jnp.concatenate([jnp.zeros((n, 2 * n)), force_z + force_q2 @ q2_of_pair])  # ∂_j β_i
+    two_form, two_form_after = lagrangian_two_form(z), lagrangian_two_form(jnp.concatenate([q1, q2]))
     change = jacobian.T @ two_form_after @ jacobian - two_form
-    dbeta = force.T - force  # (dβ)_ij = ∂_i β_j − ∂_j β_i
+    dbeta = beta.T - beta  # (dβ)_ij = ∂_i β_j − ∂_j β_i
     constraint_matrix = jax.jacfwd(lambda z: discrete.constraint(z[:n], z[n:], params))(z)
     _, _, right = jnp.linalg.svd(constraint_matrix, full_matrices=True)
     tangent = right[constraint_matrix.shape[0] :].T
     restricted = lambda form: jnp.max(jnp.abs(tangent.T @ form @ tangent))
-    size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(two_form_after) @ jnp.abs(jacobian)) + jnp.max(jnp.abs(force))
-    state = jnp.concatenate([q1, d2(q0, q1)])
-    condition = condition_number(equation, unknowns, state, t, h, params)
+    size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(two_form_after) @ jnp.abs(jacobian)) + jnp.max(jnp.abs(beta))
     return jnp.stack([restricted(change - dbeta) / size, restricted(change) / size, condition])
 
 

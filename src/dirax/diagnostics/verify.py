@@ -298,10 +298,10 @@ def _symplecticity(sol: Solution, tolerance: float | None) -> Line:
     else:
         data = {k: jnp.asarray(sol.fields[k])[..., rows, :] for k in (("x",) if "x" in sol.fields else ("q", "p"))}
         items = (data, _times(sol, rows))
-        try:
-            values = over_rows(eqx.Partial(symplecticity_defect, sol.system, sol.equation, sol.step), sol, items)
-        except (KeyError, TypeError, ValueError) as error:  # a user's `start` that takes other data than the saved ones
-            return Line(name, None, None, NOT_CHECKED, f"the scheme cannot start from a saved row: {error}")
+        reason = _cannot_start(sol, data)
+        if reason:
+            return Line(name, None, None, NOT_CHECKED, reason)
+        values = over_rows(eqx.Partial(symplecticity_defect, sol.system, sol.equation, sol.step), sol, items)
     defect, condition = values[..., 0], float(np.max(values[..., -1], where=np.isfinite(values[..., -1]), initial=1.0))
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")
@@ -314,6 +314,19 @@ def _symplecticity(sol: Solution, tolerance: float | None) -> Line:
     line = _judged(sol, name, np.nanmax(np.where(np.isfinite(defect), defect, -1.0), axis=1), limit, text)
     line.details["condition"] = condition
     return line
+
+
+def _cannot_start(sol: Solution, data: dict) -> str:
+    """Why a user's `start` does not take the saved rows as initial data; empty if it does."""
+    first = (0, 0) if sol.batch is not None else (0,)
+    params = jax.tree.map(lambda a: a[0], sol.params) if sol.batch_params else sol.params
+    stage, fraction = sol.equation.stages[0]
+    try:
+        row = {name: values[first] for name, values in data.items()}
+        jax.eval_shape(lambda row: stage.start(sol.system.complete(row, params, False), fraction * sol.step, params), row)
+    except (KeyError, TypeError, ValueError) as error:
+        return f"the scheme does not start from a saved row: {error}"
+    return ""
 
 
 def _sampled(sol: Solution) -> np.ndarray:
