@@ -126,12 +126,11 @@ class Atlas(eqx.Module):
 
     def chart_at(self, x: ArrayLike) -> RetractionChart:
         """The chart centred at x, or at the centre nearest to x; raises `ValueError` for a point off the manifold."""
-        x = jnp.asarray(x, dtype=float)
-        self.manifold.check_point(x)
+        base = jnp.asarray(x, dtype=float)
+        self.manifold.check_point(base)
         if self.centres is not None:
-            nearest = jnp.argmin(jax.vmap(lambda centre: self.manifold.distance(centre, x))(self.centres))
-            x = self.centres[nearest]
-        return RetractionChart(self.manifold, x, self.manifold.frame(x), self.exponential)
+            base = self.centres[jnp.argmin(jax.vmap(self.manifold.distance, (0, None))(self.centres, base))]
+        return RetractionChart(self.manifold, base, self.manifold.frame(base), self.exponential)
 
     def follow(self, chart: RetractionChart, r: Local, momentum: Local) -> tuple[RetractionChart, Local, Local]:
         """(chart, r, p) as it is while inside the chart, else the same covector in the chart at its point."""
