@@ -199,9 +199,14 @@ def test_counts(name, bad):
 
 def test_functions_that_are_not_finite_at_the_initial_data():
     pole = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 1 / jnp.linalg.norm(q))
-    text = complaint(ValueError, "not finite at the initial data", "outside the domain", system=pole, q=[0.0, 0.0])
+    complaint(ValueError, "lagrangian is inf at the initial data", "outside its domain", system=pole, q=[0.0, 0.0])
+    complaint(ValueError, "lagrangian is inf", "of trajectory 1", system=pole, q=[[1.0, 0.0], [0.0, 0.0]])
+    half = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.log(q[0]))  # its derivative is finite for q < 0
+    complaint(ValueError, "lagrangian is nan at the initial data", system=half, q=[-1.0, 0.0])
+    complaint(ValueError, "lagrangian is nan", system=half, q=None, v=None, q0=[-1.0], q1=[-0.9])
+    corner = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sqrt(q[0]))
+    text = complaint(ValueError, "not finite at the initial data", "outside the domain", system=corner, q=[0.0, 0.0])
     assert "discrete Lagrange–d'Alembert equation 0" in text
-    text = complaint(ValueError, "of trajectory 1", system=pole, q=[[1.0, 0.0], [0.0, 0.0]])
     form = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.stack([jnp.sqrt(q)]))
     complaint(ValueError, "one_forms is not finite at the initial data", "outside its domain", system=form, q=[-1.0, 1.0])
 
@@ -268,14 +273,12 @@ HALF_LINE = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.log(q[0]))
 
 
 def explicit_half_line(q, v, h, steps):
-    """The left rule written out: p_{k+1} = p_k − h/q_k, q_{k+1} = q_k + h p_{k+1}; up to the step before L_d is undefined."""
-    rows, p = [q], v
-    for _ in range(steps):
-        if q <= 0:
-            break
+    """The left rule written out: p_{k+1} = p_k − h/q_k, q_{k+1} = q_k + h p_{k+1}, as long as q is positive."""
+    rows, p = [], v
+    while q > 0 and len(rows) <= steps:
+        rows.append(q)
         p = p - h / q
         q = q + h * p
-        rows.append(q)
     return np.array(rows)
 
 

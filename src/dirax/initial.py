@@ -18,8 +18,8 @@ class Start(NamedTuple):
     """Where a run begins, each entry with a leading batch axis in a batch.
 
     First state and the first guess of every stage; the given row 0 of a two-point start; how far the data are off the
-    constraint, and the size of the velocity; the constraint matrix at the data, if the system has one; the residual and
-    the Jacobian of the first step.
+    constraint, and the size of the velocity; the Lagrangian and the constraint matrix at the data, if the system has them;
+    the residual and the Jacobian of the first step.
     """
 
     state: Any
@@ -28,6 +28,7 @@ class Start(NamedTuple):
     first_step: int
     defect: Any
     size: Any
+    lagrangian: Any
     one_forms: Any
     residual: Any
     jacobian: Any
@@ -104,27 +105,41 @@ def _begin(system, equation, data, params, h, t0, axes, project: bool) -> Start:
             size = jnp.max(jnp.abs(data["q1"] - data["q0"])) / h
         elif "v" in complete:
             size = jnp.max(jnp.abs(complete["v"]))
-        matrix = getattr(system, "constraint_matrix", None)
-        points = [data[name] for name in ("q", "q0") if name in data]
-        one_forms = matrix(points[0], params) if matrix and points else None
+        q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if two_points else (complete.get("q"), complete.get("v"))
+        known = lambda name, *given: hasattr(system, name) and all(x is not None for x in given)
+        lagrangian = system.lagrangian(q, v, params) if known("lagrangian", q, v) else None
+        one_forms = system.constraint_matrix(q, params) if known("constraint_matrix", q) else None
         t = t0 + int(two_points) * h
         first_step = lambda u: stage.residual(u, state, t, fraction * h, params)
         residual, jacobian = (first_step(u), jax.jacfwd(first_step)(u)) if stage.unknowns else (None, None)
-        return Start(state, guess, row0, 0, defect, size, one_forms, residual, jacobian)
+        return Start(state, guess, row0, 0, defect, size, lagrangian, one_forms, residual, jacobian)
 
     start = (one if axes is None else jax.vmap(one, in_axes=axes))(data, params, h, t0)
     return start._replace(first_step=int(two_points))
 
 
 def refuse_bad_start(start: Start, labels: tuple[str, ...], check_constraint: bool) -> None:
-    """Raise `ValueError` for dependent one-forms, data off the constraint (with the residual), functions that are not
-    finite there, and a first step that has no unique solution (with the rank of the matrix (21) of [PY]). `labels` are
-    those of the equations of the first step."""
+    """Raise `ValueError` for dependent one-forms, functions that are not finite at the data, data off the constraint (with the
+    residual), and a first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
+    the equations of the first step."""
     _refuse_dependent_one_forms(start)
+    _refuse_outside_the_domain(start)
     if check_constraint:
         _refuse_off_constraint(start)
     if start.jacobian is not None:
         _refuse_singular_step(start, labels)
+
+
+def _refuse_outside_the_domain(start: Start) -> None:
+    if start.lagrangian is None:
+        return
+    values = _lanes(start.lagrangian, 0)
+    if not np.all(np.isfinite(values)):
+        lane = int(np.argmin(np.isfinite(values)))
+        raise ValueError(
+            f"lagrangian is {values[lane]} at the initial data{_which(~np.isfinite(values))}: the data lie outside its domain, "
+            "or on its edge."
+        )
 
 
 def _refuse_dependent_one_forms(start: Start) -> None:

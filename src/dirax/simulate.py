@@ -131,7 +131,7 @@ def _solution(system, scheme, problem: Problem, outcome: Outcome, start: Start, 
     if p.batch is None:
         fields = {k: a[0] for k, a in fields.items()}
     return Solution(
-        t=p.t0 + numbers * p.h,
+        t=p.t0 + numbers.astype(float) * p.h,
         fields={k: fields[k] for k in info},
         field_info=info,
         step=p.h,

@@ -132,7 +132,7 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
         q, v = state[:n], u[:n]
         _, d2 = slot_derivatives(ld, q, v, h, params)
         # outside the domain of L its derivatives can still be numbers: those of log q are, for q < 0
-        inside = jnp.isfinite(ld(q, v, h, params))
+        inside = jnp.isfinite(system.lagrangian(q + h * v, v, params))
         return jnp.concatenate([q + h * v, jnp.where(inside, d2, jnp.nan)])
 
     def unpack(state, u, t, h, params):
