@@ -18,6 +18,18 @@ _MODULES = {
     "heavy-top": "heavy_top",
     "kirchhoff": "kirchhoff",
     "spherical-pendulums": "spherical_pendulums",
+    "charged-particle": "charged_particle",
+    "double-spherical-pendulum": "double_spherical_pendulum",
+    "vortices": "vortices",
+    "lotka-volterra": "lotka_volterra",
+    "guiding-centre": "guiding_centre",
+    "lc-ladder": "lc_ladder",
+    "dc-motor": "dc_motor",
+    "mass-spring-damper": "mass_spring_damper",
+    "snakeboard": "snakeboard",
+    "rolling-ball": "rolling_ball",
+    "chaplygin-sleigh": "chaplygin_sleigh",
+    "knife-edge": "knife_edge",
 }
 """Name → the module here that defines `EXAMPLE`; a new system is a file and a line."""
 

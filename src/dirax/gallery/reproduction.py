@@ -15,7 +15,7 @@ NOTE_WIDTH = 120
 
 HEADER = ("quantity", "paper", "computed", "verdict")
 
-_PAPERS = {"PY": "peng_yoshimura", "BLM": "barbero_linan"}
+_PAPERS = {"PY": "peng_yoshimura", "RL": "rodriguez_leok", "BLM": "barbero_linan"}
 """Short name → the module here with `reproduction(progress) -> Reproduction`; a new paper is a module and a line."""
 
 Progress = Callable[[float, str], None]

@@ -2,10 +2,56 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
+from dirax.reduction.connection import LinearConnection
 from dirax.reduction.reduced import ReducedLagrangeDirac
-from dirax.schemes.discrete_lagrangian import discrete_lagrangian
+from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_lagrangian
 from dirax.schemes.step import Field, Shape, StepEquation
+
+
+class QuotientState:
+    """The layout (x, w, μ, g) of a state on the quotient, and how a run gets its first one."""
+
+    def __init__(self, connection: LinearConnection, n: int):
+        self.connection, self.n = connection, n
+        self.k = len(connection.fibre)
+        self.s = n - self.k
+        self.matrix = connection.matrix(n)
+
+    def split(self, state: Float[Array, " state"]) -> tuple[Array, Array, Array, Array]:
+        """x, w, μ, g."""
+        s, k = self.s, self.k
+        return state[:s], state[s : 2 * s], state[2 * s : 2 * s + k], state[2 * s + k : 2 * s + 2 * k]
+
+    def slot_derivatives(self, l, x, rate, vertical, h, params) -> tuple[Array, Array, Array]:
+        """(∂l/∂x0, ∂l/∂x1, ∂l/∂g1) from the derivatives in (x0, ẋ, γ)."""
+        dx, drate, dvertical = jax.grad(l, argnums=(0, 1, 2))(x, rate, vertical, h, params)
+        return dx - drate / h, drate / h, dvertical / h
+
+    def start(self, l, data, h, params) -> tuple[Float[Array, " state"], Float[Array, " n"]]:
+        """The first state and the first guess of (ẋ, γ)."""
+        connection = self.connection
+        if "q0" in data:
+            (x0, g0), (x1, g1) = connection.split(data["q0"]), connection.split(data["q1"])
+            rate = (x1 - x0) / h
+            vertical = (g1 - g0) / h - self.matrix @ rate
+            d0, _, dg = self.slot_derivatives(l, x0, rate, vertical, h, params)
+            return jnp.concatenate([x0, -d0, dg, g0]), jnp.concatenate([rate, vertical])
+        (x, g), (rate, group_rate) = connection.split(data["q"]), connection.split(data["v"])
+        _, w, mu = connection.trivialize_covector(data["q"], data["p"])
+        return jnp.concatenate([x, w, mu, g]), jnp.concatenate([rate, group_rate - self.matrix @ rate])
+
+
+def quotient_fields(s: int, k: int) -> dict[str, Field]:
+    """What is saved of a run on the quotient."""
+    return {
+        "x": Field((s,), dims=("shape",)),
+        "w": Field((s,), dims=("shape",), description="momentum of the shape, w + h*_{d,Σ}(μ)"),
+        "mu": Field((k,), dims=("group",), description="momentum map"),
+        "g": Field((k,), dims=("group",), description="group coordinate, by reconstruction"),
+        "vertical": Field((k,), "step", ("group",), "discrete connection ω_d(q_k, q_{k+1})"),
+    }
 
 
 def reduced_discrete_lagrangian(system: ReducedLagrangeDirac, rule, sign: int, n: int):
@@ -28,60 +74,63 @@ def lagrange_poincare_dirac(system: ReducedLagrangeDirac, shape: Shape, rule, si
     """The StepEquation of [RL] (4.6) (sign +1) or (4.8) (sign −1): state (x, w, μ, g), unknowns (ẋ, γ).
 
     With linear h_d the equations are −∂l/∂x0 = w_k, ∂l/∂g1 = μ_k, ∂l/∂x1 = w_{k+1}, μ_{k+1} = μ_k, and
-    g_{k+1} = g_k + hγ + A(x_{k+1} − x_k) reconstructs the group coordinate.
+    g_{k+1} = g_k + hγ + A(x_{k+1} − x_k) reconstructs the group coordinate. Constraints that the symmetry leaves alone,
+    W(x), act with the forces λ̂_d(Wᵀλ) = ((W_x + W_g A)ᵀλ, W_gᵀλ), which move μ: μ_{k+1} = ∂l/∂g1.
     """
-    connection, n = system.connection, shape.n
-    k = len(connection.fibre)
-    s = n - k
+    quotient, n, m = QuotientState(system.connection, shape.n), shape.n, shape.m
+    connection, k, s = system.connection, quotient.k, quotient.s
     l = reduced_discrete_lagrangian(system, rule, sign, n)
+    wd = discrete_constraint(system.system.constraint_matrix, "right" if sign > 0 else "left", m)
+    at = lambda x: connection.join(x, jnp.zeros(k))
 
-    def parts(state):
-        return state[:s], state[s : 2 * s], state[2 * s : 2 * s + k], state[2 * s + k :]
+    def constraint(x, rate, vertical, h, params):
+        return wd(at(x), connection.join(rate, vertical + quotient.matrix @ rate), h, params)
 
-    def derivatives(x, rate, vertical, h, params):
-        """(∂l/∂x0, ∂l/∂x1, ∂l/∂g1) from the derivatives in (x0, ẋ, γ)."""
-        dx, drate, dvertical = jax.grad(l, argnums=(0, 1, 2))(x, rate, vertical, h, params)
-        return dx - drate / h, drate / h, dvertical / h
+    def force(x, multipliers, params):
+        """λ̂_d of Wᵀλ at (x, 0): its shape and its group part."""
+        covector = system.system.constraint_matrix(at(x), params).T @ multipliers
+        return connection.trivialize_covector(at(x), covector)[1:]
 
     def residual(u, state, t, h, params):
-        x, w, mu, _ = parts(state)
-        d0, _, dg = derivatives(x, u[:s], u[s:], h, params)
-        return jnp.concatenate([w + d0, mu - dg])
+        x, w, mu, _ = quotient.split(state)
+        rate, vertical = u[:s], u[s:n]
+        d0, _, dg = quotient.slot_derivatives(l, x, rate, vertical, h, params)
+        if not m:
+            return jnp.concatenate([w + d0, mu - dg])
+        along, across = force(x, u[n:], params)
+        return jnp.concatenate([w + d0 - along, mu - dg - across, constraint(x, rate, vertical, h, params)])
 
     def advance(u, state, t, h, params):
-        x, _, mu, g = parts(state)
-        _, d1, _ = derivatives(x, u[:s], u[s:], h, params)
-        return jnp.concatenate([x + h * u[:s], d1, mu, g + h * (u[s:] + connection.matrix(n) @ u[:s])])
+        x, _, mu, g = quotient.split(state)
+        rate, vertical = u[:s], u[s:n]
+        _, d1, dg = quotient.slot_derivatives(l, x, rate, vertical, h, params)
+        # without constraints the equation ∂l/∂g1 = μ_k is the law μ_{k+1} = μ_k
+        return jnp.concatenate([x + h * rate, d1, dg if m else mu, g + h * (vertical + quotient.matrix @ rate)])
 
     def unpack(state, u, t, h, params):
-        x, w, mu, g = parts(state)
-        return {"x": x, "w": w, "mu": mu, "g": g, "vertical": h * u[s:]}
+        x, w, mu, g = quotient.split(state)
+        saved = {"x": x, "w": w, "mu": mu, "g": g, "vertical": h * u[s:n]}
+        if m:
+            saved |= {"multipliers": u[n:], "constraint": constraint(x, u[:s], u[s:n], h, params)}
+        return saved
 
     def start(data, h, params):
-        if "q0" in data:
-            (x0, g0), (x1, g1) = connection.split(data["q0"]), connection.split(data["q1"])
-            rate = (x1 - x0) / h
-            vertical = (g1 - g0) / h - connection.matrix(n) @ rate
-            d0, _, dg = derivatives(x0, rate, vertical, h, params)
-            return jnp.concatenate([x0, -d0, dg, g0]), jnp.concatenate([rate, vertical])
-        (x, g), (rate, group_rate) = connection.split(data["q"]), connection.split(data["v"])
-        _, w, mu = connection.trivialize_covector(data["q"], data["p"])
-        return jnp.concatenate([x, w, mu, g]), jnp.concatenate([rate, group_rate - connection.matrix(n) @ rate])
+        state, u = quotient.start(l, data, h, params)
+        return state, jnp.concatenate([u, jnp.zeros(m)])
 
-    fields = {
-        "x": Field((s,), dims=("shape",)),
-        "w": Field((s,), dims=("shape",), description="momentum of the shape, w + h*_{d,Σ}(μ)"),
-        "mu": Field((k,), dims=("group",), description="momentum map"),
-        "g": Field((k,), dims=("group",), description="group coordinate, by reconstruction"),
-        "vertical": Field((k,), "step", ("group",), "discrete connection ω_d(q_k, q_{k+1})"),
-    }
+    fields = quotient_fields(s, k)
+    if m:
+        fields["multipliers"] = Field((m,), "step", ("constraint",), "Lagrange multipliers of the constraints")
+        fields["constraint"] = Field((m,), "step", ("constraint",), "discrete constraint w_d(q_k, q_{k+1})")
     return StepEquation(
         start=start,
         residual=residual,
         advance=advance,
         unpack=unpack,
         state_size=2 * n,
-        unknowns=n,
+        unknowns=n + m,
         fields=fields,
-        labels=tuple(f"horizontal equation {i}" for i in range(s)) + tuple(f"vertical equation {a}" for a in range(k)),
+        labels=tuple(f"horizontal equation {i}" for i in range(s))
+        + tuple(f"vertical equation {a}" for a in range(k))
+        + tuple(f"discrete constraint {r}" for r in range(m)),
     )
