@@ -11,17 +11,19 @@ from dirax.configure import configure
 from dirax.diagnostics.compare import compare
 from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.verify import verify
-from dirax.geometry.charts import Atlas, chart_at, check_chart
-from dirax.geometry.cotangent_lift import cotangent_lift, symplecticity_defect
+from dirax.geometry.charts import Atlas, RetractionChart, chart_at, check_chart
+from dirax.geometry.cotangent_lift import CotangentBundle, cotangent_lift, symplecticity_defect
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.manifolds import Circle, Euclidean, Product, Sphere, Torus
 from dirax.geometry.maps import (
     LieGroupExp,
     Midpoint,
+    ProductMap,
     ProjectedMap,
     RiemannianExp,
     SphereProjection,
+    Submanifold,
     Theta,
     check_discretization_map,
 )
@@ -62,6 +64,7 @@ __all__ = [
     "Circle",
     "Composition",
     "ConstraintChain",
+    "CotangentBundle",
     "DiracStructure",
     "DiracSystem",
     "DiscreteDirac",
@@ -83,8 +86,10 @@ __all__ = [
     "PlusLagrangeDirac",
     "PortHamiltonian",
     "Product",
+    "ProductMap",
     "ProjectedMap",
     "ReducedLagrangeDirac",
+    "RetractionChart",
     "RiemannianExp",
     "Shape",
     "Solution",
@@ -92,6 +97,7 @@ __all__ = [
     "SphereProjection",
     "StepEquation",
     "StepSequence",
+    "Submanifold",
     "SymmetricComposition",
     "Theta",
     "Torus",

@@ -103,7 +103,7 @@ def compare(
             sol = simulate(system, scheme, step=step, steps=steps, **run)
             seconds[name].append(sol.stats.get("run_seconds", clock.perf_counter() - tick))
     orders = {name: _order(system, scheme, step, steps, reference, run) for name, scheme in named.items()}
-    best = max((name for name in named if orders[name][0] is not None), key=lambda n: orders[n][0], default=None)
+    best = max((name for name in named if orders[name][0] is not None), key=lambda n: orders[n][0] or 0.0, default=None)
     target = reference if reference is not None else named[best] if best is not None else None
     entries = []
     for name, sol in sols.items():

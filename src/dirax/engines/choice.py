@@ -36,6 +36,6 @@ def _too_large(problem: Problem) -> str | None:
 
 
 def _other_device() -> str | None:
-    device = jax.config.jax_default_device
+    device = getattr(jax.config, "jax_default_device", None)
     platform = device.platform if hasattr(device, "platform") else device or jax.default_backend()
     return None if platform == "cpu" else f"JAX computes on {platform}"
