@@ -20,6 +20,7 @@ from dirax.systems.nonholonomic import NonholonomicMechanics
 
 TITLE = "Barbero Liñán, López Medel, Martín de Diego: Dirac systems and the constraint algorithm, §6 and §8"
 VORTICES = vortices.EXAMPLE
+SYSTEM = vortices.point_vortices(vortices.CIRCULATIONS)
 GAMMA = np.array(vortices.CIRCULATIONS)
 METHODS = {1: DiscreteDirac(), 2: DiscreteDirac(constraints="resolve")}
 SHORT, ZOOM, LONG = 300, 500, 1_000_000
@@ -83,7 +84,7 @@ def runge_kutta(rows: int, every: int) -> np.ndarray:
 
 def energies(q: np.ndarray) -> np.ndarray:
     """H of rows of q."""
-    return np.asarray(jax.jit(jax.vmap(lambda q: VORTICES.system.hamiltonian(q, None)))(jnp.asarray(q)))
+    return np.asarray(jax.jit(jax.vmap(lambda q: SYSTEM.hamiltonian(q, None)))(jnp.asarray(q)))
 
 
 def f(z: np.ndarray) -> np.ndarray:

@@ -161,7 +161,8 @@ def _lagrangian(system: LagrangeDirac, stated, near, params) -> ImplicitForm:
     x = None if data is not None else np.asarray(near, float)
     if x is not None and (x.ndim != 1 or (x.size % 2 and x.size % 3)):
         raise ValueError(f"near must be x = (q, p), or {{'q': q, 'v': v}}, but an array of shape {x.shape} was given.")
-    q = jnp.asarray(x[: x.size // (2 if x.size % 2 == 0 else 3)]) if x is not None else data["q"]
+    given = np.zeros(0) if x is None else x
+    q = data["q"] if data is not None else jnp.asarray(given[: given.size // (2 if given.size % 2 == 0 else 3)])
     zero = jnp.zeros_like(q)
     stated.sizes({"q": q, "v": zero}, params)
     affine, hessian = _momenta(system, q, data.get("v", zero) if data is not None else zero, params)

@@ -1,6 +1,7 @@
 """Interconnection of port-Hamiltonian systems: composition of their Dirac structures through shared ports."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ def interconnect(
     other_ports: Sequence[int],
     sizes: tuple[int, int],
     kind: str = "feedback",
+    params: Any = None,
 ) -> PortHamiltonian:
     """Two port-Hamiltonian systems joined at some of their ports; again one, with H the sum, x = (x_one, x_other).
 
@@ -25,7 +27,8 @@ def interconnect(
     "feedback": u = −y_other, u_other = y (a flow meets an effort: a motor's current and its load's speed).
     "joint": u = −u_other = λ with y = y_other (two efforts meet: a rigid joint), a closed port of the whole.
     Both are power-conserving, ⟨y, u⟩ + ⟨y_other, u_other⟩ = 0. Ports left over stay open, those of `one` first; closed
-    ones stay closed. Raises `ValueError` for ports that do not exist, meet twice, are closed, or have no partner.
+    ones stay closed. `params` are only needed where B takes them, to count its columns. Raises `ValueError` for ports that
+    do not exist, meet twice, are closed, or have no partner.
     """
     ports, other_ports = tuple(map(int, ports)), tuple(map(int, other_ports))
     if kind not in KINDS:
@@ -80,7 +83,7 @@ def interconnect(
 
     def count(system: PortHamiltonian, size: int, taken: tuple[int, ...]) -> tuple[int, int]:
         closed = len(system.closed) if isinstance(system.closed, tuple) else 0
-        width = jax.eval_shape(lambda x: system.input_matrix(x, None), jnp.zeros(size)).shape[1]
+        width = jax.eval_shape(lambda x: system.input_matrix(x, params), jnp.zeros(size)).shape[1]
         return width - len(taken) - closed, closed
 
     for system, size, chosen, name in ((one, sizes[0], ports, "ports"), (other, sizes[1], other_ports, "other_ports")):
