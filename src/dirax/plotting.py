@@ -26,7 +26,7 @@ ENVELOPE = 1000
 
 ENERGY_ERROR = "$|E - E_0| \\,/\\, |E_0|$"
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.size": 9.5,
     "axes.titlesize": 10.5,
     "axes.titlelocation": "left",
@@ -59,9 +59,9 @@ STYLE = {
 def style() -> Iterator[None]:
     """matplotlib's settings for dirax pictures, in force inside the block only."""
     import matplotlib
+    from cycler import cycler
 
-    with matplotlib.rc_context(STYLE):
-        matplotlib.rcParams["axes.prop_cycle"] = matplotlib.cycler(color=COLOURS)
+    with matplotlib.rc_context({**STYLE, "axes.prop_cycle": cycler(color=COLOURS)}):
         yield
 
 
@@ -89,7 +89,7 @@ def plot_trajectory(sol: Any, x: int | str = 0, y: int | str = 1, *, ax: "Axes |
     `x`, `y`: index or name of an entry of q (of `sol.x` where there is no q). Raises `ValueError` for unknown ones.
     """
     i, j = _index(sol, x), _index(sol, y)
-    ax = ax if ax is not None else new_figure()[1]
+    ax = _given_or_new(ax)
     lanes = _lanes(sol, _position(sol))
     for path, kwargs in zip(lanes, _lines(len(lanes), line), strict=True):
         (curve,) = ax.plot(path[:, i], path[:, j], **kwargs)
@@ -108,7 +108,7 @@ def plot_coordinate(sol: Any, i: int | str = 0, *, field: str = "q", ax: "Axes |
     Raises `ValueError` for an unknown entry.
     """
     index = _index(sol, i)
-    ax = ax if ax is not None else new_figure()[1]
+    ax = _given_or_new(ax)
     lanes = _lanes(sol, np.asarray(sol.fields[field]))
     for values, kwargs in zip(lanes, _lines(len(lanes), line), strict=True):
         ax.plot(sol.t, values[:, index], **kwargs)
@@ -152,7 +152,7 @@ def plot_phase(sol: Any, i: int | str = 0, *, ax: "Axes | None" = None, **line: 
         raise ValueError(
             f"a phase plane needs q and p, but this solution holds {', '.join(sol.fields)}: plot_trajectory shows x."
         )
-    ax = ax if ax is not None else new_figure()[1]
+    ax = _given_or_new(ax)
     lanes_q, lanes_p = _lanes(sol, np.asarray(sol.q)), _lanes(sol, np.asarray(sol.p))
     for q, p, kwargs in zip(lanes_q, lanes_p, _lines(len(lanes_q), line), strict=True):
         (curve,) = ax.plot(q[:, index], p[:, index], **kwargs)
@@ -171,12 +171,16 @@ def plot_constraint(sol: Any, *, ax: "Axes | None" = None, **line: Any) -> "Axes
     residual = np.asarray(sol.constraint_residual())
     if residual.shape[-1] == 0:
         raise ValueError("this system has no constraints, so there is no residual to plot.")
-    ax = ax if ax is not None else new_figure()[1]
+    ax = _given_or_new(ax)
     worst = np.atleast_2d(np.max(np.abs(residual), axis=-1))
     for values, kwargs in zip(worst, _lines(len(worst), line), strict=True):
         _plot_log(ax, np.asarray(sol.t)[: values.size], values, **kwargs)
     ax.set(xlabel=_time_label(sol), ylabel="largest constraint residual")
     return ax
+
+
+def _given_or_new(ax: "Axes | None") -> "Axes":
+    return new_figure()[1] if ax is None else ax
 
 
 def _plot_log(ax: "Axes", t: np.ndarray, values: np.ndarray, **line: Any) -> None:

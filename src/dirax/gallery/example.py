@@ -26,7 +26,7 @@ class Example:
     """A ready-made system: `dirax.gallery.get(name)`.
 
     - `name`, `title`, `source`: what it is and where its equations are.
-    - `system`, `params`: a dirax system and the parameters of its functions by name (None where there are none).
+    - `system`, `params`: a dirax system and the parameters of its functions, by name or another pytree (None without any).
     - `initial`: initial data for `simulate` by keyword, `q` and `v` of shape (n,) or another of its pairs.
     - `scheme`, `step`, `steps`: the run that the source shows, or a sensible one; `step` is in `time_unit`.
     - `coordinates`: one `Coordinate` per entry of q or x; `plane`: the two that make a good picture.
@@ -45,7 +45,7 @@ class Example:
     steps: int
     coordinates: tuple[Coordinate, ...]
     scheme: AbstractScheme = field(default_factory=LagrangeDAlembert)
-    params: Mapping[str, float] | None = None
+    params: Any = None
     time_unit: str = ""
     energy_unit: str = ""
     plane: tuple[int, int] = (0, 1)
@@ -71,7 +71,8 @@ class Example:
         if not {"q", "v", "p", "q0", "q1", "x"} & changes.keys():
             settings.update(self.initial)
         params = changes.pop("params", None)
-        settings["params"] = dict(self.params, **(params or {})) if self.params is not None else params
+        partly = isinstance(self.params, Mapping) and isinstance(params, Mapping)
+        settings["params"] = {**self.params, **params} if partly else self.params if params is None else params
         solution = simulate(self.system, scheme or self.scheme, **{**settings, **changes})
         solution.metadata.update(self.labels)
         return solution

@@ -239,7 +239,7 @@ def heisenberg_rows(lines: dict[str, Solution]) -> list[Row]:
         compared(f"Heisenberg: {symbol}(1000)", end[i], float(sol.q[-1, i]), 1e-6, note, 10) for i, symbol in enumerate("xyz")
     ]
     steps = np.diff(np.asarray(sol.q), axis=0)
-    energy = np.sum(steps**2, axis=1) / (2 * sol.step**2)
+    energy = np.linalg.norm(steps, axis=1) ** 2 / (2 * sol.step**2)
     expected = velocity @ velocity / 2
     drift = np.max(np.abs(energy / expected - 1))
     momentum = np.max(np.abs(np.asarray(sol.p)[1:] - velocity))

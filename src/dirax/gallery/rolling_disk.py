@@ -74,13 +74,13 @@ def _rotation(theta0: float, theta_dot: float, swing: float, harmonics: int = 12
     series = np.fft.rfft(1 / rate(angles)) / harmonics  # dt/dθ = Σ c_k e^{ikθ}
     k = np.arange(1, harmonics // 2)
     integrated = 2 * series[1 : harmonics // 2] / (1j * k)
-    mean = series[0].real
+    mean = float(np.real(series[0]))
 
     def time_at(angle):
         z, total = np.exp(1j * angle), np.zeros_like(angle, dtype=complex)
         for c in integrated[::-1]:  # Horner's rule
             total = (total + c) * z
-        return mean * angle + total.real
+        return mean * angle + np.real(total)
 
     def angle_at(t):
         start = time_at(np.asarray(theta0, float))

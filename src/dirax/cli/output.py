@@ -1,0 +1,85 @@
+"""What the commands show: progress, tables, errors. Results go to standard output, everything else to standard error."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import wraps
+from typing import Any
+
+import typer
+
+REPORTED = (ValueError, TypeError, OSError)
+"""Errors with a message for the user; any other is a mistake in dirax and shows its traceback."""
+
+COLOURS = {
+    "ok": "green",
+    "agrees": "green",
+    "bounded": "green",
+    "drifts": "yellow",
+    "paper is wrong": "yellow",
+    "VIOLATED": "bold red",
+    "DIFFERS": "bold red",
+}
+
+
+def with_messages(command: Callable) -> Callable:
+    """A command whose errors become one or two sentences on standard error, and exit status 1."""
+
+    @wraps(command)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return command(*args, **kwargs)
+        except REPORTED as error:
+            typer.echo(f"dirax: {error}", err=True)
+            raise typer.Exit(1) from error
+        except KeyboardInterrupt:
+            typer.echo("dirax: interrupted.", err=True)
+            raise typer.Exit(130) from None
+
+    return run
+
+
+@contextmanager
+def progress_bar(task: str) -> Iterator[Callable[[float, str], None]]:
+    """A bar on standard error, while it is a terminal: a function of (fraction done, text); it moves by itself until then."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        number = bar.add_task(task, total=None)
+
+        def tell(fraction: float, text: str = task) -> None:
+            bar.update(number, total=1.0, completed=fraction, description=text)
+
+        yield tell
+
+
+def show_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], text: str, notes: Sequence[str] = ()) -> None:
+    """A table that fits the terminal, verdicts coloured, and then the notes.
+
+    Where the output is not a terminal, `text`, which says the same, is printed as it is.
+    """
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console()
+    if not console.is_terminal:
+        typer.echo(text)
+        return
+    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False)
+    for name in header:
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell, style=COLOURS.get(cell, "")) for cell in row))
+    console.print(table)
+    for note in notes:
+        console.print(Text(note))
+
+
+def show_json(value: Any) -> None:
+    """JSON on standard output."""
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False))

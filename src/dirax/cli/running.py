@@ -1,0 +1,79 @@
+"""What `dirax run` does and shows: the run itself, its description, and a target that is refused before it."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dirax.diagnostics.report import Report
+from dirax.diagnostics.table import plain
+from dirax.diagnostics.verify import verify
+from dirax.gallery.example import Example
+from dirax.schemes.step import AbstractScheme
+from dirax.solution import Solution
+from dirax.storage import ENDINGS
+
+
+def run_and_verify(
+    example: Example, scheme: AbstractScheme, options: dict[str, Any], out: Path | None, overwrite: bool, tell: Any
+) -> tuple[Solution, Report]:
+    """Run the example, verify it and save it; `tell(fraction, text)` hears of the progress."""
+    if out is not None:
+        refuse_target(out, overwrite)
+
+    def steps_done(done: int, total: int) -> None:
+        tell(done / total, f"{example.title}: {done} of {total} steps")
+
+    sol = example.simulate(scheme, progress=steps_done, **options)
+    tell(1.0, "verifying")
+    report = verify(sol, symmetries=example.symmetries or None)
+    if out is not None:
+        sol.save(out, overwrite=overwrite)
+    return sol, report
+
+
+def refuse_target(path: Path, overwrite: bool) -> None:
+    """Raise before a run whose trajectory could not be saved in `path`."""
+    if path.suffix not in ENDINGS:
+        raise ValueError(f"--out must end in {' or '.join(ENDINGS)}, but {str(path)!r} was given.")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"the folder {path.parent} does not exist: create it, or choose another for --out.")
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists: pass --overwrite to replace it, or choose another path for --out.")
+
+
+def message(sol: Solution) -> str:
+    """What went wrong in a run, empty if nothing did; of a batch, its first failure."""
+    return sol.message if isinstance(sol.message, str) else next((text for text in sol.message if text), "")
+
+
+def summary(example: Example, sol: Solution) -> str:
+    """Three lines: the system, the scheme, how fast it ran."""
+    stats = sol.stats
+    unit = f" {example.time_unit}" if example.time_unit else ""
+    speed = f", {1e6 * stats['run_seconds'] / stats['steps']:.3g} µs a step" if np.all(sol.ok) else ""
+    done = f"{stats['steps']} steps of {float(sol.step):g}{unit} on the {stats['engine']} engine{speed}"
+    source = "" if example.source == str(example.title) else f" ({example.source})"
+    return f"{example.title}{source}\n{sol.scheme!r}\n{done}"
+
+
+def description(example: Example, sol: Solution, report: Report, out: Path | None) -> dict[str, Any]:
+    """The same and the report as plain Python values, fit for JSON."""
+    field = "q" if "q" in sol.fields else "x"
+    return plain(
+        {
+            "system": example.name,
+            "title": example.title,
+            "source": example.source,
+            "scheme": repr(sol.scheme),
+            "step": float(sol.step),
+            "steps": sol.stats["steps"],
+            "ok": np.asarray(sol.ok).tolist(),
+            "message": sol.message,
+            "t": float(sol.t[-1]),
+            field: np.asarray(sol.fields[field])[..., -1, :],
+            "stats": sol.stats,
+            "report": report.to_dict(),
+            "saved": None if out is None else str(out),
+        }
+    )
