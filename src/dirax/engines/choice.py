@@ -1,5 +1,7 @@
 """Which engine runs a problem: native for small systems on a CPU, xla for everything."""
 
+from typing import Any
+
 import jax
 
 from dirax.engines import xla
@@ -36,6 +38,6 @@ def _too_large(problem: Problem) -> str | None:
 
 
 def _other_device() -> str | None:
-    device = getattr(jax.config, "jax_default_device", None)
-    platform = device.platform if hasattr(device, "platform") else device or jax.default_backend()
+    device: Any = getattr(jax.config, "jax_default_device", None)
+    platform = getattr(device, "platform", device) or jax.default_backend()
     return None if platform == "cpu" else f"JAX computes on {platform}"

@@ -54,7 +54,7 @@ class DiracSystem(AbstractSystem):
     ) -> Float[Array, " N"]:
         """F(x) ẋ + E(x) dH(x), zero iff (ẋ, dH(x)) ∈ D_x; `differential` replaces dH(x)."""
         F, E = self.structure.kernel(x, params)
-        return F @ velocity + E @ (self.differential(x, params) if differential is None else differential)
+        return jnp.asarray(F @ velocity + E @ (self.differential(x, params) if differential is None else differential))
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
         x = data["x"] if "x" in data else jnp.concatenate([data["q"], data["p"]]) if "p" in data else None

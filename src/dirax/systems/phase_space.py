@@ -61,8 +61,7 @@ class PhaseSpaceLagrangian(AbstractSystem):
             return dict(data)
         q, p = data["q"], self.one_form(data["q"], params)
         dirac = self.dirac_system().complete({"x": q}, params, False)
-        given = data.get("p", p)
-        return {"q": q, "v": dirac["velocity"], "p": p if project else given, "defect": given - p}
+        return {"q": q, "v": dirac["velocity"], "p": p if project or "p" not in data else data["p"]}
 
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " n"]:
         """p − α(q): the primary constraints."""
