@@ -46,13 +46,13 @@ def make_step(equation, axes, max_iterations: int, differentiable: bool):
         after, unknowns = take_step(equation, lane, t, clock.h, params, max_iterations, differentiable)
         return after, packed_row(lane, unknowns)
 
-    return one if axes is None else jax.vmap(one, in_axes=(0, axes, None))
+    return one if axes is None else jax.vmap(one, in_axes=(*axes, None))
 
 
 def unpack_rows(equation, axes, packed, params, clock: Clock) -> dict:
     """The named arrays of packed rows (rows, …)."""
     one = lambda row, params: unpacked_row(equation, row, clock.t0, clock.h, clock.first_step, params)
-    lanes = one if axes is None else jax.vmap(one, in_axes=(0, axes))
+    lanes = one if axes is None else jax.vmap(one, in_axes=axes)
     return jax.vmap(lanes, in_axes=(0, None))(packed, params)
 
 
@@ -134,35 +134,39 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
     )
 
 
-def run_traced(problem: Problem, checkpoint_rows: int | None = None) -> Outcome:
-    """The same run as one scan, for `jax.grad`, `jit` and `vmap` around it; segments of about √rows are recomputed in
-    reverse mode instead of being stored."""
+def run_traced(problem: Problem) -> Outcome:
+    """The same run as one scan, for `jax.grad`, `jit` and `vmap` around it; in reverse mode segments of about √steps steps
+    are computed again instead of being stored."""
     p = problem
     axes = _axes(p)
     lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)))
     clock = Clock(p.t0, p.h, float(p.first_step), p.save_every, 0, p.steps, False)
-    step = make_step(p.equation, axes, p.max_iterations, differentiable=True)
+    one = make_step(p.equation, axes, p.max_iterations, differentiable=True)
+
+    def step(lanes, k):
+        """The lanes after step k and the row that they left; a step past the last is undone."""
+        after, row = one(lanes, p.params, clock)
+        return jax.tree.map(lambda a, b: jnp.where(k < p.steps, a, b), after, lanes), row
 
     def to_next_row(lanes, start):
-        """The lanes after `save_every` steps from `start` on, and the row they left; steps past the last are undone."""
-
-        def one(carry, k):
-            lanes, row = carry
-            after, left = step(lanes, p.params, clock)
-            after = jax.tree.map(lambda a, b: jnp.where(k < p.steps, a, b), after, lanes)
-            return (after, jnp.where(k == start, left, row)), None
-
-        row = jnp.zeros(jax.eval_shape(step, lanes, p.params, clock)[1].shape)
-        return jax.lax.scan(one, (lanes, row), start + jnp.arange(p.save_every))[0]
+        after, row = step(lanes, start)
+        if p.save_every == 1:
+            return after, row
+        later = start + 1 + jnp.arange(p.save_every - 1)
+        return jax.lax.scan(lambda lanes, k: (step(lanes, k)[0], None), after, later)[0], row
 
     @jax.checkpoint
     def segment(lanes, starts):
         return jax.lax.scan(to_next_row, lanes, starts)
 
-    length = checkpoint_rows or max(1, int(np.sqrt(p.rows)))
-    starts = jnp.arange(-(-p.rows // length) * length).reshape(-1, length) * p.save_every
+    # saving every step, the closing row is that of one more step, undone like the others that fill up the last segment
+    count = p.rows if p.save_every == 1 else p.rows - 1
+    length = max(1, int(np.sqrt(p.steps)) // p.save_every)
+    starts = jnp.arange(-(-count // length) * length).reshape(-1, length) * p.save_every
     lanes, packed = jax.lax.scan(segment, lanes, starts)
-    packed = packed.reshape(-1, *packed.shape[2:])[: p.rows]
+    packed = packed.reshape(-1, *packed.shape[2:])[:count]
+    if count < p.rows:
+        packed = jnp.concatenate([packed, step(lanes, p.steps)[1][None]])
     rows = {name: _by_lane(a, p.batch, jnp) for name, a in unpack_rows(p.equation, axes, packed, p.params, clock).items()}
     lanes = lanes if p.batch is not None else jax.tree.map(lambda a: a[None], lanes)
     return Outcome(
@@ -187,11 +191,9 @@ def _by_lane(values, batch: int | None, xp):
     return values[None] if batch is None else xp.moveaxis(values, 0, 1)
 
 
-def _axes(p: Problem):
-    """None for one trajectory; else the axes of `params` under vmap."""
-    if p.batch is None:
-        return None
-    return jax.tree.map(lambda _: 0 if p.batch_params else None, p.params) if p.params is not None else 0
+def _axes(p: Problem) -> tuple | None:
+    """None for one trajectory; else the axes of lanes and `params` under vmap."""
+    return None if p.batch is None else (0, 0 if p.batch_params else None)
 
 
 def _capacity(p: Problem) -> int:

@@ -1,0 +1,111 @@
+"""Newton's method to the roundoff floor: known roots, hard equations, linear solves, derivatives of the root."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dirax.engines.newton import EPSILON, factorised, solve
+
+
+def root(equation, guess, args=(), scale=None, **keywords):
+    guess = jnp.asarray(guess)
+    u, updates, converged = solve(equation, scale or (1.0,) * len(guess), guess, args, 50, **keywords)
+    return np.asarray(u), int(updates), bool(converged)
+
+
+def test_roots_against_mpmath():
+    """x = cos x and y eʸ = x² from far and near: the same digits, to roundoff."""
+    x = mpmath.findroot(lambda x: x - mpmath.cos(x), 0.7)
+    y = mpmath.lambertw(x**2)
+    equation = lambda u: jnp.stack([u[0] - jnp.cos(u[0]), u[1] * jnp.exp(u[1]) - u[0] ** 2])
+    for guess in ([0.1, 0.1], [2.0, 3.0], [0.739, 0.38]):
+        u, _, converged = root(equation, guess)
+        assert converged
+        np.testing.assert_allclose(u, [float(x), float(y)], rtol=4 * EPSILON)
+
+
+def test_a_good_guess_costs_two_updates():
+    """One with the Jacobian there and one that confirms it, as long as the first contracts from 1e-9 to roundoff."""
+    u, updates, converged = root(lambda u: u**2 - 2.0, [2**0.5 + 1e-9])
+    assert converged and updates == 2 and u[0] == pytest.approx(2**0.5, rel=EPSILON)
+
+
+def test_linear_equations_are_solved_by_the_first_update():
+    matrix = np.array([[2.0, 1.0, 0.0], [1.0, 3.0, 1.0], [0.0, 1.0, 4.0]])
+    u, updates, converged = root(lambda u: matrix @ u - jnp.ones(3), np.zeros(3))
+    assert converged and updates <= 2
+    np.testing.assert_allclose(u, np.linalg.solve(matrix, np.ones(3)), rtol=1e-15)
+
+
+def test_scale_is_the_unit_of_the_unknowns():
+    """The root 1e-12 of x = 1e-12 cos(1e12 x)·(…) in units of 1e-12: with the unit 1 the first update would do."""
+    equation = lambda u: u - 1e-12 * jnp.cos(1e12 * u)
+    exact = float(mpmath.findroot(lambda x: x - mpmath.cos(x), 0.7))
+    fine, _, converged = root(equation, [1e-13], scale=(1e-12,))
+    assert converged and fine[0] == pytest.approx(1e-12 * exact, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    "equation, guess",
+    [
+        (lambda u: u**2 + 1.0, [0.7]),  # no root
+        (lambda u: jnp.log(u), [-1.0]),  # outside the domain
+        (lambda u: 0.0 * u + 1.0, [1.0]),  # singular Jacobian
+    ],
+)
+def test_equations_without_a_root_are_said_not_to_converge(equation, guess):
+    _, updates, converged = root(equation, guess)
+    assert not converged and updates <= 50
+
+
+def test_an_equation_full_of_roundoff_stops_at_its_floor():
+    """x + 10⁶(1 + x − 1 − x) is x with noise of about 1e-10: found as well as it can be, in few updates."""
+    noise = lambda u: 1e6 * (((1.0 + u * (1 + 1e-9)) - 1.0) - u * (1 + 1e-9))
+    u, updates, converged = root(lambda u: u - 0.3 + noise(u), [0.1])
+    assert converged and updates < 20 and abs(u[0] - 0.3) < 1e-9
+
+
+def test_where_it_does_not_run_the_guess_comes_back():
+    u, updates, _ = root(lambda u: u - 1.0, [5.0], running=jnp.array(False))
+    assert u[0] == 5.0 and updates == 0
+
+
+def test_lanes_of_a_batch_do_not_depend_on_each_other():
+    """Each lane has the bits and the number of updates that it has among others that need more."""
+    one = lambda guess: solve(lambda u: u - jnp.cos(u) * u, (1.0,), guess, (), 50)[:2]
+    guesses = jnp.array([[0.5], [2.0], [7.0], [0.3]])
+    together, counts = jax.jit(jax.vmap(one))(guesses)
+    for order in ([3, 1, 0, 2], [0, 0, 0, 0]):
+        others, others_counts = jax.jit(jax.vmap(one))(guesses[jnp.array(order)])
+        np.testing.assert_array_equal(others, together[jnp.array(order)])
+        np.testing.assert_array_equal(others_counts, counts[jnp.array(order)])
+    assert len(set(np.asarray(counts).tolist())) > 1
+
+
+def test_derivatives_of_the_root_to_second_order():
+    """u³ = a: u' = 1/(3u²), u'' = −2/(9u⁵), forwards and backwards."""
+    cube_root = lambda a: solve(lambda u, a: u**3 - a, (1.0,), jnp.array([1.3]), (a,), 50)[0][0]
+    u = 2.0 ** (1 / 3)
+    assert jax.grad(cube_root)(2.0) == pytest.approx(1 / (3 * u**2), rel=1e-14)
+    assert jax.jvp(cube_root, (2.0,), (1.0,))[1] == pytest.approx(1 / (3 * u**2), rel=1e-14)
+    assert jax.grad(jax.grad(cube_root))(2.0) == pytest.approx(-2 / (9 * u**5), rel=1e-13)
+
+
+SOLVED = jax.jit(lambda a, b: factorised(a)(b))
+
+
+@given(st.sampled_from([1, 2, 3, 5, 9]), st.integers(0, 2**32 - 1))
+def test_linear_solves_with_zero_pivots(k, seed):
+    """Backward error at roundoff for all three ways, for saddle-point matrices, whose corner is zero."""
+    rng = np.random.default_rng(seed)
+    a, b = rng.normal(size=(k, k)), rng.normal(size=k)
+    a[k // 2 + 1 :, k // 2 + 1 :] = 0.0
+    a[0, 0] *= k == 1
+    condition = np.linalg.cond(a)
+    x = np.asarray(SOLVED(a, b))
+    exact = np.linalg.solve(a, b)
+    assert np.max(np.abs(x - exact)) <= 100 * EPSILON * condition * max(np.max(np.abs(exact)), EPSILON)

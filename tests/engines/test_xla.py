@@ -1,0 +1,242 @@
+"""The xla engine: closed forms and their gradients, chunks, batches, failures, interruption, honest residuals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.engines import xla
+from dirax.engines.result import NOT_FINITE, OK, Problem
+from dirax.schemes.step import Field, Shape, StepEquation, explicit_step, make_step_equation
+
+MIDPOINT = dx.LagrangeDAlembert()
+OSCILLATOR = dx.LagrangeDirac(lambda q, v, omega: (v @ v - omega**2 * q @ q) / 2)
+
+
+def pendulums(q, v, g):
+    kinetic = v[0] ** 2 + v[1] ** 2 / 2 + v[0] * v[1] * jnp.cos(q[0] - q[1])
+    return kinetic + g * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+
+
+PENDULUMS = dx.LagrangeDirac(pendulums)
+SWING = {"q": np.array([1.0, 0.5]), "v": np.array([0.0, 0.5]), "step": 0.01, "params": 9.81, "engine": "xla"}
+
+
+def problem(system, state, guess, h, steps, **keywords) -> Problem:
+    n = np.shape(state)[-1] // 2
+    equation = make_step_equation(MIDPOINT, system, Shape(n, 0))
+    return Problem(equation, np.asarray(state), (np.asarray(guess),), h, 0.0, steps, **keywords)
+
+
+def cayley(q, v, omega, h, t):
+    """The midpoint rule turns (ωq, p) by θ = 2 arctan(hω/2) a step: q at the step of number t/h."""
+    angle = 2 * np.arctan(h * omega / 2) * t / h
+    return q * np.cos(angle) + v / omega * np.sin(angle)
+
+
+# -------------------------------------------------------------------------------------------------- closed forms, gradients
+
+
+def test_the_midpoint_oscillator_is_a_cayley_map():
+    sol = dx.simulate(OSCILLATOR, MIDPOINT, q=[1.0], v=[0.4], params=1.7, step=0.1, steps=5000, engine="xla")
+    np.testing.assert_allclose(sol.q[:, 0], cayley(1.0, 0.4, 1.7, 0.1, sol.t), atol=1e-12)
+
+
+@pytest.mark.parametrize("save_every", [1, 7])
+def test_gradients_of_the_oscillator_against_the_closed_form(save_every):
+    """With respect to initial data, params and the step itself, of every saved row at once, in reverse mode."""
+    steps, weights = 40, np.random.default_rng(0).normal(size=len(range(0, 40, save_every)) + 1)
+    numbers = np.append(np.arange(0, steps, save_every), steps)
+
+    def loss(q, v, omega, h):
+        run = {"params": omega, "step": h, "steps": steps, "save_every": save_every}
+        return dx.simulate(OSCILLATOR, MIDPOINT, q=jnp.stack([q]), v=jnp.stack([v]), **run).q[:, 0] @ weights
+
+    q, v, omega, h = 0.8, -0.3, 1.7, 0.1
+    theta, turn = 2 * np.arctan(h * omega / 2), 1 / (1 + (h * omega / 2) ** 2)  # dθ = turn·(h dω + ω dh)
+    angle = numbers * theta
+    by_angle = (-q * np.sin(angle) + v / omega * np.cos(angle)) * numbers * turn
+    expected = [
+        np.cos(angle) @ weights,
+        np.sin(angle) / omega @ weights,
+        (by_angle * h - v / omega**2 * np.sin(angle)) @ weights,
+        by_angle * omega @ weights,
+    ]
+    np.testing.assert_allclose(jax.jit(jax.grad(loss, argnums=(0, 1, 2, 3)))(q, v, omega, h), expected, rtol=1e-10)
+
+
+def test_derivatives_of_a_nonlinear_trajectory_against_finite_differences():
+    """The double pendulum's end as a function of (q, v, g): forward mode, reverse mode and central differences."""
+
+    def end(z):
+        sol = dx.simulate(PENDULUMS, MIDPOINT, q=z[:2], v=z[2:4], params=z[4], step=0.02, steps=30, engine="xla")
+        return jnp.concatenate([sol.q[-1], sol.p[-1]])
+
+    z = np.array([1.0, 0.5, 0.0, 0.5, 9.81])
+    backward, forward = jax.jit(jax.jacrev(end))(z), jax.jit(jax.jacfwd(end))(z)
+    np.testing.assert_allclose(forward, backward, rtol=1e-11, atol=1e-13)
+    columns = [(end(z + d) - end(z - d)) / 2e-5 for d in 1e-5 * np.eye(5)]  # runs of the engine's other loop
+    np.testing.assert_allclose(forward, np.stack(columns, axis=1), rtol=1e-7, atol=1e-8)
+
+
+def test_a_traced_run_is_the_run_from_the_host():
+    """Under jit and under vmap, with a last row that is not a multiple of save_every."""
+    run = {"params": 9.81, "step": 0.01, "steps": 23, "save_every": 5}
+    host = dx.simulate(PENDULUMS, MIDPOINT, q=np.array([[1.0, 0.5], [0.2, 0.1]]), v=np.zeros((2, 2)), engine="xla", **run)
+    one = lambda q: (lambda sol: (sol.q, sol.p, sol.stats["newton_iterations"]))(
+        dx.simulate(PENDULUMS, MIDPOINT, q=q, v=jnp.zeros(2), **run)
+    )
+    q, p, iterations = jax.jit(jax.vmap(one))(jnp.array([[1.0, 0.5], [0.2, 0.1]]))
+    np.testing.assert_allclose(q, host.q, atol=1e-13)
+    np.testing.assert_allclose(p, host.p, atol=1e-12)
+    assert abs(int(iterations.sum()) - host.stats["newton_iterations"]) <= 4
+
+
+# ------------------------------------------------------------------------------------------------------------ rows and time
+
+
+def test_saving_less_is_subsampling():
+    every = dx.simulate(PENDULUMS, MIDPOINT, **SWING, steps=300)
+    seventh = dx.simulate(PENDULUMS, MIDPOINT, **SWING, steps=300, save_every=7)
+    kept = np.append(np.arange(0, 300, 7), 300)
+    for name in ("q", "p"):
+        np.testing.assert_array_equal(seventh.fields[name], every.fields[name][kept])
+    np.testing.assert_array_equal(seventh.t, every.t[kept])
+
+
+@pytest.mark.parametrize("save_every", [1, 3])
+def test_chunks_leave_no_trace(monkeypatch, save_every):
+    """The bits of a run do not depend on where its chunks end, within rows or between them, nor on how many there are."""
+    whole = dx.simulate(PENDULUMS, MIDPOINT, **SWING, steps=200, save_every=save_every)
+    monkeypatch.setattr(xla, "CHUNK_ROWS", 16)
+    monkeypatch.setattr(xla, "FIRST_CHUNK", 7)
+    monkeypatch.setattr(xla, "CHUNK_SECONDS", 1e-9)
+    calls = []
+    pieces = dx.simulate(
+        PENDULUMS, MIDPOINT, **SWING, steps=200, save_every=save_every, progress=lambda done, _: calls.append(done)
+    )
+    assert calls[:2] == [7, 8] and calls[-1] == 200
+    for name in ("q", "p"):
+        np.testing.assert_array_equal(pieces.fields[name], whole.fields[name])
+
+
+def clock_equation() -> StepEquation:
+    """An explicit step that writes down the time it is given."""
+    return StepEquation(
+        start=lambda data, h, params: (data["x"], jnp.zeros(0)),
+        residual=explicit_step,
+        advance=lambda u, state, t, h, params: jnp.stack([t, state[1] + 1.0]),
+        unpack=lambda state, u, t, h, params: {"x": state, "now": jnp.stack([t])},
+        state_size=2,
+        unknowns=0,
+        fields={"x": Field((2,)), "now": Field((1,))},
+    )
+
+
+@pytest.mark.parametrize("batch", [None, 2])
+def test_time_is_the_number_of_steps_times_the_step(batch):
+    """Not a running sum: k·h to the last bit, in the step and in the rows, after a two-point start as well."""
+    state = np.zeros(2) if batch is None else np.zeros((batch, 2))
+    guess = (np.zeros((*state.shape[:-1], 0)),)
+    out = xla.run(Problem(clock_equation(), state, guess, 0.1, 0.0, 1000, save_every=9, first_step=1, batch=batch))
+    rows = 1 + np.append(np.arange(0, 1000, 9), 1000)
+    for lane in range(batch or 1):
+        np.testing.assert_array_equal(out.fields["now"][lane, :, 0], rows * 0.1)
+        np.testing.assert_array_equal(out.fields["x"][lane, 1:, 0], (rows[1:] - 1) * 0.1)
+
+
+# ------------------------------------------------------------------------------------------------ batches, failures, Ctrl-C
+
+
+def falling_problem(states, steps, **keywords) -> Problem:
+    """L = v²/2 − q + 10⁻⁴√q: trajectories fall out of the domain q ≥ 0 of L."""
+    falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] + 1e-4 * jnp.sqrt(q[0]))
+    states = np.asarray(states)
+    return problem(falling, states, states[..., 1:], 0.01, steps, **keywords)
+
+
+def test_a_batch_is_its_trajectories_and_failures_stay_alone():
+    """The others of a batch do not change a bit when one fails, and agree with single runs to roundoff."""
+    healthy, failing = [1.0, 40.0], [0.5, -1.0]
+    sound = xla.run(falling_problem([healthy, [2.0, 30.0], healthy], 200, batch=3))
+    mixed = xla.run(falling_problem([healthy, failing, healthy], 200, batch=3))
+    assert mixed.status.tolist() == [OK, NOT_FINITE, OK] and mixed.completed[[0, 2]].tolist() == [200, 200]
+    for lane in (0, 2):
+        for name in ("q", "p"):
+            np.testing.assert_array_equal(mixed.fields[name][lane], sound.fields[name][lane])
+    alone = xla.run(falling_problem(failing, 200))
+    good = alone.completed[0]
+    assert mixed.completed[1] == good
+    assert good == pytest.approx((np.sqrt(2.0) - 1.0) / 0.01, abs=3)  # where q = 1/2 − t − t²/2 is zero
+    np.testing.assert_allclose(mixed.fields["q"][1, :good], alone.fields["q"][0, :good], atol=1e-13)
+
+
+def test_dead_trajectories_cost_nothing():
+    """10¹⁵ steps would take a lifetime: the run ends with the last living trajectory."""
+    out = xla.run(falling_problem([[0.5, -1.0], [0.3, 0.0]], 10**15, save_every=10**14, batch=2))
+    assert out.status.tolist() == [NOT_FINITE] * 2 and np.all(out.completed < 100)
+    np.testing.assert_array_equal(out.closing["q"], out.last_state[:, :1])
+
+
+def test_an_interrupted_run_keeps_what_was_computed(monkeypatch):
+    monkeypatch.setattr(xla, "FIRST_CHUNK", 50)
+    monkeypatch.setattr(xla, "CHUNK_SECONDS", 1e-9)
+    swing = problem(OSCILLATOR, [1.0, 0.0], [0.0], 0.1, 10_000, params=1.0)
+    seen = []
+
+    def stop(done, total):
+        seen.append(done)
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+
+    out = xla.run(swing, stop)
+    done = seen[-1]
+    assert out.interrupted and out.completed[0] == done == 52
+    np.testing.assert_allclose(out.fields["q"][0, :done, 0], cayley(1.0, 0.0, 1.0, 0.1, 0.1 * np.arange(done)), atol=1e-13)
+    np.testing.assert_allclose(out.closing["q"][0], cayley(1.0, 0.0, 1.0, 0.1, 0.1 * done), atol=1e-13)
+
+
+# ------------------------------------------------------------------------------------------- residuals, sizes, compiled code
+
+
+def test_the_residual_reported_is_that_of_the_accepted_step():
+    """Recomputed from the saved rows: p_k + D1 L_d(q_k, q_{k+1}) with v from the rows carries only the roundoff of q/h."""
+    sol = dx.simulate(PENDULUMS, MIDPOINT, **SWING, steps=400)
+    h = SWING["step"]
+    ld = lambda q0, q1: h * pendulums((q0 + q1) / 2, (q1 - q0) / h, SWING["params"])
+    left = jax.jit(jax.vmap(lambda p, q0, q1: p + jax.grad(ld)(q0, q1)))(sol.p[:-1], sol.q[:-1], sol.q[1:])
+    assert np.max(np.abs(left)) < 1e-12
+    # 10 units of roundoff of p, where the residual before the last update of Newton's method is 10⁻¹⁰ and more
+    assert 0 < sol.stats["max_residual"] < 10 * np.finfo(float).eps * np.max(np.abs(sol.p))
+
+
+def test_a_chain_of_thirty_oscillators():
+    """Above the size that is inverted by hand, against the Cayley map of every normal mode."""
+    n, h, steps = 30, 0.1, 500
+    stiffness = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    chain = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ jnp.asarray(stiffness) @ q / 2)
+    q, v = np.random.default_rng(1).normal(size=(2, n))
+    sol = dx.simulate(chain, MIDPOINT, q=q, v=v, step=h, steps=steps, engine="xla")
+    squares, modes = np.linalg.eigh(stiffness)
+    exact = modes @ cayley(modes.T @ q, modes.T @ v, np.sqrt(squares), h, h * steps)
+    np.testing.assert_allclose(sol.q[-1], exact, atol=1e-12)
+    assert sol.stats["newton_iterations"] <= 2 * steps
+
+
+def test_one_compiled_function_serves_every_run_of_an_equation():
+    """Other initial data, params, step, number of steps, time and rows saved: nothing is compiled again."""
+    run = {"q": [1.0], "v": [0.0], "params": 1.0, "step": 0.1, "steps": 30, "engine": "xla"}
+    dx.simulate(OSCILLATOR, MIDPOINT, **run)
+    compiled = []
+    listener = lambda event, duration, **_: compiled.append(event) if event.endswith("backend_compile_duration") else None
+    jax.monitoring.register_event_duration_secs_listener(listener)
+    try:
+        others = ({"q": [2.0], "v": [1.0]}, {"params": 3.0}, {"step": 0.05, "t0": 2.0}, {"steps": 4500}, {"save_every": 4})
+        for other in others:
+            assert dx.simulate(OSCILLATOR, MIDPOINT, **(run | other)).ok
+        assert compiled == []
+        dx.simulate(OSCILLATOR, MIDPOINT, **(run | {"q": [[1.0], [2.0]], "v": [[0.0], [0.0]]}))
+        assert compiled  # a batch is another function, so the listener does see compilations
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listener)
