@@ -149,16 +149,16 @@ def with_threads(count: int, run):
     return call
 
 
-def interleaved(programs: dict, repeats: int) -> dict[str, float]:
-    """Median seconds of each program, run in turn."""
+def interleaved(programs: dict, repeats: int, clock=time.perf_counter) -> dict[str, float]:
+    """Median seconds of each program, run in turn; `clock` may be the processor time, which others' work disturbs less."""
     for program in programs.values():
         program()
     times = {name: [] for name in programs}
     for _ in range(repeats):
         for name, program in programs.items():
-            start = time.perf_counter()
+            start = clock()
             program()
-            times[name].append(time.perf_counter() - start)
+            times[name].append(clock() - start)
     return {name: float(np.median(t)) for name, t in times.items()}
 
 
@@ -168,7 +168,6 @@ def against_c(python: str, repeats: int) -> dict:
     programs = {
         "native, one trajectory": with_threads(1, lambda: native.run(one)),
         "native, batch, one thread": with_threads(1, lambda: native.run(many)),
-        "native, batch, two threads": with_threads(2, lambda: native.run(many)),
     }
     c = casadi_c(python, one)
     if c is not None:
@@ -176,12 +175,16 @@ def against_c(python: str, repeats: int) -> dict:
         outcome, (q, p, iterations) = native.run(one), c()
         print("end states differ by", float(np.max(np.abs(outcome.last_state[0] - np.concatenate([q, p])))))
         print("Newton iterations:", int(outcome.iterations[0]), "and", iterations, "in C")
-    seconds = interleaved(programs, repeats)
-    work = {"native, batch, one thread": batch * batch_steps, "native, batch, two threads": batch * batch_steps}
+    seconds = interleaved(programs, repeats, time.process_time)
+    work = {"native, batch, one thread": batch * batch_steps}
     out = {name: 1e6 * s / work.get(name, steps) for name, s in seconds.items()}
     for name, value in out.items():
         ratio = f"   {value / out['CasADi C']:.3f} of CasADi C" if c is not None else ""
-        print(f"{name:32s} {value:8.4f} µs a step{ratio}")
+        print(f"{name:32s} {value:8.4f} µs of processor time a step{ratio}")
+    threads = {f"{n} threads": with_threads(n, lambda: native.run(many)) for n in (1, 2)}
+    wall = interleaved(threads, repeats)
+    out["two threads"] = wall["1 threads"] / wall["2 threads"]
+    print(f"two threads are {out['two threads']:.2f} times as fast as one (wall time)")
     return out
 
 

@@ -7,12 +7,13 @@ import os
 import platform
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import llvmlite
 import llvmlite.binding as llvm
 
-SLP_LINES = 20_000
-"""Modules with more lines are compiled with less effort."""
+LARGE = 20_000
+"""Modules with more lines than this are compiled with the least effort."""
 
 _numbers = itertools.count()
 
@@ -47,8 +48,13 @@ def vector_width() -> int:
     return 8 if have.get("avx512f") else 4 if have.get("avx") else 2
 
 
-def object_code(text: str, target: tuple[str, str, str] | None = None, assembly: bool = False):
-    """Optimized object code of a module (or its assembly text), for this machine or a (triple, processor, features)."""
+def object_code(text: str, target: tuple[str, str, str] | None = None, assembly: bool = False, thorough: bool = False) -> Any:
+    """Optimized object code of a module (or its assembly text), for this machine or a (triple, processor, features).
+
+    `thorough` also looks for scalar operations that fit in one vector: a tenth faster for a single trajectory, nothing
+    for code that is made of vectors, and half of the compile time.
+    """
+    _initialized()
     if target is None:
         target = host()
     else:
@@ -56,16 +62,17 @@ def object_code(text: str, target: tuple[str, str, str] | None = None, assembly:
         llvm.initialize_all_asmprinters()
     triple, cpu, flags = target
     module = llvm.parse_assembly(f'target triple = "{triple}"\n' + text)
-    module.verify()
-    large = text.count("\n") > SLP_LINES
+    large = text.count("\n") > LARGE
+    thorough = thorough and not large
     machine = llvm.Target.from_triple(triple).create_target_machine(
-        cpu=cpu, features=flags, opt=1 if large else 3, reloc="pic", codemodel="small"
+        cpu=cpu, features=flags, opt=3 if thorough else 1 if large else 2, reloc="pic", codemodel="small"
     )
-    options = llvm.create_pipeline_tuning_options(speed_level=1 if large else 3)
-    options.slp_vectorization = False
+    options = llvm.create_pipeline_tuning_options(speed_level=3 if thorough else 1)
+    options.slp_vectorization = thorough
     options.loop_vectorization = False
     options.loop_unrolling = False
-    llvm.create_pass_builder(machine, options).getModulePassManager().run(module, llvm.create_pass_builder(machine, options))
+    passes = llvm.create_pass_builder(machine, options)
+    passes.getModulePassManager().run(module, passes)
     return machine.emit_assembly(module) if assembly else machine.emit_object(module)
 
 

@@ -13,7 +13,10 @@ from dirax.engines.native.program import Program, program
 from dirax.engines.result import OK, Outcome, Problem, Progress
 
 CHUNK_SECONDS = 0.1
-FIRST_CHUNK = 4000
+SHARES = 4
+"""Parts of a batch per thread, so that a thread that is held up holds up little."""
+
+FIRST_CHUNK = 20_000
 """Lane-steps of the first call, from which the speed is estimated."""
 
 
@@ -176,7 +179,7 @@ class Lanes:
         if self.threads == 1:
             part(0, self.blocks)
             return
-        bounds = np.linspace(0, self.blocks, self.threads + 1).astype(int).tolist()
+        bounds = np.linspace(0, self.blocks, min(self.blocks, SHARES * self.threads) + 1).astype(int).tolist()
         with ThreadPoolExecutor(self.threads) as pool:
             for future in [pool.submit(part, a, b) for a, b in itertools.pairwise(bounds)]:
                 future.result()

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from dirax.engines.native import compile as llvm
+from dirax.engines.native.compensation import increments
 from dirax.engines.native.graph import Graph, GraphTooLarge
 from dirax.engines.native.interpret import UnsupportedPrimitive
 from dirax.engines.native.newton_step import newton_correction
@@ -55,7 +56,7 @@ class Program:
             size = int.from_bytes(stored[:4], "little")
             self.operations, code = json.loads(stored[4 : 4 + size])["operations"], stored[4 + size :]
         else:
-            code = llvm.object_code(kernel_module(self._planned(), width, llvm.has_fma()))
+            code = llvm.object_code(kernel_module(self._planned(), width, llvm.has_fma()), thorough=width == 1)
             header = json.dumps({"operations": self.operations}).encode()
             llvm.write_cached(key, len(header).to_bytes(4, "little") + header + code)
         library = llvm.load(code, ("run",))
@@ -67,6 +68,8 @@ class Program:
             plan = self.bare
             try:
                 plan.corrections = [newton_correction(self.graph, e) for e in self.equations]
+                if self.compensated:
+                    plan.increments = [increments(self.graph, e) for e in self.equations]
             except GraphTooLarge as error:
                 raise too_large(error) from None
             self.plan, self.operations = plan, count_operations(plan)
@@ -127,12 +130,9 @@ def program(equation: Any, params: Any, batch_params: bool, compensated: bool = 
 
 def _digest(made: Program) -> str:
     g = made.graph
+    rows = lambda e: [(name, nodes.shape, nodes.ravel().tolist()) for name, nodes in sorted(e.rows.items())]
     digest = hashlib.sha256(source_digest().encode())
-    outputs = [
-        (e.state, e.unknowns, e.previous, e.guess, e.residual, e.advance, e.scale)
-        + tuple((name, nodes.shape, nodes.ravel().tolist()) for name, nodes in sorted(e.rows.items()))
-        for e in made.equations
-    ]
+    outputs = [(e.state, e.unknowns, e.previous, e.guess, e.residual, e.advance, e.scale, rows(e)) for e in made.equations]
     for part in (g.op, g.args, sorted(g.value.items()), outputs, made.stages, made.shared, made.compensated):
         digest.update(repr(part).encode() + b"\0")
     return digest.hexdigest()

@@ -1,12 +1,12 @@
 """The kernel: rows, steps, stages and Newton iterations of `width` trajectories side by side, as LLVM IR.
 
 Every quantity of a lane is a double; counters too. A lane's record is, for each quantity, `width` doubles:
-state · for each stage the unknowns of the step before, their first differences, their second · steps done · status ·
-updates of Newton's method · largest residual.
+state · for each stage the unknowns of the step before, their first differences, their second · what rounding took from the
+state (with compensated summation) · steps done · status · updates of Newton's method · largest residual.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from dirax.engines.native.dense import add_dense_solve
 from dirax.engines.native.emitter import Body, Emitter, Module
@@ -35,6 +35,7 @@ class Plan:
     corrections: list[Correction]
     stages: list[tuple[int, float]]
     compensated: bool = False
+    increments: list[list[int | None]] = field(default_factory=list)
 
     @property
     def state_size(self) -> int:
@@ -48,7 +49,8 @@ class Plan:
     @property
     def record(self) -> int:
         """Quantities of a lane."""
-        return self.state_size + 3 * len(self.stages) * self.history + 4
+        carried = self.state_size * (2 if self.compensated else 1)
+        return carried + 3 * len(self.stages) * self.history + 4
 
     @property
     def fields(self) -> list[tuple[str, list[int]]]:
@@ -133,7 +135,8 @@ class Kernel:
         b, e, plan, g = self.body, self.e, self.plan, self.g
         s, k, stages = plan.state_size, plan.history, len(plan.stages)
         self.state = self._variables(s)
-        self.kept = self._variables(s)
+        self.lost = self._variables(s if plan.compensated else 0)
+        self.kept = self._variables(s + len(self.lost))
         self.unknowns = b.alloca(e.real, max(1, stages * k))
         self.slopes = b.alloca(e.real, max(1, stages * k))
         self.bends = b.alloca(e.real, max(1, stages * k))
@@ -145,6 +148,7 @@ class Kernel:
             *self._slots(self.unknowns, stages * k),
             *self._slots(self.slopes, stages * k),
             *self._slots(self.bends, stages * k),
+            *self.lost,
             *(self.done, self.status, self.iterations, self.worst),
         ]
         self._stores(self._loads(record), memory)
@@ -165,6 +169,7 @@ class Kernel:
         for equation, correction in zip(self.plan.equations, self.plan.corrections, strict=True):
             out += [*equation.guess, *equation.residual, *equation.advance]
             out += [*correction.change, *correction.factors, correction.stable]
+        out += [node for nodes in self.plan.increments for node in nodes if node is not None]
         return out + [node for _, nodes in self.plan.fields for node in nodes]
 
     def _steps(self, memory: list[str], record: list[str]) -> None:
@@ -193,7 +198,7 @@ class Kernel:
     def _step(self, number: str, saves: str) -> None:
         b, e, plan = self.body, self.e, self.plan
         running = self._running()
-        self._stores(self._loads(self.state), self.kept)
+        self._stores(self._loads([*self.state, *self.lost]), self.kept)
         count = e.add(e.splat(b.put("sitofp i64 %offset to double")), b.load(e.real, self.done))
         time = e.add(e.splat("%t0"), e.mul(count, e.splat("%h")))
         if len(plan.stages) == 1:
@@ -265,11 +270,29 @@ class Kernel:
         residual = e.const(0.0)
         for node in equation.residual:
             residual = e.max(e.abs(after.value(node)), residual)
+        lost: list[str] = []
+        if plan.compensated:
+            new, lost = self._compensated(plan.increments[plan.equations.index(equation)], after, new)
         self._judge(active, converged, residual, solution, new)
-        good = self._running()
-        state = self._loads(self.state)
-        self._stores([e.select(good, a, c) for a, c in zip(new, state, strict=True)], self.state)
+        good, carried = self._running(), [*self.state, *self.lost]
+        state = self._loads(carried)
+        self._stores([e.select(good, a, c) for a, c in zip([*new, *lost], state, strict=True)], carried)
         self._stores(solution, self._slots(self.fresh, k, offset))
+
+    def _compensated(self, increments: list[int | None], after: Region, new: list[str]) -> tuple[list[str], list[str]]:
+        """The new state and what rounding took from it: what was taken before is given back to the increment (Kahan)."""
+        e, sums, errors = self.e, [], []
+        after.require([node for node in increments if node is not None])
+        for i, node in enumerate(increments):
+            old, lost = self._loads((self.state[i], self.lost[i]))
+            if node is None:
+                sums.append(new[i])
+                errors.append(e.const(0.0))
+                continue
+            s, error = e.two_sum(old, e.add(after.value(node), lost))
+            sums.append(s)
+            errors.append(error)
+        return sums, errors
 
     def _judge(self, active: str, converged: str, residual: str, solution: list[str], new: list[str]) -> None:
         """The status of lanes that were active, and the largest residual of those that are good."""
@@ -288,8 +311,9 @@ class Kernel:
         """Lanes whose every stage was good take the new state and unknowns; the others keep what they had."""
         b, e, plan = self.body, self.e, self.plan
         good = e.both(running, self._running())
-        kept, state = self._loads(self.kept), self._loads(self.state)
-        self._stores([e.select(good, a, c) for a, c in zip(state, kept, strict=True)], self.state)
+        carried = [*self.state, *self.lost]
+        kept, state = self._loads(self.kept), self._loads(carried)
+        self._stores([e.select(good, a, c) for a, c in zip(state, kept, strict=True)], carried)
         count = len(plan.stages) * plan.history
         move = lambda i: self._commit_unknown(good, i)
         if count <= 64:
