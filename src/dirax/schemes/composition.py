@@ -127,17 +127,22 @@ class SymmetricComposition(AbstractScheme):
     scheme: AbstractScheme
 
     def step_equation(self, system: Any, shape: Shape) -> StepSequence:
-        adjoint = _adjoint_of(self.scheme, system, shape, "SymmetricComposition takes a one-stage scheme.")
-        return StepSequence(((adjoint, 0.5), (make_step_equation(self.scheme, system, shape), 0.5)))
+        refusal = "SymmetricComposition takes a one-stage scheme."
+        adjoint = _adjoint_of(self.scheme, system, shape, refusal)
+        return StepSequence(((adjoint, 0.5), (_one_stage(self.scheme, system, shape, refusal), 0.5)))
 
 
-def _adjoint_of(scheme: AbstractScheme, system: Any, shape: Shape, several_stages: str) -> StepEquation:
+def _adjoint_of(scheme: AbstractScheme, system: Any, shape: Shape, refusal: str) -> StepEquation:
     if isinstance(system, LagrangeDirac) and isinstance(scheme, FAMILY):
-        return make_step_equation(adjoint_scheme(scheme), system, shape)
-    inner = make_step_equation(scheme, system, shape)
-    if not isinstance(inner, StepEquation):
-        raise TypeError(several_stages)
-    return adjoint_equation(inner)
+        return _one_stage(adjoint_scheme(scheme), system, shape, refusal)
+    return adjoint_equation(_one_stage(scheme, system, shape, refusal))
+
+
+def _one_stage(scheme: AbstractScheme, system: Any, shape: Shape, refusal: str) -> StepEquation:
+    equation = make_step_equation(scheme, system, shape)
+    if not isinstance(equation, StepEquation):
+        raise TypeError(refusal)
+    return equation
 
 
 FAMILY = (LagrangeDAlembert, PlusLagrangeDirac, MinusLagrangeDirac)

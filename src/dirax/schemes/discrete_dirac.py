@@ -93,9 +93,9 @@ def discretized_relation(
 
     def unpack(state, u, t, h, params):
         row = {"x": state, "multipliers": u[d:]} if m else {"x": state}
-        if ported:
+        if ported is not None:
             x, velocity, _ = step.move(state, u[:d], h)
-            row["power"] = power_of(system, x, velocity, t + h / 2, params)
+            row["power"] = power_of(ported, x, velocity, t + h / 2, params)
         return row
 
     def start(data, h, params):
@@ -103,11 +103,11 @@ def discretized_relation(
             raise ValueError("this scheme starts from x= (or q=, p= for a system on T*Q).")
         return data["x"], jnp.concatenate([step.initial(data["x"], data["velocity"]), jnp.zeros(m)])
 
-    ported = isinstance(system, PortHamiltonian)
+    ported = system if isinstance(system, PortHamiltonian) else None
     fields = {"x": Field((size,))}
     if m:
         fields["multipliers"] = Field((m,), "step", ("closed_port",), "multipliers at the base point")
-    if ported:
+    if ported is not None:
         fields["power"] = Field((3,), "step", ("power",), "power stored ⟨dH, ẋ⟩, supplied and dissipated at the base point")
     return StepEquation(
         start=start,

@@ -63,7 +63,7 @@ def _quadrature(kind: str, nodes: int) -> tuple[tuple[float, ...], tuple[float, 
 def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, points, weights) -> StepEquation:
     """State (x, supplied, dissipated, their lost digits, H(x_0)); unknowns (ẋ_d, u of the closed ports)."""
     n, m = shape.n, shape.m
-    ported = isinstance(system, PortHamiltonian)
+    ported = system if isinstance(system, PortHamiltonian) else None
 
     def account(state):
         """What H has to be at x by the books: H(x_0) + supplied − dissipated, in two parts."""
@@ -74,7 +74,7 @@ def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, poi
         """∇̄H, with ⟨∇̄H, Δx⟩ = H(x + Δx) − account, and x̄."""
         x, change = state[:n], h * u[:n]
         at = lambda s: system.differential(x + s * change, params)
-        gradient = sum(w * at(s) for s, w in zip(points, weights, strict=True))
+        gradient = jnp.stack([w * at(s) for s, w in zip(points, weights, strict=True)]).sum(axis=0)
         first, gained = account(state)
         stored = (system.hamiltonian(x + change, params) - first) - gained
         blurred = EPSILON * (jnp.abs(first) + jnp.abs(gained)) / NOISE
@@ -84,11 +84,11 @@ def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, poi
     def ports(u, state, t, h, params):
         """(ū, ȳ, dissipated power) of the step."""
         gradient, middle = discrete_gradient(u, state, h, params)
-        if not ported:
+        if ported is None:
             return jnp.zeros(0), jnp.zeros(0), jnp.zeros(())
-        driven = system.input(t + h / 2, middle, params)
-        outputs = system.open_matrix(middle, params).T @ gradient
-        loss = jnp.zeros(()) if system.R is None else gradient @ system.R(middle, params) @ gradient
+        driven = ported.input(t + h / 2, middle, params)
+        outputs = ported.open_matrix(middle, params).T @ gradient
+        loss = jnp.zeros(()) if ported.R is None else gradient @ ported.R(middle, params) @ gradient
         return driven, outputs, loss
 
     def residual(u, state, t, h, params):
