@@ -27,7 +27,7 @@ Settings = Annotated[
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
-SCHEME_HELP = "plus, minus, midpoint, trapezoidal, or a class: \"Composition(LagrangeDAlembert(), 'suzuki4')\""
+SCHEME_HELP = "plus, minus, midpoint, trapezoidal, method1, method2, or a class: \"Composition(LagrangeDAlembert(), 'suzuki4')\""
 
 
 @app.command("list")
@@ -123,12 +123,12 @@ def compare(
 @with_messages
 def reproduce(
     paper: Annotated[str, typer.Argument(help="the short name of a paper that `dirax list` shows, or all")] = "all",
-    out: Annotated[Path | None, typer.Option(help="a folder for the figures and the tables", show_default=False)] = None,
+    out: Annotated[Path, typer.Option(help="the folder for the figures and the tables")] = Path("out"),
     as_json: Json = False,
 ) -> None:
     """Reproduce a paper: print a table of its quantities, theirs against computed, and draw its figures again.
 
-    Figures are written only with --out. The exit status is 1 when a quantity differs from what it should be.
+    The exit status is 1 when a quantity differs from what it should be.
     """
     import json
 
@@ -144,8 +144,7 @@ def reproduce(
             marks, notes = result.notes()
             cells = [(r.quantity, r.paper, r.computed, r.verdict, mark) for r, mark in zip(result.rows, marks, strict=True)]
             show_table(f"[{result.paper}] {result.title}", (*HEADER, "note"), cells, f"{result}\n", notes)
-        if out is not None:
-            typer.echo(f"figures and tables are in {out}")
+        typer.echo(f"figures and tables are in {out}")
     if not all(result.ok for result in results):
         typer.echo("dirax: a quantity differs from what it should be, see DIFFERS in the table.", err=True)
         raise typer.Exit(1)

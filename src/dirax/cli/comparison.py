@@ -6,14 +6,7 @@ from typing import Any
 from dirax.cli.schemes import SHORT_NAMES, scheme_from_text
 from dirax.diagnostics.compare import Comparison, compare
 from dirax.gallery.example import Example
-from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.step import AbstractScheme
-
-CANDIDATES: dict[str, AbstractScheme] = {
-    **SHORT_NAMES,
-    "Method 1": DiscreteDirac(constraints="discretize"),
-    "Method 2": DiscreteDirac(constraints="resolve"),
-}
 
 
 def compare_schemes(example: Example, chosen: Sequence[str], options: dict[str, Any]) -> Comparison:
@@ -35,9 +28,9 @@ def compare_schemes(example: Example, chosen: Sequence[str], options: dict[str, 
 
 
 def suitable(example: Example, options: dict[str, Any]) -> dict[str, AbstractScheme]:
-    """The example's own scheme and the candidates that can take a step of it."""
+    """The short names that can take a step of the example, after its own scheme if that is another one."""
     schemes: dict[str, AbstractScheme] = {}
-    for name, scheme in CANDIDATES.items():
+    for name, scheme in SHORT_NAMES.items():
         try:
             example.simulate(scheme, **{**options, "steps": 1})
         except (TypeError, ValueError):

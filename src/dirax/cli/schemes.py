@@ -5,24 +5,33 @@ import difflib
 from typing import Any
 
 import dirax
-from dirax.geometry.maps import AbstractDiscretizationMap
+from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.step import AbstractScheme
 
-SHORT_NAMES = {
+SHORT_NAMES: dict[str, AbstractScheme] = {
     "plus": PlusLagrangeDirac(),
     "minus": MinusLagrangeDirac(),
     "midpoint": LagrangeDAlembert("midpoint", "midpoint"),
     "trapezoidal": LagrangeDAlembert("trapezoidal", "midpoint"),
+    "method1": DiscreteDirac(constraints="discretize"),
+    "method2": DiscreteDirac(constraints="resolve"),
 }
-CLASSES = {
+"""The general schemes, from the simplest on."""
+
+ROOMS = (
+    "dirax.schemes.",
+    "dirax.geometry.maps",
+    "dirax.geometry.manifolds",
+    "dirax.geometry.lie_groups",
+    "dirax.geometry.cotangent",
+)
+MAKERS = {
     name: thing
     for name in dirax.__all__
-    if isinstance(thing := getattr(dirax, name), type)
-    and issubclass(thing, AbstractScheme | AbstractDiscretizationMap)
-    and not name.startswith("Abstract")
+    if callable(thing := getattr(dirax, name)) and thing.__module__.startswith(ROOMS) and not name.startswith("Abstract")
 }
-"""The classes that may be written: schemes, and the discretization maps that some of them take."""
+"""What may be called: public schemes, and the maps and manifolds that some of them take."""
 
 
 def scheme_from_text(text: str) -> AbstractScheme:
@@ -46,23 +55,27 @@ def scheme_from_text(text: str) -> AbstractScheme:
 def _value(node: ast.expr, text: str) -> Any:
     if isinstance(node, ast.Name) and node.id in SHORT_NAMES:
         return SHORT_NAMES[node.id]
-    if isinstance(node, ast.Name) or (isinstance(node, ast.Call) and isinstance(node.func, ast.Name)):
-        name = node.id if isinstance(node, ast.Name) else node.func.id  # pyright: ignore[reportAttributeAccessIssue]
-        if name not in CLASSES:
-            near = difflib.get_close_matches(name, [*SHORT_NAMES, *CLASSES], n=1)
-            raise ValueError(f"no scheme {name!r}: {f'did you mean {near[0]}?' if near else _choices()}")
-        arguments = node.args if isinstance(node, ast.Call) else []
-        keywords = node.keywords if isinstance(node, ast.Call) else []
-        if any(keyword.arg is None for keyword in keywords):
+    if isinstance(node, ast.Name):
+        return _maker(node.id)()
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        if any(keyword.arg is None for keyword in node.keywords):
             raise ValueError(f"cannot read {text!r}: write every argument out, without **.")
-        named = {str(keyword.arg): _value(keyword.value, text) for keyword in keywords}
-        return CLASSES[name](*(_value(argument, text) for argument in arguments), **named)
+        maker = _maker(node.func.id)
+        named = {str(keyword.arg): _value(keyword.value, text) for keyword in node.keywords}
+        return maker(*(_value(argument, text) for argument in node.args), **named)
     try:
         return ast.literal_eval(node)
     except ValueError:
         raise ValueError(
-            f"cannot read {ast.unparse(node)!r} in the scheme {text!r}: arguments are numbers, strings, lists or classes."
+            f"cannot read {ast.unparse(node)!r} in a scheme: arguments are numbers, strings, lists, or schemes and maps of dirax."
         ) from None
+
+
+def _maker(name: str) -> Any:
+    if name in MAKERS:
+        return MAKERS[name]
+    near = difflib.get_close_matches(name, [*SHORT_NAMES, *MAKERS], n=1)
+    raise ValueError(f"no scheme {name!r}: {f'did you mean {near[0]!r}?' if near else _choices()}")
 
 
 def _choices() -> str:

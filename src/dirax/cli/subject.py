@@ -101,7 +101,8 @@ def changed(example: Example, settings: Sequence[str]) -> tuple[Example, dict[st
         elif entry and entry[1] in initial:
             initial[entry[1]][_position(example, entry[1], entry[2], initial)] = _number(key, value)
         elif isinstance(params, Mapping) and key in params:
-            params = {**params, key: value}
+            real = isinstance(params[key], float) and isinstance(value, int)  # --set k=1 for a parameter that is 4.0
+            params = {**params, key: float(value) if real else value}
         else:
             raise ValueError(_unknown(key, initial, params))
     return dataclasses.replace(example, initial=initial, params=params, **numbers), options
