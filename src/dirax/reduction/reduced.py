@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import is_traced
-from dirax.reduction.connection import LinearConnection
+from dirax.reduction.connection import AbstractConnection
+from dirax.reduction.symmetry import Translations, invariance
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
-
-INVARIANCE_TOLERANCE = 1e-9
 
 
 class ReducedLagrangeDirac(AbstractSystem):
@@ -23,28 +22,31 @@ class ReducedLagrangeDirac(AbstractSystem):
     """
 
     system: LagrangeDirac
-    connection: LinearConnection
+    connection: AbstractConnection
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
         n, m = self.system.sizes(data, params)
         self.connection.check(n)
-        if m:
-            raise ValueError("reduction of systems with constraints is not available: reduce the unconstrained system.")
         if not is_traced(data, params):
-            self._check_invariance(data, params)
-        return n, 0
+            self._refuse_asymmetry(data, params)
+        return n, m
 
-    def _check_invariance(self, data, params) -> None:
+    def _refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]
         v = data["v"] if "v" in data else jnp.ones_like(q)
-        energy, (force, _) = jax.value_and_grad(lambda q, v: self.system.lagrangian(q, v, params), argnums=(0, 1))(q, v)
-        defect = np.abs(np.asarray(force)[list(self.connection.fibre)])
-        scale = max(1.0, abs(float(energy)), float(np.max(np.abs(force))))
-        if np.max(defect) > INVARIANCE_TOLERANCE * scale:
-            worst = self.connection.fibre[int(np.argmax(defect))]
+        found = invariance(self.system, Translations(self.connection.fibre), q[None], v[None], params)
+        if not found.ok:
+            worst = self.connection.fibre[found.generator]
+            what = f"∂L/∂q[{worst}]" if found.of == "lagrangian" else "the motion of its one-forms out of their span"
             raise ValueError(
-                f"the Lagrangian is not invariant under translation of q[{worst}]: ∂L/∂q[{worst}] = {np.max(defect):.3g} at "
+                f"the {found.of} is not invariant under translation of q[{worst}]: {what} = {found.defect:.3g} at "
                 "the initial data; take that coordinate out of fibre."
+            )
+        inertia, nearby = group_inertia_ranks(self.system, self.connection, q, params)
+        if inertia < nearby:
+            raise ValueError(
+                f"the orbits of the group are not free at the initial point q = {np.asarray(q)}: the group inertia has rank "
+                f"{inertia} there and {nearby} nearby. Start elsewhere, or use coordinates that do not end there."
             )
 
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
@@ -56,7 +58,7 @@ class ReducedLagrangeDirac(AbstractSystem):
     def unreduced_row(self, row: dict[str, Array]) -> dict[str, Array]:
         """The row (q, p) on T*Q over a reduced row."""
         q = self.connection.join(row["x"], row["g"])
-        return {"q": q, "p": self.connection.untrivialize_covector(row["w"], row["mu"])}
+        return {"q": q, "p": self.connection.untrivialize_covector(row["x"], row["w"], row["mu"])}
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """The energy of the unreduced system, which the group coordinate does not change."""
@@ -66,7 +68,20 @@ class ReducedLagrangeDirac(AbstractSystem):
         return self.system.constraint_at(self.unreduced_row(row), params)
 
 
-def reduce(system: LagrangeDirac, connection: LinearConnection) -> ReducedLagrangeDirac:
+def group_inertia_ranks(system: LagrangeDirac, connection: AbstractConnection, q: Array, params: Any) -> tuple[int, int]:
+    """Ranks of ∂²L/∂ġ² at rest at q and at a point near it: a generator that vanishes at q has no inertia there only."""
+    fibre = list(connection.fibre)
+    whole = jax.jit(jax.hessian(lambda v, q: system.lagrangian(q, v, params)))
+    away = np.asarray(q) + 0.1 * np.random.default_rng(0).uniform(0.5, 1.0, q.shape)
+    here, nearby = (np.asarray(whole(jnp.zeros_like(q), jnp.asarray(point)))[np.ix_(fibre, fibre)] for point in (q, away))
+    if not (np.all(np.isfinite(here)) and np.all(np.isfinite(nearby))):
+        return len(fibre), len(fibre)
+    size = max(np.max(np.abs(nearby)), 1e-300)
+    ranks = [int(np.linalg.matrix_rank(block / size, tol=1e-13, hermitian=True)) for block in (here, nearby)]
+    return ranks[0], ranks[1]
+
+
+def reduce(system: LagrangeDirac, connection: AbstractConnection) -> ReducedLagrangeDirac:
     """The system on the quotient by the translations of `connection.fibre`; run it with the same q=, v= as `system`.
 
         reduced = dx.reduce(system, dx.LinearConnection(fibre=[0]))
@@ -76,6 +91,6 @@ def reduce(system: LagrangeDirac, connection: LinearConnection) -> ReducedLagran
     """
     if not isinstance(system, LagrangeDirac):
         raise TypeError(f"dx.reduce takes a dx.LagrangeDirac system, but a {type(system).__name__} was given.")
-    if not isinstance(connection, LinearConnection):
+    if not isinstance(connection, AbstractConnection):
         raise TypeError(f"connection must be a dx.LinearConnection(fibre=[…]), but {connection!r} was given.")
     return ReducedLagrangeDirac(system, connection)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.reduction.connection import LinearConnection
+from dirax.reduction.connection import AbstractConnection, LinearConnection
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_lagrangian
 from dirax.schemes.step import Field, Shape, StepEquation
@@ -13,11 +13,10 @@ from dirax.schemes.step import Field, Shape, StepEquation
 class QuotientState:
     """The layout (x, w, μ, g) of a state on the quotient, and how a run gets its first one."""
 
-    def __init__(self, connection: LinearConnection, n: int):
+    def __init__(self, connection: AbstractConnection, n: int):
         self.connection, self.n = connection, n
         self.k = len(connection.fibre)
         self.s = n - self.k
-        self.matrix = connection.matrix(n)
 
     def split(self, state: Float[Array, " state"]) -> tuple[Array, Array, Array, Array]:
         """x, w, μ, g."""
@@ -25,9 +24,21 @@ class QuotientState:
         return state[:s], state[s : 2 * s], state[2 * s : 2 * s + k], state[2 * s + k : 2 * s + 2 * k]
 
     def slot_derivatives(self, l, x, rate, vertical, h, params) -> tuple[Array, Array, Array]:
-        """(∂l/∂x0, ∂l/∂x1, ∂l/∂g1) from the derivatives in (x0, ẋ, γ)."""
+        """(−w_k, w_{k+1}, μ) from the derivatives of l in (x0, ẋ, γ): (∂l/∂x0, ∂l/∂x1, ∂l/∂g1) for linear h_d.
+
+        Otherwise the terms with h⁰_d of (4.6) do not cancel those with A(x) = D2 h⁰_d(x, x) of the trivialization.
+        """
         dx, drate, dvertical = jax.grad(l, argnums=(0, 1, 2))(x, rate, vertical, h, params)
-        return dx - drate / h, drate / h, dvertical / h
+        d0, d1, mu = dx - drate / h, drate / h, dvertical / h
+        if isinstance(self.connection, LinearConnection):
+            return d0, d1, mu
+        x1, matrix_at = x + h * rate, self.connection.matrix_at
+        lift0, lift1 = jax.jacfwd(self.connection.lift_of_shapes, argnums=(0, 1))(x, x1)
+        return d0 - mu @ (lift0 + matrix_at(x)), d1 + mu @ (matrix_at(x1) - lift1), mu
+
+    def group_rate(self, x, rate, vertical, h) -> Float[Array, " k"]:
+        """ġ = (g1 − g0)/h with ω_d = hγ."""
+        return group_rate(self.connection, x, rate, vertical, h)
 
     def start(self, l, data, h, params) -> tuple[Float[Array, " state"], Float[Array, " n"]]:
         """The first state and the first guess of (ẋ, γ)."""
@@ -35,12 +46,19 @@ class QuotientState:
         if "q0" in data:
             (x0, g0), (x1, g1) = connection.split(data["q0"]), connection.split(data["q1"])
             rate = (x1 - x0) / h
-            vertical = (g1 - g0) / h - self.matrix @ rate
+            vertical = (g1 - g0) / h - self.group_rate(x0, rate, jnp.zeros(self.k), h)
             d0, _, dg = self.slot_derivatives(l, x0, rate, vertical, h, params)
             return jnp.concatenate([x0, -d0, dg, g0]), jnp.concatenate([rate, vertical])
-        (x, g), (rate, group_rate) = connection.split(data["q"]), connection.split(data["v"])
+        (x, g), (rate, along) = connection.split(data["q"]), connection.split(data["v"])
         _, w, mu = connection.trivialize_covector(data["q"], data["p"])
-        return jnp.concatenate([x, w, mu, g]), jnp.concatenate([rate, group_rate - self.matrix @ rate])
+        return jnp.concatenate([x, w, mu, g]), jnp.concatenate([rate, along - connection.matrix_at(x) @ rate])
+
+
+def group_rate(connection: AbstractConnection, x, rate, vertical, h) -> Float[Array, " k"]:
+    """ġ = γ + h⁰_d(x, x + hẋ)/h."""
+    if isinstance(connection, LinearConnection):
+        return vertical + connection.matrix_at(x) @ rate
+    return vertical + connection.lift_of_shapes(x, x + h * rate) / h
 
 
 def quotient_fields(s: int, k: int) -> dict[str, Field]:
@@ -54,7 +72,7 @@ def quotient_fields(s: int, k: int) -> dict[str, Field]:
     }
 
 
-def reduced_discrete_lagrangian(system: ReducedLagrangeDirac, rule, sign: int, n: int):
+def reduced_discrete_lagrangian(system: ReducedLagrangeDirac, rule, sign: int):
     """l_{d±} as a function (x0, ẋ, γ, h, params), with x1 = x0 + h ẋ and hγ = ω_d the vertical part ([RL] (4.5), (4.7)).
 
     (+) starts at (x0, 0): l_{d+}(x0, x1, g1) = L_d((x0, 0), (x1, g1 + h⁰_d(x0, x1)));
@@ -63,9 +81,9 @@ def reduced_discrete_lagrangian(system: ReducedLagrangeDirac, rule, sign: int, n
     connection, ld = system.connection, discrete_lagrangian(system.system.lagrangian, rule)
 
     def reduced(x0, rate, vertical, h, params):
-        group_rate = vertical + connection.matrix(n) @ rate
-        group = jnp.zeros_like(vertical) if sign > 0 else -h * group_rate
-        return ld(connection.join(x0, group), connection.join(rate, group_rate), h, params)
+        along = group_rate(connection, x0, rate, vertical, h)
+        group = jnp.zeros_like(vertical) if sign > 0 else -h * along
+        return ld(connection.join(x0, group), connection.join(rate, along), h, params)
 
     return reduced
 
@@ -79,12 +97,12 @@ def lagrange_poincare_dirac(system: ReducedLagrangeDirac, shape: Shape, rule, si
     """
     quotient, n, m = QuotientState(system.connection, shape.n), shape.n, shape.m
     connection, k, s = system.connection, quotient.k, quotient.s
-    l = reduced_discrete_lagrangian(system, rule, sign, n)
+    l = reduced_discrete_lagrangian(system, rule, sign)
     wd = discrete_constraint(system.system.constraint_matrix, "right" if sign > 0 else "left", m)
     at = lambda x: connection.join(x, jnp.zeros(k))
 
     def constraint(x, rate, vertical, h, params):
-        return wd(at(x), connection.join(rate, vertical + quotient.matrix @ rate), h, params)
+        return wd(at(x), connection.join(rate, quotient.group_rate(x, rate, vertical, h)), h, params)
 
     def force(x, multipliers, params):
         """λ̂_d of Wᵀλ at (x, 0): its shape and its group part."""
@@ -105,7 +123,7 @@ def lagrange_poincare_dirac(system: ReducedLagrangeDirac, shape: Shape, rule, si
         rate, vertical = u[:s], u[s:n]
         _, d1, dg = quotient.slot_derivatives(l, x, rate, vertical, h, params)
         # without constraints the equation ∂l/∂g1 = μ_k is the law μ_{k+1} = μ_k
-        return jnp.concatenate([x + h * rate, d1, dg if m else mu, g + h * (vertical + quotient.matrix @ rate)])
+        return jnp.concatenate([x + h * rate, d1, dg if m else mu, g + h * quotient.group_rate(x, rate, vertical, h)])
 
     def unpack(state, u, t, h, params):
         x, w, mu, g = quotient.split(state)

@@ -38,6 +38,10 @@ class DiscreteRouth(AbstractScheme):
                 f"dx.DiscreteRouth steps a system made by dx.reduce, but a {type(system).__name__} was given: name its "
                 "symmetry, dx.reduce(system, dx.LinearConnection(fibre=[…]))."
             )
+        if shape.m:
+            raise ValueError(
+                f"dx.DiscreteRouth fixes μ, which the forces of the {shape.m} constraints move: use dx.PlusLagrangeDirac."
+            )
         return discrete_routh(system, shape, self.discrete_lagrangian)
 
 
@@ -45,7 +49,7 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
     """The StepEquation of the discrete Routh equations: state (x, w, μ, g, γ), unknowns ẋ (n − k,)."""
     quotient = QuotientState(system.connection, shape.n)
     k, s = quotient.k, quotient.s
-    l = reduced_discrete_lagrangian(system, rule, +1, shape.n)
+    l = reduced_discrete_lagrangian(system, rule, +1)
 
     def vertical(x, rate, mu, guess, h, params):
         """γ with ∂l/∂γ = h μ, for l of slots (x, ẋ, γ)."""
@@ -59,23 +63,19 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
             gamma = gamma + solve_small(inertia(gamma), h * mu - slope(gamma))
         return gamma
 
-    def derivatives(x, rate, gamma, h, params):
-        return jax.grad(l, argnums=(0, 1))(x, rate, gamma, h, params)
-
     def split(state):
         return quotient.split(state[: 2 * shape.n]), state[2 * shape.n :]
 
     def residual(u, state, t, h, params):
         (x, w, mu, _), guess = split(state)
         # the derivatives of the Routhian are those of l at fixed γ, since ∂l/∂γ = hμ
-        dx, drate = derivatives(x, u, vertical(x, u, mu, guess, h, params), h, params)
-        return w + dx - drate / h
+        return w + quotient.slot_derivatives(l, x, u, vertical(x, u, mu, guess, h, params), h, params)[0]
 
     def advance(u, state, t, h, params):
         (x, _, mu, g), guess = split(state)
         gamma = vertical(x, u, mu, guess, h, params)
-        _, drate = derivatives(x, u, gamma, h, params)
-        return jnp.concatenate([x + h * u, drate / h, mu, g + h * (gamma + quotient.matrix @ u), gamma])
+        _, d1, _ = quotient.slot_derivatives(l, x, u, gamma, h, params)
+        return jnp.concatenate([x + h * u, d1, mu, g + h * quotient.group_rate(x, u, gamma, h), gamma])
 
     def unpack(state, u, t, h, params):
         (x, w, mu, g), guess = split(state)
@@ -100,8 +100,8 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
 
 
 def solve_small(matrix: Float[Array, "k k"], right: Float[Array, " k"]) -> Float[Array, " k"]:
-    """matrix⁻¹ right; a division where there is one equation."""
-    return right / matrix[0] if right.shape[0] == 1 else jnp.linalg.solve(matrix, right)
+    """matrix⁻¹ right; for one equation by the reciprocal, whose derivatives need no other division."""
+    return right * (1.0 / matrix[0]) if right.shape[0] == 1 else jnp.linalg.solve(matrix, right)
 
 
 def _depends(function: Callable, argument: Float[Array, " k"]) -> bool:

@@ -1,0 +1,253 @@
+"""Abelian group actions, their generators, lifts and momentum maps, and the search for symmetries of a system ([RL] §2)."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dirax.functions import UserFunction
+from dirax.reduction.connection import check_fibre, fibre_indices
+
+TOLERANCE = 1e-9
+"""Largest defect, relative to the size of L and of its derivatives, of a symmetry."""
+
+
+class AbstractAction(eqx.Module):
+    """An abelian group R^k (or a torus, in angles) acting on Q ⊂ R^n: Φ_{g+h} = Φ_g ∘ Φ_h."""
+
+    @abstractmethod
+    def dimension(self) -> int:
+        """k."""
+
+    @abstractmethod
+    def check(self, q: Float[Array, " n"]) -> None:
+        """Raise `ValueError` where it does not act on points like q."""
+
+    @abstractmethod
+    def __call__(self, g: Float[Array, " k"], q: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Φ_g(q)."""
+
+    def generator(self, xi: Float[Array, " k"], q: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The infinitesimal generator ξ_Q(q) = d/dε Φ_{εξ}(q) at ε = 0."""
+        return jax.jvp(lambda g: self(g, q), (jnp.zeros_like(xi),), (xi,))[1]
+
+    def tangent_lift(self, g: Float[Array, " k"], q: Float[Array, " n"], v: Float[Array, " n"]) -> tuple[Array, Array]:
+        """TΦ_g(q, v)."""
+        return jax.jvp(lambda q: self(g, q), (q,), (v,))
+
+    def cotangent_lift(self, g: Float[Array, " k"], q: Float[Array, " n"], p: Float[Array, " n"]) -> tuple[Array, Array]:
+        """T*Φ_{−g}(q, p): the pairing with lifted velocities stays the same."""
+        derivative = jax.jacfwd(lambda q: self(g, q))(q)
+        return self(g, q), jnp.linalg.solve(derivative.T, p)
+
+    def momentum_map(self, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " k"]:
+        """J(q, p), with ⟨J, ξ⟩ = ⟨p, ξ_Q(q)⟩."""
+        return jax.vjp(lambda g: self(g, q), jnp.zeros(self.dimension()))[1](p)[0]
+
+
+class Translations(AbstractAction):
+    """Addition to the coordinates `fibre` of q: a vector subgroup, or a torus where they are angles."""
+
+    fibre: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, fibre: Sequence[int]):
+        self.fibre = fibre_indices(fibre)
+
+    def dimension(self) -> int:
+        """k."""
+        return len(self.fibre)
+
+    def check(self, q: Float[Array, " n"]) -> None:
+        """Raise `ValueError` for an index that q does not have."""
+        check_fibre(self.fibre, q.shape[-1])
+
+    def __call__(self, g: Float[Array, " k"], q: Float[Array, " n"]) -> Float[Array, " n"]:
+        """q with g added in the fibre."""
+        return jnp.asarray(q).at[np.array(self.fibre)].add(g)
+
+
+class GroupAction(AbstractAction):
+    """An action of R^k or a torus by a function `action(g, q) -> (n,)`, g of shape (k,).
+
+    That Φ_0 is the identity and Φ_{g+h} = Φ_g ∘ Φ_h is checked at random g as soon as a point is known; `ValueError`
+    tells the defect.
+
+        turn = dx.GroupAction(lambda g, q: jnp.array([[jnp.cos(g[0]), -jnp.sin(g[0])], [jnp.sin(g[0]), jnp.cos(g[0])]]) @ q, 1)
+    """
+
+    action: UserFunction
+    size: int = eqx.field(static=True)
+
+    def __init__(self, action: Callable, dimension: int):
+        self.action, self.size = UserFunction(action, "action", ("g", "q")), int(dimension)
+
+    def dimension(self) -> int:
+        """k."""
+        return self.size
+
+    def __call__(self, g: Float[Array, " k"], q: Float[Array, " n"]) -> Float[Array, " n"]:
+        """action(g, q)."""
+        return self.action(g, q, None)
+
+    def check(self, q: Float[Array, " n"]) -> None:
+        """Raise `ValueError` where the function is no action of an abelian group at q."""
+        random, act = np.random.default_rng(0), jax.jit(self.__call__)
+        shape = self.action.shape(jnp.zeros(self.size), q, None).shape
+        if shape != q.shape:
+            raise ValueError(f"action(g, q) must return a point like q, of shape {q.shape}, but it returned shape {shape}.")
+        g, h = random.normal(size=(2, self.size))
+        for law, found, wanted in (
+            ("action(0, q) = q", act(0 * g, q), q),
+            ("action(g + h, q) = action(g, action(h, q))", act(g + h, q), act(g, act(h, q))),
+        ):
+            defect = float(np.max(np.abs(np.asarray(found) - np.asarray(wanted))))
+            if not defect <= 1e-9 * (1 + float(np.max(np.abs(np.asarray(wanted))))):
+                raise ValueError(f"action is none of an abelian group: {law} fails by {defect:.3g} at q = {np.asarray(q)}.")
+
+
+@dataclass(frozen=True)
+class Invariance:
+    """Whether a system is invariant, and where it is least so; prints as a sentence.
+
+    `of`: "lagrangian", "discrete_lagrangian" or "one_forms", whichever is worst; `defect`: the derivative of it along the
+    orbit of `generator` (index of a basis vector ξ) at (q, v), or (q0, q1) for L_d; `relative`: the defect over the size
+    of the function and its derivatives there.
+    """
+
+    ok: bool
+    of: str
+    generator: int
+    defect: float
+    relative: float
+    q: np.ndarray
+    v: np.ndarray
+
+    def __bool__(self) -> bool:
+        return self.ok
+
+    def __str__(self) -> str:
+        if self.ok:
+            return f"invariant: the largest relative defect is {self.relative:.1e} (tolerance {TOLERANCE:.0e})."
+        second = "q1" if self.of == "discrete_lagrangian" else "v"
+        return (
+            f"not invariant: the {self.of} changes along generator {self.generator} at the rate {self.defect:.3g} "
+            f"at q = {self.q}, {second} = {self.v}."
+        )
+
+
+def check_invariance(
+    system: Any,
+    action: AbstractAction,
+    *,
+    q: Any,
+    v: Any = None,
+    params: Any = None,
+    discrete_lagrangian: Callable | None = None,
+    step: float | None = None,
+    samples: int = 32,
+    radius: float = 1.0,
+) -> Invariance:
+    """Whether L and the one-forms of a `dx.LagrangeDirac` system, or with `discrete_lagrangian(q0, q1, h[, params])` and
+    `step` that function, are invariant under an action; and where not.
+
+    Looked at: `q` (n,) with `v` (n,), and `samples` random points within `radius` of them; the group being connected, the
+    derivative along its generators decides. Points where L is not finite are left out. Raises `ValueError` for an action
+    that is none, or does not fit q.
+    """
+    q = np.asarray(q, dtype=float)
+    v = np.ones_like(q) if v is None else np.asarray(v, dtype=float)
+    action.check(jnp.asarray(q))
+    random = np.random.default_rng(0)
+    near = lambda point: np.concatenate([point[None], point + radius * random.uniform(-1, 1, (samples, q.size))])
+    if discrete_lagrangian is None:
+        return invariance(system, action, near(q), near(v), params)
+    if step is None:
+        raise ValueError("discrete_lagrangian needs step=, the h that it is called with.")
+    ld = UserFunction(discrete_lagrangian, "discrete_lagrangian", ("q0", "q1", "h"))
+    points = near(q)
+    moved = lambda g, q0, q1: ld(action(g, q0), action(g, q1), step, params)
+    return _worst(
+        {"discrete_lagrangian": (moved, lambda q0, q1: ld(q0, q1, step, params))}, action, points, points + step * near(v)
+    )
+
+
+def invariance(system: Any, action: AbstractAction, q: Any, v: Any, params: Any) -> Invariance:
+    """`check_invariance` at given points q and velocities v, (samples, n)."""
+
+    def moved_lagrangian(g, q, v):
+        return system.lagrangian(*action.tangent_lift(g, q, v), params)
+
+    def moved_one_forms(g, q, v):
+        """W(Φ_g q) TΦ_g, less its part in the span of W(q)."""
+        derivative = jax.jacfwd(lambda q: action(g, q))(q)
+        rows, fixed = system.constraint_matrix(action(g, q), params) @ derivative, system.constraint_matrix(q, params)
+        return rows - rows @ jnp.linalg.pinv(fixed) @ fixed
+
+    functions = {"lagrangian": (moved_lagrangian, lambda q, v: system.lagrangian(q, v, params))}
+    if getattr(system, "one_forms", None) is not None:
+        functions["one_forms"] = (moved_one_forms, lambda q, v: system.constraint_matrix(q, params))
+    return _worst(functions, action, q, v)
+
+
+def _worst(functions: dict[str, tuple[Callable, Callable]], action: AbstractAction, q: Any, v: Any) -> Invariance:
+    zero, worst = jnp.zeros(action.dimension()), None
+    for name, (moved, plain) in functions.items():
+
+        def at(q, v, moved=moved, plain=plain):
+            rate = jax.jacfwd(lambda g: moved(g, q, v))(zero)
+            slope = jax.jacfwd(plain)(q, v)
+            size = jnp.maximum(1.0, jnp.maximum(jnp.max(jnp.abs(plain(q, v))), jnp.max(jnp.abs(slope))))
+            return jnp.max(jnp.abs(jnp.reshape(rate, (-1, zero.shape[0]))), axis=0), size
+
+        defect, size = (np.asarray(a) for a in jax.jit(jax.vmap(at))(jnp.asarray(q), jnp.asarray(v)))
+        relative = np.where(np.isfinite(defect), defect / size[:, None], 0.0)
+        row, column = np.unravel_index(int(np.argmax(relative)), relative.shape)
+        largest = float(relative[row, column])
+        if worst is None or largest > worst.relative:
+            place = np.asarray(q)[row], np.asarray(v)[row]
+            worst = Invariance(largest <= TOLERANCE, name, int(column), float(defect[row, column]), largest, *place)
+    assert worst is not None
+    return worst
+
+
+def translation_symmetries(
+    system: Any, q: Any, v: Any = None, params: Any = None, samples: int = 64, radius: float = 1.0
+) -> np.ndarray:
+    """Directions d, the rows of a (k, n) matrix with orthonormal rows, in which L and the one-forms do not change.
+
+    Found from ∂L/∂q at `samples` random points within `radius` of (q, v); `cyclic_coordinates` are those along the axes.
+    """
+    q = np.asarray(q, dtype=float)
+    v = np.zeros_like(q) if v is None else np.asarray(v, dtype=float)
+    random = np.random.default_rng(0)
+    points = [jnp.asarray(c + radius * random.uniform(-1, 1, (samples, q.size))) for c in (q, v)]
+
+    def at(q, v):
+        slope = jax.grad(lambda q: system.lagrangian(q, v, params))(q)
+        rows = [slope[None]]
+        if getattr(system, "one_forms", None) is not None:
+            rows.append(jnp.reshape(jax.jacfwd(lambda q: system.constraint_matrix(q, params))(q), (-1, q.size)))
+        return jnp.concatenate(rows)
+
+    slopes = np.asarray(jax.jit(jax.vmap(at))(*points))
+    slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))].reshape(-1, q.size)
+    if not len(slopes):
+        raise ValueError("L is finite at none of the points around q: choose q inside its domain, or a smaller radius.")
+    _, values, directions = np.linalg.svd(slopes, full_matrices=True)
+    rank = int(np.sum(values > TOLERANCE * max(1.0, values[0])))
+    return directions[rank:]
+
+
+def cyclic_coordinates(system: Any, q: Any, v: Any = None, params: Any = None, **sampling: Any) -> tuple[int, ...]:
+    """The indices of the coordinates that neither L nor the one-forms depend on: what `fibre` may hold.
+
+    dx.reduce(system, dx.LinearConnection(dx.cyclic_coordinates(system, q, params=params)))
+    """
+    free = translation_symmetries(system, q, v, params, **sampling)
+    return tuple(int(i) for i in np.flatnonzero(np.sum(free**2, axis=0) > 1 - 1e-9))
