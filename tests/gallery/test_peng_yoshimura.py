@@ -38,6 +38,14 @@ def test_positions_at_50(rows, sign, name):
     assert row.numbers["paper"] == pytest.approx(END[sign][name], abs=1e-6)
 
 
+@pytest.mark.parametrize("sign", END)
+def test_every_step_lies_in_the_discrete_dirac_structure_and_keeps_the_constraint(rows, sign):
+    for quantity in ("discrete Dirac structure", "rolling constraint", "momentum p_φ"):
+        assert rows[f"disk ({sign}): {quantity}"].verdict == AGREES
+    assert rows[f"disk ({sign}): discrete Dirac structure"].numbers["defect"] < 1e-14
+    assert rows[f"disk ({sign}): rolling constraint"].numbers["largest"] < 1e-14
+
+
 def test_continuous_solution_at_50(rows):
     numbers = rows["disk, continuous: θ, x, y at t = 50"].numbers
     assert [numbers[k] for k in "θxy"] == pytest.approx([497.53121842, -1.61792584, -2.1385646], abs=1e-7)
@@ -73,7 +81,7 @@ def test_heisenberg_numbers(rows):
 
 
 def test_nothing_differs_and_the_table_is_complete(paper):
-    assert paper.ok and len(paper.rows) == 29
+    assert paper.ok and len(paper.rows) == 31
     text, described = str(paper), paper.to_dict()
     assert all(row.quantity in text and (not row.note or row.note[:20] in text) for row in paper.rows)
     assert max(map(len, text.splitlines())) < 150

@@ -108,7 +108,17 @@ def disk_rows(sign: str, sol: Solution) -> list[Row]:
         for symbol, i in (("θ", 2), ("x", 0), ("y", 1))
     ]
     report = verify(sol, symmetries=DISK.symmetries)
-    constraint, momentum = report["constraint"], report["momentum map p_φ"]
+    keys = (f"{name}-discrete Dirac structure", "constraint", "momentum map p_φ")
+    structure, constraint, momentum = (report[key] for key in keys)
+    rows.append(
+        Row(
+            f"disk {name}: discrete Dirac structure",
+            "contains every step (Prop 5.17)",
+            f"relative defect ≤ {structure.value:.1e}",
+            AGREES if structure.verdict == "ok" else DIFFERS,
+            numbers={"defect": structure.value, "tolerance": structure.tolerance},
+        )
+    )
     largest = np.max(np.abs(sol.constraint_residual()[1:]))
     point = "q_{k+1}" if sign == "+" else "q_k"
     rows.append(
