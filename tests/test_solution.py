@@ -148,7 +148,7 @@ def test_systems_schemes_and_equations_in_a_terminal():
         "saves q[3], p[3], multipliers[1] per step, constraint[1] per step)"
     )
     sequence = dx.make_step_equation(dx.SymmetricComposition(dx.PlusLagrangeDirac()), SKATE, shape)
-    assert repr(sequence).startswith("StepSequence(2 stages of h·(0.5, 0.5); first StepEquation(solves 10 unknowns")
+    assert repr(sequence).startswith("StepSequence(2 stages of h·(0.5, 0.5); first StepEquation(solves ")
 
 
 def test_everything_in_a_notebook(skate):

@@ -13,6 +13,7 @@ import xarray as xr
 
 import dirax as dx
 from dirax import storage
+from dirax.records import decode_scheme, encode_scheme
 
 ENDINGS = (".zarr", ".nc")
 
@@ -124,6 +125,31 @@ def test_dataset_names_dimensions_units_and_what_was_run(batch):
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
+def test_names_that_clash(ending, tmp_path, two_points):
+    """A field named like its own dimension or like time, two fields with dimensions of one name and different sizes."""
+    info = {
+        "work": dx.Field((2,), dims=("work",)),
+        "time": dx.Field((), dims=()),
+        "constraint": dx.Field((3,), "step", ("constraint",)),
+        "multipliers": dx.Field((1,), "step", ("constraint",)),
+        "matrix": dx.Field((2, 2), dims=("coordinate", "coordinate")),
+    }
+    fields = {name: np.random.default_rng(0).normal(size=(5 - (f.place == "step"), *f.shape)) for name, f in info.items()}
+    sol = dx.Solution(t=two_points.t, fields=fields, field_info=info, step=0.01, save_every=1, stats={})
+    data = sol.to_xarray()
+    assert data.work.dims == ("time", "work_axis_0")
+    assert data.matrix.dims == ("time", "coordinate", "matrix_axis_1")
+    assert data.constraint_residual.dims == ("interval", "constraint")
+    assert data.multipliers.dims == ("interval", "multipliers_axis_0")
+    np.testing.assert_array_equal(data.time, two_points.t)
+    np.testing.assert_array_equal(data.time_field, fields["time"])
+    loaded = dx.load(sol.save(tmp_path / f"run{ending}"))
+    for name in fields:
+        assert bits(loaded.fields[name]) == bits(fields[name])
+        assert loaded.field_info[name] == info[name]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
 def test_files_open_in_xarray_with_units(ending, tmp_path, two_points):
     path = two_points.save(tmp_path / f"run{ending}", units={"q": "m"}, coordinates="xyφ")
     options = {"engine": "zarr", "consolidated": False} if ending == ".zarr" else {"engine": "h5netcdf"}
@@ -170,6 +196,21 @@ def test_nested_schemes_and_parameter_trees_come_back(tmp_path):
     path = sol.save(tmp_path / "code.zarr")
     assert dx.load(path).params is None
     assert "lambda" in xr.open_zarr(path, consolidated=False).attrs["params_not_stored"]
+
+
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        dx.LagrangeDAlembert("trapezoidal", "left", "outgoing"),
+        dx.DiscreteDirac(dx.Theta(0.25)),
+        dx.DiscreteDirac(dx.RiemannianExp(dx.Product(dx.Sphere(3), dx.Euclidean(2))), "resolve"),
+        dx.Composition(dx.SymmetricComposition(dx.PlusLagrangeDirac("right")), (0.25, 0.5, 0.25)),
+        dx.Adjoint(dx.MinusLagrangeDirac()),
+    ],
+    ids=lambda scheme: type(scheme).__name__,
+)
+def test_schemes_of_dirax_survive_as_plain_data(scheme):
+    assert decode_scheme(json.loads(json.dumps(encode_scheme(scheme)))) == scheme
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

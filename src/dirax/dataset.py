@@ -49,7 +49,7 @@ def to_dataset(sol: Solution, units: Mapping[str, Any] | None = None, coordinate
     layout = _layout(sol)
     units = _checked_units(sol, units)
     lead = () if sol.batch is None else ("trajectory",)
-    sizes: dict[str, int] = {}
+    sizes = dict.fromkeys((entry["variable"] for entry in layout), -1)  # no dimension may have the name of a variable
     variables: dict[str, Any] = {}
     for entry in layout:
         rows = "time" if entry["place"] == "node" else "interval"
@@ -170,10 +170,10 @@ def _derived(sol: Solution, variables) -> dict[str, np.ndarray]:
 
 def _dimensions(name: str, dims: Sequence[str], shape: Sequence[int], sizes: dict[str, int]) -> list[str]:
     """The names of a field's axes; a name of its own for an axis that would contradict the size of an earlier one."""
-    named = list(dims) if len(dims) == len(shape) else [f"{name}_{i}" for i in range(len(shape))]
+    named = list(dims) if len(dims) == len(shape) else [f"{name}_axis_{i}" for i in range(len(shape))]
     for i, size in enumerate(shape):
         if sizes.get(named[i], size) != size or named[i] in named[:i]:
-            named[i] = f"{name}_{named[i]}_{i}"
+            named[i] = f"{name}_axis_{i}"
         sizes[named[i]] = int(size)
     return named
 

@@ -7,10 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.functions import UserFunction
+from dirax.geometry.manifolds import AbstractManifold
+from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.schemes.step import AbstractScheme
 
 DTYPES = ("float64", "float32", "int64", "int32", "uint64", "uint32", "bool", "complex128")
+RECORDS = (AbstractScheme, AbstractDiscretizationMap, AbstractManifold)
+"""What a scheme and its settings may be made of, besides plain data."""
+
 PLAIN = (str, bool, int, float, type(None))
 
 
@@ -51,18 +55,16 @@ def decode_params(record: Any) -> Any:
 
 
 def encode_scheme(scheme: Any) -> Any:
-    """A scheme of dirax as its class name and settings, what has no plain form (a user's function, a map) as text."""
-    if not isinstance(scheme, AbstractScheme):
-        return None
-    settings = {field.name: _encode_setting(getattr(scheme, field.name)) for field in dataclasses.fields(scheme)}
-    return {"class": type(scheme).__name__, "module": type(scheme).__module__, "settings": settings}
+    """A scheme as its class and settings; what has no plain form there, such as a user's function, as text."""
+    return _encode_setting(scheme) if isinstance(scheme, AbstractScheme) else None
 
 
 def _encode_setting(value: Any) -> Any:
-    if isinstance(value, AbstractScheme):
-        return {"scheme": encode_scheme(value)}
-    if isinstance(value, UserFunction):
-        return {"text": value.signature}
+    if isinstance(value, RECORDS):
+        settings = {field.name: _encode_setting(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {"class": type(value).__name__, "module": type(value).__module__, "settings": settings}
+    if type(value) is tuple:
+        return {"settings": [_encode_setting(v) for v in value]}
     try:
         return encode_params(value)
     except NotPlain as text:
@@ -70,20 +72,50 @@ def _encode_setting(value: Any) -> Any:
 
 
 def decode_scheme(record: Any) -> AbstractScheme | None:
-    """The scheme, if it is one of dirax whose settings are plain data; None otherwise."""
-    known = {cls.__name__: cls for cls in AbstractScheme.__subclasses__() if cls.__module__.startswith("dirax.schemes.")}
+    """The scheme, if it and all its settings are of dirax or plain data; None otherwise."""
+    if record is None:
+        return None
+    try:
+        scheme = _decode_setting(record, _classes(RECORDS))
+    except NotPlain:
+        return None
+    if not isinstance(scheme, AbstractScheme):
+        raise ValueError("its scheme has an unknown form")
+    return scheme
+
+
+def _decode_setting(record: Any, known: dict[tuple[str, str], type]) -> Any:
     match record:
-        case {"class": str(name), "module": str(module), "settings": dict(settings)} if name in known:
-            if known[name].__module__ != module or any("text" in setting for setting in settings.values()):
-                return None
-            arguments = {k: _decode_setting(v) for k, v in settings.items()}
-            nested = any("scheme" in setting and arguments[k] is None for k, setting in settings.items())
-            return None if nested else known[name](**arguments)
-    return None
+        case {"class": str(name), "module": str(module), "settings": dict(settings)}:
+            if (module, name) not in known:
+                raise NotPlain(f"{module}.{name}")
+            return _record(known[module, name], {k: _decode_setting(v, known) for k, v in settings.items()})
+        case {"settings": list(values)}:
+            return tuple(_decode_setting(v, known) for v in values)
+        case {"text": str(text)}:
+            raise NotPlain(text)
+    return decode_params(record)
 
 
-def _decode_setting(record: Any) -> Any:
-    return decode_scheme(record["scheme"]) if "scheme" in record else decode_params(record)
+def _record(cls: type, settings: dict[str, Any]) -> Any:
+    """The frozen record with these fields; no constructor is called."""
+    if settings.keys() != {field.name for field in dataclasses.fields(cls)}:
+        raise ValueError(f"{cls.__name__} has other settings: the file is of another version of dirax")
+    made = object.__new__(cls)
+    for name, value in settings.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+def _classes(bases: tuple[type, ...]) -> dict[tuple[str, str], type]:
+    """The classes of dirax that are kinds of `bases`, by module and name."""
+    found = {}
+    for base in bases:
+        for cls in base.__subclasses__():
+            found |= _classes((cls,))
+            if cls.__module__.startswith("dirax."):
+                found[cls.__module__, cls.__name__] = cls
+    return found
 
 
 def plain(value: Any) -> Any:
