@@ -1,5 +1,7 @@
 """[RL] reproduced: its printed numbers, its Lagrangian from positions in space, its helix from an ODE solver."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from dirax.gallery import charged_particle, double_spherical_pendulum, rodriguez
 from dirax.gallery.reproduction import AGREES, DIFFERS, NEW, WRONG
 from dirax.gallery.rodriguez_leok_figures import second_mass
 
-PARTICLE, PENDULUM = charged_particle.EXAMPLE, double_spherical_pendulum.EXAMPLE
+PARTICLE: Any = charged_particle.EXAMPLE
+PENDULUM: Any = double_spherical_pendulum.EXAMPLE
 
 
 @pytest.fixture(scope="module")
