@@ -63,12 +63,15 @@ CASES = {
     "remainders": (lambda x: jnp.mod(x, 0.7) + jnp.fmod(x, 0.3) + jnp.remainder(5 * x, 2.0), V),
     "extremes": (lambda x, y: jnp.maximum(x, y) - jnp.minimum(x, 0.3) + jnp.clip(y, -0.5, 0.5), V, V),
     "where": (lambda x, y: jnp.where((x > y) & ~(x < 0) | (y == x), x, jnp.where(x != 0, 2 * y, 0.0)), V, V),
-    "booleans as numbers": (lambda x: jnp.sum((x > 0).astype(float)) + (x > 1) * x + jnp.isfinite(x) + jnp.any(x > 1), V),
+    "booleans as numbers": (
+        lambda x: jnp.sum((x > 0).astype(float)) + jnp.isfinite(x).astype(float) + jnp.any(x > 1).astype(float) * x,
+        V,
+    ),
     "products": (lambda a, x: a @ a.T @ x + jnp.einsum("ij,ik,k->j", a, a, x) + jnp.outer(x, x) @ x, M, V),
     "batched product": (lambda a: jnp.einsum("bij,bjk->bik", jnp.stack([a, a.T]), jnp.stack([a, a + 1])), M),
     "reductions": (lambda a: a.sum(0) + a.max(1) + a.min() + jnp.prod(a, axis=0) + jnp.linalg.norm(a), M),
     "cumulative": (lambda a: jnp.cumsum(a, 0) + jnp.cumprod(a, 1) + jax.lax.cummax(a, 0, reverse=True), M),
-    "positions": (lambda a: a[0, jnp.argmax(a[1])] + jnp.argmin(a, axis=0) + a[jnp.argmin(a[:, 0])], M),
+    "positions": (lambda a: a[0, jnp.argmax(a[1])] + jnp.argmin(a, axis=0).astype(float) + a[jnp.argmin(a[:, 0])], M),
     "indexing": (lambda a: a[1:, ::2] @ a[::-1, 2][:2] + a[jnp.array([0, 2]), jnp.array([1, 1])].sum() + a[-1, -2], M),
     "shapes": (lambda a: jnp.concatenate([a.ravel(), jnp.pad(a, 1).T[1], jnp.tile(a[0], 2), jnp.roll(a[1], 1)]), M),
     "stack and split": (lambda a: jnp.stack([*jnp.split(a, 3)], axis=-1).squeeze() + jnp.repeat(a[:, :1], 3, axis=1), M),
@@ -195,7 +198,7 @@ def random_expression(rng) -> list[tuple[str, tuple[int, ...]]]:
         elif kind < 0.2 and booleans:
             operations.append(("select", (recent(booleans), recent(reals), recent(reals))))
             reals.append(number)
-        elif kind < 0.5:
+        elif kind < 0.35:
             operations.append((str(rng.choice(UNARY)), (recent(reals),)))
             reals.append(number)
         else:

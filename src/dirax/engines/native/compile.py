@@ -12,8 +12,8 @@ from typing import Any
 import llvmlite
 import llvmlite.binding as llvm
 
-LARGE = 20_000
-"""Modules with more lines than this are compiled with the least effort."""
+SMALL, LARGE = 6_000, 20_000
+"""Lines of modules up to which more effort is worth while, and from which on as little as possible is spent."""
 
 _numbers = itertools.count()
 
@@ -62,8 +62,8 @@ def object_code(text: str, target: tuple[str, str, str] | None = None, assembly:
         llvm.initialize_all_asmprinters()
     triple, cpu, flags = target
     module = llvm.parse_assembly(f'target triple = "{triple}"\n' + text)
-    large = text.count("\n") > LARGE
-    thorough = thorough and not large
+    lines = text.count("\n")
+    large, thorough = lines > LARGE, thorough and lines <= SMALL
     machine = llvm.Target.from_triple(triple).create_target_machine(
         cpu=cpu, features=flags, opt=3 if thorough else 1 if large else 2, reloc="pic", codemodel="small"
     )

@@ -44,11 +44,11 @@ def branches(interpreter: Interpreter, equation: Any, which, *operands):
         return interpreter.run(choices[number], *operands)
     results = [interpreter.run(choice, *operands) for choice in choices]
     boolean = g.is_boolean(index)
-    out = results[-1]
+    out: list[Any] = results[-1]
     for k in reversed(range(len(results) - 1)):
         test = g.make("not", index) if boolean else g.make("le", index, g.constant(float(k)))
         out = [
-            _lost(a, b) or elementwise(lambda x, y, test=test: g.select(test, x, y), a, b)
+            _lost(a, b) or elementwise(lambda x, y, test=test: g.select(test, x, y), *map(np.asarray, (a, b)))
             for a, b in zip(results[k], out, strict=True)
         ]
     return out

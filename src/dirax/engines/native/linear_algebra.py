@@ -44,7 +44,7 @@ def solve(g: Graph, matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
     return solve_triangular(g, rows[:, :n], rows[:, n:], lower=False, unit=False)
 
 
-def over_batches(function, *arrays):
+def over_batches(function, *arrays) -> Any:
     """`function` on the last two axes, for every index of those before."""
     lead = arrays[0].shape[:-2]
     if not lead:
@@ -119,7 +119,7 @@ def triangular_solve(interpreter: Interpreter, equation: Any, a, b):
 
 
 @rule("lu")
-def lu(interpreter: Interpreter, equation: Any, a):
+def lu(interpreter: Interpreter, equation: Any, a) -> tuple[Any, ...]:
     g = interpreter.graph
     if a.shape[-1] != a.shape[-2]:
         raise Unsupported("factors a matrix that is not square")

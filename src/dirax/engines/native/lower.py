@@ -73,7 +73,7 @@ class Region:
         """Emit what is still missing of the outputs."""
         outputs = list(outputs)
         missing = self._missing(outputs)
-        g, uses = self.graph, Counter(outputs)
+        g, uses, members = self.graph, Counter(outputs), set(missing)
         for node in missing:
             uses.update(g.args[node])
         single = lambda node, op: g.op[node] == op and uses[node] == 1 and self.known(node) is None
@@ -81,7 +81,7 @@ class Region:
         for node in missing:
             if g.op[node] == "mul":
                 for k, a in enumerate(g.args[node]):
-                    if single(a, "recip") and a in missing:
+                    if single(a, "recip") and a in members:
                         divisions[node] = (g.args[node][1 - k], g.args[a][0])
                         fused.add(a)
                         break
@@ -89,7 +89,7 @@ class Region:
         for node in missing:
             if g.op[node] in ("add", "sub"):
                 for k, a in enumerate(g.args[node]):
-                    if single(a, "mul") and a in missing and a not in divisions:
+                    if single(a, "mul") and a in members and a not in divisions:
                         products[node] = k
                         fused.add(a)
                         break
