@@ -40,8 +40,8 @@ def with_messages(command: Callable) -> Callable:
 
 
 @contextmanager
-def progress_bar(task: str) -> Iterator[Callable[[float, str], None]]:
-    """A bar on standard error, while it is a terminal: a function of (fraction done, text); it moves by itself until then."""
+def progress_bar(task: str) -> Iterator[Callable[[float | None, str], None]]:
+    """A bar on standard error, where that is a terminal: a function of (fraction done, or None if unknown; text)."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -50,8 +50,8 @@ def progress_bar(task: str) -> Iterator[Callable[[float, str], None]]:
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         number = bar.add_task(task, total=None)
 
-        def tell(fraction: float, text: str = task) -> None:
-            bar.update(number, total=1.0, completed=fraction, description=text)
+        def tell(fraction: float | None, text: str) -> None:
+            bar.update(number, total=None if fraction is None else 1.0, completed=fraction or 0.0, description=text)
 
         yield tell
 

@@ -25,7 +25,7 @@ def run_and_verify(
         tell(done / total, f"{example.title}: {done} of {total} steps")
 
     sol = example.simulate(scheme, progress=steps_done, **options)
-    tell(1.0, "verifying")
+    tell(None, "verifying")
     report = verify(sol, symmetries=example.symmetries or None)
     if out is not None:
         sol.save(out, overwrite=overwrite)
