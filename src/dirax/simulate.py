@@ -99,13 +99,14 @@ def simulate(
 
 
 def _solution(system, scheme, problem: Problem, outcome: Outcome, start: Start, data, traced: bool) -> Solution:
-    p, first = problem, problem.first_step
+    p = problem
     info, numbers = p.equation.stages[0][0].fields, saved_steps(p)
     fields: dict[str, Any] = outcome.fields
     closing = outcome.closing
     if traced:
         ok, message = outcome.completed == p.steps, ""
-        fields = {k: _blanked(a, info[k], closing[k], numbers, outcome.completed, jnp.where) for k, a in fields.items()}
+        good = outcome.completed.astype(float)
+        fields = {k: _blanked(a, info[k], closing[k], numbers, good, jnp.where) for k, a in fields.items()}
         ok = ok if p.batch is not None else ok[0]
     else:
         good = np.asarray(outcome.completed)
@@ -122,16 +123,15 @@ def _solution(system, scheme, problem: Problem, outcome: Outcome, start: Start, 
         elif ended:
             for k, a in fields.items():
                 a[ended] = _blanked(a[ended], info[k], closing[k][ended], numbers, good[ended], np.where)
-    numbers = numbers + first
     if start.row0 is not None:  # a two-point start: row 0 is given, not computed
         join = jnp.concatenate if traced else np.concatenate
         for k in list(fields):  # one after the other, so that only one array is in memory twice
             fields[k] = join([start.row0[k][:, None], fields.pop(k)], axis=1)
-        numbers = np.concatenate([[0], numbers])
+        numbers = np.concatenate([[-1.0], numbers])
     if p.batch is None:
         fields = {k: a[0] for k, a in fields.items()}
     return Solution(
-        t=p.t0 + numbers.astype(float) * p.h,
+        t=_times(p, numbers, traced),
         fields={k: fields[k] for k in info},
         field_info=info,
         step=p.h,
@@ -146,6 +146,16 @@ def _solution(system, scheme, problem: Problem, outcome: Outcome, start: Start, 
         batch_params=p.batch_params,
         initial=data,
     )
+
+
+def _times(p: Problem, numbers, traced: bool):
+    """The times of the steps of the given numbers, in the same array where nothing that is traced can hold it."""
+    if traced:
+        return p.t0 + (numbers + p.first_step) * p.h
+    numbers += p.first_step
+    numbers *= p.h
+    numbers += p.t0
+    return numbers
 
 
 def _truncated(fields, closing, info, numbers, completed: int):

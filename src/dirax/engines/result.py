@@ -68,6 +68,8 @@ Progress = Callable[[int, int], None]
 
 
 def saved_steps(problem: Problem) -> np.ndarray:
-    """The step number of each saved row, counted from the problem's first state: 0, s, 2s, …, steps."""
-    numbers = np.arange(problem.rows) * problem.save_every
-    return np.minimum(numbers, problem.steps)
+    """The step number of each saved row, counted from the problem's first state: 0, s, 2s, …, steps, as exact floats."""
+    numbers = np.arange(problem.rows, dtype=float)  # in place from here on: a long run has no memory to waste
+    numbers *= problem.save_every
+    numbers[-1] = problem.steps
+    return numbers
