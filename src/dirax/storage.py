@@ -52,9 +52,7 @@ def save(
         if not overwrite:
             raise FileExistsError(f"{path} exists: pass overwrite=True to replace it, or choose another path.")
         if not (_is_store(path) if engine == "zarr" else path.is_file()):
-            raise FileExistsError(
-                f"{path} exists and is no {path.suffix} file, so it is not replaced: choose another path."
-            )
+            raise FileExistsError(f"{path} exists and is no {path.suffix} file, so it is not replaced: choose another path.")
     dataset = _to_file_form(to_dataset(sol, units, coordinates))
     beside = path.parent / f".{path.stem}-{uuid.uuid4().hex}{path.suffix}"
     try:

@@ -227,7 +227,7 @@ def with_numpy(expression, points: np.ndarray, rng, noise: float):
         if result.dtype != np.bool_:
             result = result * (1 + noise * rng.uniform(-1, 1, result.shape))
             if noise:
-                result = np.where(result == 0, rng.choice([-0.0, 0.0], result.shape), result)
+                result = np.where(result == 0, np.copysign(0.0, rng.random(result.shape) - 0.5), result)
             fine &= np.isfinite(result) & ((result == 0) | ((abs(result) > 1e-280) & (abs(result) < 1e280)))
         values.append(result)
     return values[-1].astype(float), fine
@@ -237,7 +237,7 @@ def disagreements(expression, points, got, rng) -> np.ndarray:
     """Points at which `got` is further from NumPy than rounding explains, measured by rounding at random many times."""
     exact, fine = with_numpy(expression, points, rng, 0.0)
     for samples in (NOISY, 30 * NOISY):
-        noisy = np.stack([with_numpy(expression, points, rng, 4e-16)[0] for _ in range(samples)])
+        noisy = with_numpy(expression, np.tile(points, samples), rng, 4e-16)[0].reshape(samples, -1)
         spread = np.max(np.abs(noisy - exact), axis=0)  # NaN where rounding decides whether there is a value at all
         bad = fine & np.isfinite(spread) & ~(np.abs(got - exact) <= 30 * spread + 1e-14 * np.abs(exact) + 1e-290)
         if not np.any(bad):
