@@ -48,7 +48,7 @@ soak: $(READY)  ## The long tests that `make test` leaves out
 	$(RUN) pytest -m soak
 
 bench: $(READY)  ## Measure speed
-	$(BIN)/dirax bench
+	$(RUN) benchmarks
 
 lock:  ## Write requirements.lock anew from pyproject.toml (UPGRADE=--upgrade takes the newest versions)
 	$(PYTHON) -m venv --clear $(VENV)-lock

@@ -29,13 +29,15 @@ from dirax.geometry.maps import (
 )
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
 from dirax.reconstruction import reconstruct
-from dirax.reduction.connection import LinearConnection
+from dirax.reduction.connection import DiscreteConnection, LinearConnection
 from dirax.reduction.reduced import ReducedLagrangeDirac, reduce
+from dirax.reduction.symmetry import GroupAction, Translations, check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.schemes.charted import InCharts
 from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.discrete_gradient import DiscreteGradient
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
+from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
 from dirax.simulate import simulate
 from dirax.solution import Solution
@@ -67,10 +69,13 @@ __all__ = [
     "CotangentBundle",
     "DiracStructure",
     "DiracSystem",
+    "DiscreteConnection",
     "DiscreteDirac",
     "DiscreteGradient",
+    "DiscreteRouth",
     "Euclidean",
     "Field",
+    "GroupAction",
     "ImplicitSystem",
     "InCharts",
     "LagrangeDAlembert",
@@ -101,15 +106,18 @@ __all__ = [
     "SymmetricComposition",
     "Theta",
     "Torus",
+    "Translations",
     "canonical_two_form",
     "chart_at",
     "check_chart",
     "check_discretization_map",
+    "check_invariance",
     "compare",
     "configure",
     "constraint_algorithm",
     "convergence",
     "cotangent_lift",
+    "cyclic_coordinates",
     "induced_dirac",
     "interconnect",
     "load",
@@ -118,5 +126,6 @@ __all__ = [
     "reduce",
     "simulate",
     "symplecticity_defect",
+    "translation_symmetries",
     "verify",
 ]
