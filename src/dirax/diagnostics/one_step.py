@@ -14,12 +14,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.engines.lane import first_lane, take_step
+from dirax.geometry.discrete import DiscretizationMapDirac
 from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector
+from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.structures import canonical_two_form
 from dirax.geometry.tulczyjew import FiniteDifferenceTriple, slot_derivatives
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_lagrangian
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.solution import Solution
+from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 MAX_ITERATIONS = 50
@@ -34,7 +37,8 @@ Scalar = Float[Array, ""]
 class DiscreteSystem(eqx.Module):
     """A Lagrangian system as a discrete Lagrange–d'Alembert scheme sees it: L_d and w_d on Q × Q, W on Q.
 
-    `sign` is "+" or "-" for the schemes of [PY], None for a general discrete constraint.
+    `sign` is "+" or "-" for the schemes of [PY], None for a general discrete constraint; `share` is the part of the
+    constraint force that is taken off the incoming momentum D2 L_d(q_{k−1}, q_k) before it is saved.
     """
 
     system: LagrangeDirac
@@ -42,6 +46,7 @@ class DiscreteSystem(eqx.Module):
     constraint_rule: Any
     step: Any
     sign: str | None = eqx.field(static=True)
+    share: float = eqx.field(static=True, default=0.0)
 
     def lagrangian(self, q0: Vector, q1: Vector, params: Any) -> Scalar:
         """L_d(q0, q1)."""
@@ -70,14 +75,24 @@ def discrete_system(system: Any, scheme: Any, step: Any) -> DiscreteSystem | str
         return f"the points of a {type(system).__name__} are not those of a Lagrangian on Q × Q"
     rule = scheme.discrete_lagrangian
     if isinstance(scheme, LagrangeDAlembert):
-        return DiscreteSystem(system, rule, scheme.constraint, step, None)
+        share = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}[scheme.momentum]
+        return DiscreteSystem(system, rule, scheme.constraint, step, None, share)
     if isinstance(scheme, PlusLagrangeDirac):
         return DiscreteSystem(system, rule, "right", step, "+")
     return DiscreteSystem(system, rule, "left", step, "-")
 
 
-def membership_defect(discrete: DiscreteSystem, q0: Vector, q1: Vector, q2: Vector, params: Any) -> Float[Array, "2"]:
-    """(constraint, force): by how much three points in a row miss the discrete Dirac structure, relative to roundoff.
+def membership_defect(
+    discrete: DiscreteSystem,
+    q0: Vector,
+    q1: Vector,
+    q2: Vector,
+    p: Vector,
+    multipliers: Float[Array, " m"],
+    params: Any,
+) -> Float[Array, "3"]:
+    """(constraint, force, saved): by how much three points in a row miss the discrete Dirac structure, in roundings, and
+    the p and the multipliers saved at the middle one the Legendre momenta and the force of the three points.
 
     (+) and (−): the element (X^{d±}, d_D^±L_d) at q1 of the induced structure ([PY] Definition 6.7, Proposition 5.17),
     with the Legendre momenta F⁺L_d or F⁻L_d; the constraint is W q̂ of the pair (q0, q1) or (q1, q2). Otherwise
@@ -101,15 +116,17 @@ def membership_defect(discrete: DiscreteSystem, q0: Vector, q1: Vector, q2: Vect
         constraint, second_order, force = structure.membership_defect(*pair, momenta, beta, gamma, params)
         force = jnp.concatenate([second_order, force])
 
+    jump = p1 + before1
     matrix = discrete.system.constraint_matrix(q1, params)
-    multipliers = jnp.linalg.pinv(matrix).T @ (p1 + before1) if matrix.shape[0] else jnp.zeros(0)
+    of_jump = jnp.linalg.pinv(matrix).T @ jump if matrix.shape[0] else jnp.zeros(0)
+    saved = jnp.concatenate([p - p1 + discrete.share * jump, jump - matrix.T @ multipliers])
 
     def force_of(z):
         a, b, c = jnp.split(z, 3)
         return slot_derivatives(ld, a, b)[1] + slot_derivatives(ld, b, c)[0]
 
     def reaction_of(q):
-        return discrete.system.constraint_matrix(q, params).T @ multipliers
+        return discrete.system.constraint_matrix(q, params).T @ of_jump
 
     def constraint_of(z):
         a, b, c = jnp.split(z, 3)
@@ -120,11 +137,36 @@ def membership_defect(discrete: DiscreteSystem, q0: Vector, q1: Vector, q2: Vect
     size = jnp.abs(z) + jnp.tile(moved, 3)
     terms = jnp.abs(p1) + jnp.abs(p2) + jnp.abs(before0) + jnp.abs(before1)
     force_scale = terms + jnp.abs(jax.jacfwd(force_of)(z)) @ size + jnp.abs(jax.jacfwd(reaction_of)(q1)) @ size[n : 2 * n]
-    relative_force = jnp.max(jnp.abs(force)) * h / nonzero(jnp.max(force_scale))
+    largest = nonzero(jnp.max(force_scale))
+    relative_force, relative_saved = jnp.max(jnp.abs(force)) * h / largest, jnp.max(jnp.abs(saved)) / largest
     if constraint.shape[0] == 0:
-        return jnp.stack([jnp.zeros(()), relative_force])
+        return jnp.stack([jnp.zeros(()), relative_force, relative_saved])
     constraint_scale = jnp.abs(jax.jacfwd(constraint_of)(z)) @ size
-    return jnp.stack([jnp.max(jnp.abs(constraint) / nonzero(constraint_scale)), relative_force])
+    return jnp.stack([jnp.max(jnp.abs(constraint) / nonzero(constraint_scale)), relative_force, relative_saved])
+
+
+def discretization_defect(system: DiracSystem, map: AbstractDiscretizationMap, h, x0, x1, params) -> Float[Array, "1"]:
+    """By how much a pair misses the discretization-map Dirac structure ([BLM] Definition 5.1) with α = dH, in roundings.
+
+    F v + E dH at the base point, v = R_d⁻¹(x0, x1)/h, tangent to the manifold of the map; relative to |F||v| + |E||dH| and
+    to what it changes when every coordinate is changed by itself.
+    """
+    structure = DiscretizationMapDirac(system.structure, map, h)
+    manifold = map.manifold(x0.shape[0])
+
+    def defect(z):
+        a, b = jnp.split(z, 2)
+        x, _ = structure.velocity(a, b)
+        missed = structure.membership_defect(a, b, system.differential(x, params), params)
+        return manifold.projection(x, jnp.asarray(missed))
+
+    z = jnp.concatenate([x0, x1])
+    x, v = structure.velocity(x0, x1)
+    F, E = system.structure.kernel(x, params)
+    terms = jnp.abs(F) @ jnp.abs(v) + jnp.abs(E) @ jnp.abs(system.differential(x, params))
+    size = jnp.abs(z) + jnp.tile(jnp.abs(x1 - x0) + h, 2)
+    scale = jnp.max(terms) + jnp.max(jnp.abs(jax.jacfwd(defect)(z)) @ size)
+    return jnp.max(jnp.abs(defect(z)))[None] / nonzero(scale)
 
 
 class DifferentiatedStep(NamedTuple):

@@ -12,6 +12,7 @@ from dirax.diagnostics.drift import judge
 from dirax.diagnostics.one_step import (
     DiscreteSystem,
     discrete_system,
+    discretization_defect,
     membership_defect,
     over_rows,
     structural_defect,
@@ -20,6 +21,7 @@ from dirax.diagnostics.one_step import (
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, OK, VIOLATED, Line, Report
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.solution import Solution
+from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.port_hamiltonian import PortHamiltonian
 
 EPSILON = 2.0**-52
@@ -39,14 +41,14 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     """Measure the structure of a solution: a `Report` with one line a quantity, each with a tolerance and a verdict.
 
     `symmetries`: {name: generator(q) -> (n,)}, whose momentum maps ⟨p, ξ_Q(q)⟩ should be conserved, or a list of the
-    numbers of cyclic coordinates. `tolerance`: one relative tolerance in place of the first four below.
+    numbers of cyclic coordinates. `tolerance`: one relative tolerance in place of those below, the energy's apart.
 
     Measured values are relative to the natural scale of the quantity, so that one rounding is 2⁻⁵³ = ε/2: the sum of the
     absolute values of the terms that should cancel, and of their change when every saved number is changed by itself
     (absolute Jacobian times |q|). The tolerances are roundoff's:
 
-    - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8): 32 ε, because it holds step by step;
-    - constraint: 32 ε, for the same reason;
+    - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
+      multipliers against those of the points, constraint: 32 ε, because these hold step by step;
     - momentum maps: 32 ε · steps, the most that 32 roundings a step add up to (a random walk gives √steps of that);
     - symplecticity of one step, and φ*Ω = Ω + dβ where there are constraints ([PY] §3.2): 32 ε · 2n · the condition
       number of the step's equations, at a few steps of the run;
@@ -66,7 +68,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     generators = _generators(sol, symmetries)
     lines = [
         _completion(sol),
-        _membership(sol, tolerance),
+        *_membership(sol, tolerance),
         _constraint(sol, tolerance),
         _energy(sol),
         *(_momentum(sol, name, generator, tolerance) for name, generator in generators.items()),
@@ -86,27 +88,53 @@ def _completion(sol: Solution) -> Line:
     return Line("steps solved", residual, None, VIOLATED, f"{which}{messages[failed[0]]}{more}")
 
 
-def _membership(sol: Solution, tolerance: float | None) -> Line:
+def _membership(sol: Solution, tolerance: float | None) -> list[Line]:
+    if isinstance(sol.system, DiracSystem) and isinstance(sol.scheme, DiscreteDirac):
+        return [_discretization(sol, tolerance)]
     found = discrete_system(sol.system, sol.scheme, sol.step)
     if isinstance(found, str):
-        return Line("discrete Dirac structure", None, None, NOT_CHECKED, found)
+        return [Line("discrete Dirac structure", None, None, NOT_CHECKED, found)]
     name = {"+": "(+)-", "-": "(−)-", None: ""}[found.sign] + "discrete Dirac structure"
     if sol.save_every != 1:
-        return Line(name, None, None, NOT_CHECKED, f"needs every step, but save_every = {sol.save_every}")
+        return [Line(name, None, None, NOT_CHECKED, f"needs every step, but save_every = {sol.save_every}")]
     if sol.rows < 3:
-        return Line(name, None, None, NOT_CHECKED, f"needs three points, but only {sol.rows} were saved")
-    q = jnp.asarray(sol.q)
-    values = over_rows(eqx.Partial(membership_defect, found), sol, (q[..., :-2, :], q[..., 1:-1, :], q[..., 2:, :]))
+        return [Line(name, None, None, NOT_CHECKED, f"needs three points, but only {sol.rows} were saved")]
+    q = np.asarray(sol.q)
+    points = (q[..., :-2, :], q[..., 1:-1, :], q[..., 2:, :])
+    multipliers = sol.fields.get("multipliers", np.zeros((*q.shape[:-2], sol.rows - 1, 0)))
+    items = (*points, np.asarray(sol.p)[..., 1:-1, :], np.asarray(multipliers)[..., 1:, :])
+    values = _where_reached(over_rows(eqx.Partial(membership_defect, found), sol, items), items, sol)
     if "q0" in sol.initial and found.sign == "+":
         values[:, 0, 0] = 0.0  # the first pair was given, not computed
-    lane, row = _worst(np.max(values, axis=-1))
-    constraint, force = values[lane, row]
+    structure, saved = values[..., :2], values[..., 2]
+    lane, row = _worst(np.max(structure, axis=-1))
+    constraint, force = structure[lane, row]
     parts = "q̂ ∈ Δ, β + p̂ ∈ Δ°" if found.sign else "w_d = 0, D₂L_d + D₁L_d ∈ Δ°"
     text = (
         f"{parts} at every step, from q alone; worst at t = {float(sol.t[row + 1]):.6g}{_lane(sol, lane)}: "
         f"constraint {constraint:.2g}, force {force:.2g}"
     )
-    return _judged(sol, name, np.nanmax(values, axis=(1, 2)), _limit(tolerance, 1), text)
+    lane, row = _worst(saved)
+    both = " and multipliers" if "multipliers" in sol.fields else ""
+    about = f"against the Legendre transforms{' and forces' if both else ''} of q; worst at t = {float(sol.t[row + 1]):.6g}"
+    limit = _limit(tolerance, 1)
+    return [
+        _judged(sol, name, np.max(structure, axis=(1, 2)), limit, text),
+        _judged(sol, f"saved p{both}", np.max(saved, axis=1), limit, about + _lane(sol, lane)),
+    ]
+
+
+def _discretization(sol: Solution, tolerance: float | None) -> Line:
+    name = "discretization-map Dirac structure"
+    if sol.save_every != 1:
+        return Line(name, None, None, NOT_CHECKED, f"needs every step, but save_every = {sol.save_every}")
+    x = np.asarray(sol.x)
+    function = eqx.Partial(discretization_defect, sol.system, sol.scheme.map, sol.step)
+    items = (x[..., :-1, :], x[..., 1:, :])
+    values = _where_reached(over_rows(function, sol, items), items, sol)[..., 0]
+    lane, row = _worst(values)
+    text = f"(R_d⁻¹(x₀, x₁)/h, dH) ∈ D at every step, from x alone; worst at t = {float(sol.t[row]):.6g}{_lane(sol, lane)}"
+    return _judged(sol, name, np.max(values, axis=1), _limit(tolerance, 1), text)
 
 
 def _constraint(sol: Solution, tolerance: float | None) -> Line | None:
@@ -118,6 +146,7 @@ def _constraint(sol: Solution, tolerance: float | None) -> Line | None:
     if residual.shape[-1] == 0:
         return None
     residual = np.max(np.abs(residual.reshape((-1, *residual.shape[-2:]))), axis=-1)
+    residual = np.where(np.isnan(residual), 0.0, residual)  # rows that were not reached
     steps = "constraint" in sol.fields
     given = int(steps and "q0" in sol.initial)  # the first pair was given, not computed
     if residual.shape[1] <= given:
@@ -126,19 +155,21 @@ def _constraint(sol: Solution, tolerance: float | None) -> Line | None:
     lane, row = _worst(values)
     kind = "discrete constraint of each step" if steps else "constraint at each row"
     text = (
-        f"{kind}, relative to |W||v|; at most {np.nanmax(residual[:, given:]):.2g}, at t = {float(sol.t[row + given]):.6g}"
+        f"{kind}, relative to its terms; at most {np.max(residual[:, given:]):.2g}, at t = {float(sol.t[row + given]):.6g}"
         f"{_lane(sol, lane)}"
     )
     if given:
-        text += f"; the pair given at the start is off by {np.nanmax(residual[:, 0]):.2g}"
-    if not steps and isinstance(sol.scheme, DiscreteDirac) and sol.scheme.constraints == "discretize":
-        text = f"Method 1 imposes it inside each step; at the rows it is off by {np.nanmax(residual):.2g}"
-        return Line(name, float(np.nanmax(values)), None, NOT_CHECKED, text)
-    return _judged(sol, name, np.nanmax(values, axis=1), _limit(tolerance, 1), text)
+        text += f"; the pair given at the start is off by {np.max(residual[:, 0]):.2g}"
+    method_one = isinstance(sol.scheme, DiscreteDirac) and sol.scheme.constraints == "discretize"
+    if not steps and method_one and np.max(values) > _limit(tolerance, 1):
+        text = f"Method 1 imposes it inside each step; at the rows it is off by {np.max(residual):.2g}"
+        return Line(name, float(np.max(values)), None, NOT_CHECKED, text)
+    return _judged(sol, name, np.max(values, axis=1), _limit(tolerance, 1), text)
 
 
 def _constraint_scale(sol: Solution) -> float:
-    """The size of the constraint's terms: |W||v|, where W is known; else the largest saved number, or term of dE."""
+    """The size of the constraint's terms: |W||v| where the steps impose W v = 0, the largest saved number of a loaded
+    solution, |dE||x| where the constraint is that dE be in the image of a Dirac structure; else from its derivative."""
     found = discrete_system(sol.system, sol.scheme, sol.step)
     if isinstance(found, DiscreteSystem):
         q = np.asarray(sol.q)
@@ -146,9 +177,11 @@ def _constraint_scale(sol: Solution) -> float:
         speed = np.nanmax(speed, axis=tuple(range(speed.ndim - 1)), initial=0.0) + 1.0
         sizes = over_rows(eqx.Partial(_size_of_forms, found), sol, (q[..., _spread(sol.rows, SAMPLED_ROWS), :],))
         return float(np.max(np.nanmax(sizes, axis=(0, 1)) @ speed, initial=0.0)) or 1.0
-    nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
-    terms = 0.0 if sol.system is None else float(np.nanmax(_sensitivities(sol)))
-    return float(max(1.0, terms, *(np.nanmax(np.abs(a)) for a in nodes)))
+    if sol.system is None:
+        nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
+        return float(max(1.0, *(np.nanmax(np.abs(a)) for a in nodes)))
+    terms = _energy_terms if isinstance(sol.system, DiracSystem) else _constraint_terms
+    return float(np.nanmax(_sampled_terms(sol, terms))) or 1.0
 
 
 def _size_of_forms(discrete: DiscreteSystem, q, params: Any):
@@ -181,7 +214,10 @@ def _energy(sol: Solution) -> Line:
     if sol.batch is not None:
         details["per_trajectory"] = [f.drift for f in found]
         details["verdicts"] = [f.verdict for f in found]
-    return Line(name, abs(worst.drift), worst.told, worst.verdict, worst.text + _lane(sol, lane), details)
+    text = worst.text + _lane(sol, lane)
+    others = sorted({f.verdict for f in found} - {worst.verdict})
+    text += "".join(f"; {details['verdicts'].count(other)} of {len(found)} {other}" for other in others)
+    return Line(name, abs(worst.drift), worst.told, worst.verdict, text, details)
 
 
 def _motion(sol: Solution, lane: int) -> np.ndarray:
@@ -194,18 +230,25 @@ def _motion(sol: Solution, lane: int) -> np.ndarray:
 def _energy_scale(sol: Solution, energy: np.ndarray) -> float:
     """|E| + |∂E/∂row| |row|, the largest: what roundings of the rows do to the energy, in units of ε."""
     scale = float(np.nanmax(np.abs(energy)))
-    return scale if sol.system is None else scale + float(np.nanmax(_sensitivities(sol)))
+    return scale if sol.system is None else scale + float(np.nanmax(_sampled_terms(sol, _energy_terms)))
 
 
-def _sensitivities(sol: Solution) -> np.ndarray:
-    """Σ |∂E/∂row_i| |row_i| at a few rows."""
+def _sampled_terms(sol: Solution, terms: Callable) -> np.ndarray:
+    """terms(system, row, params) at a few rows."""
     rows = _spread(sol.rows, SAMPLED_ROWS)
     lead = (slice(None),) * (sol.batch is not None)
     nodes = {k: np.asarray(a)[(*lead, rows)] for k, a in sol.fields.items() if sol.field_info[k].place == "node"}
-    return over_rows(eqx.Partial(_energy_terms, sol.system), sol, (nodes,))
+    return over_rows(eqx.Partial(terms, sol.system), sol, (nodes,))
+
+
+def _constraint_terms(system: Any, row: dict, params: Any):
+    """Σ |∂c/∂row_i| |row_i|, the largest over the constraints c."""
+    derivative = jax.jacfwd(lambda row: system.constraint_at(row, params))(row)
+    return jnp.max(sum(jnp.abs(derivative[name]) @ jnp.abs(row[name]) for name in row), initial=0.0)
 
 
 def _energy_terms(system: Any, row: dict, params: Any):
+    """Σ |∂E/∂row_i| |row_i|."""
     gradient = jax.grad(lambda row: system.energy_at(row, params))(row)
     return sum(jnp.sum(jnp.abs(gradient[name] * row[name])) for name in row)
 
@@ -311,7 +354,7 @@ def _symplecticity(sol: Solution, tolerance: float | None) -> Line:
     if constrained:
         text = f"on the pairs with w_d = 0, {at}; without dβ it would be off by {values[lane, row, 1]:.2g}"
     limit = _limit(tolerance, stages[0][0].state_size * condition)
-    line = _judged(sol, name, np.nanmax(np.where(np.isfinite(defect), defect, -1.0), axis=1), limit, text)
+    line = _judged(sol, name, np.max(np.where(np.isfinite(defect), defect, 0.0), axis=1), limit, text)
     line.details["condition"] = condition
     return line
 
@@ -330,10 +373,11 @@ def _cannot_start(sol: Solution, data: dict) -> str:
 
 
 def _sampled(sol: Solution) -> np.ndarray:
-    """Numbers of a few rows that have a successor, spread over the part that every trajectory has reached."""
+    """Numbers of a few rows that have a successor, spread over the shortest and over the longest trajectory."""
     values = np.asarray(sol.fields["q" if "q" in sol.fields else "x"])
-    finite = np.all(np.isfinite(values), axis=tuple(i for i in range(values.ndim) if i != values.ndim - 2))
-    return _spread(int(np.sum(finite)) - 1, SAMPLED_STEPS)
+    reached = np.sum(np.all(np.isfinite(values), axis=-1), axis=-1)
+    half = SAMPLED_STEPS // 2 if np.min(reached) < np.max(reached) else SAMPLED_STEPS
+    return np.union1d(_spread(int(np.min(reached)) - 1, half), _spread(int(np.max(reached)) - 1, half)).astype(int)
 
 
 def _times(sol: Solution, rows: np.ndarray):
@@ -344,8 +388,15 @@ def _times(sol: Solution, rows: np.ndarray):
 # ---------------------------------------------------------------------------------------------------------- small things
 
 
+def _where_reached(values: np.ndarray, items: tuple, sol: Solution) -> np.ndarray:
+    """The values, 0 at rows that were not reached, and infinite where finite rows give no finite value."""
+    finite = [np.all(np.isfinite(item), axis=-1) for item in items]
+    reached = np.logical_and.reduce(finite).reshape(values.shape[:2])[..., None]
+    return np.where(reached, np.where(np.isfinite(values), values, np.inf), 0.0)
+
+
 def _judged(sol: Solution, name: str, per_trajectory: np.ndarray, limit: float, text: str) -> Line:
-    worst = float(np.nanmax(per_trajectory))
+    worst = float(np.max(per_trajectory))
     details = {"per_trajectory": per_trajectory.tolist()} if sol.batch is not None else {}
     return Line(name, worst, limit, OK if worst <= limit else VIOLATED, text, details)
 
