@@ -155,7 +155,13 @@ def test_params():
 
 def test_systems_schemes_and_engines():
     complaint(TypeError, "system must be a dirax system such as dx.LagrangeDirac(…)", "'disk'", system="disk")
-    complaint(TypeError, "scheme must be a dirax scheme", "the class PlusLagrangeDirac", "instance", scheme=dx.PlusLagrangeDirac)
+    complaint(
+        TypeError,
+        "scheme must be a dirax scheme",
+        "the class PlusLagrangeDirac itself",
+        "parentheses",
+        scheme=dx.PlusLagrangeDirac,
+    )
     complaint(ValueError, "engine must be one of 'auto', 'xla'", "'fortran'", engine="fortran")
     complaint(TypeError, "inputs=", "dx.PortHamiltonian", "LagrangeDirac", inputs=lambda t, x: x)
     rule = "discrete_lagrangian must be one of 'left', 'right', 'midpoint', 'trapezoidal' or a function of (q0, q1, h[, params])"

@@ -166,7 +166,7 @@ def test_loading_with_the_system_restores_code_and_parameters(tmp_path, batch):
     assert loaded.params == {"g": jnp.asarray(10.0)}
     again = dx.simulate(SKATE, loaded.scheme, **loaded.initial, params=loaded.params, step=0.01, steps=5, save_every=2)
     assert bits(again.q) == bits(batch.q)
-    with pytest.raises(ValueError, match=r"holds the fields .*'q': \(3,\).* but the system .* have .*'q': \(3,\)"):
+    with pytest.raises(ValueError, match=r"the file holds the fields .*'q': \(3,\).* but the system .* have .*'q': \(3,\)"):
         dx.load(tmp_path / "run.zarr", system=dx.LagrangeDirac(skate_lagrangian))
 
 

@@ -83,42 +83,52 @@ def to_dataset(sol: Solution, units: Mapping[str, Any] | None = None, coordinate
     return xr.Dataset(variables, coords, _attributes(sol, layout, list(derived), metadata))
 
 
-def from_dataset(dataset: "Dataset", system: Any = None, scheme: Any = None, params: Any = None) -> Solution:
-    """The Solution that `to_dataset` described; `KeyError`, `TypeError` or `ValueError` for any other Dataset.
+def from_dataset(dataset: "Dataset", params: Any = None) -> Solution:
+    """The Solution that `to_dataset` described, without system; `KeyError`, `TypeError` or `ValueError` for another Dataset.
 
-    Nothing in the Dataset is executed: schemes of dirax are recognized by name, other code comes from the arguments.
+    Nothing in the Dataset is executed: schemes of dirax are recognized by name. `params` replaces the recorded ones.
     """
     about = dataset.attrs
     read = lambda name: json.loads(about[name])
     values = lambda name: np.array(dataset[name].values)
     layout, batched = read("fields"), "trajectory" in dataset.sizes
-    info = {e["name"]: Field(tuple(e["shape"]), e["place"], tuple(e["dims"]), e["description"]) for e in layout}
-    initial = {name: values(f"initial_{name}") for name in read("initial")}
-    ok, message, batch_params = read("ok"), read("message"), bool(about["batch_params"])
+    ok, message = read("ok"), read("message")
     if batched:
         ok = values("ok").astype(bool)
         message = [str(message.get(str(lane), "")) for lane in range(len(ok))]
     if params is None and "params" in about:
         params = decode_params(read("params"))
-    scheme = decode_scheme(read("scheme_settings")) if scheme is None else scheme
     return Solution(
         t=values("time"),
         fields={e["name"]: values(e["variable"]) for e in layout},
-        field_info=info,
+        field_info={e["name"]: Field(tuple(e["shape"]), e["place"], tuple(e["dims"]), e["description"]) for e in layout},
         step=float(about["step"]),
         save_every=int(about["save_every"]),
         stats=read("stats"),
         ok=ok,
         message=message,
-        system=system,
-        scheme=scheme,
-        equation=_equation(system, scheme, info, initial, params, batched, batch_params),
+        scheme=decode_scheme(read("scheme_settings")),
         params=params,
-        batch_params=batch_params,
-        initial=initial,
+        batch_params=bool(about["batch_params"]),
+        initial={name: values(f"initial_{name}") for name in read("initial")},
         derived={name: values(name) for name in read("derived")},
         metadata={**read("metadata"), **{k: str(about[k]) for k in ("system", "scheme", "dirax_version")}},
     )
+
+
+def with_code(sol: Solution, system: Any, scheme: Any) -> Solution:
+    """The solution with its system, scheme and equation; `ValueError` where they have other fields than were saved."""
+    sol.system, sol.scheme = system, sol.scheme if scheme is None else scheme
+    if sol.system is None or sol.scheme is None or not sol.initial:
+        return sol
+    one = {name: a[0] if a.ndim == 2 else a for name, a in sol.initial.items()}
+    params = jax.tree.map(lambda leaf: leaf[0], sol.params) if sol.batch_params else sol.params
+    sol.equation = make_step_equation(sol.scheme, sol.system, Shape(*sol.system.sizes(one, params)))
+    made = {name: tuple(field.shape) for name, field in sol.equation.stages[0][0].fields.items()}
+    saved = {name: tuple(field.shape) for name, field in sol.field_info.items()}
+    if made != saved:
+        raise ValueError(f"the file holds the fields {saved}, but the system and scheme that were given have {made}.")
+    return sol
 
 
 def check_format(dataset: "Dataset") -> None:
@@ -238,17 +248,3 @@ def _attributes(sol: Solution, layout, derived: list[str], metadata: dict[str, A
     except NotPlain as value:
         attributes["params_not_stored"] = str(value)
     return attributes
-
-
-def _equation(system, scheme, info, initial, params, batched: bool, batch_params: bool):
-    """The step's equation where system and scheme are known; `ValueError` where they are not those of the file."""
-    if system is None or scheme is None or not initial:
-        return None
-    one = {name: a[0] if batched and a.ndim == 2 else a for name, a in initial.items()}
-    first = lambda tree: jax.tree.map(lambda leaf: leaf[0], tree)
-    equation = make_step_equation(scheme, system, Shape(*system.sizes(one, first(params) if batch_params else params)))
-    made = {name: tuple(field.shape) for name, field in equation.stages[0][0].fields.items()}
-    saved = {name: tuple(field.shape) for name, field in info.items()}
-    if made != saved:
-        raise ValueError(f"it holds the fields {saved}, but the system and scheme that were given have {made}")
-    return equation

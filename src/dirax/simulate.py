@@ -197,8 +197,9 @@ def _check_kinds(system, scheme, engine) -> None:
         (scheme, AbstractScheme, "scheme", "dx.PlusLagrangeDirac()"),
     ):
         if not isinstance(value, kind):
-            came = f"the class {value.__name__}, not an instance of it," if isinstance(value, type) else f"{value!r:.80}"
-            raise TypeError(f"{name} must be a dirax {name} such as {example}, but {came} was given.")
+            came = f"the class {value.__name__} itself" if isinstance(value, type) else f"{value!r:.80}"
+            hint = ": add parentheses" if isinstance(value, type) else ""
+            raise TypeError(f"{name} must be a dirax {name} such as {example}, but {came} was given{hint}.")
     if engine not in ENGINES:
         raise ValueError(f"engine must be one of {', '.join(map(repr, ENGINES))}, but {engine!r} was given.")
 

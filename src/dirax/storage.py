@@ -5,13 +5,13 @@ import os
 import shutil
 import uuid
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dirax.dataset import check_format, from_dataset, to_dataset
+from dirax.dataset import check_format, from_dataset, to_dataset, with_code
 from dirax.solution import Solution
 
 if TYPE_CHECKING:
@@ -27,6 +27,10 @@ MOVED = "attribute_"
 CODECS = {"bytes", "zstd", "blosc", "gzip", "crc32c"}
 TYPES = {"float64", "float32", "int64", "int32", "int8", "uint8", "bool"}
 """What dirax writes into a zarr store. Nothing else is opened: some other codecs unpickle, which runs code from the file."""
+
+
+class Unreadable(ValueError):
+    """What is wrong with a file, without its path."""
 
 
 def save(
@@ -82,16 +86,24 @@ def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params
         raise FileNotFoundError(f"there is no file {path}: check the path.")
     try:
         (_check_store if engine == "zarr" else _check_hdf5)(path)
-        dataset = _read(path, engine)
+        dataset = _reading("it cannot be read, being damaged or incomplete", _read, path, engine)
         check_format(dataset)
         _check_sums(dataset)
-        return from_dataset(_from_file_form(dataset), system, scheme, params)
-    except KeyboardInterrupt:
+        sol = _reading("its description is not one that dirax wrote", from_dataset, _from_file_form(dataset), params)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be loaded: {str(error).rstrip('.')}.") from error
+    return with_code(sol, system, scheme)
+
+
+def _reading(problem: str, read: Callable, *arguments: Any) -> Any:
+    """`read(*arguments)`, where anything unexpected means that the file has this problem."""
+    try:
+        return read(*arguments)
+    except Unreadable:
         raise
     except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else "no reason given"
-        kind = "" if type(error) is ValueError else f"{type(error).__name__}: "
-        raise ValueError(f"{path} cannot be loaded: {kind}{reason.rstrip('.')}.") from error
+        reason = (str(error).splitlines() or ["no reason given"])[0]
+        raise Unreadable(f"{problem} ({type(error).__name__}: {reason.rstrip('.')})") from error
 
 
 def _engine(path: Path) -> str:
@@ -165,52 +177,53 @@ def _read(path: Path, engine: str) -> "Dataset":
     with xr.open_dataset(path, engine=engine, decode_cf=False, cache=False, **options) as dataset:
         for name, variable in dataset.variables.items():
             if variable.dtype.kind not in "fiub":
-                raise ValueError(f"its variable {name} has the type {variable.dtype}, which dirax does not write")
+                raise Unreadable(f"its variable {name} has the type {variable.dtype}, which dirax does not write")
         return dataset.load()
 
 
 def _check_sums(dataset: "Dataset") -> None:
-    sums = json.loads(dataset.attrs["checksums"])
+    sums = _reading("its description is not one that dirax wrote", lambda: json.loads(dataset.attrs["checksums"]))
     for name in set(sums) - set(map(str, dataset.variables)):
-        raise ValueError(f"its variable {name} is missing: the file is incomplete")
+        raise Unreadable(f"its variable {name} is missing: the file is incomplete")
     for name, variable in dataset.variables.items():
         if sums.get(str(name)) != _checksum(variable.values):
-            raise ValueError(f"its variable {name} is not what was saved: the file is damaged, incomplete or was edited")
+            raise Unreadable(f"its variable {name} is not what was saved: the file is damaged, incomplete or was edited")
 
 
 def _check_store(path: Path) -> None:
     """`ValueError` for a zarr store with anything in it that dirax does not write."""
     if not _is_store(path):
-        raise ValueError("it is not a zarr store of format 3 (it has no zarr.json)")
+        raise Unreadable("it is not a zarr store of format 3 (it has no zarr.json)")
     for file in path.rglob("*"):
         if file.name in (".zarray", ".zgroup", ".zmetadata"):
-            raise ValueError(f"it is a zarr store of format 2 ({file.relative_to(path)}), which dirax does not write")
+            raise Unreadable(f"it is a zarr store of format 2 ({file.relative_to(path)}), which dirax does not write")
         if file.name == "zarr.json":
-            _check_zarr_metadata(json.loads(file.read_text("utf-8")), str(file.relative_to(path)))
+            where = str(file.relative_to(path))
+            _check_zarr_metadata(_reading(f"{where} is damaged", json.loads, file.read_bytes()), where)
 
 
 def _check_zarr_metadata(node: Any, where: str) -> None:
     if not isinstance(node, dict) or node.get("node_type") not in ("group", "array"):
-        raise ValueError(f"{where} describes neither a group nor an array")
+        raise Unreadable(f"{where} describes neither a group nor an array")
     if node["node_type"] == "group":
         return
-    if node.get("data_type") not in TYPES:
-        raise ValueError(f"{where} has the data type {node.get('data_type')!r}, which dirax does not write")
+    if str(node.get("data_type")) not in TYPES:
+        raise Unreadable(f"{where} has the data type {node.get('data_type')!r}, which dirax does not write")
     codecs = [codec.get("name") if isinstance(codec, dict) else codec for codec in node.get("codecs", [])]
     if unknown := [codec for codec in codecs if codec not in CODECS]:
-        raise ValueError(f"{where} is encoded by {unknown[0]!r}, which dirax does not write")
+        raise Unreadable(f"{where} is encoded by {unknown[0]!r}, which dirax does not write")
     if node.get("storage_transformers"):
-        raise ValueError(f"{where} has storage transformers, which dirax does not write")
+        raise Unreadable(f"{where} has storage transformers, which dirax does not write")
 
 
 def _check_hdf5(path: Path) -> None:
     """`ValueError` for an HDF5 file that refers to other files."""
     import h5py
 
-    with h5py.File(path, "r") as file:
+    with _reading("it is not a netCDF file, or incomplete", h5py.File, path, "r") as file:
         for name in file:
             if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-                raise ValueError(f"its entry {name} is a link, which dirax does not write")
+                raise Unreadable(f"its entry {name} is a link, which dirax does not write")
             entry = file[name]
             if not isinstance(entry, h5py.Dataset) or entry.is_virtual or entry.external:
-                raise ValueError(f"its entry {name} is not an array inside the file")
+                raise Unreadable(f"its entry {name} is not an array inside the file")
