@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import dirax as dx
 from dirax.engines import native, xla
 from dirax.engines.native import compile as llvm
+from dirax.engines.native import driver
 from dirax.engines.native.program import program
 from dirax.engines.native.step_loop import kernel_module
 from dirax.engines.result import NOT_CONVERGED, NOT_FINITE, OK, Problem
@@ -105,6 +106,8 @@ def test_both_engines_agree_to_roundoff_growth(name):
 @pytest.mark.parametrize("name", ["planar double pendulum", "rolling disk, midpoint"])
 def test_bits_do_not_depend_on_batch_lane_width_threads_or_repetition(name, monkeypatch):
     batch = spread(problem(name, steps=60), 11)
+    monkeypatch.setattr(driver, "WORTH_THREADS", 0.0)
+    monkeypatch.setattr(driver, "FIRST_CHUNK", 20 * 11)
     whole = native.run(batch)
     assert np.all(whole.status == OK)
     assert_same_bits(whole, native.run(batch))
@@ -123,8 +126,6 @@ def test_bits_do_not_depend_on_batch_lane_width_threads_or_repetition(name, monk
 
 
 def test_a_chunk_boundary_leaves_no_trace(monkeypatch):
-    from dirax.engines.native import driver
-
     p = problem("planar double pendulum")
     whole = native.run(p)
     monkeypatch.setattr(driver, "FIRST_CHUNK", 1)
@@ -276,8 +277,6 @@ def test_random_equations_agree_with_xla(seed, size):
 
 
 def test_an_interruption_keeps_what_was_computed(monkeypatch):
-    from dirax.engines.native import driver
-
     monkeypatch.setattr(driver, "FIRST_CHUNK", 100)
 
     def interrupt(done, total):

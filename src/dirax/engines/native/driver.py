@@ -13,6 +13,9 @@ from dirax.engines.native.program import Program, program
 from dirax.engines.result import OK, Outcome, Problem, Progress
 
 CHUNK_SECONDS = 0.1
+WORTH_THREADS = 2e-3
+"""Seconds of work from which on it is shared among threads."""
+
 SHARES = 4
 """Parts of a batch per thread, so that a thread that is held up holds up little."""
 
@@ -42,23 +45,23 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
 
     fields = lanes.arrays(p.rows)
     outs = lanes.addresses(fields)
-    call = lambda records, outs, first, stop, every: lanes.call(kernel, records, outs, first, stop, every)
-    done, interrupted = 0, False
+    done, interrupted, threads = 0, False, 1
     count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
     try:
         while done < p.steps and np.any(lanes.status == OK):
             count = min(count, p.steps - done)
             tick = time.perf_counter()
-            call(lanes.records, outs, done, done + count, p.save_every)
+            lanes.call(kernel, lanes.records, outs, done, done + count, p.save_every, threads)
             done += count
             rate = count / max(time.perf_counter() - tick, 1e-9)
             count = max(1, int(rate * CHUNK_SECONDS))
+            threads = lanes.threads if threads > 1 or p.steps - done > rate * WORTH_THREADS else 1
             if progress:
                 progress(done, p.steps)
     except KeyboardInterrupt:
         interrupted = True
     closing_arrays = lanes.arrays(2)
-    call(lanes.records.copy(), lanes.addresses(closing_arrays), 0, 1, 1)
+    lanes.call(kernel, lanes.records.copy(), lanes.addresses(closing_arrays), 0, 1, 1, threads)
     closing = {name: a[:, 0] for name, a in closing_arrays.items()}
     completed = lanes.completed
     for name, values in fields.items():
@@ -167,7 +170,7 @@ class Lanes:
         table = np.array(columns, dtype=np.int64).reshape(len(columns), self.blocks, self.width)
         return np.ascontiguousarray(table.swapaxes(0, 1))
 
-    def call(self, kernel, records: np.ndarray, outs: np.ndarray, first: int, stop: int, every: int) -> None:
+    def call(self, kernel, records: np.ndarray, outs: np.ndarray, first: int, stop: int, every: int, threads: int) -> None:
         """Steps `first` to `stop` − 1 of every trajectory, blocks shared among threads; Ctrl-C waits for their end."""
         p = self.problem
         numbers = (p.t0, p.h, p.first_step, first, stop, every, p.max_iterations)
@@ -176,10 +179,10 @@ class Lanes:
             pointers = (a.ctypes.data + low * a.strides[0] for a in (records, self.params, outs))
             kernel(*pointers, high - low, *numbers)
 
-        if self.threads == 1:
+        if threads == 1:
             part(0, self.blocks)
             return
-        bounds = np.linspace(0, self.blocks, min(self.blocks, SHARES * self.threads) + 1).astype(int).tolist()
-        with ThreadPoolExecutor(self.threads) as pool:
+        bounds = np.linspace(0, self.blocks, min(self.blocks, SHARES * threads) + 1).astype(int).tolist()
+        with ThreadPoolExecutor(threads) as pool:
             for future in [pool.submit(part, a, b) for a, b in itertools.pairwise(bounds)]:
                 future.result()
