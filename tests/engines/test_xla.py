@@ -172,6 +172,19 @@ def test_a_batch_is_its_trajectories_and_failures_stay_alone():
     np.testing.assert_allclose(mixed.fields["q"][1, :good], alone.fields["q"][0, :good], atol=1e-13)
 
 
+def test_one_failure_in_a_large_batch_is_seen():
+    """XLA's vectorized maximum over the lanes of a large batch loses NaNs: no judgement may rest on it."""
+    n, lanes = 5, 1000
+    bowl = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sum(jnp.sqrt(q)) / 10)
+    q = np.ones((lanes, n))
+    v = np.zeros((lanes, n))
+    v[700, 3] = -30.0
+    sol = dx.simulate(bowl, MIDPOINT, q=q, v=v, step=0.01, steps=8, engine="xla")
+    assert np.flatnonzero(~sol.ok).tolist() == [700]
+    assert np.all(np.isfinite(sol.q[:700])) and np.all(np.isnan(sol.q[700, -1]))
+    assert np.all(np.isfinite(sol.q[700, :3])) and np.all(sol.q[700, :3] > 0)
+
+
 def test_dead_trajectories_cost_nothing():
     """10¹⁵ steps would take a lifetime: the run ends with the last living trajectory."""
     out = xla.run(falling_problem([[0.5, -1.0], [0.3, 0.0]], 10**15, save_every=10**14, batch=2))

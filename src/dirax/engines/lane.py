@@ -59,13 +59,13 @@ def take_step(equation, lane: Lane, t, h, params, max_iterations: int, different
         args = (state, t, fraction * h, params)
         guess = stage.guess(state, jnp.sum(before, axis=0), fraction * h, params)
         u, count, converged = solve(stage.residual, stage.scale, guess, args, max_iterations, running, differentiable)
-        new = stage.advance(u, *args)
-        # 0·new is nan where new is not finite: one reduction finds that as well
-        left = jnp.max(jnp.abs(jnp.concatenate([stage.residual(u, *args), 0.0 * new])))
-        outcome = jnp.where(jnp.isfinite(left), jnp.where(converged, OK, NOT_CONVERGED), NOT_FINITE)
+        new, left = stage.advance(u, *args), stage.residual(u, *args)
+        # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
+        finite = jnp.isfinite(jnp.sum(0.0 * jnp.concatenate([new, left])))
+        outcome = jnp.where(finite, jnp.where(converged, OK, NOT_CONVERGED), NOT_FINITE)
         status = jnp.where(running, outcome, status)
         updates = updates + jnp.where(running, count, 0)
-        worst = jnp.where(status == OK, jnp.maximum(worst, left), worst)
+        worst = jnp.where(status == OK, jnp.maximum(worst, jnp.max(jnp.abs(left), initial=0.0)), worst)
         state = jnp.where(status == OK, new, state)
         history.append(_remembered(u, before, lane.completed))
         unknowns.append(u)
