@@ -56,10 +56,11 @@ def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int =
 
 def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> tuple[Float[Array, "l k"], Float[Array, " l"]]:
     """The pseudo-inverse of a matrix with rows and columns scaled to unit size, and the units that this gives the columns."""
-    scaled, rows, columns = matrix, jnp.ones(matrix.shape[0]), jnp.ones(matrix.shape[1])
-    fitting = lambda sizes: jnp.where(sizes > 0.0, sizes, 1.0)
+    rows, columns = jnp.ones((matrix.shape[0], 1)), jnp.ones((1, matrix.shape[1]))
+    fitting = lambda sizes: jnp.sqrt(jnp.where(sizes > 0.0, sizes, 1.0))
     for _ in range(3):
-        row, column = (fitting(jnp.sqrt(jnp.max(jnp.abs(scaled), axis=axis))) for axis in (1, 0))
-        scaled = scaled / row[:, None] / column[None, :]
-        rows, columns = rows * row, columns * column
-    return jnp.linalg.pinv(scaled, rtol=RANK_TOLERANCE) / columns[:, None] / rows[None, :], 1.0 / columns
+        left = jnp.abs(lax.stop_gradient(matrix)) / rows / columns  # units have no derivative, which would be ∞ at zero
+        rows = rows * fitting(jnp.max(left, axis=1, keepdims=True))
+        columns = columns * fitting(jnp.max(left, axis=0, keepdims=True))
+    inverse = jnp.linalg.pinv(matrix / rows / columns, rtol=RANK_TOLERANCE)
+    return inverse / columns.T / rows.T, 1.0 / columns[0]
