@@ -85,6 +85,8 @@ def test_a_refined_reference_does_not_bias_the_order():
     by_itself = dx.convergence(oscillator, dx.PlusLagrangeDirac(), **run)
     by_cosine = dx.convergence(oscillator, dx.PlusLagrangeDirac(), reference=exact, **run)
     assert by_itself.order == pytest.approx(by_cosine.order, abs=0.02)
+    by_hand = dx.simulate(oscillator, dx.PlusLagrangeDirac(), step=0.1, steps=20, **START).q[-1, 0] - np.cos(2.0)
+    assert by_cosine.slopes["q"].end_errors[1] == pytest.approx(abs(by_hand), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +97,7 @@ def test_a_refined_reference_does_not_bias_the_order():
         ({"time": 0.05}, "must divide time"),
         ({"quantities": ["multipliers"]}, "are not in both"),
         ({"reference": lambda t: np.cos(t)[:, None] + 1}, "take larger steps"),
+        ({"q0": [1.0], "q1": [1.0]}, "belong to one step size"),
     ],
 )
 def test_mistakes(changes, message):

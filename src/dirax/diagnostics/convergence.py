@@ -29,13 +29,15 @@ USABLE = 3
 class Slope:
     """The measured order of one quantity: the slope of log(error) over log(h), its standard error, and what it rests on.
 
-    `errors` holds the largest error over the common times for each step size, `used` says which ones the slope rests on.
+    `errors` holds the largest error over the common times for each step size, `used` says which ones the slope rests on;
+    `end_errors` are those at the last common time.
     """
 
     order: float
     standard_error: float
     errors: np.ndarray
     used: np.ndarray
+    end_errors: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,8 @@ def convergence(
     not fit, a run that fails, or fewer than three step sizes that can be used.
     """
     h = _checked(step_sizes, time)
+    if "q0" in run or "q1" in run:
+        raise ValueError("the points q0= and q1= belong to one step size, and here there are several: give q= with v= or p=.")
     exact = reference if callable(reference) and not isinstance(reference, AbstractScheme) else None
     stride = np.round(h[0] / h).astype(int)
     runs = [_run(system, scheme, size, time, int(every), run) for size, every in zip(h, stride, strict=True)]
@@ -130,6 +134,7 @@ def convergence(
     slopes, notes = {}, []
     for name in names:
         errors = np.array([np.max(np.abs(m[name] - expected[name])) for m in measured])
+        at_end = np.array([np.max(np.abs((m[name] - expected[name])[..., -1, :])) for m in measured])
         size = max(float(np.max(np.abs(expected[name]))), np.finfo(float).tiny)
         used = _above_plateau(errors, np.finfo(float).eps * size * np.sqrt(time / h) * PLATEAU)
         if np.sum(used) < USABLE:
@@ -141,7 +146,7 @@ def convergence(
                 f"order needs {USABLE}: errors {', '.join(number(e) for e in errors)} for steps "
                 f"{', '.join(number(s) for s in h)}; take larger steps, or more of them."
             )
-        slopes[name] = Slope(*_slope(h[used], errors[used], finest), errors, used)
+        slopes[name] = Slope(*_slope(h[used], errors[used], finest), errors, used, at_end)
     return Convergence(f"{type(scheme).__name__} on {type(system).__name__}, t ≤ {time:g}", h, slopes, label, tuple(notes))
 
 
