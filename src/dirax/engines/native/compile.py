@@ -79,7 +79,8 @@ def object_code(text: str, target: tuple[str, str, str] | None = None, assembly:
 @functools.cache
 def _jit():
     _initialized()
-    return llvm.create_lljit_compiler()
+    # JITLink keeps the sections of an object together: its code reaches its constants wherever the memory is
+    return llvm.create_lljit_compiler(use_jit_link=True)
 
 
 def load(code: bytes, names: tuple[str, ...]):
