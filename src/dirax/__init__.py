@@ -10,9 +10,16 @@ jax.config.update("jax_enable_x64", True)
 from dirax.configure import configure
 from dirax.diagnostics.compare import compare
 from dirax.diagnostics.convergence import convergence
+from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
 from dirax.geometry.charts import Atlas, RetractionChart, chart_at, check_chart
 from dirax.geometry.cotangent_lift import CotangentBundle, cotangent_lift, symplecticity_defect
+from dirax.geometry.discrete import (
+    DiscretizationMapDirac,
+    FiniteDifferenceDirac,
+    GeneratingFunctionDirac,
+    InducedFiniteDifferenceDirac,
+)
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.manifolds import Circle, Euclidean, Product, Sphere, Torus
@@ -28,6 +35,15 @@ from dirax.geometry.maps import (
     check_discretization_map,
 )
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
+from dirax.geometry.subspaces import UndecidableRank
+from dirax.geometry.tulczyjew import (
+    DiscreteEvolution,
+    FiniteDifferenceTriple,
+    GeneratingFunctionTriple,
+    TulczyjewTriple,
+    minus_legendre,
+    plus_legendre,
+)
 from dirax.reconstruction import reconstruct
 from dirax.reduction.connection import DiscreteConnection, LinearConnection
 from dirax.reduction.reduced import ReducedLagrangeDirac, reduce
@@ -71,13 +87,20 @@ __all__ = [
     "DiracSystem",
     "DiscreteConnection",
     "DiscreteDirac",
+    "DiscreteEvolution",
     "DiscreteGradient",
     "DiscreteRouth",
+    "DiscretizationMapDirac",
     "Euclidean",
     "Field",
+    "FiniteDifferenceDirac",
+    "FiniteDifferenceTriple",
+    "GeneratingFunctionDirac",
+    "GeneratingFunctionTriple",
     "GroupAction",
     "ImplicitSystem",
     "InCharts",
+    "InducedFiniteDifferenceDirac",
     "LagrangeDAlembert",
     "LagrangeDirac",
     "LieGroupExp",
@@ -94,6 +117,7 @@ __all__ = [
     "ProductMap",
     "ProjectedMap",
     "ReducedLagrangeDirac",
+    "Report",
     "RetractionChart",
     "RiemannianExp",
     "Shape",
@@ -107,6 +131,8 @@ __all__ = [
     "Theta",
     "Torus",
     "Translations",
+    "TulczyjewTriple",
+    "UndecidableRank",
     "canonical_two_form",
     "chart_at",
     "check_chart",
@@ -122,6 +148,8 @@ __all__ = [
     "interconnect",
     "load",
     "make_step_equation",
+    "minus_legendre",
+    "plus_legendre",
     "reconstruct",
     "reduce",
     "simulate",
