@@ -50,9 +50,8 @@ def gradient():
 
 
 def main(short: bool = False) -> None:
-    settings = (
-        {"sizes": [16, 1024], "work": 20_000, "repeats": 3} if short else {"sizes": list(SIZES), "work": 200_000, "repeats": 9}
-    )
+    sizes, work, repeats = ([16, 1024], 20_000, 3) if short else (list(SIZES), 200_000, 9)
+    settings = {"sizes": sizes, "work": work, "repeats": repeats}
     results = {"system": "planar double pendulum, midpoint L_d, h = 0.001", **settings}
     rows = []
     for label, fast in (("as JAX comes", False), ("fast_loops", True)):
