@@ -22,6 +22,8 @@ RANK_TOLERANCE = 1e-10
 """Singular values below this fraction of the scale of a matrix count as zero."""
 RANK_GAP = 100.0
 """A singular value within this factor of the tolerance, on either side, leaves the rank undecided."""
+ROUNDOFF = 2e-13
+"""Relative singular values below this are roundoff of a few products and factorizations in dimensions up to dozens."""
 STRUCTURE_TOLERANCE = 1e-10
 """Largest relative defect (of skewness, of isotropy, of membership) that counts as roundoff."""
 
@@ -73,14 +75,16 @@ def decide_rank(
 ) -> np.ndarray:
     """Number of singular values above `tolerance * scale`, along the last axis; `scale` is the largest one by default.
 
-    Raises `UndecidableRank` where a singular value lies within a factor `RANK_GAP` of that threshold.
+    Raises `UndecidableRank` where a singular value lies within a factor `RANK_GAP` of that threshold, unless it is below
+    `ROUNDOFF` and the threshold above it.
     """
     values = np.asarray(singular_values)
     if values.shape[-1] == 0:
         return np.zeros(values.shape[:-1], dtype=int)
     reference = values.max(axis=-1, keepdims=True) if scale is None else np.full_like(values[..., :1], scale)
     relative = values / np.where(reference > 0, reference, 1.0)
-    undecided = np.any((relative > tolerance / RANK_GAP) & (relative < tolerance * RANK_GAP), axis=-1)
+    surely_zero = max(tolerance / RANK_GAP, min(ROUNDOFF, tolerance))
+    undecided = np.any((relative > surely_zero) & (relative < tolerance * RANK_GAP), axis=-1)
     if np.any(undecided):
         worst = relative[undecided].reshape(-1, values.shape[-1])[0]
         raise UndecidableRank(
