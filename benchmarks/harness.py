@@ -81,6 +81,6 @@ def store(name: str, results: dict[str, Any]) -> Path:
 
 def table(header: tuple[str, ...], rows: list[tuple[str, ...]], title: str) -> str:
     """Aligned text."""
-    from dirax.diagnostics.table import text_table
+    from dirax.tables import text_table
 
     return text_table(header, rows, title) + "\n"

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from dirax.diagnostics.report import Report
-from dirax.diagnostics.table import plain
 from dirax.diagnostics.verify import verify
 from dirax.gallery.example import Example
 from dirax.schemes.step import AbstractScheme
 from dirax.solution import Solution
 from dirax.storage import ENDINGS
+from dirax.tables import plain
 
 
 def run_and_verify(

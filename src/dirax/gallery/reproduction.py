@@ -8,6 +8,8 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
+from dirax.tables import plain, text_table
+
 AGREES, DIFFERS, WRONG, NEW = "agrees", "DIFFERS", "paper is wrong", "not in paper"
 """Verdicts. DIFFERS is the one that must not occur: dirax does not reproduce what it should."""
 
@@ -36,7 +38,7 @@ class Row:
     def to_dict(self) -> dict[str, Any]:
         """The row as plain Python values, fit for JSON."""
         cells = {name: getattr(self, name) for name in (*HEADER, "note")}
-        return {**cells, "numbers": {name: _plain(value) for name, value in self.numbers.items()}}
+        return {**cells, "numbers": {name: plain(value) for name, value in self.numbers.items()}}
 
 
 @dataclass(frozen=True)
@@ -59,14 +61,11 @@ class Reproduction:
         return {"paper": self.paper, "title": self.title, "ok": self.ok, "rows": rows, "figures": sorted(self.figures)}
 
     def __str__(self) -> str:
-        lines = [HEADER, *(tuple(getattr(row, name) for name in HEADER) for row in self.rows)]
-        widths = [max(len(line[i]) for line in lines) for i in range(len(HEADER))]
         marks, notes = self.notes()
-        text = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)) for line in lines]
-        text = [text[0].rstrip(), "  ".join("─" * w for w in widths), *text[1:]]
-        text[2:] = [f"{line} {mark}".rstrip() for line, mark in zip(text[2:], marks, strict=True)]
+        rows = [(row.quantity, row.paper, row.computed, row.verdict, mark) for row, mark in zip(self.rows, marks, strict=True)]
+        text = text_table((*HEADER, "note") if notes else HEADER, rows if notes else [row[:4] for row in rows])
         notes = [fill(note, NOTE_WIDTH, subsequent_indent="    ") for note in notes]
-        return "\n".join([f"[{self.paper}] {self.title}", "", *text, "", *notes])
+        return "\n".join([f"[{self.paper}] {self.title}", "", text, "", *notes])
 
     def notes(self) -> tuple[list[str], list[str]]:
         """The mark of each row ("" without a note, else "[1]", …; equal notes share one) and the marked notes."""
@@ -136,7 +135,3 @@ def compared(quantity: str, paper: float, computed: float, tolerance: float, not
     verdict = AGREES if abs(computed - paper) <= tolerance else DIFFERS
     numbers = {"paper": paper, "computed": computed, "difference": computed - paper, "tolerance": tolerance}
     return Row(quantity, f"{paper:.{digits}g}", f"{computed:.{digits}g}", verdict, note, numbers)
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else value

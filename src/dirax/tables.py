@@ -14,9 +14,10 @@ def text_table(header: tuple[str, ...], rows: list[tuple[str, ...]], title: str 
     return "\n".join([*([title] if title else []), text[0], rule, *text[1:]])
 
 
-def html_table(header: tuple[str, ...], rows: list[tuple[str, ...]], title: str = "") -> str:
-    """The same as an HTML table."""
-    cells = lambda tag, line: "".join(f"<{tag} style='text-align:left'>{html.escape(cell)}</{tag}>" for cell in line)
+def html_table(header: tuple[str, ...], rows: list[tuple[str, ...]], title: str = "", bold: tuple[str, ...] = ()) -> str:
+    """The same as an HTML table; cells whose text is in `bold` stand out."""
+    show = lambda cell: f"<b>{html.escape(cell)}</b>" if cell in bold else html.escape(cell)
+    cells = lambda tag, line: "".join(f"<{tag} style='text-align:left'>{show(cell)}</{tag}>" for cell in line)
     body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     top = f"<p>{html.escape(title)}</p>" if title else ""
     return f"{top}<table><thead><tr>{cells('th', header)}</tr></thead><tbody>{body}</tbody></table>"
