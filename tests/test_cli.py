@@ -186,6 +186,13 @@ def test_settings_change_data_params_and_run():
     assert set(example.initial) == {"q0", "q1"}
 
 
+@pytest.mark.parametrize("name", gallery.names())
+def test_settings_keep_what_is_not_a_number(name):
+    example, _ = changed(gallery.get(name), ())
+    for key, value in gallery.get(name).initial.items():
+        assert type(example.initial[key]) is type(value) if isinstance(value, bool) else np.all(example.initial[key] == value)
+
+
 def test_reproduce_writes_and_prints_and_fails_where_a_number_differs(tmp_path, monkeypatch):
     def paper(verdict):
         row = reproduction.Row("a quantity", "1", "2", verdict, "a note", {"value": np.float64(2.0)})

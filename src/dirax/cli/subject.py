@@ -82,7 +82,7 @@ def changed(example: Example, settings: Sequence[str]) -> tuple[Example, dict[st
     or one entry of them, `q[2]=0.5` or `q[θ]=0.5`; the parameters by name. Values are Python literals. Raises `ValueError`.
     """
     numbers: dict[str, Any] = {}
-    initial = {name: np.array(value, dtype=float) for name, value in example.initial.items()}
+    initial = {name: np.array(value, dtype=float) if name in INITIAL else value for name, value in example.initial.items()}
     params, options = example.params, {}
     for setting in settings:
         key, equals, text = setting.partition("=")
