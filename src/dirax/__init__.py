@@ -34,6 +34,7 @@ from dirax.geometry.maps import (
     Theta,
     check_discretization_map,
 )
+from dirax.geometry.semidirect import SemidirectProduct
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
 from dirax.geometry.subspaces import UndecidableRank
 from dirax.geometry.tulczyjew import (
@@ -46,12 +47,15 @@ from dirax.geometry.tulczyjew import (
 )
 from dirax.reconstruction import reconstruct
 from dirax.reduction.connection import DiscreteConnection, LinearConnection
+from dirax.reduction.euler_poincare import EulerPoincare
+from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduced import ReducedLagrangeDirac, reduce
 from dirax.reduction.symmetry import GroupAction, Translations, check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.schemes.charted import InCharts
 from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.discrete_gradient import DiscreteGradient
+from dirax.schemes.euler_poincare import DiscreteEulerPoincare
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
@@ -87,11 +91,13 @@ __all__ = [
     "DiracSystem",
     "DiscreteConnection",
     "DiscreteDirac",
+    "DiscreteEulerPoincare",
     "DiscreteEvolution",
     "DiscreteGradient",
     "DiscreteRouth",
     "DiscretizationMapDirac",
     "Euclidean",
+    "EulerPoincare",
     "Field",
     "FiniteDifferenceDirac",
     "FiniteDifferenceTriple",
@@ -104,6 +110,7 @@ __all__ = [
     "LagrangeDAlembert",
     "LagrangeDirac",
     "LieGroupExp",
+    "LiePoisson",
     "LinearConnection",
     "LinearDirac",
     "ManifoldLagrangian",
@@ -120,6 +127,7 @@ __all__ = [
     "Report",
     "RetractionChart",
     "RiemannianExp",
+    "SemidirectProduct",
     "Shape",
     "Solution",
     "Sphere",

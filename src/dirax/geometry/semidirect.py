@@ -1,0 +1,101 @@
+"""The dual of a semidirect product 𝔤 ⋉ V: body momenta of a group, with quantities that it carries along."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dirax.geometry.group_retractions import coadjoint, rotate
+from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
+from dirax.geometry.manifolds import Vector
+
+Advected = Float[Array, " r"]
+
+
+class SemidirectProduct(eqx.Module):
+    """Points x = (μ, a): a body momentum μ (d,) of `group` and advected quantities a (r,), r = `advected`.
+
+    a is seen from the body: a_t = g_t⁻¹·a_0 for a motion g_t. The group acts by `representation(matrix, a) -> (r,)`, linear
+    in a, of its matrices (homogeneous ones for rigid motions); by default a consists of vectors of the plane or of space,
+    which rotations turn and translations leave alone, such as the direction of gravity.
+    Raises `TypeError` and `ValueError` for a group that is none of dirax, and for sizes that do not fit.
+    """
+
+    group: AbstractLieGroup
+    advected: int = eqx.field(static=True, default=0)
+    representation: Callable | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if not isinstance(self.group, AbstractLieGroup):
+            raise TypeError(f"group must be a Lie group such as dx.SO3(), but {self.group!r} was given.")
+        k = self.vector_size
+        if not isinstance(self.advected, int) or self.advected < 0 or (self.representation is None and self.advected % k):
+            raise ValueError(
+                f"advected must be the number of advected quantities, a multiple of {k} for vectors that the group turns, but "
+                f"{self.advected!r} was given: give representation=, a function of (matrix, a), for other quantities."
+            )
+        if self.representation is not None and not callable(self.representation):
+            raise TypeError(f"representation must be a function (matrix, a) -> (r,), but {self.representation!r} was given.")
+
+    @property
+    def vector_size(self) -> int:
+        """2 for groups of the plane, 3 for those of space."""
+        return 3 if self.group.double_cover else 2
+
+    @property
+    def dimension(self) -> int:
+        """d, the dimension of the group."""
+        return self.group.dimension
+
+    @property
+    def size(self) -> int:
+        """d + r."""
+        return self.dimension + self.advected
+
+    def split(self, x: Float[Array, " n"]) -> tuple[Algebra, Advected]:
+        """(μ, a)."""
+        return x[: self.dimension], x[self.dimension :]
+
+    def act(self, g: Vector, a: Advected) -> Advected:
+        """g·a."""
+        if not self.advected:
+            return a
+        if self.representation is not None:
+            return self.representation(self.group.matrix(g), a)
+        k = self.vector_size
+        return jnp.concatenate([rotate(self.group, g, a[i : i + k]) for i in range(0, self.advected, k)])
+
+    def carried(self, g: Vector, a: Advected) -> Advected:
+        """g⁻¹·a."""
+        return self.act(self.group.inverse(g), a) if self.advected else a
+
+    def infinitesimal(self, xi: Algebra, a: Advected) -> Advected:
+        """ξ·a, the derivative of exp(εξ)·a at ε = 0."""
+        if not self.advected:
+            return a
+        return jax.jvp(lambda xi: self.act(self.group.group_exp(xi), a), (jnp.zeros_like(xi),), (xi,))[1]
+
+    def diamond(self, slope: Advected, a: Advected) -> Algebra:
+        """J (d,) with ⟨J, η⟩ = ⟨slope, η·a⟩: the torque that goes with a force `slope` on a."""
+        if not self.advected:
+            return jnp.zeros(self.dimension)
+        zero = jnp.zeros(self.dimension)
+        return jax.vjp(lambda xi: self.act(self.group.group_exp(xi), a), zero)[1](slope)[0]
+
+    def ad_star(self, xi: Algebra, momentum: Algebra) -> Algebra:
+        """ad*_ξ μ, the derivative of Ad*_{exp(εξ)} μ at ε = 0."""
+        flow = lambda xi: coadjoint(self.group, self.group.group_exp(xi), momentum)
+        return jax.jvp(flow, (jnp.zeros_like(xi),), (xi,))[1]
+
+    def field(self, x: Float[Array, " n"], xi: Algebra, slope: Advected) -> Float[Array, " n"]:
+        """(μ̇, ȧ) = (ad*_ξ μ − J(∂l/∂a, a), −ξ·a)."""
+        momentum, a = self.split(x)
+        rate = self.ad_star(xi, momentum) - self.diamond(slope, a)
+        return jnp.concatenate([rate, -self.infinitesimal(xi, a)]) if self.advected else rate
+
+    def bivector(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+        """The matrix Λ(x) of the Lie–Poisson bivector: ẋ = Λ(x) dh(x)."""
+        d = self.dimension
+        return jax.vmap(lambda dh: self.field(x, dh[:d], -dh[d:]), out_axes=1)(jnp.eye(self.size))
