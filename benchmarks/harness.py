@@ -1,32 +1,18 @@
-"""What every benchmark needs: interleaved repeats, a description of the machine, results as JSON."""
+"""What every benchmark needs: interleaved repeats and the machine (from the package), new processes, results as JSON."""
 
-import datetime
 import json
 import os
-import platform
-import shutil
-import statistics
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from dirax.diagnostics.bench.timing import interleaved, machine, summary
+
+__all__ = ["RESULTS", "in_new_process", "interleaved", "machine", "store", "summary", "table"]
+
 RESULTS = Path(__file__).parent / "results"
 FAST_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=65536"
-
-
-def interleaved(programs: dict[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
-    """Every program once a round, in turn, so that a busy machine slows all of them alike; what each call returned."""
-    for program in programs.values():
-        program()
-    rounds = [{name: program() for name, program in programs.items()} for _ in range(repeats)]
-    return {name: [values[name] for values in rounds] for name in programs}
-
-
-def summary(values: list[float]) -> dict[str, float]:
-    """Median and smallest of the repeats."""
-    return {"median": statistics.median(values), "min": min(values), "repeats": len(values)}
 
 
 def in_new_process(module: str, arguments: dict[str, Any], fast_loops: bool = False) -> Any:
@@ -39,36 +25,6 @@ def in_new_process(module: str, arguments: dict[str, Any], fast_loops: bool = Fa
     if done.returncode:
         raise RuntimeError(f"{module} {arguments} failed:\n{done.stderr}")
     return json.loads(done.stdout.splitlines()[-1])
-
-
-def machine() -> dict[str, Any]:
-    """Processor, system, versions and load."""
-    import jax
-    import numpy as np
-
-    import dirax
-
-    compiler = shutil.which("gcc") or shutil.which("cc")
-    version = subprocess.run([compiler, "--version"], capture_output=True, text=True).stdout if compiler else ""
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "numpy": np.__version__,
-        "compiler": version.splitlines()[0] if version else None,
-        "dirax": dirax.__version__,
-        "date": datetime.date.today().isoformat(),
-    }
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
 
 
 def store(name: str, results: dict[str, Any]) -> Path:

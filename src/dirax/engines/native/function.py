@@ -1,4 +1,4 @@
-"""Graph outputs as a compiled function on NumPy arrays, entry by entry: what the tests of the arithmetic call."""
+"""Graph outputs as a compiled function on NumPy arrays, entry by entry."""
 
 import ctypes
 from collections.abc import Sequence
@@ -37,11 +37,18 @@ def function_module(graph: Graph, inputs: Sequence[int], outputs: Sequence[int],
     return module.text()
 
 
-def compiled(graph: Graph, inputs: Sequence[int], outputs: Sequence[int], width: int = 1):
-    """A function (inputs, entries) → (outputs, entries) that runs the compiled graph."""
+def loaded(graph: Graph, inputs: Sequence[int], outputs: Sequence[int], width: int = 1):
+    """The compiled `evaluate(inputs, outputs, count)`, called with addresses."""
     text = function_module(graph, inputs, outputs, width, llvm.has_fma())
     library = llvm.load(llvm.object_code(text), ("evaluate",))
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(library["evaluate"])
+    call.library = library  # type: ignore[attr-defined]  # keeps the code alive
+    return call
+
+
+def compiled(graph: Graph, inputs: Sequence[int], outputs: Sequence[int], width: int = 1):
+    """A function (inputs, entries) → (outputs, entries) that runs the compiled graph."""
+    call = loaded(graph, inputs, outputs, width)
 
     def run(values: np.ndarray) -> np.ndarray:
         entries = values.shape[1]
@@ -52,5 +59,4 @@ def compiled(graph: Graph, inputs: Sequence[int], outputs: Sequence[int], width:
         call(packed.ctypes.data, out.ctypes.data, rows)
         return out.swapaxes(0, 1).reshape(len(outputs), -1)[:, :entries]
 
-    run.library = library  # type: ignore[attr-defined]  # keeps the code alive
     return run

@@ -1,0 +1,63 @@
+"""What `dirax bench` times, and where its results go."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from dirax import gallery
+from dirax.diagnostics.bench.measure import Bench, bench
+from dirax.diagnostics.bench.subject import Subject
+from dirax.gallery.example import Example
+from dirax.plotting import save_figure
+
+LONGEST = 2000
+"""Most steps of a timed trajectory."""
+
+QUICK, QUICK_STEPS, QUICK_REPEATS = ("kepler", "rolling-disk", "vortices"), 100, 2
+"""What `--quick` times where nothing else is asked for."""
+
+PICTURES = (".png", ".svg", ".pdf")
+
+
+def run_bench(
+    names: Sequence[str], repeats: int | None, quick: bool, tell: Callable[[float | None, str], None] | None = None
+) -> Bench:
+    """`bench` of the systems of the gallery of these names, of all of them without names.
+
+    Raises `ValueError` for an unknown name, and for fewer than one repeat.
+    """
+    chosen = [gallery.get(name) for name in (names or (QUICK if quick else gallery.names()))]
+    longest = QUICK_STEPS if quick else LONGEST
+    return bench([subject(e, longest) for e in chosen], repeats or (QUICK_REPEATS if quick else 7), tell)
+
+
+def subject(example: Example, longest: int) -> Subject:
+    """The example's own run, cut after `longest` steps."""
+    return Subject(
+        name=example.name,
+        system=example.system,
+        scheme=example.scheme,
+        initial=example.initial,
+        step=float(example.step),
+        steps=min(example.steps, longest),
+        params=example.params,
+    )
+
+
+def check_targets(table: Path | None, picture: Path | None) -> None:
+    """Raise before the measurement for files that could not be written."""
+    if picture is not None and picture.suffix not in PICTURES:
+        raise ValueError(f"--plot must end in {', '.join(PICTURES)}, but {str(picture)!r} was given.")
+    for path in (table, picture):
+        if path is not None and not path.parent.is_dir():
+            raise FileNotFoundError(
+                f"the folder {path.parent} does not exist: create it, or choose another place."
+            )
+
+
+def store(found: Bench, table: Path | None, picture: Path | None) -> None:
+    """Write the JSON file and the picture, each where a path is given."""
+    if table is not None:
+        table.write_text(json.dumps(found.to_dict(), indent=1, ensure_ascii=False) + "\n", "utf-8")
+    if picture is not None:
+        save_figure(found.plot(), picture)

@@ -1,0 +1,130 @@
+"""The engines of dirax, and the same step in JAX as one would write it."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.diagnostics.bench.subject import Program, Skipped, Subject
+from dirax.engines import native, xla
+from dirax.engines.native.interpret import UnsupportedPrimitive
+from dirax.engines.result import Problem
+
+BATCH, BATCH_STEPS = 1024, 50
+"""Size of the batches and the steps that each of their trajectories takes."""
+
+TOLERANCE, MOST_UPDATES = 1e-14, 20
+
+
+def native_one(subject: Subject) -> Program:
+    """One trajectory in one lane of the native engine."""
+    return _one(subject, native.run)
+
+
+def xla_one(subject: Subject) -> Program:
+    """One trajectory on the xla engine."""
+    return _one(subject, xla.run)
+
+
+def native_batch(subject: Subject) -> Program:
+    """A batch on the native engine, in all its lanes and threads."""
+    return _batch(subject, native.run)
+
+
+def xla_batch(subject: Subject) -> Program:
+    """A batch on the xla engine."""
+    return _batch(subject, xla.run)
+
+
+def _one(subject: Subject, engine: Callable) -> Program:
+    problem, last = subject.one, {}
+
+    def run() -> float:
+        last["outcome"] = outcome = engine(problem)
+        _refuse_failure(outcome, problem)
+        return outcome.run_seconds
+
+    run_once(run)
+    return Program(run, lambda: np.asarray(last["outcome"].fields[subject.shown][0, -1]), {})
+
+
+def _batch(subject: Subject, engine: Callable) -> Program:
+    rows = native.run(Problem(**{**vars(subject.one), "save_every": max(1, subject.steps // BATCH)}))
+    problem = subject.batch(rows, BATCH, BATCH_STEPS)
+    share = subject.steps / (BATCH * BATCH_STEPS)
+
+    def run() -> float:
+        outcome = engine(problem)
+        _refuse_failure(outcome, problem)
+        return outcome.run_seconds * share
+
+    run_once(run)
+    return Program(run, lambda: None, {"trajectories": BATCH, "steps": BATCH_STEPS})
+
+
+def run_once(run: Callable[[], float]) -> None:
+    """Compile, or raise `Skipped` with the reason why it cannot be."""
+    try:
+        run()
+    except UnsupportedPrimitive as error:
+        raise Skipped(str(error)) from None
+
+
+def _refuse_failure(outcome: Any, problem: Problem) -> None:
+    if np.any(np.asarray(outcome.completed) < problem.steps):
+        raise Skipped("a trajectory ended early")
+
+
+def plain_jax(subject: Subject) -> Program:
+    """`plain_run` of the subject, timed."""
+    run, last = plain_run(subject.one), {}
+
+    def timed() -> float:
+        tick = time.perf_counter()
+        last["end"] = run()
+        return time.perf_counter() - tick
+
+    timed()
+    return Program(timed, lambda: subject.position(*last["end"]), {"stops at": TOLERANCE})
+
+
+def plain_run(p: Problem, save: bool = False) -> Callable[[], Any]:
+    """A run as one would write it in JAX: `scan`, Newton with `jacfwd` and `jnp.linalg.solve`, linear extrapolation.
+
+    Returns a function to the state and the unknowns at the end (and the states on the way with `save`), for one trajectory
+    or, under `vmap`, a batch. Newton stops where an update is 1e-14, or below 1e-9 and no longer halved.
+    """
+    equation, h, params = p.equation, p.h, p.params
+
+    def newton(state, guess, t):
+        residual = lambda u: equation.residual(u, state, t, h, params)
+
+        def body(carry):
+            u, update, _, k = carry
+            change = jnp.linalg.solve(jax.jacfwd(residual)(u), residual(u))
+            return u - change, jnp.max(jnp.abs(change) / (jnp.abs(u) + 1)), update, k + 1
+
+        def going(carry):
+            _, update, before, k = carry
+            stalled = (update < 1e-9) & (update > before / 2)
+            return (update > TOLERANCE) & ~stalled & (k < MOST_UPDATES)
+
+        return jax.lax.while_loop(going, body, (guess, jnp.array(1.0), jnp.array(jnp.inf), 0))[0]
+
+    def step(carry, k):
+        state, last, older = carry
+        t = p.t0 + h * (k + p.first_step)
+        guess = equation.guess(state, 2 * last - older, h, params)
+        u = newton(state, guess, t) if equation.unknowns else guess
+        return (equation.advance(u, state, t, h, params), u, last), (state if save else None)
+
+    def one(state, guess):
+        (state, u, _), states = jax.lax.scan(step, (state, guess, guess), jnp.arange(p.steps, dtype=float))
+        return (state, u, states) if save else (state, u)
+
+    compiled = jax.jit(one if p.batch is None else jax.vmap(one))
+    state, guess = jnp.asarray(p.state), jnp.asarray(p.guess[0])
+    return lambda: jax.block_until_ready(compiled(state, guess))

@@ -1,0 +1,137 @@
+"""A system as an explicit ordinary differential equation ẏ = f(t, y), for libraries that integrate those."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dirax.diagnostics.bench.subject import Skipped
+from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.nonholonomic import NonholonomicMechanics
+from dirax.systems.phase_space import PhaseSpaceLagrangian
+from dirax.systems.port_hamiltonian import PortHamiltonian
+from dirax.systems.system import AbstractSystem
+
+SINGULAR = 1e12
+"""Condition number from which on the equations do not determine the derivatives."""
+
+
+@dataclass(frozen=True)
+class ExplicitODE:
+    """`derivative(t, y)` is traceable; `start` (d,) is y at t = 0, whose first `shown` entries are q (or x)."""
+
+    derivative: Callable[[Any, Float[Array, " d"]], Float[Array, " d"]]
+    start: np.ndarray
+    shown: int
+
+
+def explicit_ode(system: AbstractSystem, data: Mapping[str, Array], params: Any) -> ExplicitODE:
+    """The equations of motion solved for the derivatives, multipliers eliminated; `data` are initial data of one trajectory.
+
+    y is (q, v) for a regular Lagrangian, also with constraints: M v̇ = ∂L/∂q − (∂²L/∂v∂q) v + Wᵀλ with W v̇ = −Ẇ v. It is q
+    for a phase-space Lagrangian, and x for a Dirac or port-Hamiltonian system. Raises `Skipped` where the equations do not
+    determine ẏ, or are stated in another way.
+    """
+    match system:
+        case NonholonomicMechanics():
+            return explicit_ode(system.lagrange_dirac(), data, params)
+        case LagrangeDirac():
+            complete = system.complete(dict(data), params, False)
+            if "v" not in complete:
+                raise Skipped("the run starts from two points")
+            start = jnp.concatenate([complete["q"], complete["v"]])
+            return _solved(_newton_equations(system, len(complete["q"]), params), start, len(complete["q"]))
+        case PhaseSpaceLagrangian():
+            return _solved(_hamilton_equations(system, params), data["q"], len(data["q"]))
+        case DiracSystem():
+            x = system.complete(dict(data), params, False)["x"]
+            return _solved(_dirac_equations(system, params), x, len(x))
+        case PortHamiltonian() if not system.closed:
+            return ExplicitODE(_open_ports(system, params), np.asarray(data["x"]), len(data["x"]))
+        case PortHamiltonian():
+            raise Skipped("closed ports make it a differential-algebraic equation")
+    raise Skipped(f"no ordinary differential equation is derived for a {type(system).__name__}")
+
+
+LinearEquations = Callable[[Any, Any], tuple[Any, Any, Callable]]
+"""(t, y) ↦ (A, b, ẏ as a function of the solution z of A z = b)."""
+
+
+def _newton_equations(system: LagrangeDirac, n: int, params: Any) -> LinearEquations:
+    def equations(t, y):
+        q, v = y[:n], y[n:]
+        lagrangian = lambda q, v: system.lagrangian(q, v, params)
+        mass = jax.hessian(lagrangian, argnums=1)(q, v)
+        _, along = jax.jvp(lambda q: jax.grad(lagrangian, argnums=1)(q, v), (q,), (v,))
+        force = jax.grad(lagrangian)(q, v) - along
+        forms, rates = jax.jvp(lambda q: system.constraint_matrix(q, params), (q,), (v,))
+        matrix = jnp.block([[mass, -forms.T], [forms, jnp.zeros((len(forms), len(forms)))]])
+        return matrix, jnp.concatenate([force, -rates @ v]), lambda z: jnp.concatenate([v, z[:n]])
+
+    return equations
+
+
+def _hamilton_equations(system: PhaseSpaceLagrangian, params: Any) -> LinearEquations:
+    def equations(t, q):
+        return system.two_form(q, params), jax.grad(lambda q: system.hamiltonian(q, params))(q), lambda z: z
+
+    return equations
+
+
+def _dirac_equations(system: DiracSystem, params: Any) -> LinearEquations:
+    def equations(t, x):
+        F, E = system.structure.kernel(x, params)
+        return F, -E @ system.differential(x, params), lambda z: z
+
+    return equations
+
+
+def _open_ports(system: PortHamiltonian, params: Any) -> Callable:
+    def derivative(t, x):
+        velocity = system.flow_matrix(x, params) @ system.differential(x, params)
+        return velocity if system.inputs is None else velocity + system.open_matrix(x, params) @ system.input(t, x, params)
+
+    return derivative
+
+
+def _solved(equations: LinearEquations, start: Any, shown: int) -> ExplicitODE:
+    """The equations with z eliminated in scalars; the order of the pivots is the one at the start."""
+    matrix = np.asarray(equations(0.0, start)[0])
+    if not np.all(np.isfinite(matrix)) or np.linalg.cond(matrix) > SINGULAR:
+        raise Skipped("its equations do not determine the derivatives (singular)")
+    order = pivot_order(matrix)
+
+    def derivative(t, y):
+        matrix, right, rate = equations(t, y)
+        return rate(eliminate(matrix, right, order))
+
+    return ExplicitODE(derivative, np.asarray(start), shown)
+
+
+def pivot_order(matrix: np.ndarray) -> list[int]:
+    """The order in which partial pivoting takes the rows."""
+    table, order = np.array(matrix, dtype=float), list(range(len(matrix)))
+    for c in range(len(table)):
+        best = c + int(np.argmax(np.abs(table[c:, c])))
+        table[[c, best]], order[c], order[best] = table[[best, c]], order[best], order[c]
+        table[c + 1 :] -= np.outer(table[c + 1 :, c] / table[c, c], table[c])
+    return order
+
+
+def eliminate(matrix: Float[Array, "k k"], right: Float[Array, " k"], order: list[int]) -> Float[Array, " k"]:
+    """z with matrix z = right, elimination written out with the rows in `order`."""
+    k = len(order)
+    rows = [[matrix[i, j] for j in range(k)] + [right[i]] for i in order]
+    for c in range(k):
+        for i in range(c + 1, k):
+            factor = rows[i][c] / rows[c][c]
+            rows[i] = [a - factor * b if j > c else a for j, (a, b) in enumerate(zip(rows[i], rows[c], strict=True))]
+    z: list[Any] = [None] * k
+    for i in reversed(range(k)):
+        z[i] = (rows[i][k] - sum((rows[i][j] * z[j] for j in range(i + 1, k)), jnp.array(0.0))) / rows[i][i]
+    return jnp.stack(z)

@@ -1,0 +1,197 @@
+"""`dirax bench`: the programs agree on what they compute, are left out politely, and the table is consistent."""
+
+import importlib.util
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import dirax as dx
+from dirax import gallery
+from dirax.cli import app
+from dirax.cli.bench import subject
+from dirax.diagnostics.bench import casadi_c, ode_solvers
+from dirax.diagnostics.bench.engines import plain_run
+from dirax.diagnostics.bench.measure import PROGRAMS, Bench, Row, bench
+from dirax.diagnostics.bench.ode import eliminate, explicit_ode, pivot_order
+from dirax.diagnostics.bench.subject import Skipped, Subject
+from dirax.diagnostics.bench.timing import compiler, interleaved
+from dirax.engines import native
+
+
+def call(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def short(name, steps=50):
+    return subject(gallery.get(name), steps)
+
+
+def ode_of(example):
+    one = subject(example, 1)
+    return explicit_ode(one.system, one.arrays, one.leaves)
+
+
+# ---------------------------------------------------------------------- the other programs compute the same trajectory
+
+
+@pytest.mark.parametrize("name", ["kepler", "rolling-disk", "vortices"])
+def test_plain_jax_takes_the_steps_of_the_native_engine(name):
+    s = short(name)
+    state, _ = plain_run(s.one)()
+    np.testing.assert_allclose(state, native.run(s.one).last_state[0], rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("casadi") is None or compiler() is None, reason="needs casadi and a C compiler")
+@pytest.mark.parametrize("name", ["kepler", "rolling-disk", "dc-motor"])
+def test_casadi_c_takes_the_steps_of_the_native_engine(name):
+    s = short(name)
+    _, state, _ = casadi_c.c_run(s.one)()
+    np.testing.assert_allclose(state, native.run(s.one).last_state[0], rtol=1e-11, atol=1e-11)
+
+
+def test_batches_begin_along_the_trajectory():
+    s = short("kepler", 20)
+    rows = native.run(dx_problem(s, save_every=1))
+    batch = s.batch(rows, 5, 3)
+    np.testing.assert_allclose(batch.state[:, :2], rows.fields["q"][0, [0, 5, 10, 15, 20]])
+    after = native.run(batch).last_state
+    np.testing.assert_allclose(after[1], np.concatenate([rows.fields["q"][0, 8], rows.fields["p"][0, 8]]), rtol=1e-12)
+
+
+def dx_problem(s, **changes):
+    return type(s.one)(**{**vars(s.one), **changes})
+
+
+# ---------------------------------------------------------------------- explicit equations against known solutions
+
+
+def test_the_equations_of_a_nonholonomic_system_have_its_exact_solution():
+    example = gallery.get("rolling-disk")
+    ode = ode_of(example)
+    end = ode_solvers.reference_end(ode, 2.0)
+    np.testing.assert_allclose(end, example.exact(np.array([2.0]), **example.initial)[0], rtol=1e-10, atol=1e-10)
+
+
+def test_the_equations_of_a_lagrangian_with_magnetic_and_mass_terms():
+    """L = q0² v1²/2 + v0²/2 + q0 v1 − q1: by hand v̇0 = q0 v1² + v1, v̇1 = −(1 + v0 + 2 q0 v0 v1)/q0²."""
+    system = dx.LagrangeDirac(lambda q, v: (q[0] * v[1]) ** 2 / 2 + v[0] ** 2 / 2 + q[0] * v[1] - q[1])
+    q, v = np.array([1.3, 0.2]), np.array([0.4, -0.7])
+    ode = explicit_ode(system, {"q": jnp.asarray(q), "v": jnp.asarray(v)}, None)
+    expected = [*v, q[0] * v[1] ** 2 + v[1], -(1 + v[0] + 2 * q[0] * v[0] * v[1]) / q[0] ** 2]
+    np.testing.assert_allclose(ode.derivative(0.0, ode.start), expected, rtol=1e-14)
+    np.testing.assert_allclose(ode_solvers.compiled_field(ode)(0.0, ode.start), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["vortices", "lotka-volterra", "heavy-top", "dc-motor"])
+def test_a_fine_run_of_dirax_approaches_the_reference(name):
+    """Second order: halving the step quarters the distance, so both solve the same equations."""
+    example = gallery.get(name)
+    span = 8 * example.step
+    reference = ode_solvers.reference_end(ode_of(example), span)
+    errors = []
+    for parts in (8, 16):
+        sol = example.simulate(step=span / parts, steps=parts)
+        errors.append(ode_solvers.end_error((sol.x if "x" in sol.fields else sol.q)[-1], reference))
+    assert errors[1] < 0.3 * errors[0] < 1e-2, errors
+
+
+def test_solvers_reach_the_end_error_that_is_asked_for():
+    s = short("kepler", 100)
+    ode = ode_of(gallery.get("kepler"))
+    exact = gallery.get("kepler").exact(np.array([s.span]), **s.initial)[0]
+    assert ode_solvers.end_error(ode_solvers.reference_end(ode, s.span), exact) < 1e-11
+    errors = []
+    for wanted in (1e-2, 1e-8):
+        program = ode_solvers.dop853(ode, s.span, exact, wanted)
+        program.run()
+        errors.append(ode_solvers.end_error(program.end(), exact))
+        assert errors[-1] <= wanted
+    assert errors[1] < errors[0]
+    with pytest.raises(Skipped, match="does not reach"):
+        ode_solvers.dop853(ode, s.span, exact + 1e-3, 1e-8)
+
+
+def test_elimination_with_fixed_pivots():
+    rng = np.random.default_rng(0)
+    matrix, right = rng.standard_normal((5, 5)), rng.standard_normal(5)
+    matrix[0, 0] = 0.0
+    order = pivot_order(matrix)
+    assert sorted(order) == list(range(5)) and order[0] != 0
+    found = eliminate(jnp.asarray(matrix), jnp.asarray(right), order)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("system", "data", "reason"),
+    [
+        (dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - q @ q / 2), {"q": [1.0, 0.0], "v": [0.0, 0.0]}, "singular"),
+        (dx.PortHamiltonian(lambda x: x @ x / 2, np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]), closed=True),
+         {"x": [0.0, 0.0]}, "closed ports"),
+    ],
+)  # fmt: skip
+def test_systems_without_an_explicit_equation_are_left_out(system, data, reason):
+    with pytest.raises(Skipped, match=reason):
+        explicit_ode(system, {k: jnp.asarray(a) for k, a in data.items()}, None)
+
+
+# ---------------------------------------------------------------------- the table
+
+
+def test_interleaved_calls_every_program_once_a_round():
+    calls = []
+    values = interleaved({name: lambda name=name: calls.append(name) or len(calls) for name in "ab"}, 2)
+    assert "".join(calls) == "ababab" and values == {"a": [3, 5], "b": [4, 6]}
+
+
+def test_ratios_are_those_of_the_medians():
+    row = Row("one", "scheme", 0.1, 10, {"native": [1e-5, 3e-5, 2e-5], "xla": [8e-5, 6e-5, 1e-4]}, skipped={"heyoka": "no"})
+    table = Bench([row], {"processor": "p", "cores": 1, "python": "3", "jax": "0"}, 3)
+    assert row.ratio("xla") == pytest.approx(4.0) and row.microseconds == pytest.approx(2.0) and row.ratio("heyoka") is None
+    assert "heyoka left out (one): no" in str(table) and len(table.cells()[0]) == len(table.header) == len(PROGRAMS) + 2
+
+
+def test_missing_libraries_and_compositions_are_left_out(monkeypatch):
+    for name in ("casadi", "heyoka", "diffrax", "scipy.integrate"):
+        monkeypatch.setitem(sys.modules, name, None)
+    oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    data = {"q": np.array([1.0]), "v": np.array([0.0])}
+    scheme = dx.LagrangeDAlembert()
+    plain = Subject("spring", oscillator, scheme, data, 0.1, 20)
+    composed = Subject("composed", oscillator, dx.Composition(scheme, "yoshida4"), data, 0.1, 20)
+    first, second = bench([plain, composed], 1).rows
+    assert first.skipped == {
+        "CasADi C": "casadi is not installed", **dict.fromkeys(("heyoka", "DOP853", "diffrax"), "scipy is not installed")
+    }  # fmt: skip
+    assert set(first.seconds) == {"native", "native batch", "xla", "xla batch", "plain JAX"}
+    assert not second.seconds and set(second.skipped.values()) == {"the scheme is a composition"}
+
+
+def test_the_command_measures_and_stores(tmp_path):
+    table, picture = tmp_path / "bench.json", tmp_path / "bench.png"
+    result = call("bench", "kepler", "--quick", "--repeats", 1, "--json", table, "--plot", picture)
+    assert result.exit_code == 0, result.output
+    assert "kepler" in result.stdout and "DOP853" in result.stdout
+    stored = json.loads(table.read_text("utf-8"))
+    assert stored["repeats"] == 1 and stored["machine"]["cores"] >= 1 and stored["machine"]["jax"] == jax.__version__
+    (row,) = stored["rows"]
+    programs = row["programs"]
+    assert programs["native"]["ratio"] == 1.0 and programs["DOP853"]["end_error"] <= programs["native"]["end_error"]
+    assert set(programs) | set(row["left_out"]) == set(PROGRAMS)
+    assert all(entry["median"] > 0 for entry in programs.values())
+    assert picture.stat().st_size > 5000
+
+
+def test_the_command_refuses_what_it_cannot_do(tmp_path):
+    for arguments, message in [
+        (("kepplr",), "did you mean 'kepler'"),
+        (("kepler", "--plot", tmp_path / "bench.doc"), "must end in"),
+        (("kepler", "--json", tmp_path / "no" / "bench.json"), "does not exist"),
+    ]:
+        result = call("bench", *arguments)
+        assert result.exit_code == 1 and message in result.stderr, result.output
+    assert call("bench", "kepler", "--repeats", 0).exit_code == 2
