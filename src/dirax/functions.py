@@ -1,4 +1,5 @@
-"""User functions: plain JAX-traceable callables, with or without a trailing `params`, checked once and called uniformly."""
+"""User functions: plain JAX-traceable callables, with or without a leading `t` and a trailing `params`, checked once and
+called uniformly."""
 
 import inspect
 from collections.abc import Callable
@@ -22,6 +23,8 @@ INDEXING = ("dynamic_slice", "gather")
 class UserFunction(eqx.Module):
     """A user's function under a name, called as `f(*arguments, params)` whether or not the user wrote `params`.
 
+    A `timed` function may have the time as its first argument, which is then called `t`: `at(t, *arguments, params)` calls
+    it either way, and `f(t, *arguments, params)` is its call where it takes time.
     Raises `TypeError` at construction when the function is not callable or its signature takes neither the named
     arguments nor the named arguments and `params`.
     """
@@ -30,20 +33,32 @@ class UserFunction(eqx.Module):
     name: str = eqx.field(static=True)
     arguments: tuple[str, ...] = eqx.field(static=True)
     takes_params: bool = eqx.field(static=True)
+    takes_time: bool = eqx.field(static=True)
 
-    def __init__(self, function: Callable, name: str, arguments: tuple[str, ...]):
+    def __init__(self, function: Callable, name: str, arguments: tuple[str, ...], timed: bool = False):
         expected = f"{name}({', '.join(arguments)}[, params])"
+        expected += f" or {name}(t, {', '.join(arguments)}[, params])" * timed
         if not callable(function):
             raise TypeError(
                 f"{name} must be a function {expected}, but {value_text(function)} was given: "
                 "wrap the value in a function, e.g. a lambda."
             )
-        self.takes_params = _takes_params(function, name, expected, len(arguments))
-        self.function, self.name, self.arguments = _hashable(function), name, tuple(arguments)
+        self.takes_time = timed and _takes_time(function, len(arguments))
+        self.arguments = ("t", *arguments) if self.takes_time else tuple(arguments)
+        self.takes_params = _takes_params(function, name, expected, len(self.arguments))
+        self.function, self.name = _hashable(function), name
 
     def __call__(self, *values: Any):
         *args, params = values
         return self.function(*args, params) if self.takes_params else self.function(*args)
+
+    def at(self, t: Any, *values: Any):
+        """The function of `(*arguments, params)` at time t, which is passed on where the function takes it."""
+        return self(*self.given(t, *values))
+
+    def given(self, t: Any, *values: Any) -> tuple:
+        """What the function is called with at time t: `(t, *values)` or `values`."""
+        return (t, *values) if self.takes_time else values
 
     @property
     def signature(self) -> str:
@@ -101,6 +116,16 @@ class UserFunction(eqx.Module):
         return " and params=None (it takes params, which were not given: pass params=…)" if missing else ""
 
 
+def _takes_time(function: Callable, count: int) -> bool:
+    """Whether the first argument is called `t` and `count` others follow."""
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return False
+    positional = [p for p in parameters if p.kind in POSITIONAL]
+    return len(positional) > count and positional[0].name == "t"
+
+
 def _takes_params(function: Callable, name: str, expected: str, count: int) -> bool:
     try:
         parameters = list(inspect.signature(function).parameters.values())
@@ -148,6 +173,11 @@ def _way_out(error: Exception) -> str:
     if isinstance(error, jax.errors.ConcretizationTypeError):
         return "; write it without Python's if and float(), e.g. with jnp.where."
     return "."
+
+
+def at_time(function: Callable, t: Any, *values: Any):
+    """`function.at(t, *values)` of a user's function, `function(*values)` of any other."""
+    return function.at(t, *values) if isinstance(function, UserFunction) else function(*values)
 
 
 def is_traced(*trees: Any) -> bool:

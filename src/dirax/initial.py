@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.functions import check_finite, is_traced
+from dirax.functions import at_time, check_finite, is_traced
 
 KINDS = ({"q", "v"}, {"q", "p"}, {"q0", "q1"}, {"x"})
 OFF_CONSTRAINT = 1e-9
@@ -18,8 +18,8 @@ class Start(NamedTuple):
     """Where a run begins, each entry with a leading batch axis in a batch.
 
     First state and the first guess of every stage; the given row 0 of a two-point start; how far the data are off the
-    constraint, and the size of the velocity; the Lagrangian and the constraint matrix at the data, if the system has them;
-    the residual and the Jacobian of the first step.
+    constraints, and the size of the velocity; the Lagrangian and the matrix [W; ∂g/∂q] of the constraints at the data, if
+    the system has them; the residual and the Jacobian of the first step.
     """
 
     state: Any
@@ -29,7 +29,7 @@ class Start(NamedTuple):
     defect: Any
     size: Any
     lagrangian: Any
-    one_forms: Any
+    constraints: Any
     residual: Any
     jacobian: Any
 
@@ -93,36 +93,36 @@ def _begin(system, equation, data, params, h, t0, axes, project: bool) -> Start:
     two_points = "q0" in data
 
     def one(data, params, h, t0):
-        complete = system.complete(data, params, project)
+        complete = {**system.complete({**data, "t": t0}, params, project), "t": t0}
         defect, size = system.initial_defect(complete, params), jnp.array(1.0)
         state, u = stage.start(complete, fraction * h, params)
         guess = (u, *(other.start(complete, part * h, params)[1] for other, part in equation.stages[1:]))
         row0 = None
         if two_points:
             row0 = stage.unpack(state, u, t0, h, params)
-            defect = row0.get("constraint", defect)
+            defect = jnp.concatenate([defect, row0["constraint"]]) if "constraint" in row0 else defect
             state = stage.advance(u, state, t0, h, params)
             size = jnp.max(jnp.abs(data["q1"] - data["q0"])) / h
         elif "v" in complete:
             size = jnp.max(jnp.abs(complete["v"]))
         q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if two_points else (complete.get("q"), complete.get("v"))
         known = lambda name, *given: hasattr(system, name) and all(x is not None for x in given)
-        lagrangian = system.lagrangian(q, v, params) if known("lagrangian", q, v) else None
-        one_forms = system.constraint_matrix(q, params) if known("constraint_matrix", q) else None
+        lagrangian = at_time(system.lagrangian, t0, q, v, params) if known("lagrangian", q, v) else None
+        constraints = system.constraints.matrix(t0, q, params) if known("constraints", q) else None
         t = t0 + int(two_points) * h
         first_step = lambda u: stage.residual(u, state, t, fraction * h, params)
         residual, jacobian = (first_step(u), jax.jacfwd(first_step)(u)) if stage.unknowns else (None, None)
-        return Start(state, guess, row0, 0, defect, size, lagrangian, one_forms, residual, jacobian)
+        return Start(state, guess, row0, 0, defect, size, lagrangian, constraints, residual, jacobian)
 
     start = (one if axes is None else jax.vmap(one, in_axes=axes))(data, params, h, t0)
     return start._replace(first_step=int(two_points))
 
 
-def refuse_bad_start(start: Start, labels: tuple[str, ...], check_constraint: bool) -> None:
-    """Raise `ValueError` for dependent one-forms, functions that are not finite at the data, data off the constraint (with the
-    residual), and a first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
+def refuse_bad_start(system: Any, start: Start, labels: tuple[str, ...], check_constraint: bool) -> None:
+    """Raise `ValueError` for functions that are not finite at the data, data off the constraints (with the residual), and a
+    first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
     the equations of the first step."""
-    _refuse_dependent_one_forms(start)
+    _refuse_constraints_outside_their_domain(system, start)
     _refuse_outside_the_domain(start)
     if check_constraint:
         _refuse_off_constraint(start)
@@ -142,22 +142,19 @@ def _refuse_outside_the_domain(start: Start) -> None:
         )
 
 
-def _refuse_dependent_one_forms(start: Start) -> None:
-    if start.one_forms is None or not np.size(start.one_forms):
+def _refuse_constraints_outside_their_domain(system: Any, start: Start) -> None:
+    if start.constraints is None:
         return
-    matrices = _lanes(start.one_forms, 2)
-    finite = np.all(np.isfinite(matrices), axis=(1, 2))
-    if not np.all(finite):
-        raise ValueError(
-            f"one_forms is not finite at the initial data{_which(~finite)}: the data lie outside its domain, or on its edge."
-        )
-    ranks, _ = numerical_rank(matrices)
-    m = matrices.shape[1]
-    if np.any(ranks < m):
-        raise ValueError(
-            f"one_forms must be independent, but W(q) of shape {matrices.shape[1:]} has rank {np.min(ranks)} at the initial "
-            f"data{_which(ranks < m)}: leave out the one-forms that follow from the others."
-        )
+    for values, ndim in ((start.constraints, 2), (start.defect, 1)):
+        if not np.size(values):
+            continue
+        matrices = _lanes(values, ndim)
+        finite = np.all(np.isfinite(matrices), axis=tuple(range(1, ndim + 1)))
+        if not np.all(finite):
+            raise ValueError(
+                f"{system.constraints.names} is not finite at the initial data{_which(~finite)}: the data lie outside its "
+                "domain, or on its edge."
+            )
 
 
 def _refuse_off_constraint(start: Start) -> None:

@@ -13,6 +13,7 @@ from dirax.failures import explain
 from dirax.functions import check_finite, is_traced
 from dirax.initial import Start, initial_data, prepared, refuse_bad_start
 from dirax.progress import reporting
+from dirax.redundancy import redundant_constraints
 from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
 from dirax.solution import Solution
 from dirax.systems.system import AbstractSystem
@@ -52,9 +53,14 @@ def simulate(
 
     Under `jax.grad`, `jit` or `vmap` the run is one differentiable scan, and values are not checked.
 
+    Constraints of a Lagrangian system that follow from others where the run begins are left out of its equations:
+    `sol.stats["redundant_constraints"]` numbers them in the order of `sol.multipliers`, where theirs are zero, and their
+    residual is saved with the others.
+
     Raises `ValueError` or `TypeError`, naming the argument, for wrong shapes, dtypes and arities, values that are not
-    finite, `step` ≤ 0, `steps` < 1, data off the constraint, dependent one-forms, and a Lagrangian singular together with
-    its constraints ([PY] (21)). A run that fails midway, or is stopped by Ctrl-C, raises nothing: what was computed is
+    finite, `step` ≤ 0, `steps` < 1, data off the constraints, constraints that contradict each other, that are dependent at
+    the initial point alone, and a Lagrangian singular together with its constraints ([PY] (21)).
+    A run that fails midway, or is stopped by Ctrl-C, raises nothing: what was computed is
     kept, and `Solution.ok` and `.message` say what happened.
     """
     _check_kinds(system, scheme, engine)
@@ -70,12 +76,19 @@ def simulate(
     one = {k: a[0] if a.ndim == 2 else a for k, a in data.items()}
     one_params = jax.tree.map(lambda leaf: leaf[0], params) if batch_params else params
     shape = Shape(*system.sizes(one, one_params))
-    equation = make_step_equation(scheme, system, shape)
-    start = prepared(system, equation, data, params, h, t0, batch, batch_params, project)
+
+    def begin(shape: Shape):
+        equation = make_step_equation(scheme, system, shape)
+        return equation, prepared(system, equation, data, params, h, t0, batch, batch_params, project)
+
+    equation, start = begin(shape)
     # user functions that close over a traced value make the start traced although nothing that was passed is
-    traced = is_traced(data, params, h, t0, start)
+    traced, redundant = is_traced(data, params, h, t0, start), ()
     if not traced:
-        refuse_bad_start(start, equation.stages[0][0].labels, check_initial)
+        redundant = redundant_constraints(system, start.constraints, one, one_params, t0)
+        if redundant:
+            equation, start = begin(Shape(shape.n, shape.m, shape.c, redundant=redundant))
+        refuse_bad_start(system, start, equation.stages[0][0].labels, check_initial)
     problem = Problem(
         equation=equation,
         state=start.state,
@@ -95,6 +108,8 @@ def simulate(
     else:
         with reporting(progress, steps) as report:
             outcome = run_on(engine, problem, report)
+    if redundant:
+        outcome.notes["redundant_constraints"] = list(redundant)
     return _solution(system, scheme, problem, outcome, start, data, traced)
 
 

@@ -108,9 +108,11 @@ class Solution:
         return self.map_rows(lambda row, params: jnp.vdot(row["p"], generator(row["q"])))
 
     def map_rows(self, function: Callable):
-        """`function(row, params)` for every saved row, stacked; `row` is the dict of node fields of one trajectory."""
+        """`function(row, params)` for every saved row, stacked; `row` is the dict of node fields of one trajectory and of
+        the time `t`."""
         nodes = {k: jnp.asarray(a) for k, a in self.fields.items() if self.field_info[k].place == "node"}
         batched = self.batch is not None
+        nodes["t"] = jnp.broadcast_to(jnp.asarray(self.t), (self.batch, self.rows) if batched else (self.rows,))
         axes = (0, 0 if self.batch_params and self.params is not None else None) if batched else None
         if is_traced(nodes, self.params) or self.rows * (self.batch or 1) <= BLOCK:
             return _along(function, nodes, self.params, axes)

@@ -169,9 +169,9 @@ def test_membership_is_that_of_the_printed_formulas(plus_disk):
     residual = force - matrix.T @ np.linalg.lstsq(matrix.T, force, rcond=None)[0]
     assert np.max(np.abs(residual)) < 1e-11 < 1e-3 < np.max(np.abs(force))
     measure, given = eqx.filter_jit(membership_defect), (plus_disk.p[201], plus_disk.multipliers[201])
-    assert np.max(measure(discrete_system(DISK, dx.PlusLagrangeDirac(), h), *q, *given, None)) < EPSILON
+    assert np.max(measure(discrete_system(DISK, dx.PlusLagrangeDirac(), h), 0.0, *q, *given, None)) < EPSILON
     # the constraint of the other sign is missed by h|dW||v|, here in units of |W||q|/h
-    assert measure(discrete_system(DISK, dx.MinusLagrangeDirac(), h), *q, *given, None)[0] > 1e-6
+    assert measure(discrete_system(DISK, dx.MinusLagrangeDirac(), h), 0.0, *q, *given, None)[0] > 1e-6
 
 
 # -------------------------------------------------------------------------------------- the structural relation φ*Ω = Ω + dβ

@@ -14,12 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.engines.lane import first_lane, take_step
+from dirax.functions import UserFunction
 from dirax.geometry.discrete import DiscretizationMapDirac
 from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.structures import canonical_two_form
 from dirax.geometry.tulczyjew import FiniteDifferenceTriple, slot_derivatives
-from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_lagrangian
+from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.solution import Solution
 from dirax.systems.dirac_system import DiracSystem
@@ -35,7 +36,8 @@ Scalar = Float[Array, ""]
 
 
 class DiscreteSystem(eqx.Module):
-    """A Lagrangian system as a discrete Lagrange–d'Alembert scheme sees it: L_d and w_d on Q × Q, W on Q.
+    """A Lagrangian system as a discrete Lagrange–d'Alembert scheme sees it: L_d, f_d^± and w_d on Q × Q, [W; ∂g/∂q] on Q,
+    and g. The time t is that of q0.
 
     `sign` is "+" or "-" for the schemes of [PY], None for a general discrete constraint; `share` is the part of the
     constraint force that is taken off the incoming momentum D2 L_d(q_{k−1}, q_k) before it is saved.
@@ -48,21 +50,43 @@ class DiscreteSystem(eqx.Module):
     sign: str | None = eqx.field(static=True)
     share: float = eqx.field(static=True, default=0.0)
 
-    def lagrangian(self, q0: Vector, q1: Vector, params: Any) -> Scalar:
+    @property
+    def plain(self) -> bool:
+        """Whether the constraints are W v = 0 alone."""
+        return self.system.holonomic is None and self.system.affine is None
+
+    def lagrangian(self, t: Any, q0: Vector, q1: Vector, params: Any) -> Scalar:
         """L_d(q0, q1)."""
         ld = discrete_lagrangian(self.system.lagrangian, self.rule)
-        return ld(q0, (q1 - q0) / self.step, self.step, params)
+        return ld(t, q0, (q1 - q0) / self.step, self.step, params)
 
-    def constraint(self, q0: Vector, q1: Vector, params: Any) -> Float[Array, " m"]:
-        """w_d(q0, q1)."""
+    def impulses(self, t: Any, q0: Vector, q1: Vector, params: Any) -> tuple[Vector, Vector]:
+        """(f_d^−, f_d^+)(q0, q1)."""
+        if self.system.forces is None:
+            return jnp.zeros_like(q0), jnp.zeros_like(q0)
+        return discrete_forces(self.system.forces, self.rule)(t, q0, (q1 - q0) / self.step, self.step, params)
+
+    def slots(self, t: Any, q0: Vector, q1: Vector, params: Any) -> tuple[Vector, Vector]:
+        """(D1 L_d + f_d^−, D2 L_d + f_d^+)."""
+        d1, d2 = slot_derivatives(lambda a, b: self.lagrangian(t, a, b, params), q0, q1)
+        first, last = self.impulses(t, q0, q1, params)
+        return d1 + first, d2 + last
+
+    def constraint(self, t: Any, q0: Vector, q1: Vector, params: Any) -> Float[Array, " k"]:
+        """(w_d(q0, q1), g(q1))."""
+        found = self.system.constraints.position_defect(t + self.step, q1, params)
         if self.system.one_forms is None:
-            return jnp.zeros((0,))
-        wd = discrete_constraint(self.system.constraint_matrix, self.constraint_rule)
-        return wd(q0, (q1 - q0) / self.step, self.step, params)
+            return found
+        wd = discrete_constraint(self.system.constraints, self.constraint_rule)
+        return jnp.concatenate([wd(t, q0, (q1 - q0) / self.step, self.step, params), found])
 
-    def annihilator(self, q: Vector, params: Any) -> Float[Array, "n n"]:
+    def matrix(self, t: Any, q: Vector, params: Any) -> Float[Array, "k n"]:
+        """[W; ∂g/∂q], the one-forms of Δ_Q."""
+        return self.system.constraints.matrix(t, q, params)
+
+    def annihilator(self, t: Any, q: Vector, params: Any) -> Float[Array, "n n"]:
         """The projector onto Δ°_Q(q)."""
-        return annihilator_projector(self.system.constraint_matrix(q, params))
+        return annihilator_projector(self.matrix(t, q, params))
 
 
 def discrete_system(system: Any, scheme: Any, step: Any) -> DiscreteSystem | str:
@@ -84,6 +108,7 @@ def discrete_system(system: Any, scheme: Any, step: Any) -> DiscreteSystem | str
 
 def membership_defect(
     discrete: DiscreteSystem,
+    t: Any,
     q0: Vector,
     q1: Vector,
     q2: Vector,
@@ -96,41 +121,52 @@ def membership_defect(
 
     (+) and (−): the element (X^{d±}, d_D^±L_d) at q1 of the induced structure ([PY] Definition 6.7, Proposition 5.17),
     with the Legendre momenta F⁺L_d or F⁻L_d; the constraint is W q̂ of the pair (q0, q1) or (q1, q2). Otherwise
-    w_d(q1, q2) = 0 and D2 L_d(q0, q1) + D1 L_d(q1, q2) ∈ Δ°(q1). Δ° is taken from the singular vectors of W.
+    w_d(q1, q2) = 0 and D2 L_d(q0, q1) + D1 L_d(q1, q2) ∈ Δ°(q1). Δ° is taken from the singular vectors of [W; ∂g/∂q], so
+    that Δ = ker W ∩ ker ∂g/∂q; the constraints of a pair (q0, q1) are those of W and g(q1) = 0. Forces add f_d^+ to
+    D2 L_d and f_d^− to D1 L_d. `t` is the time of q0.
 
     Each is divided by the sum of its terms' absolute values and by what it changes when every coordinate is changed by
     itself (its absolute Jacobian times |q| + |Δq| + h): a perfect step that was rounded gives a few 2⁻⁵³.
     """
     h, n = discrete.step, q0.shape[0]
-    ld = lambda a, b: discrete.lagrangian(a, b, params)
-    (before0, p1), (before1, p2) = slot_derivatives(ld, q0, q1), slot_derivatives(ld, q1, q2)
-    onto = discrete.annihilator(q1, params)
+    here = t + h
+    (before0, p1), (before1, p2) = discrete.slots(t, q0, q1, params), discrete.slots(here, q1, q2, params)
+    matrix = discrete.matrix(here, q1, params)
+    first, pair = (t, (q0, q1)) if discrete.sign == "+" else (here, (q1, q2))
     if discrete.sign is None:
-        constraint, force = discrete.constraint(q1, q2, params), (p1 + before1) / h
-        force = force - onto @ force
+        constraint, force = discrete.constraint(first, *pair, params), (p1 + before1) / h
+        force = force - discrete.annihilator(here, q1, params) @ force
     else:
-        forms = discrete.system.one_forms
-        structure = InducedFiniteDifferenceDirac(forms, step=h, sign=discrete.sign)
+        forms = UserFunction(lambda q, params: discrete.matrix(here, q, params), "one_forms", ("q",))
+        structure = InducedFiniteDifferenceDirac(forms if matrix.shape[0] else None, step=h, sign=discrete.sign)
+        far, of_force = (here, (q1, q2)) if discrete.sign == "+" else (t, (q0, q1))
+        ld = lambda a, b: discrete.lagrangian(far, a, b, params)
         _, _, beta, gamma = FiniteDifferenceTriple(step=h, sign=discrete.sign).dirac_differential(ld, q0, q1, q2)
-        pair, momenta = ((q0, q1), (p1, p2)) if discrete.sign == "+" else ((q1, q2), (-before0, -before1))
+        beta = beta - sum(discrete.impulses(far, *of_force, params)) / h
+        momenta = (p1, p2) if discrete.sign == "+" else (-before0, -before1)
         constraint, second_order, force = structure.membership_defect(*pair, momenta, beta, gamma, params)
+        constraint = constraint if discrete.plain else discrete.constraint(first, *pair, params)
         force = jnp.concatenate([second_order, force])
 
     jump = p1 + before1
-    matrix = discrete.system.constraint_matrix(q1, params)
     of_jump = jnp.linalg.pinv(matrix).T @ jump if matrix.shape[0] else jnp.zeros(0)
-    saved = jnp.concatenate([p - p1 + discrete.share * jump, jump - matrix.T @ multipliers])
+    taken = p - p1 + discrete.share * jump
+    if discrete.system.holonomic is not None:
+        m = discrete.system.constraint_matrix(q1, params, here).shape[0]
+        taken = p - p1 + discrete.share * (matrix[:m].T @ multipliers[:m])
+        taken = taken - annihilator_projector(matrix[m:]) @ taken  # p is projected along the image of (∂g/∂q)ᵀ
+    saved = jnp.concatenate([taken, jump - matrix.T @ multipliers])
 
     def force_of(z):
         a, b, c = jnp.split(z, 3)
-        return slot_derivatives(ld, a, b)[1] + slot_derivatives(ld, b, c)[0]
+        return discrete.slots(t, a, b, params)[1] + discrete.slots(here, b, c, params)[0]
 
     def reaction_of(q):
-        return discrete.system.constraint_matrix(q, params).T @ of_jump
+        return discrete.matrix(here, q, params).T @ of_jump
 
     def constraint_of(z):
         a, b, c = jnp.split(z, 3)
-        return discrete.constraint(*((a, b) if discrete.sign == "+" else (b, c)), params)
+        return discrete.constraint(first, *((a, b) if discrete.sign == "+" else (b, c)), params)
 
     z = jnp.concatenate([q0, q1, q2])
     moved = jnp.maximum(jnp.abs(q1 - q0), jnp.abs(q2 - q1)) + h
@@ -216,7 +252,8 @@ def symplecticity_defect(system: Any, equation: Any, h, data: dict, t, params) -
     Entries are the largest ones after q and p were brought to balanced units, q → q√s, p → p/√s.
     """
     stage, fraction = equation.stages[0]
-    state, guess = stage.start(system.complete(data, params, False), fraction * h, params)
+    data = {**data, "t": t}
+    state, guess = stage.start({**system.complete(data, params, False), "t": t}, fraction * h, params)
     _, jacobian, condition = differentiated_step(equation, state, guess, t, h, params)
     n = state.shape[0] // 2
     form = canonical_two_form(n)
@@ -236,24 +273,24 @@ def structural_defect(discrete: DiscreteSystem, equation: Any, q0: Vector, q1: V
     φ(q0, q1) = (q1, q2) is the discrete Lagrange–d'Alembert map, Ω = −d(−D1 L_d dq0) = F⁻L_d*(dq ∧ dp), and
     β = ⟨F, dq1⟩ with F the part in Δ°(q1) of D2 L_d(q0, q1) + D1 L_d(q1, q2) ([PY] §3.2). There β_d is printed as a
     pull-back from the first point of the pair; the variation (11) puts the force at q1, the first point of φ(q0, q1), and
-    only this makes the relation true. Both sides are restricted to the vectors tangent to {w_d = 0}.
+    only this makes the relation true. Both sides are restricted to the vectors tangent to {w_d = 0}, or {w_d = 0, g(q0) = 0,
+    g(q1) = 0}, where dβ has no part from holonomic constraints: without others φ is symplectic. `t` is the time of q1.
     """
     n, h = q0.shape[0], discrete.step
-    ld = lambda a, b: discrete.lagrangian(a, b, params)
-    d1 = lambda a, b: slot_derivatives(ld, a, b)[0]
-    d2 = lambda a, b: slot_derivatives(ld, a, b)[1]
+    d1 = lambda t, a, b: discrete.slots(t, a, b, params)[0]
+    d2 = lambda t, a, b: discrete.slots(t, a, b, params)[1]
     m = equation.stages[0][0].unknowns - n
     guess = jnp.concatenate([(q1 - q0) / h, jnp.zeros(m)])
 
     def state_of(z):
-        return jnp.concatenate([z[n:], d2(z[:n], z[n:])])
+        return jnp.concatenate([z[n:], d2(t - h, z[:n], z[n:])])
 
     def force(z, c):
-        return discrete.annihilator(z[n:], params) @ (d2(z[:n], z[n:]) + d1(z[n:], c))
+        return discrete.annihilator(t, z[n:], params) @ (d2(t - h, z[:n], z[n:]) + d1(t, z[n:], c))
 
-    def lagrangian_two_form(z):
+    def lagrangian_two_form(t, z):
         """−dΘ of Θ = −D1 L_d dq0: dq0 ∧ dq1 with the coefficients −D1 D2 L_d, and nothing else (D1 D1 L_d is symmetric)."""
-        mixed = -jax.jacfwd(lambda b: d1(z[:n], b))(z[n:])  # ∂p0_i/∂q1_j
+        mixed = -jax.jacfwd(lambda b: d1(t, z[:n], b))(z[n:])  # ∂p0_i/∂q1_j
         zero = jnp.zeros((n, n))
         return jnp.block([[zero, mixed], [-mixed.T, zero]])
 
@@ -264,12 +301,19 @@ def structural_defect(discrete: DiscreteSystem, equation: Any, q0: Vector, q1: V
     jacobian = jnp.concatenate([jnp.eye(2 * n)[n:], q2_of_pair])  # of φ
     force_z, force_q2 = jax.jacfwd(force, argnums=(0, 1))(z, q2)
     beta = jnp.concatenate([jnp.zeros((n, 2 * n)), force_z + force_q2 @ q2_of_pair])  # ∂_j β_i
-    two_form, two_form_after = lagrangian_two_form(z), lagrangian_two_form(jnp.concatenate([q1, q2]))
+    two_form, two_form_after = lagrangian_two_form(t - h, z), lagrangian_two_form(t, jnp.concatenate([q1, q2]))
     change = jacobian.T @ two_form_after @ jacobian - two_form
     dbeta = beta.T - beta  # (dβ)_ij = ∂_i β_j − ∂_j β_i
-    constraint_matrix = jax.jacfwd(lambda z: discrete.constraint(z[:n], z[n:], params))(z)
-    _, _, right = jnp.linalg.svd(constraint_matrix, full_matrices=True)
-    tangent = right[constraint_matrix.shape[0] :].T
+
+    def constraints_of_pair(z):
+        first = discrete.system.constraints.position_defect(t - h, z[:n], params)
+        return jnp.concatenate([discrete.constraint(t - h, z[:n], z[n:], params), first])
+
+    constraint_matrix = jax.jacfwd(constraints_of_pair)(z)
+    constraint_matrix = constraint_matrix / nonzero(jnp.max(jnp.abs(constraint_matrix), axis=1, keepdims=True))
+    _, values, right = jnp.linalg.svd(constraint_matrix, full_matrices=True)
+    kept = jnp.concatenate([values > 1e-10 * values[0], jnp.zeros(right.shape[0] - values.shape[0], bool)])
+    tangent = jnp.where(kept, 0.0, right.T)  # without the normal vectors, as many as there are independent constraints
     restricted = lambda form: jnp.max(jnp.abs(tangent.T @ form @ tangent))
     size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(two_form_after) @ jnp.abs(jacobian)) + jnp.max(jnp.abs(beta))
     return jnp.stack([restricted(change - dbeta) / size, restricted(change) / size, condition])

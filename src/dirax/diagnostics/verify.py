@@ -22,6 +22,7 @@ from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, OK, VIOLATED,
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.solution import Solution
 from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.port_hamiltonian import PortHamiltonian
 
 EPSILON = 2.0**-52
@@ -103,7 +104,8 @@ def _membership(sol: Solution, tolerance: float | None) -> list[Line]:
     points = (q[..., :-2, :], q[..., 1:-1, :], q[..., 2:, :])
     multipliers = sol.fields.get("multipliers", np.zeros((*q.shape[:-2], sol.rows - 1, 0)))
     items = (*points, np.asarray(sol.p)[..., 1:-1, :], np.asarray(multipliers)[..., 1:, :])
-    values = _where_reached(over_rows(eqx.Partial(membership_defect, found), sol, items), items, sol)
+    times = _times(sol, np.arange(sol.rows - 2))
+    values = _where_reached(over_rows(eqx.Partial(membership_defect, found), sol, (times, *items)), items, sol)
     if "q0" in sol.initial and found.sign == "+":
         values[:, 0, 0] = 0.0  # the first pair was given, not computed
     structure, saved = values[..., :2], values[..., 2]
@@ -145,19 +147,22 @@ def _constraint(sol: Solution, tolerance: float | None) -> Line | None:
         return Line(name, None, None, NOT_CHECKED, str(error))
     if residual.shape[-1] == 0:
         return None
-    residual = np.max(np.abs(residual.reshape((-1, *residual.shape[-2:]))), axis=-1)
+    residual = np.abs(residual.reshape((-1, *residual.shape[-2:])))
     residual = np.where(np.isnan(residual), 0.0, residual)  # rows that were not reached
+    values, residual = np.max(residual / _constraint_scale(sol), axis=-1), np.max(residual, axis=-1)
     steps = "constraint" in sol.fields
     given = int(steps and "q0" in sol.initial)  # the first pair was given, not computed
     if residual.shape[1] <= given:
         return Line(name, None, None, NOT_CHECKED, "no step was computed")
-    values = residual[:, given:] / _constraint_scale(sol)
+    values = values[:, given:]
     lane, row = _worst(values)
     kind = "discrete constraint of each step" if steps else "constraint at each row"
     text = (
         f"{kind}, relative to its terms; at most {np.max(residual[:, given:]):.2g}, at t = {float(sol.t[row + given]):.6g}"
         f"{_lane(sol, lane)}"
     )
+    if redundant := sol.stats.get("redundant_constraints"):
+        text += f"; {', '.join(f'number {i}' for i in redundant)} left out, following from the others"
     if given:
         text += f"; the pair given at the start is off by {np.max(residual[:, 0]):.2g}"
     method_one = isinstance(sol.scheme, DiscreteDirac) and sol.scheme.constraints == "discretize"
@@ -167,16 +172,22 @@ def _constraint(sol: Solution, tolerance: float | None) -> Line | None:
     return _judged(sol, name, np.max(values, axis=1), _limit(tolerance, 1), text)
 
 
-def _constraint_scale(sol: Solution) -> float:
-    """The size of the constraint's terms: |W||v| where the steps impose W v = 0, the largest saved number of a loaded
-    solution, |dE||x| where the constraint is that dE be in the image of a Dirac structure; else from its derivative."""
+def _constraint_scale(sol: Solution) -> Any:
+    """The size of the constraint's terms: |W||v| + |b| and |∂g/∂q||q| where the steps impose W v + b = 0 and g = 0, one number
+    for all constraints or one for each; the largest saved number of a loaded solution, |dE||x| where the constraint is that
+    dE be in the image of a Dirac structure; else from its derivative."""
     found = discrete_system(sol.system, sol.scheme, sol.step)
     if isinstance(found, DiscreteSystem):
         q = np.asarray(sol.q)
         speed = np.abs(np.diff(q, axis=-2)) / (sol.step * sol.save_every)
         speed = np.nanmax(speed, axis=tuple(range(speed.ndim - 1)), initial=0.0) + 1.0
-        sizes = over_rows(eqx.Partial(_size_of_forms, found), sol, (q[..., _spread(sol.rows, SAMPLED_ROWS), :],))
-        return float(np.max(np.nanmax(sizes, axis=(0, 1)) @ speed, initial=0.0)) or 1.0
+        rows = _spread(sol.rows, SAMPLED_ROWS)
+        items = (_times(sol, rows), q[..., rows, :])
+        sizes = over_rows(eqx.Partial(_sizes_of_constraints, found, jnp.asarray(speed)), sol, items)
+        nonholonomic, holonomic = np.nanmax(sizes[..., 0], axis=(0, 1)), np.nanmax(sizes[..., 1], axis=(0, 1))
+        m = len(holonomic) if found.system.holonomic is None else _count_of_forms(sol)
+        scale = np.where(np.arange(len(holonomic)) < m, np.max(nonholonomic[:m], initial=0.0), holonomic)
+        return np.where(scale > 0, scale, 1.0)
     if sol.system is None:
         nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
         return float(max(1.0, *(np.nanmax(np.abs(a)) for a in nodes)))
@@ -184,8 +195,21 @@ def _constraint_scale(sol: Solution) -> float:
     return float(np.nanmax(_sampled_terms(sol, terms))) or 1.0
 
 
-def _size_of_forms(discrete: DiscreteSystem, q, params: Any):
-    return jnp.abs(discrete.system.constraint_matrix(q, params))
+def _sizes_of_constraints(discrete: DiscreteSystem, speed, t, q, params: Any):
+    """The sizes of the terms of W v + b and of g, for each row of [W; ∂g/∂q], (m + c, 2)."""
+    matrix, constraints = jnp.abs(discrete.matrix(t, q, params)), discrete.system.constraints
+    along = matrix @ speed
+    if constraints.affine is not None:
+        b = jnp.abs(constraints.affine.at(t, q, params))
+        along = along.at[: b.shape[0]].add(b)
+    return jnp.stack([along, matrix @ jnp.abs(q)], axis=1)
+
+
+def _count_of_forms(sol: Solution) -> int:
+    """m, the number of one-forms."""
+    q, t, forms = jnp.asarray(sol.q).reshape(-1, np.shape(sol.q)[-1])[0], float(sol.t[0]), sol.system.constraints
+    params = jax.tree.map(lambda a: a[0], sol.params) if sol.batch_params else sol.params
+    return forms.sizes(q, params)[0]
 
 
 # ---------------------------------------------------------------------------------------------- along the trajectory
@@ -198,11 +222,17 @@ def _energy(sol: Solution) -> Line:
     except ValueError as error:
         return Line(name, None, None, NOT_CHECKED, str(error))
     energy = energy.reshape(-1, energy.shape[-1])
+    if "work" in sol.fields:
+        energy = energy - np.asarray(sol.fields["work"]).reshape(energy.shape)
     roundoff = ROUNDINGS * EPSILON * _steps(sol) * _energy_scale(sol, energy)
     system = sol.system
     if isinstance(system, PortHamiltonian) and (system.R is not None or system.inputs is not None):
         change = float(np.nanmax(np.abs(energy - energy[:, :1])))
         return Line(name, change, None, NOT_CHECKED, f"the system does not conserve it; it changed by {change:.3g}")
+    if isinstance(system, LagrangeDirac) and (system.depends_on_time or system.affine is not None):
+        change, why = float(np.nanmax(np.abs(energy - energy[:, :1]))), "depends on time"
+        why = why if system.depends_on_time else "has constraints that do work (affine)"
+        return Line(name, change, None, NOT_CHECKED, f"the system {why} and does not conserve it; it changed by {change:.3g}")
     t, found = np.asarray(sol.t), []
     for lane, series in enumerate(energy):
         good = np.isfinite(series)
@@ -214,7 +244,7 @@ def _energy(sol: Solution) -> Line:
     if sol.batch is not None:
         details["per_trajectory"] = [f.drift for f in found]
         details["verdicts"] = [f.verdict for f in found]
-    text = worst.text + _lane(sol, lane)
+    text = "less the work of the forces: " * ("work" in sol.fields) + worst.text + _lane(sol, lane)
     others = sorted({f.verdict for f in found} - {worst.verdict})
     text += "".join(f"; {details['verdicts'].count(other)} of {len(found)} {other}" for other in others)
     return Line(name, abs(worst.drift), worst.told, worst.verdict, text, details)
@@ -238,18 +268,18 @@ def _sampled_terms(sol: Solution, terms: Callable) -> np.ndarray:
     rows = _spread(sol.rows, SAMPLED_ROWS)
     lead = (slice(None),) * (sol.batch is not None)
     nodes = {k: np.asarray(a)[(*lead, rows)] for k, a in sol.fields.items() if sol.field_info[k].place == "node"}
-    return over_rows(eqx.Partial(terms, sol.system), sol, (nodes,))
+    return over_rows(eqx.Partial(terms, sol.system), sol, (_times(sol, rows), nodes))
 
 
-def _constraint_terms(system: Any, row: dict, params: Any):
+def _constraint_terms(system: Any, t, row: dict, params: Any):
     """Σ |∂c/∂row_i| |row_i|, the largest over the constraints c."""
-    derivative = jax.jacfwd(lambda row: system.constraint_at(row, params))(row)
+    derivative = jax.jacfwd(lambda row: system.constraint_at({**row, "t": t}, params))(row)
     return jnp.max(sum(jnp.abs(derivative[name]) @ jnp.abs(row[name]) for name in row), initial=0.0)
 
 
-def _energy_terms(system: Any, row: dict, params: Any):
+def _energy_terms(system: Any, t, row: dict, params: Any):
     """Σ |∂E/∂row_i| |row_i|."""
-    gradient = jax.grad(lambda row: system.energy_at(row, params))(row)
+    gradient = jax.grad(lambda row: system.energy_at({**row, "t": t}, params))(row)
     return sum(jnp.sum(jnp.abs(gradient[name] * row[name])) for name in row)
 
 
@@ -322,6 +352,8 @@ def _symplecticity(sol: Solution, tolerance: float | None) -> Line:
     name = "structural relation φ*Ω = Ω + dβ" if constrained else "symplecticity of one step"
     if sol.equation is None or sol.system is None:
         return Line(name, None, None, NOT_CHECKED, "the solution was loaded without its system")
+    if "work" in sol.fields:
+        return Line(name, None, None, NOT_CHECKED, "the forces change the two-form")
     stages = sol.equation.stages
     if not all(stage.canonical for stage, _ in stages):
         return Line(name, None, None, NOT_CHECKED, "the state of this scheme is not (q, p) on T*Q")
@@ -366,7 +398,9 @@ def _cannot_start(sol: Solution, data: dict) -> str:
     stage, fraction = sol.equation.stages[0]
     try:
         row = {name: values[first] for name, values in data.items()}
-        jax.eval_shape(lambda row: stage.start(sol.system.complete(row, params, False), fraction * sol.step, params), row)
+        row["t"] = jnp.asarray(sol.t[0])
+        complete = lambda row: {**sol.system.complete(row, params, False), "t": row["t"]}
+        jax.eval_shape(lambda row: stage.start(complete(row), fraction * sol.step, params), row)
     except (KeyError, TypeError, ValueError) as error:
         return f"the scheme does not start from a saved row: {error}"
     return ""

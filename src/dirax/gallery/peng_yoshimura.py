@@ -92,8 +92,8 @@ def generalized_energy(sol: Solution, sign: str) -> np.ndarray:
     h = sol.step
 
     def of_step(q, v):
-        d1, d2 = slot_derivatives(ld, q, v, h, sol.params)
-        return h * ((d2 if sign == "+" else -d1) @ v) - ld(q, v, h, sol.params)
+        d1, d2 = slot_derivatives(ld, 0.0, q, v, h, sol.params)
+        return h * ((d2 if sign == "+" else -d1) @ v) - ld(0.0, q, v, h, sol.params)
 
     q = np.asarray(sol.q)
     return np.asarray(jax.jit(jax.vmap(of_step))(q[:-1], np.diff(q, axis=0) / h))

@@ -114,7 +114,7 @@ def discrete_energy(sol: Solution) -> np.ndarray:
     """(E_d)_k = L_d(q_k, q_{k+1}) of [RL] (5.7) at each step, (rows − 1,)."""
     ld, h = discrete_lagrangian(sol.system.lagrangian, "midpoint"), sol.step
     q = np.asarray(sol.q)
-    along = jax.jit(jax.vmap(lambda q, v: ld(q, v, h, sol.params)))
+    along = jax.jit(jax.vmap(lambda q, v: ld(0.0, q, v, h, sol.params)))
     return np.asarray(along(q[:-1], np.diff(q, axis=0) / h))
 
 

@@ -8,7 +8,8 @@ from dirax.functions import UserFunction
 from dirax.geometry.charts import Atlas, RetractionChart
 from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
-from dirax.schemes.lagrange_dirac import LD_ARGUMENTS, discrete_lagrange_dalembert
+from dirax.schemes.discrete_lagrangian import LD_ARGUMENTS
+from dirax.schemes.lagrange_dirac import discrete_lagrange_dalembert
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian

@@ -6,7 +6,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from dirax.functions import UserFunction
-from dirax.schemes.lagrange_dirac import LD_ARGUMENTS, LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
+from dirax.schemes.discrete_lagrangian import LD_ARGUMENTS
+from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation, StepSequence, make_step_equation
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
@@ -164,7 +165,10 @@ def _mirror(rule: str | UserFunction, sign: float) -> str | Callable:
     """sign·f(q1, q0, −h) of a function f(q0, q1, h), or the rule of that name's mirror image."""
     if isinstance(rule, str):
         return MIRRORED[rule]
-    return UserFunction(lambda q0, q1, h, params: sign * rule(q1, q0, -h, params), f"adjoint of {rule.name}", LD_ARGUMENTS)
+    name = f"adjoint of {rule.name}"
+    if rule.takes_time:
+        return UserFunction(lambda t, q0, q1, h, params: sign * rule(t + h, q1, q0, -h, params), name, LD_ARGUMENTS, timed=True)
+    return UserFunction(lambda q0, q1, h, params: sign * rule(q1, q0, -h, params), name, LD_ARGUMENTS)
 
 
 def adjoint_equation(inner: StepEquation) -> StepEquation:
@@ -181,7 +185,7 @@ def adjoint_equation(inner: StepEquation) -> StepEquation:
 
     def start(data, h, params):
         state, u = inner.start(data, -h, params)
-        return state, jnp.concatenate([(state - inner.advance(u, state, 0.0, -h, params)) / h, u])
+        return state, jnp.concatenate([(state - inner.advance(u, state, data.get("t", 0.0), -h, params)) / h, u])
 
     def unpack(state, u, t, h, params):
         return inner.unpack(state, u[s:], t, h, params)

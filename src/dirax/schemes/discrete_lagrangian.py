@@ -1,56 +1,99 @@
-"""Discrete Lagrangians L_d(q0, q1) ≈ ∫ L dt, and discrete constraints w_d(q0, q1), as functions of (q0, v) with q1 = q0 + h v.
+"""Discrete Lagrangians L_d(q0, q1) ≈ ∫ L dt, discrete constraints w_d(q0, q1) and discrete forces f_d^±(q0, q1), as
+functions of (t0, q0, v) with q1 = q0 + h v.
 
 The velocity is the variable because q1 − q0 loses digits that v keeps: with it the equations are solved to roundoff of v.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
+from dirax.systems.constraints import Constraints
 
+LD_ARGUMENTS = ("q0", "q1", "h")
 RULES = ("left", "right", "midpoint", "trapezoidal")
 CONSTRAINTS = ("left", "right", "midpoint")
+BASE = {"left": 0.0, "right": 1.0, "midpoint": 0.5}
+"""Where the point of a one-point rule lies in the step."""
 
 
-def checked_rule(rule, names: tuple[str, ...], argument: str, user_arguments: tuple[str, ...]):
+def checked_rule(rule, names: tuple[str, ...], argument: str):
     """A rule name, or the user's function wrapped; raises `ValueError` with the choices otherwise."""
     if callable(rule):
-        return rule if isinstance(rule, UserFunction) else UserFunction(rule, argument, user_arguments)
+        return rule if isinstance(rule, UserFunction) else UserFunction(rule, argument, LD_ARGUMENTS, timed=True)
     if rule not in names:
         choices = ", ".join(repr(n) for n in names)
         raise ValueError(
-            f"{argument} must be one of {choices} or a function of ({', '.join(user_arguments)}[, params]), "
-            f"but {rule!r} was given."
+            f"{argument} must be one of {choices} or a function of ({', '.join(LD_ARGUMENTS)}[, params]), but {rule!r} was given."
         )
     return rule
 
 
+def base_point(rule: str, t: Any, q, v, h) -> tuple[Any, Any]:
+    """The time and the point at which a one-point rule evaluates."""
+    base = BASE[rule]
+    return (t, q) if base == 0.0 else (t + base * h, q + base * h * v)
+
+
 def discrete_lagrangian(lagrangian: UserFunction, rule) -> Callable:
-    """L_d as a function (q0, v, h, params) ↦ L_d(q0, q0 + h v)."""
+    """L_d as a function (t0, q0, v, h, params) ↦ L_d(t0, q0, q0 + h v)."""
     if isinstance(rule, UserFunction):
         scalar = rule.returning(())
-        return lambda q, v, h, params: scalar(q, q + h * v, h, params)
-    rules = {
-        "left": lambda q, v, h, params: h * lagrangian(q, v, params),
-        "right": lambda q, v, h, params: h * lagrangian(q + h * v, v, params),
-        "midpoint": lambda q, v, h, params: h * lagrangian(q + h * v / 2, v, params),
-        "trapezoidal": lambda q, v, h, params: h * (lagrangian(q, v, params) + lagrangian(q + h * v, v, params)) / 2,
-    }
-    return rules[rule]
+        return lambda t, q, v, h, params: scalar(*rule.given(t, q, q + h * v, h, params))
+    if rule == "trapezoidal":
+
+        def trapezoidal(t, q, v, h, params):
+            return h * (lagrangian.at(t, q, v, params) + lagrangian.at(t + h, q + h * v, v, params)) / 2
+
+        return trapezoidal
+
+    def one_point(t, q, v, h, params):
+        at, point = base_point(rule, t, q, v, h)
+        return h * lagrangian.at(at, point, v, params)
+
+    return one_point
 
 
-def discrete_constraint(constraint_matrix: Callable, rule, m: int | None = None) -> Callable:
-    """w_d as a function (q0, v, h, params) ↦ (m,): W v at the base point that the rule names, or the user's w_d."""
+def discrete_constraint(constraints: Constraints, rule, m: int | None = None) -> Callable:
+    """w_d as a function (t0, q0, v, h, params) ↦ (m,): W v + b at the base point that the rule names, or the user's w_d."""
     if isinstance(rule, UserFunction):
         vector = rule if m is None else rule.returning((m,))
-        return lambda q, v, h, params: vector(q, q + h * v, h, params)
-    base = {"left": 0.0, "right": 1.0, "midpoint": 0.5}[rule]
-    return lambda q, v, h, params: constraint_matrix(q + base * h * v, params) @ v
+        return lambda t, q, v, h, params: vector(*rule.given(t, q, q + h * v, h, params))
+
+    def one_point(t, q, v, h, params):
+        at, point = base_point(rule, t, q, v, h)
+        return constraints.nonholonomic_defect(at, point, v, params)
+
+    return one_point
 
 
-def slot_derivatives(ld: Callable, q, v, h, params) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+def discrete_forces(forces: UserFunction, rule) -> Callable:
+    """(f_d^−, f_d^+) as a function (t0, q0, v, h, params): the impulses of the force in a step at its first and its last point,
+    by the quadrature of L_d; by that of "midpoint" for the user's L_d.
+
+    The discrete Lagrange–d'Alembert principle of Marsden and West, Acta Numerica 2001, §3.2.1.
+    """
+
+    def impulses(t, q, v, h, params):
+        q1 = q + h * v
+        if rule == "left":
+            first = h * forces(t, q, v, params)
+            return first, 0.0 * first
+        if rule == "right":
+            last = h * forces(t + h, q1, v, params)
+            return 0.0 * last, last
+        if rule == "trapezoidal":
+            return h / 2 * forces(t, q, v, params), h / 2 * forces(t + h, q1, v, params)
+        half = h / 2 * forces(t + h / 2, q + h / 2 * v, v, params)
+        return half, half
+
+    return impulses
+
+
+def slot_derivatives(ld: Callable, t, q, v, h, params) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """(D1 L_d, D2 L_d) at (q, q + h v), from the derivatives with respect to (q, v)."""
-    dq, dv = jax.grad(ld, argnums=(0, 1))(q, v, h, params)
+    dq, dv = jax.grad(ld, argnums=(1, 2))(t, q, v, h, params)
     return dq - dv / h, dv / h

@@ -3,18 +3,18 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.roots import nearest_root
+from dirax.schemes.constraint_rows import ConstraintRows, step_constraints
 from dirax.schemes.discrete_lagrangian import (
     CONSTRAINTS,
     RULES,
     checked_rule,
     discrete_constraint,
+    discrete_forces,
     discrete_lagrangian,
     slot_derivatives,
 )
@@ -22,7 +22,6 @@ from dirax.schemes.reduced import lagrange_poincare_dirac
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
-LD_ARGUMENTS = ("q0", "q1", "h")
 MOMENTA = ("incoming", "mean", "outgoing")
 
 
@@ -32,8 +31,18 @@ class LagrangeDAlembert(AbstractScheme):
         p_k + D1 L_d(q_k, q_{k+1}) = W(q_k)ᵀ μ_k,   w_d(q_k, q_{k+1}) = 0,   p_{k+1} = D2 L_d(q_k, q_{k+1}).
 
     `discrete_lagrangian`: "left" h L(q0, Δq/h), "right" h L(q1, Δq/h), "midpoint", "trapezoidal", or a function
-    L_d(q0, q1, h[, params]) returning a scalar. `constraint`: W(q) Δq/h at q0 ("left"), q1 ("right") or the midpoint,
-    or a function w_d(q0, q1, h[, params]) of shape (m,). The midpoint pair is self-adjoint and of second order.
+    L_d(q0, q1, h[, params]) returning a scalar. `constraint`: W(q) Δq/h + b(q) at q0 ("left"), q1 ("right") or the midpoint,
+    or a function w_d(q0, q1, h[, params]) of shape (m,). Both functions may take t0 first, called `t`. The midpoint pair is
+    self-adjoint and of second order.
+
+    Forces enter as impulses f_d^− and f_d^+ at both ends, added to D1 L_d and D2 L_d, by the quadrature of L_d ("midpoint"
+    for a function L_d): discrete Lagrange–d'Alembert forces (Marsden, West 2001, §3.2). Their work ⟨f_d^− + f_d^+, Δq/h⟩
+    is summed up in `sol.work`, so that E_N − E_0 − work is what the method itself changes.
+
+    Holonomic constraints g = 0 hold at every node: p_k + D1 L_d − W(q_k)ᵀ μ_k − G(q_k)ᵀ λ_k = 0, g(q_{k+1}) = 0, the
+    (SHAKE) discrete Dirac equations of Δ = ker W ∩ ker G. The saved p is projected along im Gᵀ onto G q̇ + ∂g/∂t = 0
+    (RATTLE), which changes nothing in q; without W the map of saved (q, p) is symplectic on the constraint manifold, and
+    of second order in q, p and λ for the midpoint and trapezoidal L_d.
 
     `momentum` says what is saved as p at a node where the constraint force jumps: p_k itself ("incoming", the default
     with a one-sided constraint), p_k − W(q_k)ᵀ μ_k = −D1 L_d(q_k, q_{k+1}) ("outgoing"), or the mean of both (default
@@ -51,8 +60,8 @@ class LagrangeDAlembert(AbstractScheme):
         constraint: str | Callable = "midpoint",
         momentum: str | None = None,
     ):
-        self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian", LD_ARGUMENTS)
-        self.constraint = checked_rule(constraint, CONSTRAINTS, "constraint", LD_ARGUMENTS)
+        self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
+        self.constraint = checked_rule(constraint, CONSTRAINTS, "constraint")
         one_sided = self.constraint in ("left", "right")
         self.momentum = momentum or ("incoming" if one_sided else "mean")
         if self.momentum not in MOMENTA:
@@ -74,7 +83,7 @@ class PlusLagrangeDirac(AbstractScheme):
     discrete_lagrangian: str | UserFunction
 
     def __init__(self, discrete_lagrangian: str | Callable = "left"):
-        self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian", LD_ARGUMENTS)
+        self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         if isinstance(system, ReducedLagrangeDirac):
@@ -95,7 +104,7 @@ class MinusLagrangeDirac(AbstractScheme):
     discrete_lagrangian: str | UserFunction
 
     def __init__(self, discrete_lagrangian: str | Callable = "left"):
-        self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian", LD_ARGUMENTS)
+        self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         if isinstance(system, ReducedLagrangeDirac):
@@ -104,82 +113,128 @@ class MinusLagrangeDirac(AbstractScheme):
 
 
 def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, momentum: str) -> StepEquation:
-    """The StepEquation of the discrete Lagrange–d'Alembert equations: state (q, p), unknowns (v, μ), q_{k+1} = q_k + h v."""
+    """The StepEquation of the discrete Lagrange–d'Alembert equations: state (q, p), with forces (q, p, work); unknowns
+    (v, μ, λ) with q_{k+1} = q_k + h v, and with holonomic constraints (v̂, σ) of the projection of the saved momentum."""
     if not isinstance(system, LagrangeDirac):
         raise TypeError(
             "this scheme discretizes a dx.LagrangeDirac system (a Lagrangian with one-forms), but a "
             f"{type(system).__name__} was given: use dx.DiscreteDirac for the others."
         )
-    n, m = shape.n, shape.m
+    n, m, rows = shape.n, shape.m, ConstraintRows(system, shape)
+    k, forced, holonomic = rows.count, system.forces is not None, rows.holonomic
     if isinstance(constraint, UserFunction) and not m:
         raise ValueError(
             "constraint is a function w_d(q0, q1, h), but the system has no one_forms, whose forces would impose it: "
             "give the system one_forms=, or leave constraint out."
         )
     ld = discrete_lagrangian(system.lagrangian, rule)
-    wd = discrete_constraint(system.constraint_matrix, constraint, m)
+    wd = discrete_constraint(system.constraints, constraint, m)
+    step_constraint = step_constraints(rows, wd)
+    impulses = None if system.forces is None else discrete_forces(system.forces, rule)
     share = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}[momentum] if m else 0.0
 
+    def slots(t, q, v, h, params):
+        """(D1 L_d + f_d^−, D2 L_d + f_d^+): a step leaves its first point with minus the one, and arrives with the other."""
+        d1, d2 = slot_derivatives(ld, t, q, v, h, params)
+        if impulses is None:
+            return d1, d2
+        first, last = impulses(t, q, v, h, params)
+        return d1 + first, d2 + last
+
+    def equations(u, q, p, t, h, params):
+        balance = p + slots(t, q, u[:n], h, params)[0]
+        if not k:
+            return balance
+        imposed = rows.pick(step_constraint(t, q, u[:n], h, params, unit=h))  # all in the unit of W v
+        return jnp.concatenate([balance - rows.matrix(t, q, params).T @ u[n : n + k], imposed])
+
+    def saved_momentum(u, q, p, t, params):
+        """p_k − share·Wᵀμ − Gᵀσ."""
+        if share:
+            p = p - share * (rows.matrix(t, q, params)[: rows.nonholonomic].T @ u[n : n + rows.nonholonomic])
+        return p - rows.holonomic_matrix(t, q, params).T @ u[n + k + n :] if holonomic else p
+
+    def projection(u, q, p, t, params):
+        """∂L/∂v(q, v̂) is the saved momentum, and G v̂ + ∂g/∂t = 0."""
+        v = u[n + k : n + k + n]
+        missed = system.legendre(q, v, params, t) - saved_momentum(u, q, p, t, params)
+        return jnp.concatenate([missed, rows.hidden(t, q, v, params)])
+
     def residual(u, state, t, h, params):
-        q, p, v = state[:n], state[n:], u[:n]
-        d1, _ = slot_derivatives(ld, q, v, h, params)
-        if not m:
-            return p + d1
-        force = system.constraint_matrix(q, params).T @ u[n:]
-        return jnp.concatenate([p + d1 - force, wd(q, v, h, params)])
+        q, p = state[:n], state[n : 2 * n]
+        if not holonomic:
+            return equations(u, q, p, t, h, params)
+        return jnp.concatenate([equations(u, q, p, t, h, params), projection(u, q, p, t, params)])
 
     def advance(u, state, t, h, params):
         q, v = state[:n], u[:n]
-        _, d2 = slot_derivatives(ld, q, v, h, params)
+        _, p1 = slots(t, q, v, h, params)
         # outside the domain of L its derivatives can still be numbers: those of log q are, for q < 0
-        inside = jnp.isfinite(system.lagrangian(q + h * v, v, params))
-        return jnp.concatenate([q + h * v, jnp.where(inside, d2, jnp.nan)])
+        inside = jnp.isfinite(system.lagrangian.at(t + h, q + h * v, v, params))
+        end = [q + h * v, jnp.where(inside, p1, jnp.nan)]
+        if impulses is not None:
+            end.append(state[2 * n :] + sum(impulses(t, q, v, h, params)) @ v)
+        return jnp.concatenate(end)
 
     def unpack(state, u, t, h, params):
-        q, p = state[:n], state[n:]
-        if not m:
-            return {"q": q, "p": p}
-        jump = system.constraint_matrix(q, params).T @ u[n:]
-        saved = p - share * jump if share else p
-        return {"q": q, "p": saved, "multipliers": u[n:], "constraint": wd(q, u[:n], h, params)}
+        q, p = state[:n], state[n : 2 * n]
+        row = {"q": q, "p": saved_momentum(u, q, p, t, params)}
+        if m + rows.c:
+            row |= {"multipliers": rows.all(u[n : n + k]), "constraint": step_constraint(t, q, u[:n], h, params)}
+        return row | {"work": state[2 * n]} if forced else row
 
     def start(data, h, params):
+        t, work = data.get("t", 0.0), jnp.zeros(int(forced))
         if "q0" in data:
             q, v = data["q0"], (data["q1"] - data["q0"]) / h
-            d1, _ = slot_derivatives(ld, q, v, h, params)
-            return jnp.concatenate([q, -d1]), jnp.concatenate([v, jnp.zeros(m)])
-        state = jnp.concatenate([data["q"], data["p"]])
-        u = jnp.concatenate([data["v"], jnp.zeros(m)])
-        if share:
-            state, u = _start_from_saved_momentum(residual, system.constraint_matrix, share, n, state, u, h, params)
-        return state, u
+            p, u = -slots(t, q, v, h, params)[0], jnp.concatenate([v, jnp.zeros(k)])
+        else:
+            q, p, v = data["q"], data["p"], data["v"]
+            u = jnp.concatenate([v, jnp.zeros(k)])
+            if share or holonomic:
+                p, u = incoming_momentum(q, p, u, t, h, params)
+        if holonomic:
+            along = lambda end: projection(jnp.concatenate([u, end]), q, p, t, params)
+            u = jnp.concatenate([u, nearest_root(along, jnp.concatenate([v, jnp.zeros(holonomic)]))])
+        return jnp.concatenate([q, p, work]), u
 
-    fields = {"q": Field((n,)), "p": Field((n,))}
-    if m:
-        fields["multipliers"] = Field((m,), "step", ("constraint",), "Lagrange multipliers of the constraints")
-        fields["constraint"] = Field((m,), "step", ("constraint",), "discrete constraint w_d(q_k, q_{k+1})")
+    def incoming_momentum(q, p, guess, t, h, params):
+        """The incoming momentum whose saved momentum is p, with the unknowns of the step that leaves it."""
+        first = nearest_root(lambda u: equations(u, q, p, t, h, params), guess)
+        first = jnp.where(jnp.all(jnp.isfinite(first)), first, guess)
+        # with incoming p + s/(1−s) Wᵀμ the multiplier is μ/(1−s), and its share is taken off again; at s = 1 nothing is added
+        factor = share / (1.0 - share) if share < 1.0 else 0.0
+        jump = factor * first[n : n + rows.nonholonomic]
+        if holonomic:
+            jump = jnp.concatenate([jump, arriving(q, p, first, t, h, params)])
+        return p + rows.matrix(t, q, params).T @ jump, first.at[n:].add(jump)
+
+    def arriving(q, p, first, t, h, params):
+        """σ of a step that arrives at (q, p): λ is then the whole impulse at the first node, and of second order there too."""
+
+        def backwards(u):
+            before, v = q - h * u[:n], u[:n]
+            missed = p - slots(t - h, before, v, h, params)[1] + rows.matrix(t, q, params).T @ u[n:]
+            g = rows.constraints.position_defect(t - h, before, params) / h
+            return jnp.concatenate([missed, rows.pick(jnp.concatenate([wd(t - h, before, v, h, params), g]))])
+
+        found = nearest_root(backwards, first)
+        return jnp.where(jnp.all(jnp.isfinite(found)), found, first)[n + rows.nonholonomic :]
+
+    fields = {"q": Field((n,)), "p": Field((n,)), **rows.fields()}
+    if forced:
+        fields["work"] = Field((), "node", (), "work of the forces since the start")
     return StepEquation(
         start=start,
         residual=residual,
         advance=advance,
         unpack=unpack,
-        state_size=2 * n,
-        unknowns=n + m,
+        state_size=2 * n + forced,
+        unknowns=n + k + (n + holonomic) * bool(holonomic),
         fields=fields,
         labels=tuple(f"discrete Lagrange–d'Alembert equation {i}" for i in range(n))
-        + tuple(f"discrete constraint {r}" for r in range(m)),
-        needs_leaving_step=bool(share),
-        canonical=True,
+        + rows.labels()
+        + tuple(f"projection of the momentum {i}" for i in range((n + holonomic) * bool(holonomic))),
+        needs_leaving_step=bool(share or holonomic),
+        canonical=not forced,
     )
-
-
-def _start_from_saved_momentum(residual, constraint_matrix, share: float, n: int, state, u, h, params):
-    """The incoming momentum whose saved momentum p − share·Wᵀμ is the given one: solve the first step once for μ."""
-    first = nearest_root(lambda u: residual(u, state, 0.0, h, params), u)
-    jump: Float[Array, " n"] = constraint_matrix(state[:n], params).T @ first[n:]
-    # with incoming p + s/(1−s) j the multiplier is μ/(1−s), and its share is taken off again; at s = 1 nothing is added
-    factor = share / (1.0 - share) if share < 1.0 else 0.0
-    scaled = first[n:] * (1.0 + factor)
-    incoming = state.at[n:].add(factor * jump)
-    finite = jax.numpy.all(jnp.isfinite(first))
-    return jnp.where(finite, incoming, state), jnp.where(finite, jnp.concatenate([first[:n], scaled]), u)

@@ -5,17 +5,20 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Literal, jaxprs_in_params
+import numpy as np
+from jax.extend.core import jaxprs_in_params
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
+from dirax.functions import UserFunction, is_traced
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.discrete_lagrangian import RULES, checked_rule
-from dirax.schemes.reduced import QuotientState, quotient_fields, reduced_discrete_lagrangian
+from dirax.schemes.quotient import Quotient
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 
 NEWTON_STEPS = 6
 """Newton steps for γ where L is not quadratic in it; the step that carries h ẋ carries their error with it."""
+
+SAMPLES = 5
 
 
 class DiscreteRouth(AbstractScheme):
@@ -30,7 +33,7 @@ class DiscreteRouth(AbstractScheme):
     discrete_lagrangian: str | UserFunction
 
     def __init__(self, discrete_lagrangian: str | Callable = "midpoint"):
-        self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian", ("q0", "q1", "h"))
+        self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         if not isinstance(system, ReducedLagrangeDirac):
@@ -47,20 +50,29 @@ class DiscreteRouth(AbstractScheme):
 
 def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEquation:
     """The StepEquation of the discrete Routh equations: state (x, w, μ, g, γ), unknowns ẋ (n − k,)."""
-    quotient = QuotientState(system.connection, shape.n)
+    quotient = Quotient(system, shape.n, rule)
     k, s = quotient.k, quotient.s
-    l = reduced_discrete_lagrangian(system, rule, +1)
 
-    def vertical(x, rate, mu, guess, h, params):
-        """γ with ∂l/∂γ = h μ, for l of slots (x, ẋ, γ)."""
-        slope = lambda gamma: jax.grad(l, argnums=2)(x, rate, gamma, h, params)
-        inertia = jax.jacfwd(slope)
-        if not _depends(inertia, guess):
-            zero = jnp.zeros_like(guess)
-            return solve_small(inertia(zero), h * mu - slope(zero))
+    def inertia(t, x, rate, gamma, h, params):
+        return jax.jacfwd(quotient.momentum, argnums=3)(t, x, rate, gamma, h, params)
+
+    quadratic: dict[Any, bool] = {}  # by the structure of params
+
+    def vertical(t, x, rate, mu, guess, h, params):
+        """γ with ∂l/∂γ = μ."""
+
+        def update(gamma):
+            defect = mu - quotient.momentum(t, x, rate, gamma, h, params)
+            return gamma + solve_small(inertia(t, x, rate, gamma, h, params), defect)
+
+        structure = jax.tree.structure(params)
+        if structure not in quadratic:
+            quadratic[structure] = independent(inertia, 3, (t, x, rate, guess, h, params))
+        if quadratic[structure]:
+            return update(jnp.zeros_like(guess))
         gamma = guess
         for _ in range(NEWTON_STEPS):
-            gamma = gamma + solve_small(inertia(gamma), h * mu - slope(gamma))
+            gamma = update(gamma)
         return gamma
 
     def split(state):
@@ -68,22 +80,21 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
 
     def residual(u, state, t, h, params):
         (x, w, mu, _), guess = split(state)
-        # the derivatives of the Routhian are those of l at fixed γ, since ∂l/∂γ = hμ
-        return w + quotient.slot_derivatives(l, x, u, vertical(x, u, mu, guess, h, params), h, params)[0]
+        # the derivatives of the Routhian are those of l at fixed γ, since ∂l/∂γ = μ
+        return w + quotient.slots(t, x, u, vertical(t, x, u, mu, guess, h, params), h, params)[0]
 
     def advance(u, state, t, h, params):
         (x, _, mu, g), guess = split(state)
-        gamma = vertical(x, u, mu, guess, h, params)
-        _, d1, _ = quotient.slot_derivatives(l, x, u, gamma, h, params)
-        return jnp.concatenate([x + h * u, d1, mu, g + h * quotient.group_rate(x, u, gamma, h), gamma])
+        gamma = vertical(t, x, u, mu, guess, h, params)
+        w = quotient.slots(t, x, u, gamma, h, params)[1]
+        return jnp.concatenate([x + h * u, w, mu, g + h * quotient.group_rate(x, u, gamma, h), gamma])
 
     def unpack(state, u, t, h, params):
         (x, w, mu, g), guess = split(state)
-        gamma = vertical(x, u, mu, guess, h, params)
-        return {"x": x, "w": w, "mu": mu, "g": g, "vertical": h * gamma}
+        return {"x": x, "w": w, "mu": mu, "g": g, "vertical": h * vertical(t, x, u, mu, guess, h, params)}
 
     def start(data, h, params):
-        state, u = quotient.start(l, data, h, params)
+        state, u = quotient.start(data, h, params)
         return jnp.concatenate([state, u[s:]]), u[:s]
 
     why = "which needs the group inertia ∂²l/∂γ² to be invertible: μ is not to be a singular value of the momentum map"
@@ -94,7 +105,7 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
         unpack=unpack,
         state_size=2 * shape.n + k,
         unknowns=s,
-        fields=quotient_fields(s, k),
+        fields=quotient.fields(),
         labels=tuple(f"discrete Routh equation {i}, {why}" for i in range(s)),
     )
 
@@ -104,22 +115,41 @@ def solve_small(matrix: Float[Array, "k k"], right: Float[Array, " k"]) -> Float
     return right * (1.0 / matrix[0]) if right.shape[0] == 1 else jnp.linalg.solve(matrix, right)
 
 
-def _depends(function: Callable, argument: Float[Array, " k"]) -> bool:
-    """Whether the result depends on the argument, as far as one can see from the operations (never a wrong no)."""
-    jaxpr = jax.make_jaxpr(function)(jax.ShapeDtypeStruct(argument.shape, argument.dtype)).jaxpr
-    return any(_flow(jaxpr, [True]))
+def independent(function: Callable, argument: int, values: tuple) -> bool:
+    """Whether function(*values) does not depend on one of its arguments: a NaN there goes wherever the argument does.
+
+    Never a wrong yes: where a branch of the function could hide the NaN, or nothing can be evaluated, the answer is no.
+    Traced values are replaced by random ones.
+    """
+    random = np.random.default_rng(0)
+
+    def concrete(leaf):
+        if not is_traced(leaf):
+            return leaf
+        kind = np.dtype(leaf.dtype)
+        return random.uniform(0.3, 1.7, leaf.shape) if np.issubdtype(kind, np.floating) else np.ones(leaf.shape, kind)
+
+    if _branches(jax.make_jaxpr(function)(*jax.tree.map(concrete, values)).jaxpr):
+        return False
+    with jax.ensure_compile_time_eval():
+        compiled = jax.jit(function)
+        for _ in range(SAMPLES):
+            sample = list(jax.tree.map(concrete, values))
+            sample[argument] = np.full(np.shape(sample[argument]), np.nan)
+            result = compiled(*sample)
+            if is_traced(result):
+                return False
+            if np.all(np.isfinite(result)):
+                return True
+    return False
 
 
-def _flow(jaxpr, dependent: list[bool]) -> list[bool]:
-    """Which outputs of a jaxpr depend on the inputs that are marked."""
-    marked = {var for var, is_dependent in zip(jaxpr.invars, dependent, strict=True) if is_dependent}
-    reaches = lambda atom: not isinstance(atom, Literal) and atom in marked
+def _branches(jaxpr) -> bool:
+    """Whether real numbers are chosen by conditions anywhere in it."""
     for equation in jaxpr.eqns:
-        inputs = [reaches(atom) for atom in equation.invars]
-        inner = list(jaxprs_in_params(equation.params))
-        if not any(inputs):
-            continue
-        whole = len(inner) == 1 and equation.primitive.name in ("jit", "pjit", "closed_call")
-        outputs = _flow(inner[0], inputs) if whole else [True] * len(equation.outvars)
-        marked |= {var for var, is_dependent in zip(equation.outvars, outputs, strict=True) if is_dependent}
-    return [reaches(atom) for atom in jaxpr.outvars]
+        real = any(jnp.issubdtype(getattr(v.aval, "dtype", bool), jnp.floating) for v in equation.outvars)
+        if real and equation.primitive.name in ("select_n", "cond", "while", "scan", "clamp", "sort"):
+            return True
+        if any(_branches(inner) for inner in jaxprs_in_params(equation.params)):
+            return True
+    return False

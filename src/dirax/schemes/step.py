@@ -28,7 +28,7 @@ class StepEquation(eqx.Module):
     """One step of size h of a method, as pure JAX functions on flat float64 vectors.
 
     - `start(data, h, params) -> (state, u)`: initial state (s,) and first guess (k,) from the initial data, a dict that
-      holds one of the pairs `q, v` · `q, p` · `q0, q1` or a single `x`;
+      holds one of the pairs `q, v` · `q, p` · `q0, q1` or a single `x`, and the time `t`;
     - `guess(state, previous, h, params) -> u`: where Newton starts; `previous` (k,) are the unknowns extrapolated from
       the steps before;
     - `residual(u, state, t, h, params) -> r`: (k,), zero at the step;
@@ -118,10 +118,16 @@ class StepSequence(eqx.Module):
 
 
 class Shape(eqx.Module):
-    """Sizes of a system: n coordinates and m constraints."""
+    """Sizes of a system: n coordinates, m constraints on velocities and c holonomic ones.
+
+    `redundant`: those of the m + c constraints that follow from the others where a run begins, and are left out of its
+    equations.
+    """
 
     n: int = eqx.field(static=True)
     m: int = eqx.field(static=True, default=0)
+    c: int = eqx.field(static=True, default=0)
+    redundant: tuple[int, ...] = eqx.field(static=True, default=(), kw_only=True)
 
 
 class AbstractScheme(eqx.Module):

@@ -1,4 +1,4 @@
-"""Lagrange–Dirac systems: a Lagrangian, possibly degenerate, with linear nonholonomic constraints."""
+"""Lagrange–Dirac systems: a Lagrangian, possibly degenerate, with constraints and forces."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,126 +9,196 @@ from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
 from dirax.roots import nearest_root, scaled_pseudo_inverse
+from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem, no_constraint
 
 
 class LagrangeDirac(AbstractSystem):
-    """A Lagrangian with constraints ⟨ω^r(q), q̇⟩ = 0: the system (29) of [PY], X ⊕ d_D L ∈ D on T*Q.
+    """A Lagrangian with constraints ⟨ω^r(q), q̇⟩ = 0: the system (29) of [PY], X ⊕ d_D L ∈ D on T*Q, and with holonomic and
+    affine constraints, forces and explicit time.
 
     `lagrangian(q, v[, params])` returns a scalar; q and v have shape (n,); it may be degenerate.
     `one_forms(q[, params])` returns the matrix W(q) of shape (m, n) whose rows are the constraint one-forms; without
-    it there are no constraints. Equations: ṗ − ∂L/∂q ∈ im W(q)ᵀ, p = ∂L/∂v, q̇ = v, W(q) v = 0.
-    Units are the user's: the energy has those of L, p those of L·time/q.
+    it there are no nonholonomic constraints. `affine(q[, params])` (m,) makes them W(q) q̇ + b(q) = 0: surfaces that move.
+    `holonomic(q[, params])` returns the constraints g(q) = 0, shape (c,). `forces(t, q, v[, params])` is the covector (n,)
+    of external, control and dissipative forces. Every other function may take the time too, as its first argument `t`:
+    `lagrangian(t, q, v[, params])`.
+
+    Equations, with G = ∂g/∂q: ṗ = ∂L/∂q + f − Wᵀμ − Gᵀλ, p = ∂L/∂v, q̇ = v, W v + b = 0, g = 0.
+    Units are the user's: the energy has those of L, p those of L·time/q; multipliers come out as impulses of a step, in
+    L·time over the unit of W q or g.
 
         system = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[q[1], -q[0], 1.0]]))
+        pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([q @ q - 1.0]))
 
-    Raises `TypeError` for something that is not a function of these arguments.
+    Raises `TypeError` for something that is not a function of these arguments, `ValueError` for `affine` without
+    `one_forms`.
     """
 
     lagrangian: UserFunction
     one_forms: UserFunction | None
+    holonomic: UserFunction | None
+    forces: UserFunction | None
+    affine: UserFunction | None
 
-    def __init__(self, lagrangian: Callable, one_forms: Callable | None = None):
-        self.lagrangian = UserFunction(lagrangian, "lagrangian", ("q", "v"))
-        self.one_forms = None if one_forms is None else UserFunction(one_forms, "one_forms", ("q",))
+    def __init__(
+        self,
+        lagrangian: Callable,
+        one_forms: Callable | None = None,
+        *,
+        holonomic: Callable | None = None,
+        forces: Callable | None = None,
+        affine: Callable | None = None,
+    ):
+        function = lambda f, name, arguments, timed=True: None if f is None else UserFunction(f, name, arguments, timed)
+        self.lagrangian = UserFunction(lagrangian, "lagrangian", ("q", "v"), timed=True)
+        self.one_forms = function(one_forms, "one_forms", ("q",))
+        self.holonomic = function(holonomic, "holonomic", ("q",))
+        self.forces = function(forces, "forces", ("t", "q", "v"), timed=False)
+        self.affine = function(affine, "affine", ("q",))
+        if affine is not None and one_forms is None:
+            raise ValueError("affine is the b(q) of W(q) q̇ + b(q) = 0, but no one_forms were given: give W(q) too.")
+
+    @property
+    def constraints(self) -> Constraints:
+        """All constraints, as functions of (t, q, params)."""
+        return Constraints(self.one_forms, self.affine, self.holonomic)
+
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether the Lagrangian or a constraint takes the time."""
+        functions = (self.lagrangian, self.one_forms, self.holonomic, self.affine)
+        return any(f is not None and f.takes_time for f in functions)
+
+    @property
+    def conserves_energy(self) -> bool:
+        """Whether E is a constant of the motion: no forces, no time, and constraints that do no work."""
+        return not self.depends_on_time and self.forces is None and self.affine is None
 
     # ------------------------------------------------------------------ geometry of L and W, one point at a time
 
-    def constraint_matrix(self, q: Float[Array, " n"], params: Any = None) -> Float[Array, "m n"]:
-        """W(q), whose rows are the constraint one-forms; (0, n) without constraints."""
-        if self.one_forms is None:
-            return jnp.zeros((0, q.shape[0]))
-        return self.one_forms(q, params)
+    def constraint_matrix(self, q: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, "m n"]:
+        """W(q), whose rows are the constraint one-forms; (0, n) without them."""
+        return self.constraints.one_forms_at(t, q, params)
 
-    def legendre(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None) -> Float[Array, " n"]:
+    def legendre(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " n"]:
         """The Legendre transform: p = ∂L/∂v (q, v)."""
-        return jax.grad(lambda v: self.lagrangian(q, v, params))(v)
+        return jax.grad(lambda v: self.lagrangian.at(t, q, v, params))(v)
 
     def inverse_legendre(
-        self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, guess: Float[Array, " n"] | None = None
+        self,
+        q: Float[Array, " n"],
+        p: Float[Array, " n"],
+        params: Any = None,
+        guess: Float[Array, " n"] | None = None,
+        t: Any = 0.0,
     ) -> Float[Array, " n"]:
         """A velocity v with ∂L/∂v (q, v) = p; where L is degenerate the one nearest to `guess` (zero by default)."""
         v0 = jnp.zeros_like(q) if guess is None else guess
-        return nearest_root(lambda v: self.legendre(q, v, params) - p, v0)
+        return nearest_root(lambda v: self.legendre(q, v, params, t) - p, v0)
 
-    def energy(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None) -> Float[Array, ""]:
+    def energy(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, ""]:
         """The energy E(q, v) = ⟨∂L/∂v, v⟩ − L(q, v); it is `generalized_energy` on the image of the Legendre transform."""
-        return self.generalized_energy(q, v, self.legendre(q, v, params), params)
+        return self.generalized_energy(q, v, self.legendre(q, v, params, t), params, t)
 
     def generalized_energy(
-        self, q: Float[Array, " n"], v: Float[Array, " n"], p: Float[Array, " n"], params: Any = None
+        self, q: Float[Array, " n"], v: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0
     ) -> Float[Array, ""]:
         """E(q, v, p) = ⟨p, v⟩ − L(q, v) on the Pontryagin bundle ([PY] (56))."""
-        return p @ v - self.lagrangian(q, v, params)
+        return p @ v - self.lagrangian.at(t, q, v, params)
 
     # ------------------------------------------------------------------ AbstractSystem
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
+        """(n, m), or (n, m, c) with holonomic constraints."""
         if "x" in data:
             raise ValueError("a LagrangeDirac system starts from q=, v= · q=, p= · q0=, q1=, but x= was given.")
         q = data["q"] if "q" in data else data["q0"]
-        n = q.shape[0]
-        out = self.lagrangian.shape(q, q, params)
+        n, t = q.shape[0], jnp.zeros(())
+        out = self.lagrangian.shape(*self.lagrangian.given(t, q, q, params))
         if out.shape != ():
             raise ValueError(
                 f"lagrangian(q, v) must return a scalar, but for q and v of shape ({n},) it returned shape {out.shape}: "
                 "sum or index its result."
             )
-        if self.one_forms is None:
-            return n, 0
-        out = self.one_forms.shape(q, params)
-        if len(out.shape) != 2 or out.shape[1] != n or out.shape[0] > n:
-            raise ValueError(
-                f"one_forms(q) must return an array of shape (m, n) = (m, {n}) with m ≤ {n}, one row a one-form, but it "
-                f"returned shape {out.shape}{': put it in another pair of brackets' if len(out.shape) == 1 else ''}."
-            )
-        return n, out.shape[0]
+        if self.forces is not None:
+            out = self.forces.shape(t, q, q, params)
+            if out.shape != (n,):
+                raise ValueError(
+                    f"forces(t, q, v) must return shape ({n},), one number a coordinate, but it returned shape {out.shape}."
+                )
+        m, c = self.constraints.sizes(q, params)
+        return (n, m) if self.holonomic is None else (n, m, c)
 
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
         if "q0" in data:
             return dict(data)
-        q = data["q"]
-        if "p" in data:
-            p = data["p"]
-            v = self.inverse_legendre(q, p, params)
-            if self.one_forms is not None:
-                v = v - jax.lax.stop_gradient(self._undetermined_part(q, v, params))
-            if project and self.one_forms is not None:
-                v = self.project_velocity(q, v, params)
-                p = self.legendre(q, v, params)
+        q, t, constraints = data["q"], data.get("t", 0.0), self.constraints
+        project = project and constraints.any
+        if "v" in data:
+            v = data["v"]
         else:
-            v = self.project_velocity(q, data["v"], params) if project and self.one_forms is not None else data["v"]
-            p = self.legendre(q, v, params)
-        return {"q": q, "v": v, "p": p}
+            v = self.inverse_legendre(q, data["p"], params, t=t)
+            if constraints.any:
+                v = v - jax.lax.stop_gradient(self._undetermined_part(q, v, params, t))
+        if project:
+            q = self.project_position(q, v, params, t)
+            v = self.project_velocity(q, v, params, t)
+        keep = "p" in data and not project
+        return {"q": q, "v": v, "p": data["p"] if keep else self.legendre(q, v, params, t)}
 
-    def _undetermined_part(self, q, v, params):
-        """What to take from v to satisfy W v = 0 without changing ∂L/∂v: nothing where L is regular."""
-        hessian = jax.hessian(lambda v: self.lagrangian(q, v, params))(v)
+    def _undetermined_part(self, q, v, params, t):
+        """What to take from v to satisfy the constraints without changing ∂L/∂v: nothing where L is regular."""
+        hessian = jax.hessian(lambda v: self.lagrangian.at(t, q, v, params))(v)
         kernel = jnp.eye(q.shape[0]) - scaled_pseudo_inverse(hessian)[0] @ hessian
         kernel = jnp.where(jnp.trace(kernel) > 0.5, kernel, 0.0)  # its trace is the number of undetermined directions
-        w = self.constraint_matrix(q, params)
-        return kernel @ (scaled_pseudo_inverse(w @ kernel)[0] @ (w @ v))
+        rows, defect = self.constraints.matrix(t, q, params), self.constraints.velocity_defect(t, q, v, params)
+        return kernel @ (scaled_pseudo_inverse(rows @ kernel)[0] @ defect)
 
-    def project_velocity(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None) -> Float[Array, " n"]:
-        """The velocity in Δ_Q(q) = ker W(q) nearest to v, in the metric ∂²L/∂v² where it is positive definite and the
-        Euclidean one elsewhere."""
-        w = self.constraint_matrix(q, params)
-        hessian = jax.hessian(lambda v: self.lagrangian(q, v, params))(v)
+    def _lifted(self, q, v, rows, params, t):
+        """metric⁻¹ rowsᵀ in the metric ∂²L/∂v² where it is positive definite and the Euclidean one elsewhere."""
+        hessian = jax.hessian(lambda v: self.lagrangian.at(t, q, v, params))(v)
         values = jnp.linalg.eigvalsh(hessian)
         regular = values[0] > 1e-12 * jnp.abs(values[-1])
-        metric = jnp.where(regular, hessian, jnp.eye(q.shape[0]))
-        lifted = jnp.linalg.solve(metric, w.T)
-        return v - lifted @ jnp.linalg.solve(w @ lifted, w @ v)
+        return jnp.linalg.solve(jnp.where(regular, hessian, jnp.eye(q.shape[0])), rows.T)
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
-        if self.one_forms is None or "q0" in data:
-            return no_constraint()
-        return self.constraint_matrix(data["q"], params) @ data["v"]
+    def project_velocity(
+        self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Array, " n"]:
+        """The velocity with W v + b = 0 and G v + ∂g/∂t = 0 nearest to v, in the metric ∂²L/∂v² where it is positive
+        definite and the Euclidean one elsewhere."""
+        rows = self.constraints.matrix(t, q, params)
+        lifted = self._lifted(q, v, rows, params, t)
+        return v - lifted @ (scaled_pseudo_inverse(rows @ lifted)[0] @ self.constraints.velocity_defect(t, q, v, params))
+
+    def project_position(
+        self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Array, " n"]:
+        """A point with g = 0 near q, moved along metric⁻¹ Gᵀ, in the metric of `project_velocity`."""
+        if self.holonomic is None:
+            return q
+        _, size = self.constraints.sizes(q, params)
+        lifted = self._lifted(q, v, self.constraints.holonomic_matrix(t, q, params), params, t)
+        g = lambda s: self.constraints.position_defect(t, q + lifted @ s, params)
+        return q + lifted @ nearest_root(g, jnp.zeros(size))
+
+    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " k"]:
+        """(W v + b, g, G v + ∂g/∂t); g(q0) for two points, whose step has the other constraints."""
+        t = data.get("t", 0.0)
+        if "q0" in data:
+            return no_constraint() if self.holonomic is None else self.constraints.position_defect(t, data["q0"], params)
+        return self.constraints.defect(t, data["q"], data["v"], params)
+
+    def _velocity(self, row: dict[str, Array], params: Any) -> Float[Array, " n"]:
+        """The velocity that belongs to the saved momentum."""
+        return self.inverse_legendre(row["q"], row["p"], params, t=row.get("t", 0.0))
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """E at the node, with the velocity that belongs to the saved momentum."""
-        return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params), params)
+        return self.energy(row["q"], self._velocity(row, params), params, row.get("t", 0.0))
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
-        """W(q) v at the node, with the velocity that belongs to the saved momentum."""
-        return self.constraint_matrix(row["q"], params) @ self.inverse_legendre(row["q"], row["p"], params)
+    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
+        """(W v + b, g, G v + ∂g/∂t) at the node, with the velocity that belongs to the saved momentum."""
+        if not self.constraints.any:
+            return no_constraint()
+        return self.constraints.defect(row.get("t", 0.0), row["q"], self._velocity(row, params), params)

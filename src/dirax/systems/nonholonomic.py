@@ -36,7 +36,7 @@ class NonholonomicMechanics(AbstractSystem):
         """The same system as a Lagrangian with constraints."""
         return LagrangeDirac(self.lagrangian, lambda q, params: self.one_forms(q, params))
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
         q = data["q"] if "q" in data else data["q0"]
         n = q.shape[0]
         metric = self.metric.shape(q, params)

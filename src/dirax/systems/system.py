@@ -23,8 +23,8 @@ class AbstractSystem(eqx.Module):
         return module_html(self)
 
     @abstractmethod
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
-        """(n, m): the number of coordinates and of constraints; raises when the user's functions have wrong shapes."""
+    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
+        """(n, m) or (n, m, c): the number of coordinates, of constraints and of holonomic constraints; raises when the user's functions have wrong shapes."""
 
     @abstractmethod
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:

@@ -1,0 +1,108 @@
+"""The constraints of a Lagrangian system: W(t, q) q̇ + b(t, q) = 0 and g(t, q) = 0, which may depend on each other."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dirax.functions import UserFunction
+from dirax.systems.system import no_constraint
+
+
+class Constraints(eqx.Module):
+    """Nonholonomic constraints W q̇ + b = 0 (m of them) and holonomic ones g = 0 (c of them), at one point at a time.
+
+    Together they are the affine constraints [W; G] q̇ + [b; ∂g/∂t] = 0 with G = ∂g/∂q, whose linear part has the kernel
+    Δ = ker W ∩ ker G: the distribution of the Dirac structure of the system.
+    """
+
+    one_forms: UserFunction | None
+    affine: UserFunction | None
+    holonomic: UserFunction | None
+
+    @property
+    def names(self) -> str:
+        """The names of the functions that are there, for messages."""
+        named = {"one_forms": self.one_forms, "affine": self.affine, "holonomic": self.holonomic}
+        return " or ".join(name for name, function in named.items() if function is not None)
+
+    @property
+    def any(self) -> bool:
+        """Whether there are constraints."""
+        return self.one_forms is not None or self.holonomic is not None
+
+    def sizes(self, q: Float[Array, " n"], params: Any) -> tuple[int, int]:
+        """(m, c); raises `ValueError` where a function returns a wrong shape."""
+        n, t = q.shape[0], jnp.zeros(())
+        m = c = 0
+        if self.one_forms is not None:
+            out = self.one_forms.shape(*self.one_forms.given(t, q, params))
+            if len(out.shape) != 2 or out.shape[1] != n or out.shape[0] > n:
+                raise ValueError(
+                    f"one_forms(q) must return an array of shape (m, n) = (m, {n}) with m ≤ {n}, one row a one-form, but it "
+                    f"returned shape {out.shape}{': put it in another pair of brackets' if len(out.shape) == 1 else ''}."
+                )
+            m = out.shape[0]
+        if self.affine is not None:
+            out = self.affine.shape(*self.affine.given(t, q, params))
+            if out.shape != (m,):
+                raise ValueError(
+                    f"affine(q) must return shape ({m},), one number a row of W(q) of shape ({m}, {n}), but it returned "
+                    f"shape {out.shape}."
+                )
+        if self.holonomic is not None:
+            out = self.holonomic.shape(*self.holonomic.given(t, q, params))
+            if len(out.shape) != 1 or not out.shape[0]:
+                raise ValueError(
+                    "holonomic(q) must return an array of shape (c,), one number a constraint g(q) = 0, but it returned shape "
+                    f"{out.shape}{': put it in a pair of brackets' if out.shape == () else ''}."
+                )
+            c = out.shape[0]
+        return m, c
+
+    def one_forms_at(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, "m n"]:
+        """W(t, q)."""
+        return jnp.zeros((0, q.shape[0])) if self.one_forms is None else self.one_forms.at(t, q, params)
+
+    def holonomic_matrix(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, "c n"]:
+        """G(t, q) = ∂g/∂q."""
+        if self.holonomic is None:
+            return jnp.zeros((0, q.shape[0]))
+        return jax.jacrev(lambda q: self.position_defect(t, q, params))(q)
+
+    def matrix(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, "k n"]:
+        """[W; G], the one-forms that vanish on Δ."""
+        w = self.one_forms_at(t, q, params)
+        return w if self.holonomic is None else jnp.concatenate([w, self.holonomic_matrix(t, q, params)])
+
+    def position_defect(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, " c"]:
+        """g(t, q)."""
+        return no_constraint() if self.holonomic is None else self.holonomic.at(t, q, params)
+
+    def nonholonomic_defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " m"]:
+        """W v + b."""
+        along = self.one_forms_at(t, q, params) @ v
+        return along if self.affine is None else along + self.affine.at(t, q, params)
+
+    def hidden_defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " c"]:
+        """G v + ∂g/∂t, the rate of change of g."""
+        if self.holonomic is None:
+            return no_constraint()
+        along = lambda t, q: self.position_defect(t, q, params)
+        if self.holonomic.takes_time:
+            return jax.jvp(along, (jnp.asarray(t, float), q), (jnp.ones(()), v))[1]
+        return jax.jvp(lambda q: along(t, q), (q,), (v,))[1]
+
+    def velocity_defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
+        """(W v + b, G v + ∂g/∂t)."""
+        first = self.nonholonomic_defect(t, q, v, params)
+        return first if self.holonomic is None else jnp.concatenate([first, self.hidden_defect(t, q, v, params)])
+
+    def defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
+        """(W v + b, g, G v + ∂g/∂t)."""
+        first = self.nonholonomic_defect(t, q, v, params)
+        if self.holonomic is None:
+            return first
+        return jnp.concatenate([first, self.position_defect(t, q, params), self.hidden_defect(t, q, v, params)])
