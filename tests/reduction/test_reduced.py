@@ -94,5 +94,5 @@ def test_mistakes():
         dx.simulate(dx.reduce(pulled, dx.LinearConnection([4])), dx.PlusLagrangeDirac(), **run)
     with pytest.raises(TypeError, match=r"dx\.reduce takes"):
         dx.reduce(3, dx.LinearConnection([0]))
-    with pytest.raises(TypeError, match=r"made by dx\.reduce"):
+    with pytest.raises(TypeError, match=r"dx\.reconstruct takes"):
         dx.reconstruct(dx.simulate(pulled, dx.PlusLagrangeDirac(), **run))

@@ -1,6 +1,7 @@
 """The (±)-Lagrange–Poincaré–Dirac equations: discrete Lagrange–Dirac systems on the quotient ([RL] (4.6), (4.8))."""
 
 import jax.numpy as jnp
+
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.discrete_lagrangian import discrete_constraint
 from dirax.schemes.quotient import Quotient
