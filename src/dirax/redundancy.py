@@ -50,6 +50,7 @@ def redundant_constraints(system: Any, matrices: Any, data: dict, params: Any, t
 
 def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> None:
     """Raise where the dependence is not one of the constraints as functions, or where they have no common solution."""
+    system = system.lagrange_dirac() if hasattr(system, "lagrange_dirac") else system
     constraints: Constraints = system.constraints
     total = matrices.shape[1]
     zero = np.flatnonzero(np.any(np.all(matrices == 0.0, axis=2), axis=0))

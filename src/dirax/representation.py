@@ -11,8 +11,9 @@ LINE = 100
 
 
 def module_fields(module: Any) -> dict[str, Any]:
-    """The fields of a frozen record by name, in the order of its class."""
-    return {field.name: getattr(module, field.name) for field in dataclasses.fields(module)}
+    """The fields of a frozen record by name, in the order of its class, without those left out that are None by default."""
+    values = {field.name: (getattr(module, field.name), field.default) for field in dataclasses.fields(module)}
+    return {name: value for name, (value, default) in values.items() if not (value is None and default is None)}
 
 
 def module_text(module: Any) -> str:

@@ -33,6 +33,10 @@ class ConstraintRows:
         """The kept entries of G v + ∂g/∂t."""
         return self.pick(self.constraints.hidden_defect(t, q, v, params), self.m)
 
+    def velocity_defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
+        """The kept entries of (W v + b, G v + ∂g/∂t)."""
+        return self.pick(self.constraints.velocity_defect(t, q, v, params))
+
     def pick(self, values: Array, first: int = 0) -> Array:
         """The kept ones of all constraints from number `first` on."""
         kept = [i - first for i in self.kept if i >= first]

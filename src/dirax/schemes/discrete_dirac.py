@@ -61,11 +61,13 @@ class DiscreteDirac(AbstractScheme):
                 return _on_graph(system, shape, self.map)
             return discretized_lagrangian(system.lagrange_dirac(), shape, _theta_of(self.map))
         if isinstance(system, NonholonomicMechanics):
-            if resolve:
+            if resolve and system.closed_form and not shape.redundant:
                 return resolved_nonholonomic(system, shape, _theta_of(self.map))
+            if resolve:
+                return resolved_lagrangian(system.lagrange_dirac(), shape, _theta_of(self.map))
             return discretized_lagrangian(system.lagrange_dirac(), shape, _theta_of(self.map))
         if isinstance(system, LagrangeDirac):
-            method = resolved_lagrangian if resolve and shape.m else discretized_lagrangian
+            method = resolved_lagrangian if resolve and shape.m + shape.c else discretized_lagrangian
             return method(system, shape, _theta_of(self.map))
         raise TypeError(
             "dx.DiscreteDirac discretizes DiracSystem, PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and "

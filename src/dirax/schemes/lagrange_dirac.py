@@ -20,6 +20,7 @@ from dirax.schemes.discrete_lagrangian import (
 )
 from dirax.schemes.reduced import lagrange_poincare_dirac
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
+from dirax.schemes.work import WorkBook, work_field
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 MOMENTA = ("incoming", "mean", "outgoing")
@@ -68,7 +69,7 @@ class LagrangeDAlembert(AbstractScheme):
             raise ValueError(f"momentum must be one of {', '.join(map(repr, MOMENTA))}, but {momentum!r} was given.")
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        return discrete_lagrange_dalembert(system, shape, self.discrete_lagrangian, self.constraint, self.momentum)
+        return _on_q_or_quotient(system, shape, self.discrete_lagrangian, self.constraint, self.momentum)
 
 
 class PlusLagrangeDirac(AbstractScheme):
@@ -86,9 +87,7 @@ class PlusLagrangeDirac(AbstractScheme):
         self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        if isinstance(system, ReducedLagrangeDirac):
-            return lagrange_poincare_dirac(system, shape, self.discrete_lagrangian, +1)
-        return discrete_lagrange_dalembert(system, shape, self.discrete_lagrangian, "right", "incoming")
+        return _on_q_or_quotient(system, shape, self.discrete_lagrangian, "right", "incoming")
 
 
 class MinusLagrangeDirac(AbstractScheme):
@@ -107,9 +106,15 @@ class MinusLagrangeDirac(AbstractScheme):
         self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        if isinstance(system, ReducedLagrangeDirac):
-            return lagrange_poincare_dirac(system, shape, self.discrete_lagrangian, -1)
-        return discrete_lagrange_dalembert(system, shape, self.discrete_lagrangian, "left", "incoming")
+        return _on_q_or_quotient(system, shape, self.discrete_lagrangian, "left", "incoming", -1)
+
+
+def _on_q_or_quotient(system: Any, shape: Shape, rule, constraint, momentum: str, sign: int = +1) -> StepEquation:
+    """The discrete Lagrange–d'Alembert equations of a system on Q, or on the quotient by its symmetry."""
+    if not isinstance(system, ReducedLagrangeDirac):
+        return discrete_lagrange_dalembert(system, shape, rule, constraint, momentum)
+    unreduced = discrete_lagrange_dalembert(system.system, shape, rule, constraint, momentum)
+    return lagrange_poincare_dirac(system, shape, unreduced, sign)
 
 
 def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, momentum: str) -> StepEquation:
@@ -121,7 +126,7 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
             f"{type(system).__name__} was given: use dx.DiscreteDirac for the others."
         )
     n, m, rows = shape.n, shape.m, ConstraintRows(system, shape)
-    k, forced, holonomic = rows.count, system.forces is not None, rows.holonomic
+    k, holonomic, book = rows.count, rows.holonomic, WorkBook(system, n)
     if isinstance(constraint, UserFunction) and not m:
         raise ValueError(
             "constraint is a function w_d(q0, q1, h), but the system has no one_forms, whose forces would impose it: "
@@ -172,19 +177,17 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
         # outside the domain of L its derivatives can still be numbers: those of log q are, for q < 0
         inside = jnp.isfinite(system.lagrangian.at(t + h, q + h * v, v, params))
         end = [q + h * v, jnp.where(inside, p1, jnp.nan)]
-        if impulses is not None:
-            end.append(state[2 * n :] + sum(impulses(t, q, v, h, params)) @ v)
-        return jnp.concatenate(end)
+        return jnp.concatenate(end) if impulses is None else book.add(state, end, sum(impulses(t, q, v, h, params)) @ v)
 
     def unpack(state, u, t, h, params):
         q, p = state[:n], state[n : 2 * n]
         row = {"q": q, "p": saved_momentum(u, q, p, t, params)}
         if m + rows.c:
             row |= {"multipliers": rows.all(u[n : n + k]), "constraint": step_constraint(t, q, u[:n], h, params)}
-        return row | {"work": state[2 * n]} if forced else row
+        return row | book.row(state)
 
     def start(data, h, params):
-        t, work = data.get("t", 0.0), jnp.zeros(int(forced))
+        t = data.get("t", 0.0)
         if "q0" in data:
             q, v = data["q0"], (data["q1"] - data["q0"]) / h
             p, u = -slots(t, q, v, h, params)[0], jnp.concatenate([v, jnp.zeros(k)])
@@ -196,7 +199,7 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
         if holonomic:
             along = lambda end: projection(jnp.concatenate([u, end]), q, p, t, params)
             u = jnp.concatenate([u, nearest_root(along, jnp.concatenate([v, jnp.zeros(holonomic)]))])
-        return jnp.concatenate([q, p, work]), u
+        return book.start(q, p), u
 
     def incoming_momentum(q, p, guess, t, h, params):
         """The incoming momentum whose saved momentum is p, with the unknowns of the step that leaves it."""
@@ -221,20 +224,17 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
         found = nearest_root(backwards, first)
         return jnp.where(jnp.all(jnp.isfinite(found)), found, first)[n + rows.nonholonomic :]
 
-    fields = {"q": Field((n,)), "p": Field((n,)), **rows.fields()}
-    if forced:
-        fields["work"] = Field((), "node", (), "work of the forces since the start")
     return StepEquation(
         start=start,
         residual=residual,
         advance=advance,
         unpack=unpack,
-        state_size=2 * n + forced,
+        state_size=2 * n + book.size,
         unknowns=n + k + (n + holonomic) * bool(holonomic),
-        fields=fields,
+        fields={"q": Field((n,)), "p": Field((n,)), **rows.fields(), **work_field(system)},
         labels=tuple(f"discrete Lagrange–d'Alembert equation {i}" for i in range(n))
         + rows.labels()
         + tuple(f"projection of the momentum {i}" for i in range((n + holonomic) * bool(holonomic))),
         needs_leaving_step=bool(share or holonomic),
-        canonical=not forced,
+        canonical=not book.size,
     )

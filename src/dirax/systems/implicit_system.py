@@ -155,6 +155,11 @@ def _port_hamiltonian(system: PortHamiltonian, near, params) -> ImplicitForm:
 
 
 def _lagrangian(system: LagrangeDirac, stated, near, params) -> ImplicitForm:
+    if system.depends_on_time or system.forces is not None:
+        raise ValueError(
+            "the constraint algorithm takes Lagrangian systems without forces and explicit time: make the time a coordinate, or "
+            "state the equations as dx.ImplicitSystem(E, f, B)."
+        )
     data: Any = {k: jnp.asarray(v, float) for k, v in near.items()} if isinstance(near, dict) else None
     if data is not None and set(data) not in ({"q", "v"}, {"q", "p"}, {"q"}):
         raise ValueError(f"near must hold q with v or p for a Lagrangian system, but it holds {', '.join(data)}.")
@@ -196,7 +201,7 @@ def _momenta(system: LagrangeDirac, q, v, params) -> tuple[bool, np.ndarray]:
 def _on_cotangent_bundle(system: LagrangeDirac, stated, x: np.ndarray, hessian: np.ndarray, params) -> ImplicitForm:
     """x = (q, p): ẋ = X_H + X_φ u + (0, Wᵀλ), φ = 0, W q̇ = 0, with the primary constraints φ and H = ⟨p, v⟩ − L."""
     n = x.size // 2
-    m = system.constraint_matrix(jnp.asarray(x[:n]), params).shape[0]
+    m, c = system.constraints.sizes(jnp.asarray(x[:n]), params)
     values, vectors = np.linalg.eigh(hessian)
     null = jnp.asarray(vectors[:, np.abs(values) <= RANK_TOLERANCE * max(np.abs(values).max(initial=0.0), 1e-300)])
     k = null.shape[1]
@@ -218,38 +223,44 @@ def _on_cotangent_bundle(system: LagrangeDirac, stated, x: np.ndarray, hessian: 
     def equations(x, params):
         primary = lambda x: legendre_inverse(x, params)[1]
         dh, dphi = jax.grad(hamiltonian)(x, params), jax.jacfwd(primary)(x)
-        w = system.constraint_matrix(x[:n], params)
-        forces = jnp.concatenate([J @ dphi.T, jnp.concatenate([jnp.zeros((n, m)), w.T])], axis=1)
+        w, moving = system.constraints.matrix(0.0, x[:n], params), _moving(system, x[:n], params)
+        forces = jnp.concatenate([J @ dphi.T, jnp.concatenate([jnp.zeros((n, m + c)), w.T])], axis=1)
         top = jnp.concatenate([jnp.eye(2 * n), -forces], axis=1)
-        constrained = jnp.concatenate([w, jnp.zeros((m, n + k + m))], axis=1)
-        matrix = jnp.concatenate([top, jnp.zeros((k, 2 * n + k + m)), constrained])
-        return matrix, jnp.concatenate([J @ dh, primary(x), jnp.zeros(m)])
+        constrained = jnp.concatenate([w[:m], jnp.zeros((m, n + k + m + c))], axis=1)
+        matrix = jnp.concatenate([top, jnp.zeros((k, 2 * n + k + m + c)), constrained, jnp.zeros((c, 2 * n + k + m + c))])
+        return matrix, jnp.concatenate([J @ dh, primary(x), *moving])
 
     names = (*_names("q", n), *_names("p", n))
     rank = f"Hessian of rank {n - k} of {n}" + (f": {k} primary constraint{'s' * (k > 1)}" if k else ", regular")
-    return ImplicitForm(equations, x, names, (*_names("u", k), *_names("λ", m)), hamiltonian, rank)
+    return ImplicitForm(equations, x, names, (*_names("u", k), *_names("λ", m + c)), hamiltonian, rank)
 
 
 def _on_pontryagin_bundle(system: LagrangeDirac, x: np.ndarray, params) -> ImplicitForm:
     """x = (q, v, p): q̇ = v, ṗ = ∂L/∂q + Wᵀλ, 0 = p − ∂L/∂v, 0 = W v."""
     n = x.size // 3
-    m = system.constraint_matrix(jnp.asarray(x[:n]), params).shape[0]
+    m, c = system.constraints.sizes(jnp.asarray(x[:n]), params)
 
     def equations(x, params):
         q, v, p = x[:n], x[n : 2 * n], x[2 * n :]
         dq, dv = jax.grad(lambda q, v: system.lagrangian(q, v, params), argnums=(0, 1))(q, v)
-        w = system.constraint_matrix(q, params)
+        w, (minus_b, g) = system.constraints.matrix(0.0, q, params), _moving(system, q, params)
         eye, zero = jnp.eye(n), jnp.zeros((n, n))
-        position = jnp.concatenate([eye, zero, zero, jnp.zeros((n, m))], axis=1)
+        position = jnp.concatenate([eye, zero, zero, jnp.zeros((n, m + c))], axis=1)
         momentum = jnp.concatenate([zero, zero, eye, -w.T], axis=1)
-        matrix = jnp.concatenate([position, momentum, jnp.zeros((n + m, 3 * n + m))])
-        return matrix, jnp.concatenate([v, dq, p - dv, w @ v])
+        matrix = jnp.concatenate([position, momentum, jnp.zeros((n + m + c, 3 * n + m + c))])
+        return matrix, jnp.concatenate([v, dq, p - dv, w[:m] @ v - minus_b, g])
 
     def energy(x, params):
         return system.generalized_energy(x[:n], x[n : 2 * n], x[2 * n :], params)
 
     names = (*_names("q", n), *_names("v", n), *_names("p", n))
-    return ImplicitForm(equations, x, names, _names("λ", m), energy, "momenta not affine in the velocities: x = (q, v, p)")
+    return ImplicitForm(equations, x, names, _names("λ", m + c), energy, "momenta not affine in the velocities: x = (q, v, p)")
+
+
+def _moving(system: LagrangeDirac, q, params) -> tuple[Array, Array]:
+    """(−b, g): the right-hand sides of W q̇ = −b and 0 = g."""
+    constraints = system.constraints
+    return -constraints.nonholonomic_defect(0.0, q, jnp.zeros_like(q), params), constraints.position_defect(0.0, q, params)
 
 
 def _point(near, keys: tuple[str, ...], system) -> np.ndarray:

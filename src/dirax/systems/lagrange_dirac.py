@@ -37,9 +37,9 @@ class LagrangeDirac(AbstractSystem):
 
     lagrangian: UserFunction
     one_forms: UserFunction | None
-    holonomic: UserFunction | None
-    forces: UserFunction | None
-    affine: UserFunction | None
+    holonomic: UserFunction | None = None
+    forces: UserFunction | None = None
+    affine: UserFunction | None = None
 
     def __init__(
         self,

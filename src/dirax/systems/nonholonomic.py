@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
+from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
 
@@ -16,14 +17,17 @@ class NonholonomicMechanics(AbstractSystem):
     """H = ½ pᵀ g(q)⁻¹ p + V(q) with μ(q) q̇ = 0, the closed port-Hamiltonian system with B = (0; μᵀ) ([BLM] §8).
 
     `metric(q[, params])` (n, n), symmetric positive definite; `potential(q[, params])` a scalar; `one_forms(q[, params])`
-    (m, n). q̇ = g⁻¹p, ṗ = −∂H/∂q + μᵀ λ, μ g⁻¹ p = 0.
+    (m, n). q̇ = g⁻¹p, ṗ = −∂H/∂q + μᵀ λ, μ g⁻¹ p = 0. `forces` is added as in `LagrangeDirac`; holonomic constraints and
+    explicit time are those of the `LagrangeDirac` system that `lagrange_dirac` returns.
     """
 
     metric: UserFunction
     potential: UserFunction
     one_forms: UserFunction
+    forces: UserFunction | None = None
 
-    def __init__(self, metric: Callable, potential: Callable, one_forms: Callable):
+    def __init__(self, metric: Callable, potential: Callable, one_forms: Callable, *, forces: Callable | None = None):
+        self.forces = None if forces is None else UserFunction(forces, "forces", ("t", "q", "v"))
         self.metric = UserFunction(metric, "metric", ("q",))
         self.potential = UserFunction(potential, "potential", ("q",))
         self.one_forms = UserFunction(one_forms, "one_forms", ("q",))
@@ -34,7 +38,19 @@ class NonholonomicMechanics(AbstractSystem):
 
     def lagrange_dirac(self) -> LagrangeDirac:
         """The same system as a Lagrangian with constraints."""
-        return LagrangeDirac(self.lagrangian, lambda q, params: self.one_forms(q, params))
+        function = self.forces
+        forces = None if function is None else lambda t, q, v, params: function(t, q, v, params)
+        return LagrangeDirac(self.lagrangian, lambda q, params: self.one_forms(q, params), forces=forces)
+
+    @property
+    def closed_form(self) -> bool:
+        """Whether λ and the projector of Method 2 have their closed form ([BLM] §8): no forces."""
+        return self.forces is None
+
+    @property
+    def constraints(self) -> Constraints:
+        """The constraints, as functions of (t, q, params)."""
+        return Constraints(self.one_forms, None, None)
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
         q = data["q"] if "q" in data else data["q0"]

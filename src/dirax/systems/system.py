@@ -24,7 +24,8 @@ class AbstractSystem(eqx.Module):
 
     @abstractmethod
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
-        """(n, m) or (n, m, c): the number of coordinates, of constraints and of holonomic constraints; raises when the user's functions have wrong shapes."""
+        """(n, m) or (n, m, c): the number of coordinates, of constraints and of holonomic constraints; raises when
+        the user's functions have wrong shapes."""
 
     @abstractmethod
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
