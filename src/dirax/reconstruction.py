@@ -21,9 +21,9 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     """The motion (q, p) on T*Q over a reduced solution, as a Solution.
 
     Of a system made by `dx.reduce`: q = (x, g) with g_{k+1} = g_k + ω_d + A(x_{k+1} − x_k), p = (w − h*_{d,Σ}(μ), μ)
-    ([RL] §4). Of a `dx.EulerPoincare` or `dx.LiePoisson` system: q the group element g_k = g0 f_0 ⋯ f_{k−1} (N,), p the
-    covector at it with the body momentum μ, `spatial_momentum` Ad*_{g⁻¹} μ (d,), and the reduced fields as they were; `g0`
-    is an element (N,), a matrix (k, k), in a batch also (B, N), or the identity.
+    ([RL] §4), multipliers and work as they were. Of a `dx.EulerPoincare` or `dx.LiePoisson` system: q the group element
+    g_k = g0 f_0 ⋯ f_{k−1} (N,), p the covector at it with the body momentum μ, `spatial_momentum` Ad*_{g⁻¹} μ (d,), and the
+    reduced fields as they were; `g0` is an element (N,), a matrix (k, k), in a batch also (B, N), or the identity.
 
     Raises `TypeError` for a solution of another system, `ValueError` for a g0 that is no element of the group.
     """
@@ -37,9 +37,12 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
         )
     if g0 is not None:
         raise ValueError("g0 is for systems on a Lie group: here the initial data name the group coordinate already.")
-    lifted = _each_row(solution, system.unreduced_row, ("x", "w", "mu", "g"))
+    reduced = ("x", "w", "mu", "g", "vertical")
+    lifted = _each_row(solution, system.unreduced_row, reduced[:-1])
+    lifted |= {name: a for name, a in solution.fields.items() if name not in reduced}
     n = lifted["q"].shape[-1]
-    return _lifted(solution, system.system, lifted, {"q": Field((n,)), "p": Field((n,))})
+    info = {"q": Field((n,)), "p": Field((n,))}
+    return _lifted(solution, system.system, lifted, {name: info.get(name) or solution.field_info[name] for name in lifted})
 
 
 def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> Solution:

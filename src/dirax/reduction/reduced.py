@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from dirax.functions import is_traced
 from dirax.reduction.connection import AbstractConnection
 from dirax.reduction.symmetry import Translations, invariance
+from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
 
@@ -24,12 +25,22 @@ class ReducedLagrangeDirac(AbstractSystem):
     system: LagrangeDirac
     connection: AbstractConnection
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
-        n, m = self.system.sizes(data, params)
-        self.connection.check(n)
+    @property
+    def constraints(self) -> Constraints:
+        """All constraints of the unreduced system."""
+        return self.system.constraints
+
+    @property
+    def conserves_momentum(self) -> bool:
+        """Whether μ is a constant of the motion: nothing acts but L."""
+        return self.system.forces is None and not self.constraints.any
+
+    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
+        sizes = self.system.sizes(data, params)
+        self.connection.check(sizes[0])
         if not is_traced(data, params):
             self._refuse_asymmetry(data, params)
-        return n, m
+        return sizes
 
     def _refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]
@@ -37,7 +48,8 @@ class ReducedLagrangeDirac(AbstractSystem):
         found = invariance(self.system, Translations(self.connection.fibre), q[None], v[None], params)
         if not found.ok:
             worst = self.connection.fibre[found.generator]
-            what = f"∂L/∂q[{worst}]" if found.of == "lagrangian" else "the motion of its one-forms out of their span"
+            what = {"lagrangian": f"∂L/∂q[{worst}]", "one_forms": "the motion of its one-forms out of their span"}
+            what = what.get(found.of, f"its derivative by q[{worst}]")
             raise ValueError(
                 f"the {found.of} is not invariant under translation of q[{worst}]: {what} = {found.defect:.3g} at "
                 "the initial data; take that coordinate out of fibre."
@@ -56,9 +68,10 @@ class ReducedLagrangeDirac(AbstractSystem):
         return self.system.initial_defect(data, params)
 
     def unreduced_row(self, row: dict[str, Array]) -> dict[str, Array]:
-        """The row (q, p) on T*Q over a reduced row."""
+        """The row (q, p, …) on T*Q over a reduced row."""
         q = self.connection.join(row["x"], row["g"])
-        return {"q": q, "p": self.connection.untrivialize_covector(row["x"], row["w"], row["mu"])}
+        p = self.connection.untrivialize_covector(row["x"], row["w"], row["mu"])
+        return {"q": q, "p": p} | {name: value for name, value in row.items() if name not in ("x", "w", "mu", "g")}
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """The energy of the unreduced system, which the group coordinate does not change."""
@@ -71,7 +84,7 @@ class ReducedLagrangeDirac(AbstractSystem):
 def group_inertia_ranks(system: LagrangeDirac, connection: AbstractConnection, q: Array, params: Any) -> tuple[int, int]:
     """Ranks of ∂²L/∂ġ² at rest at q and at a point near it: a generator that vanishes at q has no inertia there only."""
     fibre = list(connection.fibre)
-    whole = jax.jit(jax.hessian(lambda v, q: system.lagrangian(q, v, params)))
+    whole = jax.jit(jax.hessian(lambda v, q: system.lagrangian.at(0.0, q, v, params)))
     away = np.asarray(q) + 0.1 * np.random.default_rng(0).uniform(0.5, 1.0, q.shape)
     here, nearby = (np.asarray(whole(jnp.zeros_like(q), jnp.asarray(point)))[np.ix_(fibre, fibre)] for point in (q, away))
     if not (np.all(np.isfinite(here)) and np.all(np.isfinite(nearby))):

@@ -115,9 +115,9 @@ class GroupAction(AbstractAction):
 class Invariance:
     """Whether a system is invariant, and where it is least so; prints as a sentence.
 
-    `of`: "lagrangian", "discrete_lagrangian" or "one_forms", whichever is worst; `defect`: the derivative of it along the
-    orbit of `generator` (index of a basis vector ξ) at (q, v), or (q0, q1) for L_d; `relative`: the defect over the size
-    of the function and its derivatives there.
+    `of`: "lagrangian", "one_forms", "holonomic", "forces" or "discrete_lagrangian", whichever is worst; `defect`: the
+    derivative of it along the orbit of `generator` (index of a basis vector ξ) at (q, v), or (q0, q1) for L_d; `relative`:
+    the defect over the size of the function and its derivatives there.
     """
 
     ok: bool
@@ -153,12 +153,12 @@ def check_invariance(
     samples: int = 32,
     radius: float = 1.0,
 ) -> Invariance:
-    """Whether L and the one-forms of a `dx.LagrangeDirac` system, or with `discrete_lagrangian(q0, q1, h[, params])` and
-    `step` that function, are invariant under an action; and where not.
+    """Whether L, the constraints and the forces of a `dx.LagrangeDirac` system, or with `discrete_lagrangian(q0, q1, h[,
+    params])` and `step` that function, are invariant under an action; and where not.
 
-    Looked at: `q` (n,) with `v` (n,), and `samples` random points within `radius` of them; the group being connected, the
-    derivative along its generators decides. Points where L is not finite are left out. Raises `ValueError` for an action
-    that is none, or does not fit q.
+    Looked at: `q` (n,) with `v` (n,) at t = 0, and `samples` random points within `radius` of them at other times; the group
+    being connected, the derivative along its generators decides. Points where L is not finite are left out. Raises
+    `ValueError` for an action that is none, or does not fit q.
     """
     q = np.asarray(q, dtype=float)
     v = np.ones_like(q) if v is None else np.asarray(v, dtype=float)
@@ -171,41 +171,62 @@ def check_invariance(
         raise ValueError("discrete_lagrangian needs step=, the h that it is called with.")
     ld = UserFunction(discrete_lagrangian, "discrete_lagrangian", ("q0", "q1", "h"))
     points = near(q)
-    moved = lambda g, q0, q1: ld(action(g, q0), action(g, q1), step, params)
-    return _worst(
-        {"discrete_lagrangian": (moved, lambda q0, q1: ld(q0, q1, step, params))}, action, points, points + step * near(v)
-    )
+    moved = lambda g, t, q0, q1: ld(action(g, q0), action(g, q1), step, params)
+    return _worst({"discrete_lagrangian": moved}, action, points, points + step * near(v))
 
 
 def invariance(system: Any, action: AbstractAction, q: Any, v: Any, params: Any) -> Invariance:
-    """`check_invariance` at given points q and velocities v, (samples, n)."""
+    """`check_invariance` at given points q and velocities v, (samples, n), the first at t = 0."""
+    constraints = system.constraints
 
-    def moved_lagrangian(g, q, v):
-        return system.lagrangian(*action.tangent_lift(g, q, v), params)
-
-    def moved_one_forms(g, q, v):
-        """W(Φ_g q) TΦ_g, less its part in the span of W(q)."""
+    def pulled_back(g, t, q, v):
+        """Φ_g q, TΦ_g v and DΦ_g."""
         derivative = jax.jacfwd(lambda q: action(g, q))(q)
-        rows, fixed = system.constraint_matrix(action(g, q), params) @ derivative, system.constraint_matrix(q, params)
-        return rows - rows @ jnp.linalg.pinv(fixed) @ fixed
+        return action(g, q), derivative @ v, derivative
 
-    functions = {"lagrangian": (moved_lagrangian, lambda q, v: system.lagrangian(q, v, params))}
-    if getattr(system, "one_forms", None) is not None:
-        functions["one_forms"] = (moved_one_forms, lambda q, v: system.constraint_matrix(q, params))
+    def lagrangian(g, t, q, v):
+        there, rate, _ = pulled_back(g, t, q, v)
+        return system.lagrangian.at(t, there, rate, params)
+
+    def rows(t, q):
+        """[W b]."""
+        w = constraints.one_forms_at(t, q, params)
+        return w if constraints.affine is None else jnp.hstack([w, constraints.affine.at(t, q, params)[:, None]])
+
+    def one_forms(g, t, q, v):
+        """W(Φ_g q) TΦ_g, less its part in the span of W(q); with affine constraints [W b] likewise."""
+        there, _, derivative = pulled_back(g, t, q, v)
+        moved, fixed = rows(t, there), rows(t, q)
+        moved = jnp.hstack([moved[:, : q.size] @ derivative, moved[:, q.size :]])
+        return moved - moved @ jnp.linalg.pinv(fixed) @ fixed
+
+    def holonomic(g, t, q, v):
+        return constraints.position_defect(t, action(g, q), params)
+
+    def forces(g, t, q, v):
+        there, rate, derivative = pulled_back(g, t, q, v)
+        return system.forces(t, there, rate, params) @ derivative
+
+    functions = {"lagrangian": lagrangian}
+    for moved in (one_forms, holonomic, forces):
+        if getattr(system, moved.__name__) is not None:
+            functions[moved.__name__] = moved
     return _worst(functions, action, q, v)
 
 
-def _worst(functions: dict[str, tuple[Callable, Callable]], action: AbstractAction, q: Any, v: Any) -> Invariance:
+def _worst(functions: dict[str, Callable], action: AbstractAction, q: Any, v: Any) -> Invariance:
+    """The largest change of the functions (g, t, q, v) at g = 0, relative to their sizes and those of their derivatives."""
     zero, worst = jnp.zeros(action.dimension()), None
-    for name, (moved, plain) in functions.items():
+    times = np.random.default_rng(1).uniform(0, 1, len(q)) * (np.arange(len(q)) > 0)
+    for name, moved in functions.items():
 
-        def at(q, v, moved=moved, plain=plain):
-            rate = jax.jacfwd(lambda g: moved(g, q, v))(zero)
-            slope = jax.jacfwd(plain)(q, v)
-            size = jnp.maximum(1.0, jnp.maximum(jnp.max(jnp.abs(plain(q, v))), jnp.max(jnp.abs(slope))))
+        def at(t, q, v, moved=moved):
+            rate = jax.jacfwd(moved)(zero, t, q, v)
+            value, slope = moved(zero, t, q, v), jax.jacfwd(moved, argnums=2)(zero, t, q, v)
+            size = jnp.maximum(1.0, jnp.maximum(jnp.max(jnp.abs(value)), jnp.max(jnp.abs(slope))))
             return jnp.max(jnp.abs(jnp.reshape(rate, (-1, zero.shape[0]))), axis=0), size
 
-        defect, size = (np.asarray(a) for a in jax.jit(jax.vmap(at))(jnp.asarray(q), jnp.asarray(v)))
+        defect, size = (np.asarray(a) for a in jax.jit(jax.vmap(at))(*map(jnp.asarray, (times, q, v))))
         relative = np.where(np.isfinite(defect), defect / size[:, None], 0.0)
         row, column = np.unravel_index(int(np.argmax(relative)), relative.shape)
         largest = float(relative[row, column])
@@ -219,7 +240,7 @@ def _worst(functions: dict[str, tuple[Callable, Callable]], action: AbstractActi
 def translation_symmetries(
     system: Any, q: Any, v: Any = None, params: Any = None, samples: int = 64, radius: float = 1.0
 ) -> np.ndarray:
-    """Directions d, the rows of a (k, n) matrix with orthonormal rows, in which L and the one-forms do not change.
+    """Directions d, the rows of a (k, n) matrix with orthonormal rows, in which neither L nor constraints nor forces change.
 
     Found from ∂L/∂q at `samples` random points within `radius` of (q, v); `cyclic_coordinates` are those along the axes.
     """
@@ -228,14 +249,21 @@ def translation_symmetries(
     random = np.random.default_rng(0)
     points = [jnp.asarray(c + radius * random.uniform(-1, 1, (samples, q.size))) for c in (q, v)]
 
-    def at(q, v):
-        slope = jax.grad(lambda q: system.lagrangian(q, v, params))(q)
-        rows = [slope[None]]
-        if getattr(system, "one_forms", None) is not None:
-            rows.append(jnp.reshape(jax.jacfwd(lambda q: system.constraint_matrix(q, params))(q), (-1, q.size)))
-        return jnp.concatenate(rows)
+    constraints = system.constraints
 
-    slopes = np.asarray(jax.jit(jax.vmap(at))(*points))
+    def at(t, q, v):
+        along = [lambda q: system.lagrangian.at(t, q, v, params)]
+        if system.one_forms is not None:
+            along.append(lambda q: constraints.one_forms_at(t, q, params))
+        if system.affine is not None:
+            along.append(lambda q: system.affine.at(t, q, params))
+        if system.holonomic is not None:
+            along.append(lambda q: constraints.position_defect(t, q, params))
+        if system.forces is not None:
+            along.append(lambda q: system.forces(t, q, v, params))
+        return jnp.concatenate([jnp.reshape(jax.jacfwd(function)(q), (-1, q.size)) for function in along])
+
+    slopes = np.asarray(jax.jit(jax.vmap(at))(jnp.asarray(random.uniform(0, 1, samples)), *points))
     slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))].reshape(-1, q.size)
     if not len(slopes):
         raise ValueError("L is finite at none of the points around q: choose q inside its domain, or a smaller radius.")
@@ -245,7 +273,7 @@ def translation_symmetries(
 
 
 def cyclic_coordinates(system: Any, q: Any, v: Any = None, params: Any = None, **sampling: Any) -> tuple[int, ...]:
-    """The indices of the coordinates that neither L nor the one-forms depend on: what `fibre` may hold.
+    """The indices of the coordinates that neither L nor constraints nor forces depend on: what `fibre` may hold.
 
     dx.reduce(system, dx.LinearConnection(dx.cyclic_coordinates(system, q, params=params)))
     """

@@ -3,71 +3,74 @@
 import jax.numpy as jnp
 
 from dirax.reduction.reduced import ReducedLagrangeDirac
-from dirax.schemes.discrete_lagrangian import discrete_constraint
 from dirax.schemes.quotient import Quotient
-from dirax.schemes.step import Field, Shape, StepEquation
+from dirax.schemes.step import Shape, StepEquation
 
 
-def lagrange_poincare_dirac(system: ReducedLagrangeDirac, shape: Shape, rule, sign: int) -> StepEquation:
-    """The StepEquation of [RL] (4.6) (sign +1) or (4.8) (sign −1): state (x, w, μ, g), unknowns (ẋ, γ).
+def lagrange_poincare_dirac(system: ReducedLagrangeDirac, shape: Shape, unreduced: StepEquation, sign: int = +1) -> StepEquation:
+    """The StepEquation on (Q × Q)/G of an equation on Q with state (q, p, …) and unknowns (v, …) that the symmetry leaves
+    alone: [RL] (4.6) (sign +1) or (4.8) (sign −1) for the discrete Lagrange–Dirac equations.
 
-    With linear h_d the equations are −∂l/∂x0 = w_k, ∂l/∂g1 = μ_k, ∂l/∂x1 = w_{k+1}, μ_{k+1} = μ_k, and
-    g_{k+1} = g_k + hγ + A(x_{k+1} − x_k) reconstructs the group coordinate. Constraints that the symmetry leaves alone,
-    W(x), act with the forces λ̂_d(Wᵀλ) = ((W_x + W_g A)ᵀλ, W_gᵀλ), which move μ: μ_{k+1} = ∂l/∂g1.
+    State (x, w, μ, g, …), unknowns (ẋ, γ, …): the equation at (x, 0), for (+), or with the other point at group
+    coordinate 0, for (−), its covectors trivialized by λ̂_d: (r_x + A(x)ᵀ r_g, r_g). For linear h_d these are −∂l/∂x0 = w_k,
+    ∂l/∂g1 = μ_k, ∂l/∂x1 = w_{k+1}, μ_{k+1} = μ_k, and g_{k+1} = g_k + hγ + A(x_{k+1} − x_k) reconstructs the group coordinate.
+    Forces f and constraint forces Wᵀλ have the trivializations ((f_x + A(x)ᵀ f_g), f_g); their group part moves μ.
     """
-    quotient, n, m = Quotient(system, shape.n, rule, sign), shape.n, shape.m
-    connection, k, s = system.connection, quotient.k, quotient.s
-    wd = discrete_constraint(system.system.constraints, "right" if sign > 0 else "left", m)
-    at = lambda x: connection.join(x, jnp.zeros(k))
+    quotient, connection, n = Quotient(system.connection, shape.n), system.connection, shape.n
+    k, s, free = quotient.k, quotient.s, system.conserves_momentum
 
-    def constraint(x, rate, vertical, h, params):
-        return wd(0.0, at(x), connection.join(rate, quotient.group_rate(x, rate, vertical, h)), h, params)
+    def lifted(state, u, h):
+        """The state and the unknowns on Q, with the start at group coordinate 0 or minus the end."""
+        x, w, mu, _ = quotient.split(state)
+        along = quotient.group_rate(x, u[:s], u[s:n], h)
+        q = connection.join(x, jnp.zeros(k) if sign > 0 else -h * along)
+        on_q = jnp.concatenate([q, connection.untrivialize_covector(x, w, mu), state[2 * n :]])
+        return on_q, jnp.concatenate([connection.join(u[:s], along), u[n:]])
 
-    def force(x, multipliers, params):
-        """λ̂_d of Wᵀλ at (x, 0): its shape and its group part."""
-        covector = system.system.constraint_matrix(at(x), params).T @ multipliers
-        return connection.trivialize_covector(at(x), covector)[1:]
+    def lowered(state, g):
+        """(x, w, μ, g, …) of (q, p, …), g being the group coordinate."""
+        q, p = state[:n], state[n : 2 * n]
+        _, w, mu = connection.trivialize_covector(q, p)
+        return jnp.concatenate([connection.split(q)[0], w, mu, g, state[2 * n :]])
 
     def residual(u, state, t, h, params):
-        x, w, mu, _ = quotient.split(state)
-        rate, vertical = u[:s], u[s:n]
-        d0, _, dg = quotient.slots(t, x, rate, vertical, h, params)
-        if not m:
-            return jnp.concatenate([w + d0, mu - dg])
-        along, across = force(x, u[n:], params)
-        return jnp.concatenate([w + d0 - along, mu - dg - across, constraint(x, rate, vertical, h, params)])
+        on_q, v = lifted(state, u, h)
+        missed = unreduced.residual(v, on_q, t, h, params)
+        _, across, along = connection.trivialize_covector(on_q[:n], missed[:n])
+        return jnp.concatenate([across, along, missed[n:]])
 
     def advance(u, state, t, h, params):
-        x, _, mu, g = quotient.split(state)
-        rate, vertical = u[:s], u[s:n]
-        _, d1, dg = quotient.slots(t, x, rate, vertical, h, params)
-        # without constraints the equation ∂l/∂g1 = μ_k is the law μ_{k+1} = μ_k
-        return jnp.concatenate([x + h * rate, d1, dg if m else mu, g + h * quotient.group_rate(x, rate, vertical, h)])
+        on_q, v = lifted(state, u, h)
+        _, _, mu, g = quotient.split(state)
+        after = lowered(unreduced.advance(v, on_q, t, h, params), g + h * connection.split(v[:n])[1])
+        # without forces the equation ∂l/∂g1 = μ_k is the law μ_{k+1} = μ_k
+        return after.at[2 * s : 2 * s + k].set(mu) if free else after
 
     def unpack(state, u, t, h, params):
-        x, w, mu, g = quotient.split(state)
-        saved = {"x": x, "w": w, "mu": mu, "g": g, "vertical": h * u[s:n]}
-        if m:
-            saved |= {"multipliers": u[n:], "constraint": constraint(x, u[:s], u[s:n], h, params)}
-        return saved
+        on_q, v = lifted(state, u, h)
+        row = dict(unreduced.unpack(on_q, v, t, h, params))
+        x, _, _, g = quotient.split(state)
+        row.pop("q")
+        _, w, mu = connection.trivialize_covector(on_q[:n], row.pop("p"))
+        return {"x": x, "w": w, "mu": mu, "g": g, "vertical": h * u[s:n]} | row
 
     def start(data, h, params):
-        state, u = quotient.start(data, h, params)
-        return state, jnp.concatenate([u, jnp.zeros(m)])
+        state, u = unreduced.start(data, h, params)
+        x, g = connection.split(state[:n])
+        rate, along = connection.split(u[:n])
+        return lowered(state, g), jnp.concatenate([rate, quotient.vertical(x, rate, along, h), u[n:]])
 
-    fields = quotient.fields()
-    if m:
-        fields["multipliers"] = Field((m,), "step", ("constraint",), "Lagrange multipliers of the constraints")
-        fields["constraint"] = Field((m,), "step", ("constraint",), "discrete constraint w_d(q_k, q_{k+1})")
+    other = {name: field for name, field in unreduced.fields.items() if name not in ("q", "p")}
     return StepEquation(
         start=start,
         residual=residual,
         advance=advance,
         unpack=unpack,
-        state_size=2 * n,
-        unknowns=n + m,
-        fields=fields,
+        state_size=unreduced.state_size,
+        unknowns=unreduced.unknowns,
+        fields=quotient.fields() | other,
         labels=tuple(f"horizontal equation {i}" for i in range(s))
         + tuple(f"vertical equation {a}" for a in range(k))
-        + tuple(f"discrete constraint {r}" for r in range(m)),
+        + unreduced.labels[n:],
+        needs_leaving_step=unreduced.needs_leaving_step,
     )

@@ -13,6 +13,7 @@ from dirax.functions import UserFunction, is_traced
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.discrete_lagrangian import RULES, checked_rule
 from dirax.schemes.quotient import Quotient
+from dirax.schemes.reduced_lagrangian import ReducedDiscreteLagrangian
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 
 NEWTON_STEPS = 6
@@ -50,11 +51,11 @@ class DiscreteRouth(AbstractScheme):
 
 def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEquation:
     """The StepEquation of the discrete Routh equations: state (x, w, μ, g, γ), unknowns ẋ (n − k,)."""
-    quotient = Quotient(system, shape.n, rule)
-    k, s = quotient.k, quotient.s
+    quotient, l = Quotient(system.connection, shape.n), ReducedDiscreteLagrangian(system, shape.n, rule)
+    connection, k, s = system.connection, quotient.k, quotient.s
 
     def inertia(t, x, rate, gamma, h, params):
-        return jax.jacfwd(quotient.momentum, argnums=3)(t, x, rate, gamma, h, params)
+        return jax.jacfwd(l.momentum, argnums=3)(t, x, rate, gamma, h, params)
 
     quadratic: dict[Any, bool] = {}  # by the structure of params
 
@@ -62,7 +63,7 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
         """γ with ∂l/∂γ = μ."""
 
         def update(gamma):
-            defect = mu - quotient.momentum(t, x, rate, gamma, h, params)
+            defect = mu - l.momentum(t, x, rate, gamma, h, params)
             return gamma + solve_small(inertia(t, x, rate, gamma, h, params), defect)
 
         structure = jax.tree.structure(params)
@@ -81,12 +82,13 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
     def residual(u, state, t, h, params):
         (x, w, mu, _), guess = split(state)
         # the derivatives of the Routhian are those of l at fixed γ, since ∂l/∂γ = μ
-        return w + quotient.slots(t, x, u, vertical(t, x, u, mu, guess, h, params), h, params)[0]
+        return w + l.slots(t, x, u, vertical(t, x, u, mu, guess, h, params), h, params)[0]
 
     def advance(u, state, t, h, params):
         (x, _, mu, g), guess = split(state)
         gamma = vertical(t, x, u, mu, guess, h, params)
-        w = quotient.slots(t, x, u, gamma, h, params)[1]
+        inside = l.finite_at_end(t, x, u, gamma, h, params)
+        w = jnp.where(inside, l.slots(t, x, u, gamma, h, params)[1], jnp.nan)
         return jnp.concatenate([x + h * u, w, mu, g + h * quotient.group_rate(x, u, gamma, h), gamma])
 
     def unpack(state, u, t, h, params):
@@ -94,8 +96,16 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
         return {"x": x, "w": w, "mu": mu, "g": g, "vertical": h * vertical(t, x, u, mu, guess, h, params)}
 
     def start(data, h, params):
-        state, u = quotient.start(data, h, params)
-        return jnp.concatenate([state, u[s:]]), u[:s]
+        if "q0" in data:
+            (x, g), (x1, g1) = connection.split(data["q0"]), connection.split(data["q1"])
+            rate, t = (x1 - x) / h, data.get("t", 0.0)
+            gamma = quotient.vertical(x, rate, (g1 - g) / h, h)
+            w, mu = -l.slots(t, x, rate, gamma, h, params)[0], l.momentum(t, x, rate, gamma, h, params)
+        else:
+            (x, g), (rate, along) = connection.split(data["q"]), connection.split(data["v"])
+            gamma = quotient.vertical(x, rate, along, h)
+            _, w, mu = connection.trivialize_covector(data["q"], data["p"])
+        return jnp.concatenate([x, w, mu, g, gamma]), rate
 
     why = "which needs the group inertia ∂²l/∂γ² to be invertible: μ is not to be a singular value of the momentum map"
     return StepEquation(

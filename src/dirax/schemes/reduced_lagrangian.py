@@ -1,0 +1,89 @@
+"""The reduced discrete Lagrangian l_{d+} of a symmetric system, and its derivatives ([RL] (4.5))."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dirax.functions import UserFunction
+from dirax.reduction.connection import LinearConnection
+from dirax.reduction.reduced import ReducedLagrangeDirac
+from dirax.schemes.discrete_lagrangian import discrete_lagrangian
+from dirax.schemes.quotient import Quotient
+
+NODES = {"left": ((0.0, 1.0),), "right": ((1.0, 1.0),), "midpoint": ((0.5, 1.0),), "trapezoidal": ((0.0, 0.5), (1.0, 0.5))}
+"""The quadrature of each rule: (place in the step, weight)."""
+
+
+class ReducedDiscreteLagrangian:
+    """l_{d+}(x0, x1, g1) = L_d((x0, 0), (x1, g1 + h⁰_d(x0, x1))) on Σ × Σ × G, as a function of (t, x, ẋ, γ, h, params):
+
+    x0 = x at time t, x1 = x + hẋ, and the vertical part g1 = ω_d = hγ.
+    """
+
+    def __init__(self, system: ReducedLagrangeDirac, n: int, rule: str | UserFunction):
+        self.connection = system.connection
+        self.nodes = () if isinstance(rule, UserFunction) else NODES[rule]
+        self.quotient = Quotient(system.connection, n)
+        self._lagrangian = system.system.lagrangian
+        self._discrete = discrete_lagrangian(self._lagrangian, rule)
+
+    def __call__(self, t: Any, x, rate, vertical, h, params) -> Float[Array, ""]:
+        along = self.quotient.group_rate(x, rate, vertical, h)
+        return self._discrete(t, self._point(x), self.connection.join(rate, along), h, params)
+
+    def slots(self, t: Any, x, rate, vertical, h, params) -> tuple[Array, Array]:
+        """(−w_k, w_{k+1}): (∂l/∂x0, ∂l/∂x1) for linear h_d."""
+        if self._by_quadrature:
+            return self._slots_by_quadrature(t, x, rate, vertical, h, params)
+        dx, drate, dvertical = jax.grad(self, argnums=(1, 2, 3))(t, x, rate, vertical, h, params)
+        d0, d1, mu = dx - drate / h, drate / h, dvertical / h
+        if isinstance(self.connection, LinearConnection):
+            return d0, d1
+        # the terms with h⁰_d of (4.6) do not cancel those with A(x) = D2 h⁰_d(x, x) of the trivialization
+        x1, matrix_at = x + h * rate, self.connection.matrix_at
+        lift0, lift1 = jax.jacfwd(self.connection.lift_of_shapes, argnums=(0, 1))(x, x1)
+        return d0 - mu @ (lift0 + matrix_at(x)), d1 + mu @ (matrix_at(x1) - lift1)
+
+    def momentum(self, t: Any, x, rate, vertical, h, params) -> Float[Array, " k"]:
+        """∂l/∂g1, which is μ."""
+        if not self._by_quadrature:
+            return jax.grad(self, argnums=3)(t, x, rate, vertical, h, params) / h
+        slope = jax.grad(self._at_node, argnums=3)
+        total = jnp.zeros(self.quotient.k)
+        for place, weight in self.nodes:
+            total += weight * slope(*self._node(place, t, x, rate, h), rate, vertical, params)
+        return total
+
+    def finite_at_end(self, t: Any, x, rate, vertical, h, params):
+        """Whether L is a number at the new point: its derivatives can be numbers outside its domain too."""
+        along = self.quotient.group_rate(x, rate, vertical, h)
+        end = self._point(x + h * rate)
+        return jnp.isfinite(self._lagrangian.at(t + h, end, self.connection.join(rate, along), params))
+
+    @property
+    def _by_quadrature(self) -> bool:
+        """Whether l is a sum of values of L that the group coordinate does not enter."""
+        return isinstance(self.connection, LinearConnection) and bool(self.nodes)
+
+    def _point(self, x) -> Array:
+        """(x, 0)."""
+        return self.connection.join(x, jnp.zeros(self.quotient.k))
+
+    def _node(self, place: float, t: Any, x, rate, h) -> tuple[Any, Array]:
+        return (t, x) if place == 0.0 else (t + place * h, x + place * h * rate)
+
+    def _at_node(self, t: Any, x, rate, vertical, params) -> Float[Array, ""]:
+        """L((x, 0), (ẋ, γ + Aẋ))."""
+        velocity = self.connection.join(rate, self.quotient.group_rate(x, rate, vertical, None))
+        return self._lagrangian.at(t, self._point(x), velocity, params)
+
+    def _slots_by_quadrature(self, t: Any, x, rate, vertical, h, params) -> tuple[Array, Array]:
+        """The same from the derivatives of L at the nodes, which is less work."""
+        slope, first, last = jax.grad(self._at_node, argnums=(1, 2)), 0.0, 0.0
+        for place, weight in self.nodes:
+            dx, drate = slope(*self._node(place, t, x, rate, h), rate, vertical, params)
+            first += weight * ((1.0 - place) * h * dx - drate)
+            last += weight * (place * h * dx + drate)
+        return jnp.asarray(first), jnp.asarray(last)
