@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -133,9 +134,7 @@ class EulerPoincare(AbstractSystem):
         return self.space.size, m
 
     def _refuse_singular(self, momentum, a, params) -> None:
-        xi = self.inverse_legendre(momentum, a, params)
-        inertia = np.asarray(jax.hessian(lambda xi: self.value(xi, a, params))(xi))
-        forms = np.asarray(self.constraint_forms(a, params))
+        inertia, forms = (np.asarray(matrix) for matrix in _inertia_and_forms(self, momentum, a, params))
         if not (np.all(np.isfinite(inertia)) and np.all(np.isfinite(forms))):
             return  # the first step says where
         if np.linalg.matrix_rank(forms) < len(forms):
@@ -180,6 +179,13 @@ class EulerPoincare(AbstractSystem):
             return no_constraint()
         momentum, a = self.space.split(row["x"])
         return self.constraint_forms(a, params) @ self.inverse_legendre(momentum, a, params)
+
+
+@eqx.filter_jit
+def _inertia_and_forms(system: EulerPoincare, momentum, a, params):
+    """∂²l/∂ξ² at the ξ of μ, and A."""
+    xi = system.inverse_legendre(momentum, a, params)
+    return jax.hessian(lambda xi: system.value(xi, a, params))(xi), system.constraint_forms(a, params)
 
 
 def _constant(matrix: Any) -> Callable:
