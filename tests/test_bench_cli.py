@@ -87,6 +87,21 @@ def test_the_equations_of_a_lagrangian_with_magnetic_and_mass_terms():
     np.testing.assert_allclose(ode_solvers.compiled_field(ode)(0.0, ode.start), expected, rtol=1e-14)
 
 
+def test_the_equations_of_a_driven_pendulum_on_a_moving_circle():
+    """|q| = R = 1 + .1 sin t with friction: along the circle q̈ is −sin a − .3 R ȧ, outward it is R̈ − R ȧ²; at t = 0, R̈ = 0."""
+    system = dx.LagrangeDirac(
+        lambda q, v: v @ v / 2 - q[1],
+        holonomic=lambda t, q: jnp.array([q @ q - (1 + 0.1 * jnp.sin(t)) ** 2]),
+        forces=lambda t, q, v: -0.3 * v,
+    )
+    angle, rate = 0.4, 0.2
+    out, along = np.array([np.sin(angle), -np.cos(angle)]), np.array([np.cos(angle), np.sin(angle)])
+    data = {"q": jnp.asarray(out), "v": jnp.asarray(0.1 * out + rate * along)}
+    ode = explicit_ode(system, data, None)
+    acceleration = np.asarray(ode.derivative(0.0, ode.start))[2:]
+    np.testing.assert_allclose(acceleration, (-np.sin(angle) - 0.3 * rate) * along - rate**2 * out, rtol=1e-12)
+
+
 @pytest.mark.parametrize("name", ["vortices", "lotka-volterra", "heavy-top", "dc-motor"])
 def test_a_fine_run_of_dirax_approaches_the_reference(name):
     """Second order: halving the step quarters the distance, so both solve the same equations."""

@@ -53,6 +53,7 @@ from dirax.reduction.reduced import ReducedLagrangeDirac, reduce
 from dirax.reduction.symmetry import GroupAction, Translations, check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.schemes.charted import InCharts
 from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
+from dirax.schemes.discrete_constraints import DiscreteConstraintChain, discrete_constraint_algorithm
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.discrete_gradient import DiscreteGradient
 from dirax.schemes.euler_poincare import DiscreteEulerPoincare
@@ -90,6 +91,7 @@ __all__ = [
     "DiracStructure",
     "DiracSystem",
     "DiscreteConnection",
+    "DiscreteConstraintChain",
     "DiscreteDirac",
     "DiscreteEulerPoincare",
     "DiscreteEvolution",
@@ -152,6 +154,7 @@ __all__ = [
     "convergence",
     "cotangent_lift",
     "cyclic_coordinates",
+    "discrete_constraint_algorithm",
     "induced_dirac",
     "interconnect",
     "load",

@@ -33,9 +33,10 @@ class ExplicitODE:
 def explicit_ode(system: AbstractSystem, data: Mapping[str, Array], params: Any) -> ExplicitODE:
     """The equations of motion solved for the derivatives, multipliers eliminated; `data` are initial data of one trajectory.
 
-    y is (q, v) for a regular Lagrangian, also with constraints: M v̇ = ∂L/∂q − (∂²L/∂v∂q) v + Wᵀλ with W v̇ = −Ẇ v. It is q
-    for a phase-space Lagrangian, and x for a Dirac or port-Hamiltonian system. Raises `Skipped` where the equations do not
-    determine ẏ, or are stated in another way.
+    y is (q, v) for a regular Lagrangian, also with constraints c(t, q, v) = 0: M v̇ = ∂L/∂q + f − (∂²L/∂v∂q) v + (∂c/∂v)ᵀλ
+    with ċ = 0, without any term that would bring y back to the constraints. It is q for a phase-space Lagrangian, and x for a
+    Dirac or port-Hamiltonian system. Raises `Skipped` where the equations do not determine ẏ, or are stated in
+    another way.
     """
     match system:
         case NonholonomicMechanics():
@@ -64,14 +65,16 @@ LinearEquations = Callable[[Any, Any], tuple[Any, Any, Callable]]
 
 def _newton_equations(system: LagrangeDirac, n: int, params: Any) -> LinearEquations:
     def equations(t, y):
-        q, v = y[:n], y[n:]
-        lagrangian = lambda q, v: system.lagrangian(q, v, params)
-        mass = jax.hessian(lagrangian, argnums=1)(q, v)
-        _, along = jax.jvp(lambda q: jax.grad(lagrangian, argnums=1)(q, v), (q,), (v,))
-        force = jax.grad(lagrangian)(q, v) - along
-        forms, rates = jax.jvp(lambda q: system.constraint_matrix(q, params), (q,), (v,))
-        matrix = jnp.block([[mass, -forms.T], [forms, jnp.zeros((len(forms), len(forms)))]])
-        return matrix, jnp.concatenate([force, -rates @ v]), lambda z: jnp.concatenate([v, z[:n]])
+        t, q, v = jnp.asarray(t, float), y[:n], y[n:]
+        along = lambda function: jax.jvp(lambda t, q: function(t, q, v), (t, q), (jnp.ones(()), v))[1]
+        momentum = lambda t, q, v: system.legendre(q, v, params, t)
+        velocity = lambda t, q, v: system.constraints.velocity_defect(t, q, v, params)
+        force = jax.grad(lambda q: system.lagrangian.at(t, q, v, params))(q) - along(momentum)
+        if system.forces is not None:
+            force = force + system.forces(t, q, v, params)
+        mass, rows = jax.jacfwd(momentum, argnums=2)(t, q, v), jax.jacfwd(velocity, argnums=2)(t, q, v)
+        matrix = jnp.block([[mass, -rows.T], [rows, jnp.zeros((len(rows), len(rows)))]])
+        return matrix, jnp.concatenate([force, -along(velocity)]), lambda z: jnp.concatenate([v, z[:n]])
 
     return equations
 
