@@ -85,7 +85,8 @@ class UserFunction(eqx.Module):
             what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
             raise TypeError(f"{call} must return one array of real numbers (float64), but it returned {what}.")
         if _indexes(jaxpr.jaxpr) and not is_traced(values, jaxpr.consts):
-            outside = checkify.checkify(lambda *v: self(*v), errors=checkify.index_checks)(*values)[0].get()
+            checked = jax.jit(checkify.checkify(lambda *v: self(*v), errors=checkify.index_checks))
+            outside = checked(*values)[0].get()
             if outside:
                 raise ValueError(
                     f"{call} reads an entry that its arguments, of shapes {shapes}, do not have "

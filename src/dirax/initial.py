@@ -79,7 +79,11 @@ def prepared(system, equation, data, params, h, t0, batch, batch_params: bool, p
     axes = None if batch is None else (0, 0 if batch_params else None, None, None)
     if batch is not None:  # the batch axis can be that of the parameters alone
         data = {name: jnp.broadcast_to(a, (batch, a.shape[-1])) for name, a in data.items()}
-    start = _begin(system, equation, data, params, jnp.asarray(h, float), jnp.asarray(t0, float), axes, project)
+    start = None
+    if not is_traced(data, params, h, t0):
+        start = _begin_on_host(system, equation, data, params, h, t0, batch, batch_params, project)
+    if start is None:
+        start = _begin(system, equation, data, params, jnp.asarray(h, float), jnp.asarray(t0, float), axes, project)
     if start.row0 is not None:
         row0 = {k: (a if batch is not None else a[None]) for k, a in start.row0.items()}
         start = start._replace(row0=row0 if is_traced(row0) else {k: np.asarray(a) for k, a in row0.items()})
@@ -89,8 +93,38 @@ def prepared(system, equation, data, params, h, t0, batch, batch_params: bool, p
 @eqx.filter_jit
 def _begin(system, equation, data, params, h, t0, axes, project: bool) -> Start:
     """One compiled function for all of it, reused by later runs of the same system and scheme."""
-    stage, fraction = equation.stages[0]
+    one = _beginning(system, equation, "q0" in data, project)
+    start = (one if axes is None else jax.vmap(one, in_axes=axes))(data, params, h, t0)
+    return start._replace(first_step=int("q0" in data))
+
+
+def _begin_on_host(system, equation, data, params, h, t0, batch, batch_params: bool, project: bool) -> Start | None:
+    """The same without a compiler, which takes longer than all that has to be computed; None where that cannot be."""
+    from dirax.engines.native.on_host import linearized, on_host  # imported when it is used, with the native engine
+
+    spread = lambda leaf: np.broadcast_to(np.asarray(leaf), (batch or 1, *np.shape(leaf)))
+    given = lambda leaf: np.asarray(leaf) if batch is not None else np.asarray(leaf)[None]
+    arguments = (jax.tree.map(given, data), jax.tree.map(given if batch_params else spread, params), spread(h), spread(t0))
+    leaves, structure = jax.tree.flatten(arguments)
     two_points = "q0" in data
+    one = _beginning(system, equation, two_points, project, first_step=False)
+    start = on_host(lambda *leaves: one(*jax.tree.unflatten(structure, leaves)), leaves, (system, equation), (structure, project))
+    if start is None:
+        return None
+    stage, fraction = equation.stages[0]
+    if stage.unknowns:
+        t = spread(t0 + two_points * h)
+        found = linearized(equation, params, batch_params, start.guess[0], start.state, t, spread(fraction * h))
+        if found is None:
+            return None
+        start = start._replace(residual=found[0], jacobian=found[1])
+    start = start if batch is not None else jax.tree.map(lambda leaf: leaf[0], start._replace(first_step=None))
+    return start._replace(first_step=int(two_points))
+
+
+def _beginning(system, equation, two_points: bool, project: bool, first_step: bool = True):
+    """(data, params, h, t0) ↦ the Start of one trajectory; its residual and Jacobian are left out without `first_step`."""
+    stage, fraction = equation.stages[0]
 
     def one(data, params, h, t0):
         complete = {**system.complete({**data, "t": t0}, params, project), "t": t0}
@@ -110,12 +144,11 @@ def _begin(system, equation, data, params, h, t0, axes, project: bool) -> Start:
         lagrangian = at_time(system.lagrangian, t0, q, v, params) if known("lagrangian", q, v) else None
         constraints = system.constraints.matrix(t0, q, params) if known("constraints", q) else None
         t = t0 + int(two_points) * h
-        first_step = lambda u: stage.residual(u, state, t, fraction * h, params)
-        residual, jacobian = (first_step(u), jax.jacfwd(first_step)(u)) if stage.unknowns else (None, None)
-        return Start(state, guess, row0, 0, defect, size, lagrangian, constraints, residual, jacobian)
+        solved = lambda u: stage.residual(u, state, t, fraction * h, params)
+        residual, jacobian = (solved(u), jax.jacfwd(solved)(u)) if stage.unknowns and first_step else (None, None)
+        return Start(state, guess, row0, int(two_points), defect, size, lagrangian, constraints, residual, jacobian)
 
-    start = (one if axes is None else jax.vmap(one, in_axes=axes))(data, params, h, t0)
-    return start._replace(first_step=int(two_points))
+    return one
 
 
 def refuse_bad_start(system: Any, start: Start, labels: tuple[str, ...], check_constraint: bool) -> None:

@@ -194,7 +194,8 @@ def _blanked(values, info, closing, numbers, completed, where):
 
 
 def _stats(p: Problem, outcome: Outcome, traced: bool) -> dict[str, Any]:
-    total, worst = jnp.sum(outcome.iterations), jnp.max(outcome.max_residual)
+    xp = jnp if traced else np
+    total, worst = xp.sum(outcome.iterations), xp.max(outcome.max_residual)
     return {
         "engine": outcome.engine,
         "steps": p.steps + p.first_step,
@@ -265,7 +266,7 @@ def _arrays(params):
                 f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {leaf!r:.60}: "
                 "use such a value in the system's functions directly."
             )
-    return jax.tree.map(jnp.asarray, params)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf if is_traced(leaf) else np.asarray(leaf)), params)
 
 
 def _batch_size(batch: int | None, params, batch_params: bool) -> int | None:

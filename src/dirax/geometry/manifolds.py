@@ -71,7 +71,7 @@ class AbstractManifold(eqx.Module):
         self._check_shape(x, name)
         if is_traced(x):
             return
-        defect = self.defect(x)
+        defect = jax.jit(lambda x: self.defect(x))(x)  # one compilation, not one for each operation
         if is_traced(defect):  # a constant inside a traced function
             return
         if not float(defect) <= tolerance:
@@ -85,7 +85,7 @@ class AbstractManifold(eqx.Module):
         self._check_shape(v, name)
         if is_traced(x, v):
             return
-        defect, size = self.tangent_defect(x, v), norm(v)
+        defect, size = jax.jit(lambda x, v: (self.tangent_defect(x, v), norm(v)))(x, v)
         if is_traced(defect, size):
             return
         if not float(defect) <= tolerance * (1.0 + float(size)):

@@ -143,13 +143,13 @@ class PortHamiltonian(AbstractSystem):
         return size, len(closed)
 
     def _check_structure(self, x, params) -> None:
-        J = np.asarray(self.J(x, params))
+        J = np.asarray(jax.jit(lambda x, params: self.J(x, params))(x, params))
         skewness = np.max(np.abs(J + J.T), initial=0.0)
         if skewness > SKEW_TOLERANCE * max(np.max(np.abs(J), initial=0.0), 1e-300):
             raise ValueError(f"J is not skew at the initial point: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
         if self.R is None:
             return
-        R = np.asarray(self.R(x, params))
+        R = np.asarray(jax.jit(lambda x, params: self.R(x, params))(x, params))
         scale = max(np.max(np.abs(R), initial=0.0), 1e-300)
         if np.max(np.abs(R - R.T)) > SKEW_TOLERANCE * scale:
             raise ValueError(f"R is not symmetric at the initial point: max |R − Rᵀ| = {np.max(np.abs(R - R.T)):.3g}.")

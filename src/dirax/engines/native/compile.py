@@ -12,9 +12,6 @@ from typing import Any
 import llvmlite
 import llvmlite.binding as llvm
 
-SMALL, LARGE = 6_000, 20_000
-"""Lines of modules up to which more effort is worth while, and from which on as little as possible is spent."""
-
 _numbers = itertools.count()
 
 
@@ -48,11 +45,11 @@ def vector_width() -> int:
     return 8 if have.get("avx512f") else 4 if have.get("avx") else 2
 
 
-def object_code(text: str, target: tuple[str, str, str] | None = None, assembly: bool = False, thorough: bool = False) -> Any:
-    """Optimized object code of a module (or its assembly text), for this machine or a (triple, processor, features).
+def object_code(text: str, target: tuple[str, str, str] | None = None, assembly: bool = False) -> Any:
+    """Object code of a module (or its assembly text), for this machine or a (triple, processor, features).
 
-    `thorough` also looks for scalar operations that fit in one vector: a tenth faster for a single trajectory, nothing
-    for code that is made of vectors, and half of the compile time.
+    Few passes are run: the graph has simplified what there was to simplify. LLVM's own choice of passes takes several times
+    as long and makes no faster code.
     """
     _initialized()
     if target is None:
@@ -62,17 +59,14 @@ def object_code(text: str, target: tuple[str, str, str] | None = None, assembly:
         llvm.initialize_all_asmprinters()
     triple, cpu, flags = target
     module = llvm.parse_assembly(f'target triple = "{triple}"\n' + text)
-    lines = text.count("\n")
-    large, thorough = lines > LARGE, thorough and lines <= SMALL
     machine = llvm.Target.from_triple(triple).create_target_machine(
-        cpu=cpu, features=flags, opt=3 if thorough else 1 if large else 2, reloc="pic", codemodel="small"
+        cpu=cpu, features=flags, opt=2, reloc="pic", codemodel="small"
     )
-    options = llvm.create_pipeline_tuning_options(speed_level=3 if thorough else 1)
-    options.slp_vectorization = thorough
-    options.loop_vectorization = False
-    options.loop_unrolling = False
-    passes = llvm.create_pass_builder(machine, options)
-    passes.getModulePassManager().run(module, passes)
+    passes = llvm.create_new_module_pass_manager()
+    passes.add_sroa_pass()
+    passes.add_instruction_combine_pass()
+    passes.add_simplify_cfg_pass()
+    passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=1)))
     return machine.emit_assembly(module) if assembly else machine.emit_object(module)
 
 

@@ -1,7 +1,8 @@
 """Scalar expressions, each built once: constants folded, zeros and ones simplified away, equal expressions shared."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -233,24 +234,27 @@ class Graph:
 
     # ------------------------------------------------------------------ the whole
 
-    def reachable(self, outputs: Iterable[int]) -> list[int]:
-        """Every node that the outputs need, operands first."""
+    def reachable(self, outputs: Iterable[int], known: Container[int] = ()) -> list[int]:
+        """Every node that the outputs need and that is not known, operands first."""
         seen, stack = set(), list(outputs)
         while stack:
             node = stack.pop()
-            if node not in seen:
+            if node not in seen and node not in known:
                 seen.add(node)
                 stack.extend(self.args[node])
         return sorted(seen)
 
-    def evaluate(self, outputs: Sequence[int], inputs: dict[str, np.ndarray], table: dict | None = None) -> list:
-        """The outputs for given inputs; NumPy by default, any array library whose functions are in `table`."""
+    def evaluate(self, outputs: Sequence[int], inputs: dict[str, Any], table: dict | None = None, values: dict | None = None):
+        """The list of the outputs for given inputs; NumPy by default, any array library whose functions are in `table`.
+
+        `values` holds nodes that are known from before, and then those that were needed.
+        """
         functions = table or OPERATIONS
-        values: dict[int, object] = {}
-        for node in self.reachable(outputs):
+        values = {} if values is None else values
+        for node in self.reachable(outputs, values):
             op = self.op[node]
             if op == "input":
-                values[node] = inputs[self.value[node]]  # type: ignore[index]
+                values[node] = inputs[str(self.value[node])]
             elif self.is_constant(node):
                 values[node] = self.value[node]
             else:

@@ -1,6 +1,6 @@
 """Interprets a jaxpr on arrays of graph nodes: every array of a user's function becomes an array of scalar expressions."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -57,10 +57,10 @@ class Unsupported(Exception):
 
 
 class Interpreter:
-    """Runs jaxprs on node arrays of one graph."""
+    """Runs jaxprs on node arrays of one graph; `rules` are used before those in `RULES`."""
 
-    def __init__(self, graph: Graph):
-        self.graph = graph
+    def __init__(self, graph: Graph, rules: Mapping[str, Rule] | None = None):
+        self.graph, self.rules = graph, {**RULES, **(rules or {})}
         self._lines: list[str] = []
 
     def run(self, closed: ClosedJaxpr, *operands: Any) -> list[Any]:
@@ -96,10 +96,10 @@ class Interpreter:
         # equations inside a library's jitted functions have no line of the user's: the calling equation has it
         self._lines.append(source_line(equation) or (self._lines[-1] if self._lines else "unknown line"))
         try:
-            if name not in RULES:
+            if name not in self.rules:
                 raise Unsupported("is not supported")
             check_dtypes(equation)
-            return RULES[name](self, equation, *operands)
+            return self.rules[name](self, equation, *operands)
         except Unsupported as error:
             failure = UnsupportedPrimitive(name, str(error), self._lines[-1])
             return [Unavailable(failure)] * len(equation.outvars)

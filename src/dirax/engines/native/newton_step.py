@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from dirax.engines.native.graph import Graph
-from dirax.engines.native.operations import jacobian
 from dirax.engines.native.trace import TracedEquation
 
 ADMISSIBLE = 0.1
@@ -33,12 +32,11 @@ class Correction:
     factors: list[int]
 
 
-def newton_correction(g: Graph, equation: TracedEquation) -> Correction:
-    """The correction of one Newton iteration of an equation."""
+def newton_correction(g: Graph, equation: TracedEquation, rows: list[dict[int, int]]) -> Correction:
+    """The correction of one Newton iteration of an equation whose Jacobian has these rows {column: node}."""
     k = len(equation.unknowns)
     if k == 0:
         return Correction([], [], g.true, [], [], [], [])
-    rows = jacobian(g, equation.residual, equation.unknowns)
     matrix = [[row.get(j, g.zero) for j in range(k)] for row in rows]
     order = pivot_order(g, matrix)
     factors = Factors(g, matrix, order)

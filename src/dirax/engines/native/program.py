@@ -17,6 +17,7 @@ from dirax.engines.native.compensation import increments
 from dirax.engines.native.graph import Graph, GraphTooLarge
 from dirax.engines.native.interpret import UnsupportedPrimitive
 from dirax.engines.native.newton_step import newton_correction
+from dirax.engines.native.operations import jacobian
 from dirax.engines.native.step_loop import Plan, kernel_module
 from dirax.engines.native.trace import NODE_LIMIT, Inputs, Parameters, TracedEquation, inputs, parameters, trace
 
@@ -40,6 +41,14 @@ class Program:
     plan: Plan | None = None
     operations: int = 0
     kernels: dict[int, tuple[Any, Any]] = field(default_factory=dict)
+    jacobians: dict[int, list[dict[int, int]]] = field(default_factory=dict)
+
+    def jacobian(self, index: int) -> list[dict[int, int]]:
+        """Rows {column: node} of the Jacobian of the equation of this index. Raises `GraphTooLarge`."""
+        if index not in self.jacobians:
+            e = self.equations[index]
+            self.jacobians[index] = jacobian(self.graph, e.residual, e.unknowns)
+        return self.jacobians[index]
 
     @property
     def bare(self) -> Plan:
@@ -56,7 +65,7 @@ class Program:
             size = int.from_bytes(stored[:4], "little")
             self.operations, code = json.loads(stored[4 : 4 + size])["operations"], stored[4 + size :]
         else:
-            code = llvm.object_code(kernel_module(self._planned(), width, llvm.has_fma()), thorough=width == 1)
+            code = llvm.object_code(kernel_module(self._planned(), width, llvm.has_fma()))
             header = json.dumps({"operations": self.operations}).encode()
             llvm.write_cached(key, len(header).to_bytes(4, "little") + header + code)
         library = llvm.load(code, ("run",))
@@ -67,7 +76,7 @@ class Program:
         if self.plan is None:
             plan = self.bare
             try:
-                plan.corrections = [newton_correction(self.graph, e) for e in self.equations]
+                plan.corrections = [newton_correction(self.graph, e, self.jacobian(i)) for i, e in enumerate(self.equations)]
                 if self.compensated:
                     plan.increments = [increments(self.graph, e) for e in self.equations]
             except GraphTooLarge as error:
