@@ -33,7 +33,8 @@ class DiscreteEulerPoincare(AbstractScheme):
 
     One step, self-adjoint, second order. Without constraints it is a Poisson map that stays on the coadjoint orbits, and the
     spatial momentum Ad*_{g⁻¹}μ (its part that fixes a_0) is conserved. Saved: x = (μ, a), the group element g (from the
-    identity on), per step xi (d,) and, with constraints, `constraint` A ξ_k and the impulse `multipliers`.
+    identity on), per step xi (d,) and, with constraints, `constraint` A ξ_k and the impulse `multipliers` (h/2)(λ'_{k−1} + λ_k)
+    at its first node: μ_k⁻ − μ_k⁺ is Aᵀ times it (at k = 0, where the motion starts in the middle of it, the second half).
 
     Bobenko & Suris 1999; Marsden, Pekarsky & Shkoller 1999; Fedorov & Zenkov 2005; Kobilarov & Marsden 2011. Raises
     `TypeError` for other systems; a step that turns by π or more is refused.
@@ -56,16 +57,17 @@ class DiscreteEulerPoincare(AbstractScheme):
 
 
 def discrete_euler_poincare(system: Any, shape: Shape, name: str) -> StepEquation:
-    """The StepEquation: state (μ, a, g); unknowns ξ, of a Lie–Poisson system also ν, with constraints (λ, ξ', λ') too, ξ' the
-    velocity at the end of the step."""
+    """The StepEquation: state (μ, a, g) and the impulse (h/2)λ' of the step before; unknowns ξ, of a Lie–Poisson system
+    also ν, with constraints (λ, ξ', λ') too, ξ' the velocity at the end of the step."""
     space, m = system.space, shape.m
     group, d, n = space.group, space.dimension, space.size
     tau = retraction(group, name)
     hamiltonian = isinstance(system, LiePoisson)
     motion_size = 2 * d if hamiltonian else d
+    whole = n + group.ambient_dimension
 
     def split(state):
-        return state[:d], state[d:n], state[n:]
+        return state[:d], state[d:n], state[n:whole]
 
     def motion(u, a, h, params):
         """ξ, ν, f, the next a, J at both ends and what is left of ξ = ∂h/∂μ."""
@@ -114,14 +116,13 @@ def discrete_euler_poincare(system: Any, shape: Shape, name: str) -> StepEquatio
 
     def advance(u, state, t, h, params):
         _, _, _, arriving, after, f, _ = step(u, state, h, params)
-        return jnp.concatenate([arriving, after, group.nearest(group.multiply(split(state)[2], f))])
+        return jnp.concatenate([arriving, after, group.nearest(group.multiply(split(state)[2], f)), h / 2.0 * parts(u)[2]])
 
     def unpack(state, u, t, h, params):
-        saved = {"x": state[:n], "g": state[n:], "xi": u[:d]}
+        saved = {"x": state[:n], "g": state[n:whole], "xi": u[:d]}
         if m:
-            first, _, last = parts(u)
             a = split(state)[1]
-            saved["multipliers"] = h / 2.0 * (first + last)
+            saved["multipliers"] = state[whole:] + h / 2.0 * parts(u)[0]
             saved["constraint"] = discrete_constraint(u[:d], a, space.carried(tau(h * u[:d]), a), params)
         return saved
 
@@ -130,7 +131,7 @@ def discrete_euler_poincare(system: Any, shape: Shape, name: str) -> StepEquatio
         zero = jnp.zeros(m)
         motion = [xi, x[:d]] if hamiltonian else [xi]
         u = jnp.concatenate([*motion, *([zero, xi, zero] if m else [])])
-        return jnp.concatenate([x, group.identity()]), u
+        return jnp.concatenate([x, group.identity(), zero]), u
 
     fields = {
         "x": Field((n,), dims=("component",), description="body momentum μ and advected quantities a"),
@@ -140,7 +141,7 @@ def discrete_euler_poincare(system: Any, shape: Shape, name: str) -> StepEquatio
     labels = [f"discrete Euler–Poincaré equation {i}, of a step that turns by less than π" for i in range(d)]
     labels += [f"velocity ∂h/∂μ, component {i}" for i in range(motion_size - d)]
     if m:
-        fields["multipliers"] = Field((m,), "step", ("constraint",), "impulse of the constraints over the step")
+        fields["multipliers"] = Field((m,), "step", ("constraint",), "impulse of the constraints at the node")
         fields["constraint"] = Field((m,), "step", ("constraint",), "discrete constraint A ξ_k")
         labels += [f"discrete constraint {r}" for r in range(m)]
         labels += [f"Legendre transform {i} at the end of the step" for i in range(d)]
@@ -150,7 +151,7 @@ def discrete_euler_poincare(system: Any, shape: Shape, name: str) -> StepEquatio
         residual=residual,
         advance=advance,
         unpack=unpack,
-        state_size=n + group.ambient_dimension,
+        state_size=whole + m,
         unknowns=motion_size + (2 * m + d if m else 0),
         fields=fields,
         labels=tuple(labels),
