@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.diagnostics.books import balances, keeps_books
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.one_step import (
     DiscreteSystem,
@@ -53,6 +54,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     - momentum maps: 32 ε · steps, the most that 32 roundings a step add up to (a random walk gives √steps of that);
     - symplecticity of one step, and φ*Ω = Ω + dβ where there are constraints ([PY] §3.2): 32 ε · 2n · the condition
       number of the step's equations, at a few steps of the run;
+    - systems with ports ([BLM] §7.1): the power balance of every step and, with a discrete gradient, the books over the run,
+      H − H(0) less what was supplied plus what was dissipated: 32 ε, however many steps;
     - energy: "bounded" or "drifts", told apart by windowed means (`dirax.diagnostics.drift`); a drift below
       32 ε · steps · (|E| + |∂E| |row|) is roundoff. The tolerance shown is the drift that could have been told.
 
@@ -72,6 +75,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         *_membership(sol, tolerance),
         _constraint(sol, tolerance),
         _energy(sol),
+        *_ports(sol, tolerance),
         *(_momentum(sol, name, generator, tolerance) for name, generator in generators.items()),
         _symplecticity(sol, tolerance),
     ]
@@ -222,7 +226,8 @@ def _energy(sol: Solution) -> Line:
     except ValueError as error:
         return Line(name, None, None, NOT_CHECKED, str(error))
     energy = energy.reshape(-1, energy.shape[-1])
-    if "work" in sol.fields:
+    forced = "work" in sol.fields and not keeps_books(sol)
+    if forced:
         energy = energy - np.asarray(sol.fields["work"]).reshape(energy.shape)
     roundoff = ROUNDINGS * EPSILON * _steps(sol) * _energy_scale(sol, energy)
     system = sol.system
@@ -244,10 +249,18 @@ def _energy(sol: Solution) -> Line:
     if sol.batch is not None:
         details["per_trajectory"] = [f.drift for f in found]
         details["verdicts"] = [f.verdict for f in found]
-    text = "less the work of the forces: " * ("work" in sol.fields) + worst.text + _lane(sol, lane)
+    text = "less the work of the forces: " * forced + worst.text + _lane(sol, lane)
     others = sorted({f.verdict for f in found} - {worst.verdict})
     text += "".join(f"; {details['verdicts'].count(other)} of {len(found)} {other}" for other in others)
     return Line(name, abs(worst.drift), worst.told, worst.verdict, text, details)
+
+
+def _ports(sol: Solution, tolerance: float | None) -> list[Line]:
+    """The balances of a system with ports."""
+    if sol.system is None or not isinstance(sol.system, PortHamiltonian | DiracSystem):
+        return []
+    energy = np.asarray(sol.energy())
+    return balances(sol, _energy_scale(sol, energy), tolerance)
 
 
 def _motion(sol: Solution, lane: int) -> np.ndarray:
@@ -352,7 +365,7 @@ def _symplecticity(sol: Solution, tolerance: float | None) -> Line:
     name = "structural relation φ*Ω = Ω + dβ" if constrained else "symplecticity of one step"
     if sol.equation is None or sol.system is None:
         return Line(name, None, None, NOT_CHECKED, "the solution was loaded without its system")
-    if "work" in sol.fields:
+    if "work" in sol.fields and not keeps_books(sol):
         return Line(name, None, None, NOT_CHECKED, "the forces change the two-form")
     stages = sol.equation.stages
     if not all(stage.canonical for stage, _ in stages):

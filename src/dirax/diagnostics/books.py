@@ -1,0 +1,91 @@
+"""The books of a system with ports: what is stored is what was supplied less what was dissipated ([BLM] §7.1)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line
+from dirax.solution import Solution
+from dirax.systems.port_hamiltonian import PortHamiltonian
+
+EPSILON = float(np.finfo(float).eps)
+ROUNDINGS = 32
+"""Roundings that a balance may be off by, relative to the sum of the sizes of its terms."""
+
+PORTS = 2
+"""Entries of `work` where it keeps books: energy supplied, energy dissipated."""
+
+
+def keeps_books(sol: Solution) -> bool:
+    """Whether the run carries the energy supplied and dissipated since the start, as `dx.DiscreteGradient` does."""
+    return "work" in sol.fields and sol.field_info["work"].shape == (PORTS,)
+
+
+def balances(sol: Solution, energy_scale: float, tolerance: float | None) -> list[Line]:
+    """The power balance of every step, and the books over the whole run, where the solution has them.
+
+    `energy_scale`: what one unit of roundoff of the rows is to H, in units of ε. A batch is judged by its worst trajectory.
+    """
+    limit = ROUNDINGS * EPSILON if tolerance is None else float(tolerance)
+    lines = []
+    if "power" in sol.fields:
+        lines.append(_step_balance(sol, energy_scale, limit))
+    if keeps_books(sol):
+        lines.append(_whole_balance(sol, energy_scale, limit))
+    return lines
+
+
+def _step_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
+    """stored − supplied + dissipated of every saved step; with a discrete gradient, stored·h is the change of H."""
+    name = "power balance of every step"
+    stored, supplied, dissipated = np.moveaxis(np.asarray(sol.fields["power"]), -1, 0)
+    if stored.size == 0:
+        return Line(name, None, None, NOT_CHECKED, "no step was saved")
+    h = float(sol.step)
+    sizes = np.abs(stored) + np.abs(supplied) + np.abs(dissipated) + energy_scale / h + _flow(sol)
+    worst = np.nanmax(np.abs(stored - supplied + dissipated) / sizes)
+    text = "power stored ⟨dH, ẋ⟩ less supplied plus dissipated, at the base points"
+    if keeps_books(sol):
+        text = "power stored less supplied plus dissipated"
+        if sol.save_every == 1 and np.all(sol.ok):
+            change = np.diff(np.asarray(sol.energy(), dtype=float), axis=-1) / h
+            worst = max(worst, np.nanmax(np.abs(change - stored) / sizes))
+            text += "; stored is the change of H"
+    return _line(name, float(worst), limit, text)
+
+
+def _flow(sol: Solution) -> float:
+    """The largest sum of the sizes of the terms of ⟨dH, ẋ⟩, which may cancel, at the saved rows: |dH|ᵀ (|J − R| |dH| + 1),
+    where 1 is the unit in which ẋ is solved."""
+    system: Any = sol.system
+    if not isinstance(system, PortHamiltonian):
+        return 0.0
+    x = jnp.asarray(sol.fields["x"])
+    params = jax.tree.map(lambda leaf: leaf[0], sol.params) if sol.batch_params else sol.params
+
+    def terms(x):
+        dh = jnp.abs(system.differential(x, params))
+        return dh @ (jnp.abs(system.flow_matrix(x, params)) @ dh + 1.0)
+
+    return float(np.nanmax(np.asarray(jax.jit(jax.vmap(terms))(x.reshape(-1, x.shape[-1])))))
+
+
+def _whole_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
+    """H − H(0) − supplied + dissipated at every saved row."""
+    energy, work = np.asarray(sol.energy()), np.asarray(sol.fields["work"])
+    supplied, dissipated = work[..., 0], work[..., 1]
+    missing = np.abs(energy - energy[..., :1] - supplied + dissipated)
+    sizes = energy_scale + np.abs(supplied) + np.abs(dissipated)
+    line = _line("books of the energy", float(np.nanmax(missing / sizes)), limit, "H − H(0) less supplied plus dissipated")
+    line.details.update(
+        imbalance=float(np.nanmax(missing)),
+        supplied=float(np.ravel(supplied[..., -1])[0]),
+        dissipated=float(np.ravel(dissipated[..., -1])[0]),
+    )
+    return line
+
+
+def _line(name: str, value: float, limit: float, text: str) -> Line:
+    return Line(name, value, limit, OK if value <= limit else VIOLATED, text)
