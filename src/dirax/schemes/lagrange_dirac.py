@@ -191,38 +191,45 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
         if "q0" in data:
             q, v = data["q0"], (data["q1"] - data["q0"]) / h
             p, u = -slots(t, q, v, h, params)[0], jnp.concatenate([v, jnp.zeros(k)])
-        else:
-            q, p, v = data["q"], data["p"], data["v"]
-            u = jnp.concatenate([v, jnp.zeros(k)])
-            if share or holonomic:
-                p, u = incoming_momentum(q, p, u, t, h, params)
-        if holonomic:
-            along = lambda end: projection(jnp.concatenate([u, end]), q, p, t, params)
-            u = jnp.concatenate([u, nearest_root(along, jnp.concatenate([v, jnp.zeros(holonomic)]))])
+            if holonomic:
+                end = jnp.concatenate([v, jnp.zeros(holonomic)])
+                end = nearest_root(lambda end: projection(jnp.concatenate([u, end]), q, p, t, params), end)
+                u = jnp.concatenate([u, end])
+            return book.start(q, p), u
+        q, p, v = data["q"], data["p"], data["v"]
+        u = jnp.concatenate([v, jnp.zeros(k)])
+        if share or holonomic:
+            p, u = incoming_momentum(q, p, u, t, h, params)
         return book.start(q, p), u
 
     def incoming_momentum(q, p, guess, t, h, params):
-        """The incoming momentum whose saved momentum is p, with the unknowns of the step that leaves it."""
-        first = nearest_root(lambda u: equations(u, q, p, t, h, params), guess)
-        first = jnp.where(jnp.all(jnp.isfinite(first)), first, guess)
+        """The incoming momentum whose saved momentum is p, with the unknowns of the step that leaves it.
+
+        λ is that of the leaving step and of one that would arrive at (q, p): the whole impulse, of second order here too.
+        """
+        nonholonomic = slice(n, n + rows.nonholonomic)
+
+        def both(u):
+            leaving = equations(u[: n + k], q, p, t, h, params)
+            return jnp.concatenate([leaving, arriving(u[n + k :], q, p, t, h, params)]) if holonomic else leaving
+
+        found = nearest_root(both, jnp.tile(guess, 1 + bool(holonomic)))
+        found = jnp.where(jnp.all(jnp.isfinite(found)), found, jnp.tile(guess, 1 + bool(holonomic)))
+        first, before = found[: n + k], found[n + k :]
         # with incoming p + s/(1−s) Wᵀμ the multiplier is μ/(1−s), and its share is taken off again; at s = 1 nothing is added
-        factor = share / (1.0 - share) if share < 1.0 else 0.0
-        jump = factor * first[n : n + rows.nonholonomic]
-        if holonomic:
-            jump = jnp.concatenate([jump, arriving(q, p, first, t, h, params)])
-        return p + rows.matrix(t, q, params).T @ jump, first.at[n:].add(jump)
+        jump = share / (1.0 - share) * first[nonholonomic] if share < 1.0 else 0.0 * first[nonholonomic]
+        if not holonomic:
+            return p + rows.matrix(t, q, params).T @ jump, first.at[nonholonomic].add(jump)
+        sigma = before[n + rows.nonholonomic :]
+        jump = jnp.concatenate([jump, sigma])
+        return p + rows.matrix(t, q, params).T @ jump, jnp.concatenate([first.at[n:].add(jump), guess[:n], sigma])
 
-    def arriving(q, p, first, t, h, params):
-        """σ of a step that arrives at (q, p): λ is then the whole impulse at the first node, and of second order there too."""
-
-        def backwards(u):
-            before, v = q - h * u[:n], u[:n]
-            missed = p - slots(t - h, before, v, h, params)[1] + rows.matrix(t, q, params).T @ u[n:]
-            g = rows.constraints.position_defect(t - h, before, params) / h
-            return jnp.concatenate([missed, rows.pick(jnp.concatenate([wd(t - h, before, v, h, params), g]))])
-
-        found = nearest_root(backwards, first)
-        return jnp.where(jnp.all(jnp.isfinite(found)), found, first)[n + rows.nonholonomic :]
+    def arriving(u, q, p, t, h, params):
+        """The equations of (v, μ, σ) for a step from q − h v on the constraints to (q, p)."""
+        before, v = q - h * u[:n], u[:n]
+        missed = p - slots(t - h, before, v, h, params)[1] + rows.matrix(t, q, params).T @ u[n:]
+        g = rows.constraints.position_defect(t - h, before, params) / h
+        return jnp.concatenate([missed, rows.pick(jnp.concatenate([wd(t - h, before, v, h, params), g]))])
 
     return StepEquation(
         start=start,
