@@ -48,6 +48,7 @@ from dirax.geometry.tulczyjew import (
 from dirax.reconstruction import reconstruct
 from dirax.reduction.connection import DiscreteConnection, LinearConnection
 from dirax.reduction.euler_poincare import EulerPoincare
+from dirax.reduction.left_translation import LeftTranslation
 from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduced import ReducedLagrangeDirac, reduce
 from dirax.reduction.symmetry import GroupAction, Translations, check_invariance, cyclic_coordinates, translation_symmetries
@@ -111,6 +112,7 @@ __all__ = [
     "InducedFiniteDifferenceDirac",
     "LagrangeDAlembert",
     "LagrangeDirac",
+    "LeftTranslation",
     "LieGroupExp",
     "LiePoisson",
     "LinearConnection",

@@ -17,6 +17,7 @@ _MODULES = {
     "rigid-body": "rigid_body",
     "free-top": "free_top",
     "heavy-top": "heavy_top",
+    "heavy-top-so3": "heavy_top_so3",
     "suslov": "suslov",
     "chaplygin-sleigh-se2": "chaplygin_sleigh_se2",
     "underwater-vehicle": "underwater_vehicle",

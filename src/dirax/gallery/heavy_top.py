@@ -10,10 +10,8 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.gallery.rigid_body import bivector as cross
-from dirax.geometry.lie_groups import SO3
 from dirax.geometry.maps import Midpoint
 from dirax.geometry.structures import DiracStructure
-from dirax.reduction.lie_poisson import LiePoisson
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.systems.dirac_system import DiracSystem
 
@@ -29,9 +27,6 @@ def hamiltonian(x, params):
     """H = Π·I⁻¹Π/2 + m g l Γ_3, a scalar."""
     return (x[0] ** 2 / params["I1"] + x[1] ** 2 / params["I2"] + x[2] ** 2 / params["I3"]) / 2 + params["mgl"] * x[5]
 
-
-ON_SO3 = LiePoisson(SO3(), lambda mu, gamma, params: hamiltonian(jnp.concatenate([mu, gamma]), params), advected=3)
-"""The same system for `dx.DiscreteEulerPoincare`, which gives the attitude as well; Γ is a vector that SO(3) turns."""
 
 EXAMPLE = Example(
     name="heavy-top",
