@@ -1,55 +1,122 @@
-"""Time of a step of the unreduced, the reduced and the Routh equations of the double spherical pendulum of [RL], in one run.
+"""Time of a step of the unreduced, the reduced and the Routh equations of the double spherical pendulum of [RL] §7.2.
 
-    python benchmarks/reduction.py [--rounds 25] [--steps 10000] [--json FILE]
+    python -m benchmarks reduction
 
-Every round runs each program once, in turn; the best and the median of the rounds are shown. The paper reports that its
+The midpoint discrete Lagrangian, h = .01, constants in the program, one trajectory and a batch, on both engines and in JAX as
+one would write it (scan, jacfwd, jnp.linalg.solve). Every round runs each program once, in turn. The paper reports that its
 reduced code was about 75 % faster than its unreduced one.
+
+What to expect. With exact Newton steps the reduced equations are the unreduced ones in other variables: their Jacobians
+differ by a change of basis, and γ is a column of the elimination. The Routh equations have the Schur complement of that
+column for their Jacobian, M − b c⁻¹ bᵀ: all of M, b and c have to be computed, the first pivot of the elimination moves into
+the residual, and with it its division, which now is on the way of every evaluation and not of every Jacobian. On the native
+engine, whose single trajectory is a chain of dependent operations (sines, residual, pivots, one after the other), a division
+more an evaluation costs what an unknown less saves.
 """
 
-import argparse
-import json
-from pathlib import Path
+import time
+from typing import Any
 
-import numpy as np
+import jax
+import jax.numpy as jnp
 
-from dirax.gallery.rodriguez_leok import FASTER, PENDULUM, REDUCED_PENDULUM, pendulum_run
-from dirax.schemes.routh import DiscreteRouth
+import dirax as dx
+from benchmarks.harness import interleaved, store, summary, table
+from dirax.diagnostics.bench.engines import plain_run
+from dirax.engines import native, xla
+from dirax.engines.native.program import program
+from dirax.engines.result import Problem
+from dirax.gallery.double_spherical_pendulum import EXAMPLE, PARAMS, lagrangian
+from dirax.gallery.rodriguez_leok import FASTER
+from dirax.schemes.step import Shape, make_step_equation
+
+SYSTEM = dx.LagrangeDirac(lambda q, v: lagrangian(q, v, PARAMS))
+REDUCED = dx.reduce(SYSTEM, dx.LinearConnection(fibre=[0]))
+MIDPOINT = dx.PlusLagrangeDirac("midpoint")
+EQUATIONS: dict[str, tuple[Any, Any]] = {
+    "unreduced": (SYSTEM, MIDPOINT),
+    "reduced": (REDUCED, MIDPOINT),
+    "Routh": (REDUCED, dx.DiscreteRouth("midpoint")),
+}
 
 
-def measured(rounds: int, steps: int) -> dict[str, dict[str, float]]:
-    """Microseconds a step of each program on the native engine, with its unknowns a step."""
-    settings = {"steps": steps, "save_every": steps, "engine": "native"}
-    programs = {
-        "unreduced": lambda: pendulum_run(PENDULUM.system, **settings),
-        "reduced": lambda: pendulum_run(REDUCED_PENDULUM, **settings),
-        "Routh": lambda: pendulum_run(REDUCED_PENDULUM, DiscreteRouth("midpoint"), **settings),
-    }
-    unknowns = {name: program().stats["unknowns"] for name, program in programs.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in programs}
-    for _ in range(rounds):
-        for name, program in programs.items():
-            seconds[name].append(program().stats["run_seconds"])
-    per_step = {name: 1e6 * np.array(times) / steps for name, times in seconds.items()}
+def problem(name: str, steps: int, batch: int | None) -> Problem:
+    """A run from the paper's initial data, or from a batch of points near them; only the last row is saved."""
+    system, scheme = EQUATIONS[name]
+    equation = make_step_equation(scheme, system, Shape(4))
+
+    def start(shift):
+        q, p = jnp.asarray(EXAMPLE.initial["q"]).at[1].add(shift), jnp.asarray(EXAMPLE.initial["p"])
+        data = {**SYSTEM.complete({"q": q, "p": p, "t": 0.0}, None, False), "t": 0.0}
+        return equation.start(data, EXAMPLE.step, None)
+
+    shifts = jnp.zeros(()) if batch is None else 1e-3 * jnp.arange(batch) / batch
+    state, guess = (start if batch is None else jax.vmap(start))(shifts)
+    return Problem(equation, state, (guess,), EXAMPLE.step, 0.0, steps, steps, batch=batch)
+
+
+def operations(name: str) -> dict[str, int]:
+    """Scalar operations of the compiled step: residual, Jacobian, elimination and all together."""
+    made, _ = program(problem(name, 1, None).equation, None, False)
+    plan = made._planned()
+    g, equation, correction = plan.graph, plan.equations[0], plan.corrections[0]
+    count = lambda nodes: sum(1 for node in g.reachable(nodes) if g.args[node])
+    jacobian = [node for row in correction.jacobian for node in row]
+    residual, with_jacobian = count(equation.residual), count([*equation.residual, *jacobian])
+    everything = count([*equation.residual, *jacobian, *correction.change, correction.stable])
     return {
-        name: {"unknowns": unknowns[name], "best": float(times.min()), "median": float(np.median(times))}
-        for name, times in per_step.items()
+        "unknowns": len(equation.unknowns),
+        "residual": residual,
+        "Jacobian": with_jacobian - residual,
+        "elimination": everything - with_jacobian,
+        "step": made.operations,
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=25)
-    parser.add_argument("--steps", type=int, default=10_000)
-    parser.add_argument("--json")
-    chosen = parser.parse_args()
-    results = measured(chosen.rounds, chosen.steps)
-    for name, line in results.items():
-        ratio = results["unreduced"]["best"] / line["best"]
-        print(f"{name:10s} {line['unknowns']} unknowns   best {line['best']:.3f} µs   median {line['median']:.3f} µs   "
-              f"{ratio:.2f}× the speed of the unreduced")  # fmt: skip
-    print(f"paper      reduced about {FASTER:.0%} faster than unreduced")
-    if chosen.json:
-        Path(chosen.json).write_text(json.dumps(results, indent=1))
+def timed(run) -> float:
+    started = time.perf_counter()
+    run()
+    return time.perf_counter() - started
+
+
+def measure(repeats: int, steps: int, batch: int) -> dict[str, dict[str, dict[str, float]]]:
+    """Microseconds a step and trajectory, by setting and equations."""
+    few = max(1, steps // 100)
+    settings = {
+        "native, one trajectory": (native.run, steps, None),
+        f"native, {batch} trajectories": (native.run, few, batch),
+        "xla, one trajectory": (xla.run, steps // 4, None),
+        f"xla, {batch} trajectories": (xla.run, few, batch),
+        "JAX as one writes it": (None, steps // 4, None),
+    }
+    found = {}
+    for label, (engine, count, size) in settings.items():
+        programs = {}
+        for name in EQUATIONS:
+            p = problem(name, count, size)
+            run = plain_run(p) if engine is None else lambda p=p, engine=engine: engine(p)
+            programs[name] = lambda run=run: timed(run)
+        seconds = interleaved(programs, repeats)
+        unit = 1e6 / (count * (size or 1))
+        found[label] = {name: summary([unit * s for s in values]) for name, values in seconds.items()}
+    return found
+
+
+def main(short: bool = False) -> None:
+    repeats, steps, batch = (9, 8_000, 256) if short else (31, 40_000, 2048)
+    found = measure(repeats, steps, batch)
+    counts = {name: operations(name) for name in EQUATIONS}
+    rows = []
+    for label, times in found.items():
+        base = times["unreduced"]["median"]
+        cells = [f"{times[name]['median']:.3f} ({base / times[name]['median']:.2f}×)" for name in EQUATIONS]
+        rows.append((label, *cells))
+    title = f"double spherical pendulum: µs a step, medians of {repeats} (speed over unreduced)"
+    print(table(("", *EQUATIONS), rows, title))
+    kinds = list(next(iter(counts.values())))
+    print(table(("", *kinds), [(name, *(str(c[k]) for k in kinds)) for name, c in counts.items()], "scalar operations, native"))
+    print(f"the paper's reduced code was about {FASTER:.0%} faster than its unreduced one")
+    store("reduction", {"microseconds_per_step": found, "operations": counts, "paper": {"faster": FASTER}})
 
 
 if __name__ == "__main__":

@@ -37,19 +37,23 @@ class AbstractConnection(eqx.Module):
     def matrix_at(self, x: Float[Array, " n-k"]) -> Float[Array, "k n-k"]:
         """A(x) = D2 h⁰_d(x, x): the horizontal subspace at x is ġ = A(x) ẋ."""
 
+    @abstractmethod
+    def momentum_shift(self, x: Float[Array, " n-k"], mu: Float[Array, " k"]) -> Float[Array, " n-k"]:
+        """h*_{d,Σ}(μ) = A(x)ᵀ μ."""
+
     def shape_indices(self, n: int) -> np.ndarray:
         """The indices of q that are the shape coordinates x."""
         return np.setdiff1d(np.arange(n), self.fibre)
 
     def split(self, q: Float[Array, " n"]) -> tuple[Float[Array, " n-k"], Float[Array, " k"]]:
         """q (or p, or v) as its (x, g) parts."""
-        return q[self.shape_indices(q.shape[-1])], q[np.array(self.fibre)]
+        return picked(q, self.shape_indices(q.shape[-1])), picked(q, np.array(self.fibre))
 
     def join(self, x: Float[Array, " n-k"], g: Float[Array, " k"]) -> Float[Array, " n"]:
         """The inverse of `split`."""
         n = x.shape[-1] + g.shape[-1]
         order = np.argsort(np.concatenate([self.shape_indices(n), self.fibre]))
-        return jnp.concatenate([x, g])[order]
+        return picked(jnp.concatenate([x, g]), order)
 
     def one_form(self, q0: Float[Array, " n"], q1: Float[Array, " n"]) -> Float[Array, " k"]:
         """ω_d(q0, q1): e on the diagonal, and ω_d(g q0, g' q1) = g' ω_d(q0, q1) g⁻¹."""
@@ -76,13 +80,13 @@ class AbstractConnection(eqx.Module):
     def trivialize_covector(self, q0: Float[Array, " n"], p0: Float[Array, " n"]) -> tuple[Array, Array, Array]:
         """λ̂_d(q0, p0) = (q0, w0 + h*_{d,Σ}(r0), r0) for p0 = (w0, r0); r0 is the momentum map."""
         w0, r0 = self.split(p0)
-        return q0, w0 + self.matrix_at(self.split(q0)[0]).T @ r0, r0
+        return q0, w0 + self.momentum_shift(self.split(q0)[0], r0), r0
 
     def untrivialize_covector(
         self, x: Float[Array, " n-k"], w: Float[Array, " n-k"], mu: Float[Array, " k"]
     ) -> Float[Array, " n"]:
         """p0 = (w − h*_{d,Σ}(μ), μ): the inverse of `trivialize_covector` at a point over x."""
-        return self.join(w - self.matrix_at(x).T @ mu, mu)
+        return self.join(w - self.momentum_shift(x, mu), mu)
 
 
 class LinearConnection(AbstractConnection):
@@ -129,6 +133,10 @@ class LinearConnection(AbstractConnection):
     def matrix_at(self, x: Float[Array, " n-k"]) -> Float[Array, "k n-k"]:
         """A, at every x."""
         return self.matrix(x.shape[-1] + len(self.fibre))
+
+    def momentum_shift(self, x: Float[Array, " n-k"], mu: Float[Array, " k"]) -> Float[Array, " n-k"]:
+        """Aᵀ μ."""
+        return jnp.zeros_like(x) if self.horizontal is None else self.matrix_at(x).T @ mu
 
     def lift_of_shapes(self, x0: Float[Array, " n-k"], x1: Float[Array, " n-k"]) -> Float[Array, " k"]:
         """h⁰_d(x0, x1) = A(x1 − x0)."""
@@ -194,6 +202,20 @@ class DiscreteConnection(AbstractConnection):
     def matrix_at(self, x: Float[Array, " n-k"]) -> Float[Array, "k n-k"]:
         """D2 h⁰_d(x, x)."""
         return jax.jacfwd(self.lift_of_shapes, argnums=1)(x, x)
+
+    def momentum_shift(self, x: Float[Array, " n-k"], mu: Float[Array, " k"]) -> Float[Array, " n-k"]:
+        """A(x)ᵀ μ."""
+        return jax.vjp(lambda x1: self.lift_of_shapes(x, x1), x)[1](mu)[0]
+
+
+def picked(a: Float[Array, " n"], indices: np.ndarray) -> Float[Array, " r"]:
+    """a[indices] by slices of neighbours: XLA is slow with gathers of a few numbers, and slower with their derivatives."""
+    starts = [0, *(i for i in range(1, len(indices)) if indices[i] != indices[i - 1] + 1)]
+    runs = zip(starts, [*starts[1:], len(indices)], strict=True)
+    parts = [a[int(indices[first]) : int(indices[last - 1]) + 1] for first, last in runs if last > first]
+    if not parts:
+        return a[:0]
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
 
 
 def fibre_indices(fibre: Any) -> tuple[int, ...]:

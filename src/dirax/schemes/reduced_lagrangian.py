@@ -50,17 +50,17 @@ class ReducedDiscreteLagrangian:
         """∂l/∂g1, which is μ."""
         if not self._by_quadrature:
             return jax.grad(self, argnums=3)(t, x, rate, vertical, h, params) / h
-        slope = jax.grad(self._at_node, argnums=3)
         total = jnp.zeros(self.quotient.k)
         for place, weight in self.nodes:
-            total += weight * slope(*self._node(place, t, x, rate, h), rate, vertical, params)
+            total += weight * self.connection.split(self._slopes(place, t, x, rate, vertical, h, params)[1])[1]
         return total
 
-    def finite_at_end(self, t: Any, x, rate, vertical, h, params):
-        """Whether L is a number at the new point: its derivatives can be numbers outside its domain too."""
-        along = self.quotient.group_rate(x, rate, vertical, h)
-        end = self._point(x + h * rate)
-        return jnp.isfinite(self._lagrangian.at(t + h, end, self.connection.join(rate, along), params))
+    def finite(self, t: Any, x, rate, vertical, h, params) -> Array:
+        """Whether l is a number: its derivatives can be numbers outside the domain of L too."""
+        if not self._by_quadrature:
+            return jnp.isfinite(self(t, x, rate, vertical, h, params))
+        values = [self._lagrangian.at(*self._node(place, t, x, rate, vertical, h), params) for place, _ in self.nodes]
+        return jnp.all(jnp.isfinite(jnp.stack(values)))
 
     @property
     def _by_quadrature(self) -> bool:
@@ -71,19 +71,22 @@ class ReducedDiscreteLagrangian:
         """(x, 0)."""
         return self.connection.join(x, jnp.zeros(self.quotient.k))
 
-    def _node(self, place: float, t: Any, x, rate, h) -> tuple[Any, Array]:
-        return (t, x) if place == 0.0 else (t + place * h, x + place * h * rate)
+    def _node(self, place: float, t: Any, x, rate, vertical, h) -> tuple[Any, Array, Array]:
+        """The time, point and velocity at a place in the step."""
+        velocity = self.connection.join(rate, self.quotient.group_rate(x, rate, vertical, h))
+        return (t, self._point(x), velocity) if place == 0.0 else (t + place * h, self._point(x + place * h * rate), velocity)
 
-    def _at_node(self, t: Any, x, rate, vertical, params) -> Float[Array, ""]:
-        """L((x, 0), (ẋ, γ + Aẋ))."""
-        velocity = self.connection.join(rate, self.quotient.group_rate(x, rate, vertical, None))
-        return self._lagrangian.at(t, self._point(x), velocity, params)
+    def _slopes(self, place: float, t: Any, x, rate, vertical, h, params) -> tuple[Array, Array]:
+        """∂L/∂q and ∂L/∂v there; in all coordinates, which XLA makes less of than of derivatives by some of them."""
+        time, q, v = self._node(place, t, x, rate, vertical, h)
+        return jax.grad(lambda q, v: self._lagrangian.at(time, q, v, params), argnums=(0, 1))(q, v)
 
     def _slots_by_quadrature(self, t: Any, x, rate, vertical, h, params) -> tuple[Array, Array]:
         """The same from the derivatives of L at the nodes, which is less work."""
-        slope, first, last = jax.grad(self._at_node, argnums=(1, 2)), 0.0, 0.0
+        first, last = jnp.zeros(self.quotient.s), jnp.zeros(self.quotient.s)
         for place, weight in self.nodes:
-            dx, drate = slope(*self._node(place, t, x, rate, h), rate, vertical, params)
-            first += weight * ((1.0 - place) * h * dx - drate)
-            last += weight * (place * h * dx + drate)
-        return jnp.asarray(first), jnp.asarray(last)
+            dq, dv = self._slopes(place, t, x, rate, vertical, h, params)
+            along, momentum = self.connection.split(dq)[0], self.connection.trivialize_covector(self._point(x), dv)[1]
+            first += weight * ((1.0 - place) * h * along - momentum)
+            last += weight * (place * h * along + momentum)
+        return first, last

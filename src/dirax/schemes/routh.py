@@ -54,20 +54,25 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
     quotient, l = Quotient(system.connection, shape.n), ReducedDiscreteLagrangian(system, shape.n, rule)
     connection, k, s = system.connection, quotient.k, quotient.s
 
-    def inertia(t, x, rate, gamma, h, params):
-        return jax.jacfwd(l.momentum, argnums=3)(t, x, rate, gamma, h, params)
+    def equation(t, x, rate, gamma, h, params):
+        """∂l/∂γ, and the group inertia ∂²l/∂γ² (k, k) as its columns."""
+        along = lambda gamma: l.momentum(t, x, rate, gamma, h, params)
+        columns = [jax.jvp(along, (gamma,), (unit,)) for unit in jnp.eye(k)]
+        return columns[0][0], [column for _, column in columns]
 
     quadratic: dict[Any, bool] = {}  # by the structure of params
 
+    @jax.custom_jvp
     def vertical(t, x, rate, mu, guess, h, params):
         """γ with ∂l/∂γ = μ."""
 
         def update(gamma):
-            defect = mu - l.momentum(t, x, rate, gamma, h, params)
-            return gamma + solve_small(inertia(t, x, rate, gamma, h, params), defect)
+            momentum, columns = equation(t, x, rate, gamma, h, params)
+            return gamma + solve_small(columns, mu - momentum)
 
         structure = jax.tree.structure(params)
         if structure not in quadratic:
+            inertia = lambda *values: jnp.stack(equation(*values)[1])
             quadratic[structure] = independent(inertia, 3, (t, x, rate, guess, h, params))
         if quadratic[structure]:
             return update(jnp.zeros_like(guess))
@@ -75,6 +80,16 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
         for _ in range(NEWTON_STEPS):
             gamma = update(gamma)
         return gamma
+
+    @vertical.defjvp
+    def derivative(primals, tangents):
+        """By the implicit function theorem: no derivative of the inertia, and none of Newton's steps."""
+        t, x, rate, mu, guess, h, params = primals
+        gamma = vertical(*primals)
+        along = lambda t, x, rate, h, params: l.momentum(t, x, rate, gamma, h, params)
+        others = lambda values: tuple(values[i] for i in (0, 1, 2, 5, 6))
+        change = jax.jvp(along, others(primals), others(tangents))[1]
+        return gamma, solve_small(equation(t, x, rate, gamma, h, params)[1], tangents[3] - change)
 
     def split(state):
         return quotient.split(state[: 2 * shape.n]), state[2 * shape.n :]
@@ -87,7 +102,7 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
     def advance(u, state, t, h, params):
         (x, _, mu, g), guess = split(state)
         gamma = vertical(t, x, u, mu, guess, h, params)
-        inside = l.finite_at_end(t, x, u, gamma, h, params)
+        inside = l.finite(t, x, u, gamma, h, params)
         w = jnp.where(inside, l.slots(t, x, u, gamma, h, params)[1], jnp.nan)
         return jnp.concatenate([x + h * u, w, mu, g + h * quotient.group_rate(x, u, gamma, h), gamma])
 
@@ -120,9 +135,10 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
     )
 
 
-def solve_small(matrix: Float[Array, "k k"], right: Float[Array, " k"]) -> Float[Array, " k"]:
-    """matrix⁻¹ right; for one equation by the reciprocal, whose derivatives need no other division."""
-    return right * (1.0 / matrix[0]) if right.shape[0] == 1 else jnp.linalg.solve(matrix, right)
+def solve_small(columns: list[Float[Array, " k"]], right: Float[Array, " k"]) -> Float[Array, " k"]:
+    """The solution of the equations with a matrix of these columns; one equation by the reciprocal, whose derivatives need
+    no other division."""
+    return right * (1.0 / columns[0]) if len(columns) == 1 else jnp.linalg.solve(jnp.stack(columns, axis=1), right)
 
 
 def independent(function: Callable, argument: int, values: tuple) -> bool:
