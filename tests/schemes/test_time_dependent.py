@@ -7,8 +7,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dirax as dx
+from dirax import gallery
 from dirax.diagnostics.verify import verify
 from dirax.functions import UserFunction
+from dirax.gallery import turntable
 
 
 def slopes(errors) -> np.ndarray:
@@ -196,6 +198,15 @@ def test_a_ball_on_a_turntable_goes_round_with_two_sevenths_of_its_frequency(sch
     report = verify(sol)
     assert report.ok, report
     assert report["energy"].verdict == "not checked" and "affine" in report["energy"].explanation
+
+
+def test_the_gallery_has_it_in_euler_angles():
+    example, errors = gallery.get("turntable"), []
+    for steps in (100, 200, 400):
+        sol = example.simulate(step=4.0 / steps, steps=steps)
+        errors.append(np.max(np.abs(sol.q[:, :2] - turntable.exact(sol.t, example.initial["q"], example.initial["v"]))))
+    assert slopes(errors) == pytest.approx(2.0, abs=0.1)
+    assert np.max(np.abs(sol.constraint)) < 1e-14
 
 
 def test_projection_onto_affine_constraints_and_engines():

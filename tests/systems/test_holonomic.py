@@ -10,7 +10,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dirax as dx
+from dirax import gallery
 from dirax.diagnostics.verify import verify
+from dirax.gallery.cartesian_double_pendulum import from_angles
 
 MIDPOINT, TRAPEZOIDAL = dx.LagrangeDAlembert("midpoint"), dx.LagrangeDAlembert("trapezoidal")
 
@@ -259,6 +261,18 @@ def test_verify_finds_the_discrete_dirac_structure_of_the_constraint_distributio
     assert [line.verdict for line in report.lines[:4]] == ["ok"] * 4 and report.lines[-1].verdict == "ok"
     sol.fields["multipliers"] = sol.multipliers * (1 + 1e-9)
     assert verify(sol)["saved p and multipliers"].verdict == "VIOLATED"
+
+
+def test_the_gallery_has_it_beside_its_angles():
+    in_angles = gallery.get("double-pendulum").simulate(steps=500)
+    sol = gallery.get("cartesian-double-pendulum").simulate(steps=500)
+    y = np.asarray(in_angles.q)
+    first = np.stack([np.sin(y[:, 0]), -np.cos(y[:, 0])], 1)
+    both = np.concatenate([first, first + np.stack([np.sin(y[:, 1]), -np.cos(y[:, 1])], 1)], 1)
+    assert np.max(np.abs(sol.q - both)) < 1e-3  # two schemes of order 2
+    assert np.max(np.abs(sol.constraint)) < 1e-14
+    hanging = gallery.get("cartesian-double-pendulum").simulate(steps=500, **from_angles([0.0, 0.0], [0.0, 0.0]))
+    np.testing.assert_allclose(hanging.multipliers / hanging.step, [[2 * 9.81, 9.81]] * 500, rtol=1e-11)
 
 
 # ------------------------------------------------------------------------------------ holonomic and nonholonomic together

@@ -12,6 +12,8 @@ _MODULES = {
     "heisenberg": "heisenberg",
     "kepler": "kepler",
     "double-pendulum": "double_pendulum",
+    "cartesian-double-pendulum": "cartesian_double_pendulum",
+    "turntable": "turntable",
     "henon-heiles": "henon_heiles",
     "pendulum": "pendulum",
     "rigid-body": "rigid_body",
