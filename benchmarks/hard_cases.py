@@ -1,0 +1,99 @@
+"""The energy of nonholonomic integrators over a million steps, on hard cases: the table of docs/hard_cases.md.
+
+    python -m benchmarks.hard_cases [--steps 1000000] [SYSTEM …]      prints the table in Markdown
+
+The energy is judged by `dirax.diagnostics.drift`: "bounded", "drifts", or how the run ended.
+"""
+
+import argparse
+import sys
+
+import numpy as np
+
+import dirax as dx
+from dirax import gallery
+from dirax.diagnostics.drift import judge
+from dirax.gallery import contact_particle, transmission
+
+METHOD_2 = dx.DiscreteDirac(constraints="resolve")
+SCHEMES = {
+    "(+)": dx.PlusLagrangeDirac(),
+    "(−)": dx.MinusLagrangeDirac(),
+    "midpoint": dx.LagrangeDAlembert("midpoint", "midpoint"),
+    "Method 1": dx.DiscreteDirac(constraints="discretize"),
+    "Method 2": METHOD_2,
+    "Method 2, order 4": dx.Composition(METHOD_2, "suzuki4"),
+}
+ROWS = 20_000
+ROUNDINGS = 32
+
+
+def cases() -> dict[str, tuple]:
+    """Name → (example, changes of its run)."""
+    found = {}
+    for module in (contact_particle, transmission):
+        for case, params in module.CASES.items():
+            found[f"{module.EXAMPLE.title.lower()}, {case}"] = (module.EXAMPLE, {"params": params})
+    for name, changes in {
+        "rolling-disk": {"step": 0.01},
+        "knife-edge": {},
+        "chaplygin-sleigh": {},
+        "snakeboard": {},
+    }.items():
+        example = gallery.get(name)
+        found[example.title.lower()] = (example, changes)
+    return found
+
+
+def lagrangian_form(example):
+    """The system as the one-sided schemes take it."""
+    system = example.system
+    return system.lagrange_dirac() if hasattr(system, "lagrange_dirac") else system
+
+
+def initial_energy(example, changes: dict) -> float:
+    """H at the start."""
+    return float(example.simulate(METHOD_2, **{**changes, "steps": 1}).energy()[0])
+
+
+def verdict(example, scheme, steps: int, changes: dict) -> str:
+    """One cell: the verdict on the energy, its range in the first and last tenth of the run."""
+    system = example.system if isinstance(scheme, dx.DiscreteDirac | dx.Composition) else lagrangian_form(example)
+    params = {**(example.params or {}), **changes.get("params", {})} or None
+    data = {name: changes[name] for name in ("q", "v") if name in changes} or {name: example.initial[name] for name in ("q", "v")}
+    step = changes.get("step", example.step)
+    rows = {"steps": steps, "save_every": max(1, steps // ROWS)}
+    sol = dx.simulate(system, scheme, **data | rows, step=step, params=params, project=True)
+    energy = np.asarray(sol.energy())
+    good = np.isfinite(energy)
+    t, energy, motion = np.asarray(sol.t)[good], energy[good], np.concatenate([sol.q, sol.p], axis=1)[good]
+    roundoff = ROUNDINGS * np.finfo(float).eps * steps * (1 + np.abs(energy).max())
+    tenth = max(1, len(energy) // 10)
+    first, last = np.abs(energy[:tenth] - energy[0]).max(), np.abs(energy[-tenth:] - energy[0]).max()
+    if not sol.ok:
+        number = f"{round((t[-1] - t[0]) / step):,}".replace(",", " ")
+        return f"fails at step {number}: {first:.1e}, {last:.1e}"
+    return f"{judge(t, energy, motion, roundoff).verdict}: {first:.1e}, {last:.1e}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=1_000_000)
+    parser.add_argument("systems", nargs="*", help="parts of names")
+    chosen = parser.parse_args()
+    print("| system, h | scheme | \\|H − H(0)\\|, first tenth, last tenth |\n|---|---|---|")
+    for name, (example, changes) in cases().items():
+        if chosen.systems and not any(part in name for part in chosen.systems):
+            continue
+        label = f"{name}, {changes.get('step', example.step):g}; H(0) = {initial_energy(example, changes):.3g}"
+        for scheme_name, scheme in SCHEMES.items():
+            try:
+                cell = verdict(example, scheme, chosen.steps, changes)
+            except (TypeError, ValueError) as error:
+                cell = f"does not apply: {error}"[:80]
+            print(f"| {label} | {scheme_name} | {cell} |", flush=True)
+            label = ""
+
+
+if __name__ == "__main__":
+    sys.exit(main())
