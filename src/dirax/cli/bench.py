@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dirax import gallery
+from dirax.cli.subject import INITIAL
 from dirax.diagnostics.bench.measure import Bench, bench
 from dirax.diagnostics.bench.subject import Subject
 from dirax.gallery.example import Example
@@ -37,10 +38,11 @@ def subject(example: Example, longest: int) -> Subject:
         name=example.name,
         system=example.system,
         scheme=example.scheme,
-        initial=example.initial,
+        initial={name: value for name, value in example.initial.items() if name in INITIAL},
         step=float(example.step),
         steps=min(example.steps, longest),
         params=example.params,
+        project=bool(example.initial.get("project", False)),
     )
 
 
@@ -50,9 +52,7 @@ def check_targets(table: Path | None, picture: Path | None) -> None:
         raise ValueError(f"--plot must end in {', '.join(PICTURES)}, but {str(picture)!r} was given.")
     for path in (table, picture):
         if path is not None and not path.parent.is_dir():
-            raise FileNotFoundError(
-                f"the folder {path.parent} does not exist: create it, or choose another place."
-            )
+            raise FileNotFoundError(f"the folder {path.parent} does not exist: create it, or choose another place.")
 
 
 def store(found: Bench, table: Path | None, picture: Path | None) -> None:

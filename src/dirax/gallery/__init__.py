@@ -37,6 +37,8 @@ _MODULES = {
     "rolling-ball": "rolling_ball",
     "chaplygin-sleigh": "chaplygin_sleigh",
     "knife-edge": "knife_edge",
+    "contact-particle": "contact_particle",
+    "transmission": "transmission",
 }
 """Name → the module here that defines `EXAMPLE`; a new system is a file and a line."""
 

@@ -42,7 +42,8 @@ class Program:
 
 @dataclass(frozen=True)
 class Subject:
-    """A run: `initial` holds one of the pairs of initial data of `dx.simulate`, of one trajectory."""
+    """A run: `initial` holds one of the pairs of initial data of `dx.simulate`, of one trajectory; with `project` they are
+    moved onto the constraint."""
 
     name: str
     system: AbstractSystem
@@ -51,6 +52,7 @@ class Subject:
     step: float
     steps: int
     params: Any = None
+    project: bool = False
 
     @property
     def span(self) -> float:
@@ -59,7 +61,13 @@ class Subject:
 
     @cached_property
     def arrays(self) -> dict[str, jax.Array]:
-        return initial_data(dict(self.initial))[0]
+        return self._projected(initial_data(dict(self.initial))[0])
+
+    def _projected(self, data: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        if not self.project:
+            return data
+        complete = self.system.complete(data, self.leaves, True)
+        return {name: complete[name] for name in data}
 
     @cached_property
     def leaves(self) -> Any:
