@@ -123,7 +123,8 @@ def with_code(sol: Solution, system: Any, scheme: Any) -> Solution:
         return sol
     one = {name: a[0] if a.ndim == 2 else a for name, a in sol.initial.items()}
     params = jax.tree.map(lambda leaf: leaf[0], sol.params) if sol.batch_params else sol.params
-    sol.equation = make_step_equation(sol.scheme, sol.system, Shape(*sol.system.sizes(one, params)))
+    redundant = tuple(sol.stats.get("redundant_constraints", ()))
+    sol.equation = make_step_equation(sol.scheme, sol.system, Shape(*sol.system.sizes(one, params), redundant=redundant))
     made = {name: tuple(field.shape) for name, field in sol.equation.stages[0][0].fields.items()}
     saved = {name: tuple(field.shape) for name, field in sol.field_info.items()}
     if made != saved:

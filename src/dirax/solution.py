@@ -203,6 +203,8 @@ class Solution:
         every = "every step" if self.save_every == 1 else f"every {counted(self.save_every, 'step')}"
         about["time"] = f"{self.t[0]:.6g} to {self.t[-1]:.6g}, step {float(self.step):.6g}, {every} saved"
         about["holds"] = shapes
+        if redundant := self.stats.get("redundant_constraints"):
+            about["redundant"] = f"constraints {', '.join(map(str, redundant))}, left out because they follow from the others"
         about["ended"] = self._ending()
         if "energy" in self.derived:
             energy = np.asarray(self.derived["energy"])
