@@ -129,3 +129,16 @@ def test_a_step_that_turns_too_far_ends_the_run_with_a_message():
     top = dx.EulerPoincare(SO3, lambda xi, a: xi @ (jnp.asarray(I) * xi) / 2 - 500.0 * a[2], advected=3)
     sol = dx.simulate(top, dx.DiscreteEulerPoincare(), x=top.state([0, 0.1, 0], [0, 0.1, 0.99]), step=0.1, steps=200)
     assert not sol.ok and "turns by less than π" in sol.message and len(sol.t) < 20
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("map", ["exp", "cayley"])
+def test_a_body_at_rest_stays_at_rest(map, engine):
+    sol = run(BODY, map, x=np.zeros(3), steps=3, engine=engine)
+    assert np.all(sol.x == 0) and np.all(sol.g == [1, 0, 0, 0])
+
+
+def test_a_rotation_that_dies_out_never_fails():
+    """The sleigh's turning rate falls below the smallest number whose square is one."""
+    sol = gallery.get("chaplygin-sleigh-se2").simulate(steps=200_000, save_every=10_000, step=0.02)
+    assert sol.ok and abs(sol.x[-1, 2]) < 1e-160 and sol.x[-1, 0] == pytest.approx(np.sqrt(2 * 0.455), abs=1e-4)

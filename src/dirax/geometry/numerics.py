@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 Scalar: TypeAlias = Float[Array, ""]
 
 TINY = 1e-30  # a squared distance below which two points of the unit sphere are the same in float64
+NO_ANGLE = 1e-200  # a squared angle below which its cosine is 1, and 1/√s still far from overflow
 RADIAL_SERIES_BELOW = 4.0  # 13 terms of the series reach 1e-19 here
 ARC_SERIES_BELOW = 0.05  # 18 terms of the series reach 1e-20 here, those of its third derivative 1e-16
 
@@ -27,11 +28,11 @@ def radial(order: int, s: Scalar) -> Scalar:
 
     f_n(x²) = j_{n−1}(x)/x^{n−1} with the spherical Bessel functions j, so f_{n+1} = ((2n − 1) f_n − f_{n−1})/s.
     """
-    root = jnp.sqrt(s)
-    if order == 0:
-        return jnp.cos(root)
-    if order == 1:
-        return jnp.where(s == 0.0, 1.0, jnp.sin(root) / jnp.where(s == 0.0, 1.0, root))
+    if order <= 1:
+        # finite also for a derivative that is taken through the root, as that of a scalar graph is
+        none = s < NO_ANGLE
+        root = jnp.sqrt(jnp.where(none, 1.0, s))
+        return jnp.where(none, 1.0, jnp.cos(root) if order == 0 else jnp.sin(root) / root)
 
     def by_recurrence(s):
         before, value = jnp.cos(jnp.sqrt(s)), jnp.sin(jnp.sqrt(s)) / jnp.sqrt(s)
