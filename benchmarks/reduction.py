@@ -43,12 +43,11 @@ EQUATIONS: dict[str, tuple[Any, Any]] = {
 def problem(name: str, steps: int, batch: int | None) -> Problem:
     """A run from the paper's initial data, or from a batch of points near them; only the last row is saved."""
     system, scheme = EQUATIONS[name]
-    equation = make_step_equation(scheme, system, Shape(4))
+    equation: Any = make_step_equation(scheme, system, Shape(4))
 
     def start(shift):
         q, p = jnp.asarray(EXAMPLE.initial["q"]).at[1].add(shift), jnp.asarray(EXAMPLE.initial["p"])
-        data = {**SYSTEM.complete({"q": q, "p": p, "t": 0.0}, None, False), "t": 0.0}
-        return equation.start(data, EXAMPLE.step, None)
+        return equation.start(SYSTEM.complete({"q": q, "p": p}, None, False), EXAMPLE.step, None)
 
     shifts = jnp.zeros(()) if batch is None else 1e-3 * jnp.arange(batch) / batch
     state, guess = (start if batch is None else jax.vmap(start))(shifts)

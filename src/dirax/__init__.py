@@ -47,6 +47,7 @@ from dirax.geometry.tulczyjew import (
 )
 from dirax.reconstruction import reconstruct
 from dirax.reduction.connection import DiscreteConnection, LinearConnection
+from dirax.reduction.coordinates import adapted_basis, in_coordinates
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.left_translation import LeftTranslation
 from dirax.reduction.lie_poisson import LiePoisson
@@ -145,6 +146,7 @@ __all__ = [
     "Translations",
     "TulczyjewTriple",
     "UndecidableRank",
+    "adapted_basis",
     "canonical_two_form",
     "chart_at",
     "check_chart",
@@ -157,6 +159,7 @@ __all__ = [
     "cotangent_lift",
     "cyclic_coordinates",
     "discrete_constraint_algorithm",
+    "in_coordinates",
     "induced_dirac",
     "interconnect",
     "load",

@@ -27,6 +27,7 @@ _MODULES = {
     "spherical-pendulums": "spherical_pendulums",
     "charged-particle": "charged_particle",
     "double-spherical-pendulum": "double_spherical_pendulum",
+    "planar-n-body": "planar_n_body",
     "vortices": "vortices",
     "lotka-volterra": "lotka_volterra",
     "guiding-centre": "guiding_centre",

@@ -84,7 +84,7 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, rule) -> StepEqua
     @vertical.defjvp
     def derivative(primals, tangents):
         """By the implicit function theorem: no derivative of the inertia, and none of Newton's steps."""
-        t, x, rate, mu, guess, h, params = primals
+        t, x, rate, _, _, h, params = primals
         gamma = vertical(*primals)
         along = lambda t, x, rate, h, params: l.momentum(t, x, rate, gamma, h, params)
         others = lambda values: tuple(values[i] for i in (0, 1, 2, 5, 6))
