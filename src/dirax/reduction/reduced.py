@@ -104,11 +104,6 @@ def reduce(system: LagrangeDirac, connection: AbstractConnection) -> ReducedLagr
     """
     if not isinstance(system, LagrangeDirac):
         raise TypeError(f"dx.reduce takes a dx.LagrangeDirac system, but a {type(system).__name__} was given.")
-    if system.holonomic is not None or system.affine is not None or system.forces is not None or system.depends_on_time:
-        raise ValueError(
-            "dx.reduce takes systems without holonomic or affine constraints, forces and time: run this one unreduced, or "
-            "use coordinates on the constraint surface."
-        )
     if not isinstance(connection, AbstractConnection):
         raise TypeError(f"connection must be a dx.LinearConnection(fibre=[…]), but {connection!r} was given.")
     return ReducedLagrangeDirac(system, connection)

@@ -42,10 +42,10 @@ class DiscreteRouth(AbstractScheme):
                 f"dx.DiscreteRouth steps a system made by dx.reduce, but a {type(system).__name__} was given: name its "
                 "symmetry, dx.reduce(system, dx.LinearConnection(fibre=[…]))."
             )
-        if shape.m:
-            raise ValueError(
-                f"dx.DiscreteRouth fixes μ, which the forces of the {shape.m} constraints move: use dx.PlusLagrangeDirac."
-            )
+        moved = [f"the forces of the {shape.m + shape.c} constraints"] * bool(shape.m + shape.c)
+        moved += ["the forces f(t, q, v)"] * (system.system.forces is not None)
+        if moved:
+            raise ValueError(f"dx.DiscreteRouth fixes μ, which {' and '.join(moved)} may move: use dx.LagrangeDAlembert.")
         return discrete_routh(system, shape, self.discrete_lagrangian)
 
 
