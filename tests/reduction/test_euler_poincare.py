@@ -117,6 +117,32 @@ def test_general_lagrangian_with_advected_quantities_is_poisson():
 # ------------------------------------------------------------------------- the unreduced discrete equations, on matrices
 
 
+@pytest.mark.parametrize("case", ["top", "suslov"])
+def test_a_step_back_is_the_way_one_came(case):
+    """The step equation at −h, with the unknowns of the two ends exchanged, leads from the end of a step to its start."""
+    system, h = system_of(case), 0.2
+    d, n, m = 3, system.space.size, int(case == "suslov")
+    equation = dx.make_step_equation(dx.DiscreteEulerPoincare(), system, dx.Shape(n, m))
+    x = system.state(*CASES[case][2:4])
+    data = jax.jit(lambda x: system.complete({"x": x}, None, False))(x)
+    state, u = equation.start(data, h, None)
+    residual = lambda u, state, h: equation.residual(u, state, 0.0, h, None)
+    step = jax.jit(
+        lambda u, state, h: (
+            residual(u, state, h),
+            jax.jacfwd(residual)(u, state, h),
+            equation.advance(u, state, 0.0, h, None),
+        )
+    )
+    for _ in range(8):
+        value, slope, end = step(u, state, h)
+        u = u - np.linalg.solve(slope, value)
+    back = jnp.concatenate([u[:d], u[2 * d + m :], data["v"], u[d : d + m]]) if m else u
+    value, _, start = step(back, end, -h)
+    assert np.abs(end[:n] - state[:n]).max() > 0.01
+    assert np.abs(value).max() < 1e-14 and np.abs(start[: n + 4] - state[: n + 4]).max() < 1e-14
+
+
 def spinning(xi, a):
     """A heavy top with a flywheel whose axis turns with gravity: l is not a difference of kinetic and potential energy."""
     return xi @ (jnp.asarray(I) * xi) / 2 + 0.2 * (xi @ a) ** 2 - 0.7 * a[2] - 0.3 * a[0] * a[1]

@@ -26,6 +26,7 @@ def test_batches_are_their_trajectories_and_derivatives_those_of_differences():
     for lane in (0, 1):
         one = run(top, "exp", x=x[lane], params=I, steps=50, engine="native")
         assert np.array_equal(both.x[lane], one.x) and np.array_equal(both.g[lane], one.g)
+    assert np.abs(run(top, "exp", x=x, params=I, steps=50, engine="xla").g - both.g).max() < 1e-13
     lifted = dx.reconstruct(both, g0=np.array([[1.0, 0, 0, 0], [0.6, 0.8, 0, 0]]))
     assert lifted.q.shape == (2, 51, 4) and np.ptp(lifted.spatial_momentum, axis=1).max() < 1e-14
 
