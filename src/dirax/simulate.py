@@ -55,7 +55,7 @@ def simulate(
 
     Constraints of a Lagrangian system that follow from others where the run begins are left out of its equations:
     `sol.stats["redundant_constraints"]` numbers them in the order of `sol.multipliers`, where theirs are zero, and their
-    residual is saved with the others.
+    residual is saved with the others. Under a JAX transformation none are looked for.
 
     Raises `ValueError` or `TypeError`, naming the argument, for wrong shapes, dtypes and arities, values that are not
     finite, `step` ≤ 0, `steps` < 1, data off the constraints, constraints that contradict each other, that are dependent at

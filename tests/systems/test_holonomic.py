@@ -258,7 +258,10 @@ def test_verify_finds_the_discrete_dirac_structure_of_the_constraint_distributio
     sol = dx.simulate(PENDULUM, scheme, step=0.02, steps=100, **START)
     report = verify(sol)
     assert report.ok, report
-    assert [line.verdict for line in report.lines[:4]] == ["ok"] * 4 and report.lines[-1].verdict == "ok"
+    assert [line.verdict for line in report.lines[:5]] == ["ok"] * 5 and report.lines[-1].verdict == "ok"
+    assert report["hidden constraint"].value < 1e-15
+    sol.fields["p"] = sol.p + 1e-13 * sol.q
+    assert verify(sol)["hidden constraint"].verdict == "VIOLATED"
     sol.fields["multipliers"] = sol.multipliers * (1 + 1e-9)
     assert verify(sol)["saved p and multipliers"].verdict == "VIOLATED"
 

@@ -74,6 +74,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         _completion(sol),
         *_membership(sol, tolerance),
         _constraint(sol, tolerance),
+        _hidden_constraint(sol, tolerance),
         _energy(sol),
         *_ports(sol, tolerance),
         *(_momentum(sol, name, generator, tolerance) for name, generator in generators.items()),
@@ -176,6 +177,30 @@ def _constraint(sol: Solution, tolerance: float | None) -> Line | None:
     return _judged(sol, name, np.max(values, axis=1), _limit(tolerance, 1), text)
 
 
+def _hidden_constraint(sol: Solution, tolerance: float | None) -> Line | None:
+    """G v + ∂g/∂t = 0 at every row, which the schemes with holonomic constraints impose on the saved momentum."""
+    system = sol.system
+    if not isinstance(system, LagrangeDirac) or system.holonomic is None or "constraint" not in sol.fields:
+        return None
+    items = (_times(sol, np.arange(sol.rows)), jnp.asarray(sol.q), jnp.asarray(sol.p))
+    values = over_rows(eqx.Partial(_hidden_terms, system), sol, items)
+    scale = float(np.nanmax(values[..., 1])) or 1.0
+    lane, row = _worst(values[..., 0])
+    text = f"∂g/∂q v + ∂g/∂t at each row, relative to its terms, worst at t = {float(sol.t[row]):.6g}{_lane(sol, lane)}"
+    return _judged(sol, "hidden constraint", np.nanmax(values[..., 0], axis=1) / scale, _limit(tolerance, 1), text)
+
+
+def _hidden_terms(system: LagrangeDirac, t, q, p, params: Any):
+    """The largest |G v + ∂g/∂t|, and the largest of |∂(G v + ∂g/∂t)/∂(q, p)||(q, p)|."""
+
+    def defect(q, p):
+        return system.constraints.hidden_defect(t, q, system.inverse_legendre(q, p, params, t=t), params)
+
+    of_q, of_p = jax.jacfwd(defect, argnums=(0, 1))(q, p)
+    size = jnp.abs(of_q) @ jnp.abs(q) + jnp.abs(of_p) @ jnp.abs(p)
+    return jnp.stack([jnp.max(jnp.abs(defect(q, p))), jnp.max(size)])
+
+
 def _constraint_scale(sol: Solution) -> Any:
     """The size of the constraint's terms: |W||v| + |b| and |∂g/∂q||q| where the steps impose W v + b = 0 and g = 0, one number
     for all constraints or one for each; the largest saved number of a loaded solution, |dE||x| where the constraint is that
@@ -211,7 +236,7 @@ def _sizes_of_constraints(discrete: DiscreteSystem, speed, t, q, params: Any):
 
 def _count_of_forms(sol: Solution) -> int:
     """m, the number of one-forms."""
-    q, t, forms = jnp.asarray(sol.q).reshape(-1, np.shape(sol.q)[-1])[0], float(sol.t[0]), sol.system.constraints
+    q, forms = jnp.asarray(sol.q).reshape(-1, np.shape(sol.q)[-1])[0], sol.system.constraints
     params = jax.tree.map(lambda a: a[0], sol.params) if sol.batch_params else sol.params
     return forms.sizes(q, params)[0]
 
