@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines import xla
-from dirax.engines.choice import ENGINES, run_on
+from dirax.engines.choice import ENGINES, run_on, run_traced_on
 from dirax.engines.result import Outcome, Problem, saved_steps
 from dirax.failures import explain
 from dirax.functions import check_finite, is_traced
@@ -104,7 +103,7 @@ def simulate(
         max_iterations=max_iterations,
     )
     if traced:
-        outcome = xla.run_traced(problem)
+        outcome = run_traced_on(engine, problem)
     else:
         with reporting(progress, steps) as report:
             outcome = run_on(engine, problem, report)

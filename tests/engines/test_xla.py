@@ -50,7 +50,7 @@ def test_gradients_of_the_oscillator_against_the_closed_form(save_every):
     numbers = np.append(np.arange(0, steps, save_every), steps)
 
     def loss(q, v, omega, h):
-        run = {"params": omega, "step": h, "steps": steps, "save_every": save_every}
+        run = {"params": omega, "step": h, "steps": steps, "save_every": save_every, "engine": "xla"}
         return dx.simulate(OSCILLATOR, MIDPOINT, q=jnp.stack([q]), v=jnp.stack([v]), **run).q[:, 0] @ weights
 
     q, v, omega, h = 0.8, -0.3, 1.7, 0.1
@@ -82,8 +82,8 @@ def test_derivatives_of_a_nonlinear_trajectory_against_finite_differences():
 
 def test_a_traced_run_is_the_run_from_the_host():
     """Under jit and under vmap, with a last row that is not a multiple of save_every."""
-    run = {"params": 9.81, "step": 0.01, "steps": 23, "save_every": 5}
-    host = dx.simulate(PENDULUMS, MIDPOINT, q=np.array([[1.0, 0.5], [0.2, 0.1]]), v=np.zeros((2, 2)), engine="xla", **run)
+    run = {"params": 9.81, "step": 0.01, "steps": 23, "save_every": 5, "engine": "xla"}
+    host = dx.simulate(PENDULUMS, MIDPOINT, q=np.array([[1.0, 0.5], [0.2, 0.1]]), v=np.zeros((2, 2)), **run)
     one = lambda q: (lambda sol: (sol.q, sol.p, sol.stats["newton_iterations"]))(
         dx.simulate(PENDULUMS, MIDPOINT, q=q, v=jnp.zeros(2), **run)
     )

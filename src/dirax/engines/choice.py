@@ -32,6 +32,25 @@ def run_on(engine: str, problem: Problem, progress: Progress | None = None) -> O
     return outcome
 
 
+def run_traced_on(engine: str, problem: Problem) -> Outcome:
+    """The same under `jax.grad`, `jit` or `vmap`: differentiable on every engine."""
+    if engine == "xla":
+        return xla.run_traced(problem)
+    from dirax.engines import native
+
+    if engine == "native":
+        return native.run_traced(problem)
+    reason = _too_large(problem) or _other_device()
+    if reason is None:
+        try:
+            return native.run_traced(problem)
+        except native.UnsupportedPrimitive as error:
+            reason = str(error)
+    outcome = xla.run_traced(problem)
+    outcome.notes["not_native"] = reason
+    return outcome
+
+
 def _too_large(problem: Problem) -> str | None:
     size = max(max(stage.unknowns, stage.state_size) for stage, _ in problem.equation.stages)
     return None if size <= LARGEST_NATIVE else f"{size} numbers a step, more than {LARGEST_NATIVE}"

@@ -181,6 +181,14 @@ def run_traced(problem: Problem) -> Outcome:
     )
 
 
+def unpacked_rows(problem: Problem, packed) -> dict:
+    """The named arrays (B, rows, …) of packed rows (B, rows, …), B = 1 for one trajectory."""
+    p = problem
+    clock = Clock(p.t0, p.h, float(p.first_step), p.save_every, 0, p.steps, False)
+    rows = packed[0] if p.batch is None else jnp.moveaxis(packed, 1, 0)
+    return {name: _by_lane(a, p.batch, jnp) for name, a in unpack_rows(p.equation, _axes(p), rows, p.params, clock).items()}
+
+
 def _next_row(step, every):
     """Number of the first row saved at `step` or later."""
     return -(-step // every)

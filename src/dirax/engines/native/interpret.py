@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from jax._src import source_info_util
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
 from dirax.engines.native.graph import Graph
@@ -76,6 +77,8 @@ class Interpreter:
 
     def constants(self, value: Any) -> Nodes | Unavailable:
         """The nodes of a concrete array."""
+        if isinstance(value, Tracer):
+            return Unavailable(UnsupportedPrimitive("constant", "is a value that JAX traces", "a captured array"))
         array = np.asarray(value)
         if not (array.dtype == np.bool_ or np.issubdtype(array.dtype, np.integer) or array.dtype == np.float64):
             return Unavailable(UnsupportedPrimitive("constant", f"has dtype {array.dtype}", "a captured array"))

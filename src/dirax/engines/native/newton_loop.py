@@ -58,7 +58,7 @@ class NewtonLoop:
         change = [inner.value(n) for n in correction.change]
         stable = inner.value(correction.stable)
         if correction.stable != g.true:
-            change = self._by_partial_pivoting(inner, change, stable, now)
+            change = by_partial_pivoting(inner, correction.jacobian, self.equation.residual, change, stable, now)
         self._apply(old, change, stable, now)
         return inner
 
@@ -112,28 +112,30 @@ class NewtonLoop:
         small = e.either(e.compare("ole", update, e.const(FLOOR)), e.compare("ole", left, e.const(NEGLIGIBLE)))
         return e.either(small, stalled)
 
-    def _by_partial_pivoting(self, inner: Region, change: list[str], stable: str, now: str) -> list[str]:
-        """The change, in lanes with a pivot that was too small solved for anew, one lane at a time."""
-        b, e, k = self.body, self.e, len(change)
-        slots = lambda base, count: [b.at(e.real, base, i) for i in range(count)]
-        memory, matrix, right = b.alloca(e.real, k), b.alloca(e.real, k * k), b.alloca(e.real, k)
-        scratch = b.alloca("double", k * (k + 1))
-        store = lambda values, base: [
-            b.store(e.real, value, p) for value, p in zip(values, slots(base, len(values)), strict=True)
-        ]
-        store(change, memory)
-        weak = e.both(e.invert(stable), now)
-        with b.when(e.any(weak)):
-            entries = [node for row in self.correction.jacobian for node in row]
-            cold = Region(e, inner.graph, inner)
-            cold.require([*entries, *self.equation.residual])
-            store([cold.value(n) for n in entries], matrix)
-            store([cold.value(n) for n in self.equation.residual], right)
-            for lane in range(e.width):
-                with b.when(e.extract(weak, lane, e.bool)):
-                    pointers = ", ".join(f"ptr {b.at('double', m, lane)}" for m in (matrix, right, memory))
-                    b.line(f"call void @dense_solve({pointers}, ptr {scratch}, i64 {k}, i64 {e.width})")
-        return [b.load(e.real, p) for p in slots(memory, k)]
+
+def by_partial_pivoting(
+    region: Region, matrix: list[list[int]], right: list[int], change: list[str], stable: str, now: str
+) -> list[str]:
+    """The solution `change` of matrix·x = right, in lanes with a pivot that was too small solved for anew, one at a time."""
+    e, k = region.emitter, len(change)
+    b = e.body
+    slots = lambda base, count: [b.at(e.real, base, i) for i in range(count)]
+    memory, entries, side = b.alloca(e.real, k), b.alloca(e.real, k * k), b.alloca(e.real, k)
+    scratch = b.alloca("double", k * (k + 1))
+    store = lambda values, base: [b.store(e.real, value, p) for value, p in zip(values, slots(base, len(values)), strict=True)]
+    store(change, memory)
+    weak = e.both(e.invert(stable), now)
+    with b.when(e.any(weak)):
+        nodes = [node for row in matrix for node in row]
+        cold = Region(e, region.graph, region)
+        cold.require([*nodes, *right])
+        store([cold.value(n) for n in nodes], entries)
+        store([cold.value(n) for n in right], side)
+        for lane in range(e.width):
+            with b.when(e.extract(weak, lane, e.bool)):
+                pointers = ", ".join(f"ptr {b.at('double', m, lane)}" for m in (entries, side, memory))
+                b.line(f"call void @dense_solve({pointers}, ptr {scratch}, i64 {k}, i64 {e.width})")
+    return [b.load(e.real, p) for p in slots(memory, k)]
 
 
 class _While:

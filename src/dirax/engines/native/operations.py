@@ -197,3 +197,26 @@ def _chain(g: "Graph", node: int, rows: dict[int, dict[int, int]]) -> dict[int, 
             term = g.mul(slope, inner)
             total[j] = g.add(total[j], term) if j in total else term
     return {j: d for j, d in total.items() if d != g.zero}
+
+
+def gradient(g: "Graph", seeds: dict[int, int], inputs: list[int]) -> list[int]:
+    """The derivative of Σ seed·node over {node: seed} with respect to each input, backward over the graph."""
+    flow = dict(seeds)
+    for node in reversed(g.reachable(seeds)):
+        if node not in flow or not g.args[node]:
+            continue
+        for a, slope in zip(g.args[node], partials(g, node), strict=True):
+            if slope is not None and (term := g.mul(slope, flow[node])) != g.zero:
+                flow[a] = g.add(flow[a], term) if a in flow else term
+    return [flow.get(node, g.zero) for node in inputs]
+
+
+def directional(g: "Graph", outputs: list[int], tangents: dict[int, int]) -> list[int]:
+    """The derivative of each output along {input: tangent}."""
+    rows = {}
+    for node in g.reachable(outputs):
+        if node in tangents:
+            rows[node] = {0: tangents[node]}
+        else:
+            rows[node] = _chain(g, node, rows) if any(rows[a] for a in g.args[node]) else {}
+    return [rows[node].get(0, g.zero) for node in outputs]

@@ -6,11 +6,10 @@ import hashlib
 import json
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from dirax.engines.native import compile as llvm
 from dirax.engines.native.compensation import increments
@@ -19,12 +18,14 @@ from dirax.engines.native.interpret import UnsupportedPrimitive
 from dirax.engines.native.newton_step import newton_correction
 from dirax.engines.native.operations import jacobian
 from dirax.engines.native.step_loop import Plan, kernel_module
+from dirax.engines.native.sweep import Sweep, backward, forward
 from dirax.engines.native.trace import NODE_LIMIT, Inputs, Parameters, TracedEquation, inputs, parameters, trace
 
 KEPT = 128
 """Programs kept in memory."""
 
 SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 5)
+SWEEP_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3)
 
 
 @dataclass
@@ -37,11 +38,13 @@ class Program:
     stages: list[tuple[int, float]]
     parameters: Parameters
     compensated: bool
+    every_stage: bool
     digest: str
     plan: Plan | None = None
     operations: int = 0
     kernels: dict[int, tuple[Any, Any]] = field(default_factory=dict)
     jacobians: dict[int, list[dict[int, int]]] = field(default_factory=dict)
+    sweeps: dict[tuple[bool, int], tuple[Any, Any]] = field(default_factory=dict)
 
     def jacobian(self, index: int) -> list[dict[int, int]]:
         """Rows {column: node} of the Jacobian of the equation of this index. Raises `GraphTooLarge`."""
@@ -53,24 +56,48 @@ class Program:
     @property
     def bare(self) -> Plan:
         """The plan without corrections: sizes and names only."""
-        return self.plan or Plan(self.graph, self.shared, self.equations, [], self.stages, self.compensated)
+        return self.plan or Plan(self.graph, self.shared, self.equations, [], self.stages, self.compensated, self.every_stage)
 
     def kernel(self, width: int) -> tuple[Any, bool]:
         """The compiled `run` for a width, and whether it came from a cache."""
         if width in self.kernels:
             return self.kernels[width][1], True
-        key = llvm.kernel_key(self.digest, width)
+        library, cached = self._library("run", width, lambda: kernel_module(self._planned(), width, llvm.has_fma()))
+        self.kernels[width] = library, SIGNATURE(library["run"])
+        return self.kernels[width][1], cached
+
+    def sweep(self, reverse: bool, width: int) -> Any:
+        """The compiled `sweep` for a width: of tangents forward or of cotangents backward. Raises `UnsupportedPrimitive`."""
+        if (reverse, width) not in self.sweeps:
+            text = lambda: self._linearized(reverse).module(width, llvm.has_fma())
+            library, _ = self._library("sweep", width, text, "backward" if reverse else "forward")
+            self.sweeps[reverse, width] = library, SWEEP_SIGNATURE(library["sweep"])
+        return self.sweeps[reverse, width][1]
+
+    def check(self) -> None:
+        """Raise `UnsupportedPrimitive` for a step with too many operations."""
+        self._planned()
+
+    def _library(self, name: str, width: int, text: Callable[[], str], *more: str) -> tuple[Any, bool]:
+        """The linked code that exports `name`, and whether it came from the disk."""
+        key = llvm.kernel_key(self.digest, width, *more)
         stored = llvm.read_cached(key)
         if stored is not None:
             size = int.from_bytes(stored[:4], "little")
             self.operations, code = json.loads(stored[4 : 4 + size])["operations"], stored[4 + size :]
         else:
-            code = llvm.object_code(kernel_module(self._planned(), width, llvm.has_fma()))
+            code = llvm.object_code(text())
             header = json.dumps({"operations": self.operations}).encode()
             llvm.write_cached(key, len(header).to_bytes(4, "little") + header + code)
-        library = llvm.load(code, ("run",))
-        self.kernels[width] = library, SIGNATURE(library["run"])
-        return self.kernels[width][1], stored is not None
+        return llvm.load(code, (name,)), stored is not None
+
+    def _linearized(self, reverse: bool) -> Sweep:
+        g, stage = self.graph, backward if reverse else forward
+        try:
+            linear = [stage(g, e, self.shared, self.jacobian(i)) for i, e in enumerate(self.equations)]
+        except GraphTooLarge as error:
+            raise too_large(error) from None
+        return Sweep(g, self.shared, self.equations, linear, self.stages, reverse)
 
     def _planned(self) -> Plan:
         if self.plan is None:
@@ -111,11 +138,13 @@ def source_digest() -> str:
 _programs: OrderedDict[tuple, tuple[Any, Program]] = OrderedDict()
 
 
-def program(equation: Any, params: Any, batch_params: bool, compensated: bool = False) -> tuple[Program, float]:
-    """The program of a step, and the seconds that tracing took (0 when it was known). Raises `UnsupportedPrimitive`."""
+def program(
+    equation: Any, params: Any, batch_params: bool, compensated: bool = False, every_stage: bool = False
+) -> tuple[Program, float]:
+    """The program of a step, and the seconds that tracing took (0 when it was known); with `every_stage` each stage has a
+    row in the saved arrays. Raises `UnsupportedPrimitive`."""
     p = parameters(params, batch_params)
-    fixed = tuple((a.dtype.str, a.shape, a.tobytes()) if isinstance(a, np.ndarray) else id(a) for a in p.fixed)
-    key = (id(equation), p.treedef, p.shapes, fixed, compensated)
+    key = (id(equation), p.key, compensated, every_stage)
     if key in _programs:
         _programs.move_to_end(key)
         return _programs[key][1], 0.0
@@ -129,7 +158,7 @@ def program(equation: Any, params: Any, batch_params: bool, compensated: bool = 
         distinct += [stage] if index == len(distinct) else []
         stages.append((index, float(fraction)))
     equations = [trace(graph, shared, stage, p) for stage in distinct]
-    made = Program(graph, shared, equations, stages, p, compensated, "")
+    made = Program(graph, shared, equations, stages, p, compensated, every_stage, "")
     made.digest = _digest(made)
     _programs[key] = (equation, p.fixed), made  # the equation is kept alive, so that its id stays its own
     if len(_programs) > KEPT:
@@ -142,6 +171,6 @@ def _digest(made: Program) -> str:
     rows = lambda e: [(name, nodes.shape, nodes.ravel().tolist()) for name, nodes in sorted(e.rows.items())]
     digest = hashlib.sha256(source_digest().encode())
     outputs = [(e.state, e.unknowns, e.previous, e.guess, e.residual, e.advance, e.scale, rows(e)) for e in made.equations]
-    for part in (g.op, g.args, sorted(g.value.items()), outputs, made.stages, made.shared, made.compensated):
+    for part in (g.op, g.args, sorted(g.value.items()), outputs, made.stages, made.shared, made.compensated, made.every_stage):
         digest.update(repr(part).encode() + b"\0")
     return digest.hexdigest()

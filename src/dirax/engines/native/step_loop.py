@@ -35,6 +35,7 @@ class Plan:
     corrections: list[Correction]
     stages: list[tuple[int, float]]
     compensated: bool = False
+    every_stage: bool = False  # a row for each stage of a step, of the equation that it solves; `every` is then 1
     increments: list[list[int | None]] = field(default_factory=list)
 
     @property
@@ -55,8 +56,12 @@ class Plan:
     @property
     def fields(self) -> list[tuple[str, list[int]]]:
         """The saved arrays, each as the nodes of a row; they come from the first stage."""
-        first = self.equations[self.stages[0][0]]
-        return [(name, first.rows[name].ravel().tolist()) for name in sorted(first.rows)]
+        return fields_of(self.equations[self.stages[0][0]])
+
+
+def fields_of(equation: TracedEquation) -> list[tuple[str, list[int]]]:
+    """The saved arrays of an equation, each as the nodes of a row."""
+    return [(name, equation.rows[name].ravel().tolist()) for name in sorted(equation.rows)]
 
 
 def kernel_module(plan: Plan, width: int, fma: bool) -> str:
@@ -170,7 +175,8 @@ class Kernel:
             out += [*equation.guess, *equation.residual, *equation.advance]
             out += [*correction.change, *correction.factors, correction.stable]
         out += [node for nodes in self.plan.increments for node in nodes if node is not None]
-        return out + [node for _, nodes in self.plan.fields for node in nodes]
+        saving = self.plan.equations if self.plan.every_stage else [self.plan.equations[self.plan.stages[0][0]]]
+        return out + [node for equation in saving for _, nodes in fields_of(equation) for node in nodes]
 
     def _steps(self, memory: list[str], record: list[str]) -> None:
         """The steps, saving a row at every `every`-th; nothing more is done once every lane has failed."""
@@ -224,12 +230,15 @@ class Kernel:
         time = b.load(e.real, clock)
         which = b.load("i64", b.at("i64", "@stage_equation", stage))
         is_first = b.put(f"icmp eq i64 {stage}, 0")
-        saves = b.put(f"and i1 {is_first}, {saves}")
+        if plan.every_stage:
+            number = b.put(f"add i64 {b.put(f'mul i64 {number}, {len(plan.stages)}')}, {stage}")
+        else:
+            saves = b.put(f"and i1 {is_first}, {saves}")
         for i, (equation, correction) in enumerate(zip(plan.equations, plan.corrections, strict=True)):
             with b.when(b.put(f"icmp eq i64 {which}, {i}")):
                 region = Region(e, self.g, self.run)
                 region.bind(plan.shared.h, h)
-                first = i == plan.stages[0][0]
+                first = i == plan.stages[0][0] or plan.every_stage
                 self._stage(stage, equation, correction, region, time, running, number, saves if first else None)
         b.store(e.real, e.add(time, h), clock)
 
@@ -342,7 +351,7 @@ class Kernel:
         for node, new, old in zip(equation.unknowns, solution, last, strict=True):
             finite = e.compare("olt", e.abs(new), e.const(float("inf")))
             inside.bind(node, e.select(finite, new, old))
-        fields, row = self.plan.fields, b.put(f"sdiv i64 {number}, %every")
+        fields, row = fields_of(equation), b.put(f"sdiv i64 {number}, %every")
         inside.require([node for _, nodes in fields for node in nodes])
         for f, (_, nodes) in enumerate(fields):
             if not nodes:

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from dirax.engines.native import (
     control,  # noqa: F401  (these five register their rules)
@@ -34,6 +35,12 @@ class Parameters:
     def size(self) -> int:
         return sum(int(np.prod(s)) for s in self.shapes)
 
+    @property
+    def key(self) -> tuple:
+        """Equal for parameters that give the same program; other leaves than arrays count by identity."""
+        fixed = ((a.dtype.str, a.shape, a.tobytes()) if isinstance(a, np.ndarray) else id(a) for a in self.fixed)
+        return self.treedef, self.shapes, tuple(fixed)
+
     def rebuild(self, leaves) -> Any:
         leaves, fixed = iter(leaves), iter(self.fixed)
         return jax.tree.unflatten(self.treedef, [next(leaves) if d else next(fixed) for d in self.dynamic])
@@ -52,11 +59,14 @@ def parameters(params: Any, batched: bool) -> Parameters:
     dynamic, shapes, fixed = [], [], []
     for leaf in leaves:
         number = isinstance(leaf, int | float | np.ndarray | np.generic | jax.Array) and not isinstance(leaf, bool)
-        moves = number and (batched or np.issubdtype(np.asarray(leaf).dtype, np.floating))
+        dtype = leaf.dtype if isinstance(leaf, Tracer) else np.asarray(leaf).dtype
+        moves = number and (batched or np.issubdtype(dtype, np.floating))
         dynamic.append(bool(moves))
         if moves:
             shapes.append(np.shape(leaf)[1:] if batched else np.shape(leaf))
         else:
+            if isinstance(leaf, Tracer):
+                raise UnsupportedPrimitive("params", f"has a leaf of dtype {dtype} that JAX traces", "see docs/native-engine.md")
             fixed.append(np.asarray(leaf) if number else leaf)
     return Parameters(tuple(shapes), tuple(fixed), treedef, tuple(dynamic))
 

@@ -1,0 +1,180 @@
+"""Derivatives of native runs: against the xla engine, a closed form and finite differences; forward, backward, twice."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.engines import native
+from dirax.engines.native import UnsupportedPrimitive, sweeper
+from dirax.engines.result import Problem
+from dirax.schemes.step import Field, StepEquation
+
+MIDPOINT = dx.LagrangeDAlembert()
+
+
+def pendulums(q, v, params):
+    kinetic = params["m"] * v[0] ** 2 + v[1] ** 2 / 2 + v[0] * v[1] * jnp.cos(q[0] - q[1])
+    return kinetic + params["g"] * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+
+
+PENDULUMS = dx.LagrangeDirac(pendulums)
+DISK = dx.LagrangeDirac(
+    lambda q, v, g: (v[0] ** 2 + v[1] ** 2) / 2 + v[2] ** 2 / 8 + v[3] ** 2 / 4 - g * jnp.sin(q[2]),
+    lambda q: jnp.array([[1.0, 0.0, -jnp.cos(q[3]), 0.0], [0.0, 1.0, -jnp.sin(q[3]), 0.0]]),
+)
+OPEN = dx.PortHamiltonian(
+    lambda x, k: k * x[0] ** 4 / 4 + x @ x / 2, J=np.array([[0.0, 1.0], [-1.0, 0.0]]), B=np.array([[0.0], [1.0]])
+)
+GRAVITY = {"m": 1.0, "g": 9.81}
+
+
+def rows_of(sol) -> jax.Array:
+    """Every saved array in one."""
+    return jnp.concatenate([jnp.ravel(sol.fields[name]) for name in sorted(sol.fields)])
+
+
+def swing(engine, q, v, params, h: Any = 0.02, scheme: Any = MIDPOINT, **more: Any):
+    return dx.simulate(PENDULUMS, scheme, q=q, v=v, params=params, step=h, engine=engine, **({"steps": 30} | more))  # pyright: ignore[reportArgumentType]
+
+
+def roll(engine, q, v, g, **more):
+    return dx.simulate(DISK, dx.PlusLagrangeDirac(), q=q, v=v, params=g, step=1e-3, engine=engine, project=True, **more)
+
+
+def driven(engine, x, k, h):
+    inputs = lambda t, x, k: jnp.stack([jnp.cos(3 * t) * k])
+    return dx.simulate(OPEN, dx.DiscreteGradient(), x=x, params=k, step=h, steps=25, t0=0.3, engine=engine, inputs=inputs)
+
+
+POINT = (jnp.array([1.0, 0.5]), jnp.array([0.0, 0.5]))
+SPREAD = (jnp.array([[1.0, 0.5], [0.3, 2.0], [-1.0, 0.1]]), jnp.array([[0.0, 0.5], [1.0, 0.0], [0.2, -0.4]]))
+SEVERAL = {"m": jnp.array([1.0, 1.1, 0.9]), "g": jnp.array([9.81, 5.0, 1.6])}
+RUNS = {
+    "every row": (lambda e, *z: swing(e, *z), (*POINT, GRAVITY, 0.02)),
+    "some rows": (lambda e, *z: swing(e, *z, save_every=7), (*POINT, GRAVITY, 0.02)),
+    "batch": (lambda e, *z: swing(e, *z, save_every=4, steps=20), (*SPREAD, GRAVITY, 0.02)),
+    "batch of parameters": (lambda e, *z: swing(e, *z, batch_params=True, steps=20), (*SPREAD, SEVERAL, 0.02)),
+    "composition": (
+        lambda e, *z: swing(e, *z, scheme=dx.Composition(MIDPOINT, "yoshida4"), steps=12, save_every=5),
+        (*POINT, GRAVITY, 0.02),
+    ),
+    "two equations": (
+        lambda e, *z: swing(e, *z, scheme=dx.SymmetricComposition(dx.PlusLagrangeDirac()), steps=12),
+        (*POINT, GRAVITY, 0.02),
+    ),
+    "constraints": (
+        lambda e, *z: roll(e, *z, steps=30, save_every=4),
+        (jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([5.0, 8.0, 10.0, 1.0]), 10.0),
+    ),
+    "time and inputs": (driven, (jnp.array([1.0, -0.5]), 0.7, 0.05)),
+}
+
+
+QUICK = ("some rows", "batch of parameters", "time and inputs")
+
+
+@pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.soak) for name in RUNS])
+def test_cotangents_of_all_rows_are_the_xla_engines(name):
+    """With random weights on every saved number: positions, momenta and multipliers, by initial data, params and step."""
+    run, point = RUNS[name]
+    weights = np.random.default_rng(0).normal(size=10_000)
+
+    def loss(engine, *z):
+        rows = rows_of(run(engine, *z))
+        return rows @ weights[: rows.shape[0]]
+
+    arguments = tuple(range(len(point)))
+    mine = jax.grad(lambda *z: loss("native", *z), arguments)(*point)
+    theirs = jax.jit(jax.grad(lambda *z: loss("xla", *z), arguments))(*point)
+    for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * float(np.max(np.abs(b))))
+    # forward: the same derivative along a direction
+    direction = jax.tree.map(lambda a: jnp.cos(jnp.arange(jnp.size(a), dtype=float)).reshape(jnp.shape(a)), point)
+    _, along = jax.jvp(lambda *z: loss("native", *z), point, direction)
+    products = jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), theirs, direction))
+    scale = sum(float(np.sum(np.abs(np.asarray(a) * np.asarray(b)))) for a, b in zip(
+        jax.tree.leaves(theirs), jax.tree.leaves(direction), strict=True))  # fmt: skip
+    assert abs(float(along - sum(products))) < 1e-10 * scale
+
+
+def test_jit_vmap_and_second_derivatives():
+    end = lambda z, e: (lambda s: jnp.concatenate([s.q[-1], s.p[-1]]))(swing(e, z[:2], z[2:4], {"m": z[4], "g": z[5]}, steps=12))
+    z = jnp.array([1.0, 0.5, 0.0, 0.5, 1.0, 9.81])
+    mine, theirs = (lambda z: end(z, "native")), (lambda z: end(z, "xla"))
+    expected = jax.jit(jax.jacrev(theirs))(z)
+    for transform in (jax.jacrev, lambda f: jax.jit(jax.jacrev(f)), lambda f: jax.jit(jax.jacfwd(f))):
+        np.testing.assert_allclose(transform(mine)(z), expected, rtol=1e-11, atol=1e-12)
+    steps = np.array([0.01, 0.02])  # another step in each lane of a vmap
+    by_step = lambda h, e: swing(e, *POINT, GRAVITY, h, steps=10).p[-1].sum()
+    found, expected = (jax.jit(jax.vmap(jax.grad(by_step), (0, None)), static_argnums=1)(steps, e) for e in ("native", "xla"))
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+    curvature = lambda f: jax.jit(jax.hessian(lambda z: f(z)[2]))(z)
+    np.testing.assert_allclose(curvature(mine), curvature(theirs), rtol=1e-9, atol=1e-9)
+
+
+def test_derivatives_of_a_long_run_against_the_closed_form(monkeypatch):
+    """Oscillator, 3000 steps in many segments: q_k = q cos kθ + v/ω sin kθ with θ = 2 arctan(hω/2)."""
+    monkeypatch.setattr(sweeper, "SEGMENT_BYTES", 5000)
+    system = dx.LagrangeDirac(lambda q, v, omega: (v @ v - omega**2 * q @ q) / 2)
+    end = lambda q, v, omega: dx.simulate(
+        system, MIDPOINT, q=jnp.stack([q]), v=jnp.stack([v]), params=omega, step=0.1, steps=3000, save_every=500, engine="native"
+    ).q[-1, 0]  # fmt: skip
+    q, v, omega, k = 0.8, -0.3, 1.7, 3000
+    angle, turn = k * 2 * np.arctan(0.1 * omega / 2), k * 0.1 / (1 + (0.1 * omega / 2) ** 2)
+    by_omega = (-q * np.sin(angle) + v / omega * np.cos(angle)) * turn - v / omega**2 * np.sin(angle)
+    expected = np.array([np.cos(angle), np.sin(angle) / omega, by_omega])
+    np.testing.assert_allclose(jax.grad(end, (0, 1, 2))(q, v, omega), expected, rtol=1e-10)
+    forward = [jax.jvp(end, (q, v, omega), tuple(row))[1] for row in np.eye(3)]
+    np.testing.assert_allclose(forward, expected, rtol=1e-10)
+
+
+def test_a_trajectory_that_ends_keeps_its_derivative_and_spoils_no_other():
+    """L = v²/2 − q + 10⁻⁴√q falls out of its domain; up to there against central differences."""
+    falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] + 1e-4 * jnp.sqrt(q[0]))
+
+    def rows(q):
+        sol = dx.simulate(falling, MIDPOINT, q=q, v=jnp.array([[40.0], [-1.0]]), step=0.01, steps=200, save_every=20)
+        return jnp.where(jnp.isnan(sol.q), 0.0, sol.q)[..., 0]
+
+    q = np.array([[1.0], [0.5]])
+    slopes = jax.jit(jax.jacrev(rows))(q)[..., 0]
+    nudge = 1e-5 * np.eye(2)[:, :, None]
+    expected = np.stack([(rows(q + d) - rows(q - d)) / 2e-5 for d in nudge], axis=-1)
+    assert int(np.sum(slopes[1, :, 1] != 0)) == int(np.ceil((np.sqrt(2) - 1) / 0.2))  # the rows before q = 1/2 − t − t²/2 is zero
+    np.testing.assert_allclose(slopes, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_small_pivots_are_exchanged_in_derivatives_too():
+    """The matrix [[s, 1], [1, s]] with s = 1e-20 and 1e20: ∂u/∂x is its inverse."""
+    equation = StepEquation(
+        start=lambda data, h, c: (data["x"], data["x"]),
+        residual=lambda u, x, t, h, c: jnp.stack([jnp.exp(c) * u[0] + u[1], u[0] + jnp.exp(c) * u[1]]) - x,
+        advance=lambda u, x, t, h, c: u,
+        unpack=lambda x, u, t, h, c: {"x": x},
+        state_size=2,
+        unknowns=2,
+        fields={"x": Field((2,))},
+    )
+
+    def last(x, s):
+        p = Problem(equation, x, (x,), 0.1, 0.0, 1, params=s)
+        return native.run_traced(p).fields["x"][0, -1]
+
+    for s in (np.log(1e-20), np.log(1e20), 0.4):
+        matrix = np.array([[np.exp(s), 1.0], [1.0, np.exp(s)]])
+        slopes = jax.jit(jax.jacrev(last))(jnp.array([1.0, 2.0]), s)
+        np.testing.assert_allclose(slopes, np.linalg.inv(matrix), rtol=1e-12, atol=1e-25)
+
+
+def test_what_the_kernel_cannot_take_is_run_by_xla_under_auto():
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(jnp.sort(q) ** 2 * jnp.array([1.0, 2.0])))
+    run = lambda q, e: dx.simulate(system, MIDPOINT, q=q, v=jnp.zeros(2), step=0.1, steps=3, engine=e)
+    engines = []
+    slope = jax.grad(lambda q: (engines.append((s := run(q, "auto")).stats), s.q[-1].sum())[1])(jnp.array([1.0, 0.5]))
+    assert np.all(np.isfinite(slope)) and engines[0]["engine"] == "xla" and "sort" in engines[0]["not_native"]
+    with pytest.raises(UnsupportedPrimitive, match="sort"):
+        jax.grad(lambda q: run(q, "native").q[-1].sum())(jnp.array([1.0, 0.5]))
