@@ -8,7 +8,7 @@ import dirax as dx
 from dirax.gallery import charged_particle, heisenberg, rolling_disk
 
 DISK, HEISENBERG, PARTICLE = rolling_disk.EXAMPLE, heisenberg.EXAMPLE, charged_particle.EXAMPLE
-SCHEMES = [dx.PlusLagrangeDirac(), dx.MinusLagrangeDirac("midpoint"), dx.LagrangeDAlembert()]
+OUTGOING = dx.LagrangeDAlembert(momentum="outgoing")
 TWIST = np.array([[0.2, 0.1, -0.3], [-0.3, 0.4, 0.1], [0.1, -0.2, 0.2]])
 STEPS = 500
 
@@ -29,8 +29,9 @@ def compared(system, scheme, fibre, twisted: bool, **settings):
     return unreduced, lifted, quotient
 
 
-@pytest.mark.parametrize("twisted", [False, True])
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize(
+    ("scheme", "twisted"), [(dx.PlusLagrangeDirac(), False), (dx.MinusLagrangeDirac("midpoint"), True), (OUTGOING, True)]
+)
 def test_rolling_disk_without_its_place(scheme, twisted):
     """x and y of the contact point are cyclic; the rolling force moves their momenta."""
     _, _, quotient = compared(
@@ -51,16 +52,13 @@ def test_rolling_disk_without_potential_has_its_angle_too():
         dx.simulate(dx.reduce(DISK.system, dx.LinearConnection([0, 3])), dx.LagrangeDAlembert(), steps=2, **start)
 
 
-@pytest.mark.parametrize("twisted", [False, True])
-def test_heisenberg_without_its_height(twisted):
+def test_heisenberg_without_its_height():
     start = {"q": [1.0, 0.0, 0.1], "v": [0.5, 1.0, -1.0], "step": 0.01}
     assert dx.check_invariance(HEISENBERG.system, dx.Translations([2]), q=start["q"])
-    for scheme in (dx.PlusLagrangeDirac(), dx.LagrangeDAlembert()):
-        compared(HEISENBERG.system, scheme, [2], twisted, project=True, **start)
+    compared(HEISENBERG.system, dx.PlusLagrangeDirac(), [2], True, project=True, **start)
 
 
-@pytest.mark.parametrize("twisted", [False, True])
-def test_holonomic_constraint_force_and_time(twisted):
+def test_holonomic_constraint_force_and_time():
     """A cart on a moving belt of springs with a pendulum on a rod: X cyclic, x² + y² = 1, drag, and a driven length of L."""
 
     def lagrangian(t, q, v):
@@ -73,12 +71,12 @@ def test_holonomic_constraint_force_and_time(twisted):
         forces=lambda t, q, v: jnp.array([0.3 * jnp.sin(t) - 0.1 * v[0], 0.0, -0.2 * v[2]]),
     )
     start = {"q": [0.0, 0.6, -0.8], "v": [0.3, 0.4, 0.3], "step": 0.01}
-    unreduced, lifted, quotient = compared(cart, dx.LagrangeDAlembert(), [0], twisted, **start)
+    _, lifted, quotient = compared(cart, dx.LagrangeDAlembert(), [0], True, **start)
     assert np.abs(lifted.q[:, 1] ** 2 + lifted.q[:, 2] ** 2 - 1).max() < 1e-13
     assert np.ptp(quotient.mu) > 0.05 and np.ptp(quotient.work) > 0.01
 
 
-@pytest.mark.parametrize("rule", ["left", "right", "midpoint", "trapezoidal"])
+@pytest.mark.parametrize("rule", ["right", "trapezoidal"])
 def test_momentum_changes_by_the_group_part_of_the_force(rule):
     """Drag in space alone leaves the charge; a force along θ adds its impulses, here c·t, to it."""
     push = 0.25

@@ -1,5 +1,6 @@
 """Discrete Routh equations, connections that are not linear, constraints and bad input in reduction."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ PARTICLE, PENDULUM, DISK = charged_particle.EXAMPLE, double_spherical_pendulum.E
 
 
 def run(example, system, scheme, steps=500, **changes):
-    settings = {**example.initial, "params": dict(example.params), "step": example.step, "steps": steps}
+    settings = {"engine": "native", **example.initial, "params": dict(example.params), "step": example.step, "steps": steps}
     return dx.simulate(system, scheme, **{**settings, **changes})
 
 
@@ -46,14 +47,6 @@ def test_particle_on_the_quotient_is_the_particle(particle, scheme, connection):
     assert quotient.vertical[7] == pytest.approx(np.asarray(vertical), abs=1e-11)
 
 
-@pytest.mark.parametrize("horizontal", [TWISTED])
-def test_routh_pendulum_is_the_unreduced_one(horizontal):
-    unreduced = run(PENDULUM, PENDULUM.system, dx.PlusLagrangeDirac("midpoint"))
-    quotient = run(PENDULUM, dx.reduce(PENDULUM.system, dx.LinearConnection([0], horizontal)), DiscreteRouth("midpoint"))
-    assert quotient.equation.unknowns == 3
-    assert np.abs(dx.reconstruct(quotient).q - unreduced.q).max() < 1e-10
-
-
 def test_routh_where_l_is_not_quadratic_in_the_group_velocity():
     relativistic = dx.LagrangeDirac(lambda q, v: -jnp.sqrt(1 - v[0] ** 2 - q[0] ** 2 * v[1] ** 2) + 0.2 / q[0])
     start = {"q": [1.0, 0.0], "v": [0.1, 0.5], "step": 0.02, "steps": 300}
@@ -63,22 +56,42 @@ def test_routh_where_l_is_not_quadratic_in_the_group_velocity():
     assert quotient.ok and np.abs(dx.reconstruct(quotient).q - unreduced.q).max() < 1e-11
 
 
-@pytest.mark.parametrize(
-    ("scheme", "connection"),
-    [
-        (dx.PlusLagrangeDirac(), dx.LinearConnection([0, 1])),
-        (dx.MinusLagrangeDirac("midpoint"), dx.LinearConnection([0, 1], [[0.2, 0.1], [-0.3, 0.4]])),
-    ],
-)
-def test_rolling_disk_with_its_place_removed_is_the_rolling_disk(scheme, connection):
-    """Constraints that respect the symmetry: x and y of the contact point are cyclic, the rolling force moves their momenta."""
-    start = {name: DISK.initial[name] for name in ("q", "v")}
-    unreduced = run(DISK, DISK.system, scheme, **start)
-    quotient = run(DISK, dx.reduce(DISK.system, connection), scheme, **start)
-    lifted = dx.reconstruct(quotient)
-    assert np.abs(lifted.q - unreduced.q).max() < 1e-10 and np.abs(lifted.p - unreduced.p).max() < 1e-10
-    assert np.abs(quotient.multipliers - unreduced.multipliers).max() < 1e-6 * np.abs(unreduced.multipliers).max()
-    assert np.ptp(quotient.mu[:, 0]) > 1.0
+KEPLER = dx.LagrangeDirac(lambda q, v, params: (v[0] ** 2 + (q[0] * v[1]) ** 2) / 2 + params / q[0])
+"""In polar coordinates."""
+
+
+def test_gradients_are_those_of_the_unreduced_run_and_of_differences():
+    reduced = dx.reduce(KEPLER, dx.LinearConnection([1], [[0.4]]))
+
+    def end(system, scheme, v, mu):
+        sol = dx.simulate(system, scheme, q=jnp.array([1.0, 0.3]), v=v, params=mu, step=0.05, steps=20)
+        sol = dx.reconstruct(sol) if system is reduced else sol
+        return sol.q[-1] @ jnp.array([1.0, 2.0]) + sol.p[-1] @ jnp.array([0.5, -1.0])
+
+    v, mu = jnp.array([0.2, 0.9]), 1.1
+    by_routh = lambda v, mu: end(reduced, DiscreteRouth("midpoint"), v, mu)
+    slopes = jax.jit(jax.grad(by_routh, argnums=(0, 1)))(v, mu)
+    unreduced = jax.grad(lambda v, mu: end(KEPLER, dx.PlusLagrangeDirac("midpoint"), v, mu), argnums=(0, 1))
+    for found, wanted in zip(slopes, jax.jit(unreduced)(v, mu), strict=True):
+        assert np.asarray(found) == pytest.approx(np.asarray(wanted), rel=1e-10)
+    e, run = 1e-4, jax.jit(by_routh)
+    assert float(slopes[1]) == pytest.approx(float(run(v, mu + e) - run(v, mu - e)) / (2 * e), rel=1e-6)
+    assert float(slopes[0][1]) == pytest.approx(float(run(v.at[1].add(e), mu) - run(v.at[1].add(-e), mu)) / (2 * e), rel=1e-6)
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_a_batch_is_its_trajectories(engine):
+    reduced, scheme = dx.reduce(KEPLER, dx.LinearConnection([1])), DiscreteRouth("midpoint")
+    q, v, mu = (
+        np.array([[1.0, 0.0], [1.2, 0.5], [0.8, -1.0]]),
+        np.array([[0.0, 1.0], [0.3, 0.8], [0.1, 1.1]]),
+        np.array([1, 1.2, 0.9]),
+    )
+    settings = {"step": 0.05, "steps": 100, "engine": engine}
+    batch = dx.simulate(reduced, scheme, q=q, v=v, params=mu, batch_params=True, **settings)
+    for i in range(3):
+        one = dx.simulate(reduced, scheme, q=q[i], v=v[i], params=mu[i], **{**settings, "engine": "native"})
+        assert np.abs(dx.reconstruct(batch).q[i] - dx.reconstruct(one).q).max() < 1e-12
 
 
 def test_mistakes():
@@ -87,8 +100,11 @@ def test_mistakes():
         dx.simulate(dx.reduce(PENDULUM.system, dx.LinearConnection([0])), DiscreteRouth(), q=np.array([0.0, 0, 1, 0]), **start)
     with pytest.raises(TypeError, match=r"made by dx\.reduce"):
         dx.simulate(PENDULUM.system, DiscreteRouth(), **{**start, "q": np.ones(4)})
-    with pytest.raises(ValueError, match="fixes μ, which the forces of the 2 constraints"):
+    with pytest.raises(ValueError, match="fixes μ, which the forces of the 2 constraints may move"):
         run(DISK, dx.reduce(DISK.system, dx.LinearConnection([0, 1])), DiscreteRouth(), 3)
+    dragged = dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v: -v)
+    with pytest.raises(ValueError, match=r"fixes μ, which the forces f\(t, q, v\) may move"):
+        dx.simulate(dx.reduce(dragged, dx.LinearConnection([1])), DiscreteRouth(), q=[0.0, 0.0], v=[0.1, 0.2], step=0.1, steps=3)
     drifting = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 + v[0] * v[1])
     with pytest.raises(ValueError, match="group inertia"):
         dx.simulate(dx.reduce(drifting, dx.LinearConnection([1])), DiscreteRouth(), q=[0.0, 0.0], v=[0.1, 0.2], step=0.1, steps=3)
