@@ -118,7 +118,10 @@ def test_left_invariance_is_found_and_its_momentum_is_the_spatial_one():
         dx.check_invariance(on_the_group(0.0), left, q=q[:3], v=v[:3])
 
 
-def test_verify_measures_the_momentum_of_a_reconstructed_top():
+def test_verify_measures_the_poisson_structure_and_spatial_momenta():
+    body = run(BODY, x=BODY.state(OMEGA), steps=20)
+    poisson = next(line for line in dx.verify(body).lines if line.quantity == "symplecticity of one step")
+    assert poisson.verdict == "ok" and poisson.value < 1e-14
     sol = dx.reconstruct(gallery.get("heavy-top-so3").simulate(steps=200))
     left, gravity = dx.LeftTranslation(SO3), jnp.asarray(sol.x[0, 3:])
     symmetries = {"gravity": lambda q: left.generator(gravity, q), "x": lambda q: left.generator(jnp.eye(3)[0], q)}

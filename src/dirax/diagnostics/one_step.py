@@ -267,6 +267,18 @@ def symplecticity_defect(system: Any, equation: Any, h, data: dict, t, params) -
     return jnp.stack([defect / size, condition])
 
 
+def poisson_defect(system: Any, equation: Any, h, data: dict, t, params) -> Float[Array, "2"]:
+    """(‖JΛJᵀ − Λ∘Φ‖ relative to ‖|J||Λ||J|ᵀ‖, condition number) of the step Φ from saved points x of a Lie–Poisson space."""
+    stage, fraction = equation.stages[0]
+    state, guess = stage.start(system.complete(data, params, False), fraction * h, params)
+    after, jacobian, condition = differentiated_step(equation, state, guess, t, h, params)
+    n = system.space.size
+    jacobian, before = jacobian[:n, :n], system.space.bivector(state[:n])
+    defect = jnp.max(jnp.abs(jacobian @ before @ jacobian.T - system.space.bivector(after[:n])))
+    size = jnp.max(jnp.abs(jacobian) @ jnp.abs(before) @ jnp.abs(jacobian).T)
+    return jnp.stack([defect / nonzero(size), condition])
+
+
 def structural_defect(discrete: DiscreteSystem, equation: Any, q0: Vector, q1: Vector, t, params) -> Float[Array, "3"]:
     """(defect of φ*Ω = Ω + dβ, ‖φ*Ω − Ω‖, both relative; condition number) at a pair (q0, q1) with w_d(q0, q1) = 0.
 

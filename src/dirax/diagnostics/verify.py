@@ -16,10 +16,13 @@ from dirax.diagnostics.one_step import (
     discretization_defect,
     membership_defect,
     over_rows,
+    poisson_defect,
     structural_defect,
     symplecticity_defect,
 )
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, OK, VIOLATED, Line, Report
+from dirax.reduction.euler_poincare import EulerPoincare
+from dirax.reduction.lie_poisson import LiePoisson
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.solution import Solution
 from dirax.systems.dirac_system import DiracSystem
@@ -52,8 +55,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
     - momentum maps: 32 ε · steps, the most that 32 roundings a step add up to (a random walk gives √steps of that);
-    - symplecticity of one step, and φ*Ω = Ω + dβ where there are constraints ([PY] §3.2): 32 ε · 2n · the condition
-      number of the step's equations, at a few steps of the run;
+    - symplecticity of one step (of Euler–Poincaré and Lie–Poisson systems: whether it is a Poisson map), and φ*Ω = Ω + dβ
+      where there are constraints ([PY] §3.2): 32 ε · 2n · the condition number of the step's equations, at a few steps;
     - systems with ports ([BLM] §7.1): the power balance of every step and, with a discrete gradient, the books over the run,
       H − H(0) less what was supplied plus what was dissipated: 32 ε, however many steps;
     - energy: "bounded" or "drifts", told apart by windowed means (`dirax.diagnostics.drift`); a drift below
@@ -393,7 +396,8 @@ def _symplecticity(sol: Solution, tolerance: float | None) -> Line:
     if "work" in sol.fields and not keeps_books(sol):
         return Line(name, None, None, NOT_CHECKED, "the forces change the two-form")
     stages = sol.equation.stages
-    if not all(stage.canonical for stage, _ in stages):
+    reduced = isinstance(sol.system, EulerPoincare | LiePoisson) and not constrained
+    if not reduced and not all(stage.canonical for stage, _ in stages):
         return Line(name, None, None, NOT_CHECKED, "the state of this scheme is not (q, p) on T*Q")
     found = discrete_system(sol.system, sol.scheme, sol.step)
     if constrained and isinstance(found, str):
@@ -414,13 +418,14 @@ def _symplecticity(sol: Solution, tolerance: float | None) -> Line:
         reason = _cannot_start(sol, data)
         if reason:
             return Line(name, None, None, NOT_CHECKED, reason)
-        values = over_rows(eqx.Partial(symplecticity_defect, sol.system, sol.equation, sol.step), sol, items)
+        of_step = poisson_defect if reduced else symplecticity_defect
+        values = over_rows(eqx.Partial(of_step, sol.system, sol.equation, sol.step), sol, items)
     defect, condition = values[..., 0], float(np.max(values[..., -1], where=np.isfinite(values[..., -1]), initial=1.0))
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")
     lane, row = _worst(defect)
     at = f"worst of {len(rows)} steps at t = {float(sol.t[rows[row]]):.6g}{_lane(sol, lane)}"
-    text = f"‖JᵀΩJ − Ω‖/‖JᵀΩJ‖, {at}"
+    text = f"‖JΛJᵀ − Λ‖/‖JΛJᵀ‖ of the Lie–Poisson bivector, {at}" if reduced else f"‖JᵀΩJ − Ω‖/‖JᵀΩJ‖, {at}"
     if constrained:
         text = f"on the pairs with w_d = 0, {at}; without dβ it would be off by {values[lane, row, 1]:.2g}"
     limit = _limit(tolerance, stages[0][0].state_size * condition)
