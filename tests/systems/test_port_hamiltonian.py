@@ -106,3 +106,38 @@ def test_method_2_of_closed_ports_names_the_chain():
     system = dx.PortHamiltonian(lambda x: x @ x / 2, J=dx.canonical_two_form(2), B=jnp.eye(4)[:, 2:3], closed=True)
     with pytest.raises(ValueError, match="constraint_algorithm"):
         dx.simulate(system, dx.DiscreteDirac(constraints="resolve"), x=[0.0, 1, 0, 1], step=0.1, steps=2)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"J": np.array([[0.0, 1.0], [-1.0, 0.1]])}, r"J is not skew at the initial point: max \|J \+ Jᵀ\| = 0.2"),
+        ({"R": np.array([[0.1, 0.2], [0.0, 0.1]])}, r"R is not symmetric.*0.2"),
+        ({"R": np.array([[0.1, 0.2], [0.2, 0.1]])}, "R is not positive semidefinite.*lowest eigenvalue is -0.1"),
+    ],
+)
+def test_structures_that_are_none(change, message):
+    system = dx.PortHamiltonian(lambda x: x @ x / 2, **{"J": J, **change})
+    for scheme in (dx.DiscreteDirac(), dx.DiscreteGradient()):
+        with pytest.raises(ValueError, match=message):
+            dx.simulate(system, scheme, x=[0.0, 1.0], step=0.1, steps=2)
+
+
+@pytest.mark.parametrize(
+    "metric, message",
+    [
+        (lambda q: jnp.diag(jnp.array([1.0, -1.0])), "not positive definite.*lowest eigenvalue is -1"),
+        (lambda q: jnp.diag(jnp.array([1.0, 0.0])), "not positive definite.*dx.LagrangeDirac"),
+        (lambda q: jnp.array([[1.0, 0.5], [0.0, 1.0]]), "not symmetric.*0.5"),
+    ],
+)
+def test_metrics_that_are_none(metric, message):
+    system = dx.NonholonomicMechanics(metric, lambda q: 0.0 * q[0], lambda q: jnp.array([[1.0, 0.0]]))
+    with pytest.raises(ValueError, match=message):
+        dx.simulate(system, dx.DiscreteDirac(), q=[0.0, 0.0], v=[0.0, 1.0], step=0.1, steps=2)
+
+
+def test_open_ports_of_a_dirac_structure_have_to_be_connected():
+    mass = dx.DiracStructure.from_bivector(lambda p: jnp.array([[0.0, 1.0], [-1.0, 0.0]]), n=1, ports=1)
+    with pytest.raises(ValueError, match="1 ports are open; connect them by `compose`"):
+        dx.simulate(dx.DiracSystem(mass, lambda p: p @ p / 2), dx.DiscreteDirac(), x=[1.0], step=0.1, steps=2)

@@ -210,7 +210,7 @@ class _Search:
                 "regular zero set. State such a constraint by a function whose derivative does not vanish.",
             )
         select = _independent(slope[old:], slope[:old], reference[old:], new)
-        part = lambda x, params: jnp.asarray(select) @ conditions(x, params)
+        part = jax.jit(lambda x, params: jnp.asarray(select) @ conditions(x, params))
 
         def constraints_of_level(x):
             value, slope = function(x)
@@ -277,13 +277,18 @@ class _bordered:
     """(x, params) ↦ (w, s) of the bordered equations, and the smooth kernel basis of A that they give."""
 
     def __init__(self, equations: Callable, left: np.ndarray, right: np.ndarray):
-        self.equations, self.left, self.right = equations, jnp.asarray(left), jnp.asarray(right)
+        # jitted, so that the levels above, which differentiate this one, trace it once
+        self.equations, self.left, self.right = jax.jit(equations), jnp.asarray(left), jnp.asarray(right)
+        self._solve = jax.jit(self._solved)
 
     def _matrix(self, matrix):
         corner = jnp.zeros((self.right.shape[1], self.left.shape[1]))
         return jnp.block([[matrix, self.left], [self.right.T, corner]])
 
     def __call__(self, x, params):
+        return self._solve(x, params)
+
+    def _solved(self, x, params):
         matrix, right = self.equations(x, params)
         return jnp.linalg.solve(self._matrix(matrix), jnp.concatenate([right, jnp.zeros(self.right.shape[1])]))
 

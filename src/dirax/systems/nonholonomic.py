@@ -5,12 +5,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
+from dirax.functions import UserFunction, is_traced
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
+
+SYMMETRIC = 1e-10
+"""Smallest eigenvalue and largest asymmetry of a metric, relative to its largest entry."""
 
 
 class NonholonomicMechanics(AbstractSystem):
@@ -58,6 +62,8 @@ class NonholonomicMechanics(AbstractSystem):
         metric = self.metric.shape(q, params)
         if metric.shape != (n, n):
             raise ValueError(f"metric must return shape ({n}, {n}), but it returned shape {metric.shape}.")
+        if not is_traced(q, params):
+            _check_metric(np.asarray(self.metric(q, params)))
         if self.potential.shape(q, params).shape != ():
             raise ValueError(f"potential must return a scalar, but it returned shape {self.potential.shape(q, params).shape}.")
         return self.lagrange_dirac().sizes(data, params)
@@ -98,3 +104,18 @@ class NonholonomicMechanics(AbstractSystem):
         """μ(q) g⁻¹(q) p."""
         q = row["q"]
         return self.one_forms(q, params) @ jnp.linalg.solve(self.metric(q, params), row["p"])
+
+
+def _check_metric(metric: np.ndarray) -> None:
+    """Raise `ValueError` for a metric that is not symmetric and positive definite; not finite ones are refused later."""
+    scale = np.abs(metric).max()
+    if not np.isfinite(scale):
+        return
+    if (defect := np.abs(metric - metric.T).max()) > SYMMETRIC * scale:
+        raise ValueError(f"metric is not symmetric at the initial point: max |g − gᵀ| = {defect:.3g}; return (g + gᵀ)/2.")
+    lowest = float(np.linalg.eigvalsh(metric)[0])
+    if lowest <= SYMMETRIC * scale:
+        raise ValueError(
+            f"metric is not positive definite at the initial point: its lowest eigenvalue is {lowest:.3g}. A degenerate kinetic "
+            "energy belongs in dx.LagrangeDirac, whose Lagrangian may be singular."
+        )
