@@ -29,6 +29,7 @@ _MODULES = {
     "double-spherical-pendulum": "double_spherical_pendulum",
     "planar-n-body": "planar_n_body",
     "vortices": "vortices",
+    "chaotic-vortices": "chaotic_vortices",
     "lotka-volterra": "lotka_volterra",
     "guiding-centre": "guiding_centre",
     "lc-ladder": "lc_ladder",
