@@ -123,6 +123,10 @@ def test_mistakes():
     pulled = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1])
     with pytest.raises(ValueError, match=r"not invariant under translation of q\[1\]: ∂L/∂q\[1\] = 1"):
         dx.simulate(dx.reduce(pulled, dx.LinearConnection([1])), dx.PlusLagrangeDirac(), **run)
+    # a defect that the initial point itself does not show
+    spring = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1] ** 2)
+    with pytest.raises(ValueError, match=r"∂L/∂q\[1\] = 0\.\d+ at q = \[.*at or near the initial data"):
+        dx.simulate(dx.reduce(spring, dx.LinearConnection([1])), dx.PlusLagrangeDirac(), **run | {"q": [0.1, 0.0]})
     with pytest.raises(ValueError, match="does not fit a system of 2"):
         dx.simulate(dx.reduce(pulled, dx.LinearConnection([4])), dx.PlusLagrangeDirac(), **run)
     with pytest.raises(TypeError, match=r"dx\.reduce takes"):

@@ -94,6 +94,23 @@ def test_a_batch_is_its_trajectories(engine):
         assert np.abs(dx.reconstruct(batch).q[i] - dx.reconstruct(one).q).max() < 1e-12
 
 
+@pytest.mark.soak
+@pytest.mark.parametrize(("example", "fibre", "start", "step"), [
+    (PARTICLE, 3, PARTICLE.initial, 0.01),
+    (PENDULUM, 0, {"q": [0.0, 2.2, 0.0, 2.3], "v": [0.25, 0.0, 0.0, 0.0]}, 0.1),  # stays away from the poles
+])  # fmt: skip
+def test_momentum_over_a_million_steps(example, fibre, start, step):
+    settings = {**start, "params": example.params, "step": step, "steps": 10**6, "save_every": 100, "engine": "native"}
+    unreduced = dx.simulate(example.system, dx.PlusLagrangeDirac("midpoint"), **settings)
+    momentum = unreduced.p[:, fibre]
+    assert unreduced.ok and np.abs(momentum / momentum[0] - 1).max() < 1e-12
+    reduced = dx.reduce(example.system, dx.LinearConnection([fibre], TWISTED))
+    for scheme in (dx.PlusLagrangeDirac("midpoint"), DiscreteRouth("midpoint")):
+        quotient = dx.simulate(reduced, scheme, **settings)
+        assert quotient.ok and np.all(quotient.mu == quotient.mu[0])
+        assert np.abs(dx.reconstruct(quotient).q - unreduced.q).max() < 1e-6
+
+
 def test_mistakes():
     start = {"params": dict(PENDULUM.params), "v": np.full(4, 0.1), "step": 0.01, "steps": 3}
     with pytest.raises(ValueError, match="orbits of the group are not free at the initial point"):

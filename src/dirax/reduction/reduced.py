@@ -14,6 +14,9 @@ from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
 
+NEARBY, SAMPLES = 0.3, 8
+"""Invariance is looked at in the initial data and at so many random points within this distance of them."""
+
 
 class ReducedLagrangeDirac(AbstractSystem):
     """A Lagrangian system on the quotient (Q × Q)/G ≅ Σ × Σ × G by translations in the fibre ([RL] §4). Made by `dx.reduce`.
@@ -45,14 +48,18 @@ class ReducedLagrangeDirac(AbstractSystem):
     def _refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]
         v = data["v"] if "v" in data else jnp.ones_like(q)
-        found = invariance(self.system, Translations(self.connection.fibre), q[None], v[None], params)
+        random = np.random.default_rng(0)
+        nearby = lambda a: np.concatenate(
+            [np.asarray(a)[None], np.asarray(a) + NEARBY * random.uniform(-1, 1, (SAMPLES, a.size))]
+        )
+        found = invariance(self.system, Translations(self.connection.fibre), nearby(q), nearby(v), params)
         if not found.ok:
             worst = self.connection.fibre[found.generator]
             what = {"lagrangian": f"∂L/∂q[{worst}]", "one_forms": "the motion of its one-forms out of their span"}
             what = what.get(found.of, f"its derivative by q[{worst}]")
             raise ValueError(
                 f"the {found.of} is not invariant under translation of q[{worst}]: {what} = {found.defect:.3g} at "
-                "the initial data; take that coordinate out of fibre."
+                f"q = {found.q}, v = {found.v}, at or near the initial data; take that coordinate out of fibre."
             )
         inertia, nearby = group_inertia_ranks(self.system, self.connection, q, params)
         if inertia < nearby:

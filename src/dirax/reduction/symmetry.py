@@ -227,7 +227,8 @@ def _worst(functions: dict[str, Callable], action: AbstractAction, q: Any, v: An
             return jnp.max(jnp.abs(jnp.reshape(rate, (-1, zero.shape[0]))), axis=0), size
 
         defect, size = (np.asarray(a) for a in jax.jit(jax.vmap(at))(*map(jnp.asarray, (times, q, v))))
-        relative = np.where(np.isfinite(defect), defect / size[:, None], 0.0)
+        known = np.isfinite(defect) & np.isfinite(size)[:, None]
+        relative = np.where(known, defect / np.where(known, size[:, None], 1.0), 0.0)
         row, column = np.unravel_index(int(np.argmax(relative)), relative.shape)
         largest = float(relative[row, column])
         if worst is None or largest > worst.relative:
