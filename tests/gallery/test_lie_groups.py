@@ -181,6 +181,5 @@ def test_casimirs_and_momenta_over_a_million_steps(name, map):
         P, gamma = sol.x[:, :3], sol.x[:, 6:]
         kept = [np.sum(P**2, axis=1), np.sum(P * gamma, axis=1), np.sum(gamma**2, axis=1), *sol.spatial_momentum[:, :3].T]
     scale = np.abs(kept).max()
-    print(name, map, np.ptp(kept, axis=1) / scale)
     assert np.ptp(kept, axis=1).max() < 2e-12 * scale
     assert np.abs(np.linalg.norm(sol.q[:, :4], axis=1) - 1).max() < 1e-15
