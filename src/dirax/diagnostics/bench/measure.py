@@ -1,5 +1,6 @@
 """Every program on every subject, by turns, and the table of their times as ratios to one lane of the native engine."""
 
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -33,6 +34,9 @@ SAME_ERROR: dict[str, Callable[[ExplicitODE, float, np.ndarray, float], Program]
 """Programs that take steps of their own, at the end error of the scheme."""
 
 PROGRAMS = (*SAME_STEPS, *SAME_ERROR)
+LONGEST_RUN = 3.0
+"""Seconds of a run from which on it is timed once and not repeated."""
+
 ROUNDOFF = 1e-13
 """End errors below this are not asked of the other programs."""
 
@@ -96,8 +100,13 @@ class Bench:
         for row in self.rows:
             for program, reason in row.skipped.items():
                 reasons.setdefault((program, reason), []).append(row.name)
+        for row in self.rows:
+            for program, seconds in row.seconds.items():
+                if len(seconds) < self.repeats:
+                    reasons.setdefault((program, "a run is long"), []).append(row.name)
         everywhere = lambda names: "everywhere" if len(names) == len(self.rows) > 1 else ", ".join(names)
-        return [f"{program} left out ({everywhere(names)}): {reason}" for (program, reason), names in reasons.items()]
+        verb = lambda reason: "timed once" if reason == "a run is long" else "left out"
+        return [f"{program} {verb(reason)} ({everywhere(names)}): {reason}" for (program, reason), names in reasons.items()]
 
     def __str__(self) -> str:
         return "\n".join([text_table(self.header, self.cells(), self.title), *([""] if self.notes() else []), *self.notes()])
@@ -146,7 +155,8 @@ class Bench:
 
 
 def bench(subjects: Iterable[Subject], repeats: int = 7, tell: Callable[[float | None, str], None] | None = None) -> Bench:
-    """Time every program on every subject; `tell(fraction done, text)` hears of the progress.
+    """Time every program on every subject; `tell(fraction done, text)` hears of the progress. Ctrl-C
+    ends it with the subjects that are done.
 
     Raises `ValueError` for fewer than one repeat.
     """
@@ -155,7 +165,12 @@ def bench(subjects: Iterable[Subject], repeats: int = 7, tell: Callable[[float |
     subjects, rows = list(subjects), []
     for i, subject in enumerate(subjects):
         say = lambda text, i=i, name=subject.name: tell(i / len(subjects), f"{name}: {text}") if tell else None
-        rows.append(measure(subject, repeats, say))
+        try:
+            rows.append(measure(subject, repeats, say))
+        except KeyboardInterrupt:
+            if not rows:
+                raise
+            break
     return Bench(rows, machine(), repeats)
 
 
@@ -163,11 +178,16 @@ def measure(subject: Subject, repeats: int, say: Callable[[str], Any]) -> Row:
     """One row of the table."""
     row = Row(subject.name, repr(subject.scheme), subject.step, subject.steps)
     programs: dict[str, Program] = {}
+    once: dict[str, list[float]] = {}
 
     def add(name: str, make: Callable[[], Program]) -> None:
         say(name)
         try:
-            programs[name] = make()
+            programs[name] = made = make()
+            tick = time.perf_counter()
+            seconds = made.run()
+            if time.perf_counter() - tick > LONGEST_RUN:
+                once[name] = [seconds]
         except Skipped as reason:
             row.skipped[name] = str(reason)
 
@@ -187,7 +207,9 @@ def measure(subject: Subject, repeats: int, say: Callable[[str], Any]) -> Row:
     except Skipped as reason:
         row.skipped |= {name: str(reason) for name in SAME_ERROR}
     say("timing")
-    row.seconds = interleaved({name: program.run for name, program in programs.items()}, repeats)
+    repeated = {name: program.run for name, program in programs.items() if name not in once or name == NATIVE}
+    found = interleaved(repeated, repeats) | {name: seconds for name, seconds in once.items() if name != NATIVE}
+    row.seconds = {name: found[name] for name in programs}
     row.settings = {name: dict(program.settings) for name, program in programs.items()}
     ends = {name: end for name, program in programs.items() if (end := program.end()) is not None}
     if reference is not None:
