@@ -40,6 +40,7 @@ def simulate(
     check_initial: bool = True,
     t0: float = 0.0,
     max_iterations: int = 50,
+    compensated: bool = False,
 ) -> Solution:
     """Run `scheme` on `system` for `steps` steps of size `step` and return the Solution.
 
@@ -49,6 +50,8 @@ def simulate(
     time, and `t0` is the time of the first row. `inputs(t, x[, params])` drives an open port-Hamiltonian system.
     `progress`: True for a bar, or a function of (steps done, steps in all). `project` moves initial data onto the
     constraint; `check_initial=False` accepts data off it as they are. `max_iterations` bounds Newton's iterations a step.
+    `compensated` keeps what rounding takes from the state and gives it back at the next step (Kahan), so that conserved
+    quantities do not drift over very long runs.
 
     Under `jax.grad`, `jit` or `vmap` the run is one differentiable scan, and values are not checked.
 
@@ -101,6 +104,7 @@ def simulate(
         batch=batch,
         batch_params=batch_params,
         max_iterations=max_iterations,
+        compensated=bool(compensated),
     )
     if traced:
         outcome = run_traced_on(engine, problem)

@@ -14,13 +14,15 @@ class Lane(eqx.Module):
 
     `history` holds for each stage the unknowns of the step before and their first and second differences over the steps
     before, (3, k); `counts` (3,) the good steps, the outcome, and Newton's updates. `max_residual` is the largest entry of
-    the residual that was left at the unknowns of any good step.
+    the residual that was left at the unknowns of any good step; `lost` (s,) what rounding took from the state, with
+    compensated summation, else (0,).
     """
 
     state: Any
     history: tuple
     counts: Any
     max_residual: Any
+    lost: Any
 
     @property
     def unknowns(self) -> tuple:
@@ -43,18 +45,24 @@ class Lane(eqx.Module):
         return self.counts[..., 2]
 
 
-def first_lane(state, guess: tuple, xp=jnp) -> Lane:
+def first_lane(state, guess: tuple, xp=jnp, compensated: bool = False) -> Lane:
     """The lane at the initial state, with one guess per stage; a leading batch axis is kept. `xp`: numpy or jax.numpy."""
     batch = state.shape[:-1]
     history = tuple(xp.stack([u, xp.zeros_like(u), xp.zeros_like(u)], axis=-2) for u in guess)
-    return Lane(state, history, xp.full((*batch, 3), OK), xp.zeros(batch))
+    lost = xp.zeros((*batch, state.shape[-1] if compensated else 0))
+    return Lane(state, history, xp.full((*batch, 3), OK), xp.zeros(batch), lost)
 
 
-def take_step(equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True) -> tuple[Lane, tuple]:
-    """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns."""
-    state, history, unknowns = lane.state, [], []
+def take_step(
+    equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True, increments: tuple | None = None
+) -> tuple[Lane, tuple]:
+    """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns.
+
+    `increments`, one function of (u, state, t, h, params) per stage, say what the step adds to the state (NaN: unknown)."""
+    state, lost, history, unknowns = lane.state, lane.lost, [], []
     status, updates, worst = lane.status, 0, lane.max_residual
-    for (stage, fraction), before in zip(equation.stages, lane.history, strict=True):
+    added = increments or (None,) * len(equation.stages)
+    for (stage, fraction), before, increment in zip(equation.stages, lane.history, added, strict=True):
         running = status == OK
         args = (state, t, fraction * h, params)
         guess = stage.guess(state, jnp.sum(before, axis=0), fraction * h, params)
@@ -66,6 +74,9 @@ def take_step(equation, lane: Lane, t, h, params, max_iterations: int, different
         status = jnp.where(running, outcome, status)
         updates = updates + jnp.where(running, count, 0)
         worst = jnp.where(status == OK, jnp.maximum(worst, jnp.max(jnp.abs(left), initial=0.0)), worst)
+        if increment is not None:
+            new, left_out = compensated_sum(state, lost, increment(u, *args), new)
+            lost = jnp.where(status == OK, left_out, lost)
         state = jnp.where(status == OK, new, state)
         history.append(_remembered(u, before, lane.completed))
         unknowns.append(u)
@@ -76,8 +87,20 @@ def take_step(equation, lane: Lane, t, h, params, max_iterations: int, different
         tuple(jnp.where(good, new, old) for new, old in zip(history, lane.history, strict=True)),
         jnp.stack([lane.completed + good.astype(int), status, lane.iterations + updates]),
         worst,
+        jnp.where(good, lost, lane.lost),
     )
     return after, tuple(unknowns)
+
+
+def compensated_sum(state, lost, increment, new):
+    """state + increment and what rounding takes from it: what was taken before is given back to the increment (Kahan).
+    Where the increment is not known, the new state as it is."""
+    small = increment + lost
+    total = state + small
+    back = total - state
+    error = (state - (total - back)) + (small - back)
+    known = jnp.isfinite(increment)
+    return jnp.where(known, total, new), jnp.where(known, error, 0.0)
 
 
 def _remembered(u, before, completed):

@@ -38,12 +38,12 @@ class Clock(eqx.Module):
     closing: Any  # whether it is the step leaving the last row, taken even if every trajectory has ended
 
 
-def make_step(equation, axes, max_iterations: int, differentiable: bool):
+def make_step(equation, axes, max_iterations: int, differentiable: bool, increments: tuple | None = None):
     """(lanes, params, clock) ↦ (lanes after a step, packed rows that they left), over the batch if there is one."""
 
     def one(lane, params, clock):
         t = time_of(lane, clock.t0, clock.h, clock.first_step)
-        after, unknowns = take_step(equation, lane, t, clock.h, params, max_iterations, differentiable)
+        after, unknowns = take_step(equation, lane, t, clock.h, params, max_iterations, differentiable, increments)
         return after, packed_row(lane, unknowns)
 
     return one if axes is None else jax.vmap(one, in_axes=(*axes, None))
@@ -57,9 +57,11 @@ def unpack_rows(equation, axes, packed, params, clock: Clock) -> dict:
 
 
 @eqx.filter_jit
-def _chunk(equation, lanes: Lane, params, clock: Clock, capacity: int, axes, max_iterations: int) -> tuple[Lane, dict]:
+def _chunk(
+    equation, lanes: Lane, params, clock: Clock, capacity: int, axes, max_iterations: int, increments
+) -> tuple[Lane, dict]:
     """The steps from clock.start to clock.stop: the lanes after them, and the at most `capacity` rows saved on the way."""
-    step = make_step(equation, axes, max_iterations, differentiable=False)
+    step = make_step(equation, axes, max_iterations, False, increments)
     row = jax.eval_shape(step, lanes, params, clock)[1]
     first_row = _next_row(clock.start, clock.every)
 
@@ -83,13 +85,14 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
     """Run `problem`, saving into host arrays; Ctrl-C and failing steps keep what was computed."""
     p, started = problem, time.perf_counter()
     axes, capacity = _axes(p), _capacity(p)
-    lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np)
+    increments, notes = _increments(p)
+    lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, increments is not None)
 
     def call(lanes, start, stop, closing=False):
         t0, h, first_step = map(np.float64, (p.t0, p.h, p.first_step))
         every, start, stop = map(np.int64, (p.save_every, start, stop))
         clock = Clock(t0, h, first_step, every, start, stop, np.bool_(closing))
-        after, rows = _chunk(p.equation, lanes, p.params, clock, capacity, axes, p.max_iterations)
+        after, rows = _chunk(p.equation, lanes, p.params, clock, capacity, axes, p.max_iterations, increments)
         return after, {name: _by_lane(np.asarray(values), p.batch, np) for name, values in rows.items()}
 
     _, empty = call(lanes, 0, 0)  # compile
@@ -131,7 +134,18 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
         interrupted=interrupted,
         compile_seconds=compile_seconds,
         run_seconds=time.perf_counter() - started,
+        notes=notes,
     )
+
+
+def _increments(p: Problem) -> tuple[tuple | None, dict[str, Any]]:
+    """What the stages add to the state, for compensated summation, and what `stats` say where that cannot be."""
+    if not p.compensated:
+        return None, {}
+    from dirax.engines.native.in_jax import increments_of  # the scalar graph is imported when it is used
+
+    found = increments_of(p.equation, p.params, p.batch_params)
+    return (None, {"not_compensated": found}) if isinstance(found, str) else (found, {})
 
 
 def run_traced(problem: Problem) -> Outcome:
@@ -139,9 +153,10 @@ def run_traced(problem: Problem) -> Outcome:
     are computed again instead of being stored."""
     p = problem
     axes = _axes(p)
-    lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)))
+    increments, notes = _increments(p)
+    lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), compensated=increments is not None)
     clock = Clock(p.t0, p.h, float(p.first_step), p.save_every, 0, p.steps, False)
-    one = make_step(p.equation, axes, p.max_iterations, differentiable=True)
+    one = make_step(p.equation, axes, p.max_iterations, True, increments)
 
     def step(lanes, k):
         """The lanes after step k and the row that they left; a step past the last is undone."""
@@ -178,6 +193,7 @@ def run_traced(problem: Problem) -> Outcome:
         max_residual=lanes.max_residual,
         last_state=lanes.state,
         last_unknowns=lanes.unknowns[0],
+        notes=notes,
     )
 
 

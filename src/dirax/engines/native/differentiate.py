@@ -45,6 +45,7 @@ class Recorded:
             "save_every": p.save_every,
             "first_step": p.first_step,
             "max_iterations": p.max_iterations,
+            "compensated": p.compensated,
         }
 
     def problem(self, state, guess, c, t0, h) -> Problem:
@@ -226,7 +227,7 @@ def run_traced(problem: Problem) -> Outcome:
     per_lane = lambda a: a if p.batch_params else jnp.broadcast_to(a, (batch, *jnp.shape(a)))
     columns = [per_lane(jnp.asarray(leaf, float)).reshape(batch, -1) for leaf in moving]
     c = jnp.concatenate(columns, axis=1) if columns else jnp.zeros((batch, 1))
-    made, _ = program(task.equation, np.zeros((1, c.shape[1])), True)
+    made, _ = program(task.equation, np.zeros((1, c.shape[1])), True, p.compensated)
     made.check()
     guesses = [jnp.asarray(g).reshape(batch, -1) for g in p.guess]
     guess = jnp.stack([jnp.pad(g, ((0, 0), (0, task.unknowns - g.shape[1]))) for g in guesses], axis=1)

@@ -23,7 +23,7 @@ class Sweeper:
         self.task, self.problem = task, task.problem(*inputs)
         p = self.problem
         self.stages = len(p.equation.stages)
-        made, _ = program(p.equation, p.params, True, every_stage=self.stages > 1)
+        made, _ = program(p.equation, p.params, True, p.compensated, self.stages > 1)
         self.lanes = Lanes(p, made, width_for(p.batch or 1))
         self.kernel, _ = made.kernel(self.lanes.width)
         self.sweep = made.sweep(reverse, self.lanes.width)
