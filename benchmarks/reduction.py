@@ -1,19 +1,22 @@
-"""Time of a step of the unreduced, the reduced and the Routh equations of the double spherical pendulum of [RL] §7.2.
+"""Time of a step of the unreduced, the reduced and the Routh equations, in one run.
 
     python -m benchmarks reduction
 
-The midpoint discrete Lagrangian, h = .01, constants in the program, one trajectory and a batch, on both engines and in JAX as
-one would write it (scan, jacfwd, jnp.linalg.solve). Every round runs each program once, in turn. The paper reports that its
-reduced code was about 75 % faster than its unreduced one.
+The double spherical pendulum of [RL] §7.2 (dim G = 1 of 4) on both engines and in JAX as one would write it (scan, jacfwd,
+jnp.linalg.solve), and the planar three-body problem without translations and rotations (dim G = 3 of 6) on the native engine:
+midpoint discrete Lagrangian, constants in the program, one thread, processor time, every program once a round. The paper
+reports that its reduced code for the pendulum was about 75 % faster than its unreduced one.
 
 What to expect. With exact Newton steps the reduced equations are the unreduced ones in other variables: their Jacobians
 differ by a change of basis, and γ is a column of the elimination. The Routh equations have the Schur complement of that
-column for their Jacobian, M − b c⁻¹ bᵀ: all of M, b and c have to be computed, the first pivot of the elimination moves into
-the residual, and with it its division, which now is on the way of every evaluation and not of every Jacobian. On the native
-engine, whose single trajectory is a chain of dependent operations (sines, residual, pivots, one after the other), a division
-more an evaluation costs what an unknown less saves.
+column for their Jacobian, M − b c⁻¹ bᵀ: all of M, b and c have to be computed, and the first pivot of the elimination moves
+into the residual. For the pendulum that saves half of the elimination, a fifteenth of the scalar operations of a step, and
+puts a division in the way of every evaluation of the residual; a single trajectory on the native engine is a chain of
+dependent operations (sines, residual, pivots), where this costs what an unknown less saves. The reduction pays where the
+group is large or L at group coordinate 0 is simpler than L, as for the three bodies.
 """
 
+import os
 import time
 from typing import Any
 
@@ -26,37 +29,55 @@ from dirax.diagnostics.bench.engines import plain_run
 from dirax.engines import native, xla
 from dirax.engines.native.program import program
 from dirax.engines.result import Problem
-from dirax.gallery.double_spherical_pendulum import EXAMPLE, PARAMS, lagrangian
+from dirax.gallery import double_spherical_pendulum, planar_n_body
 from dirax.gallery.rodriguez_leok import FASTER
 from dirax.schemes.step import Shape, make_step_equation
 
-SYSTEM = dx.LagrangeDirac(lambda q, v: lagrangian(q, v, PARAMS))
-REDUCED = dx.reduce(SYSTEM, dx.LinearConnection(fibre=[0]))
-MIDPOINT = dx.PlusLagrangeDirac("midpoint")
-EQUATIONS: dict[str, tuple[Any, Any]] = {
-    "unreduced": (SYSTEM, MIDPOINT),
-    "reduced": (REDUCED, MIDPOINT),
-    "Routh": (REDUCED, dx.DiscreteRouth("midpoint")),
-}
+MIDPOINT, ROUTH = dx.PlusLagrangeDirac("midpoint"), dx.DiscreteRouth("midpoint")
 
 
-def problem(name: str, steps: int, batch: int | None) -> Problem:
-    """A run from the paper's initial data, or from a batch of points near them; only the last row is saved."""
-    system, scheme = EQUATIONS[name]
-    equation: Any = make_step_equation(scheme, system, Shape(4))
+def equations(system: dx.LagrangeDirac, fibre: list[int]) -> dict[str, tuple[Any, Any]]:
+    """The three ways to step a system."""
+    reduced = dx.reduce(system, dx.LinearConnection(fibre))
+    return {"unreduced": (system, MIDPOINT), "reduced": (reduced, MIDPOINT), "Routh": (reduced, ROUTH)}
+
+
+PENDULUM = dx.LagrangeDirac(lambda q, v: double_spherical_pendulum.lagrangian(q, v, double_spherical_pendulum.PARAMS))
+BODIES = dx.in_coordinates(
+    dx.LagrangeDirac(lambda q, v: planar_n_body.lagrangian(q, v, planar_n_body.PARAMS)),
+    lambda y: planar_n_body.from_shape(y, planar_n_body.PARAMS),
+)
+WAYS = {"pendulum": equations(PENDULUM, [0]), "three bodies": equations(BODIES, [3, 4, 5])}
+
+
+def initial(subject: str) -> tuple[Any, Any, float]:
+    """q, p and the step: the paper's, and the figure eight in shape coordinates."""
+    if subject == "pendulum":
+        data = double_spherical_pendulum.EXAMPLE.initial
+        return jnp.asarray(data["q"]), jnp.asarray(data["p"]), 0.01
+    data = planar_n_body.EXAMPLE.initial
+    q, v = jax.jvp(lambda q: planar_n_body.to_shape(q, planar_n_body.PARAMS), (data["q"],), (data["v"],))
+    return q, BODIES.legendre(q, v), 0.003
+
+
+def problem(subject: str, way: str, steps: int, batch: int | None) -> Problem:
+    """A run from the initial data, or from a batch of points near them; only the last row is saved."""
+    system, scheme = WAYS[subject][way]
+    q, p, h = initial(subject)
+    equation: Any = make_step_equation(scheme, system, Shape(len(q)))
+    unreduced = WAYS[subject]["unreduced"][0]
 
     def start(shift):
-        q, p = jnp.asarray(EXAMPLE.initial["q"]).at[1].add(shift), jnp.asarray(EXAMPLE.initial["p"])
-        return equation.start(SYSTEM.complete({"q": q, "p": p}, None, False), EXAMPLE.step, None)
+        return equation.start(unreduced.complete({"q": q.at[1].add(shift), "p": p}, None, False), h, None)
 
     shifts = jnp.zeros(()) if batch is None else 1e-3 * jnp.arange(batch) / batch
     state, guess = (start if batch is None else jax.vmap(start))(shifts)
-    return Problem(equation, state, (guess,), EXAMPLE.step, 0.0, steps, steps, batch=batch)
+    return Problem(equation, state, (guess,), h, 0.0, steps, steps, batch=batch)
 
 
-def operations(name: str) -> dict[str, int]:
+def operations(subject: str, way: str) -> dict[str, int]:
     """Scalar operations of the compiled step: residual, Jacobian, elimination and all together."""
-    made, _ = program(problem(name, 1, None).equation, None, False)
+    made, _ = program(problem(subject, way, 1, None).equation, None, False)
     plan = made._planned()
     g, equation, correction = plan.graph, plan.equations[0], plan.corrections[0]
     count = lambda nodes: sum(1 for node in g.reachable(nodes) if g.args[node])
@@ -73,48 +94,49 @@ def operations(name: str) -> dict[str, int]:
 
 
 def timed(run) -> float:
-    started = time.perf_counter()
+    started = time.process_time()
     run()
-    return time.perf_counter() - started
+    return time.process_time() - started
 
 
 def measure(repeats: int, steps: int, batch: int) -> dict[str, dict[str, dict[str, float]]]:
-    """Microseconds a step and trajectory, by setting and equations."""
+    """Microseconds of processor time a step and trajectory, by setting and way."""
+    os.environ["DIRAX_THREADS"] = "1"
     few = max(1, steps // 100)
     settings = {
-        "native, one trajectory": (native.run, steps, None),
-        f"native, {batch} trajectories": (native.run, few, batch),
-        "xla, one trajectory": (xla.run, steps // 4, None),
-        f"xla, {batch} trajectories": (xla.run, few, batch),
-        "JAX as one writes it": (None, steps // 4, None),
+        "pendulum, native": ("pendulum", native.run, steps, None),
+        f"pendulum, native, {batch} at once": ("pendulum", native.run, few, batch),
+        "pendulum, xla": ("pendulum", xla.run, steps // 4, None),
+        "pendulum, JAX as one writes it": ("pendulum", None, steps // 4, None),
+        "three bodies, native": ("three bodies", native.run, steps, None),
+        f"three bodies, native, {batch} at once": ("three bodies", native.run, few, batch),
     }
     found = {}
-    for label, (engine, count, size) in settings.items():
+    for label, (subject, engine, count, size) in settings.items():
         programs = {}
-        for name in EQUATIONS:
-            p = problem(name, count, size)
+        for way in WAYS[subject]:
+            p = problem(subject, way, count, size)
             run = plain_run(p) if engine is None else lambda p=p, engine=engine: engine(p)
-            programs[name] = lambda run=run: timed(run)
+            programs[way] = lambda run=run: timed(run)
         seconds = interleaved(programs, repeats)
         unit = 1e6 / (count * (size or 1))
-        found[label] = {name: summary([unit * s for s in values]) for name, values in seconds.items()}
+        found[label] = {way: summary([unit * s for s in values]) for way, values in seconds.items()}
     return found
 
 
 def main(short: bool = False) -> None:
     repeats, steps, batch = (9, 8_000, 256) if short else (31, 40_000, 2048)
     found = measure(repeats, steps, batch)
-    counts = {name: operations(name) for name in EQUATIONS}
+    counts = {f"{subject}, {way}": operations(subject, way) for subject, ways in WAYS.items() for way in ways}
     rows = []
     for label, times in found.items():
         base = times["unreduced"]["median"]
-        cells = [f"{times[name]['median']:.3f} ({base / times[name]['median']:.2f}×)" for name in EQUATIONS]
-        rows.append((label, *cells))
-    title = f"double spherical pendulum: µs a step, medians of {repeats} (speed over unreduced)"
-    print(table(("", *EQUATIONS), rows, title))
+        rows.append((label, *(f"{t['median']:.3f} ({base / t['median']:.2f}×)" for t in times.values())))
+    print(table(("", *WAYS["pendulum"]), rows, f"µs a step, medians of {repeats} (speed over unreduced)"))
     kinds = list(next(iter(counts.values())))
-    print(table(("", *kinds), [(name, *(str(c[k]) for k in kinds)) for name, c in counts.items()], "scalar operations, native"))
-    print(f"the paper's reduced code was about {FASTER:.0%} faster than its unreduced one")
+    lines = [(name, *(str(c[k]) for k in kinds)) for name, c in counts.items()]
+    print(table(("", *kinds), lines, "scalar operations of a step, native"))
+    print(f"the paper's reduced code for the pendulum was about {FASTER:.0%} faster than its unreduced one")
     store("reduction", {"microseconds_per_step": found, "operations": counts, "paper": {"faster": FASTER}})
 
 
