@@ -169,6 +169,11 @@ def test_verify_judges_the_energy_less_the_work():
         assert report.ok and report.lines[1].verdict == "ok", report
 
 
+def test_compare_takes_the_work_off_the_energy():
+    entry = dx.compare(OSCILLATOR, [dx.LagrangeDAlembert()], q=[Q0], v=[V0], step=0.02, steps=2000).entries[0]
+    assert entry.energy_band < 1e-12 and entry.drift == "bounded"
+
+
 def test_work_is_kept_with_rows_left_out_and_in_a_dataset():
     every = dx.simulate(NONLINEAR, dx.LagrangeDAlembert(), step=0.05, steps=40, params=0.3, **START)
     some = dx.simulate(NONLINEAR, dx.LagrangeDAlembert(), step=0.05, steps=40, params=0.3, save_every=10, **START)

@@ -247,25 +247,33 @@ def _count_of_forms(sol: Solution) -> int:
 # ---------------------------------------------------------------------------------------------- along the trajectory
 
 
+def energy_less_work(sol: Solution) -> tuple[np.ndarray, bool, str]:
+    """The energy less the work of the forces, (…, rows), whether there are forces, and why the system changes it all the
+    same ("" if it does not)."""
+    energy, system = np.asarray(sol.energy()), sol.system
+    forced = "work" in sol.fields and not keeps_books(sol)
+    if forced:
+        energy = energy - np.asarray(sol.fields["work"])
+    if isinstance(system, PortHamiltonian) and (system.R is not None or system.inputs is not None):
+        return energy, forced, "does not conserve it"
+    if isinstance(system, LagrangeDirac) and system.depends_on_time:
+        return energy, forced, "depends on time and does not conserve it"
+    if isinstance(system, LagrangeDirac) and system.affine is not None:
+        return energy, forced, "has constraints that do work (affine) and does not conserve it"
+    return energy, forced, ""
+
+
 def _energy(sol: Solution) -> Line:
     name = "energy"
     try:
-        energy = np.asarray(sol.energy())
+        energy, forced, changes = energy_less_work(sol)
     except ValueError as error:
         return Line(name, None, None, NOT_CHECKED, str(error))
     energy = energy.reshape(-1, energy.shape[-1])
-    forced = "work" in sol.fields and not keeps_books(sol)
-    if forced:
-        energy = energy - np.asarray(sol.fields["work"]).reshape(energy.shape)
     roundoff = ROUNDINGS * EPSILON * _steps(sol) * _energy_scale(sol, energy)
-    system = sol.system
-    if isinstance(system, PortHamiltonian) and (system.R is not None or system.inputs is not None):
+    if changes:
         change = float(np.nanmax(np.abs(energy - energy[:, :1])))
-        return Line(name, change, None, NOT_CHECKED, f"the system does not conserve it; it changed by {change:.3g}")
-    if isinstance(system, LagrangeDirac) and (system.depends_on_time or system.affine is not None):
-        change, why = float(np.nanmax(np.abs(energy - energy[:, :1]))), "depends on time"
-        why = why if system.depends_on_time else "has constraints that do work (affine)"
-        return Line(name, change, None, NOT_CHECKED, f"the system {why} and does not conserve it; it changed by {change:.3g}")
+        return Line(name, change, None, NOT_CHECKED, f"the system {changes}; it changed by {change:.3g}")
     t, found = np.asarray(sol.t), []
     for lane, series in enumerate(energy):
         good = np.isfinite(series)

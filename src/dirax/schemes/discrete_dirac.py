@@ -27,7 +27,8 @@ class DiscreteDirac(AbstractScheme):
 
     `map`: any discretization map; on T*Q of a Lagrangian system a map on Q is lifted. `constraints`:
     "discretize" ([BLM] Method 1) discretizes the implicit system S_0 as it stands; "resolve" ([BLM] Method 2) runs the
-    constraint algorithm first and discretizes on M_f, so that its constraints hold at the nodes to roundoff.
+    constraint algorithm first and discretizes on M_f, so that its constraints hold at the nodes to roundoff. Of holonomic
+    constraints of a Lagrangian, Method 1 imposes the distribution G q̇ + ∂g/∂t = 0, and Method 2 takes the resolved chain.
 
     Takes DiracSystem, PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian
     systems, and what `ConstraintChain.resolved` returns, on which it is Method 2 for any system; raises `TypeError` for

@@ -70,11 +70,6 @@ class LagrangeDirac(AbstractSystem):
         functions = (self.lagrangian, self.one_forms, self.holonomic, self.affine)
         return any(f is not None and f.takes_time for f in functions)
 
-    @property
-    def conserves_energy(self) -> bool:
-        """Whether E is a constant of the motion: no forces, no time, and constraints that do no work."""
-        return not self.depends_on_time and self.forces is None and self.affine is None
-
     # ------------------------------------------------------------------ geometry of L and W, one point at a time
 
     def constraint_matrix(self, q: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, "m n"]:
