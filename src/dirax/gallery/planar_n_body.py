@@ -44,10 +44,9 @@ def jacobi(q, masses):
 
 def from_jacobi(vectors, masses):
     """The bodies (2N,) of `jacobi`; linear in the vectors (N, 2)."""
-    m, total, n = jnp.asarray(masses), 0.0, len(vectors)
-    bodies = [jnp.zeros(2)]
+    m, bodies = jnp.asarray(masses), [jnp.zeros(2)]
     total = m[0]
-    for j in range(n - 1):  # each body is put where its Jacobi vector says, and the centre of mass moved back to 0
+    for j in range(len(vectors) - 1):  # each body is put where its Jacobi vector says, and the centre of mass moved back to 0
         here = vectors[j]
         share = m[j + 1] / (total + m[j + 1])
         bodies = [body - share * here for body in bodies] + [(1.0 - share) * here]
