@@ -45,6 +45,11 @@ def with_option(flags: str, on: bool) -> str:
     return " ".join(others + [FLAG + ",".join(options)] * bool(options))
 
 
+def fast_loops_asked_for() -> bool:
+    """Whether XLA_FLAGS holds the option."""
+    return OPTION in os.environ.get("XLA_FLAGS", "")
+
+
 def small_loops_are_one_kernel() -> bool:
     """Whether XLA compiles a loop over 2 kB into one kernel on a CPU: its limit is 1 kB unless raised."""
     with jax.default_device(jax.devices("cpu")[0]):

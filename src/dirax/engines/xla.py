@@ -1,5 +1,6 @@
 """The xla engine: jitted steps, driven from the host in chunks, or as one differentiable scan under a JAX transformation."""
 
+import dataclasses
 import time
 from typing import Any
 
@@ -8,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.configure import fast_loops_asked_for
 from dirax.engines.lane import Lane, first_lane, packed_row, take_step, time_of, unpacked_row
 from dirax.engines.result import OK, Outcome, Problem, Progress
 
@@ -21,6 +23,13 @@ FIRST_CHUNK = 64
 """Steps of the first chunk; those after it are as many as take CHUNK_SECONDS."""
 
 CHUNK_SECONDS = 0.25
+
+
+LARGEST_SCALAR = 16
+"""Unknowns of a stage, or entries of the state, up to which a step may be written in scalars."""
+
+SCALAR_BATCH = 64
+"""Trajectories from which on it is, whatever XLA does with its loops."""
 
 
 class Clock(eqx.Module):
@@ -83,7 +92,7 @@ def _chunk(
 
 def run(problem: Problem, progress: Progress | None = None) -> Outcome:
     """Run `problem`, saving into host arrays; Ctrl-C and failing steps keep what was computed."""
-    p, started = problem, time.perf_counter()
+    started, p = time.perf_counter(), _in_scalars(problem)
     axes, capacity = _axes(p), _capacity(p)
     increments, notes = _increments(p)
     lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, increments is not None)
@@ -138,6 +147,18 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
     )
 
 
+def _in_scalars(p: Problem) -> Problem:
+    """The run with its equations written in scalars, where that was measured to pay: small ones on a CPU, in batches, and in
+    loops that XLA makes one kernel (`dirax.configure`)."""
+    size = max(max(stage.unknowns, stage.state_size) for stage, _ in p.equation.stages)
+    many = p.batch is not None and p.batch >= SCALAR_BATCH
+    if size > LARGEST_SCALAR or not (many or fast_loops_asked_for()) or jax.default_backend() != "cpu":
+        return p
+    from dirax.engines.native.in_jax import in_scalars  # the scalar graph is imported when it is used
+
+    return dataclasses.replace(p, equation=in_scalars(p.equation, p.params, p.batch_params))
+
+
 def _increments(p: Problem) -> tuple[tuple | None, dict[str, Any]]:
     """What the stages add to the state, for compensated summation, and what `stats` say where that cannot be."""
     if not p.compensated:
@@ -151,7 +172,7 @@ def _increments(p: Problem) -> tuple[tuple | None, dict[str, Any]]:
 def run_traced(problem: Problem) -> Outcome:
     """The same run as one scan, for `jax.grad`, `jit` and `vmap` around it; in reverse mode segments of about √steps steps
     are computed again instead of being stored."""
-    p = problem
+    p = _in_scalars(problem)
     axes = _axes(p)
     increments, notes = _increments(p)
     lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), compensated=increments is not None)

@@ -10,6 +10,7 @@ from dirax.engines.native.compensation import increments
 from dirax.engines.native.interpret import UnsupportedPrimitive
 from dirax.engines.native.program import Program, program
 from dirax.engines.native.trace import TracedEquation
+from dirax.schemes.step import StepEquation, StepSequence
 
 OPERATIONS: dict[str, Callable] = {
     **{name: getattr(jax.lax, name) for name in ("add", "sub", "mul", "neg", "abs", "sqrt", "floor", "ceil", "sign")},
@@ -60,3 +61,36 @@ def increments_of(equation: Any, params: Any, batch_params: bool) -> tuple[Calla
         return made.increments
     except UnsupportedPrimitive as error:
         return str(error)
+
+
+def in_scalars(equation: Any, params: Any, batch_params: bool) -> Any:
+    """The equation with its residual and its advance as scalar programs; the same object for the same program, and the
+    equation itself where it is none."""
+    try:
+        made, _ = program(equation, params, batch_params)
+    except UnsupportedPrimitive:
+        return equation
+    if made.as_scalars is None:
+        distinct = {index: stage for (index, _), (stage, _) in zip(made.stages, equation.stages, strict=True)}
+        new = {i: _replaced(stage, made, made.equations[i]) for i, stage in distinct.items()}
+        single = len(equation.stages) == 1 and equation.stages[0][1] == 1.0
+        stages = tuple((new[i], fraction) for i, fraction in made.stages)
+        made.as_scalars = stages[0][0] if single else StepSequence(stages)
+    return made.as_scalars
+
+
+def _replaced(stage: StepEquation, made: Program, traced: TracedEquation) -> StepEquation:
+    return StepEquation(
+        start=stage.start,
+        residual=function_of(made, traced, traced.residual) if stage.unknowns else stage.residual,
+        advance=function_of(made, traced, traced.advance),
+        unpack=stage.unpack,
+        state_size=stage.state_size,
+        unknowns=stage.unknowns,
+        fields=stage.fields,
+        guess=stage.guess,
+        scale=stage.scale,
+        labels=stage.labels,
+        needs_leaving_step=stage.needs_leaving_step,
+        canonical=stage.canonical,
+    )
