@@ -6,6 +6,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dirax as dx
+from dirax import gallery
 from dirax.schemes.discrete_gradient import DiscreteGradient
 
 KINDS = ("gonzalez", "mean-value")
@@ -107,3 +108,13 @@ def test_other_systems_and_kinds_are_refused():
         DiscreteGradient("average")
     with pytest.raises(TypeError, match="which have a Hamiltonian of x"):
         dx.simulate(dx.LagrangeDirac(lambda q, v: v @ v), DiscreteGradient(), q=[0.0], v=[1.0], step=0.1, steps=1)
+
+
+@pytest.mark.parametrize("step", [0.1, 0.01])
+def test_a_driven_system_that_comes_to_rest_is_stepped_on(step):
+    """The motor under constant voltage: at rest H does not change at all, and the correction divides roundoff by nothing."""
+    sol = gallery.get("dc-motor").simulate(step=step, steps=3000)
+    supplied, dissipated = sol.work.T
+    energy = np.asarray(sol.energy())
+    assert sol.ok, sol.message
+    assert np.abs(energy - energy[0] - supplied + dissipated).max() < 1e-13 * supplied[-1]

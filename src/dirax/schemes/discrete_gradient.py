@@ -11,7 +11,7 @@ from dirax.systems.port_hamiltonian import PortHamiltonian
 
 KINDS = ("gonzalez", "mean-value")
 EPSILON = 2.220446049250313e-16
-NOISE = 1e-9
+NOISE = 1e-11
 """How much of dH the correction may be, relative, where it is roundoff of H only. It fades out for steps so short that it
 would be more: dividing roundoff by such a step would push a system that comes to rest."""
 TINY = 1e-300
@@ -78,7 +78,7 @@ def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, poi
         first, gained = account(state)
         stored = (system.hamiltonian(x + change, params) - first) - gained
         blurred = EPSILON * (jnp.abs(first) + jnp.abs(gained)) / NOISE
-        length = change @ change + blurred**2 / (gradient @ gradient + TINY)
+        length = jnp.sqrt((change @ change) ** 2 + (blurred**2 / (gradient @ gradient + TINY)) ** 2 + TINY)
         return gradient + (stored - gradient @ change) / length * change, x + change / 2
 
     def ports(u, state, t, h, params):
