@@ -36,7 +36,7 @@ POINTS = {  # function: arguments, largest error in units of the last place
     "atanh": (NEAR_ONE[: 2 * COUNT], 2.0),
     "cbrt": (np.concatenate([between(-9, 9), powers(-300, 300)]), 1.0),
     "erf": (np.concatenate([between(-3, 3), powers(-10, 1)]), 2.0),
-    "erfc": (np.concatenate([between(-3, 3), between(1, 26)]), 8.0),
+    "erfc": (np.concatenate([between(-3, 3), between(1, 26)]), 4.0),
     "sqrt": (abs(powers(-300, 300)), 0.5),
 }
 EXACT = {

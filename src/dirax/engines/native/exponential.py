@@ -159,5 +159,9 @@ def erfc(e: Emitter, x: str) -> str:
     size = clamp(e, e.abs(x), 0.0, 28.0)
     far = _complement(e, e.max(size, e.const(1.0)))
     reflected = e.select(e.compare("olt", x, e.const(0.0)), e.sub(e.const(2.0), far), far)
-    near = e.sub(e.const(1.0), erf(e, x))
+    slope, slope_low = 1.1283791670955126, 1.533545961316588e-17  # 2/√π
+    product, lost = e.two_product(x, e.const(slope))
+    total, error = e.two_sum(e.const(1.0), e.neg(product))
+    small = e.sub(e.fma(x, e.const(-slope_low), error), lost)
+    near = e.add(total, e.fma(e.neg(x), e.polynomial(c.ERROR_FUNCTION, e.mul(x, x)), small))
     return e.select(e.compare("ogt", size, e.const(1.0)), reflected, near)
