@@ -365,3 +365,17 @@ def test_compensated_runs_agree_with_plain_ones_and_do_not_depend_on_the_batch()
     assert_close(whole, plain, 1e-12)
     alone = dataclasses.replace(p, state=p.state[3], guess=(p.guess[0][3],), batch=None)
     assert_same_bits(native.run(alone), whole, rows_b=slice(3, 4))
+
+
+@pytest.mark.parametrize("engine", [native, xla])
+def test_every_kind_of_failure_stays_in_its_lane(engine):
+    """u₀² = c₀, c₁(u₁ − x₁) = 0: solvable, without a root, with a singular Jacobian, not a number, solvable."""
+    equation = implicit(lambda u, x, t, h, c: jnp.stack([u[0] ** 2 - c[0], c[1] * (u[1] - x[1])]), size=2)
+    c = np.array([[4.0, 1.0], [-1.0, 1.0], [4.0, 0.0], [np.nan, 1.0], [9.0, 2.0]])
+    p = small(equation, [[0.3, 1.0 + i] for i in range(5)], steps=6, params=c, batch_params=True)
+    outcome = engine.run(p)
+    assert np.asarray(outcome.status).tolist() == [OK, NOT_CONVERGED, NOT_FINITE, NOT_FINITE, OK]
+    assert np.asarray(outcome.completed).tolist() == [6, 0, 0, 0, 6]
+    expected = [[2.0, 1.0], [0.3, 2.0], [0.3, 3.0], [0.3, 4.0], [3.0, 5.0]]
+    np.testing.assert_allclose(outcome.last_state, expected, rtol=1e-15)
+    np.testing.assert_allclose(np.asarray(outcome.closing["x"]), expected, rtol=1e-15)
