@@ -61,19 +61,19 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
         )
     q = jnp.asarray(data["q"] if "q" in data else data["q0"])
     near, positions, velocities = map(np.asarray, _nearby(system, q, params, jnp.asarray(t0, float)))
-    if max(np.max(np.abs(positions), initial=0.0), np.max(np.abs(velocities), initial=0.0)) > CONSISTENT * (
-        1 + np.max(np.abs(q))
-    ):
-        left = positions if np.max(np.abs(positions), initial=0.0) > np.max(np.abs(velocities), initial=0.0) else velocities
+    worst = max((positions, velocities), key=lambda residual: np.max(np.abs(residual), initial=0.0))
+    if np.max(np.abs(worst), initial=0.0) > CONSISTENT * (1 + np.max(np.abs(q))):
         raise ValueError(
             f"the constraints ({constraints.names}) contradict each other at the initial data: their rank is {np.min(ranks)} "
-            f"of {total}, and the nearest point and velocity leave the residual {np.array2string(left, precision=4)}. Take out those that cannot hold."
+            f"of {total}, and the nearest point and velocity leave the residual {np.array2string(worst, precision=4)}. Take "
+            "out those that cannot hold."
         )
     nearby = int(numerical_rank(near[None])[0][0])
     if nearby > np.min(ranks):
         raise ValueError(
             f"the constraints ({constraints.names}) are dependent at the initial data{where}, with rank {np.min(ranks)} of "
-            f"{total}, but have rank {nearby} nearby: a singular configuration, where the multipliers are not determined. Start elsewhere."
+            f"{total}, but have rank {nearby} nearby: a singular configuration, where the multipliers are not determined. "
+            "Start elsewhere."
         )
 
 

@@ -149,7 +149,8 @@ class PortHamiltonian(AbstractSystem):
             raise ValueError(f"J is not skew at the initial point: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
         if self.R is None:
             return
-        R = np.asarray(jax.jit(lambda x, params: self.R(x, params))(x, params))
+        dissipation = self.R
+        R = np.asarray(jax.jit(lambda x, params: dissipation(x, params))(x, params))
         scale = max(np.max(np.abs(R), initial=0.0), 1e-300)
         if np.max(np.abs(R - R.T)) > SKEW_TOLERANCE * scale:
             raise ValueError(f"R is not symmetric at the initial point: max |R − Rᵀ| = {np.max(np.abs(R - R.T)):.3g}.")
