@@ -12,9 +12,10 @@ from hypothesis import given, settings
 
 import dirax as dx
 from dirax.diagnostics.drift import SMALLEST_SERIES, judge, oscillations
+from dirax.diagnostics.judging import EPSILON, ROUNDINGS
 from dirax.diagnostics.one_step import discrete_system, membership_defect, structural_defect
 from dirax.diagnostics.report import Line, Report
-from dirax.diagnostics.verify import EPSILON, ROUNDINGS, verify
+from dirax.diagnostics.verify import verify
 from dirax.schemes.step import explicit_step
 
 MASSES = np.array([1.0, 1.0, 0.25, 0.5])

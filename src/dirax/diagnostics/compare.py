@@ -9,7 +9,7 @@ import numpy as np
 
 from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.drift import judge
-from dirax.diagnostics.verify import energy_less_work
+from dirax.diagnostics.energy_lines import energy_less_work
 from dirax.schemes.step import AbstractScheme
 from dirax.simulate import simulate
 from dirax.solution import Solution

@@ -1,0 +1,87 @@
+"""Lines of `dx.verify` on the energy and on the books of ports."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.diagnostics.books import balances, keeps_books
+from dirax.diagnostics.drift import judge
+from dirax.diagnostics.judging import EPSILON, ROUNDINGS, of_lane, sampled_terms, steps_of
+from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, Line
+from dirax.solution import Solution
+from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.port_hamiltonian import PortHamiltonian
+
+
+def energy_less_work(sol: Solution) -> tuple[np.ndarray, bool, str]:
+    """The energy less the work of the forces, (…, rows), whether there are forces, and why the system changes it all the
+    same ("" if it does not)."""
+    energy, system = np.asarray(sol.energy()), sol.system
+    forced = "work" in sol.fields and not keeps_books(sol)
+    if forced:
+        energy = energy - np.asarray(sol.fields["work"])
+    if isinstance(system, PortHamiltonian) and (system.R is not None or system.inputs is not None):
+        return energy, forced, "does not conserve it"
+    if isinstance(system, LagrangeDirac) and system.depends_on_time:
+        return energy, forced, "depends on time and does not conserve it"
+    if isinstance(system, LagrangeDirac) and system.affine is not None:
+        return energy, forced, "has constraints that do work (affine) and does not conserve it"
+    return energy, forced, ""
+
+
+def energy_line(sol: Solution) -> Line:
+    name = "energy"
+    try:
+        energy, forced, changes = energy_less_work(sol)
+    except ValueError as error:
+        return Line(name, None, None, NOT_CHECKED, str(error))
+    energy = energy.reshape(-1, energy.shape[-1])
+    roundoff = ROUNDINGS * EPSILON * steps_of(sol) * energy_scale(sol, energy)
+    if changes:
+        change = float(np.nanmax(np.abs(energy - energy[:, :1])))
+        return Line(name, change, None, NOT_CHECKED, f"the system {changes}; it changed by {change:.3g}")
+    t, found = np.asarray(sol.t), []
+    for lane, series in enumerate(energy):
+        good = np.isfinite(series)
+        found.append(judge(t[good], series[good], _motion(sol, lane)[good], roundoff))
+    order = (NOT_CHECKED, BOUNDED, DRIFTS)
+    lane = max(range(len(found)), key=lambda i: (order.index(found[i].verdict), abs(found[i].drift)))
+    worst = found[lane]
+    details: dict[str, Any] = {**worst.details, "roundoff": roundoff}
+    if sol.batch is not None:
+        details["per_trajectory"] = [f.drift for f in found]
+        details["verdicts"] = [f.verdict for f in found]
+    text = "less the work of the forces: " * forced + worst.text + of_lane(sol, lane)
+    others = sorted({f.verdict for f in found} - {worst.verdict})
+    text += "".join(f"; {details['verdicts'].count(other)} of {len(found)} {other}" for other in others)
+    return Line(name, abs(worst.drift), worst.told, worst.verdict, text, details)
+
+
+def port_lines(sol: Solution, tolerance: float | None) -> list[Line]:
+    """The balances of a system with ports."""
+    if sol.system is None or not isinstance(sol.system, PortHamiltonian | DiracSystem):
+        return []
+    energy = np.asarray(sol.energy())
+    return balances(sol, energy_scale(sol, energy), tolerance)
+
+
+def _motion(sol: Solution, lane: int) -> np.ndarray:
+    """All node fields of one trajectory side by side, (rows, d)."""
+    nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
+    rows = [a if sol.batch is None else a[lane] for a in nodes]
+    return np.concatenate([a.reshape(len(a), -1) for a in rows], axis=1)
+
+
+def energy_scale(sol: Solution, energy: np.ndarray) -> float:
+    """|E| + |∂E/∂row| |row|, the largest: what roundings of the rows do to the energy, in units of ε."""
+    scale = float(np.nanmax(np.abs(energy)))
+    return scale if sol.system is None else scale + float(np.nanmax(sampled_terms(sol, energy_terms)))
+
+
+def energy_terms(system: Any, t, row: dict, params: Any):
+    """Σ |∂E/∂row_i| |row_i|."""
+    gradient = jax.grad(lambda row: system.energy_at({**row, "t": t}, params))(row)
+    return sum(jnp.sum(jnp.abs(gradient[name] * row[name])) for name in row)

@@ -1,0 +1,78 @@
+"""Lines of `dx.verify` on the momentum maps of the symmetries that the user names."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.diagnostics.judging import judged, of_lane, roundoff_limit, steps_of
+from dirax.diagnostics.one_step import over_rows
+from dirax.diagnostics.report import NOT_CHECKED, Line
+from dirax.solution import Solution
+
+Symmetries = Mapping[str, Callable] | Sequence[int] | None
+"""{name: generator(q) -> (n,)}, or the numbers of cyclic coordinates."""
+
+
+def generators_of(sol: Solution, symmetries: Symmetries) -> dict[str, Callable]:
+    if symmetries is None:
+        return {}
+    if isinstance(symmetries, Mapping):
+        for name, generator in symmetries.items():
+            if not callable(generator):
+                raise TypeError(
+                    f"symmetries[{name!r}] must be a function generator(q) -> (n,), but a {type(generator).__name__} was given."
+                )
+            if "q" in sol.fields:
+                _check_generator(name, generator, np.shape(sol.q)[-1])
+        return {str(name): generator for name, generator in symmetries.items()}
+    if isinstance(symmetries, (str, bytes)) or not isinstance(symmetries, Sequence | np.ndarray):
+        raise TypeError(
+            "symmetries must be a dict {name: generator(q)} or a list of coordinate numbers, but a "
+            f"{type(symmetries).__name__} was given."
+        )
+    if "q" not in sol.fields:
+        raise ValueError(f"symmetries need a solution with q and p, but this one holds {', '.join(sol.fields)}.")
+    n, found = np.shape(sol.q)[-1], {}
+    for index in symmetries:
+        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
+            raise ValueError(f"symmetries must name coordinates by whole numbers from 0 to {n - 1}, but {index!r} was given.")
+        found[f"p[{int(index)}]"] = eqx.Partial(_translation, int(index))
+    return found
+
+
+def _translation(index: int, q):
+    return jnp.zeros_like(q).at[index].set(1.0)
+
+
+def _check_generator(name: str, generator: Callable, n: int) -> None:
+    try:
+        out = jax.eval_shape(generator, jax.ShapeDtypeStruct((n,), jnp.float64))
+    except Exception as error:
+        raise TypeError(
+            f"symmetries[{name!r}](q) could not be traced by JAX for q of shape ({n},): "
+            f"{type(error).__name__}: {str(error).splitlines()[0]}"
+        ) from error
+    if getattr(out, "shape", None) != (n,):
+        raise ValueError(f"symmetries[{name!r}](q) must return shape ({n},), but it returned {getattr(out, 'shape', out)}.")
+
+
+def momentum(sol: Solution, name: str, generator: Callable, tolerance: float | None) -> Line:
+    title = f"momentum map {name}"
+    if "p" not in sol.fields or "q" not in sol.fields:
+        return Line(title, None, None, NOT_CHECKED, "the solution has no q and p")
+    values = over_rows(eqx.Partial(_momentum_terms, generator), sol, (jnp.asarray(sol.q), jnp.asarray(sol.p)))
+    change = np.nanmax(np.abs(values[..., 0] - values[:, :1, 0]), axis=1)
+    scale = np.nanmax(values[..., 1], axis=1)
+    relative = np.divide(change, scale, out=np.zeros_like(change), where=scale > 0)
+    lane = int(np.argmax(relative))
+    text = f"⟨p, ξ⟩ = {values[lane, 0, 0]:.6g} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
+    return judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)
+
+
+def _momentum_terms(generator: Callable, q, p, params: Any):
+    terms = p * generator(q)
+    return jnp.stack([jnp.sum(terms), jnp.sum(jnp.abs(terms))])
