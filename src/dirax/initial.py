@@ -158,7 +158,7 @@ def refuse_bad_start(system: Any, start: Start, labels: tuple[str, ...], check_c
     _refuse_constraints_outside_their_domain(system, start)
     _refuse_outside_the_domain(start)
     if check_constraint:
-        _refuse_off_constraint(start)
+        _refuse_off_constraint(system, start)
     if start.jacobian is not None:
         _refuse_singular_step(start, labels)
 
@@ -190,7 +190,7 @@ def _refuse_constraints_outside_their_domain(system: Any, start: Start) -> None:
             )
 
 
-def _refuse_off_constraint(start: Start) -> None:
+def _refuse_off_constraint(system: Any, start: Start) -> None:
     defect = _lanes(start.defect, 1)
     if not defect.size:
         return
@@ -203,9 +203,10 @@ def _refuse_off_constraint(start: Start) -> None:
             if start.first_step
             else "pass project=True to project them, or check_initial=False to take them as they are"
         )
+        more = f" {system.explained(_lanes(start.state, 1)[lane])}." if hasattr(system, "explained") else ""
         raise ValueError(
             f"the initial data{_which(bad)} are off the constraint, whose residual is "
-            f"{np.array2string(defect[lane], precision=4)} (largest {worst[lane]:.3g}); {way}."
+            f"{np.array2string(defect[lane], precision=4)} (largest {worst[lane]:.3g}); {way}.{more}"
         )
 
 

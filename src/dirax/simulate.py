@@ -53,7 +53,7 @@ def simulate(
     `compensated` keeps what rounding takes from the state and gives it back at the next step (Kahan), so that conserved
     quantities do not drift over very long runs.
 
-    Under `jax.grad`, `jit` or `vmap` the run is one differentiable scan, and values are not checked.
+    Under `jax.grad`, `jit` or `vmap` the run is differentiable on both engines, and values are not checked.
 
     Constraints of a Lagrangian system that follow from others where the run begins are left out of its equations:
     `sol.stats["redundant_constraints"]` numbers them in the order of `sol.multipliers`, where theirs are zero, and their

@@ -51,6 +51,8 @@ def test_points_off_the_final_manifold_are_refused_with_level_and_projection(pen
         pendulum.check(np.array([0.6, -0.8, 0.3, 0.2]))
     with pytest.raises(ValueError, match=r"must have shape \(4,\)"):
         pendulum.check(np.zeros(3))
+    with pytest.raises(ValueError, match=r"project=True.*off M_1.*nearest point of M_f"):
+        dx.simulate(pendulum.resolved(), dx.DiscreteDirac(), x=[0.6, -0.8, 0.3, 0.2], step=0.01, steps=1)
 
 
 def test_method_2_on_a_chain_follows_the_pendulum_and_keeps_both_constraints(pendulum):

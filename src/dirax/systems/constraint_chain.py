@@ -105,17 +105,24 @@ class ConstraintChain:
             return
         if x.shape != (len(self.coordinates),):
             raise ValueError(f"x must have shape ({len(self.coordinates)},) = {self.coordinates}, but it has shape {x.shape}.")
+        if text := self.off(x, params):
+            raise ValueError(f"{text}: start from chain.project(x).")
+
+    def off(self, x: Float[Array, " N"], params: Any = None) -> str:
+        """The first level that x is off, the values of its constraints and the nearest point of M_f, in words; "" on M_f."""
+        params = self._with(params)
         for level in self.levels:
             value = np.asarray(level.constraints(x, params))
             slope = np.abs(_slope(level.constraints, x, params)).max(initial=0.0)
             if np.abs(value).max(initial=0.0) > OFF * slope * (1.0 + np.abs(np.asarray(x)).max()):
                 where = np.asarray(self.project(x, params))
-                raise ValueError(
+                return (
                     f"x is off M_{level.number}: its {level.count} new constraint{'s' * (level.count > 1)} there "
                     f"{'have the values' if level.count > 1 else 'has the value'} {np.array2string(value, precision=4)}. "
                     f"The nearest point of M_f is {np.array2string(where, precision=6)}, at distance "
-                    f"{np.linalg.norm(where - np.asarray(x)):.3g}: start from chain.project(x)."
+                    f"{np.linalg.norm(where - np.asarray(x)):.3g}"
                 )
+        return ""
 
     def resolved(self) -> "ResolvedSystem":
         """The system ẋ = field(x) on M_f, for Method 2: `dx.simulate(chain.resolved(), dx.DiscreteDirac(), x=…)`.
@@ -190,8 +197,12 @@ class ResolvedSystem(AbstractSystem):
         return {"x": x, "velocity": self.chain.field(x, params)}
 
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
-        """φ(x); `ConstraintChain.check` says more."""
+        """φ(x)."""
         return self.chain.constraints(data["x"], params)
+
+    def explained(self, state: Float[Array, " N"]) -> str:
+        """Which manifold of the chain a point is off, and the nearest point of M_f."""
+        return self.chain.off(state)
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """The energy of the system that the chain came from."""
