@@ -85,8 +85,7 @@ class UserFunction(eqx.Module):
             what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
             raise TypeError(f"{call} must return one array of real numbers (float64), but it returned {what}.")
         if _indexes(jaxpr.jaxpr) and not is_traced(values, jaxpr.consts):
-            checked = jax.jit(checkify.checkify(lambda *v: self(*v), errors=checkify.index_checks))
-            outside = checked(*values)[0].get()
+            outside = compiled(_Indexing(self), *values)[0].get()
             if outside:
                 raise ValueError(
                     f"{call} reads an entry that its arguments, of shapes {shapes}, do not have "
@@ -125,6 +124,21 @@ def _takes_time(function: Callable, count: int) -> bool:
         return False
     positional = [p for p in parameters if p.kind in POSITIONAL]
     return len(positional) > count and positional[0].name == "t"
+
+
+@eqx.filter_jit
+def compiled(function: Callable, *values: Any) -> Any:
+    """`function(*values)` by one compiled program instead of one an operation, kept for later calls with equal functions."""
+    return function(*values)
+
+
+class _Indexing(eqx.Module):
+    """A user's function with its indices checked: (error, result)."""
+
+    function: UserFunction
+
+    def __call__(self, *values: Any):
+        return checkify.checkify(lambda *v: self.function(*v), errors=checkify.index_checks)(*values)
 
 
 def _takes_params(function: Callable, name: str, expected: str, count: int) -> bool:

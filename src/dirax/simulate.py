@@ -269,7 +269,8 @@ def _arrays(params):
                 f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {leaf!r:.60}: "
                 "use such a value in the system's functions directly."
             )
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf if is_traced(leaf) else np.asarray(leaf)), params)
+    # device_put takes a number as it is, where jnp.asarray compiles a program
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf) if is_traced(leaf) else jax.device_put(np.asarray(leaf)), params)
 
 
 def _batch_size(batch: int | None, params, batch_params: bool) -> int | None:

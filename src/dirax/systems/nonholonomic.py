@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction, is_traced
+from dirax.functions import UserFunction, compiled, is_traced
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
@@ -63,7 +63,7 @@ class NonholonomicMechanics(AbstractSystem):
         if metric.shape != (n, n):
             raise ValueError(f"metric must return shape ({n}, {n}), but it returned shape {metric.shape}.")
         if not is_traced(q, params):
-            _check_metric(np.asarray(self.metric(q, params)))
+            _check_metric(np.asarray(compiled(self.metric, q, params)))
         if self.potential.shape(q, params).shape != ():
             raise ValueError(f"potential must return a scalar, but it returned shape {self.potential.shape(q, params).shape}.")
         return self.lagrange_dirac().sizes(data, params)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction, is_traced
+from dirax.functions import UserFunction, compiled, is_traced
 from dirax.systems.system import AbstractSystem, no_constraint
 
 SKEW_TOLERANCE = 1e-10
@@ -143,14 +143,13 @@ class PortHamiltonian(AbstractSystem):
         return size, len(closed)
 
     def _check_structure(self, x, params) -> None:
-        J = np.asarray(jax.jit(lambda x, params: self.J(x, params))(x, params))
+        J = np.asarray(compiled(self.J, x, params))
         skewness = np.max(np.abs(J + J.T), initial=0.0)
         if skewness > SKEW_TOLERANCE * max(np.max(np.abs(J), initial=0.0), 1e-300):
             raise ValueError(f"J is not skew at the initial point: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
         if self.R is None:
             return
-        dissipation = self.R
-        R = np.asarray(jax.jit(lambda x, params: dissipation(x, params))(x, params))
+        R = np.asarray(compiled(self.R, x, params))
         scale = max(np.max(np.abs(R), initial=0.0), 1e-300)
         if np.max(np.abs(R - R.T)) > SKEW_TOLERANCE * scale:
             raise ValueError(f"R is not symmetric at the initial point: max |R − Rᵀ| = {np.max(np.abs(R - R.T)):.3g}.")
