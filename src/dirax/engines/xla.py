@@ -19,6 +19,9 @@ CHUNK_BYTES = 32 * 2**20
 """Largest buffer of saved rows on the device; longer runs go through it several times."""
 
 CHUNK_ROWS = 4096
+UNPACKED_ROWS = 64
+"""Rows that are unpacked together."""
+
 FIRST_CHUNK = 64
 """Steps of the first chunk; those after it are as many as take CHUNK_SECONDS."""
 
@@ -87,7 +90,23 @@ def _chunk(
 
     rows = jnp.zeros((capacity + 1, *row.shape))
     _, lanes, rows = jax.lax.while_loop(going, body, (clock.start, lanes, rows))
-    return lanes, unpack_rows(equation, axes, rows[:capacity], params, clock)
+    return lanes, _unpack_written(equation, axes, rows[:capacity], params, clock, _next_row(clock.stop, clock.every) - first_row)
+
+
+def _unpack_written(equation, axes, packed, params, clock: Clock, count) -> dict:
+    """The named arrays of packed rows, of the first `count` of them: unpacking can cost as much as a step."""
+    capacity, block = len(packed), min(UNPACKED_ROWS, len(packed))
+    unpack = lambda rows: unpack_rows(equation, axes, rows, params, clock)
+    shapes = jax.eval_shape(unpack, packed[:block])
+    empty = jax.tree.map(lambda a: jnp.zeros((capacity, *a.shape[1:]), a.dtype), shapes)
+
+    def body(carry):
+        i, out = carry
+        first = jnp.minimum(i, capacity - block)
+        rows = unpack(jax.lax.dynamic_slice_in_dim(packed, first, block))
+        return i + block, jax.tree.map(lambda a, b: jax.lax.dynamic_update_slice_in_dim(a, b, first, 0), out, rows)
+
+    return jax.lax.while_loop(lambda carry: carry[0] < count, body, (jnp.zeros((), int), empty))[1]
 
 
 def run(problem: Problem, progress: Progress | None = None) -> Outcome:
