@@ -6,13 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.diagnostics.judging import roundoff_limit
 from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line
 from dirax.solution import Solution
 from dirax.systems.port_hamiltonian import PortHamiltonian
-
-EPSILON = float(np.finfo(float).eps)
-ROUNDINGS = 32
-"""Roundings that a balance may be off by, relative to the sum of the sizes of its terms."""
 
 PORTS = 2
 """Entries of `work` where it keeps books: energy supplied, energy dissipated."""
@@ -28,7 +25,7 @@ def balances(sol: Solution, energy_scale: float, tolerance: float | None) -> lis
 
     `energy_scale`: what one unit of roundoff of the rows is to H, in units of ε. A batch is judged by its worst trajectory.
     """
-    limit = ROUNDINGS * EPSILON if tolerance is None else float(tolerance)
+    limit = roundoff_limit(tolerance, 1)
     lines = []
     if "power" in sol.fields:
         lines.append(_step_balance(sol, energy_scale, limit))

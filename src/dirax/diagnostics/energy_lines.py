@@ -62,7 +62,8 @@ def energy_line(sol: Solution) -> Line:
 
 def port_lines(sol: Solution, tolerance: float | None) -> list[Line]:
     """The balances of a system with ports."""
-    if sol.system is None or not isinstance(sol.system, PortHamiltonian | DiracSystem):
+    balanced = "power" in sol.fields or keeps_books(sol)
+    if not balanced or not isinstance(sol.system, PortHamiltonian | DiracSystem):
         return []
     energy = np.asarray(sol.energy())
     return balances(sol, energy_scale(sol, energy), tolerance)

@@ -82,8 +82,7 @@ class DiscreteConstraintChain:
 
     def to_dict(self) -> dict[str, Any]:
         """The table as plain Python values."""
-        keys = ("number", "count", "dimension", "rank", "note")
-        rows = [{key: getattr(level, key) for key in keys} for level in self.levels]
+        rows = [level.to_dict() for level in self.levels]
         keys = ("step", "verdict", "explanation", "freedom", "dimension", "distance", "agrees", "comparison")
         return {"levels": rows, **{key: getattr(self, key) for key in keys}}
 

@@ -30,6 +30,10 @@ class ConstraintLevel:
     constraints: Callable = field(repr=False)
     note: str = ""
 
+    def to_dict(self) -> dict[str, Any]:
+        """The level without its functions, as plain Python values."""
+        return {key: getattr(self, key) for key in ("number", "count", "dimension", "rank", "note")}
+
 
 @dataclass(frozen=True, eq=False)
 class ConstraintChain:
@@ -144,8 +148,7 @@ class ConstraintChain:
 
     def to_dict(self) -> dict[str, Any]:
         """The table as plain Python values."""
-        keys = ("number", "count", "dimension", "rank", "note")
-        rows = [{key: getattr(level, key) for key in keys} for level in self.levels]
+        rows = [level.to_dict() for level in self.levels]
         keys = ("index", "verdict", "explanation", "freedom", "redundant", "dimension")
         return {"levels": rows, **{key: getattr(self, key) for key in keys}}
 
