@@ -22,19 +22,11 @@ from dirax.geometry.discrete import (
 )
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.geometry.linear import LinearDirac
-from dirax.geometry.manifolds import Circle, Euclidean, Product, Sphere, Torus
-from dirax.geometry.maps import (
-    LieGroupExp,
-    Midpoint,
-    ProductMap,
-    ProjectedMap,
-    RiemannianExp,
-    SphereProjection,
-    Submanifold,
-    Theta,
-    check_discretization_map,
-)
+from dirax.geometry.map_report import check_discretization_map
+from dirax.geometry.maps import LieGroupExp, Midpoint, ProductMap, RiemannianExp, SphereProjection, Theta
+from dirax.geometry.projected_map import ProjectedMap, Submanifold
 from dirax.geometry.semidirect import SemidirectProduct
+from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
 from dirax.geometry.subspaces import UndecidableRank
 from dirax.geometry.tulczyjew import (

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dirax.geometry.charts import Atlas, chart_at, check_chart
 from dirax.geometry.lie_groups import SE2, SO3
-from dirax.geometry.manifolds import Circle, Euclidean, Product, Sphere, Torus
+from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
 
 BATCH = 4
 MANIFOLDS = {

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
-from dirax.geometry.manifolds import Circle, Euclidean, Product, Sphere, Torus
 from dirax.geometry.numerics import arc_over_sine, newton_root, norm, radial
+from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
 
 BATCH = 6
 GROUPS = {"SO2": SO2(), "SE2": SE2(), "SO3": SO3(), "SE3": SE3()}

@@ -12,19 +12,18 @@ from hypothesis import strategies as st
 
 from dirax.geometry.cotangent_lift import CotangentBundle, CotangentLift, cotangent_lift, symplecticity_defect
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
-from dirax.geometry.manifolds import Euclidean, Product, Sphere, Torus
+from dirax.geometry.map_report import check_discretization_map
 from dirax.geometry.maps import (
     AbstractDiscretizationMap,
     LieGroupExp,
     Midpoint,
     ProductMap,
-    ProjectedMap,
     RiemannianExp,
     SphereProjection,
-    Submanifold,
     Theta,
-    check_discretization_map,
 )
+from dirax.geometry.projected_map import ProjectedMap, Submanifold
+from dirax.geometry.spaces import Euclidean, Product, Sphere, Torus
 
 
 def normalize(x):

@@ -6,8 +6,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dirax as dx
-from dirax.geometry.manifolds import Sphere
 from dirax.geometry.maps import Midpoint, RiemannianExp, SphereProjection, Theta
+from dirax.geometry.spaces import Sphere
 
 GAMMA = np.array([1.0, 1.0, -1.0, -1.0])
 FOUR_VORTICES = np.array([-1.0, 1.0, -1.0, 1.0, 2.0, 2.0, -2.0, -2.0])

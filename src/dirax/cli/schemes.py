@@ -22,7 +22,8 @@ SHORT_NAMES: dict[str, AbstractScheme] = {
 ROOMS = (
     "dirax.schemes.",
     "dirax.geometry.maps",
-    "dirax.geometry.manifolds",
+    "dirax.geometry.projected_map",
+    "dirax.geometry.spaces",
     "dirax.geometry.lie_groups",
     "dirax.geometry.cotangent",
 )

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
-from dirax.geometry.manifolds import Product, Sphere
 from dirax.geometry.maps import RiemannianExp
+from dirax.geometry.spaces import Product, Sphere
 from dirax.schemes.charted import InCharts
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 

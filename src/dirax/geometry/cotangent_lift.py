@@ -5,8 +5,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from dirax.geometry.manifolds import AbstractManifold, Euclidean, Vector
-from dirax.geometry.maps import AbstractDiscretizationMap, tangent_coordinates
+from dirax.geometry.manifolds import AbstractManifold, Vector
+from dirax.geometry.map_report import tangent_coordinates
+from dirax.geometry.maps import AbstractDiscretizationMap
+from dirax.geometry.spaces import Euclidean
 
 
 class CotangentBundle(AbstractManifold):

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from dirax.functions import is_traced
 from dirax.geometry.representations import (
     KernelPair,
     annihilator_pair,
@@ -26,20 +25,17 @@ from dirax.geometry.representations import (
     subspace_pair,
     two_form_pair,
 )
+from dirax.geometry.scattering import block_diagonal, eliminate, inverse_on_range, range_basis, rows, scattering_matrix
 from dirax.geometry.subspaces import (
     RANK_TOLERANCE,
     STRUCTURE_TOLERANCE,
     AnyArray,
     PontryaginSubspace,
-    UndecidableRank,
     as_matrix,
-    decide_rank,
     known,
     matrix_transpose,
     namespace,
     pairing_defect,
-    pseudo_inverse,
-    uniform_rank,
 )
 
 TRANSVERSALITY_TOLERANCE = 1e-12
@@ -162,7 +158,7 @@ class LinearDirac(eqx.Module):
         Raises `UndecidableRank` where k is unclear, ValueError where it varies over the batch; with `rank` given it is
         not asked for, as is necessary under tracing.
         """
-        return _range_basis(_image(self)[0], "the projection of D on V", rank, tolerance)
+        return range_basis(_image(self)[0], "the projection of D on V", rank, tolerance)
 
     def two_form(self, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n n"]:
         """ω_D, the two-form on F_D given by ω_D(u, v) = α(v) for (u, α) ∈ D ([BLM] Proposition 2.3).
@@ -171,7 +167,7 @@ class LinearDirac(eqx.Module):
         determine D. Raises `UndecidableRank` where the dimension of F_D is unclear.
         """
         A, B = _image(self)
-        flat = B @ _inverse_on_range(A, "the projection of D on V", tolerance)
+        flat = B @ inverse_on_range(A, "the projection of D on V", tolerance)
         return jnp.asarray((matrix_transpose(flat) - flat) / 2)
 
     def codistribution(self, rank: int | None = None, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n k"]:
@@ -179,7 +175,7 @@ class LinearDirac(eqx.Module):
 
         Raises as `distribution` does.
         """
-        return _range_basis(_image(self)[1], "the projection of D on V*", rank, tolerance)
+        return range_basis(_image(self)[1], "the projection of D on V*", rank, tolerance)
 
     def bivector(self, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n n"]:
         """Λ_D on F*_D, given by Λ_D(β, α) = β(v) for (v, α) ∈ D ([BLM] Theorem 2.5).
@@ -188,7 +184,7 @@ class LinearDirac(eqx.Module):
         Raises `UndecidableRank` where the dimension of F*_D is unclear.
         """
         A, B = _image(self)
-        sharp = A @ _inverse_on_range(B, "the projection of D on V*", tolerance)
+        sharp = A @ inverse_on_range(B, "the projection of D on V*", tolerance)
         return jnp.asarray((sharp - matrix_transpose(sharp)) / 2)
 
     # Tests
@@ -249,9 +245,9 @@ class LinearDirac(eqx.Module):
         F, E = _kernel(self)
         # F φ w + E β = 0 and α − φᵀβ = 0, β internal.
         width = phi.shape[-1]
-        vectors = _rows(F @ phi, np.zeros((width, width)))
-        covectors = _rows(np.zeros((self.n, width)), np.eye(width))
-        return _eliminate(vectors, covectors, _rows(E, -matrix_transpose(phi)), "the pull-back", tolerance)
+        vectors = rows(F @ phi, np.zeros((width, width)))
+        covectors = rows(np.zeros((self.n, width)), np.eye(width))
+        return LinearDirac(eliminate(vectors, covectors, rows(E, -matrix_transpose(phi)), "the pull-back", tolerance))
 
     def push_forward(self, linear_map: ArrayLike, tolerance: float = TRANSVERSALITY_TOLERANCE) -> "LinearDirac":
         """φ_*D = {(φ v, β) : (v, φᵀβ) ∈ D} on W, for φ: V → W given as a matrix (..., dim W, n), of any rank.
@@ -262,9 +258,9 @@ class LinearDirac(eqx.Module):
         F, E = _kernel(self)
         # F v + E φᵀβ = 0 and w − φ v = 0, v internal.
         height = phi.shape[-2]
-        vectors = _rows(np.zeros((self.n, height)), np.eye(height))
-        covectors = _rows(E @ matrix_transpose(phi), np.zeros((height, height)))
-        return _eliminate(vectors, covectors, _rows(F, -phi), "the push-forward", tolerance)
+        vectors = rows(np.zeros((self.n, height)), np.eye(height))
+        covectors = rows(E @ matrix_transpose(phi), np.zeros((height, height)))
+        return LinearDirac(eliminate(vectors, covectors, rows(F, -phi), "the push-forward", tolerance))
 
     def compose(
         self,
@@ -295,7 +291,7 @@ class LinearDirac(eqx.Module):
         vectors = F[..., first] + sign * F[..., second]
         covectors = E[..., first] - sign * E[..., second]
         internal = namespace(F).concatenate([vectors, covectors], axis=-1)
-        return _eliminate(F[..., kept], E[..., kept], internal, "the composition", tolerance)
+        return LinearDirac(eliminate(F[..., kept], E[..., kept], internal, "the composition", tolerance))
 
     def _map_matrix(self, linear_map: ArrayLike, axis: int) -> Float[AnyArray, "*batch i j"]:
         matrix = as_matrix("linear_map", linear_map)
@@ -303,22 +299,6 @@ class LinearDirac(eqx.Module):
             expected = f"(..., {self.n}, dim W)" if axis == -2 else f"(..., dim W, {self.n})"
             raise ValueError(f"linear_map has shape {matrix.shape}; {expected} was expected.")
         return matrix
-
-
-def block_diagonal(first: Float[AnyArray, "*batch i j"], second: Float[AnyArray, "*batch k l"]) -> Float[AnyArray, "*batch m n"]:
-    """[[first, 0], [0, second]] over broadcast leading axes."""
-    upper = np.zeros((*first.shape[:-1], second.shape[-1]))
-    lower = np.zeros((*second.shape[:-1], first.shape[-1]))
-    xp = namespace(first, second)
-    return _rows(xp.concatenate([first, upper], axis=-1), xp.concatenate([lower, second], axis=-1))
-
-
-def scattering_matrix(pair: KernelPair) -> Float[AnyArray, "*batch n n"]:
-    """The orthogonal matrix O of D = {F v + E α = 0}, smooth in the pair."""
-    # With v = (s + d)/2 and α = (s − d)/2 this reads (F + E) s = (E − F) d; on a Dirac structure F + E has the singular
-    # values of [F E], so it is as well conditioned as the pair itself.
-    F, E = pair
-    return _nearest_orthogonal(namespace(F, E).linalg.solve(F + E, E - F))
 
 
 def _kernel(structure: LinearDirac) -> KernelPair:
@@ -329,78 +309,6 @@ def _kernel(structure: LinearDirac) -> KernelPair:
 def _image(structure: LinearDirac) -> tuple[Float[AnyArray, "*batch n n"], Float[AnyArray, "*batch n n"]]:
     O, identity = known(structure.scattering), np.eye(structure.n)
     return (O + identity) / 2, (O - identity) / 2
-
-
-def _nearest_orthogonal(matrix: Float[AnyArray, "*batch n n"]) -> Float[AnyArray, "*batch n n"]:
-    # Two Newton–Schulz steps for the polar factor: a defect of roundoff size, magnified by an ill-conditioned solve, is
-    # removed (ε → ε⁴), and a matrix far from orthogonal stays so and can be told by is_dirac().
-    for _ in range(2):
-        matrix = 1.5 * matrix - 0.5 * matrix @ (matrix_transpose(matrix) @ matrix)
-    return matrix
-
-
-def _eliminate(
-    F: Float[AnyArray, "*batch m n"],
-    E: Float[AnyArray, "*batch m n"],
-    internal: Float[AnyArray, "*batch m l"],
-    what: str,
-    tolerance: float,
-) -> LinearDirac:
-    """The Dirac structure {(v, α) : F v + E α + G z = 0 for some z}, from m = n + l equations with G = `internal`.
-
-    With v = (s + d)/2 and α = (s − d)/2 the unknowns are the wave s and z. The wave is unique for every d even where z
-    is not: d = 0 makes v = α, and no power through the internal ports makes ⟨α, v⟩ = 0. So a least-squares solution of
-    low rank gives the case that is not transversal as well. Roundoff is divided by its smallest nonzero singular value.
-    """
-    xp, n = namespace(F, E, internal), F.shape[-1]
-    batch = np.broadcast_shapes(F.shape[:-2], E.shape[:-2], internal.shape[:-2])
-    blocks = [xp.broadcast_to(block, (*batch, *block.shape[-2:])) for block in (F + E, internal)]
-    matrix = xp.concatenate(blocks, axis=-1)
-    if not is_traced(matrix):
-        _require_decided(matrix, blocks[1], what, tolerance)
-    scattering = (pseudo_inverse(matrix, tolerance) @ (E - F))[..., :n, :]
-    return LinearDirac(_nearest_orthogonal(scattering))
-
-
-def _require_decided(matrix: np.ndarray, internal: np.ndarray, what: str, tolerance: float) -> None:
-    """Raise where the elimination is closer to a degenerate one than roundoff lets us see.
-
-    The kernel of G and that of the whole matrix are the same space of (0, z) ∈ D. Next to a degenerate case the singular
-    values of G measure the angle, those of the matrix possibly its square, so they may disagree.
-    """
-    values = np.linalg.svd(matrix, compute_uv=False)
-    scale = values.max(axis=-1, keepdims=True, initial=0.0)
-    values, angles = values / scale, np.linalg.svd(internal, compute_uv=False) / scale
-    nullity = values.shape[-1] - decide_rank(values, what, tolerance, scale=1.0)
-    hidden = nullity != angles.shape[-1] - decide_rank(angles, what, tolerance, scale=1.0)
-    if np.any(hidden):
-        raise UndecidableRank(
-            f"The rank of {what} is undecidable: a relative singular value of {values[hidden].min():.1e} counts as zero at "
-            f"the tolerance {tolerance:.0e}, but comes from an angle of {angles[hidden].min():.1e}, which does not."
-        )
-
-
-def _rows(upper: Float[AnyArray, "*batch i k"], lower: Float[AnyArray, "*batch j k"]) -> Float[AnyArray, "*batch m k"]:
-    xp = namespace(upper, lower)
-    batch = np.broadcast_shapes(upper.shape[:-2], lower.shape[:-2])
-    return xp.concatenate([xp.broadcast_to(part, (*batch, *part.shape[-2:])) for part in (upper, lower)], axis=-2)
-
-
-def _range_basis(
-    matrix: Float[AnyArray, "*batch n n"], what: str, rank: int | None, tolerance: float
-) -> Float[Array, "*batch n k"]:
-    left, values, _ = namespace(matrix).linalg.svd(matrix)
-    if rank is None:
-        if is_traced(matrix):
-            raise ValueError(f"The dimension of {what} must be given as `rank` under jit, vmap or grad.")
-        rank = uniform_rank(decide_rank(values, what, tolerance, scale=1.0), what)
-    return jnp.asarray(left[..., :rank])
-
-
-def _inverse_on_range(matrix: Float[AnyArray, "*batch n n"], what: str, tolerance: float) -> Float[AnyArray, "*batch n n"]:
-    if not is_traced(matrix):
-        decide_rank(np.linalg.svd(matrix, compute_uv=False), what, tolerance, scale=1.0)
-    return pseudo_inverse(matrix, tolerance, 1.0)
 
 
 def _port_list(name: str, ports: Sequence[int], n: int) -> list[int]:

@@ -5,7 +5,6 @@
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -15,8 +14,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from dirax.functions import is_traced
 from dirax.geometry.lie_groups import AbstractLieGroup
-from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold, Euclidean, Product, Sphere, Vector
-from dirax.geometry.numerics import Scalar, newton_root, norm
+from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold, Vector
+from dirax.geometry.numerics import Scalar, norm
+from dirax.geometry.spaces import Euclidean, Product, Sphere
 
 Pair = tuple[Vector, Vector]
 
@@ -228,147 +228,6 @@ class ProductMap(AbstractDiscretizationMap):
     def _joined(self, method: str, a: Vector, b: Vector) -> Pair:
         firsts, seconds = zip(*(getattr(map, method)(*block) for map, *block in self._blocks(a, b)), strict=True)
         return jnp.concatenate(firsts), jnp.concatenate(seconds)
-
-
-class Submanifold(AbstractManifold):
-    """The image M0 of a smooth projector P: R^N → R^N, P ∘ P = P, defined near M0; `projector(x)` (N,) → (N,).
-
-    P may be oblique: `projection` is the orthogonal one to the tangent space, which is the image of DP. Without
-    `dimension` it is the trace of DP, taken at P of some point of R^N; raises `ValueError` if that is no whole number.
-    """
-
-    projector: Callable = eqx.field(static=True)
-    ambient_dimension: int = eqx.field(static=True)
-    dimension: int = eqx.field(static=True)
-
-    def __init__(self, projector: Callable, ambient_dimension: int, dimension: int | None = None):
-        self.projector, self.ambient_dimension = projector, ambient_dimension
-        self.dimension = self._dimension() if dimension is None else dimension
-
-    def _dimension(self) -> int:
-        with jax.ensure_compile_time_eval():
-            x = self.projector(jnp.cos(1.0 + jnp.arange(self.ambient_dimension, dtype=float)))
-            trace = float(jnp.trace(jax.jacfwd(self.projector)(x)))
-        if not abs(trace - round(trace)) < 1e-6:
-            raise ValueError(
-                f"The projector's derivative has trace {trace:.6g} at a point of its image, where a projector has a "
-                "whole number: P(P(x)) = P(x) must hold, and P be defined at that point; otherwise give dimension=."
-            )
-        return round(trace)
-
-    def defect(self, x):
-        return norm(self.projector(x) - x)
-
-    def nearest(self, x):
-        return self.projector(x)
-
-    def projection(self, x, v):
-        # A the projection DP(x), oblique: the orthogonal projection with the same image is A (A + Aᵀ − 1)⁻¹.
-        oblique = jax.jacfwd(self.projector)(x)
-        return oblique @ jnp.linalg.solve(oblique + oblique.T - jnp.eye(self.ambient_dimension), v)
-
-    def representative(self, x, near):
-        return x
-
-    def local_parametrization(self, x):
-        basis = self.frame(x)
-        return lambda r: self.projector(x + basis @ r)
-
-    def frame(self, x):
-        # A choice of coordinates, held fixed under differentiation: singular vectors have no derivative here.
-        oblique = jax.jacfwd(self.projector)(jax.lax.stop_gradient(x))
-        return jax.lax.stop_gradient(jnp.linalg.svd(oblique)[0][:, : self.dimension])
-
-    def coordinates(self, x, v):
-        return self.frame(x).T @ v
-
-
-class ProjectedMap(AbstractDiscretizationMap):
-    """(P × P) ∘ R_d on the image M0 of a projector P, from a map R_d on the space around it ([BLM] Proposition 7.3).
-
-    `projector(x)` takes and returns (N,), with P(P(x)) = P(x). The inverse is found by Newton's method, and is
-    differentiable; where Newton does not converge it is NaN, and an error for concrete points. `dimension` of M0 is
-    found from P if not given.
-    """
-
-    map: AbstractDiscretizationMap
-    projector: Callable = eqx.field(static=True)
-    dimension: int | None = eqx.field(static=True, default=None)
-
-    def manifold(self, ambient_dimension):
-        return Submanifold(self.projector, ambient_dimension, self.dimension)
-
-    def forward(self, x, v):
-        x0, x1 = self.map.forward(x, v)
-        return self.projector(x0), self.projector(x1)
-
-    def backward(self, x0, x1):
-        n = x0.shape[0]
-
-        def tangent(z):
-            """(y, w) ∈ R^2N to a tangent vector of M0."""
-            x = self.projector(z[:n])
-            return x, jax.jvp(self.projector, (x,), (z[n:],))[1]
-
-        def residual(z):
-            # 2N equations: the two points, and in the directions normal to M0 that y and w are on it and tangent.
-            x, v = tangent(z)
-            y0, y1 = self.forward(x, v)
-            return jnp.concatenate([y0 - x0 + z[:n] - x, y1 - x1 + z[n:] - v])
-
-        return tangent(newton_root(residual, jnp.concatenate(self.map.backward(x0, x1))))
-
-    def reach(self, x, v):
-        return self.map.reach(x, v)
-
-
-class DiscretizationMapReport(eqx.Module):
-    """What `check_discretization_map` found; all numbers are 0 for an exact map but the condition number."""
-
-    point_defect: Float[Array, ""]
-    """(D1): largest component of R_d(x, 0) − (x, x)."""
-    derivative_defect: Float[Array, ""]
-    """(D2): largest component of (D_v R_d² − D_v R_d¹)(x, 0)·e − e, over the frame vectors e of the tangent space."""
-    inverse_defect: Float[Array, ""]
-    """Largest component of R_d⁻¹(R_d(x, v)) − (x, v)."""
-    condition_number: Float[Array, ""]
-    """Condition number of D R_d(x, v) in the manifold's frames: the map is invertible near (x, v) if it is finite."""
-
-
-def check_discretization_map(map: AbstractDiscretizationMap, x: ArrayLike, v: ArrayLike) -> DiscretizationMapReport:
-    """How far (D1), (D2) and invertibility ([BLM] Definition 4.5, Proposition 4.6) fail at the tangent vector v at x."""
-    x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
-    manifold = map.manifold(x.shape[0])
-    d = manifold.dimension
-
-    def with_derivative(v):
-        """The two points at (x, v), and their derivatives (N, 2d) in coordinates of TM."""
-        tangent, here = tangent_coordinates(manifold, x, v)
-        push = lambda direction: jax.jvp(lambda z: map.forward(*tangent(z)), (here,), (direction,))
-        return jax.vmap(push, out_axes=(None, -1))(jnp.eye(2 * d))
-
-    (starts, ends), (start_derivatives, end_derivatives) = jax.vmap(with_derivative)(jnp.stack([jnp.zeros_like(v), v]))
-    difference_in_v = (end_derivatives - start_derivatives)[0, :, d:]
-    components = jax.vmap(jax.vmap(manifold.coordinates, (None, 1), 1))
-    jacobian = components(jnp.stack([starts[1], ends[1]]), jnp.stack([start_derivatives[1], end_derivatives[1]]))
-    found, velocity = map.backward(starts[1], ends[1])
-    return DiscretizationMapReport(
-        point_defect=_largest(starts[0] - x, ends[0] - x),
-        derivative_defect=_largest(difference_in_v - manifold.frame(x)),
-        inverse_defect=_largest(found - x, velocity - v),
-        condition_number=jnp.linalg.cond(jacobian.reshape(2 * d, 2 * d)),
-    )
-
-
-def tangent_coordinates(manifold: AbstractManifold, x: Vector, v: Vector) -> tuple[Callable, Float[Array, " 2d"]]:
-    """Coordinates (r, ṙ) of TM near the tangent vector v at x: the map to (point, vector), and its argument at (x, v)."""
-    point = manifold.local_parametrization(x)
-    here = jnp.concatenate([jnp.zeros(manifold.dimension), manifold.coordinates(x, v)])
-    return lambda z: jax.jvp(point, (z[: manifold.dimension],), (z[manifold.dimension :],)), here
-
-
-def _largest(*arrays: Array) -> Float[Array, ""]:
-    return jnp.max(jnp.stack([jnp.max(jnp.abs(array)) for array in arrays]))
 
 
 def _times(theta: float) -> Float[Array, " 2"]:

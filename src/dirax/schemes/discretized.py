@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from dirax.geometry.cotangent_lift import CotangentLift
-from dirax.geometry.manifolds import Euclidean
 from dirax.geometry.maps import AbstractDiscretizationMap, Theta
+from dirax.geometry.spaces import Euclidean
 
 
 class Stepping(NamedTuple):

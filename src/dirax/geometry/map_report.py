@@ -1,0 +1,60 @@
+"""Whether a map is a discretization map at a point ([BLM] Definition 4.5), and coordinates of TM."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from dirax.geometry.manifolds import AbstractManifold, Vector
+from dirax.geometry.maps import AbstractDiscretizationMap
+
+
+class DiscretizationMapReport(eqx.Module):
+    """What `check_discretization_map` found; all numbers are 0 for an exact map but the condition number."""
+
+    point_defect: Float[Array, ""]
+    """(D1): largest component of R_d(x, 0) − (x, x)."""
+    derivative_defect: Float[Array, ""]
+    """(D2): largest component of (D_v R_d² − D_v R_d¹)(x, 0)·e − e, over the frame vectors e of the tangent space."""
+    inverse_defect: Float[Array, ""]
+    """Largest component of R_d⁻¹(R_d(x, v)) − (x, v)."""
+    condition_number: Float[Array, ""]
+    """Condition number of D R_d(x, v) in the manifold's frames: the map is invertible near (x, v) if it is finite."""
+
+
+def check_discretization_map(map: AbstractDiscretizationMap, x: ArrayLike, v: ArrayLike) -> DiscretizationMapReport:
+    """How far (D1), (D2) and invertibility ([BLM] Definition 4.5, Proposition 4.6) fail at the tangent vector v at x."""
+    x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
+    manifold = map.manifold(x.shape[0])
+    d = manifold.dimension
+
+    def with_derivative(v):
+        """The two points at (x, v), and their derivatives (N, 2d) in coordinates of TM."""
+        tangent, here = tangent_coordinates(manifold, x, v)
+        push = lambda direction: jax.jvp(lambda z: map.forward(*tangent(z)), (here,), (direction,))
+        return jax.vmap(push, out_axes=(None, -1))(jnp.eye(2 * d))
+
+    (starts, ends), (start_derivatives, end_derivatives) = jax.vmap(with_derivative)(jnp.stack([jnp.zeros_like(v), v]))
+    difference_in_v = (end_derivatives - start_derivatives)[0, :, d:]
+    components = jax.vmap(jax.vmap(manifold.coordinates, (None, 1), 1))
+    jacobian = components(jnp.stack([starts[1], ends[1]]), jnp.stack([start_derivatives[1], end_derivatives[1]]))
+    found, velocity = map.backward(starts[1], ends[1])
+    return DiscretizationMapReport(
+        point_defect=_largest(starts[0] - x, ends[0] - x),
+        derivative_defect=_largest(difference_in_v - manifold.frame(x)),
+        inverse_defect=_largest(found - x, velocity - v),
+        condition_number=jnp.linalg.cond(jacobian.reshape(2 * d, 2 * d)),
+    )
+
+
+def tangent_coordinates(manifold: AbstractManifold, x: Vector, v: Vector) -> tuple[Callable, Float[Array, " 2d"]]:
+    """Coordinates (r, ṙ) of TM near the tangent vector v at x: the map to (point, vector), and its argument at (x, v)."""
+    point = manifold.local_parametrization(x)
+    here = jnp.concatenate([jnp.zeros(manifold.dimension), manifold.coordinates(x, v)])
+    return lambda z: jax.jvp(point, (z[: manifold.dimension],), (z[manifold.dimension :],)), here
+
+
+def _largest(*arrays: Array) -> Float[Array, ""]:
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(array)) for array in arrays]))

@@ -1,0 +1,103 @@
+"""The image of a projector as a manifold, and discretization maps projected to it ([BLM] Proposition 7.3)."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from dirax.geometry.manifolds import AbstractManifold
+from dirax.geometry.maps import AbstractDiscretizationMap
+from dirax.geometry.numerics import newton_root, norm
+
+
+class Submanifold(AbstractManifold):
+    """The image M0 of a smooth projector P: R^N → R^N, P ∘ P = P, defined near M0; `projector(x)` (N,) → (N,).
+
+    P may be oblique: `projection` is the orthogonal one to the tangent space, which is the image of DP. Without
+    `dimension` it is the trace of DP, taken at P of some point of R^N; raises `ValueError` if that is no whole number.
+    """
+
+    projector: Callable = eqx.field(static=True)
+    ambient_dimension: int = eqx.field(static=True)
+    dimension: int = eqx.field(static=True)
+
+    def __init__(self, projector: Callable, ambient_dimension: int, dimension: int | None = None):
+        self.projector, self.ambient_dimension = projector, ambient_dimension
+        self.dimension = self._dimension() if dimension is None else dimension
+
+    def _dimension(self) -> int:
+        with jax.ensure_compile_time_eval():
+            x = self.projector(jnp.cos(1.0 + jnp.arange(self.ambient_dimension, dtype=float)))
+            trace = float(jnp.trace(jax.jacfwd(self.projector)(x)))
+        if not abs(trace - round(trace)) < 1e-6:
+            raise ValueError(
+                f"The projector's derivative has trace {trace:.6g} at a point of its image, where a projector has a "
+                "whole number: P(P(x)) = P(x) must hold, and P be defined at that point; otherwise give dimension=."
+            )
+        return round(trace)
+
+    def defect(self, x):
+        return norm(self.projector(x) - x)
+
+    def nearest(self, x):
+        return self.projector(x)
+
+    def projection(self, x, v):
+        # A the projection DP(x), oblique: the orthogonal projection with the same image is A (A + Aᵀ − 1)⁻¹.
+        oblique = jax.jacfwd(self.projector)(x)
+        return oblique @ jnp.linalg.solve(oblique + oblique.T - jnp.eye(self.ambient_dimension), v)
+
+    def representative(self, x, near):
+        return x
+
+    def local_parametrization(self, x):
+        basis = self.frame(x)
+        return lambda r: self.projector(x + basis @ r)
+
+    def frame(self, x):
+        # A choice of coordinates, held fixed under differentiation: singular vectors have no derivative here.
+        oblique = jax.jacfwd(self.projector)(jax.lax.stop_gradient(x))
+        return jax.lax.stop_gradient(jnp.linalg.svd(oblique)[0][:, : self.dimension])
+
+    def coordinates(self, x, v):
+        return self.frame(x).T @ v
+
+
+class ProjectedMap(AbstractDiscretizationMap):
+    """(P × P) ∘ R_d on the image M0 of a projector P, from a map R_d on the space around it ([BLM] Proposition 7.3).
+
+    `projector(x)` takes and returns (N,), with P(P(x)) = P(x). The inverse is found by Newton's method, and is
+    differentiable; where Newton does not converge it is NaN, and an error for concrete points. `dimension` of M0 is
+    found from P if not given.
+    """
+
+    map: AbstractDiscretizationMap
+    projector: Callable = eqx.field(static=True)
+    dimension: int | None = eqx.field(static=True, default=None)
+
+    def manifold(self, ambient_dimension):
+        return Submanifold(self.projector, ambient_dimension, self.dimension)
+
+    def forward(self, x, v):
+        x0, x1 = self.map.forward(x, v)
+        return self.projector(x0), self.projector(x1)
+
+    def backward(self, x0, x1):
+        n = x0.shape[0]
+
+        def tangent(z):
+            """(y, w) ∈ R^2N to a tangent vector of M0."""
+            x = self.projector(z[:n])
+            return x, jax.jvp(self.projector, (x,), (z[n:],))[1]
+
+        def residual(z):
+            # 2N equations: the two points, and in the directions normal to M0 that y and w are on it and tangent.
+            x, v = tangent(z)
+            y0, y1 = self.forward(x, v)
+            return jnp.concatenate([y0 - x0 + z[:n] - x, y1 - x1 + z[n:] - v])
+
+        return tangent(newton_root(residual, jnp.concatenate(self.map.backward(x0, x1))))
+
+    def reach(self, x, v):
+        return self.map.reach(x, v)

@@ -1,0 +1,278 @@
+"""Vector spaces, tori, spheres and products as manifolds."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
+from dirax.geometry.numerics import TINY, arc_over_sine, norm, radial
+
+
+class Euclidean(AbstractGeodesicManifold):
+    """The vector space R^n."""
+
+    dimension: int = eqx.field(static=True)
+    ambient_dimension: int = eqx.field(static=True)
+
+    def __init__(self, dimension: int):
+        self.dimension = self.ambient_dimension = dimension
+
+    def defect(self, x):
+        return jnp.zeros(())
+
+    def nearest(self, x):
+        return x
+
+    def projection(self, x, v):
+        return v
+
+    def representative(self, x, near):
+        return x
+
+    def local_parametrization(self, x):
+        return lambda r: x + r
+
+    def frame(self, x):
+        return jnp.eye(self.dimension)
+
+    def coordinates(self, x, v):
+        return v
+
+    def exp(self, x, v):
+        return x + v
+
+    def log(self, x, y):
+        return y - x
+
+    def distance(self, x, y):
+        return norm(y - x)
+
+    def transport(self, x, v, y):
+        return v
+
+    def retraction(self, x, v):
+        return x + v
+
+    def inverse_retraction(self, x, y):
+        return y - x
+
+    def exp_reach(self, x, v):
+        return jnp.zeros(())
+
+    def retraction_reach(self, x, v):
+        return jnp.zeros(())
+
+
+class Torus(AbstractGeodesicManifold):
+    """The torus T^n, a point being n angles in radians, any real numbers, equal modulo 2π; `log` is in [−π, π]."""
+
+    dimension: int = eqx.field(static=True)
+    ambient_dimension: int = eqx.field(static=True)
+
+    def __init__(self, dimension: int):
+        self.dimension = self.ambient_dimension = dimension
+
+    def defect(self, x):
+        return jnp.zeros(())
+
+    def nearest(self, x):
+        return x
+
+    def projection(self, x, v):
+        return v
+
+    def representative(self, x, near):
+        return near + self.log(near, x)
+
+    def local_parametrization(self, x):
+        return lambda r: x + r
+
+    def frame(self, x):
+        return jnp.eye(self.dimension)
+
+    def coordinates(self, x, v):
+        return v
+
+    def exp(self, x, v):
+        return x + v
+
+    def log(self, x, y):
+        turns = jnp.round((y - x) / (2.0 * jnp.pi))
+        return (y - x) - 2.0 * jnp.pi * turns
+
+    def distance(self, x, y):
+        return norm(self.log(x, y))
+
+    def transport(self, x, v, y):
+        return v
+
+    def retraction(self, x, v):
+        return x + v
+
+    def inverse_retraction(self, x, y):
+        return self.log(x, y)
+
+    def exp_reach(self, x, v):
+        return jnp.max(jnp.abs(v)) / jnp.pi
+
+    def retraction_reach(self, x, v):
+        return jnp.max(jnp.abs(v)) / jnp.pi
+
+
+def Circle() -> Torus:
+    """The circle, a point being one angle in radians: `Torus(1)`."""
+    return Torus(1)
+
+
+class Sphere(AbstractGeodesicManifold):
+    """The unit sphere S^{n−1} of R^n, n ≥ 2, in ambient coordinates, with the round metric.
+
+    The retraction is (x + v)/‖x + v‖, and its inverse y/⟨x, y⟩ − x is defined on the open hemisphere around x.
+    Raises `ValueError` for n < 2.
+    """
+
+    dimension: int = eqx.field(static=True)
+    ambient_dimension: int = eqx.field(static=True)
+
+    def __init__(self, n: int):
+        if n < 2:
+            raise ValueError(f"Sphere(n) is the unit sphere of R^n with n ≥ 2, but n = {n} came.")
+        self.dimension, self.ambient_dimension = n - 1, n
+
+    def defect(self, x):
+        return jnp.abs(norm(x) - 1.0)
+
+    def nearest(self, x):
+        return x / norm(x)
+
+    def projection(self, x, v):
+        return v - x * jnp.dot(x, v)
+
+    def representative(self, x, near):
+        return x
+
+    def local_parametrization(self, x):
+        # The frame is only a choice of coordinates, so it is held fixed under differentiation in x.
+        frame = jax.lax.stop_gradient(orthonormal_complement(x))
+        return lambda r: self.nearest(x + frame @ r)
+
+    def frame(self, x):
+        return orthonormal_complement(x)
+
+    def coordinates(self, x, v):
+        return orthonormal_complement(x).T @ v
+
+    def exp(self, x, v):
+        s = jnp.dot(v, v)
+        return radial(0, s) * x + radial(1, s) * v
+
+    def log(self, x, y):
+        difference, sum_ = y - x, y + x
+        near, far = jnp.dot(difference, difference) / 4.0, jnp.dot(sum_, sum_) / 4.0
+        # Both differences have the same tangential part; the short one has it without cancellation.
+        direction = arc_over_sine(0, near, far) * self.projection(x, jnp.where(near < far, difference, sum_))
+        return jnp.where(far < TINY, jnp.pi * orthonormal_complement(x)[:, 0], direction)
+
+    def distance(self, x, y):
+        return 2.0 * jnp.arctan2(norm(y - x), norm(y + x))
+
+    def transport(self, x, v, y):
+        along = 1.0 + jnp.dot(x, y)
+        return v - jnp.dot(y, v) / jnp.where(along < TINY, 1.0, along) * (x + y)
+
+    def retraction(self, x, v):
+        return self.nearest(x + v)
+
+    def inverse_retraction(self, x, y):
+        return y / jnp.dot(x, y) - x
+
+    def exp_reach(self, x, v):
+        return norm(v) / jnp.pi
+
+    def retraction_reach(self, x, v):
+        return jnp.arctan(norm(v)) * (2.0 / jnp.pi)
+
+
+class Product(AbstractGeodesicManifold):
+    """The product M1 × M2 × …, its ambient coordinates, vectors and metric joined in this order.
+
+    Raises `TypeError` for a factor that is not a geodesic manifold.
+    """
+
+    factors: tuple[AbstractGeodesicManifold, ...]
+    dimension: int = eqx.field(static=True)
+    ambient_dimension: int = eqx.field(static=True)
+
+    def __init__(self, *factors: AbstractGeodesicManifold):
+        for factor in factors:
+            if not isinstance(factor, AbstractGeodesicManifold):
+                raise TypeError(f"The factors of Product must be manifolds such as Sphere(3), but {factor!r} came.")
+        flat = [factor.factors if isinstance(factor, Product) else (factor,) for factor in factors]
+        self.factors = tuple(factor for group in flat for factor in group)
+        self.dimension = sum(factor.dimension for factor in factors)
+        self.ambient_dimension = sum(factor.ambient_dimension for factor in factors)
+
+    def split(self, x: Vector) -> list[Vector]:
+        """The ambient blocks of x, one a factor."""
+        return jnp.split(x, np.cumsum([factor.ambient_dimension for factor in self.factors])[:-1].tolist())
+
+    def _blocks(self, method: str, *arguments):
+        rows = zip(self.factors, *(self.split(argument) for argument in arguments), strict=True)
+        return [getattr(factor, method)(*blocks) for factor, *blocks in rows]
+
+    def defect(self, x):
+        return jnp.max(jnp.stack(self._blocks("defect", x)))
+
+    def nearest(self, x):
+        return jnp.concatenate(self._blocks("nearest", x))
+
+    def projection(self, x, v):
+        return jnp.concatenate(self._blocks("projection", x, v))
+
+    def representative(self, x, near):
+        return jnp.concatenate(self._blocks("representative", x, near))
+
+    def local_parametrization(self, x):
+        maps = self._blocks("local_parametrization", x)
+        ends = np.cumsum([factor.dimension for factor in self.factors])[:-1].tolist()
+        return lambda r: jnp.concatenate([f(block) for f, block in zip(maps, jnp.split(r, ends), strict=True)])
+
+    def frame(self, x):
+        return jax.scipy.linalg.block_diag(*self._blocks("frame", x))
+
+    def coordinates(self, x, v):
+        return jnp.concatenate(self._blocks("coordinates", x, v))
+
+    def exp(self, x, v):
+        return jnp.concatenate(self._blocks("exp", x, v))
+
+    def log(self, x, y):
+        return jnp.concatenate(self._blocks("log", x, y))
+
+    def distance(self, x, y):
+        return norm(jnp.stack(self._blocks("distance", x, y)))
+
+    def transport(self, x, v, y):
+        return jnp.concatenate(self._blocks("transport", x, v, y))
+
+    def retraction(self, x, v):
+        return jnp.concatenate(self._blocks("retraction", x, v))
+
+    def inverse_retraction(self, x, y):
+        return jnp.concatenate(self._blocks("inverse_retraction", x, y))
+
+    def exp_reach(self, x, v):
+        return jnp.max(jnp.stack(self._blocks("exp_reach", x, v)))
+
+    def retraction_reach(self, x, v):
+        return jnp.max(jnp.stack(self._blocks("retraction_reach", x, v)))
+
+
+def orthonormal_complement(x: Float[Array, " n"]) -> Float[Array, "n n-1"]:
+    """An orthonormal basis of the hyperplane orthogonal to a unit vector x: columns of the reflection of x to ±e_n."""
+    identity = np.eye(x.shape[0])
+    reflector = x + jnp.where(x[-1] >= 0.0, 1.0, -1.0) * identity[-1]
+    scaled = reflector * (2.0 / jnp.dot(reflector, reflector))
+    return jnp.asarray(identity[:, :-1]) - jnp.outer(reflector, scaled[:-1])
