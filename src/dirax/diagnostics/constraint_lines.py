@@ -15,6 +15,7 @@ from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.solution import Solution
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.nonholonomic import as_lagrange_dirac
 
 
 def constraint(sol: Solution, tolerance: float | None) -> Line | None:
@@ -52,7 +53,7 @@ def constraint(sol: Solution, tolerance: float | None) -> Line | None:
 
 def hidden_constraint(sol: Solution, tolerance: float | None) -> Line | None:
     """G v + ∂g/∂t = 0 at every row, which the schemes with holonomic constraints impose on the saved momentum."""
-    system = sol.system
+    system = as_lagrange_dirac(sol.system)
     if not isinstance(system, LagrangeDirac) or system.holonomic is None or "constraint" not in sol.fields:
         return None
     items = (times_at(sol, np.arange(sol.rows)), jnp.asarray(sol.q), jnp.asarray(sol.p))

@@ -13,13 +13,14 @@ from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, Line
 from dirax.solution import Solution
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.nonholonomic import as_lagrange_dirac
 from dirax.systems.port_hamiltonian import PortHamiltonian
 
 
 def energy_less_work(sol: Solution) -> tuple[np.ndarray, bool, str]:
     """The energy less the work of the forces, (…, rows), whether there are forces, and why the system changes it all the
     same ("" if it does not)."""
-    energy, system = np.asarray(sol.energy()), sol.system
+    energy, system = np.asarray(sol.energy()), as_lagrange_dirac(sol.system)
     forced = "work" in sol.fields and not keeps_books(sol)
     if forced:
         energy = energy - np.asarray(sol.fields["work"])

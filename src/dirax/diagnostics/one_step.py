@@ -25,6 +25,7 @@ from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, 
 from dirax.solution import Solution
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.nonholonomic import as_lagrange_dirac
 
 MAX_ITERATIONS = 50
 
@@ -95,6 +96,7 @@ def discrete_system(system: Any, scheme: Any, step: Any) -> DiscreteSystem | str
         return "the solution was loaded without its system"
     if not isinstance(scheme, (PlusLagrangeDirac, MinusLagrangeDirac, LagrangeDAlembert)):
         return f"{type(scheme).__name__} has no discrete Lagrangian on Q × Q"
+    system = as_lagrange_dirac(system)
     if not isinstance(system, LagrangeDirac):
         return f"the points of a {type(system).__name__} are not those of a Lagrangian on Q × Q"
     rule = scheme.discrete_lagrangian

@@ -10,6 +10,7 @@ from dirax.schemes.discrete_lagrangian import LD_ARGUMENTS
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation, StepSequence, make_step_equation
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.nonholonomic import as_lagrange_dirac
 
 
 def _symmetric(half: Sequence[float], middle: float | None = None) -> tuple[float, ...]:
@@ -134,7 +135,7 @@ class SymmetricComposition(AbstractScheme):
 
 
 def _adjoint_of(scheme: AbstractScheme, system: Any, shape: Shape, refusal: str) -> StepEquation:
-    if isinstance(system, LagrangeDirac) and isinstance(scheme, FAMILY):
+    if isinstance(as_lagrange_dirac(system), LagrangeDirac) and isinstance(scheme, FAMILY):
         return _one_stage(adjoint_scheme(scheme), system, shape, refusal)
     return adjoint_equation(_one_stage(scheme, system, shape, refusal))
 

@@ -29,6 +29,10 @@ class ConstraintRows:
         """The kept rows of G."""
         return self.pick(self.constraints.holonomic_matrix(t, q, params), self.m)
 
+    def position(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, " r"]:
+        """The kept entries of g."""
+        return self.pick(self.constraints.position_defect(t, q, params), self.m)
+
     def hidden(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " r"]:
         """The kept entries of G v + ∂g/∂t."""
         return self.pick(self.constraints.hidden_defect(t, q, v, params), self.m)

@@ -13,7 +13,7 @@ from dirax.systems.constraint_chain import ResolvedSystem
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
-from dirax.systems.nonholonomic import NonholonomicMechanics
+from dirax.systems.nonholonomic import NonholonomicMechanics, as_lagrange_dirac
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 from dirax.systems.port_hamiltonian import PortHamiltonian
 
@@ -28,7 +28,8 @@ class DiscreteDirac(AbstractScheme):
     `map`: any discretization map; on T*Q of a Lagrangian system a map on Q is lifted. `constraints`:
     "discretize" ([BLM] Method 1) discretizes the implicit system S_0 as it stands; "resolve" ([BLM] Method 2) runs the
     constraint algorithm first and discretizes on M_f, so that its constraints hold at the nodes to roundoff. Of holonomic
-    constraints of a Lagrangian, Method 1 imposes the distribution G q̇ + ∂g/∂t = 0, and Method 2 takes the resolved chain.
+    constraints g = 0, Method 1 imposes the distribution G q̇ + ∂g/∂t = 0 at the base point, which keeps quadratic g for the
+    midpoint map and lets others drift; Method 2 keeps g and G q̇ + ∂g/∂t at the nodes.
 
     Takes DiracSystem, PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian
     systems, and what `ConstraintChain.resolved` returns, on which it is Method 2 for any system; raises `TypeError` for
@@ -61,12 +62,9 @@ class DiscreteDirac(AbstractScheme):
             if resolve:
                 return _on_graph(system, shape, self.map)
             return discretized_lagrangian(system.lagrange_dirac(), shape, _theta_of(self.map))
-        if isinstance(system, NonholonomicMechanics):
-            if resolve and system.closed_form and not shape.redundant:
-                return resolved_nonholonomic(system, shape, _theta_of(self.map))
-            if resolve:
-                return resolved_lagrangian(system.lagrange_dirac(), shape, _theta_of(self.map))
-            return discretized_lagrangian(system.lagrange_dirac(), shape, _theta_of(self.map))
+        if isinstance(system, NonholonomicMechanics) and resolve and system.closed_form and not shape.redundant:
+            return resolved_nonholonomic(system, shape, _theta_of(self.map))
+        system = as_lagrange_dirac(system)
         if isinstance(system, LagrangeDirac):
             method = resolved_lagrangian if resolve and shape.m + shape.c else discretized_lagrangian
             return method(system, shape, _theta_of(self.map))

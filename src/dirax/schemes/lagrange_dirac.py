@@ -22,6 +22,7 @@ from dirax.schemes.reduced import lagrange_poincare_dirac
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.schemes.work import WorkBook, work_field
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.nonholonomic import as_lagrange_dirac
 
 MOMENTA = ("incoming", "mean", "outgoing")
 
@@ -112,7 +113,7 @@ class MinusLagrangeDirac(AbstractScheme):
 def _on_q_or_quotient(system: Any, shape: Shape, rule, constraint, momentum: str, sign: int = +1) -> StepEquation:
     """The discrete Lagrange–d'Alembert equations of a system on Q, or on the quotient by its symmetry."""
     if not isinstance(system, ReducedLagrangeDirac):
-        return discrete_lagrange_dalembert(system, shape, rule, constraint, momentum)
+        return discrete_lagrange_dalembert(as_lagrange_dirac(system), shape, rule, constraint, momentum)
     unreduced = discrete_lagrange_dalembert(system.system, shape, rule, constraint, momentum)
     return lagrange_poincare_dirac(system, shape, unreduced, sign)
 
@@ -122,8 +123,8 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
     (v, μ, λ) with q_{k+1} = q_k + h v, and with holonomic constraints (v̂, σ) of the projection of the saved momentum."""
     if not isinstance(system, LagrangeDirac):
         raise TypeError(
-            "this scheme discretizes a dx.LagrangeDirac system (a Lagrangian with one-forms), but a "
-            f"{type(system).__name__} was given: use dx.DiscreteDirac for the others."
+            "this scheme discretizes a dx.LagrangeDirac or dx.NonholonomicMechanics system (a Lagrangian with constraints), but "
+            f"a {type(system).__name__} was given: use dx.DiscreteDirac for the others."
         )
     n, m, rows = shape.n, shape.m, ConstraintRows(system, shape)
     k, holonomic, book = rows.count, rows.holonomic, WorkBook(system, n)

@@ -85,20 +85,21 @@ def resolved_nonholonomic(system: NonholonomicMechanics, shape: Shape, theta: fl
     p_k + μ(q_k)ᵀσ = p − (1 − θ)h ṗ, μ(q) v = 0; then q_{k+1} = q + (1 − θ)h v, p_{k+1} = P(p + θh ṗ).
     """
     n, m = shape.n, shape.m
+    one_forms = lambda q, params: system.constraints.one_forms_at(0.0, q, params)
 
     def base(u, state, h, params):
         q0, v = state[:n], u[:n]
         q = q0 + theta * h * v
         p = system.metric(q, params) @ v
         multipliers = system.multipliers(q, p, params)
-        force = -jax.grad(system.hamiltonian)(q, p, params) + system.one_forms(q, params).T @ multipliers
+        force = -jax.grad(system.hamiltonian)(q, p, params) + one_forms(q, params).T @ multipliers
         return q, p, force, multipliers
 
     def residual(u, state, t, h, params):
         q0, p0 = state[:n], state[n:]
         q, p, force, _ = base(u, state, h, params)
-        balance = p0 + system.one_forms(q0, params).T @ u[n:] - (p - (1.0 - theta) * h * force)
-        return jnp.concatenate([balance, system.one_forms(q, params) @ u[:n]])
+        balance = p0 + one_forms(q0, params).T @ u[n:] - (p - (1.0 - theta) * h * force)
+        return jnp.concatenate([balance, one_forms(q, params) @ u[:n]])
 
     def advance(u, state, t, h, params):
         q, p, force, _ = base(u, state, h, params)
@@ -114,56 +115,79 @@ def resolved_nonholonomic(system: NonholonomicMechanics, shape: Shape, theta: fl
 
 
 def resolved_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) -> StepEquation:
-    """Method 2 for any regular Lagrangian: λ from the derivative of W v + b = 0 along the flow, and the projector
-    p ↦ p − W(q)ᵀσ onto W(q) v(q, p) + b = 0 as further equations, since it has no closed form when L is not quadratic.
+    """Method 2 for any regular Lagrangian: the projected θ map ([BLM] Prop 7.3) on M_f = {g = 0, W v + b = 0, G v + ∂g/∂t = 0}.
 
-    Unknowns are (v, σ) of the base point and (v1, σ1) of the end point.
+    At the base point (q, v) ∈ M_f, λ follows from the derivatives of the last two along the flow, and with p = ∂L/∂v, ṗ
+
+        (q_k, p_k) = P(q − θh v, p − (1 − θ)h ṗ),   (q_{k+1}, p_{k+1}) = P(q + (1 − θ)h v, p + θh ṗ),
+
+    P(q̃, p̃) = (q', p'): q̃ = q' + M⁻¹G(q')ᵀs with g(q') = 0, and p̃ = p' + [W; G](q')ᵀσ with the velocity of p' on the other
+    constraints; M = ∂²L/∂v² at (q', v). Unknowns are (v, σ, s) of the first half and (v', σ, w, s) of the second, where h w
+    moves q and M(w − v) = Gᵀs. Constraints at the times t_k, t_k + θh and t_k + h hold to roundoff at all three points.
     """
-    if shape.c:
-        raise ValueError(
-            "Method 2 of a Lagrangian with holonomic constraints needs its final manifold: simulate "
-            'dx.constraint_algorithm(system, near={"q": q, "v": v}).resolved() instead, or use dx.LagrangeDAlembert, whose '
-            "constraints hold at the nodes."
-        )
     n, rows = shape.n, ConstraintRows(system, shape)
-    k, book = n + rows.count, WorkBook(system, shape.n)
+    k, c, book = n + rows.count, rows.holonomic, WorkBook(system, shape.n)
+    first, second = k + c, (k + n + c) if c else k
+
+    def mass(t, q, v, params):
+        return jax.hessian(lambda v: system.lagrangian.at(t, q, v, params))(v)
 
     def flow(t, q, v, params):
         """(p, ṗ, λ) at a point of M_f."""
         rate, p = _rates(system, t, q, v, params)
         w = rows.matrix(t, q, params)
-        mass = jax.hessian(lambda v: system.lagrangian.at(t, q, v, params))(v)
         coupling = _along(system, lambda t, q: system.legendre(q, v, params, t), t, q, v)
         turning = _along(system, lambda t, q: rows.velocity_defect(t, q, v, params), t, q, v)
-        lifted = jnp.linalg.solve(mass, w.T)
+        lifted = jnp.linalg.solve(mass(t, q, v, params), w.T)
         multipliers = -jnp.linalg.solve(w @ lifted, turning + lifted.T @ (rate - coupling))
         return p, rate + w.T @ multipliers, multipliers
 
+    def pushed(t, q, v, s, params):
+        """v + M⁻¹G(q)ᵀs, the direction of the projection onto g = 0 at q."""
+        return v + jnp.linalg.solve(mass(t, q, v, params), rows.holonomic_matrix(t, q, params).T @ s)
+
+    def base(u, state, t, h, params):
+        """The base point, its time, and where the second half ends."""
+        q0, v = state[:n], u[:n]
+        at = t + theta * h
+        if not c:
+            return at, q0 + theta * h * v, q0 + h * v
+        q = q0 + (theta * h * pushed(t, q0, v, u[k:first], params) if theta else 0.0)
+        return at, q, q + (1.0 - theta) * h * u[first + k : first + k + n]
+
+    def position(u, state, t, h, params):
+        """g at the base and at the end, and the direction of the second half; a half of length zero needs no force."""
+        at, q, q1 = base(u, state, t, h, params)
+        v, w, s, s1 = u[:n], u[first + k : first + k + n], u[k:first], u[first + k + n :]
+        onto = rows.position(at, q, params) / h if theta else s
+        last = rows.position(t + h, q1, params) / h if theta < 1.0 else s1
+        return jnp.concatenate([onto, w - pushed(t + h, q1, v, s1, params), last])
+
     def residual(u, state, t, h, params):
-        q0, p0, v, v1 = state[:n], state[n : 2 * n], u[:n], u[k : k + n]
-        at, q, q1 = t + theta * h, q0 + theta * h * v, q0 + h * v
+        q0, p0, v, v1 = state[:n], state[n : 2 * n], u[:n], u[first : first + n]
+        at, q, q1 = base(u, state, t, h, params)
         p, rate, _ = flow(at, q, v, params)
-        first = p0 + rows.matrix(t, q0, params).T @ u[n:k] - (p - (1.0 - theta) * h * rate)
-        projected = system.legendre(q1, v1, params, t + h) + rows.matrix(t + h, q1, params).T @ u[k + n :]
-        ends = [rows.velocity_defect(at, q, v, params), projected - (p + theta * h * rate)]
-        return jnp.concatenate([first, *ends, rows.velocity_defect(t + h, q1, v1, params)])
+        begun = p0 + rows.matrix(t, q0, params).T @ u[n:k] - (p - (1.0 - theta) * h * rate)
+        ended = system.legendre(q1, v1, params, t + h) + rows.matrix(t + h, q1, params).T @ u[first + n : first + k]
+        ends = [rows.velocity_defect(at, q, v, params), ended - (p + theta * h * rate)]
+        ends = [begun, *ends, rows.velocity_defect(t + h, q1, v1, params)]
+        return jnp.concatenate([*ends, position(u, state, t, h, params)] if c else ends)
 
     def advance(u, state, t, h, params):
-        v = u[:n]
-        q, q1 = state[:n] + theta * h * v, state[:n] + h * v
-        end = [q1, system.legendre(q1, u[k : k + n], params, t + h)]
-        return book.after(state, end, t + theta * h, q, v, h, params)
+        at, q, q1 = base(u, state, t, h, params)
+        end = [q1, system.legendre(q1, u[first : first + n], params, t + h)]
+        return book.after(state, end, at, q, u[:n], h, params)
 
     def unpack(state, u, t, h, params):
-        q, v = state[:n] + theta * h * u[:n], u[:n]
-        multipliers = rows.all(flow(t + theta * h, q, v, params)[2])
+        at, q, _ = base(u, state, t, h, params)
+        multipliers = rows.all(flow(at, q, u[:n], params)[2])
         return {"q": state[:n], "p": state[n : 2 * n], "multipliers": multipliers, **book.row(state)}
 
     def first_guess(data):
-        zero = jnp.zeros(rows.count)
-        return jnp.concatenate([data["v"], zero, data["v"], zero])
+        v, forces, shift = data["v"], jnp.zeros(rows.count), jnp.zeros(c)
+        return jnp.concatenate([v, forces, shift, v, forces] + [v, shift] * bool(c))
 
-    return _resolved(system, shape, 2 * k, residual, advance, unpack, first_guess)
+    return _resolved(system, shape, first + second, residual, advance, unpack, first_guess)
 
 
 def _along(system: LagrangeDirac, function, t, q, v):
@@ -189,7 +213,7 @@ def _resolved(system: Any, shape: Shape, unknowns: int, residual, advance, unpac
         unpack=unpack,
         state_size=2 * n + book.size,
         unknowns=unknowns,
-        fields=_fields(system, n, shape.m),
+        fields=_fields(system, n, shape.m + shape.c),
         labels=tuple(f"equation {i} of Method 2" for i in range(unknowns)),
         canonical=not book.size,
     )

@@ -1,10 +1,12 @@
 """The constraints of a Lagrangian system: W(t, q) q̇ + b(t, q) = 0 and g(t, q) = 0, which may depend on each other."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
@@ -22,6 +24,14 @@ class Constraints(eqx.Module):
     affine: UserFunction | None
     holonomic: UserFunction | None
 
+    @classmethod
+    def of(cls, one_forms: Callable | None, affine: Callable | None, holonomic: Callable | None) -> "Constraints":
+        """The constraints of a user's functions; raises `ValueError` for `affine` without `one_forms`."""
+        if affine is not None and one_forms is None:
+            raise ValueError("affine is the b(q) of W(q) q̇ + b(q) = 0, but no one_forms were given: give W(q) too.")
+        named = {"one_forms": one_forms, "affine": affine, "holonomic": holonomic}
+        return cls(*(None if f is None else UserFunction(f, name, ("q",), timed=True) for name, f in named.items()))
+
     @property
     def names(self) -> str:
         """The names of the functions that are there, for messages."""
@@ -35,7 +45,7 @@ class Constraints(eqx.Module):
 
     def sizes(self, q: Float[Array, " n"], params: Any) -> tuple[int, int]:
         """(m, c); raises `ValueError` where a function returns a wrong shape."""
-        n, t = q.shape[0], jnp.zeros(())
+        n, t = q.shape[0], np.zeros(())
         m = c = 0
         if self.one_forms is not None:
             out = self.one_forms.shape(*self.one_forms.given(t, q, params))

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
@@ -50,14 +51,10 @@ class LagrangeDirac(AbstractSystem):
         forces: Callable | None = None,
         affine: Callable | None = None,
     ):
-        function = lambda f, name, arguments, timed=True: None if f is None else UserFunction(f, name, arguments, timed)
         self.lagrangian = UserFunction(lagrangian, "lagrangian", ("q", "v"), timed=True)
-        self.one_forms = function(one_forms, "one_forms", ("q",))
-        self.holonomic = function(holonomic, "holonomic", ("q",))
-        self.forces = function(forces, "forces", ("t", "q", "v"), timed=False)
-        self.affine = function(affine, "affine", ("q",))
-        if affine is not None and one_forms is None:
-            raise ValueError("affine is the b(q) of W(q) q̇ + b(q) = 0, but no one_forms were given: give W(q) too.")
+        given = Constraints.of(one_forms, affine, holonomic)
+        self.one_forms, self.affine, self.holonomic = given.one_forms, given.affine, given.holonomic
+        self.forces = None if forces is None else UserFunction(forces, "forces", ("t", "q", "v"))
 
     @property
     def constraints(self) -> Constraints:
@@ -109,7 +106,7 @@ class LagrangeDirac(AbstractSystem):
         if "x" in data:
             raise ValueError("a LagrangeDirac system starts from q=, v= · q=, p= · q0=, q1=, but x= was given.")
         q = data["q"] if "q" in data else data["q0"]
-        n, t = q.shape[0], jnp.zeros(())
+        n, t = q.shape[0], np.zeros(())
         out = self.lagrangian.shape(*self.lagrangian.given(t, q, q, params))
         if out.shape != ():
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Nonholonomic mechanics: a metric, a potential and constraint one-forms, as a closed port-Hamiltonian system."""
+"""Mechanics with a metric, a potential and constraints: nonholonomic mechanics as a closed port-Hamiltonian system."""
 
 from collections.abc import Callable
 from typing import Any
@@ -21,51 +21,82 @@ class NonholonomicMechanics(AbstractSystem):
     """H = ½ pᵀ g(q)⁻¹ p + V(q) with μ(q) q̇ = 0, the closed port-Hamiltonian system with B = (0; μᵀ) ([BLM] §8).
 
     `metric(q[, params])` (n, n), symmetric positive definite; `potential(q[, params])` a scalar; `one_forms(q[, params])`
-    (m, n). q̇ = g⁻¹p, ṗ = −∂H/∂q + μᵀ λ, μ g⁻¹ p = 0. `forces` is added as in `LagrangeDirac`; holonomic constraints and
-    explicit time are those of the `LagrangeDirac` system that `lagrange_dirac` returns.
+    (m, n). q̇ = g⁻¹p, ṗ = −∂H/∂q + μᵀ λ, μ g⁻¹ p = 0. `holonomic`, `forces` and `affine` are those of `LagrangeDirac`, of
+    which this is the case L = ½ q̇ᵀ g q̇ − V; every function but the forces may take the time first, as `t`.
+
+        disk = dx.NonholonomicMechanics(metric, potential, one_forms)
+        pendulum = dx.NonholonomicMechanics(metric, potential, holonomic=lambda q: jnp.array([q @ q - 1.0]))
+
+    Raises as `LagrangeDirac`, and `ValueError` at the start of a run for a metric that is not symmetric positive definite.
     """
 
     metric: UserFunction
     potential: UserFunction
-    one_forms: UserFunction
+    one_forms: UserFunction | None = None
+    holonomic: UserFunction | None = None
     forces: UserFunction | None = None
+    affine: UserFunction | None = None
 
-    def __init__(self, metric: Callable, potential: Callable, one_forms: Callable, *, forces: Callable | None = None):
+    def __init__(
+        self,
+        metric: Callable,
+        potential: Callable,
+        one_forms: Callable | None = None,
+        *,
+        holonomic: Callable | None = None,
+        forces: Callable | None = None,
+        affine: Callable | None = None,
+    ):
+        self.metric = UserFunction(metric, "metric", ("q",), timed=True)
+        self.potential = UserFunction(potential, "potential", ("q",), timed=True)
+        given = Constraints.of(one_forms, affine, holonomic)
+        self.one_forms, self.affine, self.holonomic = given.one_forms, given.affine, given.holonomic
         self.forces = None if forces is None else UserFunction(forces, "forces", ("t", "q", "v"))
-        self.metric = UserFunction(metric, "metric", ("q",))
-        self.potential = UserFunction(potential, "potential", ("q",))
-        self.one_forms = UserFunction(one_forms, "one_forms", ("q",))
 
-    def lagrangian(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None) -> Float[Array, ""]:
+    def lagrangian(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, ""]:
         """½ vᵀ g(q) v − V(q)."""
-        return v @ self.metric(q, params) @ v / 2 - self.potential(q, params)
+        return v @ self.metric.at(t, q, params) @ v / 2 - self.potential.at(t, q, params)
+
+    def _lagrangian_at(self, t, q, v, params=None):
+        return self.lagrangian(q, v, params, t)
 
     def lagrange_dirac(self) -> LagrangeDirac:
         """The same system as a Lagrangian with constraints."""
-        function = self.forces
-        forces = None if function is None else lambda t, q, v, params: function(t, q, v, params)
-        return LagrangeDirac(self.lagrangian, lambda q, params: self.one_forms(q, params), forces=forces)
+        timed = self.metric.takes_time or self.potential.takes_time
+        own = lambda function: None if function is None else function.function
+        return LagrangeDirac(
+            self._lagrangian_at if timed else self.lagrangian,
+            own(self.one_forms),
+            holonomic=own(self.holonomic),
+            forces=own(self.forces),
+            affine=own(self.affine),
+        )
 
     @property
     def closed_form(self) -> bool:
-        """Whether λ and the projector of Method 2 have their closed form ([BLM] §8): no forces."""
-        return self.forces is None
+        """Whether λ and the projector of Method 2 have their closed form ([BLM] §8): one-forms alone, without time."""
+        functions = (self.metric, self.potential, self.one_forms)
+        alone = self.forces is None and self.holonomic is None and self.affine is None and self.one_forms is not None
+        return alone and not any(function is not None and function.takes_time for function in functions)
 
     @property
     def constraints(self) -> Constraints:
         """The constraints, as functions of (t, q, params)."""
-        return Constraints(self.one_forms, None, None)
+        return Constraints(self.one_forms, self.affine, self.holonomic)
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
+        if "x" in data:
+            raise ValueError("a NonholonomicMechanics system starts from q=, v= · q=, p= · q0=, q1=, but x= was given.")
         q = data["q"] if "q" in data else data["q0"]
-        n = q.shape[0]
-        metric = self.metric.shape(q, params)
+        n, t = q.shape[0], np.zeros(())
+        metric = self.metric.shape(*self.metric.given(t, q, params))
         if metric.shape != (n, n):
             raise ValueError(f"metric must return shape ({n}, {n}), but it returned shape {metric.shape}.")
         if not is_traced(q, params):
-            _check_metric(np.asarray(compiled(self.metric, q, params)))
-        if self.potential.shape(q, params).shape != ():
-            raise ValueError(f"potential must return a scalar, but it returned shape {self.potential.shape(q, params).shape}.")
+            _check_metric(np.asarray(compiled(self.metric, *self.metric.given(t, q, params))))
+        potential = self.potential.shape(*self.potential.given(t, q, params))
+        if potential.shape != ():
+            raise ValueError(f"potential must return a scalar, but it returned shape {potential.shape}.")
         return self.lagrange_dirac().sizes(data, params)
 
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
@@ -74,36 +105,57 @@ class NonholonomicMechanics(AbstractSystem):
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
         return self.lagrange_dirac().initial_defect(data, params)
 
-    def hamiltonian(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None) -> Float[Array, ""]:
+    def hamiltonian(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, ""]:
         """½ pᵀ g(q)⁻¹ p + V(q)."""
-        return p @ jnp.linalg.solve(self.metric(q, params), p) / 2 + self.potential(q, params)
+        return p @ self.velocity(q, p, params, t) / 2 + self.potential.at(t, q, params)
 
-    def projector(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None) -> Float[Array, " n"]:
-        """P_q(p) = p − C_ab (g^{ij} p_j μ^a_i) μ^b: onto the momenta with μ g⁻¹ p = 0 ([BLM] §8)."""
-        forms = self.one_forms(q, params)
-        lifted = jnp.linalg.solve(self.metric(q, params), forms.T)
-        return p - forms.T @ jnp.linalg.solve(forms @ lifted, lifted.T @ p)
+    def velocity(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " n"]:
+        """g(q)⁻¹ p."""
+        return jnp.linalg.solve(self.metric.at(t, q, params), p)
 
-    def multipliers(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None) -> Float[Array, " m"]:
-        """λ(q, p) that keeps μ g⁻¹ p = 0 along the flow ([BLM] (39)): derivatives of the constraint along q̇ and ṗ."""
-        dq, dp = jax.grad(self.hamiltonian, argnums=(0, 1))(q, p, params)
-        forms = self.one_forms(q, params)
-        lifted = jnp.linalg.solve(self.metric(q, params), forms.T)
+    def _lifted(self, q, params, t):
+        """(μ, g⁻¹μᵀ) with the rows of all constraints, one-forms and derivatives of holonomic ones."""
+        rows = self.constraints.matrix(t, q, params)
+        return rows, jnp.linalg.solve(self.metric.at(t, q, params), rows.T)
 
-        def constraint(q, p):
-            return self.one_forms(q, params) @ jnp.linalg.solve(self.metric(q, params), p)
+    def projector(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " n"]:
+        """P_q(p) = p − C_ab (g^{ij} p_j μ^a_i) μ^b: onto the momenta with μ g⁻¹ p = 0 ([BLM] §8), for independent constraints.
 
-        _, rate = jax.jvp(constraint, (q, p), (dp, -dq))
-        return -jnp.linalg.solve(forms @ lifted, rate)
+        The rows μ are those of W and of ∂g/∂q; with affine or moving constraints the momenta are those with W q̇ + b = 0 and
+        G q̇ + ∂g/∂t = 0.
+        """
+        rows, lifted = self._lifted(q, params, t)
+        defect = self.constraints.velocity_defect(t, q, self.velocity(q, p, params, t), params)
+        return p - rows.T @ jnp.linalg.solve(rows @ lifted, defect)
+
+    def multipliers(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " k"]:
+        """λ(q, p) (m + c,) that keeps μ g⁻¹ p = 0 along the flow ([BLM] (39)): derivatives of the constraints along (ṫ, q̇, ṗ)."""
+        dq, v = jax.grad(self.hamiltonian, argnums=(0, 1))(q, p, params, t)
+        rate = -dq if self.forces is None else self.forces(t, q, v, params) - dq
+        rows, lifted = self._lifted(q, params, t)
+
+        def constraint(t, q, p):
+            return self.constraints.velocity_defect(t, q, self.velocity(q, p, params, t), params)
+
+        if self.lagrange_dirac().depends_on_time:
+            _, rate = jax.jvp(constraint, (jnp.asarray(t, float), q, p), (jnp.ones(()), v, rate))
+        else:
+            _, rate = jax.jvp(lambda q, p: constraint(t, q, p), (q, p), (v, rate))
+        return -jnp.linalg.solve(rows @ lifted, rate)
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """H(q, p)."""
-        return self.hamiltonian(row["q"], row["p"], params)
+        return self.hamiltonian(row["q"], row["p"], params, row.get("t", 0.0))
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
-        """μ(q) g⁻¹(q) p."""
-        q = row["q"]
-        return self.one_forms(q, params) @ jnp.linalg.solve(self.metric(q, params), row["p"])
+    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
+        """(μ g⁻¹p + b, g, G g⁻¹p + ∂g/∂t) at the node."""
+        q, t = row["q"], row.get("t", 0.0)
+        return self.constraints.defect(t, q, self.velocity(q, row["p"], params, t), params)
+
+
+def as_lagrange_dirac(system: Any) -> Any:
+    """The `LagrangeDirac` system that a `NonholonomicMechanics` is; any other system as it stands."""
+    return system.lagrange_dirac() if isinstance(system, NonholonomicMechanics) else system
 
 
 def _check_metric(metric: np.ndarray) -> None:
