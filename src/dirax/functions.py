@@ -84,8 +84,8 @@ class UserFunction(eqx.Module):
         if not isinstance(out, jax.ShapeDtypeStruct) or out.dtype != jnp.float64:
             what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
             raise TypeError(f"{call} must return one array of real numbers (float64), but it returned {what}.")
-        if _indexes(jaxpr.jaxpr) and not is_traced(values, jaxpr.consts):
-            outside = compiled(_Indexing(self), *values)[0].get()
+        if _indexes(jaxpr.jaxpr) and not is_traced(values, jaxpr.consts) and not _reads_inside(jaxpr, values):
+            outside = _compiled(_Indexing(self), *values)[0].get()
             if outside:
                 raise ValueError(
                     f"{call} reads an entry that its arguments, of shapes {shapes}, do not have "
@@ -126,10 +126,32 @@ def _takes_time(function: Callable, count: int) -> bool:
     return len(positional) > count and positional[0].name == "t"
 
 
+def evaluated(function: Callable, *values: Any) -> Any:
+    """`function(*values)` for checks of concrete values: without a compiler where that can be, else by one compiled program
+    instead of one an operation; either is kept for later calls with equal functions."""
+    host = _host()
+    found = None if host is None or is_traced(values) else host.evaluated(function, values)
+    return _compiled(function, *values) if found is None else found[0]
+
+
 @eqx.filter_jit
-def compiled(function: Callable, *values: Any) -> Any:
-    """`function(*values)` by one compiled program instead of one an operation, kept for later calls with equal functions."""
+def _compiled(function: Callable, *values: Any) -> Any:
     return function(*values)
+
+
+def _no_host() -> Any:
+    return None
+
+
+_host = _no_host
+
+
+def evaluate_on(host: Callable[[], Any]) -> None:
+    """Have concrete values found without a compiler by what `host` returns: a module with `evaluated(function, values)`, a
+    tuple of one result, and `reads_inside(jaxpr, values)`, whether every index is inside its array; None and False where it
+    cannot say."""
+    global _host
+    _host = host
 
 
 class _Indexing(eqx.Module):
@@ -176,6 +198,11 @@ def _indexes(jaxpr) -> bool:
     """Whether an index occurs that JAX could not see to be inside its array."""
     inner = [sub for equation in jaxpr.eqns for sub in jaxprs_in_params(equation.params)]
     return any(e.primitive.name in INDEXING for e in jaxpr.eqns) or any(map(_indexes, inner))
+
+
+def _reads_inside(jaxpr, values) -> bool:
+    host = _host()
+    return host is not None and host.reads_inside(jaxpr, values)
 
 
 def _first_line(message: Any) -> str:

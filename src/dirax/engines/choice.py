@@ -6,6 +6,7 @@ import jax
 
 from dirax.engines import xla
 from dirax.engines.result import Outcome, Problem, Progress
+from dirax.functions import evaluate_on
 
 ENGINES = ("auto", "xla", "native")
 
@@ -60,3 +61,12 @@ def _other_device() -> str | None:
     device: Any = getattr(jax.config, "jax_default_device", None)
     platform = getattr(device, "platform", device) or jax.default_backend()
     return None if platform == "cpu" else f"JAX computes on {platform}"
+
+
+def _native_host() -> Any:
+    from dirax.engines.native import concrete  # imported when it is used
+
+    return concrete
+
+
+evaluate_on(_native_host)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from dirax.functions import compiled, is_traced
+from dirax.functions import evaluated, is_traced
 from dirax.geometry.numerics import TINY, Scalar, arc_over_sine, norm, radial
 
 Vector: TypeAlias = Float[Array, " N"]
@@ -71,7 +71,7 @@ class AbstractManifold(eqx.Module):
         self._check_shape(x, name)
         if is_traced(x):
             return
-        defect = compiled(self.defect, x)
+        defect = evaluated(self.defect, x)
         if is_traced(defect):  # a constant inside a traced function
             return
         if not float(defect) <= tolerance:
@@ -85,7 +85,7 @@ class AbstractManifold(eqx.Module):
         self._check_shape(v, name)
         if is_traced(x, v):
             return
-        defect, size = compiled(self.tangent_defect, x, v), compiled(norm, v)
+        defect, size = evaluated(self.tangent_defect, x, v), evaluated(norm, v)
         if is_traced(defect, size):
             return
         if not float(defect) <= tolerance * (1.0 + float(size)):

@@ -3,13 +3,12 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction, is_traced
+from dirax.functions import UserFunction, evaluated, is_traced
 from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.reduction.lie_poisson import LiePoisson, checked_point
@@ -134,7 +133,7 @@ class EulerPoincare(AbstractSystem):
         return self.space.size, m
 
     def _refuse_singular(self, momentum, a, params) -> None:
-        inertia, forms = (np.asarray(matrix) for matrix in _inertia_and_forms(self, momentum, a, params))
+        inertia, forms = map(np.asarray, evaluated(self._inertia_and_forms, momentum, a, params))
         if not (np.all(np.isfinite(inertia)) and np.all(np.isfinite(forms))):
             return  # the first step says where
         if np.linalg.matrix_rank(forms) < len(forms):
@@ -146,6 +145,11 @@ class EulerPoincare(AbstractSystem):
                 f"the inertia ∂²l/∂ξ² is singular at the initial data: it has rank {rank} of {len(inertia)}, so that μ does not "
                 "determine ξ. Give every direction of the algebra an inertia, or take a smaller group."
             )
+
+    def _inertia_and_forms(self, momentum, a, params):
+        """∂²l/∂ξ² at the ξ of μ, and A."""
+        xi = self.inverse_legendre(momentum, a, params)
+        return jax.hessian(lambda xi: self.value(xi, a, params))(xi), self.constraint_forms(a, params)
 
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
         momentum, a = self.space.split(data["x"])
@@ -179,13 +183,6 @@ class EulerPoincare(AbstractSystem):
             return no_constraint()
         momentum, a = self.space.split(row["x"])
         return self.constraint_forms(a, params) @ self.inverse_legendre(momentum, a, params)
-
-
-@eqx.filter_jit
-def _inertia_and_forms(system: EulerPoincare, momentum, a, params):
-    """∂²l/∂ξ² at the ξ of μ, and A."""
-    xi = system.inverse_legendre(momentum, a, params)
-    return jax.hessian(lambda xi: system.value(xi, a, params))(xi), system.constraint_forms(a, params)
 
 
 def _constant(matrix: Any) -> Callable:

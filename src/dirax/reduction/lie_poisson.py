@@ -82,6 +82,6 @@ def checked_point(space: SemidirectProduct, data: dict[str, Array], kind: str, w
     if data["x"].shape != (space.size,):
         raise ValueError(f"a {kind} system on {name} starts from {what}, but x has shape {data['x'].shape}: x={way}.")
     a = data["x"][d:]
-    if r and jax.eval_shape(space.act, space.group.identity(), a).shape != (r,):
+    if r and jax.eval_shape(lambda a: space.act(space.group.identity(), a), a).shape != (r,):
         raise ValueError(f"representation(matrix, a) must return shape ({r},) like a.")
-    return data["x"][:d], jnp.asarray(a)
+    return data["x"][:d], a

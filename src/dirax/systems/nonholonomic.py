@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction, compiled, is_traced
+from dirax.functions import UserFunction, evaluated, is_traced
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
@@ -93,7 +93,7 @@ class NonholonomicMechanics(AbstractSystem):
         if metric.shape != (n, n):
             raise ValueError(f"metric must return shape ({n}, {n}), but it returned shape {metric.shape}.")
         if not is_traced(q, params):
-            _check_metric(np.asarray(compiled(self.metric, *self.metric.given(t, q, params))))
+            _check_metric(np.asarray(evaluated(self.metric, *self.metric.given(t, q, params))))
         potential = self.potential.shape(*self.potential.given(t, q, params))
         if potential.shape != ():
             raise ValueError(f"potential must return a scalar, but it returned shape {potential.shape}.")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction, compiled, is_traced
+from dirax.functions import UserFunction, evaluated, is_traced
 from dirax.systems.system import AbstractSystem, no_constraint
 
 SKEW_TOLERANCE = 1e-10
@@ -133,7 +133,7 @@ class PortHamiltonian(AbstractSystem):
         if any(not 0 <= port < ports for port in closed) or len(set(closed)) < len(closed):
             raise ValueError(f"closed must name different columns of B, which has {ports}, but {closed} were given.")
         if self.inputs is not None:
-            shape = self.inputs.shape(jnp.array(0.0), x, params).shape
+            shape = self.inputs.shape(np.zeros(()), x, params).shape
             if shape != (len(unclosed),):
                 raise ValueError(
                     f"inputs must return shape ({len(unclosed)},), one number an open port, but it returned shape {shape}."
@@ -143,13 +143,13 @@ class PortHamiltonian(AbstractSystem):
         return size, len(closed)
 
     def _check_structure(self, x, params) -> None:
-        J = np.asarray(compiled(self.J, x, params))
+        J = np.asarray(evaluated(self.J, x, params))
         skewness = np.max(np.abs(J + J.T), initial=0.0)
         if skewness > SKEW_TOLERANCE * max(np.max(np.abs(J), initial=0.0), 1e-300):
             raise ValueError(f"J is not skew at the initial point: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
         if self.R is None:
             return
-        R = np.asarray(compiled(self.R, x, params))
+        R = np.asarray(evaluated(self.R, x, params))
         scale = max(np.max(np.abs(R), initial=0.0), 1e-300)
         if np.max(np.abs(R - R.T)) > SKEW_TOLERANCE * scale:
             raise ValueError(f"R is not symmetric at the initial point: max |R − Rᵀ| = {np.max(np.abs(R - R.T)):.3g}.")
