@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from dirax.diagnostics.casimir_lines import casimir_lines
 from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
 from dirax.diagnostics.judging import steps_of
@@ -23,7 +24,9 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
 
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
-    - momentum maps: 32 ε · steps, the most that 32 roundings a step add up to (a random walk gives √steps of that);
+    - momentum maps, and of Euler–Poincaré and Lie–Poisson systems the Casimirs and the spatial momentum (where quantities
+      are advected, its part that leaves them alone): 32 ε · steps, the most that 32 roundings a step add up to (a random
+      walk gives √steps of that);
     - symplecticity of one step (of Euler–Poincaré and Lie–Poisson systems: whether it is a Poisson map), and φ*Ω = Ω + dβ
       where there are constraints ([PY] §3.2): 32 ε · 2n · the condition number of the step's equations, at a few steps;
     - systems with ports ([BLM] §7.1): the power balance of every step and, with a discrete gradient, the books over the run,
@@ -50,6 +53,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         energy_line(sol),
         *port_lines(sol, tolerance),
         *(momentum(sol, name, generator, tolerance) for name, generator in generators.items()),
+        *casimir_lines(sol, tolerance),
         symplecticity(sol, tolerance),
     ]
     return Report(_title(sol), tuple(line for line in lines if line is not None))

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Array, Float
 
 from dirax.functions import is_traced
 from dirax.reduction.connection import AbstractConnection
-from dirax.reduction.symmetry import Translations, invariance
+from dirax.reduction.symmetry import TOLERANCE, Translations, invariance, times
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
@@ -28,15 +29,25 @@ class ReducedLagrangeDirac(AbstractSystem):
     system: LagrangeDirac
     connection: AbstractConnection
 
+    def lagrange_dirac(self) -> LagrangeDirac:
+        """The unreduced system."""
+        return self.system
+
     @property
     def constraints(self) -> Constraints:
         """All constraints of the unreduced system."""
         return self.system.constraints
 
     @property
-    def conserves_momentum(self) -> bool:
-        """Whether μ is a constant of the motion: nothing acts but L."""
+    def free(self) -> bool:
+        """Whether nothing acts but L."""
         return self.system.forces is None and not self.constraints.any
+
+    @property
+    def conserves_momentum(self) -> bool:
+        """Whether μ is a constant of the motion whatever the functions: G = ∂g/∂q of invariant holonomic constraints has no
+        part along the group."""
+        return self.system.forces is None and self.system.one_forms is None
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
         sizes = self.system.sizes(data, params)
@@ -45,14 +56,26 @@ class ReducedLagrangeDirac(AbstractSystem):
             self._refuse_asymmetry(data, params)
         return sizes
 
+    def moves_momentum(self, data: dict[str, Array], params: Any) -> str:
+        """What has a part along the group and moves μ, with the part and where, at initial data and near them, which must be
+        concrete; empty where nothing does."""
+        if self.conserves_momentum:
+            return ""
+        t, q, v = sampled(data)
+        parts, sizes = (np.asarray(a) for a in _parts_along(self, t, q, v, params))
+        defects = np.abs(parts) / np.maximum(1.0, sizes)[..., None]
+        where, row, column = np.unravel_index(int(np.argmax(np.where(np.isfinite(defects), defects, 0.0))), defects.shape)
+        if not defects[where, row, column] > TOLERANCE:
+            return ""
+        forces, coordinate = row == parts.shape[1] - 1, f"q[{self.connection.fibre[column]}]"
+        what = "the forces f(t, q, v) move" if forces else "the forces of the constraints move"
+        part = f"f has the part {{:.3g}} along {coordinate}" if forces else f"one-form {row} has {{:.3g}} d{coordinate}"
+        at = f"q = {np.asarray(q[where])}" + f", v = {np.asarray(v[where])}" * bool(forces)
+        return f"{what}: {part.format(parts[where, row, column])} at {at}, at or near the initial data"
+
     def _refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]
-        v = data["v"] if "v" in data else jnp.ones_like(q)
-        random = np.random.default_rng(0)
-        nearby = lambda a: np.concatenate(
-            [np.asarray(a)[None], np.asarray(a) + NEARBY * random.uniform(-1, 1, (SAMPLES, a.size))]
-        )
-        found = invariance(self.system, Translations(self.connection.fibre), nearby(q), nearby(v), params)
+        found = invariance(self.system, Translations(self.connection.fibre), *sampled(data), params)
         if not found.ok:
             worst = self.connection.fibre[found.generator]
             what = {"lagrangian": f"∂L/∂q[{worst}]", "one_forms": "the motion of its one-forms out of their span"}
@@ -86,6 +109,28 @@ class ReducedLagrangeDirac(AbstractSystem):
 
     def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
         return self.system.constraint_at(self.unreduced_row(row), params)
+
+
+@eqx.filter_jit
+def _parts_along(reduced: ReducedLagrangeDirac, t, q, v, params):
+    """The entries of the rows of W and of f along the group, (samples, m + 1, k), and the sizes of the rows."""
+    system, fibre = reduced.system, np.array(reduced.connection.fibre)
+
+    def at(t, q, v):
+        forces = jnp.zeros_like(q) if system.forces is None else system.forces(t, q, v, params)
+        rows = jnp.concatenate([reduced.constraints.one_forms_at(t, q, params), forces[None]])
+        return rows[:, fibre], jnp.max(jnp.abs(rows), axis=1)
+
+    return jax.vmap(at)(t, q, v)
+
+
+def sampled(data: dict[str, Array]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, points and velocities, (1 + SAMPLES, …) each: the initial data, at t = 0, and random ones near them."""
+    q = np.asarray(data["q"] if "q" in data else data["q0"])
+    v = np.asarray(data["v"]) if "v" in data else np.ones_like(q)
+    random = np.random.default_rng(0)
+    nearby = lambda a: np.concatenate([a[None], a + NEARBY * random.uniform(-1, 1, (SAMPLES, a.size))])
+    return times(1 + SAMPLES), nearby(q), nearby(v)
 
 
 def group_inertia_ranks(system: LagrangeDirac, connection: AbstractConnection, q: Array, params: Any) -> tuple[int, int]:

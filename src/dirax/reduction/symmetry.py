@@ -166,17 +166,22 @@ def check_invariance(
     random = np.random.default_rng(0)
     near = lambda point: np.concatenate([point[None], point + radius * random.uniform(-1, 1, (samples, q.size))])
     if discrete_lagrangian is None:
-        return invariance(system, action, near(q), near(v), params)
+        return invariance(system, action, times(1 + samples), near(q), near(v), params)
     if step is None:
         raise ValueError("discrete_lagrangian needs step=, the h that it is called with.")
     ld = UserFunction(discrete_lagrangian, "discrete_lagrangian", ("q0", "q1", "h"))
     points = near(q)
     moved = lambda g, t, q0, q1: ld(action(g, q0), action(g, q1), step, params)
-    return _worst({"discrete_lagrangian": moved}, action, points, points + step * near(v))
+    return _worst({"discrete_lagrangian": moved}, action, times(1 + samples), points, points + step * near(v))
 
 
-def invariance(system: Any, action: AbstractAction, q: Any, v: Any, params: Any) -> Invariance:
-    """`check_invariance` at given points q and velocities v, (samples, n), the first at t = 0."""
+def times(count: int) -> np.ndarray:
+    """Times at which functions are looked at: 0, and random ones up to 1."""
+    return np.random.default_rng(1).uniform(0, 1, count) * (np.arange(count) > 0)
+
+
+def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, params: Any) -> Invariance:
+    """`check_invariance` at given times (samples,), points q and velocities v, (samples, n)."""
     constraints = system.constraints
 
     def pulled_back(g, t, q, v):
@@ -211,13 +216,12 @@ def invariance(system: Any, action: AbstractAction, q: Any, v: Any, params: Any)
     for moved in (one_forms, holonomic, forces):
         if getattr(system, moved.__name__) is not None:
             functions[moved.__name__] = moved
-    return _worst(functions, action, q, v)
+    return _worst(functions, action, t, q, v)
 
 
-def _worst(functions: dict[str, Callable], action: AbstractAction, q: Any, v: Any) -> Invariance:
+def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: Any, v: Any) -> Invariance:
     """The largest change of the functions (g, t, q, v) at g = 0, relative to their sizes and those of their derivatives."""
     zero, worst = jnp.zeros(action.dimension()), None
-    times = np.random.default_rng(1).uniform(0, 1, len(q)) * (np.arange(len(q)) > 0)
     for name, moved in functions.items():
 
         def at(t, q, v, moved=moved):
@@ -226,7 +230,7 @@ def _worst(functions: dict[str, Callable], action: AbstractAction, q: Any, v: An
             size = jnp.maximum(1.0, jnp.maximum(jnp.max(jnp.abs(value)), jnp.max(jnp.abs(slope))))
             return jnp.max(jnp.abs(jnp.reshape(rate, (-1, zero.shape[0]))), axis=0), size
 
-        defect, size = (np.asarray(a) for a in jax.jit(jax.vmap(at))(*map(jnp.asarray, (times, q, v))))
+        defect, size = (np.asarray(a) for a in jax.jit(jax.vmap(at))(*map(jnp.asarray, (t, q, v))))
         known = np.isfinite(defect) & np.isfinite(size)[:, None]
         relative = np.where(known, defect / np.where(known, size[:, None], 1.0), 0.0)
         row, column = np.unravel_index(int(np.argmax(relative)), relative.shape)

@@ -38,7 +38,8 @@ class StepEquation(eqx.Module):
 
     An explicit method has `unknowns = 0`. `scale` (k,) is the unit of each unknown, for the stopping test of Newton's
     method only. `labels` names each row of the residual for messages. With `needs_leaving_step` the node fields depend on
-    `u`, and an engine solves one more step to fill the last row.
+    `u`, and an engine solves one more step to fill the last row. `check(data, params)` raises `ValueError` for initial data,
+    concrete ones, at which a premise of the method does not hold.
     """
 
     start: Callable = eqx.field(static=True)
@@ -53,6 +54,7 @@ class StepEquation(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
     needs_leaving_step: bool = eqx.field(static=True)
     canonical: bool = eqx.field(static=True)
+    check: Callable = eqx.field(static=True)
 
     def __init__(
         self,
@@ -69,6 +71,7 @@ class StepEquation(eqx.Module):
         labels: tuple[str, ...] | None = None,
         needs_leaving_step: bool = False,
         canonical: bool = False,
+        check: Callable | None = None,
     ):
         """`canonical` says that the state is (q, p) of T*Q, so that its symplecticity can be measured."""
         self.start, self.residual, self.advance, self.unpack = start, residual, advance, unpack
@@ -77,6 +80,7 @@ class StepEquation(eqx.Module):
         self.scale = (1.0,) * unknowns if scale is None else tuple(float(s) for s in scale)
         self.labels = labels or tuple(f"equation {i}" for i in range(unknowns))
         self.needs_leaving_step, self.canonical = needs_leaving_step, canonical
+        self.check = check or nothing_to_check
         if not len(self.scale) == len(self.labels) == unknowns:
             raise ValueError(
                 f"scale and labels need one entry per unknown ({unknowns}), but {len(self.scale)} and {len(self.labels)} "
@@ -147,6 +151,10 @@ class AbstractScheme(eqx.Module):
 def previous_unknowns(state, previous, h, params):
     """The default guess: the unknowns extrapolated from the steps before."""
     return previous
+
+
+def nothing_to_check(data, params) -> None:
+    """The default check of initial data."""
 
 
 def explicit_step(u, state, t, h, params) -> Float[Array, "0"]:
