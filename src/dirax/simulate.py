@@ -89,6 +89,7 @@ def simulate(
     # user functions that close over a traced value make the start traced although nothing that was passed is
     traced, redundant = is_traced(data, params, h, t0, start), ()
     if not traced:
+        equation.stages[0][0].check(one, one_params)
         redundant = redundant_constraints(system, start.constraints, one, one_params, t0)
         if redundant:
             equation, start = begin(Shape(shape.n, shape.m, shape.c, redundant=redundant))
