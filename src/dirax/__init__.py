@@ -43,7 +43,8 @@ from dirax.reduction.coordinates import adapted_basis, in_coordinates
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.left_translation import LeftTranslation
 from dirax.reduction.lie_poisson import LiePoisson
-from dirax.reduction.reduced import ReducedLagrangeDirac, reduce
+from dirax.reduction.reduce import reduce
+from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import GroupAction, Translations, check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.schemes.charted import InCharts
 from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition

@@ -23,7 +23,8 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     Of a system made by `dx.reduce`: q = (x, g) with g_{k+1} = g_k + ω_d + A(x_{k+1} − x_k), p = (w − h*_{d,Σ}(μ), μ)
     ([RL] §4), multipliers and work as they were. Of a `dx.EulerPoincare` or `dx.LiePoisson` system: q the group element
     g_k = g0 f_0 ⋯ f_{k−1} (N,), p the covector at it with the body momentum μ, `spatial_momentum` Ad*_{g⁻¹} μ (d,), and the
-    reduced fields as they were; `g0` is an element (N,), a matrix (k, k), in a batch also (B, N), or the identity.
+    reduced fields as they were; `g0` is an element (N,), a matrix (k, k), in a batch also (B, N), or the identity, as for a
+    run that started from q=.
 
     Raises `TypeError` for a solution of another system, `ValueError` for a g0 that is no element of the group.
     """

@@ -11,7 +11,7 @@ from dirax.gallery import charged_particle, double_spherical_pendulum
 from dirax.gallery.reproduction import AGREES, DIFFERS, NEW, WRONG, Progress, Reproduction, Row, compared
 from dirax.reconstruction import reconstruct
 from dirax.reduction.connection import LinearConnection
-from dirax.reduction.reduced import reduce
+from dirax.reduction.reduce import reduce
 from dirax.schemes.discrete_lagrangian import RULES, discrete_lagrangian
 from dirax.schemes.lagrange_dirac import PlusLagrangeDirac
 from dirax.schemes.routh import DiscreteRouth

@@ -31,8 +31,9 @@ class EulerPoincare(AbstractSystem):
     - `one_forms`: an (m, d) array A, or a function `one_forms([a][, params])` that returns one, takes a iff there is one.
     - `representation`: how the group acts on a, as in `dx.SemidirectProduct`; by default a is made of vectors it turns.
 
-    The state is x = (μ, a) with the body momentum μ = ∂l/∂ξ; `state(xi, a)` makes one from a velocity. Stepped by
-    `dx.DiscreteEulerPoincare`; `dx.reconstruct` gives the motion on the group.
+    The state is x = (μ, a) with the body momentum μ = ∂l/∂ξ; `state(xi, a)` makes one from a velocity. Without advected
+    quantities a run also starts from q=, v= or q=, p=, an element g of the group and a tangent vector or covector there.
+    Stepped by `dx.DiscreteEulerPoincare`; `dx.reconstruct` gives the motion on the group.
 
         body = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ (jnp.array([1.0, 2.0, 3.0]) * xi) / 2)
         sol = dx.simulate(body, dx.DiscreteEulerPoincare(), x=body.state([0.1, 1.0, 0.1]), step=0.1, steps=100)
@@ -115,6 +116,7 @@ class EulerPoincare(AbstractSystem):
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
         """(d + r, m)."""
+        data = self._on_the_dual(data, params)
         momentum, a = checked_point(self.space, data, "EulerPoincare", "body.state(xi, a)")
         d, given = self.space.dimension, self._given(momentum, a)
         out = self.lagrangian.shape(*given, params)
@@ -151,13 +153,25 @@ class EulerPoincare(AbstractSystem):
         xi = self.inverse_legendre(momentum, a, params)
         return jax.hessian(lambda xi: self.value(xi, a, params))(xi), self.constraint_forms(a, params)
 
+    def _on_the_dual(self, data: dict[str, Array], params: Any) -> dict[str, Array]:
+        """x = μ of data q with v or p on the group; other data as they are."""
+        if "q" not in data or self.space.advected:
+            return data
+        group, q = self.space.group, jnp.asarray(data["q"])
+        group.check_point(q, "q")
+        if "p" in data:
+            return {"x": group.body_momentum(q, jnp.asarray(data["p"]))}
+        group.check_tangent(q, data["v"], "v")
+        return {"x": self.legendre(group.to_algebra(q, data["v"]), jnp.zeros(0), params)}
+
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
-        momentum, a = self.space.split(data["x"])
+        momentum, a = self.space.split(self._on_the_dual(data, params)["x"])
         xi = self.inverse_legendre(momentum, a, params)
         if project and self.one_forms is not None:
             xi = self._constrained_velocity(momentum, a, xi, params)
             momentum = self.legendre(xi, a, params)
-        return {"x": jnp.concatenate([momentum, a]), "v": xi}
+        start = {"g": data["q"]} if "q" in data else {}
+        return {"x": jnp.concatenate([momentum, a]), "v": xi} | start
 
     def _constrained_velocity(self, momentum, a, guess, params):
         """The ξ with A ξ = 0 and μ − ∂l/∂ξ a reaction Aᵀσ."""

@@ -2,13 +2,12 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import is_traced
+from dirax.functions import evaluated, is_traced
 from dirax.reduction.connection import AbstractConnection
 from dirax.reduction.symmetry import TOLERANCE, Translations, invariance, times
 from dirax.systems.constraints import Constraints
@@ -61,8 +60,8 @@ class ReducedLagrangeDirac(AbstractSystem):
         concrete; empty where nothing does."""
         if self.conserves_momentum:
             return ""
-        t, q, v = sampled(data)
-        parts, sizes = (np.asarray(a) for a in _parts_along(self, t, q, v, params))
+        _, q, v = sampled(data)
+        parts, sizes = (np.asarray(a) for a in evaluated(self._parts_along, *sampled(data), params))
         defects = np.abs(parts) / np.maximum(1.0, sizes)[..., None]
         where, row, column = np.unravel_index(int(np.argmax(np.where(np.isfinite(defects), defects, 0.0))), defects.shape)
         if not defects[where, row, column] > TOLERANCE:
@@ -72,6 +71,17 @@ class ReducedLagrangeDirac(AbstractSystem):
         part = f"f has the part {{:.3g}} along {coordinate}" if forces else f"one-form {row} has {{:.3g}} d{coordinate}"
         at = f"q = {np.asarray(q[where])}" + f", v = {np.asarray(v[where])}" * bool(forces)
         return f"{what}: {part.format(parts[where, row, column])} at {at}, at or near the initial data"
+
+    def _parts_along(self, t, q, v, params):
+        """The entries of the rows of W and of f along the group, (samples, m + 1, k), and the sizes of the rows."""
+        system, fibre = self.system, np.array(self.connection.fibre)
+
+        def at(t, q, v):
+            forces = jnp.zeros_like(q) if system.forces is None else system.forces(t, q, v, params)
+            rows = jnp.concatenate([self.constraints.one_forms_at(t, q, params), forces[None]])
+            return rows[:, fibre], jnp.max(jnp.abs(rows), axis=1)
+
+        return jax.vmap(at)(t, q, v)
 
     def _refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]
@@ -111,19 +121,6 @@ class ReducedLagrangeDirac(AbstractSystem):
         return self.system.constraint_at(self.unreduced_row(row), params)
 
 
-@eqx.filter_jit
-def _parts_along(reduced: ReducedLagrangeDirac, t, q, v, params):
-    """The entries of the rows of W and of f along the group, (samples, m + 1, k), and the sizes of the rows."""
-    system, fibre = reduced.system, np.array(reduced.connection.fibre)
-
-    def at(t, q, v):
-        forces = jnp.zeros_like(q) if system.forces is None else system.forces(t, q, v, params)
-        rows = jnp.concatenate([reduced.constraints.one_forms_at(t, q, params), forces[None]])
-        return rows[:, fibre], jnp.max(jnp.abs(rows), axis=1)
-
-    return jax.vmap(at)(t, q, v)
-
-
 def sampled(data: dict[str, Array]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times, points and velocities, (1 + SAMPLES, …) each: the initial data, at t = 0, and random ones near them."""
     q = np.asarray(data["q"] if "q" in data else data["q0"])
@@ -144,18 +141,3 @@ def group_inertia_ranks(system: LagrangeDirac, connection: AbstractConnection, q
     size = max(np.max(np.abs(nearby)), 1e-300)
     ranks = [int(np.linalg.matrix_rank(block / size, tol=1e-13, hermitian=True)) for block in (here, nearby)]
     return ranks[0], ranks[1]
-
-
-def reduce(system: LagrangeDirac, connection: AbstractConnection) -> ReducedLagrangeDirac:
-    """The system on the quotient by the translations of `connection.fibre`; run it with the same q=, v= as `system`.
-
-        reduced = dx.reduce(system, dx.LinearConnection(fibre=[0]))
-        sol = dx.reconstruct(dx.simulate(reduced, dx.PlusLagrangeDirac("midpoint"), q=q, v=v, step=0.01, steps=100))
-
-    Raises `TypeError` for other systems; invariance is checked at the start of a run.
-    """
-    if not isinstance(system, LagrangeDirac):
-        raise TypeError(f"dx.reduce takes a dx.LagrangeDirac system, but a {type(system).__name__} was given.")
-    if not isinstance(connection, AbstractConnection):
-        raise TypeError(f"connection must be a dx.LinearConnection(fibre=[…]), but {connection!r} was given.")
-    return ReducedLagrangeDirac(system, connection)

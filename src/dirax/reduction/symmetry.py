@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
 from dirax.reduction.connection import check_fibre, fibre_indices
+from dirax.systems.nonholonomic import as_lagrange_dirac
 
 TOLERANCE = 1e-9
 """Largest defect, relative to the size of L and of its derivatives, of a symmetry."""
@@ -153,7 +154,7 @@ def check_invariance(
     samples: int = 32,
     radius: float = 1.0,
 ) -> Invariance:
-    """Whether L, the constraints and the forces of a `dx.LagrangeDirac` system, or with `discrete_lagrangian(q0, q1, h[,
+    """Whether L, the constraints and the forces of a Lagrangian system, or with `discrete_lagrangian(q0, q1, h[,
     params])` and `step` that function, are invariant under an action; and where not.
 
     Looked at: `q` (n,) with `v` (n,) at t = 0, and `samples` random points within `radius` of them at other times; the group
@@ -182,7 +183,8 @@ def times(count: int) -> np.ndarray:
 
 def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, params: Any) -> Invariance:
     """`check_invariance` at given times (samples,), points q and velocities v, (samples, n)."""
-    constraints = system.constraints
+    system = as_lagrange_dirac(system)
+    constraints: Any = getattr(system, "constraints", None)
 
     def pulled_back(g, t, q, v):
         """Φ_g q, TΦ_g v and DΦ_g."""
@@ -214,7 +216,7 @@ def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, para
 
     functions = {"lagrangian": lagrangian}
     for moved in (one_forms, holonomic, forces):
-        if getattr(system, moved.__name__) is not None:
+        if getattr(system, moved.__name__, None) is not None:
             functions[moved.__name__] = moved
     return _worst(functions, action, t, q, v)
 
@@ -249,7 +251,7 @@ def translation_symmetries(
 
     Found from ∂L/∂q at `samples` random points within `radius` of (q, v); `cyclic_coordinates` are those along the axes.
     """
-    q = np.asarray(q, dtype=float)
+    system, q = as_lagrange_dirac(system), np.asarray(q, dtype=float)
     v = np.zeros_like(q) if v is None else np.asarray(v, dtype=float)
     random = np.random.default_rng(0)
     points = [jnp.asarray(c + radius * random.uniform(-1, 1, (samples, q.size))) for c in (q, v)]

@@ -33,8 +33,9 @@ class DiscreteEulerPoincare(AbstractScheme):
 
     One step, self-adjoint, second order. Without constraints it is a Poisson map that stays on the coadjoint orbits, and the
     spatial momentum Ad*_{g⁻¹}μ (its part that fixes a_0) is conserved. Saved: x = (μ, a), the group element g (from the
-    identity on), per step xi (d,) and, with constraints, `constraint` A ξ_k and the impulse `multipliers` (h/2)(λ'_{k−1} + λ_k)
-    at its first node: μ_k⁻ − μ_k⁺ is Aᵀ times it (at k = 0, where the motion starts in the middle of it, the second half).
+    identity on, or from q=), per step xi (d,) and, with constraints, `constraint` A ξ_k and the impulse `multipliers`
+    (h/2)(λ'_{k−1} + λ_k) at its first node: μ_k⁻ − μ_k⁺ is Aᵀ times it (at k = 0, where the motion starts in the middle of
+    it, the second half).
 
     Bobenko & Suris 1999; Marsden, Pekarsky & Shkoller 1999; Fedorov & Zenkov 2005; Kobilarov & Marsden 2011. Raises
     `TypeError` for other systems; a step that turns by π or more is refused.
@@ -131,11 +132,13 @@ def discrete_euler_poincare(system: Any, shape: Shape, name: str) -> StepEquatio
         zero = jnp.zeros(m)
         motion = [xi, x[:d]] if hamiltonian else [xi]
         u = jnp.concatenate([*motion, *([zero, xi, zero] if m else [])])
-        return jnp.concatenate([x, group.identity(), zero]), u
+        return jnp.concatenate([x, data.get("g", group.identity()), zero]), u
 
     fields = {
         "x": Field((n,), dims=("component",), description="body momentum μ and advected quantities a"),
-        "g": Field((group.ambient_dimension,), dims=("group",), description="group element g_0⁻¹g_k"),
+        "g": Field(
+            (group.ambient_dimension,), dims=("group",), description="group element g_k, from the identity on unless q= was given"
+        ),
         "xi": Field((d,), "step", ("algebra",), "velocity ξ_k of the step, g_k⁻¹g_{k+1} = τ(hξ_k)"),
     }
     labels = [f"discrete Euler–Poincaré equation {i}, of a step that turns by less than π" for i in range(d)]

@@ -1,0 +1,49 @@
+"""dx.reduce: from a system and its symmetry to the system on the quotient."""
+
+from typing import Any, overload
+
+from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.reduction.connection import AbstractConnection
+from dirax.reduction.euler_poincare import EulerPoincare
+from dirax.reduction.left_invariant import reduced_by_left_translations
+from dirax.reduction.reduced import ReducedLagrangeDirac
+from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.nonholonomic import as_lagrange_dirac
+from dirax.systems.system import AbstractSystem
+
+
+@overload
+def reduce(system: AbstractSystem, connection: AbstractConnection, params: Any = None) -> ReducedLagrangeDirac: ...
+@overload
+def reduce(system: AbstractSystem, connection: AbstractLieGroup, params: Any = None) -> EulerPoincare: ...
+def reduce(system: Any, connection: Any, params: Any = None) -> ReducedLagrangeDirac | EulerPoincare:
+    """The system on the quotient by a symmetry; run it with the same q=, v= as `system`, and undo it by `dx.reconstruct`.
+
+    With a connection, the quotient of a `dx.LagrangeDirac` or `dx.NonholonomicMechanics` system by the translations of
+    `connection.fibre` ([RL] §4); that these leave it alone is checked at the start of a run.
+
+        reduced = dx.reduce(system, dx.LinearConnection(fibre=[0]))
+        sol = dx.reconstruct(dx.simulate(reduced, dx.PlusLagrangeDirac("midpoint"), q=q, v=v, step=0.01, steps=100))
+
+    With a Lie group, the quotient TG/G ≅ 𝔤 of a left-invariant Lagrangian L(g, ġ) on that group: the `dx.EulerPoincare`
+    system of l(ξ) = L(e, ξ), with left-invariant one-forms that of Euler, Poincaré and Suslov, A = W(e). `system` is a
+    `dx.ManifoldLagrangian` on the group, or a `dx.LagrangeDirac` whose q are the coordinates of its elements. Invariance
+    L(g, gξ) = L(e, ξ) is checked here, at random g and ξ; functions that take `params` are called with those given here.
+
+        body = dx.reduce(dx.ManifoldLagrangian(lambda g, v: l(dx.SO3().to_algebra(g, v)), dx.SO3()), dx.SO3())
+        sol = dx.reconstruct(dx.simulate(body, dx.DiscreteEulerPoincare(), q=g, v=v, step=0.01, steps=100))
+
+    Raises `TypeError` for other systems and symmetries, and for missing params; `ValueError`, with the defect and where, for a
+    Lagrangian or one-forms that the group does not leave alone, and for what has no reduced counterpart.
+    """
+    if isinstance(connection, AbstractLieGroup):
+        return reduced_by_left_translations(system, connection, params)
+    system = as_lagrange_dirac(system)
+    if not isinstance(system, LagrangeDirac):
+        raise TypeError(f"dx.reduce takes a dx.LagrangeDirac system, but a {type(system).__name__} was given.")
+    if not isinstance(connection, AbstractConnection):
+        raise TypeError(
+            "the symmetry must be a connection such as dx.LinearConnection(fibre=[…]), or a Lie group such as dx.SO3(), but "
+            f"{connection!r} was given."
+        )
+    return ReducedLagrangeDirac(system, connection)
