@@ -142,7 +142,8 @@ def _beginning(system, equation, two_points: bool, project: bool, first_step: bo
         q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if two_points else (complete.get("q"), complete.get("v"))
         known = lambda name, *given: hasattr(system, name) and all(x is not None for x in given)
         lagrangian = at_time(system.lagrangian, t0, q, v, params) if known("lagrangian", q, v) else None
-        constraints = system.constraints.matrix(t0, q, params) if known("constraints", q) else None
+        at = complete.get("x", q)
+        constraints = system.constraints.matrix(t0, at, params) if known("constraints", at) else None
         t = t0 + int(two_points) * h
         solved = lambda u: stage.residual(u, state, t, fraction * h, params)
         residual, jacobian = (solved(u), jax.jacfwd(solved)(u)) if stage.unknowns and first_step else (None, None)
@@ -176,7 +177,7 @@ def _refuse_outside_the_domain(start: Start) -> None:
 
 
 def _refuse_constraints_outside_their_domain(system: Any, start: Start) -> None:
-    if start.constraints is None:
+    if start.constraints is None or not np.size(start.constraints):
         return
     for values, ndim in ((start.constraints, 2), (start.defect, 1)):
         if not np.size(values):

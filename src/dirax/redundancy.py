@@ -9,6 +9,7 @@ import numpy as np
 
 from dirax.initial import numerical_rank
 from dirax.systems.constraints import Constraints
+from dirax.systems.dirac_system import DiracSystem
 
 CONSISTENT = 1e-9
 """Largest residual of constraints, relative to 1 or to the velocity, that counts as satisfied."""
@@ -59,7 +60,9 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
             f"constraint {zero[0]} (in the order of the multipliers: one_forms, then holonomic) has no direction at the "
             f"initial data{where}: its row of [W; ∂g/∂q] is zero there. Leave it out, or start elsewhere."
         )
-    q = jnp.asarray(data["q"] if "q" in data else data["q0"])
+    if isinstance(system, DiracSystem) and "x" not in data:
+        data = {"x": jnp.concatenate([data["q"], data["p"]])}
+    q = jnp.asarray(next(data[name] for name in ("x", "q", "q0") if name in data))
     near, positions, velocities = map(np.asarray, _nearby(system, q, params, jnp.asarray(t0, float)))
     worst = max((positions, velocities), key=lambda residual: np.max(np.abs(residual), initial=0.0))
     if np.max(np.abs(worst), initial=0.0) > CONSISTENT * (1 + np.max(np.abs(q))):

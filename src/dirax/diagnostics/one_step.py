@@ -183,25 +183,31 @@ def membership_defect(
     return jnp.stack([jnp.max(jnp.abs(constraint) / nonzero(constraint_scale)), relative_force, relative_saved])
 
 
-def discretization_defect(system: DiracSystem, map: AbstractDiscretizationMap, h, x0, x1, params) -> Float[Array, "1"]:
-    """By how much a pair misses the discretization-map Dirac structure ([BLM] Definition 5.1) with α = dH, in roundings.
+def discretization_defect(
+    system: DiracSystem, map: AbstractDiscretizationMap, h, x0, x1, multipliers, params
+) -> Float[Array, "1"]:
+    """By how much a pair misses the discretization-map Dirac structure ([BLM] Definition 5.1) with α = dH − Gᵀλ, in
+    roundings, λ the multipliers of holonomic constraints.
 
-    F v + E dH at the base point, v = R_d⁻¹(x0, x1)/h, tangent to the manifold of the map; relative to |F||v| + |E||dH| and
+    F v + E α at the base point, v = R_d⁻¹(x0, x1)/h, tangent to the manifold of the map; relative to |F||v| + |E||α| and
     to what it changes when every coordinate is changed by itself.
     """
     structure = DiscretizationMapDirac(system.structure, map, h)
     manifold = map.manifold(x0.shape[0])
 
+    def covector(x):
+        return system.differential(x, params) - system.holonomic_matrix(x, params).T @ multipliers
+
     def defect(z):
         a, b = jnp.split(z, 2)
         x, _ = structure.velocity(a, b)
-        missed = structure.membership_defect(a, b, system.differential(x, params), params)
+        missed = structure.membership_defect(a, b, covector(x), params)
         return manifold.projection(x, jnp.asarray(missed))
 
     z = jnp.concatenate([x0, x1])
     x, v = structure.velocity(x0, x1)
     F, E = system.structure.kernel(x, params)
-    terms = jnp.abs(F) @ jnp.abs(v) + jnp.abs(E) @ jnp.abs(system.differential(x, params))
+    terms = jnp.abs(F) @ jnp.abs(v) + jnp.abs(E) @ jnp.abs(covector(x))
     size = jnp.abs(z) + jnp.tile(jnp.abs(x1 - x0) + h, 2)
     scale = jnp.max(terms) + jnp.max(jnp.abs(jax.jacfwd(defect)(z)) @ size)
     return jnp.max(jnp.abs(defect(z)))[None] / nonzero(scale)

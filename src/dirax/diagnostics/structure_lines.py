@@ -69,9 +69,12 @@ def _discretization(sol: Solution, tolerance: float | None) -> Line:
     name = "discretization-map Dirac structure"
     if sol.save_every != 1:
         return Line(name, None, None, NOT_CHECKED, f"needs every step, but save_every = {sol.save_every}")
+    if sol.system.holonomic is not None and sol.scheme.constraints == "resolve":
+        return Line(name, None, None, NOT_CHECKED, "Method 2 projects the step of D onto the final manifold")
     x = np.asarray(sol.x)
     function = eqx.Partial(discretization_defect, sol.system, sol.scheme.map, sol.step)
-    items = (x[..., :-1, :], x[..., 1:, :])
+    multipliers = np.asarray(sol.fields.get("multipliers", np.zeros((*x.shape[:-2], sol.rows - 1, 0))))
+    items = (x[..., :-1, :], x[..., 1:, :], multipliers)
     values = where_reached(over_rows(function, sol, items), items, sol)[..., 0]
     lane, row = worst_place(values)
     text = f"(R_d⁻¹(x₀, x₁)/h, dH) ∈ D at every step, from x alone; worst at t = {float(sol.t[row]):.6g}{of_lane(sol, lane)}"

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.schemes.step import Field, Shape
+from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 
@@ -14,7 +15,7 @@ class ConstraintRows:
     """The rows of [W; G] that enter the equations of a step, with their multipliers: `count` of them, the first
     `nonholonomic` from W and the last `holonomic` from G. Saved arrays have all m + c entries."""
 
-    def __init__(self, system: LagrangeDirac, shape: Shape):
+    def __init__(self, system: LagrangeDirac | DiracSystem, shape: Shape):
         self.constraints, self.m, self.c = system.constraints, shape.m, shape.c
         self.kept = tuple(i for i in range(shape.m + shape.c) if i not in shape.redundant)
         self.count = len(self.kept)
@@ -70,6 +71,16 @@ class ConstraintRows:
         """The names of the constraint equations."""
         of = lambda i: f"discrete constraint {i}" if i < self.m else f"holonomic constraint {i - self.m}"
         return tuple(of(i) for i in self.kept)
+
+
+def independent_constraints(system: Any, shape: Shape) -> tuple[Any, int, Callable]:
+    """(system, k, all) of a system in coordinates x: the same with the k multipliers of independent constraints only, and the
+    function that puts them among all of them."""
+    if not shape.redundant:
+        return system, shape.m + shape.c, lambda multipliers: multipliers
+    rows, g = ConstraintRows(system, shape), system.holonomic
+    picked = lambda x, params: rows.pick(g(x, params))
+    return DiracSystem(system.structure, system.hamiltonian.function, holonomic=picked), rows.count, rows.all
 
 
 def step_constraints(rows: ConstraintRows, wd: Callable) -> Callable:

@@ -5,9 +5,10 @@ from typing import Any
 import jax.numpy as jnp
 
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
+from dirax.schemes.constraint_rows import independent_constraints
 from dirax.schemes.discretized import stepping
 from dirax.schemes.lagrangian_methods import discretized_lagrangian, resolved_lagrangian, resolved_nonholonomic
-from dirax.schemes.resolved import projected_field
+from dirax.schemes.resolved import of_chain, of_constrained_hamiltonian, projected_field
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.systems.constraint_chain import ResolvedSystem
 from dirax.systems.dirac_system import DiracSystem
@@ -29,7 +30,10 @@ class DiscreteDirac(AbstractScheme):
     "discretize" ([BLM] Method 1) discretizes the implicit system S_0 as it stands; "resolve" ([BLM] Method 2) runs the
     constraint algorithm first and discretizes on M_f, so that its constraints hold at the nodes to roundoff. Of holonomic
     constraints g = 0, Method 1 imposes the distribution G q̇ + ∂g/∂t = 0 at the base point, which keeps quadratic g for the
-    midpoint map and lets others drift; Method 2 keeps g and G q̇ + ∂g/∂t at the nodes.
+    midpoint map and lets others drift; Method 2 keeps g and G q̇ + ∂g/∂t at the nodes. With either kind of constraint the
+    multipliers of Method 1 alternate around those of the system by O(h), and means of neighbours are of the order of q.
+    Method 2 of a DiracSystem with `holonomic` is stated here for graphs of two-forms and bivectors with {g_i, g_j} = 0, and
+    by its resolved chain for others.
 
     Takes DiracSystem, PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian
     systems, and what `ConstraintChain.resolved` returns, on which it is Method 2 for any system; raises `TypeError` for
@@ -50,10 +54,12 @@ class DiscreteDirac(AbstractScheme):
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         resolve = self.constraints == "resolve"
         if isinstance(system, ResolvedSystem):
-            return projected_field(system, shape, _theta_of(self.map))
-        if isinstance(system, PortHamiltonian | ImplicitSystem) and shape.m and resolve:
+            return projected_field(of_chain(system), shape.n, _theta_of(self.map))
+        if isinstance(system, DiracSystem) and system.is_graph and shape.c and resolve:
+            return projected_field(of_constrained_hamiltonian(system, shape), shape.n, _theta_of(self.map))
+        if isinstance(system, DiracSystem | PortHamiltonian | ImplicitSystem) and shape.m + shape.c and resolve:
             raise ValueError(
-                f"Method 2 of a {type(system).__name__} with multipliers needs its final manifold: simulate "
+                f"Method 2 of this {type(system).__name__} with multipliers needs its final manifold: simulate "
                 "dx.constraint_algorithm(system, near=x).resolved() instead of the system."
             )
         if isinstance(system, DiracSystem | PortHamiltonian | ImplicitSystem):
@@ -78,7 +84,8 @@ def discretized_relation(
     system: DiracSystem | PortHamiltonian | ImplicitSystem, shape: Shape, map: AbstractDiscretizationMap
 ) -> StepEquation:
     """The relation between (x, ẋ) of a system on M, discretized by a map on M: state x, unknowns (ẋ, multipliers)."""
-    size, m = shape.n, shape.m
+    size = shape.n
+    system, m, all_of_them = independent_constraints(system, shape)
     step = stepping(map, size)
     d = step.dimension
 
@@ -93,7 +100,7 @@ def discretized_relation(
         return step.move(state, u[:d], h)[2]
 
     def unpack(state, u, t, h, params):
-        row = {"x": state, "multipliers": u[d:]} if m else {"x": state}
+        row = {"x": state, "multipliers": all_of_them(u[d:])} if m else {"x": state}
         if ported is not None:
             x, velocity, _ = step.move(state, u[:d], h)
             row["power"] = power_of(ported, x, velocity, t + h / 2, params)
@@ -107,7 +114,8 @@ def discretized_relation(
     ported = system if isinstance(system, PortHamiltonian) else None
     fields = {"x": Field((size,))}
     if m:
-        fields["multipliers"] = Field((m,), "step", ("closed_port",), "multipliers at the base point")
+        axis = "constraint" if shape.c else "closed_port"
+        fields["multipliers"] = Field((shape.m + shape.c,), "step", (axis,), "multipliers at the base point")
     if ported is not None:
         fields["power"] = Field((3,), "step", ("power",), "power stored ⟨dH, ẋ⟩, supplied and dissipated at the base point")
     return StepEquation(
@@ -118,8 +126,9 @@ def discretized_relation(
         state_size=size,
         unknowns=d + m,
         fields=fields,
-        labels=tuple(f"component {i} of the Dirac condition" for i in range(d)) + tuple(f"output y[{a}]" for a in range(m)),
-        canonical=isinstance(system, DiracSystem) and is_canonical(system),
+        labels=tuple(f"component {i} of the Dirac condition" for i in range(d))
+        + tuple(f"rate of constraint {a}" if shape.c else f"output y[{a}]" for a in range(m)),
+        canonical=isinstance(system, DiracSystem) and system.canonical,
     )
 
 
@@ -129,11 +138,6 @@ def power_of(system: PortHamiltonian, x, velocity, t, params):
     supplied = system.input(t, x, params) @ (system.open_matrix(x, params).T @ dh)
     dissipated = jnp.zeros(()) if system.R is None else dh @ system.R(x, params) @ dh
     return jnp.stack([dh @ velocity, supplied, dissipated])
-
-
-def is_canonical(system: DiracSystem) -> bool:
-    """Whether the structure is the canonical symplectic one of T*Q in (q, p)."""
-    return system.structure.representation == "two_form" and getattr(system.structure.evaluate, "one_forms", 0) is None
 
 
 def _on_graph(system: PhaseSpaceLagrangian, shape: Shape, map: AbstractDiscretizationMap) -> StepEquation:

@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.schemes.constraint_rows import independent_constraints
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.port_hamiltonian import PortHamiltonian
@@ -62,7 +63,8 @@ def _quadrature(kind: str, nodes: int) -> tuple[tuple[float, ...], tuple[float, 
 
 def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, points, weights) -> StepEquation:
     """State (x, supplied, dissipated, their lost digits, H(x_0)); unknowns (ẋ_d, u of the closed ports)."""
-    n, m = shape.n, shape.m
+    n = shape.n
+    system, m, all_of_them = independent_constraints(system, shape)
     ported = system if isinstance(system, PortHamiltonian) else None
 
     def account(state):
@@ -108,7 +110,7 @@ def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, poi
         driven, outputs, loss = ports(u, state, t, h, params)
         power = jnp.stack([gradient @ u[:n], driven @ outputs, loss])
         row = {"x": state[:n], "work": state[n : n + 2] + state[n + 2 : n + 4], "power": power}
-        return row | {"multipliers": u[n:]} if m else row
+        return row | {"multipliers": all_of_them(u[n:])} if m else row
 
     def start(data, h, params):
         if "x" not in data:
@@ -123,7 +125,9 @@ def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, poi
         "power": Field((3,), "step", ("power",), "power stored, supplied and dissipated"),
     }
     if m:
-        fields["multipliers"] = Field((m,), "step", ("closed_port",), "inputs that keep the closed ports closed")
+        about = "multipliers of the constraints" if shape.c else "inputs that keep the closed ports closed"
+        axis = "constraint" if shape.c else "closed_port"
+        fields["multipliers"] = Field((shape.m + shape.c,), "step", (axis,), about)
     return StepEquation(
         start=start,
         residual=residual,

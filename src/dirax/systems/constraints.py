@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
+from dirax.roots import nearest_root, scaled_pseudo_inverse
 from dirax.systems.system import no_constraint
 
 
@@ -65,9 +66,10 @@ class Constraints(eqx.Module):
         if self.holonomic is not None:
             out = self.holonomic.shape(*self.holonomic.given(t, q, params))
             if len(out.shape) != 1 or not out.shape[0]:
+                hint = ": put it in a pair of brackets" if out.shape == () else ""
                 raise ValueError(
-                    "holonomic(q) must return an array of shape (c,), one number a constraint g(q) = 0, but it returned shape "
-                    f"{out.shape}{': put it in a pair of brackets' if out.shape == () else ''}."
+                    f"holonomic({', '.join(self.holonomic.arguments)}) must return an array of shape (c,), one number a "
+                    f"constraint g = 0, but it returned shape {out.shape}{hint}."
                 )
             c = out.shape[0]
         return m, c
@@ -116,3 +118,15 @@ class Constraints(eqx.Module):
         if self.holonomic is None:
             return first
         return jnp.concatenate([first, self.position_defect(t, q, params), self.hidden_defect(t, q, v, params)])
+
+    def nearest_velocity(
+        self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], lifted: Float[Array, "n k"], params: Any
+    ) -> Float[Array, " n"]:
+        """The velocity with W v + b = 0 and G v + ∂g/∂t = 0 that differs from v by a combination of the columns of `lifted`."""
+        inverse, _ = scaled_pseudo_inverse(self.matrix(t, q, params) @ lifted)
+        return v - lifted @ (inverse @ self.velocity_defect(t, q, v, params))
+
+    def nearest_position(self, t: Any, q: Float[Array, " n"], lifted: Float[Array, "n c"], params: Any) -> Float[Array, " n"]:
+        """The point with g = 0 near q that differs from q by a combination of the columns of `lifted`."""
+        g = lambda s: self.position_defect(t, q + lifted @ s, params)
+        return q + lifted @ nearest_root(g, jnp.zeros(lifted.shape[1]))

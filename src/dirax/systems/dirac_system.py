@@ -9,6 +9,8 @@ from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
 from dirax.geometry.structures import DiracStructure
+from dirax.roots import nearest_root
+from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
 
 RANK_TOLERANCE = 1e-10
@@ -20,17 +22,23 @@ class DiracSystem(AbstractSystem):
 
     `structure`: a `DiracStructure` in coordinates x (N,), integrable or not; `hamiltonian(x[, params])` returns a scalar.
     On a submanifold such as the sphere, x are ambient coordinates, and the discretization map names the manifold.
+    `holonomic(x[, params])` (c,) restricts the system to N = {g = 0}: (ẋ, dH − Gᵀλ) ∈ D and ẋ ∈ TN with G = ∂g/∂x and
+    multipliers λ, the Dirac system of H on N with the structure that N inherits from D. On T*Q, where x = (q, p) and g is a
+    function of q, these are q̇ = ∂H/∂p, ṗ = −∂H/∂q + Gᵀλ, g = 0 for any H, and G ∂H/∂p = 0 follows.
 
         so3 = dx.DiracStructure.from_bivector(lambda x: jnp.cross(x, jnp.eye(3), axisb=0, axisc=0))
         body = dx.DiracSystem(so3, lambda x: x @ (x / jnp.array([1.0, 2.0, 3.0])) / 2)
+        pendulum = dx.DiracSystem(  # x = (q, p), |q| = 1
+            dx.induced_dirac(None, 3), lambda x: x[3:] @ x[3:] / 2 + x[2], holonomic=lambda x: jnp.array([x[:3] @ x[:3] - 1.0]))
 
-    Raises `TypeError` where `structure` is not a DiracStructure or `hamiltonian` not a function of x.
+    Raises `TypeError` where `structure` is not a DiracStructure, or a function not one of x.
     """
 
     structure: DiracStructure
     hamiltonian: UserFunction
+    holonomic: UserFunction | None = None
 
-    def __init__(self, structure: DiracStructure, hamiltonian: Callable):
+    def __init__(self, structure: DiracStructure, hamiltonian: Callable, *, holonomic: Callable | None = None):
         if not isinstance(structure, DiracStructure):
             raise TypeError(
                 f"structure must be a dx.DiracStructure, but a {type(structure).__name__} was given: "
@@ -38,25 +46,87 @@ class DiracSystem(AbstractSystem):
             )
         self.structure = structure
         self.hamiltonian = UserFunction(hamiltonian, "hamiltonian", ("x",))
+        self.holonomic = None if holonomic is None else UserFunction(holonomic, "holonomic", ("x",))
 
     def differential(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
         """dH(x)."""
         return jax.grad(lambda x: self.hamiltonian(x, params))(x)
 
+    @property
+    def constraints(self) -> Constraints:
+        """The constraints g(x) = 0, as functions of (t, x, params)."""
+        return Constraints(None, None, self.holonomic)
+
+    def holonomic_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "c N"]:
+        """G(x) = ∂g/∂x; (0, N) without constraints."""
+        return self.constraints.holonomic_matrix(0.0, x, params)
+
     def relation(
         self,
         x: Float[Array, " N"],
         velocity: Float[Array, " N"],
-        multipliers: Float[Array, "0"],
+        multipliers: Float[Array, " c"],
         t: Any,
         params: Any = None,
         differential: Float[Array, " N"] | None = None,
-    ) -> Float[Array, " N"]:
-        """F(x) ẋ + E(x) dH(x), zero iff (ẋ, dH(x)) ∈ D_x; `differential` replaces dH(x)."""
+    ) -> Float[Array, " k"]:
+        """F ẋ + E (dH − Gᵀλ), zero iff (ẋ, dH − Gᵀλ) ∈ D_x, and G ẋ; `differential` replaces dH(x)."""
         F, E = self.structure.kernel(x, params)
-        return jnp.asarray(F @ velocity + E @ (self.differential(x, params) if differential is None else differential))
+        dh = self.differential(x, params) if differential is None else differential
+        if self.holonomic is None:
+            return jnp.asarray(F @ velocity + E @ dh)
+        rows = self.holonomic_matrix(x, params)
+        return jnp.concatenate([F @ velocity + E @ (dh - rows.T @ multipliers), rows @ velocity])
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def equations(self, x: Float[Array, " N"], params: Any = None) -> tuple[Array, Array]:
+        """([F, −E Gᵀ], −E dH), of shapes (N, N + c) and (N,): the linear equations of (ẋ, λ)."""
+        F, E = map(jnp.asarray, self.structure.kernel(x, params))
+        return jnp.concatenate([F, -E @ self.holonomic_matrix(x, params).T], axis=1), -E @ self.differential(x, params)
+
+    # ------------------------------------------------------------------ where D is a graph: M_f = {g = 0, {g, H} = 0}
+
+    @property
+    def is_graph(self) -> bool:
+        """Whether D is stated as the graph of a two-form or of a bivector, so that every covector has one velocity."""
+        return self.structure.representation in ("two_form", "bivector")
+
+    @property
+    def canonical(self) -> bool:
+        """Whether D is the canonical symplectic structure of T*Q in (q, p)."""
+        return self.structure.representation == "two_form" and getattr(self.structure.evaluate, "one_forms", 0) is None
+
+    def hamiltonian_vector(self, x: Float[Array, " N"], covector: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+        """The ẋ with (ẋ, α) ∈ D_x, unique where D is the graph of a bivector or of a nondegenerate two-form."""
+        if self.canonical:
+            q, p = jnp.split(covector, 2)
+            return jnp.concatenate([p, -q])
+        F, E = self.structure.kernel(x, params)
+        v = jnp.asarray(-E @ covector)
+        return v if self.structure.representation == "bivector" else jnp.linalg.solve(F, v)
+
+    def hidden_defect(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " c"]:
+        """{g, H} = G ẋ for the ẋ of dH, the rate of change of g."""
+        velocity = self.hamiltonian_vector(x, self.differential(x, params), params)
+        return self.constraints.hidden_defect(0.0, x, velocity, params)
+
+    def brackets(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "c c"]:
+        """{g_i, g_j}: zero for functions of q on T*Q, and wherever N is coisotropic."""
+        rows = self.holonomic_matrix(x, params)
+        return jax.vmap(lambda row: self.hamiltonian_vector(x, row, params))(rows) @ rows.T
+
+    def constrained_field(self, x: Float[Array, " N"], params: Any = None) -> tuple[Float[Array, " N"], Float[Array, " c"]]:
+        """(ẋ, λ) at a point of M_f = {g = 0, {g, H} = 0}, where the brackets {g_i, g_j} are zero: λ keeps {g, H} = 0."""
+        free = self.hamiltonian_vector(x, self.differential(x, params), params)
+        rows = self.holonomic_matrix(x, params)
+        forces = jnp.stack([self.hamiltonian_vector(x, row, params) for row in rows], axis=1)
+        slope = jax.jacfwd(lambda x: self.hidden_defect(x, params))(x)
+        multipliers = jnp.linalg.solve(slope @ forces, slope @ free)
+        return free - forces @ multipliers, multipliers
+
+    # ------------------------------------------------------------------ AbstractSystem
+
+    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
+        """(N, 0), or (N, 0, c) with holonomic constraints."""
         x = data["x"] if "x" in data else jnp.concatenate([data["q"], data["p"]]) if "p" in data else None
         if x is None:
             raise ValueError(f"a DiracSystem starts from x= (or q=, p= with x = (q, p)), but {', '.join(data)} were given.")
@@ -69,22 +139,51 @@ class DiracSystem(AbstractSystem):
                 f"the Dirac structure has dimension {F.shape[0]}, but x has {x.size} entries"
                 + (f": {self.structure.ports} ports are open; connect them by `compose`." if self.structure.ports else ".")
             )
-        return x.size, 0
+        return (x.size, 0) if self.holonomic is None else (x.size, *self.constraints.sizes(x, params))
 
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+        """x, ẋ and λ; `project` moves x to M_f where D is a graph."""
         x = data["x"] if "x" in data else jnp.concatenate([data["q"], data["p"]])
-        F, E = self.structure.kernel(x, params)
-        velocity = -jnp.linalg.pinv(F, rtol=RANK_TOLERANCE) @ (E @ self.differential(x, params))
-        return {"x": x, "velocity": velocity}
+        if project and self.holonomic is not None and self.is_graph:
+            x = self.project(x, params)
+        matrix, right = self.equations(x, params)
+        rows = self.holonomic_matrix(x, params)
+        count = rows.shape[0]
+        matrix = jnp.concatenate([matrix, jnp.concatenate([rows, jnp.zeros((count, count))], axis=1)])
+        rates = jnp.linalg.pinv(matrix, rtol=RANK_TOLERANCE) @ jnp.concatenate([right, jnp.zeros(count)])
+        return {"x": x, "velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " N"]:
-        """The part of F ẋ + E dH that no velocity makes zero: x is on M_0 where it vanishes."""
-        return self.relation(data["x"], data["velocity"], jnp.zeros(0), 0.0, params)
+    def project(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+        """A point of M_f = {g = 0, {g, H} = 0} near x: g = 0 nearest in x, then moved along the vectors of G."""
+        x = self.project_position(x, x, params)
+        forces = lambda x: jax.vmap(lambda row: self.hamiltonian_vector(x, row, params))(self.holonomic_matrix(x, params)).T
+        along = forces(x)
+        return x + along @ nearest_root(lambda s: self.hidden_defect(x + along @ s, params), jnp.zeros(along.shape[1]))
+
+    def project_position(self, x: Float[Array, " N"], v: Any, params: Any = None, t: Any = 0.0) -> Float[Array, " N"]:
+        """A point with g = 0 near x, moved along Gᵀ."""
+        return self.constraints.nearest_position(t, x, self.holonomic_matrix(x, params).T, params)
+
+    def project_velocity(
+        self, x: Float[Array, " N"], v: Float[Array, " N"], params: Any = None, t: Any = 0.0
+    ) -> Float[Array, " N"]:
+        """The ẋ with G ẋ = 0 nearest to v."""
+        return self.constraints.nearest_velocity(t, x, v, self.holonomic_matrix(x, params).T, params)
+
+    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " k"]:
+        """The part of F ẋ + E dH that no velocity makes zero: x is on M_0 where it vanishes. With holonomic constraints
+        (g, {g, H}) where D is a graph, and g with what no (ẋ, λ) makes zero elsewhere."""
+        x = data["x"]
+        if self.holonomic is None:
+            return self.relation(x, data["velocity"], jnp.zeros(0), 0.0, params)
+        if self.is_graph:
+            return jnp.concatenate([self.holonomic(x, params), self.hidden_defect(x, params)])
+        return jnp.concatenate([self.holonomic(x, params), self.relation(x, data["velocity"], data["multipliers"], 0.0, params)])
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """H(x)."""
         return self.hamiltonian(row["x"], params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " N"]:
-        """The defect of x ∈ M_0, as in `initial_defect`."""
+    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
+        """The defect of x, as in `initial_defect`."""
         return self.initial_defect(self.complete({"x": row["x"]}, params, False), params)

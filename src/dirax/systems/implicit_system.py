@@ -120,13 +120,16 @@ def implicit_form(system: AbstractSystem, near: Any, params: Any) -> ImplicitFor
         return ImplicitForm(system.equations, x, _names("x", x.size), _names("u", m), _of_x(system), "as stated")
     if isinstance(system, DiracSystem):
         x = _point(near, ("x",), system)
-        system.sizes({"x": jnp.asarray(x)}, params)
+        c = sum(system.sizes({"x": jnp.asarray(x)}, params)[1:])
 
         def dirac(x, params):
-            F, E = system.structure.kernel(x, params)
-            return F, -E @ system.differential(x, params)
+            matrix, right = system.equations(x, params)
+            return jnp.concatenate([matrix, jnp.zeros((c, x.size + c))]), jnp.concatenate(
+                [right, system.constraints.position_defect(0.0, x, params)]
+            )
 
-        return ImplicitForm(dirac, x, _names("x", x.size), (), _of_x(system), "F ẋ = −E dH")
+        about = "F ẋ = −E dH" if not c else "F ẋ = −E (dH − Gᵀλ), g = 0"
+        return ImplicitForm(dirac, x, _names("x", x.size), _names("λ", c), _of_x(system), about)
     if isinstance(system, PortHamiltonian):
         return _port_hamiltonian(system, near, params)
     if isinstance(system, NonholonomicMechanics | PhaseSpaceLagrangian):

@@ -160,8 +160,7 @@ class LagrangeDirac(AbstractSystem):
         """The velocity with W v + b = 0 and G v + ∂g/∂t = 0 nearest to v, in the metric ∂²L/∂v² where it is positive
         definite and the Euclidean one elsewhere."""
         rows = self.constraints.matrix(t, q, params)
-        lifted = self._lifted(q, v, rows, params, t)
-        return v - lifted @ (scaled_pseudo_inverse(rows @ lifted)[0] @ self.constraints.velocity_defect(t, q, v, params))
+        return self.constraints.nearest_velocity(t, q, v, self._lifted(q, v, rows, params, t), params)
 
     def project_position(
         self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0
@@ -169,10 +168,8 @@ class LagrangeDirac(AbstractSystem):
         """A point with g = 0 near q, moved along metric⁻¹ Gᵀ, in the metric of `project_velocity`."""
         if self.holonomic is None:
             return q
-        _, size = self.constraints.sizes(q, params)
         lifted = self._lifted(q, v, self.constraints.holonomic_matrix(t, q, params), params, t)
-        g = lambda s: self.constraints.position_defect(t, q + lifted @ s, params)
-        return q + lifted @ nearest_root(g, jnp.zeros(size))
+        return self.constraints.nearest_position(t, q, lifted, params)
 
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " k"]:
         """(W v + b, g, G v + ∂g/∂t); g(q0) for two points, whose step has the other constraints."""

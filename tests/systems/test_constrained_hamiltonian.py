@@ -1,0 +1,214 @@
+"""Hamiltonian systems with holonomic constraints: a spherical pendulum in curved coordinates of T*R³ against its angles and
+against its Lagrangian, a rigid body's level set, redundant constraints, and what cannot be stated so.
+
+The oracles are scipy's DOP853 at tight tolerance in angles, the Lagrangian route, and conservation laws.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dirax as dx
+
+METHOD_1, METHOD_2 = dx.DiscreteDirac(), dx.DiscreteDirac(constraints="resolve")
+
+
+def place(y):
+    """Cartesian coordinates of the curved ones y (3,)."""
+    return jnp.stack([y[0], y[1] + 0.2 * y[0] ** 2, y[2] + 0.3 * jnp.sin(y[1])])
+
+
+def unplace(x):
+    """The curved coordinates of points x (…, 3)."""
+    y1 = x[..., 1] - 0.2 * x[..., 0] ** 2
+    return np.stack([x[..., 0], y1, x[..., 2] - 0.3 * np.sin(y1)], -1)
+
+
+def metric(y):
+    jacobian = jax.jacfwd(place)(y)
+    return jacobian.T @ jacobian
+
+
+def hamiltonian(x):
+    return x[3:] @ jnp.linalg.solve(metric(x[:3]), x[3:]) / 2 + place(x[:3])[2]
+
+
+sphere = lambda x: jnp.stack([place(x[:3]) @ place(x[:3]) - 1.0])
+PENDULUM = dx.DiracSystem(dx.induced_dirac(None, 3), hamiltonian, holonomic=sphere)
+ANGLES = np.array([1.1, 0.4, 0.3, 0.9])
+
+
+def slopes(errors) -> np.ndarray:
+    """log2 of successive ratios, for halved steps."""
+    errors = np.asarray(errors)
+    return np.log2(errors[:-1] / errors[1:])
+
+
+def swing(t, z):
+    """(θ, φ) from the downward vertical, unit length and gravity."""
+    s, c = np.sin(z[0]), np.cos(z[0])
+    return [z[2], z[3], s * c * z[3] ** 2 - s, -2 * c / s * z[2] * z[3]]
+
+
+def exact(times):
+    """(x, λ): x = (y, p) on T*R³, λ = −(|v|² − z)/2, so that 2λ times the Cartesian position is the force of the rod."""
+    z = solve_ivp(swing, (0.0, times[-1]), ANGLES, method="DOP853", rtol=1e-13, atol=1e-13, t_eval=times).y
+    s, c, u, w = np.sin(z[0]), np.cos(z[0]), np.cos(z[1]), np.sin(z[1])
+    x = np.stack([s * u, s * w, -c], -1)
+    v = np.stack([c * u * z[2] - s * w * z[3], c * w * z[2] + s * u * z[3], s * z[2]], -1)
+    y = unplace(x)
+    p = np.asarray(jax.vmap(lambda y, v: jax.jacfwd(place)(y).T @ v)(jnp.asarray(y), jnp.asarray(v)))
+    return np.concatenate([y, p], 1), -(np.sum(v * v, -1) - x[:, 2])[:, None] / 2
+
+
+START = exact(np.array([0.0, 1.0]))[0][0]
+
+
+def pendulum_errors(scheme, steps):
+    """Errors of q, p, of λ at the middle of each step and of the mean of two neighbours at their node."""
+    sol = dx.simulate(PENDULUM, scheme, x=START, step=2.0 / steps, steps=steps)
+    (x, at_nodes), (_, in_steps) = exact(sol.t), exact((sol.t[1:] + sol.t[:-1]) / 2)
+    means = (sol.multipliers[1:] + sol.multipliers[:-1]) / 2
+    parts = ((sol.x[:, :3], x[:, :3]), (sol.x[:, 3:], x[:, 3:]), (sol.multipliers, in_steps), (means, at_nodes[1:-1]))
+    return [np.max(np.abs(found - known)) for found, known in parts], sol
+
+
+def test_orders_of_q_p_and_the_tension_of_method_2():
+    errors = []
+    for steps in (50, 100, 200):
+        found, sol = pendulum_errors(METHOD_2, steps)
+        errors.append(found)
+        assert np.max(np.abs(sol.constraint_residual())) < 5e-15
+    assert slopes(errors) == pytest.approx(2.0, abs=0.1)
+
+
+def test_the_multipliers_of_method_1_alternate_and_their_means_are_of_second_order():
+    """p̄ is on the hidden constraint, so that the nodes are off it by O(h²), to either side in turn, and λ by O(h)."""
+    errors, h = [pendulum_errors(METHOD_1, steps)[0] for steps in (50, 100, 200)], 2.0 / 200
+    for measured in slopes(errors):
+        assert measured == pytest.approx([2.0, 2.0, 1.0, 2.0], abs=0.1)
+    _, sol = pendulum_errors(METHOD_1, 200)
+    signs = np.sign(np.asarray(jax.vmap(PENDULUM.hidden_defect)(jnp.asarray(sol.x[1:11])))[:, 0])
+    assert np.all(signs[1:9:2] == -signs[:8:2]) and errors[-1][2] > h * 0.05
+
+
+def test_method_1_is_that_of_the_lagrangian():
+    """The same equations in x = (q, p), to roundoff, multipliers included; and q, p as initial data."""
+    lagrangian = dx.LagrangeDirac(
+        lambda y, v: v @ metric(y) @ v / 2 - place(y)[2], holonomic=lambda y: jnp.stack([place(y) @ place(y) - 1.0])
+    )
+    run = {"q": START[:3], "p": START[3:], "step": 0.05, "steps": 40}
+    one, other = (dx.simulate(system, METHOD_1, **run) for system in (PENDULUM, lagrangian))
+    np.testing.assert_allclose(one.x, np.concatenate([other.q, other.p], 1), atol=1e-13)
+    np.testing.assert_allclose(one.multipliers, other.multipliers, atol=1e-12)
+    assert one.ok and dx.verify(one).ok
+
+
+def test_constraints_and_momentum_over_many_steps():
+    """Method 2 keeps g and {g, H}; the angular momentum about the vertical, where coordinates are Cartesian."""
+    flat = dx.DiracSystem(
+        dx.induced_dirac(None, 3), lambda x: x[3:] @ x[3:] / 2 + x[2], holonomic=lambda x: jnp.stack([x[:3] @ x[:3] - 1.0])
+    )
+    sol = dx.simulate(
+        flat, METHOD_2, q=[0.6, 0.0, -0.8], p=[0.4, 0.9, 0.3], step=0.02, steps=50_000, save_every=50, engine="native"
+    )
+    assert sol.ok and np.max(np.abs(sol.constraint_residual())) < 5e-15
+    assert np.max(np.abs(sol.energy() - sol.energy()[0])) < 1e-4
+    momentum = sol.x[:, 0] * sol.x[:, 4] - sol.x[:, 1] * sol.x[:, 3]
+    assert np.max(np.abs(momentum - momentum[0])) < 1e-12
+
+
+curve = lambda x: jnp.stack([x[0] ** 2 + 2 * x[1] ** 2 + x[0] ** 4 - 2.0])
+FLAT = dx.DiracSystem(
+    dx.induced_dirac(None, 2),
+    lambda x: x[2:] @ x[2:] / 2 + 0.1 * (x[0] * x[3]) ** 2 + x[1],
+    holonomic=curve,
+)
+FLAT_START = np.array([1.0, 0.0, 0.0, 0.7])
+
+
+def test_engines_batches_and_a_gradient():
+    run = {"step": 0.1, "steps": 10}
+    batch = np.stack([FLAT_START, FLAT_START * np.array([1.0, 1.0, 1.0, -0.5])])
+    native, xla = (dx.simulate(FLAT, METHOD_2, x=batch, engine=e, **run) for e in ("native", "xla"))
+    np.testing.assert_allclose(native.x, xla.x, atol=1e-13)
+    np.testing.assert_allclose(native.multipliers, xla.multipliers, atol=1e-12)
+    np.testing.assert_array_equal(dx.simulate(FLAT, METHOD_2, x=FLAT_START, **run).x, native.x[0])
+    end = lambda speed: dx.simulate(FLAT, METHOD_2, x=jnp.array([1.0, 0.0, 0.0, 1.0]) * jnp.stack([1, 0, 0, speed]), **run).x[
+        -1, 1
+    ]
+    slope = jax.grad(end)(0.7)
+    assert slope == pytest.approx((float(end(0.7 + 1e-5)) - float(end(0.7 - 1e-5))) / 2e-5, rel=1e-7)
+
+
+def test_the_chain_finds_the_same_final_manifold_field_and_multipliers():
+    chain = dx.constraint_algorithm(FLAT, near=FLAT_START)
+    assert [level.dimension for level in chain.levels] == [3, 2, 2] and chain.verdict == "determined"
+    x = FLAT.project(jnp.asarray(FLAT_START) + jnp.array([0.02, -0.01, 0.03, 0.01]))
+    assert np.max(np.abs(chain.constraints(x))) < 1e-13
+    velocity, multipliers = FLAT.constrained_field(x)
+    np.testing.assert_allclose(chain.field(x), velocity, atol=1e-12)
+    np.testing.assert_allclose(chain.multipliers(x), multipliers, atol=1e-12)
+
+
+def test_composition_and_the_exact_energy_of_a_discrete_gradient():
+    errors = []
+    fine = dx.simulate(FLAT, dx.Composition(METHOD_2, "suzuki4"), x=FLAT_START, step=0.0025, steps=400).x[-1]
+    for steps in (10, 20, 40):
+        sol = dx.simulate(FLAT, dx.Composition(METHOD_2, "suzuki4"), x=FLAT_START, step=1.0 / steps, steps=steps)
+        errors.append(np.max(np.abs(sol.x[-1] - fine)))
+        assert np.max(np.abs(sol.constraint_residual())) < 5e-15
+    assert slopes(errors) == pytest.approx(4.0, abs=0.35)
+    sol = dx.simulate(FLAT, dx.DiscreteGradient(), x=FLAT_START, step=0.02, steps=500)
+    assert sol.ok and np.max(np.abs(sol.energy() - sol.energy()[0])) < 1e-14
+
+
+def test_a_redundant_constraint_is_left_out_and_reported():
+    make = lambda g: dx.DiracSystem(FLAT.structure, FLAT.hamiltonian.function, holonomic=g)
+    twice = make(lambda x: jnp.concatenate([curve(x), 2 * curve(x) + curve(x) ** 2]))
+    for scheme in (METHOD_1, METHOD_2, dx.DiscreteGradient()):
+        one, both = (dx.simulate(system, scheme, x=FLAT_START, step=0.05, steps=40) for system in (FLAT, twice))
+        assert both.stats["redundant_constraints"] == [1]
+        np.testing.assert_allclose(both.x, one.x, atol=1e-13)
+        np.testing.assert_allclose(both.multipliers, one.multipliers * [1.0, 0.0], atol=1e-12)
+    contradicting = make(lambda x: jnp.concatenate([curve(x), curve(x) - 1e-3]))
+    with pytest.raises(ValueError, match="contradict each other"):
+        dx.simulate(contradicting, METHOD_2, x=FLAT_START, step=0.05, steps=4, check_initial=False)
+
+
+def test_a_constrained_poisson_structure():
+    """The rigid body ẋ = x × ∇H restricted to |x|² = 1, a Casimir: {g, ·} = 0, so that nothing is to be imposed."""
+    so3 = dx.DiracStructure.from_bivector(lambda x: jnp.cross(x, jnp.eye(3), axisb=0, axisc=0))
+    body = dx.DiracSystem(so3, lambda x: x @ (x / jnp.array([1.0, 2.0, 3.0])) / 2, holonomic=lambda x: jnp.stack([x @ x - 1.0]))
+    with pytest.raises(ValueError, match="no unique solution"):
+        dx.simulate(body, METHOD_1, x=[0.6, 0.0, 0.8], step=0.1, steps=2)
+
+
+def test_initial_data_off_the_final_manifold_are_refused_or_projected():
+    for x in FLAT_START + 0.1 * np.eye(4)[1:3]:
+        with pytest.raises(ValueError, match="off the constraint"):
+            dx.simulate(FLAT, METHOD_2, x=x, step=0.1, steps=1)
+        sol = dx.simulate(FLAT, METHOD_2, x=x, step=0.1, steps=1, project=True)
+        assert np.max(np.abs(sol.constraint_residual())) < 5e-15
+
+
+def test_what_method_2_refuses():
+    """A plane in phase space is symplectic, {q_0, p_0} = 1: the constraint algorithm stops at level 0 there."""
+    plane = dx.DiracSystem(dx.induced_dirac(None, 2), lambda x: x @ x / 2, holonomic=lambda x: x[::2] - 0.5 * x[1::2])
+    with pytest.raises(ValueError, match=r"brackets .* are up to 1\.25 here: simulate dx\.constraint_algorithm"):
+        dx.simulate(plane, METHOD_2, x=[0.5, 1.0, 0.25, 0.5], step=0.1, steps=1, check_initial=False)
+    sol = dx.simulate(plane, METHOD_1, x=[0.5, 1.0, 0.25, 0.5], step=0.1, steps=20, check_initial=False)
+    assert np.max(np.abs(sol.x[:, ::2] - 0.5 * sol.x[:, 1::2])) < 1e-14
+    edge = dx.DiracSystem(
+        dx.induced_dirac(lambda q: jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0.0 * q[0]])[None], 3),
+        lambda x: x[3:] @ x[3:] / 2,
+        holonomic=lambda x: x[:1] ** 2 + x[1:2] ** 2 - 1.0,
+    )
+    with pytest.raises(ValueError, match=r"constraint_algorithm\(system, near=x\)"):
+        dx.simulate(edge, METHOD_2, x=[1.0, 0.0, np.pi / 2, 0.0, 1.0, 1.0], step=0.1, steps=1)
+    with pytest.raises(ValueError, match=r"holonomic\(x\) must return an array of shape"):
+        dx.simulate(
+            dx.DiracSystem(PENDULUM.structure, hamiltonian, holonomic=lambda x: x @ x), METHOD_1, x=START, step=0.1, steps=1
+        )
