@@ -21,10 +21,10 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     """The motion (q, p) on T*Q over a reduced solution, as a Solution.
 
     Of a system made by `dx.reduce`: q = (x, g) with g_{k+1} = g_k + ω_d + A(x_{k+1} − x_k), p = (w − h*_{d,Σ}(μ), μ)
-    ([RL] §4), multipliers and work as they were. Of a `dx.EulerPoincare` or `dx.LiePoisson` system: q the group element
-    g_k = g0 f_0 ⋯ f_{k−1} (N,), p the covector at it with the body momentum μ, `spatial_momentum` Ad*_{g⁻¹} μ (d,), and the
-    reduced fields as they were; `g0` is an element (N,), a matrix (k, k), in a batch also (B, N), or the identity, as for a
-    run that started from q=.
+    ([RL] §4), multipliers those of the one-forms at q, work as it was. Of a `dx.EulerPoincare` or `dx.LiePoisson` system: q
+    the group element g_k = g0 f_0 ⋯ f_{k−1} (N,), p the covector at it with the body momentum μ, `spatial_momentum`
+    Ad*_{g⁻¹} μ (d,), and the reduced fields as they were; `g0` is an element (N,), a matrix (k, k), in a batch also (B, N),
+    or the identity, as for a run that started from q=.
 
     Raises `TypeError` for a solution of another system, `ValueError` for a g0 that is no element of the group.
     """
@@ -41,9 +41,38 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     reduced = ("x", "w", "mu", "g", "vertical")
     lifted = _each_row(solution, system.unreduced_row, reduced[:-1])
     lifted |= {name: a for name, a in solution.fields.items() if name not in reduced}
+    if system.system.one_forms is not None:
+        lifted["multipliers"] = _multipliers_at(solution, lifted["q"])
     n = lifted["q"].shape[-1]
     info = {"q": Field((n,)), "p": Field((n,))}
     return _lifted(solution, system.system, lifted, {name: info.get(name) or solution.field_info[name] for name in lifted})
+
+
+def _multipliers_at(solution: Solution, q: Any) -> Any:
+    """The λ of the one-forms W(q): on the quotient they are those of W(x, 0), whose rows span the same after the translation
+    but may be others, so that W(q)ᵀλ is the same force."""
+    system, multipliers = solution.system, solution.fields["multipliers"]
+    m, _ = system.constraints.sizes(jnp.zeros(np.shape(q)[-1]), _of_one_run(solution))
+    kept = np.array([i for i in range(m) if i not in solution.stats.get("redundant_constraints", ())], int)
+
+    def at(t, q, given, params):
+        fixed, moved = (
+            system.constraints.one_forms_at(t, point, params)[kept]
+            for point in (system.connection.join(system.connection.split(q)[0], jnp.zeros(len(system.connection.fibre))), q)
+        )
+        force = moved @ (fixed.T @ given[kept])
+        return given.at[kept].set(jnp.linalg.solve(moved @ moved.T, force))
+
+    along = jax.vmap(at, in_axes=(0, 0, 0, None))
+    if solution.batch is not None:
+        along = jax.vmap(along, in_axes=(None, 0, 0, 0 if solution.batch_params else None))
+    rows = jnp.asarray(q)[..., :-1, :]
+    found = jax.jit(along)(jnp.asarray(solution.t)[:-1], rows, jnp.asarray(multipliers), solution.params)
+    return found if is_traced(found) else np.asarray(found)
+
+
+def _of_one_run(solution: Solution) -> Any:
+    return jax.tree.map(lambda leaf: leaf[0], solution.params) if solution.batch_params else solution.params
 
 
 def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> Solution:

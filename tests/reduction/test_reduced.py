@@ -7,7 +7,7 @@ import pytest
 
 import dirax as dx
 from dirax import gallery
-from dirax.gallery import charged_particle, planar_n_body
+from dirax.gallery import charged_particle
 
 TWISTED = [[0.3, -0.2, 0.1]]
 PENDULUM = gallery.get("double-spherical-pendulum")
@@ -37,53 +37,6 @@ def test_pendulum_of_the_paper():
     scale = abs(unreduced.energy()[0])
     assert np.abs(quotient.energy() - unreduced.energy()).max() < 1e-10 * scale
     assert np.all(quotient.mu == quotient.mu[0]) and np.ptp(unreduced.p[:, 0]) < 1e-8 * np.abs(unreduced.p).max()
-
-
-def shape_coordinates(example):
-    """The figure eight in the coordinates whose last three are cyclic."""
-    inverse = jax.jvp(lambda q: planar_n_body.to_shape(q, example.params), *((example.initial[k],) for k in "qv"))
-    return planar_n_body.SYMMETRIC, dict(zip("qv", inverse, strict=True))
-
-
-CASES = [  # name, fibre, discrete Lagrangian, step
-    ("double-spherical-pendulum", [0], "midpoint", 0.01),
-    ("charged-particle", [3], "left", 0.1),
-    ("charged-particle", [2, 3], "trapezoidal", 0.05),
-    ("planar-n-body", [3, 4, 5], "midpoint", 0.01),
-    ("rolling-disk", [0, 1], "left", 1e-3),
-    ("heisenberg", [2], "midpoint", 0.01),
-    ("turntable", [4], "midpoint", 0.01),
-]
-
-
-@pytest.mark.parametrize(("name", "fibre", "rule", "step"), CASES)
-def test_gallery_on_the_quotient(name, fibre, rule, step):
-    """500 steps, for the zero and a twisted connection, lifted back; and by Routh where nothing moves the momentum."""
-    example = gallery.get(name)
-    system, start = example.system, dict(example.initial)
-    if name == "planar-n-body":
-        system, start = shape_coordinates(example)
-    n = len(start["q"])
-    assert set(fibre) <= set(dx.cyclic_coordinates(system, start["q"], params=example.params, radius=0.1))
-    run = {**start, "params": example.params, "step": step, "steps": 500, "engine": "native"}
-    constrained = system.constraints.any
-    scheme = dx.LagrangeDAlembert(rule) if constrained else dx.PlusLagrangeDirac(rule)
-    unreduced = dx.simulate(system, scheme, **run)
-    zero = dx.reduce(system, dx.LinearConnection(fibre))
-    twist = np.random.default_rng(n).uniform(-0.4, 0.4, (len(fibre), n - len(fibre)))
-    twisted = dx.reduce(system, dx.LinearConnection(fibre, twist))
-    others = [] if constrained else [(twisted, dx.DiscreteRouth(rule))]
-    for reduced, chosen in ((zero, scheme), (twisted, scheme), *others):
-        quotient = dx.simulate(reduced, chosen, **run)
-        lifted = dx.reconstruct(quotient)
-        assert unreduced.ok and quotient.ok and quotient.x.shape == (501, n - len(fibre))
-        assert np.abs(lifted.q - unreduced.q).max() < 1e-10
-        assert np.abs(lifted.p - unreduced.p).max() < 1e-10 * max(1.0, np.abs(unreduced.p).max())
-        if constrained:
-            scale = max(1.0, np.abs(unreduced.multipliers).max())
-            assert np.abs(lifted.multipliers - unreduced.multipliers).max() < 1e-8 * scale
-        else:
-            assert np.all(quotient.mu == quotient.mu[0])
 
 
 def test_charged_particle_table_1_of_the_paper():

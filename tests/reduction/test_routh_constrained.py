@@ -112,6 +112,14 @@ def test_redundant_constraints_and_two_points():
     compared(SKATE, {"q0": first.q[0], "q1": first.q[1]}, [3], steps=50)
 
 
+def test_one_forms_of_which_only_the_span_is_invariant():
+    """The multipliers are those of the one-forms at q, not of those at group coordinate 0."""
+    scaled = dx.LagrangeDirac(skate_lagrangian, lambda q: jnp.exp(q[3]) * edge(q), forces=drag)
+    assert dx.cyclic_coordinates(scaled, SKATE_START["q"]) == (3,)
+    unreduced, quotient = compared(scaled, SKATE_START, [3], steps=200)
+    assert np.abs(quotient.multipliers - unreduced.multipliers).max() > 1e-4
+
+
 def field(t, y):
     """(q̇, v̇) of the skate from M v̇ = ∂L/∂q − ∂²L/∂v∂q v + f − Wᵀλ and W v̇ + Ẇ v = 0, and λ."""
     q, v = y[:4], y[4:8]

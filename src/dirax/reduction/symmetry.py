@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
 from dirax.reduction.connection import check_fibre, fibre_indices
+from dirax.systems.constraints import Constraints
 from dirax.systems.nonholonomic import as_lagrange_dirac
 
 TOLERANCE = 1e-9
@@ -195,17 +196,12 @@ def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, para
         there, rate, _ = pulled_back(g, t, q, v)
         return system.lagrangian.at(t, there, rate, params)
 
-    def rows(t, q):
-        """[W b]."""
-        w = constraints.one_forms_at(t, q, params)
-        return w if constraints.affine is None else jnp.hstack([w, constraints.affine.at(t, q, params)[:, None]])
-
     def one_forms(g, t, q, v):
         """W(Φ_g q) TΦ_g, less its part in the span of W(q); with affine constraints [W b] likewise."""
         there, _, derivative = pulled_back(g, t, q, v)
-        moved, fixed = rows(t, there), rows(t, q)
+        moved = affine_rows(constraints, t, there, params)
         moved = jnp.hstack([moved[:, : q.size] @ derivative, moved[:, q.size :]])
-        return moved - moved @ jnp.linalg.pinv(fixed) @ fixed
+        return off_span(moved, affine_rows(constraints, t, q, params))
 
     def holonomic(g, t, q, v):
         return constraints.position_defect(t, action(g, q), params)
@@ -219,6 +215,17 @@ def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, para
         if getattr(system, moved.__name__, None) is not None:
             functions[moved.__name__] = moved
     return _worst(functions, action, t, q, v)
+
+
+def affine_rows(constraints: Constraints, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, "m r"]:
+    """W(t, q), or [W b] of affine constraints."""
+    w = constraints.one_forms_at(t, q, params)
+    return w if constraints.affine is None else jnp.hstack([w, constraints.affine.at(t, q, params)[:, None]])
+
+
+def off_span(moved: Float[Array, "m r"], fixed: Float[Array, "m r"]) -> Float[Array, "m r"]:
+    """The rows `moved` less their parts in the span of the rows `fixed`."""
+    return moved - moved @ jnp.linalg.pinv(fixed) @ fixed
 
 
 def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: Any, v: Any) -> Invariance:
@@ -247,7 +254,8 @@ def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: An
 def translation_symmetries(
     system: Any, q: Any, v: Any = None, params: Any = None, samples: int = 64, radius: float = 1.0
 ) -> np.ndarray:
-    """Directions d, the rows of a (k, n) matrix with orthonormal rows, in which neither L nor constraints nor forces change.
+    """Directions d, the rows of a (k, n) matrix with orthonormal rows, in which neither L nor constraints nor forces change
+    (of the one-forms, their span).
 
     Found from ∂L/∂q at `samples` random points within `radius` of (q, v); `cyclic_coordinates` are those along the axes.
     """
@@ -261,9 +269,8 @@ def translation_symmetries(
     def at(t, q, v):
         along = [lambda q: system.lagrangian.at(t, q, v, params)]
         if system.one_forms is not None:
-            along.append(lambda q: constraints.one_forms_at(t, q, params))
-        if system.affine is not None:
-            along.append(lambda q: system.affine.at(t, q, params))
+            fixed = affine_rows(constraints, t, q, params)
+            along.append(lambda q: off_span(affine_rows(constraints, t, q, params), fixed))
         if system.holonomic is not None:
             along.append(lambda q: constraints.position_defect(t, q, params))
         if system.forces is not None:
