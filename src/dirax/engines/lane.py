@@ -1,12 +1,21 @@
 """One step of one trajectory: solve every stage, advance, and judge; what an engine carries from step to step."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from dirax.engines.newton import solve
 from dirax.engines.result import NOT_CONVERGED, NOT_FINITE, OK
+
+
+class Derived(NamedTuple):
+    """What is known of an equation besides its functions, one function of (u, state, t, h, params) per stage or None:
+    what the step adds to the state (NaN: unknown), and the Jacobian (k, k) of the residual."""
+
+    increments: tuple[Callable, ...] | None = None
+    jacobians: tuple[Callable, ...] | None = None
 
 
 class Lane(eqx.Module):
@@ -54,19 +63,18 @@ def first_lane(state, guess: tuple, xp=jnp, compensated: bool = False) -> Lane:
 
 
 def take_step(
-    equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True, increments: tuple | None = None
+    equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True, derived: Derived | None = None
 ) -> tuple[Lane, tuple]:
-    """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns.
-
-    `increments`, one function of (u, state, t, h, params) per stage, say what the step adds to the state (NaN: unknown)."""
+    """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns."""
     state, lost, history, unknowns = lane.state, lane.lost, [], []
     status, updates, worst = lane.status, 0, lane.max_residual
-    added = increments or (None,) * len(equation.stages)
-    for (stage, fraction), before, increment in zip(equation.stages, lane.history, added, strict=True):
+    nothing = (None,) * len(equation.stages)
+    increments, jacobians = (found or nothing for found in derived or Derived())
+    for (stage, fraction), before, increment, jacobian in zip(equation.stages, lane.history, increments, jacobians, strict=True):
         running = status == OK
         args = (state, t, fraction * h, params)
         guess = stage.guess(state, jnp.sum(before, axis=0), fraction * h, params)
-        u, count, converged = solve(stage.residual, stage.scale, guess, args, max_iterations, running, differentiable)
+        u, count, converged = solve(stage.residual, stage.scale, guess, args, max_iterations, running, differentiable, jacobian)
         new, left = stage.advance(u, *args), stage.residual(u, *args)
         # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
         finite = jnp.isfinite(jnp.sum(0.0 * jnp.concatenate([new, left])))

@@ -57,17 +57,21 @@ def solve(
     max_iterations: int,
     running: Any = True,
     differentiable: bool = True,
+    jacobian: Callable[..., Float[Array, "k k"]] | None = None,
 ) -> tuple[Float[Array, " k"], Int[Array, ""], Bool[Array, ""]]:
     """(u, number of updates, converged) of residual(u, *args) = 0; differentiable in args, not in the guess.
 
     `scale` (k,) is the unit of each unknown, relative to which updates are measured. The guess comes back where `running`
-    is false. Without `differentiable` there is less to trace.
+    is false. Without `differentiable` there is less to trace. `jacobian(u, *args)` is that of the residual, derived here
+    where it is not given.
     """
     if guess.shape[0] == 0:
         return guess, jnp.zeros((), jnp.int64), jnp.array(True)
 
+    slopes = (lambda u: jacobian(u, *args)) if jacobian else jax.jacfwd(lambda u: residual(u, *args))
+
     def search(equation, guess):
-        return newton(equation, jnp.asarray(scale), guess, max_iterations, running)
+        return newton(equation, slopes, jnp.asarray(scale), guess, max_iterations, running)
 
     def tangent_solve(linear, right_hand_side):
         matrix = jax.vmap(linear, out_axes=1)(jnp.eye(guess.shape[0]))
@@ -81,7 +85,14 @@ def solve(
     return found.u, found.updates.astype(int), at_floor(found)
 
 
-def newton(equation: Callable, scale: Float[Array, " k"], guess: Float[Array, " k"], max_iterations: int, running: Any) -> Search:
+def newton(
+    equation: Callable,
+    jacobian: Callable,
+    scale: Float[Array, " k"],
+    guess: Float[Array, " k"],
+    max_iterations: int,
+    running: Any,
+) -> Search:
     """Newton's method in which a Jacobian serves several updates while they contract quickly, and is renewed otherwise."""
 
     def updated(s: Search, solver: Callable) -> Search:
@@ -98,7 +109,7 @@ def newton(equation: Callable, scale: Float[Array, " k"], guess: Float[Array, " 
         return unfinished(s) & ((s.ratio < CONTRACTING) | (jnp.isnan(s.ratio) & (s.update < NEAR)))
 
     def with_new_jacobian(s: Search) -> Search:
-        solver = factorised(jax.jacfwd(equation)(s.u))
+        solver = factorised(jacobian(s.u))
         return jax.lax.while_loop(contracting, lambda s: updated(s, solver), updated(s, solver))
 
     start = Search(guess, jnp.array([jnp.inf, jnp.nan, 0.0]))

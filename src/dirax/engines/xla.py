@@ -1,6 +1,7 @@
 """The xla engine: jitted steps, driven from the host in chunks, or as one differentiable scan under a JAX transformation."""
 
 import dataclasses
+import functools
 import time
 from typing import Any
 
@@ -10,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.configure import fast_loops_asked_for
-from dirax.engines.lane import Lane, first_lane, packed_row, take_step, time_of, unpacked_row
+from dirax.engines.lane import Derived, Lane, first_lane, packed_row, take_step, time_of, unpacked_row
 from dirax.engines.result import OK, Outcome, Problem, Progress
 
 __all__ = ["first_lane", "run", "run_traced", "take_step"]
 
-CHUNK_BYTES = 32 * 2**20
-"""Largest buffer of saved rows on the device; longer runs go through it several times."""
+CHUNK_BYTES = 2**20
+"""Largest buffer of saved rows on the device. Runs of more go through it several times; runs of less pay for all of it."""
 
 CHUNK_ROWS = 4096
 UNPACKED_ROWS = 64
@@ -34,6 +35,9 @@ LARGEST_SCALAR = 16
 SCALAR_BATCH = 64
 """Trajectories from which on it is, whatever XLA does with its loops."""
 
+QUICK_TO_COMPILE = {"xla_cpu_use_fusion_emitters": False}
+"""Halves the time of compilation on a CPU, where the steps were measured to take the same time or less."""
+
 
 class Clock(eqx.Module):
     """The numbers of a chunk of steps, all of them traced, so that one compiled function serves every run of an equation.
@@ -49,13 +53,18 @@ class Clock(eqx.Module):
     stop: Any  # one past its last
     closing: Any  # whether it is the step leaving the last row, taken even if every trajectory has ended
 
+    @classmethod
+    def of(cls, p: Problem) -> "Clock":
+        """That of the whole run as one chunk."""
+        return cls(p.t0, p.h, float(p.first_step), p.save_every, 0, p.steps, False)
 
-def make_step(equation, axes, max_iterations: int, differentiable: bool, increments: tuple | None = None):
+
+def make_step(equation, axes, max_iterations: int, differentiable: bool, derived: Derived):
     """(lanes, params, clock) ↦ (lanes after a step, packed rows that they left), over the batch if there is one."""
 
     def one(lane, params, clock):
         t = time_of(lane, clock.t0, clock.h, clock.first_step)
-        after, unknowns = take_step(equation, lane, t, clock.h, params, max_iterations, differentiable, increments)
+        after, unknowns = take_step(equation, lane, t, clock.h, params, max_iterations, differentiable, derived)
         return after, packed_row(lane, unknowns)
 
     return one if axes is None else jax.vmap(one, in_axes=(*axes, None))
@@ -68,12 +77,23 @@ def unpack_rows(equation, axes, packed, params, clock: Clock) -> dict:
     return jax.vmap(lanes, in_axes=(0, None))(packed, params)
 
 
-@eqx.filter_jit
+@functools.cache
+def _compiled(platform: str) -> Any:
+    """`_chunk` compiled for a platform, with the options that this version of XLA knows."""
+    if platform != "cpu":
+        return eqx.filter_jit(_chunk)
+    try:
+        jax.jit(lambda: 0.0, compiler_options=QUICK_TO_COMPILE).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return eqx.filter_jit(_chunk)
+    return eqx.filter_jit(_chunk, compiler_options=QUICK_TO_COMPILE)  # pyright: ignore[reportCallIssue]
+
+
 def _chunk(
-    equation, lanes: Lane, params, clock: Clock, capacity: int, axes, max_iterations: int, increments
+    equation, lanes: Lane, params, clock: Clock, capacity: int, axes, max_iterations: int, derived: Derived
 ) -> tuple[Lane, dict]:
     """The steps from clock.start to clock.stop: the lanes after them, and the at most `capacity` rows saved on the way."""
-    step = make_step(equation, axes, max_iterations, False, increments)
+    step = make_step(equation, axes, max_iterations, False, derived)
     row = jax.eval_shape(step, lanes, params, clock)[1]
     first_row = _next_row(clock.start, clock.every)
 
@@ -111,16 +131,17 @@ def _unpack_written(equation, axes, packed, params, clock: Clock, count) -> dict
 
 def run(problem: Problem, progress: Progress | None = None) -> Outcome:
     """Run `problem`, saving into host arrays; Ctrl-C and failing steps keep what was computed."""
-    started, p = time.perf_counter(), _in_scalars(problem)
+    started = time.perf_counter()
+    p, derived, notes = _derived(problem)
+    chunk = _compiled(jax.default_backend())
     axes, capacity = _axes(p), _capacity(p)
-    increments, notes = _increments(p)
-    lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, increments is not None)
+    lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, derived.increments is not None)
 
     def call(lanes, start, stop, closing=False):
         t0, h, first_step = map(np.float64, (p.t0, p.h, p.first_step))
         every, start, stop = map(np.int64, (p.save_every, start, stop))
         clock = Clock(t0, h, first_step, every, start, stop, np.bool_(closing))
-        after, rows = _chunk(p.equation, lanes, p.params, clock, capacity, axes, p.max_iterations, increments)
+        after, rows = chunk(p.equation, lanes, p.params, clock, capacity, axes, p.max_iterations, derived)
         return after, {name: _by_lane(np.asarray(values), p.batch, np) for name, values in rows.items()}
 
     _, empty = call(lanes, 0, 0)  # compile
@@ -166,37 +187,37 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
     )
 
 
-def _in_scalars(p: Problem) -> Problem:
-    """The run with its equations written in scalars, where that was measured to pay: small ones on a CPU, in batches, and in
-    loops that XLA makes one kernel (`dirax.configure`)."""
+def _derived(p: Problem) -> tuple[Problem, Derived, dict[str, Any]]:
+    """The run with its equations written in scalars where that was measured to pay, what the scalar graph derives from them,
+    and what `stats` say about what it cannot."""
+    from dirax.engines.native import in_jax  # the scalar graph is imported when it is used
+
+    key, notes, jacobians, increments = (p.equation, p.params, p.batch_params), {}, None, None
+    if p.compensated:
+        found = in_jax.increments_of(*key)
+        increments, notes = (None, {"not_compensated": found}) if isinstance(found, str) else (found, {})
+    if _small(p):
+        equation, jacobians = in_jax.in_scalars(*key)
+        p = dataclasses.replace(p, equation=equation)
+    return p, Derived(increments, jacobians), notes
+
+
+def _small(p: Problem) -> bool:
+    """Whether the step should be written in scalars: small ones on a CPU, in batches, and in loops that XLA makes one kernel
+    (`dirax.configure`)."""
     size = max(max(stage.unknowns, stage.state_size) for stage, _ in p.equation.stages)
     many = p.batch is not None and p.batch >= SCALAR_BATCH
-    if size > LARGEST_SCALAR or not (many or fast_loops_asked_for()) or jax.default_backend() != "cpu":
-        return p
-    from dirax.engines.native.in_jax import in_scalars  # the scalar graph is imported when it is used
-
-    return dataclasses.replace(p, equation=in_scalars(p.equation, p.params, p.batch_params))
-
-
-def _increments(p: Problem) -> tuple[tuple | None, dict[str, Any]]:
-    """What the stages add to the state, for compensated summation, and what `stats` say where that cannot be."""
-    if not p.compensated:
-        return None, {}
-    from dirax.engines.native.in_jax import increments_of  # the scalar graph is imported when it is used
-
-    found = increments_of(p.equation, p.params, p.batch_params)
-    return (None, {"not_compensated": found}) if isinstance(found, str) else (found, {})
+    return size <= LARGEST_SCALAR and (many or fast_loops_asked_for()) and jax.default_backend() == "cpu"
 
 
 def run_traced(problem: Problem) -> Outcome:
     """The same run as one scan, for `jax.grad`, `jit` and `vmap` around it; in reverse mode segments of about √steps steps
     are computed again instead of being stored."""
-    p = _in_scalars(problem)
+    p, derived, notes = _derived(problem)
     axes = _axes(p)
-    increments, notes = _increments(p)
-    lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), compensated=increments is not None)
-    clock = Clock(p.t0, p.h, float(p.first_step), p.save_every, 0, p.steps, False)
-    one = make_step(p.equation, axes, p.max_iterations, True, increments)
+    lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), compensated=derived.increments is not None)
+    clock = Clock.of(p)
+    one = make_step(p.equation, axes, p.max_iterations, True, derived)
 
     def step(lanes, k):
         """The lanes after step k and the row that they left; a step past the last is undone."""
@@ -240,7 +261,7 @@ def run_traced(problem: Problem) -> Outcome:
 def unpacked_rows(problem: Problem, packed) -> dict:
     """The named arrays (B, rows, …) of packed rows (B, rows, …), B = 1 for one trajectory."""
     p = problem
-    clock = Clock(p.t0, p.h, float(p.first_step), p.save_every, 0, p.steps, False)
+    clock = Clock.of(p)
     rows = packed[0] if p.batch is None else jnp.moveaxis(packed, 1, 0)
     return {name: _by_lane(a, p.batch, jnp) for name, a in unpack_rows(p.equation, _axes(p), rows, p.params, clock).items()}
 

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from dirax.schemes.constraint_rows import ConstraintRows
@@ -10,11 +9,12 @@ from dirax.schemes.step import Field, Shape, StepEquation
 from dirax.schemes.work import WorkBook, work_field
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import NonholonomicMechanics
+from dirax.tracing import along, gradient, jacobian
 
 
 def _rates(system: LagrangeDirac, t, q, v, params):
     """(∂L/∂q + f, ∂L/∂v) at (t, q, v)."""
-    dq, dv = jax.grad(lambda q, v: system.lagrangian.at(t, q, v, params), argnums=(0, 1))(q, v)
+    dq, dv = gradient(lambda q, v: system.lagrangian.at(t, q, v, params), (0, 1))(q, v)
     return (dq if system.forces is None else dq + system.forces(t, q, v, params)), dv
 
 
@@ -88,12 +88,15 @@ def resolved_nonholonomic(system: NonholonomicMechanics, shape: Shape, theta: fl
     one_forms = lambda q, params: system.constraints.one_forms_at(0.0, q, params)
 
     def base(u, state, h, params):
-        q0, v = state[:n], u[:n]
-        q = q0 + theta * h * v
-        p = system.metric(q, params) @ v
-        multipliers = system.multipliers(q, p, params)
-        force = -jax.grad(system.hamiltonian)(q, p, params) + one_forms(q, params).T @ multipliers
-        return q, p, force, multipliers
+        """(q, p, ṗ, λ) at the base point. With v at hand the metric is inverted once, and its inverse never differentiated."""
+        q, v = state[:n] + theta * h * u[:n], u[:n]
+        metric, forms = system.metric.at(0.0, q, params), one_forms(q, params)
+        turning = along(lambda q: system.metric.at(0.0, q, params), (q,), (v,))
+        drift = along(lambda q: one_forms(q, params), (q,), (v,))
+        rate = gradient(lambda q: system.lagrangian(q, v, params))(q)  # −∂H/∂q at p = g v
+        solved = jnp.linalg.solve(metric, jnp.concatenate([forms.T, (rate - turning @ v)[:, None]], axis=1))
+        multipliers = -jnp.linalg.solve(forms @ solved[:, :m], drift @ v + forms @ solved[:, m])  # (μ v)˙ = 0
+        return q, metric @ v, rate + forms.T @ multipliers, multipliers
 
     def residual(u, state, t, h, params):
         q0, p0 = state[:n], state[n:]
@@ -130,7 +133,7 @@ def resolved_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) -> St
     first, second = k + c, (k + n + c) if c else k
 
     def mass(t, q, v, params):
-        return jax.hessian(lambda v: system.lagrangian.at(t, q, v, params))(v)
+        return jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(v)
 
     def flow(t, q, v, params):
         """(p, ṗ, λ) at a point of M_f."""
@@ -193,8 +196,8 @@ def resolved_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) -> St
 def _along(system: LagrangeDirac, function, t, q, v):
     """The derivative of function(t, q) along q̇ = v, ṫ = 1."""
     if system.depends_on_time:
-        return jax.jvp(function, (jnp.asarray(t, float), q), (jnp.ones(()), v))[1]
-    return jax.jvp(lambda q: function(t, q), (q,), (v,))[1]
+        return along(function, (jnp.asarray(t, float), q), (jnp.ones(()), v))
+    return along(lambda q: function(t, q), (q,), (v,))
 
 
 def _resolved(system: Any, shape: Shape, unknowns: int, residual, advance, unpack, first_guess) -> StepEquation:

@@ -7,10 +7,14 @@ import jax
 import jax.numpy as jnp
 
 from dirax.engines.native.compensation import increments
+from dirax.engines.native.graph import GraphTooLarge
 from dirax.engines.native.interpret import UnsupportedPrimitive
 from dirax.engines.native.program import Program, program
 from dirax.engines.native.trace import TracedEquation
 from dirax.schemes.step import StepEquation, StepSequence
+
+MOST_OPERATIONS = 6000
+"""Scalar operations of a residual with its Jacobian up to which XLA is given them: it takes some milliseconds to compile each."""
 
 OPERATIONS: dict[str, Callable] = {
     **{name: getattr(jax.lax, name) for name in ("add", "sub", "mul", "neg", "abs", "sqrt", "floor", "ceil", "sign")},
@@ -44,7 +48,7 @@ def function_of(made: Program, equation: TracedEquation, outputs: list[int]) -> 
                 values[node] = jnp.asarray(g.value[node])
         return jnp.stack([jnp.asarray(x, float) for x in g.evaluate(outputs, {}, OPERATIONS, values)])
 
-    return evaluated
+    return jax.jit(evaluated)  # so that JAX traces it once for all the places that a loop has it in
 
 
 def increments_of(equation: Any, params: Any, batch_params: bool) -> tuple[Callable, ...] | str:
@@ -63,20 +67,39 @@ def increments_of(equation: Any, params: Any, batch_params: bool) -> tuple[Calla
         return str(error)
 
 
-def in_scalars(equation: Any, params: Any, batch_params: bool) -> Any:
-    """The equation with its residual and its advance as scalar programs; the same object for the same program, and the
-    equation itself where it is none."""
+def in_scalars(equation: Any, params: Any, batch_params: bool) -> tuple[Any, tuple[Callable, ...] | None]:
+    """The equation with its residual and its advance as scalar programs, and the Jacobian (k, k) of the residual of each stage
+    as one, (u, state, t, h, params) ↦ J; the same objects for the same program.
+
+    The equation itself, and None, where it is no scalar program or one of more than MOST_OPERATIONS."""
     try:
         made, _ = program(equation, params, batch_params)
-    except UnsupportedPrimitive:
-        return equation
-    if made.as_scalars is None:
-        distinct = {index: stage for (index, _), (stage, _) in zip(made.stages, equation.stages, strict=True)}
-        new = {i: _replaced(stage, made, made.equations[i]) for i, stage in distinct.items()}
-        single = len(equation.stages) == 1 and equation.stages[0][1] == 1.0
-        stages = tuple((new[i], fraction) for i, fraction in made.stages)
-        made.as_scalars = stages[0][0] if single else StepSequence(stages)
-    return made.as_scalars
+        if made.as_scalars is None:
+            made.as_scalars = _in_scalars(equation, made)
+        return made.as_scalars or (equation, None)
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return equation, None
+
+
+def _in_scalars(equation: Any, made: Program) -> tuple:
+    """Nothing for a program that is too large."""
+    g, slopes = made.graph, [made.jacobian(i) for i in range(len(made.equations))]
+    outputs = [[*e.residual, *(n for row in rows for n in row.values())] for e, rows in zip(made.equations, slopes, strict=True)]
+    if any(sum(1 for node in g.reachable(nodes) if g.args[node]) > MOST_OPERATIONS for nodes in outputs):
+        return ()
+    distinct = {index: stage for (index, _), (stage, _) in zip(made.stages, equation.stages, strict=True)}
+    new = {i: _replaced(stage, made, made.equations[i]) for i, stage in distinct.items()}
+    jacobians = {i: _dense(made, made.equations[i], slopes[i]) for i in distinct}
+    single = len(equation.stages) == 1 and equation.stages[0][1] == 1.0
+    stages = tuple((new[i], fraction) for i, fraction in made.stages)
+    return stages[0][0] if single else StepSequence(stages), tuple(jacobians[i] for i, _ in made.stages)
+
+
+def _dense(made: Program, equation: TracedEquation, rows: list[dict[int, int]]) -> Callable:
+    """(u, state, t, h, params) ↦ the matrix (k, k) of these rows {column: node}."""
+    k, zero = len(rows), made.graph.zero
+    entries = function_of(made, equation, [row.get(j, zero) for row in rows for j in range(k)])
+    return lambda *args: entries(*args).reshape(k, k)
 
 
 def _replaced(stage: StepEquation, made: Program, traced: TracedEquation) -> StepEquation:

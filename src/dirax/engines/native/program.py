@@ -45,7 +45,7 @@ class Program:
     kernels: dict[int, tuple[Any, Any]] = field(default_factory=dict)
     jacobians: dict[int, list[dict[int, int]]] = field(default_factory=dict)
     increments: tuple[Callable, ...] | None = None
-    as_scalars: Any = None
+    as_scalars: tuple | None = None
     sweeps: dict[tuple[bool, int], tuple[Any, Any]] = field(default_factory=dict)
 
     def jacobian(self, index: int) -> list[dict[int, int]]:
