@@ -257,5 +257,3 @@ def test_bad_affine_and_timed_functions():
         run(dx.LagrangeDirac(lambda t, q, v: v))
     with pytest.raises(ValueError, match="lagrangian is nan at the initial data"):
         run(dx.LagrangeDirac(lambda t, q, v: v @ v / 2 + jnp.log(t)), t0=-1.0)
-    with pytest.raises(ValueError, match="without forces and explicit time"):
-        dx.constraint_algorithm(CALDIROLA, near={"q": [1.0], "v": [0.0]})

@@ -35,7 +35,7 @@ def of_chain(system: ResolvedSystem) -> FinalManifold:
     """M_f of a constraint chain, projected onto by the nearest point."""
     chain = system.chain
     count = sum(level.count for level in chain.levels)
-    nearest = lambda x, covector, params: covector
+    nearest = lambda x, covector, params: chain.normal(covector)
     return FinalManifold(chain.constraints, count, chain.field, chain.multipliers, len(chain.multiplier_names), nearest)
 
 

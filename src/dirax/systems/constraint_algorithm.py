@@ -19,7 +19,7 @@ import numpy as np
 
 from dirax.functions import check_finite, is_traced
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
-from dirax.systems.implicit_system import ImplicitForm, implicit_form
+from dirax.systems.implicit_form import ImplicitForm, implicit_form
 from dirax.systems.system import AbstractSystem
 
 RANK_TOLERANCE = 1e-8
@@ -31,7 +31,8 @@ SAMPLES = 6
 def constraint_algorithm(system: AbstractSystem, near: Any, params: Any = None, radius: float = 0.02) -> ConstraintChain:
     """The chain of constraint manifolds of an implicit system around the point `near`.
 
-    `near`: a point x (N,), not necessarily on the constraints, or initial data {"q": …, "v": …} of a Lagrangian system;
+    `near`: a point x (N,), not necessarily on the constraints, or initial data {"q": …, "v": …} of a Lagrangian system, with
+    "t" where it depends on time: t is then the last coordinate of the chain, with ṫ = 1, and no projection moves it;
     `radius`: size of the neighbourhood, relative to 1 + |x|, in which ranks are checked to be constant.
 
         chain = dx.constraint_algorithm(system, near=x)
@@ -64,6 +65,7 @@ class _Search:
         self.form, self.params = form, params
         self.x = np.array(form.point)
         self.size, self.unknowns = self.x.size, self.x.size + len(form.multipliers)
+        self.moved = np.arange(self.size) < self.size - form.clock  # what a search may move: all but the time
         self.radius = radius * (1.0 + np.abs(self.x).max())
         self.rng = np.random.default_rng(0)
         self.singular = False
@@ -120,7 +122,7 @@ class _Search:
                 self.singular = True
                 return None
             first = max(first, np.abs(slope).max())
-            change = np.linalg.lstsq(slope, value, rcond=1e-12)[0]
+            change = np.linalg.lstsq(slope * self.moved, value, rcond=1e-12)[0]
             x = x - change
             if np.linalg.norm(x - start) > 1e3 * (1.0 + np.linalg.norm(start)):
                 return None
@@ -265,6 +267,7 @@ class _Search:
             redundant=redundant,
             coordinates=self.form.coordinates,
             multiplier_names=self.form.multipliers,
+            clock=self.form.clock,
             params=self.params,
             _constraints=eqx.filter_jit(self.constraints()),
             _solution=None if solution is None else eqx.filter_jit(solution),

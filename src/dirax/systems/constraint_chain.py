@@ -42,6 +42,7 @@ class ConstraintChain:
     - `levels`: the manifolds M_k; `dimension`: that of M_f; `point` (N,): a point of M_f (of the last level reached).
     - `index`: how often constraints are differentiated until (ẋ, u) is determined, or as far as it ever is.
     - `verdict`: "determined", "gauge freedom", "empty" or "irregular", and `explanation` in words.
+    - `coordinates` and `multiplier_names`; with a `clock` the last coordinate is the time, which no projection moves.
     - `freedom`: the number of undetermined directions of ẋ; `redundant`: that of undetermined multipliers.
 
     The functions are smooth around `point`, where their bases were chosen, and traceable.
@@ -56,6 +57,7 @@ class ConstraintChain:
     redundant: int
     coordinates: tuple[str, ...]
     multiplier_names: tuple[str, ...]
+    clock: bool
     params: Any = field(repr=False)
     _constraints: Callable = field(repr=False)
     _solution: Callable | None = field(repr=False)
@@ -100,7 +102,11 @@ class ConstraintChain:
         """The point y of M_f nearest to x: y + Dφ(y)ᵀσ = x, φ(y) = 0. Differentiable."""
         self._solved()
         multipliers = jnp.zeros(sum(level.count for level in self.levels))
-        return _nearest(self._constraints, jnp.asarray(x, dtype=float), multipliers, self._with(params))
+        return _nearest(self._constraints, self.normal, jnp.asarray(x, dtype=float), multipliers, self._with(params))
+
+    def normal(self, covector: Float[Array, " N"]) -> Float[Array, " N"]:
+        """The vector that a combination of the dφ pushes points along: the same numbers, without the time's."""
+        return covector.at[-1].set(0.0) if self.clock else covector
 
     def check(self, x: Float[Array, " N"], params: Any = None) -> None:
         """Raise `ValueError` for a point off M_f, with the first level it is off, the values, and its projection."""
@@ -163,12 +169,12 @@ class ConstraintChain:
 
 
 @eqx.filter_jit
-def _nearest(constraints: Callable, x, multipliers, params):
+def _nearest(constraints: Callable, normal: Callable, x, multipliers, params):
     size = x.shape[0]
 
     def residual(u):
         phi, pull = jax.vjp(lambda y: constraints(y, params), u[:size])
-        return jnp.concatenate([u[:size] + pull(u[size:])[0] - x, phi])
+        return jnp.concatenate([u[:size] + normal(pull(u[size:])[0]) - x, phi])
 
     return nearest_root(residual, jnp.concatenate([x, multipliers]))[:size]
 

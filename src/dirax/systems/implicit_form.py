@@ -1,0 +1,269 @@
+"""The implicit form E(x) ẋ = f(x) + B(x) u of every system, on which the constraint algorithm works; the time as a coordinate."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from dirax.functions import UserFunction
+from dirax.geometry.structures import canonical_two_form
+from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.implicit_system import ImplicitSystem
+from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.nonholonomic import NonholonomicMechanics
+from dirax.systems.phase_space import PhaseSpaceLagrangian
+from dirax.systems.port_hamiltonian import PortHamiltonian
+from dirax.systems.system import AbstractSystem
+
+RANK_TOLERANCE = 1e-9
+
+
+class ImplicitForm(NamedTuple):
+    """A system as linear equations matrix (ẋ, u) = right at every x, and the point it was asked for.
+
+    `multipliers` names the entries of u, `coordinates` those of x; with a `clock` the last of them is the time, ṫ = 1.
+    """
+
+    equations: Callable
+    point: np.ndarray
+    coordinates: tuple[str, ...]
+    multipliers: tuple[str, ...]
+    energy: Callable
+    about: str
+    clock: bool = False
+
+
+def implicit_form(system: AbstractSystem, near: Any, params: Any) -> ImplicitForm:
+    """The implicit form of a system around the point `near`: an array x, or a dict of initial data such as {"q": …, "v": …}.
+
+    Systems on T*Q have x = (q, p). A Lagrangian whose momenta are affine in the velocities is put on T*Q with its primary
+    constraints and their multipliers (Dirac, Bergmann); any other on the Pontryagin bundle, x = (q, v, p), and a singular
+    one with forces f(q, v) too. What depends on time has t as its last coordinate; `near` has it as "t", zero by default.
+    Raises `TypeError` for systems without an implicit form, `ValueError` for open ports and points of the wrong length.
+    """
+    if isinstance(system, ImplicitSystem):
+        x = _point(near, ("x",), system)
+        _, m = system.sizes({"x": jnp.asarray(x)}, params)
+        return ImplicitForm(system.equations, x, _names("x", x.size), _names("u", m), _of_x(system), "as stated")
+    if isinstance(system, DiracSystem):
+        return _dirac(system, near, params)
+    if isinstance(system, PortHamiltonian):
+        return _port_hamiltonian(system, near, params)
+    if isinstance(system, NonholonomicMechanics | PhaseSpaceLagrangian):
+        return _lagrangian(system.lagrange_dirac(), system, near, params)
+    if isinstance(system, LagrangeDirac):
+        return _lagrangian(system, system, near, params)
+    raise TypeError(
+        "the constraint algorithm takes ImplicitSystem, DiracSystem, PortHamiltonian, LagrangeDirac, NonholonomicMechanics "
+        f"and PhaseSpaceLagrangian systems, but a {type(system).__name__} was given: state it as dx.ImplicitSystem(E, f, B)."
+    )
+
+
+def _dirac(system: DiracSystem, near, params) -> ImplicitForm:
+    x = _point(near, ("x",), system)
+    c = sum(system.sizes({"x": jnp.asarray(x)}, params)[1:])
+
+    def equations(x, params):
+        matrix, right = system.equations(x, params)
+        right = jnp.concatenate([right, system.constraints.position_defect(0.0, x, params)])
+        return jnp.concatenate([matrix, jnp.zeros((c, x.size + c))]), right
+
+    about = "F ẋ = −E (dH − Gᵀλ), g = 0" if c else "F ẋ = −E dH"
+    return ImplicitForm(equations, x, _names("x", x.size), _names("λ", c), _of_x(system), about)
+
+
+def _port_hamiltonian(system: PortHamiltonian, near, params) -> ImplicitForm:
+    near, t = _without_time(near)
+    x = _point(near, ("x",), system)
+    n, m = system.sizes({"x": jnp.asarray(x)}, params)
+
+    def equations(t, x, params):
+        dh = system.differential(x, params)
+        closed = system.closed_matrix(x, params)
+        right = system.flow_matrix(x, params) @ dh + system.open_matrix(x, params) @ system.input(t, x, params)
+        matrix = jnp.block([[jnp.eye(n), -closed], [jnp.zeros((m, n + m))]])
+        return matrix, jnp.concatenate([right, closed.T @ dh])
+
+    about = "closed ports: u keeps y = 0" if m else "no closed ports"
+    energy = lambda t, x, params: system.energy_at({"x": x}, params)
+    timed = _uses_time(system.inputs, x, params)
+    return _in_time(timed, t, equations, x, _names("x", n), _names("u", m), energy, about)
+
+
+def _in_time(timed: bool, t: float, equations: Callable, x: np.ndarray, coordinates, multipliers, energy, about) -> ImplicitForm:
+    """The form of `equations(t, x, params)` and `energy(t, x, params)`: those at t = 0, or with t as the last coordinate."""
+    if not timed:
+        autonomous = lambda x, params: equations(0.0, x, params)
+        return ImplicitForm(autonomous, x, coordinates, multipliers, lambda x, params: energy(0.0, x, params), about)
+    n = x.size
+
+    def extended(x, params):
+        matrix, right = equations(x[n], x[:n], params)
+        matrix = jnp.insert(matrix, n, 0.0, axis=1)
+        clock = jnp.zeros((1, matrix.shape[1])).at[0, n].set(1.0)
+        return jnp.concatenate([matrix, clock]), jnp.concatenate([right, jnp.ones(1)])
+
+    of_x = lambda x, params: energy(x[n], x[:n], params)
+    words = f"{about}; t as a coordinate"
+    return ImplicitForm(extended, np.append(x, t), (*coordinates, "t"), multipliers, of_x, words, clock=True)
+
+
+def _without_time(near) -> tuple[Any, float]:
+    """(near without its time, the time)."""
+    if not isinstance(near, dict) or "t" not in near:
+        return near, 0.0
+    return {name: value for name, value in near.items() if name != "t"}, float(near["t"])
+
+
+def _uses_time(function: UserFunction | None, *values) -> bool:
+    """Whether the result of a function of (t, …) depends on t as it is written."""
+    if function is None:
+        return False
+    jaxpr = jax.make_jaxpr(lambda t: function(t, *values))(jnp.zeros(())).jaxpr
+    (t,) = jaxpr.invars
+    used = [v for equation in jaxpr.eqns for v in equation.invars]
+    return any(v is t for v in (*used, *jaxpr.outvars))
+
+
+def _lagrangian(system: LagrangeDirac, stated, near, params) -> ImplicitForm:
+    near, t = _without_time(near)
+    data: Any = {k: jnp.asarray(v, float) for k, v in near.items()} if isinstance(near, dict) else None
+    if data is not None and set(data) not in ({"q", "v"}, {"q", "p"}, {"q"}):
+        raise ValueError(f"near must hold q with v or p for a Lagrangian system, but it holds {', '.join(data)}.")
+    x = None if data is not None else np.asarray(near, float)
+    if x is not None and (x.ndim != 1 or (x.size % 2 and x.size % 3)):
+        raise ValueError(f"near must be x = (q, p), or {{'q': q, 'v': v}}, but an array of shape {x.shape} was given.")
+    given = np.zeros(0) if x is None else x
+    q = data["q"] if data is not None else jnp.asarray(given[: given.size // (2 if given.size % 2 == 0 else 3)])
+    zero = jnp.zeros_like(q)
+    stated.sizes({"q": q, "v": zero}, params)
+    timed = system.depends_on_time or _uses_time(system.forces, q, zero, params)
+    affine, hessian = _momenta(system, q, data.get("v", zero) if data is not None else zero, params, t)
+    regular = not _kernel(hessian).shape[1]
+    if affine and (regular or system.forces is None):
+        if data is not None:
+            p = data["p"] if "p" in data else system.legendre(q, data.get("v", zero), params, t)
+            x = np.concatenate([q, p])
+        return _on_cotangent_bundle(system, np.asarray(x), hessian, params, timed, t)
+    why = "the momenta of this Lagrangian are not affine in the velocities"
+    why = "this Lagrangian is singular and has forces, which are functions of v" if affine else why
+    if data is None and (x is None or x.size % 3):
+        raise ValueError(f'{why}: give near={{"q": …, "v": …}}.')
+    if data is not None:
+        if "v" not in data:
+            raise ValueError(f'{why}: give near={{"q": …, "v": …}}.')
+        x = np.concatenate([q, data["v"], system.legendre(q, data["v"], params, t)])
+    return _on_pontryagin_bundle(system, np.asarray(x), params, timed, t, f"{why.split(': ')[0]}: x = (q, v, p)")
+
+
+def _momenta(system: LagrangeDirac, q, v, params, t) -> tuple[bool, np.ndarray]:
+    """Whether ∂L/∂v is affine in v (at three points around q), and the Hessian ∂²L/∂v² at q."""
+    hessian = jax.jit(lambda q, v: jax.hessian(lambda v: system.lagrangian.at(t, q, v, params))(v))
+    rng, q, v = np.random.default_rng(0), np.asarray(q), np.asarray(v)
+    here, scale = np.asarray(hessian(q, v)), 1.0 + np.abs(q).max()
+    for _ in range(3):
+        at = q + 1e-2 * scale * rng.normal(size=q.shape)
+        one, other = (np.asarray(hessian(at, v + r * rng.normal(size=q.shape))) for r in (0.0, 0.5))
+        if np.abs(one - other).max() > 1e-9 * (1e-300 + np.abs(one).max()):
+            return False, here
+    return True, here
+
+
+def _kernel(hessian: np.ndarray) -> np.ndarray:
+    """A basis (n, k) of the kernel of a symmetric matrix."""
+    values, vectors = np.linalg.eigh(hessian)
+    return vectors[:, np.abs(values) <= RANK_TOLERANCE * max(np.abs(values).max(initial=0.0), 1e-300)]
+
+
+def _on_cotangent_bundle(
+    system: LagrangeDirac, x: np.ndarray, hessian: np.ndarray, params, timed: bool, t: float
+) -> ImplicitForm:
+    """x = (q, p): ẋ = X_H + X_φ u + (0, f + Wᵀλ), φ = 0, W q̇ = −b, with the primary constraints φ and H = ⟨p, v⟩ − L."""
+    n = x.size // 2
+    m, c = system.constraints.sizes(jnp.asarray(x[:n]), params)
+    null = jnp.asarray(_kernel(hessian))
+    k = null.shape[1]
+    J = canonical_two_form(n)  # as the Poisson matrix: (q̇, ṗ) = J dH
+
+    def legendre_inverse(t, x, params):
+        """(v, φ) with ∂L/∂v (q, v) = p − Zφ and Zᵀv = 0, Z a basis of the Hessian's kernel at the point of the chain."""
+        q, p = x[:n], x[n:]
+        zero = jnp.zeros(n)
+        mass = jax.hessian(lambda v: system.lagrangian.at(t, q, v, params))(zero)
+        bordered = jnp.block([[mass, null], [null.T, jnp.zeros((k, k))]])
+        solution = jnp.linalg.solve(bordered, jnp.concatenate([p - system.legendre(q, zero, params, t), jnp.zeros(k)]))
+        return solution[:n], solution[n:]
+
+    def hamiltonian(t, x, params):
+        v, _ = legendre_inverse(t, x, params)
+        return x[n:] @ v - system.lagrangian.at(t, x[:n], v, params)
+
+    def equations(t, x, params):
+        primary = lambda x: legendre_inverse(t, x, params)[1]
+        flow, dphi = J @ jax.grad(lambda x: hamiltonian(t, x, params))(x), jax.jacfwd(primary)(x)
+        if system.forces is not None:
+            flow = flow.at[n:].add(system.forces(t, x[:n], legendre_inverse(t, x, params)[0], params))
+        w, moving = system.constraints.matrix(t, x[:n], params), _moving(system, t, x[:n], params)
+        forces = jnp.concatenate([J @ dphi.T, jnp.concatenate([jnp.zeros((n, m + c)), w.T])], axis=1)
+        top = jnp.concatenate([jnp.eye(2 * n), -forces], axis=1)
+        constrained = jnp.concatenate([w[:m], jnp.zeros((m, n + k + m + c))], axis=1)
+        matrix = jnp.concatenate([top, jnp.zeros((k, 2 * n + k + m + c)), constrained, jnp.zeros((c, 2 * n + k + m + c))])
+        return matrix, jnp.concatenate([flow, primary(x), *moving])
+
+    names, multipliers = (*_names("q", n), *_names("p", n)), (*_names("u", k), *_names("λ", m + c))
+    rank = f"Hessian of rank {n - k} of {n}" + (f": {k} primary constraint{'s' * (k > 1)}" if k else ", regular")
+    return _in_time(timed, t, equations, x, names, multipliers, hamiltonian, rank)
+
+
+def _on_pontryagin_bundle(system: LagrangeDirac, x: np.ndarray, params, timed: bool, t: float, about: str) -> ImplicitForm:
+    """x = (q, v, p): q̇ = v, ṗ = ∂L/∂q + f + Wᵀλ, 0 = p − ∂L/∂v, 0 = W v + b."""
+    n = x.size // 3
+    m, c = system.constraints.sizes(jnp.asarray(x[:n]), params)
+
+    def equations(t, x, params):
+        q, v, p = x[:n], x[n : 2 * n], x[2 * n :]
+        dq, dv = jax.grad(lambda q, v: system.lagrangian.at(t, q, v, params), argnums=(0, 1))(q, v)
+        rate = dq if system.forces is None else dq + system.forces(t, q, v, params)
+        w, (minus_b, g) = system.constraints.matrix(t, q, params), _moving(system, t, q, params)
+        eye, zero = jnp.eye(n), jnp.zeros((n, n))
+        position = jnp.concatenate([eye, zero, zero, jnp.zeros((n, m + c))], axis=1)
+        momentum = jnp.concatenate([zero, zero, eye, -w.T], axis=1)
+        matrix = jnp.concatenate([position, momentum, jnp.zeros((n + m + c, 3 * n + m + c))])
+        return matrix, jnp.concatenate([v, rate, p - dv, w[:m] @ v - minus_b, g])
+
+    def energy(t, x, params):
+        return system.generalized_energy(x[:n], x[n : 2 * n], x[2 * n :], params, t)
+
+    names = (*_names("q", n), *_names("v", n), *_names("p", n))
+    return _in_time(timed, t, equations, x, names, _names("λ", m + c), energy, about)
+
+
+def _moving(system: LagrangeDirac, t, q, params) -> tuple[Array, Array]:
+    """(−b, g): the right-hand sides of W q̇ = −b and 0 = g."""
+    constraints = system.constraints
+    return -constraints.nonholonomic_defect(t, q, jnp.zeros_like(q), params), constraints.position_defect(t, q, params)
+
+
+def _point(near, keys: tuple[str, ...], system) -> np.ndarray:
+    if isinstance(near, dict):
+        if set(near) == {"q", "p"}:
+            near = np.concatenate([np.asarray(near["q"]), np.asarray(near["p"])])
+        elif set(near) == {"x"}:
+            near = near["x"]
+        else:
+            raise ValueError(f"near must hold {', '.join(keys)} for a {type(system).__name__}, but holds {', '.join(near)}.")
+    x = np.asarray(near, dtype=float)
+    if x.ndim != 1 or not x.size or not np.all(np.isfinite(x)):
+        raise ValueError(f"near must be one finite point x of shape (N,), but {near!r:.80} was given.")
+    return x
+
+
+def _names(letter: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{letter}{i}" for i in range(count))
+
+
+def _of_x(system):
+    return lambda x, params: system.energy_at({"x": x}, params)
