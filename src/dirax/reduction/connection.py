@@ -66,26 +66,32 @@ class AbstractConnection(eqx.Module):
         return g0 + self.lift_of_shapes(x0, x1)
 
     def trivialize_pair(self, q0: Float[Array, " n"], q1: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        """λ_d(q0, q1) = (q0, x1, g1 − h_d(q0, x1)), the vertical part being ω_d(q0, q1)."""
+        """λ_d(q0, q1) = (q0, x1, g1 − h_d(q0, x1)), the vertical part being ω_d(q0, q1) ([RL] (3.2))."""
         return q0, self.split(q1)[0], self.one_form(q0, q1)
 
     def untrivialize_pair(self, q0: Float[Array, " n"], x1: Float[Array, " n-k"], g1: Float[Array, " k"]) -> Float[Array, " n"]:
-        """q1 = (x1, g1 + h_d(q0, x1)): the inverse of `trivialize_pair`."""
+        """q1 = (x1, g1 + h_d(q0, x1)): the inverse of `trivialize_pair` ([RL] (3.3))."""
         return self.join(x1, g1 + self.horizontal_lift(q0, x1))
 
     def trivialize_pair_backward(self, q0: Float[Array, " n"], q1: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        """λ̃_d(q0, q1) = (x0, g0 − h_d(q1, x0), q1): the (−) counterpart of `trivialize_pair` ([RL] (5.4))."""
+        """λ̃_d(q0, q1) = (x0, g0 − h_d(q1, x0), q1): the (−) counterpart of `trivialize_pair` ([RL] Remark 3.1)."""
         return self.split(q0)[0], self.one_form(q1, q0), q1
 
+    def untrivialize_pair_backward(
+        self, x0: Float[Array, " n-k"], g0: Float[Array, " k"], q1: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """q0 = (x0, g0 + h_d(q1, x0)): the inverse of `trivialize_pair_backward`."""
+        return self.join(x0, g0 + self.horizontal_lift(q1, x0))
+
     def trivialize_covector(self, q0: Float[Array, " n"], p0: Float[Array, " n"]) -> tuple[Array, Array, Array]:
-        """λ̂_d(q0, p0) = (q0, w0 + h*_{d,Σ}(r0), r0) for p0 = (w0, r0); r0 is the momentum map."""
+        """λ̂_d(q0, p0) = (q0, w0 + h*_{d,Σ}(r0), r0) for p0 = (w0, r0); r0 is the momentum map ([RL] (3.6), Lemma 2.2)."""
         w0, r0 = self.split(p0)
         return q0, w0 + self.momentum_shift(self.split(q0)[0], r0), r0
 
     def untrivialize_covector(
         self, x: Float[Array, " n-k"], w: Float[Array, " n-k"], mu: Float[Array, " k"]
     ) -> Float[Array, " n"]:
-        """p0 = (w − h*_{d,Σ}(μ), μ): the inverse of `trivialize_covector` at a point over x."""
+        """p0 = (w − h*_{d,Σ}(μ), μ): the inverse of `trivialize_covector` at a point over x ([RL] (3.7))."""
         return self.join(w - self.momentum_shift(x, mu), mu)
 
 
@@ -150,6 +156,10 @@ class LinearConnection(AbstractConnection):
     def lift_of_shape(self, x1: Float[Array, " n-k"]) -> Float[Array, " k"]:
         """h_{d,Σ}(x1) = A x1."""
         return self.matrix_at(x1) @ x1
+
+    def adjoint_of_point(self, x: Float[Array, " n-k"], mu: Float[Array, " k"]) -> Float[Array, " n"]:
+        """h*_{d,Q}(μ) = (−Aᵀμ, μ), with ⟨h*_{d,Q}(μ), q⟩ = ⟨μ, h_{d,Q}(q)⟩; h*_{d,Σ} is `momentum_shift` ([RL] (2.4))."""
+        return self.join(-self.momentum_shift(x, mu), mu)
 
 
 class DiscreteConnection(AbstractConnection):

@@ -8,22 +8,30 @@ import numpy as np
 
 from dirax.functions import UserFunction
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 
 
-def in_coordinates(system: LagrangeDirac, coordinates: Callable) -> LagrangeDirac:
+def in_coordinates(system: LagrangeDirac | ManifoldLagrangian, coordinates: Callable) -> LagrangeDirac:
     """The same system in coordinates y: `coordinates(y[, params])` is the point q of y, both of shape (n,).
 
     L(q(y), Dq ẏ), and constraints and forces pulled back. Schemes commute with changes that are linear in y; other changes
-    give other discrete equations of the same continuous ones.
+    give other discrete equations of the same continuous ones. Of a `dx.ManifoldLagrangian` y are as many coordinates of its
+    manifold as it has dimensions: of a torus, or where a torus acts, its angles are coordinates of a retraction-compatible
+    chart, in which the action is addition and the discrete equations are those of the manifold ([RL] §6).
 
         polar = dx.in_coordinates(kepler, lambda y: y[0] * jnp.array([jnp.cos(y[1]), jnp.sin(y[1])]))
         dx.reduce(polar, dx.LinearConnection(fibre=[1]))
 
     Raises `TypeError` for another kind of system, or a function of other arguments.
     """
-    if not isinstance(system, LagrangeDirac):
-        raise TypeError(f"in_coordinates takes a dx.LagrangeDirac system, but a {type(system).__name__} was given.")
     point = UserFunction(coordinates, "coordinates", ("y",))
+    if isinstance(system, ManifoldLagrangian):
+        on_manifold = system.lagrangian
+        return LagrangeDirac(lambda y, v, params: on_manifold(*jax.jvp(lambda y: point(y, params), (y,), (v,)), params))
+    if not isinstance(system, LagrangeDirac):
+        raise TypeError(
+            f"in_coordinates takes a dx.LagrangeDirac or a dx.ManifoldLagrangian system, but a {type(system).__name__} was given."
+        )
     constraints = system.constraints
 
     def moved(y, v, params):

@@ -1,4 +1,5 @@
-"""Reduced discrete Dirac structures, Dirac differentials and generalized energies, in a trivialization ([RL] §§3–5).
+"""Reduced discrete Dirac structures, Dirac differentials, Lagrangians and generalized energies, in a trivialization
+([RL] §§3–5).
 
 A pair of reduced states is (x0, w0, μ0, q1, w1, μ1) for (+), with q1 = (x1, g1), and (q0, w0, μ0, x1, w1, μ1) for (−),
 where the group coordinate of the other point is 0. h_d is linear here, as it is in the paper.
@@ -47,13 +48,25 @@ def minus_differential(connection: LinearConnection, ld: Callable, x0: Array, g0
     return w, mu, x1, -x0, -g0 - connection.lift_of_point(q1), -d1
 
 
+def plus_lagrangian(connection: LinearConnection, ld: Callable, x0: Array, x1: Array, g1: Array) -> Float[Array, ""]:
+    """l_{d+}(x0, x1, g1) = L_d((x0, 0), (x1, g1 + h⁰_d(x0, x1))) ([RL] (4.5))."""
+    q0 = connection.join(x0, jnp.zeros_like(g1))
+    return ld(q0, connection.untrivialize_pair(q0, x1, g1))
+
+
+def minus_lagrangian(connection: LinearConnection, ld: Callable, x0: Array, g0: Array, x1: Array) -> Float[Array, ""]:
+    """l_{d−}(x0, g0, x1) = L_d((x0, g0 + h⁰_d(x1, x0)), (x1, 0)) ([RL] (4.7))."""
+    q1 = connection.join(x1, jnp.zeros_like(g0))
+    return ld(connection.untrivialize_pair_backward(x0, g0, q1), q1)
+
+
 def plus_energy(
     connection: LinearConnection, ld: Callable, x0: Array, x_plus: Array, g_plus: Array, q1: Array, w1: Array, mu1: Array
 ) -> Float[Array, ""]:
     """e_{d+}(x0, x0⁺, g0⁺, q1, w1, μ1) = l_{d+} + ⟨w1 − h*μ1, x1 − x0⁺⟩ + ⟨μ1, g1 − g0⁺ − h⁰_d(x0, x0⁺)⟩ ([RL] Lemma 5.1)."""
     there = connection.join(x_plus, g_plus + connection.lift_of_shapes(x0, x_plus))
-    here = connection.join(x0, jnp.zeros_like(g_plus))
-    return ld(here, there) + connection.untrivialize_covector(connection.split(q1)[0], w1, mu1) @ (q1 - there)
+    along = connection.untrivialize_covector(connection.split(q1)[0], w1, mu1) @ (q1 - there)
+    return plus_lagrangian(connection, ld, x0, x_plus, g_plus) + along
 
 
 def minus_energy(
@@ -61,5 +74,5 @@ def minus_energy(
 ) -> Float[Array, ""]:
     """e_{d−}(x0⁻, g0⁻, x1, w0, μ0, q0) = l_{d−} + ⟨w0 − h*μ0, x0 − x0⁻⟩ + ⟨μ0, g0 − g0⁻ − h⁰_d(x1, x0⁻)⟩ ([RL] Lemma 5.4)."""
     there = connection.join(x_minus, g_minus + connection.lift_of_shapes(x1, x_minus))
-    here = connection.join(x1, jnp.zeros_like(g_minus))
-    return ld(there, here) + connection.untrivialize_covector(connection.split(q0)[0], w0, mu0) @ (q0 - there)
+    along = connection.untrivialize_covector(connection.split(q0)[0], w0, mu0) @ (q0 - there)
+    return minus_lagrangian(connection, ld, x_minus, g_minus, x1) + along
