@@ -14,6 +14,7 @@ from jax.experimental import checkify
 from jax.extend.core import jaxprs_in_params
 
 from dirax.representation import value_text
+from dirax.tracing import call
 
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 INDEXING = ("dynamic_slice", "gather")
@@ -50,7 +51,7 @@ class UserFunction(eqx.Module):
 
     def __call__(self, *values: Any):
         *args, params = values
-        return self.function(*args, params) if self.takes_params else self.function(*args)
+        return call(self.function, *args, *((params,) if self.takes_params else ()))
 
     def at(self, t: Any, *values: Any):
         """The function of `(*arguments, params)` at time t, which is passed on where the function takes it."""

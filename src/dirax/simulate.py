@@ -16,6 +16,7 @@ from dirax.redundancy import redundant_constraints
 from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
 from dirax.solution import Solution
 from dirax.systems.system import AbstractSystem
+from dirax.tracing import once
 
 
 def simulate(
@@ -79,21 +80,22 @@ def simulate(
     plain = lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf)
     one = {k: a[0] if a.ndim == 2 else a for k, a in ((k, plain(a)) for k, a in data.items())}
     one_params = jax.tree.map(lambda leaf: plain(leaf)[0], params) if batch_params else params
-    shape = Shape(*system.sizes(one, one_params))
 
     def begin(shape: Shape):
         equation = make_step_equation(scheme, system, shape)
         return equation, prepared(system, equation, data, params, h, t0, batch, batch_params, project)
 
-    equation, start = begin(shape)
-    # user functions that close over a traced value make the start traced although nothing that was passed is
-    traced, redundant = is_traced(data, params, h, t0, start), ()
-    if not traced:
-        equation.stages[0][0].check(one, one_params)
-        redundant = redundant_constraints(system, start.constraints, one, one_params, t0)
-        if redundant:
-            equation, start = begin(Shape(shape.n, shape.m, shape.c, redundant=redundant))
-        refuse_bad_start(system, start, equation.stages[0][0].labels, check_initial)
+    with once():
+        shape = Shape(*system.sizes(one, one_params))
+        equation, start = begin(shape)
+        # user functions that close over a traced value make the start traced although nothing that was passed is
+        traced, redundant = is_traced(data, params, h, t0, start), ()
+        if not traced:
+            equation.stages[0][0].check(one, h, one_params)
+            redundant = redundant_constraints(system, start.constraints, one, one_params, t0)
+            if redundant:
+                equation, start = begin(Shape(shape.n, shape.m, shape.c, redundant=redundant))
+            refuse_bad_start(system, start, equation.stages[0][0].labels, check_initial)
     problem = Problem(
         equation=equation,
         state=start.state,

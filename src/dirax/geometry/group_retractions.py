@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.geometry.lie_groups import AbstractLieGroup, Algebra, _cross, _quarter_turn
 from dirax.geometry.manifolds import Vector
+from dirax.tracing import gradient
 
 RETRACTIONS = ("exp", "cayley")
 
@@ -58,8 +58,6 @@ def coadjoint(group: AbstractLieGroup, g: Vector, momentum: Algebra) -> Algebra:
 def pulled_back(group: AbstractLieGroup, tau: Callable, zeta: Algebra, momentum: Algebra) -> Algebra:
     """(dτ_ζ)*μ for the right-trivialized tangent dτ_ζ(δ) = (Dτ(ζ)·δ) τ(ζ)⁻¹, whose inverse it spares."""
     f = tau(zeta)
-
-    def left_trivialized(delta):
-        return group.to_algebra(f, jax.jvp(tau, (zeta,), (delta,))[1])
-
-    return jax.linear_transpose(left_trivialized, zeta)(coadjoint(group, f, momentum))[0]
+    body = coadjoint(group, f, momentum)
+    # to_algebra(f, ·) is linear, so that this is the derivative of one number
+    return gradient(lambda near: body @ group.to_algebra(f, tau(near)))(zeta)

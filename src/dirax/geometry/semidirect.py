@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.geometry.group_retractions import coadjoint, rotate
-from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
+from dirax.geometry.lie_groups import AbstractLieGroup, Algebra, _cross, _quarter_turn
 from dirax.geometry.manifolds import Vector
 
 Advected = Float[Array, " r"]
@@ -75,14 +75,33 @@ class SemidirectProduct(eqx.Module):
         """ξ·a, the derivative of exp(εξ)·a at ε = 0."""
         if not self.advected:
             return a
+        if self.representation is None:
+            return jnp.concatenate([self._turned(xi, part) for part in self._vectors(a)])
         return jax.jvp(lambda xi: self.act(self.group.group_exp(xi), a), (jnp.zeros_like(xi),), (xi,))[1]
 
     def diamond(self, slope: Advected, a: Advected) -> Algebra:
         """J (d,) with ⟨J, η⟩ = ⟨slope, η·a⟩: the torque that goes with a force `slope` on a."""
         if not self.advected:
             return jnp.zeros(self.dimension)
+        if self.representation is None:
+            torque = sum(self._moment(part, force) for part, force in zip(self._vectors(a), self._vectors(slope), strict=True))
+            return jnp.concatenate([jnp.zeros(self.group.translations), torque])
         zero = jnp.zeros(self.dimension)
         return jax.vjp(lambda xi: self.act(self.group.group_exp(xi), a), zero)[1](slope)[0]
+
+    def _vectors(self, a: Advected) -> list[Float[Array, " k"]]:
+        """The vectors that a is made of."""
+        k = self.vector_size
+        return [a[i : i + k] for i in range(0, self.advected, k)]
+
+    def _turned(self, xi: Algebra, vector: Float[Array, " k"]) -> Float[Array, " k"]:
+        """ω × v with the angular velocity ω of ξ."""
+        omega = xi[self.group.translations :]
+        return omega * _quarter_turn(vector) if self.vector_size == 2 else _cross(omega, vector)
+
+    def _moment(self, vector: Float[Array, " k"], force: Float[Array, " k"]) -> Float[Array, " d"]:
+        """v × f, with ⟨v × f, ω⟩ = ⟨f, ω × v⟩."""
+        return jnp.sum(force * _quarter_turn(vector))[None] if self.vector_size == 2 else _cross(vector, force)
 
     def ad_star(self, xi: Algebra, momentum: Algebra) -> Algebra:
         """ad*_ξ μ, the derivative of Ad*_{exp(εξ)} μ at ε = 0."""

@@ -14,6 +14,7 @@ from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.reduction.lie_poisson import LiePoisson, checked_point
 from dirax.roots import nearest_root
 from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.tracing import gradient
 
 SINGULAR = 1e-13
 """An inertia with singular values below this, relative to the largest, is singular."""
@@ -67,7 +68,7 @@ class EulerPoincare(AbstractSystem):
 
     def slopes(self, xi: Algebra, a: Advected, params: Any = None) -> tuple[Algebra, Advected]:
         """(∂l/∂ξ, ∂l/∂a)."""
-        return jax.grad(lambda xi, a: self.value(xi, a, params), argnums=(0, 1))(xi, a)
+        return gradient(lambda xi, a: self.value(xi, a, params), (0, 1))(xi, a)
 
     def legendre(self, xi: Algebra, a: Advected, params: Any = None) -> Algebra:
         """The body momentum μ = ∂l/∂ξ."""

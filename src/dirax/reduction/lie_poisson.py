@@ -12,6 +12,7 @@ from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.geometry.structures import DiracStructure
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.tracing import gradient
 
 
 class LiePoisson(AbstractSystem):
@@ -43,7 +44,7 @@ class LiePoisson(AbstractSystem):
 
     def slopes(self, momentum: Algebra, a: Advected, params: Any = None) -> tuple[Algebra, Advected]:
         """(∂h/∂μ, ∂h/∂a)."""
-        return jax.grad(lambda momentum, a: self.value(momentum, a, params), argnums=(0, 1))(momentum, a)
+        return gradient(lambda momentum, a: self.value(momentum, a, params), (0, 1))(momentum, a)
 
     def dirac_system(self) -> DiracSystem:
         """The Dirac system (graph of the Lie–Poisson bivector, h)."""

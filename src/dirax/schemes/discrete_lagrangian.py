@@ -7,11 +7,11 @@ The velocity is the variable because q1 − q0 loses digits that v keeps: with i
 from collections.abc import Callable
 from typing import Any
 
-import jax
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
 from dirax.systems.constraints import Constraints
+from dirax.tracing import gradient
 
 LD_ARGUMENTS = ("q0", "q1", "h")
 RULES = ("left", "right", "midpoint", "trapezoidal")
@@ -95,5 +95,5 @@ def discrete_forces(forces: UserFunction, rule) -> Callable:
 
 def slot_derivatives(ld: Callable, t, q, v, h, params) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """(D1 L_d, D2 L_d) at (q, q + h v), from the derivatives with respect to (q, v)."""
-    dq, dv = jax.grad(ld, argnums=(1, 2))(t, q, v, h, params)
+    dq, dv = gradient(ld, (1, 2))(t, q, v, h, params)
     return dq - dv / h, dv / h

@@ -10,6 +10,7 @@ from dirax.geometry.group_retractions import RETRACTIONS, coadjoint, pulled_back
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.lie_poisson import LiePoisson
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
+from dirax.tracing import call
 
 
 class DiscreteEulerPoincare(AbstractScheme):
@@ -91,6 +92,9 @@ def discrete_euler_poincare(system: Any, shape: Shape, name: str) -> StepEquatio
         return v[:m], v[m : m + d], v[m + d :]
 
     def step(u, state, h, params):
+        return call(whole_step, u, state, h, params)
+
+    def whole_step(u, state, h, params):
         """ξ, m, ν, the next μ and a, f, and the residual of ξ = ∂h/∂μ."""
         momentum, a, _ = split(state)
         xi, nu, f, after, torque, next_torque, defect = motion(u, a, h, params)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from dirax.functions import UserFunction
 from dirax.roots import nearest_root, scaled_pseudo_inverse
 from dirax.systems.system import no_constraint
+from dirax.tracing import jacobian
 
 
 class Constraints(eqx.Module):
@@ -82,7 +83,7 @@ class Constraints(eqx.Module):
         """G(t, q) = ∂g/∂q."""
         if self.holonomic is None:
             return jnp.zeros((0, q.shape[0]))
-        return jax.jacrev(lambda q: self.position_defect(t, q, params))(q)
+        return jacobian(lambda q: self.position_defect(t, q, params), reverse=True)(q)
 
     def matrix(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, "k n"]:
         """[W; G], the one-forms that vanish on Δ."""

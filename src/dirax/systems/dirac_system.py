@@ -12,6 +12,7 @@ from dirax.geometry.structures import DiracStructure
 from dirax.roots import nearest_root
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
+from dirax.tracing import gradient
 
 RANK_TOLERANCE = 1e-10
 """Singular values of the kernel matrix F below this, relative to the largest, count as zero in the initial check."""
@@ -50,7 +51,7 @@ class DiracSystem(AbstractSystem):
 
     def differential(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
         """dH(x)."""
-        return jax.grad(lambda x: self.hamiltonian(x, params))(x)
+        return gradient(lambda x: self.hamiltonian(x, params))(x)
 
     @property
     def constraints(self) -> Constraints:

@@ -12,6 +12,7 @@ from dirax.functions import UserFunction
 from dirax.roots import nearest_root, scaled_pseudo_inverse
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.tracing import gradient, jacobian
 
 
 class LagrangeDirac(AbstractSystem):
@@ -75,7 +76,7 @@ class LagrangeDirac(AbstractSystem):
 
     def legendre(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " n"]:
         """The Legendre transform: p = ∂L/∂v (q, v)."""
-        return jax.grad(lambda v: self.lagrangian.at(t, q, v, params))(v)
+        return gradient(lambda v: self.lagrangian.at(t, q, v, params))(v)
 
     def inverse_legendre(
         self,
@@ -141,7 +142,7 @@ class LagrangeDirac(AbstractSystem):
 
     def _undetermined_part(self, q, v, params, t):
         """What to take from v to satisfy the constraints without changing ∂L/∂v: nothing where L is regular."""
-        hessian = jax.hessian(lambda v: self.lagrangian.at(t, q, v, params))(v)
+        hessian = jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v)
         kernel = jnp.eye(q.shape[0]) - scaled_pseudo_inverse(hessian)[0] @ hessian
         kernel = jnp.where(jnp.trace(kernel) > 0.5, kernel, 0.0)  # its trace is the number of undetermined directions
         rows, defect = self.constraints.matrix(t, q, params), self.constraints.velocity_defect(t, q, v, params)
@@ -149,7 +150,7 @@ class LagrangeDirac(AbstractSystem):
 
     def _lifted(self, q, v, rows, params, t):
         """metric⁻¹ rowsᵀ in the metric ∂²L/∂v² where it is positive definite and the Euclidean one elsewhere."""
-        hessian = jax.hessian(lambda v: self.lagrangian.at(t, q, v, params))(v)
+        hessian = jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v)
         values = jnp.linalg.eigvalsh(hessian)
         regular = values[0] > 1e-12 * jnp.abs(values[-1])
         return jnp.linalg.solve(jnp.where(regular, hessian, jnp.eye(q.shape[0])), rows.T)

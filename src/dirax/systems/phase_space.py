@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
@@ -11,6 +10,7 @@ from dirax.geometry.structures import DiracStructure
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.tracing import jacobian
 
 
 class PhaseSpaceLagrangian(AbstractSystem):
@@ -37,7 +37,7 @@ class PhaseSpaceLagrangian(AbstractSystem):
 
     def two_form(self, q: Float[Array, " n"], params: Any = None) -> Float[Array, "n n"]:
         """The matrix of dα: (dα)_ij = ∂_i α_j − ∂_j α_i."""
-        derivative = jax.jacfwd(lambda q: self.one_form(q, params))(q)
+        derivative = jacobian(lambda q: self.one_form(q, params))(q)
         return derivative.T - derivative
 
     def dirac_system(self) -> DiracSystem:

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction, evaluated, is_traced
 from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.tracing import gradient
 
 SKEW_TOLERANCE = 1e-10
 
@@ -59,7 +59,7 @@ class PortHamiltonian(AbstractSystem):
 
     def differential(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
         """dH(x)."""
-        return jax.grad(lambda x: self.hamiltonian(x, params))(x)
+        return gradient(lambda x: self.hamiltonian(x, params))(x)
 
     def input_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N m"]:
         """B(x); (N, 0) without ports."""

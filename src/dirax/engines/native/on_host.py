@@ -18,6 +18,7 @@ from dirax.engines.native.graph import Graph, GraphTooLarge
 from dirax.engines.native.interpret import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
 from dirax.engines.native.program import program
 from dirax.engines.native.trace import NODE_LIMIT
+from dirax.tracing import in_scalars
 
 KEPT = 128
 """Functions kept in memory."""
@@ -179,7 +180,8 @@ def on_host(function: Callable, leaves: list[np.ndarray], kept: tuple, key: Any 
 
 
 def _traced(function: Callable, shapes: list[jax.ShapeDtypeStruct]) -> tuple[HostFunction, Any] | None:
-    closed, result = jax.make_jaxpr(function, return_shape=True)(*shapes)
+    with in_scalars():
+        closed, result = jax.make_jaxpr(function, return_shape=True)(*shapes)
     if any(isinstance(c, Tracer) for c in closed.consts):
         return None
     try:

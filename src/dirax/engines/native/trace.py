@@ -9,7 +9,8 @@ import numpy as np
 from jax.core import Tracer
 
 from dirax.engines.native import (
-    control,  # noqa: F401  (these five register their rules)
+    control,  # noqa: F401  (these six register their rules)
+    derivatives,  # noqa: F401
     elementwise,  # noqa: F401
     linear_algebra,  # noqa: F401
     movement,  # noqa: F401
@@ -17,6 +18,7 @@ from dirax.engines.native import (
 )
 from dirax.engines.native.graph import Graph, GraphTooLarge
 from dirax.engines.native.interpret import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
+from dirax.tracing import in_scalars
 
 NODE_LIMIT = 60_000
 """Most scalar operations of one step; beyond it an array program is faster to compile, and to run."""
@@ -114,7 +116,8 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
             [jnp.asarray(row[name]) for name in sorted(row)],
         )
 
-    closed = jax.make_jaxpr(everything)(vector(k), vector(s), vector(k), scalar, scalar, leaf_shapes)
+    with in_scalars():
+        closed = jax.make_jaxpr(everything)(vector(k), vector(s), vector(k), scalar, scalar, leaf_shapes)
     names = sorted(equation.fields)
     state = [g.input(f"state{i}") for i in range(s)]
     unknowns = [g.input(f"u{i}") for i in range(k)]

@@ -1,0 +1,157 @@
+"""The rule of a derivative that tracing left to the graph."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+
+from dirax.engines.native.graph import Graph
+from dirax.engines.native.interpret import Interpreter, Nodes, Unavailable, Unsupported, elementwise, rule
+from dirax.engines.native.operations import partials
+
+
+@rule("dirax_derivative")
+def derivative(interpreter: Interpreter, equation: Any, *operands: Nodes):
+    """Derived on a graph of its own, whose inputs are the operands, so that nothing is simplified across them."""
+    g, p, own = interpreter.graph, equation.params, Derived(interpreter.graph.limit)
+    outside: dict[int, int] = {}
+
+    def inside(node: int, wanted: bool) -> int:
+        if g.is_constant(node) and not wanted:
+            return own.graph.constant(g.value[node])
+        made = own.graph.input(f"x{len(outside)}")
+        outside[made] = node
+        return made
+
+    inputs = [
+        np.array([inside(node, k in p["wanted"]) for node in nodes.ravel().tolist()], np.int64).reshape(nodes.shape)
+        for k, nodes in enumerate(operands)
+    ]
+    (value,) = own.interpreter.run(p["jaxpr"], *inputs)
+    if isinstance(value, Unavailable):
+        raise Unsupported(f"of a function with {value.error}")
+    columns = np.concatenate([inputs[k].ravel() for k in p["wanted"]]).tolist()
+    outputs = value.ravel().tolist()
+    rows = own.rows(outputs, columns)
+    moved = own.made_in(g, [node for row in rows for node in row], outside)
+    table = np.array(moved, np.int64).reshape(value.size, len(columns))
+    parts = np.split(table, np.cumsum([inputs[k].size for k in p["wanted"]])[:-1], axis=1)
+    return [part.reshape((*value.shape, *inputs[k].shape)) for part, k in zip(parts, p["wanted"], strict=True)]
+
+
+class Derived:
+    """A graph in which powers and functions with rules of their own are single nodes, as long as it is differentiated.
+
+    `slopes[node]` are the derivatives of such a function's value by its operands, `written[node]` is the value in other nodes.
+    """
+
+    def __init__(self, limit: int):
+        self.graph = Graph(limit)
+        self.slopes: dict[int, dict[int, int]] = {}
+        self.written: dict[int, int] = {}
+        rules = {"integer_pow": _power, "pow": _power, "custom_jvp_call": self._custom}
+        self.interpreter = Interpreter(self.graph, rules)
+
+    def _custom(self, interpreter: Interpreter, equation: Any, *operands: Nodes):
+        """A function of numbers with a rule for its derivative, which is interpreted along each operand."""
+        p, g = equation.params, self.graph
+        (written,) = interpreter.run(p["call_jaxpr"], *operands)
+        if isinstance(written, Unavailable) or g.is_constant(written.item()):
+            return [written]
+        inner = p["call_jaxpr"].jaxpr
+        alone = equation.replace(invars=inner.invars)
+        whole = ClosedJaxpr(inner.replace(constvars=(), outvars=equation.outvars, eqns=[alone]), ())
+        node = g.input(f"value{len(self.slopes)}")
+        self.written[node], self.slopes[node] = written.item(), {}
+        scalar = jax.ShapeDtypeStruct((), np.float64)
+        for k, operand in enumerate(operands):
+            if g.is_constant(operand.item()):
+                continue
+            along = tuple(float(i == k) for i in range(len(operands)))
+            pushed = lambda *x, along=along: jax.jvp(lambda *x: jaxpr_as_fun(whole)(*x)[0], x, along)[1]
+            (slope,) = Interpreter(g).run(jax.make_jaxpr(pushed)(*[scalar] * len(operands)), *operands)
+            if isinstance(slope, Unavailable):
+                return [slope]
+            known = self.slopes[node]
+            known[operand.item()] = g.add(known.get(operand.item(), g.zero), slope.item())
+        return [np.array(node, np.int64)]
+
+    def rows(self, outputs: list[int], inputs: list[int]) -> list[list[int]]:
+        """The derivatives of each output by each input, the way that has less to do."""
+        if len(inputs) < len(outputs):
+            return self.forward(outputs, inputs)
+        return [self.gradient(output, inputs) for output in outputs]
+
+    def gradient(self, output: int, inputs: list[int]) -> list[int]:
+        """The derivatives of a node, backward over the graph."""
+        g, flow = self.graph, {output: self.graph.one}
+        for node in reversed(self._needed([output])):
+            if node not in flow:
+                continue
+            for a, slope in self._slopes(node):
+                if (term := g.mul(slope, flow[node])) != g.zero:
+                    flow[a] = g.add(flow[a], term) if a in flow else term
+        return [flow.get(node, g.zero) for node in inputs]
+
+    def forward(self, outputs: list[int], inputs: list[int]) -> list[list[int]]:
+        """The derivatives of nodes, forward over the graph."""
+        g, zero = self.graph, self.graph.zero
+        rows = {node: {j: g.one} for j, node in enumerate(inputs)}
+        for node in self._needed(outputs):
+            if node in rows:
+                continue
+            if g.op[node] == "select":
+                which, yes, no = g.args[node]
+                entries = {*rows[yes], *rows[no]}
+                rows[node] = {j: g.select(which, rows[yes].get(j, zero), rows[no].get(j, zero)) for j in sorted(entries)}
+                continue
+            rows[node] = {}
+            for a, slope in self._slopes(node):
+                for j, inner in rows[a].items():
+                    term = g.mul(slope, inner)
+                    rows[node][j] = g.add(rows[node][j], term) if j in rows[node] else term
+        return [[rows[node].get(j, zero) for j in range(len(inputs))] for node in outputs]
+
+    def _slopes(self, node: int) -> list[tuple[int, int]]:
+        """(operand, derivative by it) of a node, where there is one."""
+        if node in self.slopes:
+            return list(self.slopes[node].items())
+        args = self.graph.args[node]
+        pairs = zip(args, partials(self.graph, node), strict=True) if args else ()
+        return [(a, slope) for a, slope in pairs if slope is not None]
+
+    def _needed(self, outputs: list[int], written: bool = False) -> list[int]:
+        """Every node that the outputs are made of, operands first."""
+        g, seen, stack = self.graph, set(), list(outputs)
+        while stack:
+            node = stack.pop()
+            if node not in seen:
+                seen.add(node)
+                if node not in self.slopes:
+                    stack.extend(g.args[node])
+                else:
+                    stack.extend([self.written[node]] if written else self.slopes[node])
+        return sorted(seen)
+
+    def made_in(self, target: Graph, outputs: list[int], known: dict[int, int]) -> list[int]:
+        """The nodes of `outputs` made again in another graph, inputs replaced as `known` says."""
+        source, there = self.graph, dict(known)
+        for node in self._needed(outputs, written=True):
+            if node in there:
+                continue
+            if node in self.written:
+                there[node] = there[self.written[node]]
+            elif source.is_constant(node):
+                there[node] = target.constant(source.value[node])
+            else:
+                there[node] = target.make(source.op[node], *(there[a] for a in source.args[node]))
+        return [there[node] for node in outputs]
+
+
+def _power(interpreter: Interpreter, equation: Any, x: Nodes, *exponent: Nodes):
+    """A power as one node, whose derivative is n·xⁿ⁻¹; it is written out where it is made again."""
+    g = interpreter.graph
+    y = exponent[0] if exponent else np.array(g.constant(float(equation.params["y"])))
+    constant = lambda a, b: g.is_constant(a) and g.is_constant(b)
+    return [elementwise(lambda a, b: g.make("pow", a, b) if constant(a, b) else g._plain("pow", a, b), x, y)]
