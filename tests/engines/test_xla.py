@@ -210,6 +210,30 @@ def test_an_interrupted_run_keeps_what_was_computed(monkeypatch):
     np.testing.assert_allclose(out.closing["q"][0], cayley(1.0, 0.0, 1.0, 0.1, 0.1 * done), atol=1e-13)
 
 
+@pytest.mark.parametrize("state", [[0.5, -1.0], [0.00501, -1.0]], ids=["on the way", "in the first step"])
+def test_a_failure_leaves_the_derivatives_of_the_others(state):
+    """With respect to initial data and to a parameter that all share; the good rows of the one that fails keep theirs."""
+    falling = dx.LagrangeDirac(lambda q, v, g: v @ v / 2 - g * q[0] + 1e-4 * jnp.sqrt(q[0]))
+    run = {"step": 0.01, "steps": 60, "save_every": 10, "engine": "xla"}
+    q, v = np.array([[1.0], [state[0]], [2.0]]), np.array([[40.0], [state[1]], [30.0]])
+
+    def weighted(q, v, g, weights):
+        sol = dx.simulate(falling, MIDPOINT, q=q, v=v, params=g, **run)
+        rows = jnp.concatenate([sol.q, sol.p], axis=1)[..., 0]
+        return weights @ jnp.sum(jnp.where(jnp.isnan(rows), 0.0, jnp.sin(rows)), axis=1)
+
+    slopes, others = jax.jit(jax.grad(weighted, argnums=(0, 1, 2))), np.array([0, 2])
+    mixed = slopes(q, v, 1.0, np.ones(3))
+    assert all(np.all(np.isfinite(slope)) for slope in mixed)
+    alone = slopes(q[others], v[others], 1.0, np.ones(2))
+    for slope, sound in zip(mixed[:2], alone[:2], strict=True):
+        np.testing.assert_allclose(slope[others], sound, rtol=1e-12)
+    np.testing.assert_allclose(slopes(q, v, 1.0, np.array([1.0, 0.0, 1.0]))[2], alone[2], rtol=1e-12)
+    d = 1e-6
+    values = [weighted(q + nudge * np.array([[0.0], [1.0], [0.0]]), v, 1.0, np.array([0.0, 1.0, 0.0])) for nudge in (d, -d)]
+    np.testing.assert_allclose(mixed[0][1, 0], (values[0] - values[1]) / (2 * d), rtol=1e-5)
+
+
 # ------------------------------------------------------------------------------------------- residuals, sizes, compiled code
 
 

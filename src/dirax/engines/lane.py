@@ -4,9 +4,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
-from dirax.engines.newton import solve
+from dirax.engines.newton import as_function, solve
 from dirax.engines.result import NOT_CONVERGED, NOT_FINITE, OK
 
 
@@ -65,7 +66,9 @@ def first_lane(state, guess: tuple, xp=jnp, compensated: bool = False) -> Lane:
 def take_step(
     equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True, derived: Derived | None = None
 ) -> tuple[Lane, tuple]:
-    """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns."""
+    """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns.
+
+    With `differentiable` it can be differentiated in reverse mode too, and no derivative passes through a step that failed."""
     state, lost, history, unknowns = lane.state, lane.lost, [], []
     status, updates, worst = lane.status, 0, lane.max_residual
     nothing = (None,) * len(equation.stages)
@@ -73,15 +76,21 @@ def take_step(
     for (stage, fraction), before, increment, jacobian in zip(equation.stages, lane.history, increments, jacobians, strict=True):
         running = status == OK
         args = (state, t, fraction * h, params)
-        guess = stage.guess(state, jnp.sum(before, axis=0), fraction * h, params)
-        u, count, converged = solve(stage.residual, stage.scale, guess, args, max_iterations, running, differentiable, jacobian)
-        new, left = stage.advance(u, *args), stage.residual(u, *args)
+        fixed = passing(args, False) if differentiable else args
+        guess = stage.guess(fixed[0], jnp.sum(before, axis=0), *fixed[2:])
+        guess = jax.lax.stop_gradient(guess) if differentiable else guess
+        u, count, converged = solve(stage.residual, stage.scale, guess, fixed, max_iterations, running, jacobian)
+        new, left = stage.advance(u, *fixed), stage.residual(u, *fixed)
         # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
         finite = jnp.isfinite(jnp.sum(0.0 * jnp.concatenate([new, left])))
         outcome = jnp.where(finite, jnp.where(converged, OK, NOT_CONVERGED), NOT_FINITE)
         status = jnp.where(running, outcome, status)
         updates = updates + jnp.where(running, count, 0)
         worst = jnp.where(status == OK, jnp.maximum(worst, jnp.max(jnp.abs(left), initial=0.0)), worst)
+        if differentiable:
+            args = passing(args, status == OK)
+            u = as_function(stage.residual, u, args)
+            new = stage.advance(u, *args)
         if increment is not None:
             new, left_out = compensated_sum(state, lost, increment(u, *args), new)
             lost = jnp.where(status == OK, left_out, lost)
@@ -98,6 +107,13 @@ def take_step(
         jnp.where(good, lost, lane.lost),
     )
     return after, tuple(unknowns)
+
+
+def passing(numbers: Any, pass_on: Any) -> Any:
+    """The same numbers, through which derivatives, NaNs among them, go on where `pass_on` is true and not otherwise."""
+    stop = jax.lax.stop_gradient
+    one = lambda x: stop(x) if pass_on is False else jnp.where(pass_on, x, stop(x))
+    return jax.tree.map(lambda x: one(x) if eqx.is_inexact_array(x) else x, numbers)
 
 
 def compensated_sum(state, lost, increment, new):

@@ -56,33 +56,33 @@ def solve(
     args: tuple[Any, ...],
     max_iterations: int,
     running: Any = True,
-    differentiable: bool = True,
     jacobian: Callable[..., Float[Array, "k k"]] | None = None,
 ) -> tuple[Float[Array, " k"], Int[Array, ""], Bool[Array, ""]]:
-    """(u, number of updates, converged) of residual(u, *args) = 0; differentiable in args, not in the guess.
+    """(u, number of updates, converged) of residual(u, *args) = 0; not for reverse mode, see `as_function`.
 
     `scale` (k,) is the unit of each unknown, relative to which updates are measured. The guess comes back where `running`
-    is false. Without `differentiable` there is less to trace. `jacobian(u, *args)` is that of the residual, derived here
-    where it is not given.
+    is false. `jacobian(u, *args)` is that of the residual, derived here where it is not given.
     """
     if guess.shape[0] == 0:
         return guess, jnp.zeros((), jnp.int64), jnp.array(True)
+    equation = lambda u: residual(u, *args)
+    slopes = (lambda u: jacobian(u, *args)) if jacobian else jax.jacfwd(equation)
+    found = newton(equation, slopes, jnp.asarray(scale), guess, max_iterations, running)
+    return found.u, found.updates.astype(int), at_floor(found)
 
-    slopes = (lambda u: jacobian(u, *args)) if jacobian else jax.jacfwd(lambda u: residual(u, *args))
 
-    def search(equation, guess):
-        return newton(equation, slopes, jnp.asarray(scale), guess, max_iterations, running)
+def as_function(
+    residual: Callable[..., Float[Array, " k"]], root: Float[Array, " k"], args: tuple[Any, ...]
+) -> Float[Array, " k"]:
+    """`root`, with its derivatives as the function of args that residual(root, *args) = 0 makes of it."""
+    if root.shape[0] == 0:
+        return root
 
     def tangent_solve(linear, right_hand_side):
-        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(guess.shape[0]))
+        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(root.shape[0]))
         return factorised(matrix)(right_hand_side)
 
-    equation = lambda u: residual(u, *args)
-    if differentiable:
-        found = Search(*jax.lax.custom_root(equation, guess, search, tangent_solve, has_aux=True))
-    else:
-        found = search(equation, guess)
-    return found.u, found.updates.astype(int), at_floor(found)
+    return jax.lax.custom_root(lambda u: residual(u, *args), root, lambda _, u: u, tangent_solve)
 
 
 def newton(
