@@ -78,7 +78,7 @@ def simulate(
 
     # NumPy's arrays where they can be: an entry or a part of JAX's is a program to compile
     plain = lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf)
-    one = {k: a[0] if a.ndim == 2 else a for k, a in ((k, plain(a)) for k, a in data.items())}
+    one: dict[str, Any] = {k: a[0] if a.ndim == 2 else a for k, a in ((k, plain(a)) for k, a in data.items())}
     one_params = jax.tree.map(lambda leaf: plain(leaf)[0], params) if batch_params else params
 
     def begin(shape: Shape):

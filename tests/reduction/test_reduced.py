@@ -82,7 +82,26 @@ def test_mistakes():
         dx.simulate(dx.reduce(spring, dx.LinearConnection([1])), dx.PlusLagrangeDirac(), **run | {"q": [0.1, 0.0]})
     with pytest.raises(ValueError, match="does not fit a system of 2"):
         dx.simulate(dx.reduce(pulled, dx.LinearConnection([4])), dx.PlusLagrangeDirac(), **run)
-    with pytest.raises(TypeError, match=r"dx\.reduce takes"):
-        dx.reduce(3, dx.LinearConnection([0]))
+    free = dx.LagrangeDirac(lambda q, v: v @ v / 2)
+    for fibre in ([1.5], "z", []):
+        with pytest.raises(ValueError, match=r"different non-negative indices of coordinates, such as \[0\], but"):
+            dx.LinearConnection(fibre)
+    pulling = lambda q0, q1, h: (q1 - q0) @ (q1 - q0) / (2 * h) - h * q1[1] ** 2
+    for scheme in (dx.PlusLagrangeDirac(pulling), dx.DiscreteRouth(pulling)):
+        with pytest.raises(ValueError, match=r"discrete_lagrangian is not invariant .* q\[1\]: its derivative .* is 0\.0"):
+            dx.simulate(dx.reduce(free, dx.LinearConnection([1])), scheme, **run)
+    tied = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[1.0, -0.5]]))
+    scheme = dx.LagrangeDAlembert(constraint=lambda q0, q1, h: jnp.array([1.0, -0.5]) @ (q1 - q0) / h + q0[1:])
+    with pytest.raises(ValueError, match=r"constraint is not invariant under translation of q\[1\]"):
+        dx.simulate(dx.reduce(tied, dx.LinearConnection([1])), scheme, **run)
+    for other, way in (
+        (3, "int was given"),
+        (dx.PhaseSpaceLagrangian(lambda q: q, lambda q: q @ q), r"give system\.lagrange_dirac"),
+    ):
+        with pytest.raises(TypeError, match=r"dx\.reduce takes a dx\.LagrangeDirac .*" + way):
+            dx.reduce(other, dx.LinearConnection([0]))
+    for symmetry, way in ((dx.Translations([1]), r"dx\.LinearConnection\(fibre=\[1\]\)"), (dx.SO3, "add parentheses")):
+        with pytest.raises(TypeError, match="the symmetry must be a connection such as .* was given: " + way):
+            dx.reduce(free, symmetry)
     with pytest.raises(TypeError, match=r"dx\.reconstruct takes"):
         dx.reconstruct(dx.simulate(pulled, dx.PlusLagrangeDirac(), **run))

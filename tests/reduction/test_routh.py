@@ -123,8 +123,14 @@ def test_mistakes():
     with pytest.raises(ValueError, match=r"forces f\(t, q, v\) move: f has the part -0\.\d+ along q\[1\] at"):
         dx.simulate(dx.reduce(dragged, dx.LinearConnection([1])), DiscreteRouth(), q=[0.0, 0.0], v=[0.1, 0.2], step=0.1, steps=3)
     drifting = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 + v[0] * v[1])
-    with pytest.raises(ValueError, match="group inertia"):
+    with pytest.raises(ValueError, match=r"singular value at the initial data: the group inertia .* rank 0 of 1"):
         dx.simulate(dx.reduce(drifting, dx.LinearConnection([1])), DiscreteRouth(), q=[0.0, 0.0], v=[0.1, 0.2], step=0.1, steps=3)
+    quartic = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 + v[1] ** 4 / 4)
+    with pytest.raises(ValueError, match="singular value at the initial data"):
+        dx.simulate(dx.reduce(quartic, dx.LinearConnection([1])), DiscreteRouth(), q=[0.0, 0.0], v=[0.1, 0.0], step=0.1, steps=3)
+    patchy = DiscreteConnection(lambda q0, q1: q1[3:] - q0[3:] + jnp.log(q1[:1] / q0[:1]), fibre=[3])
+    with pytest.raises(ValueError, match="no discrete connection on all of Q: it is not finite at q0 ="):
+        run(PARTICLE, dx.reduce(PARTICLE.system, patchy), DiscreteRouth(), 3)
     broken = DiscreteConnection(lambda q0, q1: q1[3:] - q0[3:] + q0[:1], fibre=[3])
     with pytest.raises(ValueError, match=r"ω_d\(q, q\) = 0 fails by"):
         run(PARTICLE, dx.reduce(PARTICLE.system, broken), DiscreteRouth(), 3)

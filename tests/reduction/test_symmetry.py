@@ -74,6 +74,16 @@ def test_mistakes():
         check_invariance(CENTRAL, GroupAction(lambda g, q: q + jnp.sin(g[0]), 1), q=[1.0, 0.0], params=1.0)
     with pytest.raises(ValueError, match="does not fit a system of 2"):
         check_invariance(CENTRAL, Translations([2]), q=[1.0, 0.0], params=1.0)
+    with pytest.raises(TypeError, match=r"action must be one such as dx\.Translations"):
+        check_invariance(CENTRAL, [0], q=[1.0, 0.0], params=1.0)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"a Lagrangian L\(q, v\), such as a dx\.LagrangeDirac, but one of type DiracSystem was"):
+        cyclic_coordinates(dx.DiracSystem(dx.induced_dirac(None, 1), lambda x: x @ x), [1.0, 0.0])
+    with pytest.raises(TypeError, match="takes params, which were not given"):
+        check_invariance(CENTRAL, TURN, q=[1.0, 0.0])
+    with pytest.raises(ValueError, match=r"shape \(n,\), but their shapes are \(\) and \(\)"):
+        cyclic_coordinates(CENTRAL, 1.0, params=1.0)
+    with pytest.raises(ValueError, match="L is finite at none of the points"):
+        cyclic_coordinates(dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.log(q[0])), [-5.0, 0.0])
     with pytest.raises(ValueError, match="needs step="):
         check_invariance(CENTRAL, TURN, q=[1.0, 0.0], discrete_lagrangian=lambda a, b, h: jnp.sum(a))
 

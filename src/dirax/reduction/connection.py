@@ -201,6 +201,8 @@ class DiscreteConnection(AbstractConnection):
                      f"q0 = {q0}, q1 = {q1}"),
                 ):  # fmt: skip
                     defect = float(np.max(np.abs(np.asarray(found) - np.asarray(wanted))))
+                    if not np.isfinite(defect):
+                        raise ValueError(f"one_form is no discrete connection on all of Q: it is not finite at {where}.")
                     if not defect <= AXIOM_TOLERANCE * (1 + float(np.max(np.abs(np.asarray(wanted))))):
                         raise ValueError(f"one_form is no discrete connection: {axiom} fails by {defect:.3g} at {where}.")
 
@@ -230,9 +232,10 @@ def picked(a: Float[Array, " n"], indices: np.ndarray) -> Float[Array, " r"]:
 
 def fibre_indices(fibre: Any) -> tuple[int, ...]:
     """Indices of group coordinates; raises `ValueError` for repeated or negative ones."""
-    indices = tuple(int(i) for i in np.atleast_1d(np.asarray(fibre)))
+    given = np.atleast_1d(np.asarray(list(fibre) if isinstance(fibre, range | set) else fibre))
+    indices = tuple(int(i) for i in given) if np.issubdtype(given.dtype, np.integer) and given.ndim == 1 else ()
     if not indices or len(set(indices)) != len(indices) or min(indices) < 0:
-        raise ValueError(f"fibre must hold different non-negative indices of coordinates, but {fibre!r} was given.")
+        raise ValueError(f"fibre must hold different non-negative indices of coordinates, such as [0], but {fibre!r} was given.")
     return indices
 
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import evaluated, is_traced
+from dirax.functions import UserFunction, evaluated, is_traced
 from dirax.reduction.connection import AbstractConnection
-from dirax.reduction.symmetry import TOLERANCE, Translations, invariance, times
+from dirax.reduction.symmetry import TOLERANCE, Translations, discrete_invariance, invariance, times
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
@@ -82,6 +82,17 @@ class ReducedLagrangeDirac(AbstractSystem):
             return rows[:, fibre], jnp.max(jnp.abs(rows), axis=1)
 
         return jax.vmap(at)(t, q, v)
+
+    def refuse_asymmetric(self, functions: dict[str, UserFunction], data: dict[str, Array], h: float, params: Any) -> None:
+        """Raise `ValueError` where functions of ([t, ]q0, q1, h[, params]) are not invariant, at data that must be concrete."""
+        found = discrete_invariance(functions, Translations(self.connection.fibre), *sampled(data), h, params)
+        if not found.ok:
+            worst = self.connection.fibre[found.generator]
+            raise ValueError(
+                f"the {found.of} is not invariant under translation of q[{worst}]: its derivative along it is "
+                f"{found.defect:.3g} at q0 = {found.q}, q1 = {found.v}, at or near the initial data; let it depend on "
+                f"q1[{worst}] − q0[{worst}] alone, or take that coordinate out of fibre."
+            )
 
     def _refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]

@@ -162,8 +162,10 @@ def check_invariance(
     being connected, the derivative along its generators decides. Points where L is not finite are left out. Raises
     `ValueError` for an action that is none, or does not fit q.
     """
-    q = np.asarray(q, dtype=float)
-    v = np.ones_like(q) if v is None else np.asarray(v, dtype=float)
+    if not isinstance(action, AbstractAction):
+        raise TypeError(f"action must be one such as dx.Translations([0]) or dx.GroupAction(…), but {action!r} was given.")
+    own = None if discrete_lagrangian is not None else system
+    q, v = checked_state(own, q, np.ones_like if v is None else v, params)
     action.check(jnp.asarray(q))
     random = np.random.default_rng(0)
     near = lambda point: np.concatenate([point[None], point + radius * random.uniform(-1, 1, (samples, q.size))])
@@ -171,15 +173,42 @@ def check_invariance(
         return invariance(system, action, times(1 + samples), near(q), near(v), params)
     if step is None:
         raise ValueError("discrete_lagrangian needs step=, the h that it is called with.")
-    ld = UserFunction(discrete_lagrangian, "discrete_lagrangian", ("q0", "q1", "h"))
-    points = near(q)
-    moved = lambda g, t, q0, q1: ld(action(g, q0), action(g, q1), step, params)
-    return _worst({"discrete_lagrangian": moved}, action, times(1 + samples), points, points + step * near(v))
+    ld = UserFunction(discrete_lagrangian, "discrete_lagrangian", ("q0", "q1", "h"), timed=True)
+    return discrete_invariance({"discrete_lagrangian": ld}, action, times(1 + samples), near(q), near(v), step, params)
 
 
 def times(count: int) -> np.ndarray:
     """Times at which functions are looked at: 0, and random ones up to 1."""
     return np.random.default_rng(1).uniform(0, 1, count) * (np.arange(count) > 0)
+
+
+def checked_state(system: Any, q: Any, v: Any, params: Any) -> tuple[np.ndarray, np.ndarray]:
+    """q and v as arrays of one length, v also a function of q; raises `ValueError` for other shapes, and `TypeError` for a
+    `system`, if there is one, without a Lagrangian L(q, v) that takes them."""
+    q = np.asarray(q, dtype=float)
+    v = v(q) if callable(v) else np.asarray(v, dtype=float)
+    if q.ndim != 1 or not q.size or v.shape != q.shape:
+        raise ValueError(f"q and v must be one point and velocity of shape (n,), but their shapes are {q.shape} and {v.shape}.")
+    if system is not None:
+        lagrangian = getattr(as_lagrange_dirac(system), "lagrangian", None)
+        if not isinstance(lagrangian, UserFunction) or lagrangian.arguments[-2:] != ("q", "v"):
+            raise TypeError(
+                "system must be one with a Lagrangian L(q, v), such as a dx.LagrangeDirac, but one of type "
+                f"{type(system).__name__} was given."
+            )
+        lagrangian.shape(*lagrangian.given(jnp.zeros(()), jnp.asarray(q), jnp.asarray(v), params))
+    return q, v
+
+
+def discrete_invariance(
+    functions: dict[str, UserFunction], action: AbstractAction, t: Any, q: Any, v: Any, h: float, params: Any
+) -> Invariance:
+    """Whether functions of ([t, ]q0, q1, h[, params]) by name are invariant, at given t, q0 = q and q1 = q + hv (samples, …)."""
+
+    def moving(function):
+        return lambda g, t, q0, q1: function(*function.given(t, action(g, q0), action(g, q1), h, params))
+
+    return _worst({name: moving(function) for name, function in functions.items()}, action, t, q, q + h * v)
 
 
 def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, params: Any) -> Invariance:
@@ -259,8 +288,8 @@ def translation_symmetries(
 
     Found from ∂L/∂q at `samples` random points within `radius` of (q, v); `cyclic_coordinates` are those along the axes.
     """
-    system, q = as_lagrange_dirac(system), np.asarray(q, dtype=float)
-    v = np.zeros_like(q) if v is None else np.asarray(v, dtype=float)
+    system = as_lagrange_dirac(system)
+    q, v = checked_state(system, q, np.zeros_like if v is None else v, params)
     random = np.random.default_rng(0)
     points = [jnp.asarray(c + radius * random.uniform(-1, 1, (samples, q.size))) for c in (q, v)]
 
@@ -275,10 +304,11 @@ def translation_symmetries(
             along.append(lambda q: constraints.position_defect(t, q, params))
         if system.forces is not None:
             along.append(lambda q: system.forces(t, q, v, params))
-        return jnp.concatenate([jnp.reshape(jax.jacfwd(function)(q), (-1, q.size)) for function in along])
+        inside = jnp.full((1, q.size), along[0](q))  # not finite where L is not
+        return jnp.concatenate([*(jnp.reshape(jax.jacfwd(function)(q), (-1, q.size)) for function in along), inside])
 
     slopes = np.asarray(jax.jit(jax.vmap(at))(jnp.asarray(random.uniform(0, 1, samples)), *points))
-    slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))].reshape(-1, q.size)
+    slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))][:, :-1].reshape(-1, q.size)
     if not len(slopes):
         raise ValueError("L is finite at none of the points around q: choose q inside its domain, or a smaller radius.")
     _, values, directions = np.linalg.svd(slopes, full_matrices=True)

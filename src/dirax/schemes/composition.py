@@ -207,4 +207,5 @@ def adjoint_equation(inner: StepEquation) -> StepEquation:
         labels=tuple(f"adjoint: component {i} of the state" for i in range(s)) + inner.labels,
         needs_leaving_step=inner.needs_leaving_step,
         canonical=inner.canonical,
+        check=lambda data, h, params: inner.check(data, -h, params),
     )

@@ -115,7 +115,7 @@ def _on_q_or_quotient(system: Any, shape: Shape, rule, constraint, momentum: str
     if not isinstance(system, ReducedLagrangeDirac):
         return discrete_lagrange_dalembert(as_lagrange_dirac(system), shape, rule, constraint, momentum)
     unreduced = discrete_lagrange_dalembert(system.system, shape, rule, constraint, momentum)
-    return lagrange_poincare_dirac(system, shape, unreduced, sign)
+    return lagrange_poincare_dirac(system, shape, unreduced, rule, constraint, sign)
 
 
 def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, momentum: str) -> StepEquation:

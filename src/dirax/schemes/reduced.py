@@ -2,12 +2,15 @@
 
 import jax.numpy as jnp
 
+from dirax.functions import UserFunction
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.quotient import Quotient
 from dirax.schemes.step import Shape, StepEquation
 
 
-def lagrange_poincare_dirac(system: ReducedLagrangeDirac, shape: Shape, unreduced: StepEquation, sign: int = +1) -> StepEquation:
+def lagrange_poincare_dirac(
+    system: ReducedLagrangeDirac, shape: Shape, unreduced: StepEquation, rule, constraint, sign: int = +1
+) -> StepEquation:
     """The StepEquation on (Q × Q)/G of an equation on Q with state (q, p, …) and unknowns (v, …) that the symmetry leaves
     alone: [RL] (4.6) (sign +1) or (4.8) (sign −1) for the discrete Lagrange–Dirac equations.
 
@@ -15,6 +18,7 @@ def lagrange_poincare_dirac(system: ReducedLagrangeDirac, shape: Shape, unreduce
     coordinate 0, for (−), its covectors trivialized by λ̂_d: (r_x + A(x)ᵀ r_g, r_g). For linear h_d these are −∂l/∂x0 = w_k,
     ∂l/∂g1 = μ_k, ∂l/∂x1 = w_{k+1}, μ_{k+1} = μ_k, and g_{k+1} = g_k + hγ + A(x_{k+1} − x_k) reconstructs the group coordinate.
     Forces f and constraint forces Wᵀλ have the trivializations ((f_x + A(x)ᵀ f_g), f_g); their group part moves μ.
+    A discrete Lagrangian `rule` and a discrete `constraint` that are the user's functions are checked for invariance.
     """
     quotient, connection, n = Quotient(system.connection, shape.n), system.connection, shape.n
     k, s, free = quotient.k, quotient.s, system.conserves_momentum
@@ -60,6 +64,13 @@ def lagrange_poincare_dirac(system: ReducedLagrangeDirac, shape: Shape, unreduce
         rate, along = connection.split(u[:n])
         return lowered(state, g), jnp.concatenate([rate, quotient.vertical(x, rate, along, h), u[n:]])
 
+    own = {"discrete_lagrangian": rule, "constraint": constraint}
+    own = {name: function for name, function in own.items() if isinstance(function, UserFunction)}
+
+    def check(data, h, params):
+        if own:
+            system.refuse_asymmetric(own, data, h, params)
+
     other = {name: field for name, field in unreduced.fields.items() if name not in ("q", "p")}
     return StepEquation(
         start=start,
@@ -73,4 +84,5 @@ def lagrange_poincare_dirac(system: ReducedLagrangeDirac, shape: Shape, unreduce
         + tuple(f"vertical equation {a}" for a in range(k))
         + unreduced.labels[n:],
         needs_leaving_step=unreduced.needs_leaving_step,
+        check=check,
     )

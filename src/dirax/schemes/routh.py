@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
-from dirax.functions import UserFunction
+from dirax.functions import UserFunction, evaluated
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, discrete_lagrange_dalembert
@@ -14,6 +16,9 @@ from dirax.schemes.reduced import lagrange_poincare_dirac
 from dirax.schemes.reduced_lagrangian import ReducedDiscreteLagrangian
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.schemes.vertical import vertical_velocity
+
+SINGULAR = 1e-13
+"""A group inertia with singular values below this, relative to the largest or to 1, is singular."""
 
 
 class DiscreteRouth(AbstractScheme):
@@ -52,7 +57,8 @@ class DiscreteRouth(AbstractScheme):
                 "symmetry, dx.reduce(system, dx.LinearConnection(fibre=[…]))."
             )
         unreduced = discrete_lagrange_dalembert(system.system, shape, self.discrete_lagrangian, self.constraint, self.momentum)
-        return discrete_routh(system, shape, lagrange_poincare_dirac(system, shape, unreduced), self.discrete_lagrangian)
+        reduced = lagrange_poincare_dirac(system, shape, unreduced, self.discrete_lagrangian, self.constraint)
+        return discrete_routh(system, shape, reduced, self.discrete_lagrangian)
 
 
 def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, reduced: StepEquation, rule) -> StepEquation:
@@ -117,7 +123,24 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, reduced: StepEqua
             kept += [connection.split(u[k + head : k + head + n])[0], u[k + head + n :]]
         return jnp.concatenate([state, u[s:n]]), jnp.concatenate(kept)
 
-    def check(data, params):
+    def inertia(data, h, params):
+        """∂²l/∂γ² (k, k) at initial data, over h."""
+        q = data["q"] if "q" in data else data["q0"]
+        v = (data["q1"] - q) / h if "q1" in data else system.complete(data, params, False)["v"]
+        (x, _), (rate, along) = connection.split(q), connection.split(v)
+        gamma = quotient.vertical(x, rate, along, h)
+        return jax.jacfwd(lambda gamma: l.momentum(data.get("t", 0.0), x, rate, gamma, h, params))(gamma)
+
+    def check(data, h, params):
+        reduced.check(data, h, params)
+        matrix = np.asarray(evaluated(inertia, data, h, params))
+        rank = int(np.linalg.matrix_rank(matrix, tol=SINGULAR * max(1.0, np.max(np.abs(matrix))))) if k else 0
+        if np.all(np.isfinite(matrix)) and rank < k:
+            raise ValueError(
+                f"μ has a singular value at the initial data: the group inertia ∂²l_d/∂γ² = {matrix.tolist()} has rank {rank} of "
+                f"{k} there, so that ∂l_d/∂γ = μ does not determine γ. Start elsewhere, or use dx.LagrangeDAlembert, which "
+                "keeps γ among its unknowns."
+            )
         moved = system.moves_momentum(data, params)
         if moved:
             raise ValueError(

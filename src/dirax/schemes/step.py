@@ -38,8 +38,8 @@ class StepEquation(eqx.Module):
 
     An explicit method has `unknowns = 0`. `scale` (k,) is the unit of each unknown, for the stopping test of Newton's
     method only. `labels` names each row of the residual for messages. With `needs_leaving_step` the node fields depend on
-    `u`, and an engine solves one more step to fill the last row. `check(data, params)` raises `ValueError` for initial data,
-    concrete ones, at which a premise of the method does not hold.
+    `u`, and an engine solves one more step to fill the last row. `check(data, h, params)` raises `ValueError` for initial
+    data, concrete ones, at which a premise of the method does not hold.
     """
 
     start: Callable = eqx.field(static=True)
@@ -153,7 +153,7 @@ def previous_unknowns(state, previous, h, params):
     return previous
 
 
-def nothing_to_check(data, params) -> None:
+def nothing_to_check(data, h, params) -> None:
     """The default check of initial data."""
 
 
