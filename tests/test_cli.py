@@ -102,6 +102,14 @@ def test_compare_finds_the_schemes_that_suit_a_system():
     assert [entry["scheme"] for entry in json.loads(result.stdout)["schemes"]] == ["method1", "method2"]
 
 
+def test_compare_finds_every_lagrangian_scheme_for_nonholonomic_mechanics():
+    result = call("compare", "knife-edge", "--set", "steps=20", "--json")
+    assert result.exit_code == 0, result.output
+    orders = {entry["scheme"]: entry["order"] for entry in json.loads(result.stdout)["schemes"]}
+    expected = {"plus": 1, "minus": 1, "midpoint": 2, "trapezoidal": 2, "method1": 2, "method2": 2}
+    assert orders == pytest.approx(expected, abs=0.1)
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [

@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dirax as dx
+from dirax.diagnostics.bench.ode import explicit_ode
 
 METHOD_1, METHOD_2 = dx.DiscreteDirac(), dx.DiscreteDirac(constraints="resolve")
 
@@ -104,6 +105,13 @@ def test_method_1_is_that_of_the_lagrangian():
     np.testing.assert_allclose(one.x, np.concatenate([other.q, other.p], 1), atol=1e-13)
     np.testing.assert_allclose(one.multipliers, other.multipliers, atol=1e-12)
     assert one.ok and dx.verify(one).ok
+    report = dx.verify(dx.simulate(PENDULUM, METHOD_2, **run))
+    assert report.ok and report["constraint"].verdict == "ok", report
+
+
+def test_the_explicit_equations_of_the_benchmarks_are_those_of_the_constrained_system():
+    ode = explicit_ode(PENDULUM, {"x": jnp.asarray(START)}, None)
+    np.testing.assert_allclose(ode.derivative(0.0, jnp.asarray(START)), PENDULUM.constrained_field(START)[0], atol=1e-13)
 
 
 def test_constraints_and_momentum_over_many_steps():
@@ -186,6 +194,36 @@ def test_a_constrained_poisson_structure():
         dx.simulate(body, METHOD_1, x=[0.6, 0.0, 0.8], step=0.1, steps=2)
 
 
+def test_a_charge_on_a_sphere_in_kinetic_momenta():
+    """Λ = [[0, I], [−I, B]] for the force v × b: a bivector that is not constant in form, against ẍ = f + 2λx in scipy."""
+    field = np.array([0.3, -0.2, 0.8])
+    force = lambda v, xp: xp.cross(v, xp.asarray(field)) - xp.array([0.0, 0.0, 1.0])
+    turn = np.cross(np.eye(3), field).T  # turn @ v = v × b
+    bivector = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.eye(3), turn]])
+    system = dx.DiracSystem(
+        dx.DiracStructure.from_bivector(lambda x: jnp.asarray(bivector)),
+        lambda x: x[3:] @ x[3:] / 2 + x[2],
+        holonomic=lambda x: jnp.stack([x[:3] @ x[:3] - 1.0]),
+    )
+
+    def tension(x, v):
+        return -(np.sum(v * v, -1) + np.sum(x * force(v, np), -1)) / 2
+
+    def newton(t, y):
+        x, v = y[:3], y[3:]
+        return np.concatenate([v, force(v, np) + 2 * tension(x, v) * x])
+
+    start, errors = np.array([0.6, 0.0, -0.8, 0.4, 0.9, 0.3]), []
+    for steps in (50, 100, 200):
+        sol = dx.simulate(system, METHOD_2, x=start, step=2.0 / steps, steps=steps)
+        y = solve_ivp(newton, (0, 2), start, method="DOP853", rtol=1e-13, atol=1e-13, dense_output=True).sol
+        middle = y((sol.t[1:] + sol.t[:-1]) / 2).T
+        known = tension(middle[:, :3], middle[:, 3:])
+        errors.append([np.max(np.abs(sol.x - y(sol.t).T)), np.max(np.abs(sol.multipliers[:, 0] - known))])
+        assert np.max(np.abs(sol.constraint_residual())) < 5e-15
+    assert slopes(errors) == pytest.approx(2.0, abs=0.1)
+
+
 def test_initial_data_off_the_final_manifold_are_refused_or_projected():
     for x in FLAT_START + 0.1 * np.eye(4)[1:3]:
         with pytest.raises(ValueError, match="off the constraint"):
@@ -201,6 +239,8 @@ def test_what_method_2_refuses():
         dx.simulate(plane, METHOD_2, x=[0.5, 1.0, 0.25, 0.5], step=0.1, steps=1, check_initial=False)
     sol = dx.simulate(plane, METHOD_1, x=[0.5, 1.0, 0.25, 0.5], step=0.1, steps=20, check_initial=False)
     assert np.max(np.abs(sol.x[:, ::2] - 0.5 * sol.x[:, 1::2])) < 1e-14
+    with pytest.raises(ValueError, match="but CotangentLift was given"):
+        dx.simulate(FLAT, dx.DiscreteDirac(dx.cotangent_lift(dx.Theta(0.0)), "resolve"), x=FLAT_START, step=0.1, steps=1)
     edge = dx.DiracSystem(
         dx.induced_dirac(lambda q: jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0.0 * q[0]])[None], 3),
         lambda x: x[3:] @ x[3:] / 2,

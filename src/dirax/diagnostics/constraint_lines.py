@@ -94,7 +94,8 @@ def _constraint_scale(sol: Solution) -> Any:
     if sol.system is None:
         nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
         return float(max(1.0, *(np.nanmax(np.abs(a)) for a in nodes)))
-    terms = energy_terms if isinstance(sol.system, DiracSystem) else _constraint_terms
+    of_image = isinstance(sol.system, DiracSystem) and sol.system.holonomic is None
+    terms = energy_terms if of_image else _constraint_terms
     return float(np.nanmax(sampled_terms(sol, terms))) or 1.0
 
 

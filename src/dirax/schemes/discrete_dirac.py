@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from dirax.geometry.cotangent_lift import CotangentLift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
 from dirax.schemes.constraint_rows import independent_constraints
 from dirax.schemes.discretized import stepping
@@ -33,7 +34,8 @@ class DiscreteDirac(AbstractScheme):
     midpoint map and lets others drift; Method 2 keeps g and G q̇ + ∂g/∂t at the nodes. With either kind of constraint the
     multipliers of Method 1 alternate around those of the system by O(h), and means of neighbours are of the order of q.
     Method 2 of a DiracSystem with `holonomic` is stated here for graphs of two-forms and bivectors with {g_i, g_j} = 0, and
-    by its resolved chain for others.
+    by its resolved chain for others. Multipliers are forces at the base point, ṗ = … + Wᵀλ; those of `dx.LagrangeDAlembert`
+    are impulses of the opposite sign.
 
     Takes DiracSystem, PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian
     systems, and what `ConstraintChain.resolved` returns, on which it is Method 2 for any system; raises `TypeError` for
@@ -54,9 +56,9 @@ class DiscreteDirac(AbstractScheme):
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         resolve = self.constraints == "resolve"
         if isinstance(system, ResolvedSystem):
-            return projected_field(of_chain(system), shape.n, _theta_of(self.map))
+            return projected_field(of_chain(system), shape.n, _theta_of_points(self.map))
         if isinstance(system, DiracSystem) and system.is_graph and shape.c and resolve:
-            return projected_field(of_constrained_hamiltonian(system, shape), shape.n, _theta_of(self.map))
+            return projected_field(of_constrained_hamiltonian(system, shape), shape.n, _theta_of_points(self.map))
         if isinstance(system, DiracSystem | PortHamiltonian | ImplicitSystem) and shape.m + shape.c and resolve:
             raise ValueError(
                 f"Method 2 of this {type(system).__name__} with multipliers needs its final manifold: simulate "
@@ -173,3 +175,16 @@ def _theta_of(map: AbstractDiscretizationMap) -> float:
             "the system on its manifold as a dx.DiracSystem on T*Q, with dx.cotangent_lift(map)."
         )
     return base.theta
+
+
+def _theta_of_points(map: AbstractDiscretizationMap) -> float:
+    """θ of a θ map of all coordinates x alike; the lift of the midpoint map is one."""
+    theta = map.theta if isinstance(map, Theta) else None
+    if isinstance(map, CotangentLift) and isinstance(map.map, Theta) and map.map.theta == 0.5:
+        theta = 0.5
+    if theta is None:
+        raise ValueError(
+            "Method 2 on a final manifold in coordinates x takes dx.Theta maps and dx.Midpoint(), which treat all coordinates "
+            f"alike, but {type(map).__name__} was given."
+        )
+    return theta

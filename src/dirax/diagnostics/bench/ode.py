@@ -49,6 +49,8 @@ def explicit_ode(system: AbstractSystem, data: Mapping[str, Array], params: Any)
             return _solved(_newton_equations(system, len(complete["q"]), params), start, len(complete["q"]))
         case PhaseSpaceLagrangian():
             return _solved(_hamilton_equations(system, params), data["q"], len(data["q"]))
+        case DiracSystem() if system.holonomic is not None and not system.is_graph:
+            raise Skipped("its constraints make it a differential-algebraic equation")
         case DiracSystem():
             x = system.complete(dict(data), params, False)["x"]
             return _solved(_dirac_equations(system, params), x, len(x))
@@ -88,8 +90,13 @@ def _hamilton_equations(system: PhaseSpaceLagrangian, params: Any) -> LinearEqua
 
 def _dirac_equations(system: DiracSystem, params: Any) -> LinearEquations:
     def equations(t, x):
-        F, E = system.structure.kernel(x, params)
-        return F, -E @ system.differential(x, params), lambda z: z
+        matrix, right = system.equations(x, params)
+        if system.holonomic is None:
+            return matrix, right, lambda z: z
+        slope = jax.jacfwd(lambda x: system.hidden_defect(x, params))(x)  # of {g, H}, which stays zero
+        c, n = slope.shape
+        matrix = jnp.concatenate([matrix, jnp.concatenate([slope, jnp.zeros((c, c))], axis=1)])
+        return matrix, jnp.concatenate([right, jnp.zeros(c)]), lambda z: z[:n]
 
     return equations
 
