@@ -26,9 +26,11 @@ NODE_LIMIT = 60_000
 
 @dataclass(frozen=True)
 class Parameters:
-    """How a params pytree becomes scalar inputs: floating leaves in order; other leaves are part of the program."""
+    """How a params pytree becomes scalar inputs: floating leaves in order; other leaves are part of the program, or, where
+    they have a batch axis, inputs too, of their own dtype to the user's functions."""
 
     shapes: tuple[tuple[int, ...], ...]
+    dtypes: tuple[np.dtype, ...]
     fixed: tuple[Any, ...]
     treedef: Any
     dynamic: tuple[bool, ...]
@@ -41,10 +43,12 @@ class Parameters:
     def key(self) -> tuple:
         """Equal for parameters that give the same program; other leaves than arrays count by identity."""
         fixed = ((a.dtype.str, a.shape, a.tobytes()) if isinstance(a, np.ndarray) else id(a) for a in self.fixed)
-        return self.treedef, self.shapes, tuple(fixed)
+        return self.treedef, self.shapes, self.dtypes, tuple(fixed)
 
     def rebuild(self, leaves) -> Any:
-        leaves, fixed = iter(leaves), iter(self.fixed)
+        """The pytree of its float64 inputs."""
+        own = lambda x, dtype: x if np.issubdtype(dtype, np.floating) else jnp.asarray(x).astype(dtype)
+        leaves, fixed = iter([own(*given) for given in zip(leaves, self.dtypes, strict=True)]), iter(self.fixed)
         return jax.tree.unflatten(self.treedef, [next(leaves) if d else next(fixed) for d in self.dynamic])
 
     def flatten(self, params: Any, batch: int | None) -> np.ndarray:
@@ -58,7 +62,7 @@ class Parameters:
 def parameters(params: Any, batched: bool) -> Parameters:
     """Which leaves of `params` are inputs of the kernel."""
     leaves, treedef = jax.tree.flatten(params)
-    dynamic, shapes, fixed = [], [], []
+    dynamic, shapes, dtypes, fixed = [], [], [], []
     for leaf in leaves:
         number = isinstance(leaf, int | float | np.ndarray | np.generic | jax.Array) and not isinstance(leaf, bool)
         dtype = leaf.dtype if isinstance(leaf, Tracer) else np.asarray(leaf).dtype
@@ -66,11 +70,12 @@ def parameters(params: Any, batched: bool) -> Parameters:
         dynamic.append(bool(moves))
         if moves:
             shapes.append(np.shape(leaf)[1:] if batched else np.shape(leaf))
+            dtypes.append(np.dtype(dtype))
         else:
             if isinstance(leaf, Tracer):
                 raise UnsupportedPrimitive("params", f"has a leaf of dtype {dtype} that JAX traces", "see docs/native-engine.md")
             fixed.append(np.asarray(leaf) if number else leaf)
-    return Parameters(tuple(shapes), tuple(fixed), treedef, tuple(dynamic))
+    return Parameters(tuple(shapes), tuple(dtypes), tuple(fixed), treedef, tuple(dynamic))
 
 
 @dataclass

@@ -1,0 +1,62 @@
+"""Whole numbers and truth values among the parameters of a batch: the dtype that the user's functions see, on every engine."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+
+MIDPOINT = dx.LagrangeDAlembert()
+TABLE = np.array([1.0, 2.0, 5.0])
+RUN = {"step": 0.1, "steps": 30, "batch_params": True}
+
+
+def oscillator(stiffness):
+    """L = v²/2 − k q²/2 with k = stiffness(params)."""
+    return dx.LagrangeDirac(lambda q, v, params: (v @ v - stiffness(params) * q @ q) / 2)
+
+
+def cayley(k, h, steps):
+    """q of the midpoint rule from q = 1 at rest: it turns (√k q, p) by 2 arctan(h√k/2) a step."""
+    return np.cos(steps * 2 * np.arctan(h * np.sqrt(k) / 2))
+
+
+@pytest.mark.parametrize("engine", ["xla", "auto", "native"])
+def test_indices_and_truth_values(engine):
+    chosen = oscillator(lambda p: jnp.asarray(TABLE)[p["k"]] * jnp.where(p["stiff"], p["factor"], 1.0))
+    k, stiff = np.array([2, 0, 1, 2]), np.array([True, False, True, False])
+    params = {"k": k, "stiff": stiff, "factor": np.full(4, 3.0)}
+    sol = dx.simulate(chosen, MIDPOINT, q=np.ones((4, 1)), v=np.zeros((4, 1)), params=params, engine=engine, **RUN)
+    assert sol.ok.all() and sol.stats["engine"] == ("native" if engine == "auto" else engine)
+    exact = cayley(TABLE[k] * np.where(stiff, 3.0, 1.0), 0.1, 30)
+    np.testing.assert_allclose(sol.q[:, -1, 0], exact, atol=1e-12)
+
+
+@pytest.mark.parametrize("engine", ["xla", "auto"])
+def test_derivatives_beside_an_index(engine):
+    """By the floating parameter, of which the index chooses the entry: by central differences of the closed form."""
+    chosen = oscillator(lambda p: p["table"][p["k"]])
+    k, table = np.array([2, 0]), np.stack([TABLE, 2 * TABLE])
+
+    def end(table):
+        params = {"k": k, "table": table}
+        return (
+            dx.simulate(chosen, MIDPOINT, q=jnp.ones((2, 1)), v=jnp.zeros((2, 1)), params=params, engine=engine, **RUN)
+            .q[:, -1]
+            .sum()
+        )
+
+    slopes = np.zeros((2, 3))
+    for lane, i in enumerate(k):
+        at = table[lane, i]
+        slopes[lane, i] = (cayley(at + 1e-6, 0.1, 30) - cayley(at - 1e-6, 0.1, 30)) / 2e-6
+    np.testing.assert_allclose(jax.grad(end)(jnp.asarray(table)), slopes, atol=1e-8)
+
+
+def test_what_only_whole_numbers_can_do_falls_back_and_says_so():
+    shifted = oscillator(lambda p: (1 << p["k"]).astype(float))
+    k = np.array([0, 1, 3])
+    sol = dx.simulate(shifted, MIDPOINT, q=np.ones((3, 1)), v=np.zeros((3, 1)), params={"k": k}, **RUN)
+    assert sol.stats["engine"] == "xla" and "shift_left" in sol.stats["not_native"]
+    np.testing.assert_allclose(sol.q[:, -1, 0], cayley(2.0**k, 0.1, 30), atol=1e-12)
