@@ -1,7 +1,14 @@
-"""What the first run of an equation costs: tracing and compiling, in processor seconds, and the second run in a new place."""
+"""What the first run of an equation costs: tracing and compiling, and the second run in a new place.
+
+`python -m benchmarks.first_call` compares the engines on three systems; with `--gallery` it measures the first call of every
+system of the gallery in new processes, with no kernel on the disk and with one.
+"""
 
 import json
+import os
+import statistics
 import sys
+import tempfile
 import time
 
 import jax
@@ -51,6 +58,46 @@ def measure(name: str, engine: str) -> dict:
     return found
 
 
+def first_call(name: str) -> dict:
+    """Seconds of the first call of a system of the gallery in this process, after the imports."""
+    import dirax.engines.native  # noqa: F401  (it is imported when it is used; so that the call is measured alone)
+    from dirax import gallery
+
+    jax.config.update("jax_enable_compilation_cache", False)
+    example = gallery.get(name)
+    wall, processor = time.perf_counter(), time.process_time()
+    stats = example.simulate(steps=10, save_every=10).stats
+    wall, processor = time.perf_counter() - wall, time.process_time() - processor
+    return {"wall": wall, "processor": processor, "engine": stats["engine"], "cached": stats.get("kernel_cached", False)}
+
+
+def over_gallery(repeats: int = 5) -> None:
+    """The table of first calls, each the median of `repeats` pairs of new processes: nothing on the disk, then the kernel."""
+    from dirax import gallery
+
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # Python's byte code is in place, as it is on a user's machine
+    results: dict = {}
+    for repeat in range(repeats + 1):
+        for name in gallery.names():
+            with tempfile.TemporaryDirectory() as folder:
+                os.environ["DIRAX_CACHE"] = folder
+                pair = [in_new_process("benchmarks.first_call", {"gallery": name}) for _ in range(2)]
+            if repeat:  # the first round writes the byte code
+                results.setdefault(name, []).append(pair)
+    middle = lambda name, k, clock: statistics.median(pair[k][clock] for pair in results[name])
+    columns = [(0, "wall"), (1, "wall"), (0, "processor"), (1, "processor")]
+    found = {name: {f"{('first', 'from the disk')[k]}, {c}": middle(name, k, c) for k, c in columns} for name in results}
+    names = sorted(found, key=lambda name: middle(name, 0, "wall"))
+    rows = [(name, *(f"{value:.3f}" for value in found[name].values()), results[name][0][0]["engine"]) for name in names]
+    header = ("system", "first call", "from the disk", "first, processor", "disk, processor", "engine")
+    print(table(header, rows, f"seconds of the first call in a new process, after the imports; medians of {repeats}"))
+    for k, label in ((0, "first call"), (1, "from the disk")):
+        times = [middle(name, k, "wall") for name in names]
+        within = ", ".join(f"{sum(t <= limit for t in times)} within {limit:g} s" for limit in (0.1, 0.2, 0.5, 1.0))
+        print(f"{label}: median {statistics.median(times):.3f} s, largest {max(times):.3f} s; of {len(times)}, {within}")
+    store("first_call_gallery", found)
+
+
 def main(short: bool = False) -> None:
     results, rows = {}, []
     for name in list(RUNS)[: 2 if short else None]:
@@ -66,6 +113,9 @@ def main(short: bool = False) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) > 1 and sys.argv[1].startswith("{"):
-        print(json.dumps(measure(**json.loads(sys.argv[1]))))
+        given = json.loads(sys.argv[1])
+        print(json.dumps(first_call(given["gallery"]) if "gallery" in given else measure(**given)))
+    elif "--gallery" in sys.argv:
+        over_gallery(1 if "--short" in sys.argv else 5)
     else:
         main("--short" in sys.argv)

@@ -1,5 +1,7 @@
 """The rule of a derivative that tracing left to the graph."""
 
+import math
+from collections import OrderedDict
 from typing import Any
 
 import jax
@@ -10,34 +12,32 @@ from dirax.engines.native.graph import Graph
 from dirax.engines.native.interpret import Interpreter, Nodes, Unavailable, Unsupported, elementwise, rule
 from dirax.engines.native.operations import partials
 
+KEPT = 256
+"""Derivatives kept in memory."""
+
 
 @rule("dirax_derivative")
 def derivative(interpreter: Interpreter, equation: Any, *operands: Nodes):
-    """Derived on a graph of its own, whose inputs are the operands, so that nothing is simplified across them."""
-    g, p, own = interpreter.graph, equation.params, Derived(interpreter.graph.limit)
-    outside: dict[int, int] = {}
+    """Derived on a graph of its own, whose inputs stand for the operands, so that nothing is simplified across them."""
+    own = derived(equation.params["jaxpr"], equation.params["wanted"], interpreter.graph.limit)
+    nodes = [node for operand in operands for node in operand.ravel().tolist()]
+    outputs = [node for result in own.results for node in result.ravel().tolist()]
+    made = own.made_in(interpreter.graph, outputs, dict(zip(own.inputs, nodes, strict=True)))
+    parts = np.split(np.array(made, np.int64), np.cumsum([result.size for result in own.results])[:-1])
+    return [part.reshape(result.shape) for part, result in zip(parts, own.results, strict=True)]
 
-    def inside(node: int, wanted: bool) -> int:
-        if g.is_constant(node) and not wanted:
-            return own.graph.constant(g.value[node])
-        made = own.graph.input(f"x{len(outside)}")
-        outside[made] = node
-        return made
 
-    inputs = [
-        np.array([inside(node, k in p["wanted"]) for node in nodes.ravel().tolist()], np.int64).reshape(nodes.shape)
-        for k, nodes in enumerate(operands)
-    ]
-    (value,) = own.interpreter.run(p["jaxpr"], *inputs)
-    if isinstance(value, Unavailable):
-        raise Unsupported(f"of a function with {value.error}")
-    columns = np.concatenate([inputs[k].ravel() for k in p["wanted"]]).tolist()
-    outputs = value.ravel().tolist()
-    rows = own.rows(outputs, columns)
-    moved = own.made_in(g, [node for row in rows for node in row], outside)
-    table = np.array(moved, np.int64).reshape(value.size, len(columns))
-    parts = np.split(table, np.cumsum([inputs[k].size for k in p["wanted"]])[:-1], axis=1)
-    return [part.reshape((*value.shape, *inputs[k].shape)) for part, k in zip(parts, p["wanted"], strict=True)]
+_derived: OrderedDict[tuple, tuple[Any, "Derived"]] = OrderedDict()
+
+
+def derived(jaxpr: Any, wanted: tuple[int, ...], limit: int) -> "Derived":
+    """The derivatives of a jaxpr on a graph of their own, the same object for the same jaxpr. Raises `Unsupported`."""
+    key = id(jaxpr), wanted
+    if key not in _derived:
+        _derived[key] = jaxpr, Derived(jaxpr, wanted, limit)  # the jaxpr is kept alive, so that its id stays its own
+        if len(_derived) > KEPT:
+            _derived.popitem(last=False)
+    return _derived[key][1]
 
 
 class Derived:
@@ -46,12 +46,25 @@ class Derived:
     `slopes[node]` are the derivatives of such a function's value by its operands, `written[node]` is the value in other nodes.
     """
 
-    def __init__(self, limit: int):
+    def __init__(self, jaxpr: Any, wanted: tuple[int, ...], limit: int):
         self.graph = Graph(limit)
         self.slopes: dict[int, dict[int, int]] = {}
         self.written: dict[int, int] = {}
         rules = {"integer_pow": _power, "pow": _power, "custom_jvp_call": self._custom}
-        self.interpreter = Interpreter(self.graph, rules)
+        inputs = [self._fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
+        self.inputs = [node for nodes in inputs for node in nodes.ravel().tolist()]
+        (value,) = Interpreter(self.graph, rules).run(jaxpr, *inputs)
+        if isinstance(value, Unavailable):
+            raise Unsupported(f"of a function with {value.error}")
+        columns = [node for k in wanted for node in inputs[k].ravel().tolist()]
+        table = np.array(self._rows(value.ravel().tolist(), columns), np.int64).reshape(value.size, len(columns))
+        parts = np.split(table, np.cumsum([inputs[k].size for k in wanted])[:-1], axis=1)
+        shapes = [(*value.shape, *inputs[k].shape) for k in wanted]
+        self.results: list[Nodes] = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+    def _fresh(self, shape: tuple[int, ...]) -> Nodes:
+        first, count = len(self.graph), math.prod(shape)
+        return np.array([self.graph.input(f"x{first + i}") for i in range(count)], np.int64).reshape(shape)
 
     def _custom(self, interpreter: Interpreter, equation: Any, *operands: Nodes):
         """A function of numbers with a rule for its derivative, which is interpreted along each operand."""
@@ -77,13 +90,11 @@ class Derived:
             known[operand.item()] = g.add(known.get(operand.item(), g.zero), slope.item())
         return [np.array(node, np.int64)]
 
-    def rows(self, outputs: list[int], inputs: list[int]) -> list[list[int]]:
-        """The derivatives of each output by each input, the way that has less to do."""
-        if len(inputs) < len(outputs):
-            return self.forward(outputs, inputs)
-        return [self.gradient(output, inputs) for output in outputs]
+    def _rows(self, outputs: list[int], inputs: list[int]) -> list[list[int]]:
+        """The derivatives of each output by each input: backward from a single number, else forward."""
+        return [self._gradient(outputs[0], inputs)] if len(outputs) == 1 else self._forward(outputs, inputs)
 
-    def gradient(self, output: int, inputs: list[int]) -> list[int]:
+    def _gradient(self, output: int, inputs: list[int]) -> list[int]:
         """The derivatives of a node, backward over the graph."""
         g, flow = self.graph, {output: self.graph.one}
         for node in reversed(self._needed([output])):
@@ -94,7 +105,7 @@ class Derived:
                     flow[a] = g.add(flow[a], term) if a in flow else term
         return [flow.get(node, g.zero) for node in inputs]
 
-    def forward(self, outputs: list[int], inputs: list[int]) -> list[list[int]]:
+    def _forward(self, outputs: list[int], inputs: list[int]) -> list[list[int]]:
         """The derivatives of nodes, forward over the graph."""
         g, zero = self.graph, self.graph.zero
         rows = {node: {j: g.one} for j, node in enumerate(inputs)}

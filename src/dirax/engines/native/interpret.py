@@ -62,7 +62,8 @@ class Interpreter:
 
     def __init__(self, graph: Graph, rules: Mapping[str, Rule] | None = None):
         self.graph, self.rules = graph, {**RULES, **(rules or {})}
-        self._lines: list[str] = []
+        self._equations: list[Any] = []
+        self.called: dict[tuple, tuple[Any, list[Any]]] = {}
 
     def run(self, closed: ClosedJaxpr, *operands: Any) -> list[Any]:
         """The results of a closed jaxpr; each a Nodes array or Unavailable."""
@@ -96,18 +97,19 @@ class Interpreter:
         lost = next((o for o in operands if isinstance(o, Unavailable)), None)
         if lost is not None and name not in LAZY:
             return [lost] * len(equation.outvars)
-        # equations inside a library's jitted functions have no line of the user's: the calling equation has it
-        self._lines.append(source_line(equation) or (self._lines[-1] if self._lines else "unknown line"))
+        self._equations.append(equation)
         try:
             if name not in self.rules:
                 raise Unsupported("is not supported")
             check_dtypes(equation)
             return self.rules[name](self, equation, *operands)
         except Unsupported as error:
-            failure = UnsupportedPrimitive(name, str(error), self._lines[-1])
+            # equations inside a library's jitted functions have no line of the user's: the calling equation has it
+            line = next(filter(None, map(source_line, reversed(self._equations))), "unknown line")
+            failure = UnsupportedPrimitive(name, str(error), line)
             return [Unavailable(failure)] * len(equation.outvars)
         finally:
-            self._lines.pop()
+            self._equations.pop()
 
 
 def check_dtypes(equation: Any) -> None:
