@@ -347,6 +347,17 @@ def test_newton_that_does_not_converge():
     assert "condition number 1" in sol.message and "smaller step may help" in sol.message
 
 
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.PlusLagrangeDirac(), dx.DiscreteDirac(constraints="resolve")])
+def test_a_step_that_is_too_small_for_double_precision(scheme):
+    """g(q)/h carries ε/h ≈ 2·10⁻⁸ of noise: more of it in a smaller step, which is not what is advised."""
+    pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.81 * q[1], holonomic=lambda q: jnp.stack([q @ q - 1.0]))
+    run = {"q": [0.6, -0.8], "v": [0.8, 0.6], "steps": 20}
+    sol = dx.simulate(pendulum, scheme, step=1e-8, **run)
+    assert not sol.ok and "too small for double precision" in sol.message and "take a larger step" in sol.message
+    assert "smaller step may help" not in sol.message
+    assert dx.simulate(pendulum, scheme, step=1e-5, **run).ok
+
+
 def test_a_step_that_becomes_singular():
     """The mass 1 − q1 of q0 is zero when q1 = k/8 arrives at 1."""
     fading = dx.LagrangeDirac(lambda q, v: (1 - q[1]) * v[0] ** 2 / 2 + v[1] ** 2 / 2)
