@@ -7,18 +7,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.dataset import with_code
 from dirax.functions import is_traced
 from dirax.geometry.group_retractions import coadjoint
 from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduced import ReducedLagrangeDirac
+from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import Field
 from dirax.solution import Solution
 
 
 def reconstruct(solution: Solution, g0: Any = None) -> Solution:
-    """The motion (q, p) on T*Q over a reduced solution, as a Solution.
+    """The motion (q, p) on T*Q over a reduced solution, as a Solution of the system that was reduced by the scheme whose
+    equations on Q × Q it satisfies (of Routh's, `dx.LagrangeDAlembert`).
 
     Of a system made by `dx.reduce`: q = (x, g) with g_{k+1} = g_k + ω_d + A(x_{k+1} − x_k), p = (w − h*_{d,Σ}(μ), μ)
     ([RL] §4), multipliers those of the one-forms at q, work as it was. Of a `dx.EulerPoincare` or `dx.LiePoisson` system: q
@@ -45,7 +49,11 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
         lifted["multipliers"] = _multipliers_at(solution, lifted["q"])
     n = lifted["q"].shape[-1]
     info = {"q": Field((n,)), "p": Field((n,))}
-    return _lifted(solution, system.system, lifted, {name: info.get(name) or solution.field_info[name] for name in lifted})
+    about = {name: info.get(name) or solution.field_info[name] for name in lifted}
+    whole = _lifted(solution, system.system, lifted, about)
+    if isinstance(scheme := solution.scheme, DiscreteRouth):
+        whole.scheme = LagrangeDAlembert(scheme.discrete_lagrangian, scheme.constraint, scheme.momentum)
+    return whole if is_traced(lifted) or solution.equation is None else with_code(whole, whole.system, whole.scheme)
 
 
 def _multipliers_at(solution: Solution, q: Any) -> Any:
@@ -93,7 +101,8 @@ def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> S
         "p": Field((group.ambient_dimension,), dims=("group",), description="covector at q, as a tangent vector"),
         "spatial_momentum": Field((d,), dims=("algebra",), description="Ad*_{g⁻¹} μ"),
     }
-    return _lifted(solution, solution.system, lifted | kept, about | {name: solution.field_info[name] for name in kept})
+    about |= {name: solution.field_info[name] for name in kept}
+    return _lifted(solution, solution.system, lifted | kept, about, solution.equation)
 
 
 def _element(group: AbstractLieGroup, g0: Any, batch: int | None) -> jax.Array:
@@ -127,7 +136,7 @@ def _plain(fields: dict[str, Any]) -> dict[str, Any]:
     return {name: np.asarray(a) if not is_traced(a) else a for name, a in fields.items()}
 
 
-def _lifted(solution: Solution, system: Any, fields: dict[str, Any], info: dict[str, Field]) -> Solution:
+def _lifted(solution: Solution, system: Any, fields: dict[str, Any], info: dict[str, Field], equation: Any = None) -> Solution:
     return Solution(
         t=solution.t,
         fields=fields,
@@ -139,6 +148,7 @@ def _lifted(solution: Solution, system: Any, fields: dict[str, Any], info: dict[
         message=solution.message,
         system=system,
         scheme=solution.scheme,
+        equation=equation,
         params=solution.params,
         batch_params=solution.batch_params,
         initial=solution.initial,

@@ -11,6 +11,7 @@ import numpy as np
 from dirax.diagnostics.judging import judged, of_lane, roundoff_limit, steps_of
 from dirax.diagnostics.one_step import over_rows
 from dirax.diagnostics.report import NOT_CHECKED, Line
+from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.solution import Solution
 
 Symmetries = Mapping[str, Callable] | Sequence[int] | None
@@ -71,6 +72,28 @@ def momentum(sol: Solution, name: str, generator: Callable, tolerance: float | N
     lane = int(np.argmax(relative))
     text = f"⟨p, ξ⟩ = {values[lane, 0, 0]:.6g} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
     return judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)
+
+
+def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
+    """μ of a run on the quotient by an abelian symmetry, relative to its largest value."""
+    if not isinstance(sol.system, ReducedLagrangeDirac):
+        return []
+    title, mu = "momentum map μ", np.asarray(sol.fields["mu"]).reshape(-1, *np.shape(sol.fields["mu"])[-2:])
+    change = np.nanmax(np.abs(mu - mu[:, :1]), axis=(1, 2))
+    scale = np.nanmax(np.abs(mu), axis=(1, 2))
+    lane = int(np.argmax(change))
+    text = f"{np.array2string(mu[lane, 0], precision=6)} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
+    if _moved(sol):
+        return [Line(title, float(change[lane]), None, NOT_CHECKED, f"forces with a part along the group move it; {text}")]
+    relative = np.divide(change, scale, out=np.zeros_like(change), where=scale > 0)
+    return [judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)]
+
+
+def _moved(sol: Solution) -> bool:
+    """Whether something of the system has a part along the group."""
+    one = {name: jnp.asarray(a)[0] if np.ndim(a) == 2 else jnp.asarray(a) for name, a in sol.initial.items()}
+    params = jax.tree.map(lambda leaf: leaf[0], sol.params) if sol.batch_params else sol.params
+    return bool(sol.system.moves_momentum(one, params))
 
 
 def _momentum_terms(generator: Callable, q, p, params: Any):

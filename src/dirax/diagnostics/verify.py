@@ -6,9 +6,11 @@ from dirax.diagnostics.casimir_lines import casimir_lines
 from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
 from dirax.diagnostics.judging import steps_of
-from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum
+from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.report import OK, VIOLATED, Line, Report
 from dirax.diagnostics.structure_lines import membership, symplecticity
+from dirax.reconstruction import reconstruct
+from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.solution import Solution
 
 
@@ -34,6 +36,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     - energy: "bounded" or "drifts", told apart by windowed means (`dirax.diagnostics.drift`); a drift below
       32 ε · steps · (|E| + |∂E| |row|) is roundoff. The tolerance shown is the drift that could have been told.
 
+    A run on the quotient by an abelian symmetry has the structure of the motion that `dx.reconstruct` gives, and μ besides.
     A batch is judged by its worst trajectory, a failed run by the part that was computed, and what cannot be checked says
     so, and why: membership needs every step saved, a loaded solution its system (`dx.load(path, system=…)`).
 
@@ -45,16 +48,18 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     if not isinstance(sol, Solution):
         raise TypeError(f"sol must be a dirax Solution (from dx.simulate or dx.load), but a {type(sol).__name__} was given.")
     generators = generators_of(sol, symmetries)
+    whole = reconstruct(sol) if isinstance(sol.system, ReducedLagrangeDirac) else sol
     lines = [
         _completion(sol),
-        *membership(sol, tolerance),
-        constraint(sol, tolerance),
-        hidden_constraint(sol, tolerance),
+        *membership(whole, tolerance),
+        constraint(whole, tolerance),
+        hidden_constraint(whole, tolerance),
         energy_line(sol),
         *port_lines(sol, tolerance),
         *(momentum(sol, name, generator, tolerance) for name, generator in generators.items()),
+        *quotient_momentum(sol, tolerance),
         *casimir_lines(sol, tolerance),
-        symplecticity(sol, tolerance),
+        symplecticity(whole, tolerance),
     ]
     return Report(_title(sol), tuple(line for line in lines if line is not None))
 
