@@ -137,13 +137,18 @@ FLAT = dx.DiracSystem(
 FLAT_START = np.array([1.0, 0.0, 0.0, 0.7])
 
 
-def test_engines_batches_and_a_gradient():
+def test_engines_and_batches_agree():
     run = {"step": 0.1, "steps": 10}
     batch = np.stack([FLAT_START, FLAT_START * np.array([1.0, 1.0, 1.0, -0.5])])
     native, xla = (dx.simulate(FLAT, METHOD_2, x=batch, engine=e, **run) for e in ("native", "xla"))
     np.testing.assert_allclose(native.x, xla.x, atol=1e-13)
     np.testing.assert_allclose(native.multipliers, xla.multipliers, atol=1e-12)
     np.testing.assert_array_equal(dx.simulate(FLAT, METHOD_2, x=FLAT_START, **run).x, native.x[0])
+
+
+@pytest.mark.soak
+def test_a_gradient_against_finite_differences():
+    run = {"step": 0.1, "steps": 10}
     end = lambda speed: dx.simulate(FLAT, METHOD_2, x=jnp.array([1.0, 0.0, 0.0, 1.0]) * jnp.stack([1, 0, 0, speed]), **run).x[
         -1, 1
     ]
@@ -236,9 +241,14 @@ def test_what_method_2_refuses():
     """A plane in phase space is symplectic, {q_0, p_0} = 1: the constraint algorithm stops at level 0 there."""
     plane = dx.DiracSystem(dx.induced_dirac(None, 2), lambda x: x @ x / 2, holonomic=lambda x: x[::2] - 0.5 * x[1::2])
     with pytest.raises(ValueError, match=r"brackets .* are up to 1\.25 here: simulate dx\.constraint_algorithm"):
-        dx.simulate(plane, METHOD_2, x=[0.5, 1.0, 0.25, 0.5], step=0.1, steps=1, check_initial=False)
-    sol = dx.simulate(plane, METHOD_1, x=[0.5, 1.0, 0.25, 0.5], step=0.1, steps=20, check_initial=False)
+        dx.simulate(plane, METHOD_2, x=[0.5, 1.0, 0.25, 0.5], step=0.1, steps=1)
+    sol = dx.simulate(plane, METHOD_1, x=[0.5, 1.0, 0.25, 0.5], step=0.1, steps=20)
     assert np.max(np.abs(sol.x[:, ::2] - 0.5 * sol.x[:, 1::2])) < 1e-14
+    chain = dx.constraint_algorithm(plane, near=[0.5, 1.0, 0.25, 0.5])
+    np.testing.assert_allclose(
+        chain.multipliers(jnp.asarray(chain.point)), sol.multipliers[0], atol=0.1
+    )  # at the middle of the step
+    assert [level.dimension for level in chain.levels] == [2, 2]
     with pytest.raises(ValueError, match="but CotangentLift was given"):
         dx.simulate(FLAT, dx.DiscreteDirac(dx.cotangent_lift(dx.Theta(0.0)), "resolve"), x=FLAT_START, step=0.1, steps=1)
     edge = dx.DiracSystem(

@@ -11,10 +11,7 @@ from dirax.functions import evaluated
 from dirax.schemes.constraint_rows import independent_constraints
 from dirax.schemes.step import Field, Shape, StepEquation
 from dirax.systems.constraint_chain import ResolvedSystem
-from dirax.systems.dirac_system import DiracSystem
-
-COMMUTE = 1e-10
-"""Largest bracket of two constraints, relative to the square of their derivatives, that counts as zero."""
+from dirax.systems.dirac_system import TINY_BRACKET, DiracSystem
 
 
 class FinalManifold(NamedTuple):
@@ -50,7 +47,7 @@ def of_constrained_hamiltonian(system: DiracSystem, shape: Shape) -> FinalManifo
     def check(data, h, params):
         x = jnp.asarray(data["x"] if "x" in data else jnp.concatenate([data["q"], data["p"]]))
         brackets, rows = (np.asarray(evaluated(f, x, params)) for f in (system.brackets, system.holonomic_matrix))
-        if np.max(np.abs(brackets)) > COMMUTE * np.max(np.abs(rows)) ** 2:
+        if np.max(np.abs(brackets)) > TINY_BRACKET * np.sum(rows**2):
             raise ValueError(
                 f"Method 2 takes holonomic constraints whose brackets {{g_i, g_j}} vanish, as those of functions of q on T*Q do, "
                 f"but they are up to {np.max(np.abs(brackets)):.3g} here: simulate dx.constraint_algorithm(system, near=x)"

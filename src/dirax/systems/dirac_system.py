@@ -17,6 +17,9 @@ from dirax.tracing import gradient
 RANK_TOLERANCE = 1e-10
 """Singular values of the kernel matrix F below this, relative to the largest, count as zero in the initial check."""
 
+TINY_BRACKET = 1e-8
+"""Largest bracket of two constraints, relative to the size of their derivatives, that counts as zero."""
+
 
 class DiracSystem(AbstractSystem):
     """The Dirac system (D, H): ẋ ⊕ dH(x) ∈ D_x ([BLM] §3), with D = {F(x) ẋ + E(x) dH(x) = 0} in kernel form.
@@ -112,14 +115,24 @@ class DiracSystem(AbstractSystem):
 
     def brackets(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "c c"]:
         """{g_i, g_j}: zero for functions of q on T*Q, and wherever N is coisotropic."""
+        return self.holonomic_matrix(x, params) @ self.forces(x, params)
+
+    def forces(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N c"]:
+        """The velocities of the rows of G, by columns: λ changes ẋ by −forces λ."""
         rows = self.holonomic_matrix(x, params)
-        return jax.vmap(lambda row: self.hamiltonian_vector(x, row, params))(rows) @ rows.T
+        return jax.vmap(lambda row: self.hamiltonian_vector(x, row, params))(rows).T
+
+    def tangency_defect(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " c"]:
+        """The part of {g, H} that no λ takes away by its brackets {g_i, g_j} λ: all of it where they vanish."""
+        hidden, brackets = self.hidden_defect(x, params), self.brackets(x, params)
+        size = jnp.sum(self.holonomic_matrix(x, params) ** 2)
+        normal = brackets.T @ brackets + (TINY_BRACKET * size) ** 2 * jnp.eye(hidden.shape[0])
+        return hidden - brackets @ jnp.linalg.solve(normal, brackets.T @ hidden)
 
     def constrained_field(self, x: Float[Array, " N"], params: Any = None) -> tuple[Float[Array, " N"], Float[Array, " c"]]:
         """(ẋ, λ) at a point of M_f = {g = 0, {g, H} = 0}, where the brackets {g_i, g_j} are zero: λ keeps {g, H} = 0."""
         free = self.hamiltonian_vector(x, self.differential(x, params), params)
-        rows = self.holonomic_matrix(x, params)
-        forces = jnp.stack([self.hamiltonian_vector(x, row, params) for row in rows], axis=1)
+        forces = self.forces(x, params)
         slope = jax.jacfwd(lambda x: self.hidden_defect(x, params))(x)
         multipliers = jnp.linalg.solve(slope @ forces, slope @ free)
         return free - forces @ multipliers, multipliers
@@ -155,11 +168,11 @@ class DiracSystem(AbstractSystem):
         return {"x": x, "velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
 
     def project(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
-        """A point of M_f = {g = 0, {g, H} = 0} near x: g = 0 nearest in x, then moved along the vectors of G."""
+        """A point of M_f near x, for a graph D: g = 0 nearest in x, then {g, H} = 0 along the forces if the brackets vanish."""
         x = self.project_position(x, x, params)
-        forces = lambda x: jax.vmap(lambda row: self.hamiltonian_vector(x, row, params))(self.holonomic_matrix(x, params)).T
-        along = forces(x)
-        return x + along @ nearest_root(lambda s: self.hidden_defect(x + along @ s, params), jnp.zeros(along.shape[1]))
+        along, rows = self.forces(x, params), self.holonomic_matrix(x, params)
+        end = x + along @ nearest_root(lambda s: self.hidden_defect(x + along @ s, params), jnp.zeros(along.shape[1]))
+        return jnp.where(jnp.max(jnp.abs(rows @ along)) <= TINY_BRACKET * jnp.sum(rows**2), end, x)
 
     def project_position(self, x: Float[Array, " N"], v: Any, params: Any = None, t: Any = 0.0) -> Float[Array, " N"]:
         """A point with g = 0 near x, moved along Gᵀ."""
@@ -172,13 +185,13 @@ class DiracSystem(AbstractSystem):
         return self.constraints.nearest_velocity(t, x, v, self.holonomic_matrix(x, params).T, params)
 
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " k"]:
-        """The part of F ẋ + E dH that no velocity makes zero: x is on M_0 where it vanishes. With holonomic constraints
-        (g, {g, H}) where D is a graph, and g with what no (ẋ, λ) makes zero elsewhere."""
+        """The part of F ẋ + E dH that no velocity makes zero: x is on M_0 where it vanishes. With holonomic constraints g and
+        what no (ẋ, λ) makes zero of (F ẋ + E (dH − Gᵀλ), G ẋ): the tangency defect where D is a graph."""
         x = data["x"]
         if self.holonomic is None:
             return self.relation(x, data["velocity"], jnp.zeros(0), 0.0, params)
         if self.is_graph:
-            return jnp.concatenate([self.holonomic(x, params), self.hidden_defect(x, params)])
+            return jnp.concatenate([self.holonomic(x, params), self.tangency_defect(x, params)])
         return jnp.concatenate([self.holonomic(x, params), self.relation(x, data["velocity"], data["multipliers"], 0.0, params)])
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
