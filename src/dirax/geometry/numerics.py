@@ -6,13 +6,15 @@ own derivative, so that derivatives of any order are accurate and finite, and co
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
+
+from dirax.tracing import call
 
 Scalar: TypeAlias = Float[Array, ""]
 
@@ -22,12 +24,22 @@ RADIAL_SERIES_BELOW = 4.0  # 13 terms of the series reach 1e-19 here
 ARC_SERIES_BELOW = 0.05  # 18 terms of the series reach 1e-20 here, those of its third derivative 1e-16
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def radial(order: int, s: Scalar) -> Scalar:
     """The functions f_0(s) = cos √s, f_1(s) = sin √s/√s, f_{n+1} = −2 f_n', of a squared angle s ≥ 0 in radians².
 
     f_n(x²) = j_{n−1}(x)/x^{n−1} with the spherical Bessel functions j, so f_{n+1} = ((2n − 1) f_n − f_{n−1})/s.
     """
+    return call(_of_order(_radial, order), s)
+
+
+@lru_cache
+def _of_order(function: Callable, order: int) -> Callable:
+    """The same object for the same order, so that the function of an order is traced once."""
+    return partial(function, order)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _radial(order: int, s: Scalar) -> Scalar:
     if order <= 1:
         # finite also for a derivative that is taken through the root, as that of a scalar graph is
         none = s < NO_ANGLE
@@ -47,18 +59,22 @@ def radial(order: int, s: Scalar) -> Scalar:
     return _piecewise(s, RADIAL_SERIES_BELOW, coefficients, by_recurrence)
 
 
-@radial.defjvp
+@_radial.defjvp
 def _radial_jvp(order, primals, tangents):
     return radial(order, *primals), -0.5 * radial(order + 1, *primals) * tangents[0]
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
 def arc_over_sine(order: int, near: Scalar, far: Scalar) -> Scalar:
     """F = φ/sin φ for an arc 0 ≤ φ < π, as a function of near = sin²(φ/2) (its derivative F^(order)); far = cos²(φ/2).
 
     For points of a unit sphere near and far are |y − x|²/4 and |y + x|²/4, each accurate at its own end of the arc.
     F is the hypergeometric function F(1, 1; 3/2; near). Right up to φ = π − 10⁻¹⁵, and some finite number beyond.
     """
+    return call(_of_order(_arc_over_sine, order), near, far)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _arc_over_sine(order: int, near: Scalar, far: Scalar) -> Scalar:
     far = jnp.where(far < TINY, 1.0, far)
 
     def by_recurrence(near):
@@ -77,7 +93,7 @@ def arc_over_sine(order: int, near: Scalar, far: Scalar) -> Scalar:
     return _piecewise(near, ARC_SERIES_BELOW, coefficients, by_recurrence)
 
 
-@arc_over_sine.defjvp
+@_arc_over_sine.defjvp
 def _arc_over_sine_jvp(order, primals, tangents):
     # near + far = 1, so F is a function of near alone.
     return arc_over_sine(order, *primals), arc_over_sine(order + 1, *primals) * tangents[0]

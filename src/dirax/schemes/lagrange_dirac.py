@@ -23,6 +23,7 @@ from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.schemes.work import WorkBook, work_field
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import as_lagrange_dirac
+from dirax.tracing import call
 
 MOMENTA = ("incoming", "mean", "outgoing")
 
@@ -140,6 +141,9 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
     share = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}[momentum] if m else 0.0
 
     def slots(t, q, v, h, params):
+        return call(both_slots, t, q, v, h, params)
+
+    def both_slots(t, q, v, h, params):
         """(D1 L_d + f_d^−, D2 L_d + f_d^+): a step leaves its first point with minus the one, and arrives with the other."""
         d1, d2 = slot_derivatives(ld, t, q, v, h, params)
         if impulses is None:

@@ -9,7 +9,7 @@ from dirax.schemes.step import Field, Shape, StepEquation
 from dirax.schemes.work import WorkBook, work_field
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import NonholonomicMechanics
-from dirax.tracing import along, gradient, jacobian
+from dirax.tracing import along, call, gradient, jacobian
 
 
 def _rates(system: LagrangeDirac, t, q, v, params):
@@ -88,6 +88,9 @@ def resolved_nonholonomic(system: NonholonomicMechanics, shape: Shape, theta: fl
     one_forms = lambda q, params: system.constraints.one_forms_at(0.0, q, params)
 
     def base(u, state, h, params):
+        return call(at_base, u, state, h, params)
+
+    def at_base(u, state, h, params):
         """(q, p, ṗ, λ) at the base point. With v at hand the metric is inverted once, and its inverse never differentiated."""
         q, v = state[:n] + theta * h * u[:n], u[:n]
         metric, forms = system.metric.at(0.0, q, params), one_forms(q, params)
@@ -136,6 +139,9 @@ def resolved_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) -> St
         return jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(v)
 
     def flow(t, q, v, params):
+        return call(at_point, t, q, v, params)
+
+    def at_point(t, q, v, params):
         """(p, ṗ, λ) at a point of M_f."""
         rate, p = _rates(system, t, q, v, params)
         w = rows.matrix(t, q, params)

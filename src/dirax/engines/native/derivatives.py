@@ -40,6 +40,24 @@ def derived(jaxpr: Any, wanted: tuple[int, ...], limit: int) -> "Derived":
     return _derived[key][1]
 
 
+_pushed: OrderedDict[tuple, tuple[Any, ClosedJaxpr]] = OrderedDict()
+
+
+def pushed_forward(equation: Any, k: int) -> ClosedJaxpr:
+    """The derivative of a function with a rule of its own by its operand number k, the same for the same jaxpr."""
+    inner = equation.params["call_jaxpr"].jaxpr
+    key = id(inner), k
+    if key not in _pushed:
+        alone = equation.replace(invars=inner.invars)
+        whole = ClosedJaxpr(inner.replace(constvars=(), outvars=equation.outvars, eqns=[alone]), ())
+        along = tuple(float(i == k) for i in range(len(inner.invars)))
+        tangent = lambda *x: jax.jvp(lambda *x: jaxpr_as_fun(whole)(*x)[0], x, along)[1]
+        _pushed[key] = inner, jax.make_jaxpr(tangent)(*[jax.ShapeDtypeStruct((), np.float64)] * len(along))
+        if len(_pushed) > KEPT:
+            _pushed.popitem(last=False)
+    return _pushed[key][1]
+
+
 class Derived:
     """A graph in which powers and functions with rules of their own are single nodes, as long as it is differentiated.
 
@@ -72,18 +90,12 @@ class Derived:
         (written,) = interpreter.run(p["call_jaxpr"], *operands)
         if isinstance(written, Unavailable) or g.is_constant(written.item()):
             return [written]
-        inner = p["call_jaxpr"].jaxpr
-        alone = equation.replace(invars=inner.invars)
-        whole = ClosedJaxpr(inner.replace(constvars=(), outvars=equation.outvars, eqns=[alone]), ())
         node = g.input(f"value{len(self.slopes)}")
         self.written[node], self.slopes[node] = written.item(), {}
-        scalar = jax.ShapeDtypeStruct((), np.float64)
         for k, operand in enumerate(operands):
             if g.is_constant(operand.item()):
                 continue
-            along = tuple(float(i == k) for i in range(len(operands)))
-            pushed = lambda *x, along=along: jax.jvp(lambda *x: jaxpr_as_fun(whole)(*x)[0], x, along)[1]
-            (slope,) = Interpreter(g).run(jax.make_jaxpr(pushed)(*[scalar] * len(operands)), *operands)
+            (slope,) = Interpreter(g).run(pushed_forward(equation, k), *operands)
             if isinstance(slope, Unavailable):
                 return [slope]
             known = self.slopes[node]

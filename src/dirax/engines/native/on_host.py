@@ -5,6 +5,7 @@ NumPy between two parts of the graph.
 """
 
 import functools
+import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,6 +23,9 @@ from dirax.tracing import in_scalars
 
 KEPT = 128
 """Functions kept in memory."""
+
+LARGE_PRODUCT = 256
+"""Multiplications of a product of arrays from which on it is no graph of them."""
 
 LANES = 1024
 """Entries of a batch that are computed at a time, which bounds the memory that the nodes' values take."""
@@ -99,12 +103,36 @@ def interpreted(jaxpr: Any) -> HostFunction:
     """A closed jaxpr as a HostFunction. Raises `UnsupportedPrimitive` and `GraphTooLarge`."""
     made = HostFunction([])
     made.inputs = [made.fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
-    rules = {name: functools.partial(rule, made) for name, rule in (("svd", _svd), ("eigh", _eigh), ("while", _while))}
+    own = (("svd", _svd), ("eigh", _eigh), ("while", _while), ("dot_general", _dot_general))
+    rules = {name: functools.partial(rule, made) for name, rule in own}
     made.results = Interpreter(made.graph, rules).run(jaxpr, *made.inputs)
     for result in made.results:
         if isinstance(result, Unavailable):
             raise result.error
     return made
+
+
+def _dot_general(made: HostFunction, interpreter: Interpreter, equation: Any, a: Nodes, b: Nodes) -> list[Nodes]:
+    """Large products stay products of arrays; summed in one order, so that an entry's bits do not depend on the others."""
+    (ac, bc), (ab, bb) = equation.params["dimension_numbers"]
+    shape, length = equation.outvars[0].aval.shape, math.prod(a.shape[axis] for axis in ac)
+    if math.prod(shape) * length < LARGE_PRODUCT or equation.outvars[0].aval.dtype != np.float64:
+        return list(RULES["dot_general"](interpreter, equation, a, b))
+    free_a = [axis for axis in range(a.ndim) if axis not in (*ac, *ab)]
+    free_b = [axis for axis in range(b.ndim) if axis not in (*bc, *bb)]
+    batch, rows = math.prod(a.shape[axis] for axis in ab), math.prod(a.shape[axis] for axis in free_a)
+    left = np.transpose(a, (*ac, *ab, *free_a)).reshape(length, batch, rows, 1)
+    right = np.transpose(b, (*bc, *bb, *free_b)).reshape(length, batch, 1, -1)
+
+    def product(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        x, y = arrays
+        with np.errstate(all="ignore"):
+            total = x[:, 0] * y[:, 0]
+            for k in range(1, length):
+                total = total + x[:, k] * y[:, k]
+        return [total.reshape(len(x), *shape)]
+
+    return made.between([left, right], [shape], product)
 
 
 def _svd(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
