@@ -164,9 +164,10 @@ def check_invariance(
     """
     if not isinstance(action, AbstractAction):
         raise TypeError(f"action must be one such as dx.Translations([0]) or dx.GroupAction(…), but {action!r} was given.")
-    own = None if discrete_lagrangian is not None else system
-    q, v = checked_state(own, q, np.ones_like if v is None else v, params)
+    q, v = checked_state(q, np.ones_like if v is None else v)
     action.check(jnp.asarray(q))
+    if discrete_lagrangian is None:
+        check_lagrangian(system, q, v, params)
     random = np.random.default_rng(0)
     near = lambda point: np.concatenate([point[None], point + radius * random.uniform(-1, 1, (samples, q.size))])
     if discrete_lagrangian is None:
@@ -182,22 +183,24 @@ def times(count: int) -> np.ndarray:
     return np.random.default_rng(1).uniform(0, 1, count) * (np.arange(count) > 0)
 
 
-def checked_state(system: Any, q: Any, v: Any, params: Any) -> tuple[np.ndarray, np.ndarray]:
-    """q and v as arrays of one length, v also a function of q; raises `ValueError` for other shapes, and `TypeError` for a
-    `system`, if there is one, without a Lagrangian L(q, v) that takes them."""
+def checked_state(q: Any, v: Any) -> tuple[np.ndarray, np.ndarray]:
+    """q and v as arrays of one length, v also a function of q; raises `ValueError` for other shapes."""
     q = np.asarray(q, dtype=float)
     v = v(q) if callable(v) else np.asarray(v, dtype=float)
     if q.ndim != 1 or not q.size or v.shape != q.shape:
         raise ValueError(f"q and v must be one point and velocity of shape (n,), but their shapes are {q.shape} and {v.shape}.")
-    if system is not None:
-        lagrangian = getattr(as_lagrange_dirac(system), "lagrangian", None)
-        if not isinstance(lagrangian, UserFunction) or lagrangian.arguments[-2:] != ("q", "v"):
-            raise TypeError(
-                "system must be one with a Lagrangian L(q, v), such as a dx.LagrangeDirac, but one of type "
-                f"{type(system).__name__} was given."
-            )
-        lagrangian.shape(*lagrangian.given(jnp.zeros(()), jnp.asarray(q), jnp.asarray(v), params))
     return q, v
+
+
+def check_lagrangian(system: Any, q: np.ndarray, v: np.ndarray, params: Any) -> None:
+    """Raise `TypeError` for a system without a Lagrangian L(q, v) that takes such q and v."""
+    lagrangian = getattr(as_lagrange_dirac(system), "lagrangian", None)
+    if not isinstance(lagrangian, UserFunction) or lagrangian.arguments[-2:] != ("q", "v"):
+        raise TypeError(
+            "system must be one with a Lagrangian L(q, v), such as a dx.LagrangeDirac, but one of type "
+            f"{type(system).__name__} was given."
+        )
+    lagrangian.shape(*lagrangian.given(jnp.zeros(()), jnp.asarray(q), jnp.asarray(v), params))
 
 
 def discrete_invariance(
@@ -289,7 +292,8 @@ def translation_symmetries(
     Found from ∂L/∂q at `samples` random points within `radius` of (q, v); `cyclic_coordinates` are those along the axes.
     """
     system = as_lagrange_dirac(system)
-    q, v = checked_state(system, q, np.zeros_like if v is None else v, params)
+    q, v = checked_state(q, np.zeros_like if v is None else v)
+    check_lagrangian(system, q, v, params)
     random = np.random.default_rng(0)
     points = [jnp.asarray(c + radius * random.uniform(-1, 1, (samples, q.size))) for c in (q, v)]
 
