@@ -92,6 +92,7 @@ WITHOUT = {
     "heavy-top": "a Dirac system on the quotient already: heavy-top-so3 is the one with its group",
     "kirchhoff": "a Dirac system on the quotient already: underwater-vehicle is the one with its group",
     "spherical-pendulums": "in charts of S² × S², which are not those of the quotient: double-spherical-pendulum has its angles",
+    "magnetic-spherical-pendulum": "a Dirac system in kinetic momenta, with a constraint",
     "lc-ladder": "a circuit, not a Lagrangian system on Q",
     "dc-motor": "ports, not a Lagrangian system on Q",
     "mass-spring-damper": "ports, not a Lagrangian system on Q",

@@ -26,6 +26,7 @@ _MODULES = {
     "kirchhoff": "kirchhoff",
     "spherical-pendulums": "spherical_pendulums",
     "charged-particle": "charged_particle",
+    "magnetic-spherical-pendulum": "magnetic_spherical_pendulum",
     "double-spherical-pendulum": "double_spherical_pendulum",
     "planar-n-body": "planar_n_body",
     "vortices": "vortices",
