@@ -14,9 +14,9 @@ import dirax as dx
 from dirax import gallery
 from dirax.cli import app
 from dirax.cli.bench import subject
-from dirax.diagnostics.bench import casadi_c, ode_solvers
+from dirax.diagnostics.bench import casadi_c, measure, ode_solvers
 from dirax.diagnostics.bench.engines import plain_run
-from dirax.diagnostics.bench.measure import PROGRAMS, Bench, Row, bench
+from dirax.diagnostics.bench.measure import PROGRAMS, SAME_STEPS, Bench, Row, bench
 from dirax.diagnostics.bench.ode import eliminate, explicit_ode, pivot_order
 from dirax.diagnostics.bench.subject import Skipped, Subject
 from dirax.diagnostics.bench.timing import compiler, interleaved
@@ -182,19 +182,32 @@ def test_missing_libraries_and_compositions_are_left_out(monkeypatch):
     assert first.skipped == {
         "CasADi C": "casadi is not installed", **dict.fromkeys(("heyoka", "DOP853", "diffrax"), "scipy is not installed")
     }  # fmt: skip
-    assert set(first.seconds) == {"native", "native batch", "xla", "xla batch", "plain JAX"}
+    assert set(first.seconds) == {"native", "native batch", "xla", "xla batch", "plain JAX", "plain JAX batch"}
     assert not second.seconds and set(second.skipped.values()) == {"the scheme is a composition"}
+
+
+def test_a_program_that_ends_in_an_error_is_left_out(monkeypatch):
+    def broken(problem):
+        raise RuntimeError("no such thing\nand more")
+
+    monkeypatch.setitem(SAME_STEPS, "xla", broken)
+    monkeypatch.setattr(measure, "explicit_ode", lambda *_: 1 / 0)
+    (row,) = bench([short("kepler", 20)], 1).rows
+    assert row.skipped["xla"] == "it ended in RuntimeError: no such thing"
+    assert row.skipped["DOP853"] == "it ended in ZeroDivisionError: division by zero"
+    assert {"native", "native batch", "xla batch", "plain JAX"} <= set(row.seconds) and "xla" not in row.seconds
 
 
 def test_the_command_measures_and_stores(tmp_path):
     table, picture = tmp_path / "bench.json", tmp_path / "bench.png"
-    result = call("bench", "kepler", "--quick", "--repeats", 1, "--json", table, "--plot", picture)
+    result = call("bench", "kepler", "--steps", 60, "--repeats", 1, "--json", table, "--plot", picture)
     assert result.exit_code == 0, result.output
     assert "kepler" in result.stdout and "DOP853" in result.stdout
     stored = json.loads(table.read_text("utf-8"))
     assert stored["repeats"] == 1 and stored["machine"]["cores"] >= 1 and stored["machine"]["jax"] == jax.__version__
     (row,) = stored["rows"]
     programs = row["programs"]
+    assert row["steps"] == 60
     assert programs["native"]["ratio"] == 1.0 and programs["DOP853"]["end_error"] <= programs["native"]["end_error"]
     assert set(programs) | set(row["left_out"]) == set(PROGRAMS)
     assert all(entry["median"] > 0 for entry in programs.values())

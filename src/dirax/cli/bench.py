@@ -12,7 +12,7 @@ from dirax.gallery.example import Example
 from dirax.plotting import save_figure
 
 LONGEST = 2000
-"""Most steps of a timed trajectory."""
+"""Most steps of a timed trajectory, unless others are asked for."""
 
 QUICK, QUICK_STEPS, QUICK_REPEATS = ("kepler", "rolling-disk", "vortices"), 100, 2
 """What `--quick` times where nothing else is asked for."""
@@ -21,14 +21,18 @@ PICTURES = (".png", ".svg", ".pdf")
 
 
 def run_bench(
-    names: Sequence[str], repeats: int | None, quick: bool, tell: Callable[[float | None, str], None] | None = None
+    names: Sequence[str],
+    repeats: int | None,
+    quick: bool,
+    tell: Callable[[float | None, str], None] | None = None,
+    steps: int | None = None,
 ) -> Bench:
-    """`bench` of the systems of the gallery of these names, of all of them without names.
+    """`bench` of the systems of the gallery of these names, of all of them without names; their runs are cut after `steps`.
 
     Raises `ValueError` for an unknown name, and for fewer than one repeat.
     """
     chosen = [gallery.get(name) for name in (names or (QUICK if quick else gallery.names()))]
-    longest = QUICK_STEPS if quick else LONGEST
+    longest = steps or (QUICK_STEPS if quick else LONGEST)
     return bench([subject(e, longest) for e in chosen], repeats or (QUICK_REPEATS if quick else 7), tell)
 
 

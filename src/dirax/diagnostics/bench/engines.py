@@ -52,9 +52,7 @@ def _one(subject: Subject, engine: Callable) -> Program:
 
 
 def _batch(subject: Subject, engine: Callable) -> Program:
-    rows = native.run(Problem(**{**vars(subject.one), "save_every": max(1, subject.steps // BATCH)}))
-    problem = subject.batch(rows, BATCH, BATCH_STEPS)
-    share = subject.steps / (BATCH * BATCH_STEPS)
+    problem, share = _many(subject)
 
     def run() -> float:
         outcome = engine(problem)
@@ -63,6 +61,12 @@ def _batch(subject: Subject, engine: Callable) -> Program:
 
     run_once(run)
     return Program(run, lambda: None, {"trajectories": BATCH, "steps": BATCH_STEPS})
+
+
+def _many(subject: Subject) -> tuple[Problem, float]:
+    """A batch from points along the trajectory, and the share of its time that is that of one run of the subject."""
+    rows = native.run(Problem(**{**vars(subject.one), "save_every": max(1, subject.steps // BATCH)}))
+    return subject.batch(rows, BATCH, BATCH_STEPS), subject.steps / (BATCH * BATCH_STEPS)
 
 
 def run_once(run: Callable[[], float]) -> None:
@@ -89,6 +93,20 @@ def plain_jax(subject: Subject) -> Program:
 
     timed()
     return Program(timed, lambda: subject.position(*last["end"]), {"stops at": TOLERANCE})
+
+
+def plain_jax_batch(subject: Subject) -> Program:
+    """The same under `vmap`."""
+    problem, share = _many(subject)
+    run = plain_run(problem)
+
+    def timed() -> float:
+        tick = time.perf_counter()
+        run()
+        return (time.perf_counter() - tick) * share
+
+    timed()
+    return Program(timed, lambda: None, {"stops at": TOLERANCE, "trajectories": BATCH, "steps": BATCH_STEPS})
 
 
 def plain_run(p: Problem, save: bool = False) -> Callable[[], Any]:

@@ -1,7 +1,8 @@
 """Every program on every subject, by turns, and the table of their times as ratios to one lane of the native engine."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,6 +23,7 @@ SAME_STEPS: dict[str, Callable[[Subject], Program]] = {
     "xla": engines.xla_one,
     "xla batch": engines.xla_batch,
     "plain JAX": engines.plain_jax,
+    "plain JAX batch": engines.plain_jax_batch,
     "CasADi C": casadi_c,
 }
 """Programs that take the steps of the scheme."""
@@ -34,8 +36,11 @@ SAME_ERROR: dict[str, Callable[[ExplicitODE, float, np.ndarray, float], Program]
 """Programs that take steps of their own, at the end error of the scheme."""
 
 PROGRAMS = (*SAME_STEPS, *SAME_ERROR)
-LONGEST_RUN = 3.0
+LONGEST_RUN = 0.5
 """Seconds of a run from which on it is timed once and not repeated."""
+
+LONGEST_REASON = 160
+"""Letters of the reason why a program was left out."""
 
 ROUNDOFF = 1e-13
 """End errors below this are not asked of the other programs."""
@@ -141,7 +146,7 @@ class Bench:
     def plot(self) -> Any:
         """A dot for every program and system on a logarithmic axis; returns the matplotlib figure."""
         figure, ax = new_figure(size=(9, 1.8 + 0.34 * len(self.rows)))
-        markers = dict(zip(PROGRAMS, ("|", "s", "o", "D", "^", "P", "X", "v", "*"), strict=True))
+        markers = dict(zip(PROGRAMS, ("|", "s", "o", "D", "^", "<", "P", "X", "v", "*"), strict=True))
         for program in PROGRAMS:
             points = [(r, i) for i, row in enumerate(self.rows) if (r := row.ratio(program)) is not None]
             if points and program != NATIVE:
@@ -174,6 +179,18 @@ def bench(subjects: Iterable[Subject], repeats: int = 7, tell: Callable[[float |
     return Bench(rows, machine(), repeats)
 
 
+@contextmanager
+def leaving_out(row: Row, *names: str) -> Iterator[None]:
+    """Programs that cannot run, or end in an error, are left out of the row with the reason; the others are still timed."""
+    try:
+        yield
+    except Skipped as reason:
+        row.skipped |= dict.fromkeys(names, str(reason))
+    except Exception as error:
+        first = next(iter(str(error).splitlines()), "")
+        row.skipped |= dict.fromkeys(names, f"it ended in {type(error).__name__}: {first}"[:LONGEST_REASON])
+
+
 def measure(subject: Subject, repeats: int, say: Callable[[str], Any]) -> Row:
     """One row of the table."""
     row = Row(subject.name, repr(subject.scheme), subject.step, subject.steps)
@@ -182,21 +199,20 @@ def measure(subject: Subject, repeats: int, say: Callable[[str], Any]) -> Row:
 
     def add(name: str, make: Callable[[], Program]) -> None:
         say(name)
-        try:
-            programs[name] = made = make()
+        with leaving_out(row, name):
+            made = make()
             tick = time.perf_counter()
             seconds = made.run()
+            programs[name] = made
             if time.perf_counter() - tick > LONGEST_RUN:
                 once[name] = [seconds]
-        except Skipped as reason:
-            row.skipped[name] = str(reason)
 
     for name, make in SAME_STEPS.items():
         add(name, lambda make=make: make(subject))
     if NATIVE not in programs:
         return Row(row.name, row.scheme, row.step, row.steps, skipped=row.skipped)
     reference = None
-    try:
+    with leaving_out(row, *SAME_ERROR):
         ode = explicit_ode(subject.system, subject.arrays, subject.leaves)
         reference = ode_solvers.reference_end(ode, subject.span)
         end = programs[NATIVE].end()
@@ -204,8 +220,6 @@ def measure(subject: Subject, repeats: int, say: Callable[[str], Any]) -> Row:
         wanted = max(ROUNDOFF, ode_solvers.end_error(end, reference))
         for name, make in SAME_ERROR.items():
             add(name, lambda make=make: make(ode, subject.span, reference, wanted))
-    except Skipped as reason:
-        row.skipped |= {name: str(reason) for name in SAME_ERROR}
     say("timing")
     repeated = {name: program.run for name, program in programs.items() if name not in once or name == NATIVE}
     found = interleaved(repeated, repeats) | {name: seconds for name, seconds in once.items() if name != NATIVE}
