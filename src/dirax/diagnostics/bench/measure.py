@@ -42,6 +42,9 @@ LONGEST_RUN = 0.5
 LONGEST_REASON = 160
 """Letters of the reason why a program was left out."""
 
+LONGEST_LIST = 12
+"""Systems that a note names; more are counted."""
+
 ROUNDOFF = 1e-13
 """End errors below this are not asked of the other programs."""
 
@@ -100,18 +103,23 @@ class Bench:
         ]
 
     def notes(self) -> list[str]:
-        """Why programs were left out, those left out for one reason together."""
-        reasons: dict[tuple[str, str], list[str]] = {}
+        """Why programs were left out or timed once, those of one reason together."""
+        found: dict[tuple[str, str, str], list[str]] = {}
         for row in self.rows:
             for program, reason in row.skipped.items():
-                reasons.setdefault((program, reason), []).append(row.name)
-        for row in self.rows:
+                found.setdefault((program, "left out", reason), []).append(row.name)
             for program, seconds in row.seconds.items():
                 if len(seconds) < self.repeats:
-                    reasons.setdefault((program, "a run is long"), []).append(row.name)
-        everywhere = lambda names: "everywhere" if len(names) == len(self.rows) > 1 else ", ".join(names)
-        verb = lambda reason: "timed once" if reason == "a run is long" else "left out"
-        return [f"{program} {verb(reason)} ({everywhere(names)}): {reason}" for (program, reason), names in reasons.items()]
+                    found.setdefault((program, "timed once", "a run is long"), []).append(row.name)
+        together: dict[tuple[str, str, str], list[str]] = {}
+        for (program, what, reason), names in found.items():
+            together.setdefault((what, self._where(names), reason), []).append(program)
+        return [f"{', '.join(programs)} {what} ({where}): {reason}" for (what, where, reason), programs in together.items()]
+
+    def _where(self, names: list[str]) -> str:
+        if len(names) == len(self.rows) > 1:
+            return "everywhere"
+        return ", ".join(names) if len(names) <= LONGEST_LIST else f"{len(names)} systems"
 
     def __str__(self) -> str:
         return "\n".join([text_table(self.header, self.cells(), self.title), *([""] if self.notes() else []), *self.notes()])

@@ -58,7 +58,7 @@ def explicit_ode(system: AbstractSystem, data: Mapping[str, Array], params: Any)
             return ExplicitODE(_open_ports(system, params), np.asarray(data["x"]), len(data["x"]))
         case PortHamiltonian():
             raise Skipped("closed ports make it a differential-algebraic equation")
-    raise Skipped(f"no ordinary differential equation is derived for a {type(system).__name__}")
+    raise Skipped(f"no ordinary differential equation is derived for {type(system).__name__} systems")
 
 
 LinearEquations = Callable[[Any, Any], tuple[Any, Any, Callable]]
