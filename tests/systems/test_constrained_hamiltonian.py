@@ -236,6 +236,34 @@ def test_a_charge_on_a_sphere_over_many_steps():
     assert np.max(np.abs(sol.energy() - sol.energy()[0])) < 1e-4
 
 
+ROLLING = dx.DiracSystem(  # x² + y² = 1 and dz = y ds on T*R⁴: the second in the structure, the first beside it
+    dx.induced_dirac(lambda q: jnp.stack([0.0 * q[0], 0.0 * q[0], 1.0 + 0.0 * q[0], -q[1]])[None], 4),
+    lambda x: x[4:] @ x[4:] / 2,
+    holonomic=lambda x: jnp.stack([x[0] ** 2 + x[1] ** 2 - 1.0]),
+)
+ROLLING_START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.8])
+
+
+def test_holonomic_constraints_of_a_nonholonomic_structure():
+    """θ = t and ṡ = ṡ0/√(1 + sin²θ), by Method 1."""
+    errors = []
+    for steps in (50, 100, 200):
+        sol = dx.simulate(ROLLING, METHOD_1, x=ROLLING_START, step=2.0 / steps, steps=steps)
+        sine, rate = np.sin(sol.t), 0.8 / np.sqrt(1 + np.sin(sol.t) ** 2)
+        pairs = ((sol.x[:, :2], np.stack([np.cos(sol.t), sine], 1)), (sol.x[:, 6:], np.stack([sine * rate, rate], 1)))
+        errors.append([np.max(np.abs(found - known)) for found, known in pairs])
+    assert slopes(errors) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.soak
+def test_the_chain_of_both_kinds_of_constraints():
+    chain = dx.constraint_algorithm(ROLLING, near=ROLLING_START)
+    assert [level.dimension for level in chain.levels] == [6, 5, 5]
+    field = chain.field(jnp.asarray(ROLLING_START))
+    np.testing.assert_allclose(field, [0.0, 1.0, 0.0, 0.8, -1.0, 0.0, 0.8, 0.0], atol=1e-12)
+    assert chain.multipliers(jnp.asarray(ROLLING_START)) == pytest.approx([-0.5], abs=1e-12)
+
+
 def test_initial_data_off_the_final_manifold_are_refused_or_projected():
     for x in FLAT_START + 0.1 * np.eye(4)[1:3]:
         with pytest.raises(ValueError, match="off the constraint"):
