@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from dirax.tracing import jacobian
+from dirax.tracing import call, jacobian
 
 EPSILON = 2.220446049250313e-16
 RANK_TOLERANCE = 1e-12
@@ -70,6 +70,10 @@ def _root_jvp(residual, max_steps, primals, tangents):
 
 def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> tuple[Float[Array, "l k"], Float[Array, " l"]]:
     """The pseudo-inverse of a matrix with rows and columns scaled to unit size, and the units that this gives the columns."""
+    return call(_scaled_pseudo_inverse, matrix)
+
+
+def _scaled_pseudo_inverse(matrix):
     rows, columns = jnp.ones((matrix.shape[0], 1)), jnp.ones((1, matrix.shape[1]))
     fitting = lambda sizes: jnp.sqrt(jnp.where(sizes > 0.0, sizes, 1.0))
     for _ in range(3):
