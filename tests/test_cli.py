@@ -110,6 +110,13 @@ def test_compare_finds_every_lagrangian_scheme_for_nonholonomic_mechanics():
     assert orders == pytest.approx(expected, abs=0.1)
 
 
+def test_compare_has_the_exact_energy_of_discrete_gradients_where_there_is_a_hamiltonian():
+    result = call("compare", "magnetic-spherical-pendulum", "--set", "steps=200", "--json")
+    assert result.exit_code == 0, result.output
+    entries = {entry["scheme"]: entry for entry in json.loads(result.stdout)["schemes"]}
+    assert list(entries) == ["method1", "method2", "gradient"] and entries["gradient"]["energy_band"] < 1e-14
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [

@@ -27,7 +27,9 @@ Settings = Annotated[
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
-SCHEME_HELP = "plus, minus, midpoint, trapezoidal, method1, method2, or a class: \"Composition(LagrangeDAlembert(), 'suzuki4')\""
+SCHEME_HELP = (
+    "plus, minus, midpoint, trapezoidal, method1, method2, gradient, or a class: \"Composition(LagrangeDAlembert(), 'suzuki4')\""
+)
 
 
 @app.command("list")

@@ -6,6 +6,7 @@ from typing import Any
 
 import dirax
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.schemes.discrete_gradient import DiscreteGradient
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.step import AbstractScheme
 
@@ -16,6 +17,7 @@ SHORT_NAMES: dict[str, AbstractScheme] = {
     "trapezoidal": LagrangeDAlembert("trapezoidal", "midpoint"),
     "method1": DiscreteDirac(constraints="discretize"),
     "method2": DiscreteDirac(constraints="resolve"),
+    "gradient": DiscreteGradient(),
 }
 """The general schemes, from the simplest on."""
 
