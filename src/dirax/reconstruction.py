@@ -51,9 +51,15 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     info = {"q": Field((n,)), "p": Field((n,))}
     about = {name: info.get(name) or solution.field_info[name] for name in lifted}
     whole = _lifted(solution, system.system, lifted, about)
-    if isinstance(scheme := solution.scheme, DiscreteRouth):
-        whole.scheme = LagrangeDAlembert(scheme.discrete_lagrangian, scheme.constraint, scheme.momentum)
+    whole.scheme = jax.tree.map(_on_q, solution.scheme, is_leaf=lambda part: isinstance(part, DiscreteRouth))
     return whole if is_traced(lifted) or solution.equation is None else with_code(whole, whole.system, whole.scheme)
+
+
+def _on_q(part: Any) -> Any:
+    """The scheme on Q × Q whose trajectories those of Routh's equations are, also inside a composition."""
+    if not isinstance(part, DiscreteRouth):
+        return part
+    return LagrangeDAlembert(part.discrete_lagrangian, part.constraint, part.momentum)
 
 
 def _multipliers_at(solution: Solution, q: Any) -> Any:

@@ -16,12 +16,13 @@ from dirax.reduction.dirac import (
 )
 
 H, STEPS = 0.1, 4
-CONNECTION = dx.LinearConnection([0], [[0.3, -0.2]])
+CONNECTION = dx.LinearConnection([0, 3], [[0.3, -0.2], [0.1, 0.4]])
 
 
 def lagrangian(q, v):
-    """Regular, not a product, and free of q[0]."""
-    return (1 + q[1] ** 2) * v[0] ** 2 / 2 + v[0] * v[2] * jnp.sin(q[1]) + v[1] ** 2 + v[2] ** 2 - jnp.cos(q[2] - q[1])
+    """Regular, not a product, and free of q[0] and q[3]."""
+    rotor = (v[3] + q[1] * v[2] - 0.3 * v[0]) ** 2 / 2
+    return rotor + (1 + q[1] ** 2) * v[0] ** 2 / 2 + v[0] * v[2] * jnp.sin(q[1]) + v[1] ** 2 + v[2] ** 2 - jnp.cos(q[2] - q[1])
 
 
 def ld(q0, q1):
@@ -31,7 +32,7 @@ def ld(q0, q1):
 @pytest.fixture(scope="module", params=[dx.PlusLagrangeDirac, dx.MinusLagrangeDirac])
 def rows(request):
     system = dx.reduce(dx.LagrangeDirac(lagrangian), CONNECTION)
-    start = {"q": [0.0, 0.4, 1.0], "v": [0.5, -0.3, 0.8], "step": H, "steps": STEPS}
+    start = {"q": [0.0, 0.4, 1.0, 0.2], "v": [0.5, -0.3, 0.8, 0.6], "step": H, "steps": STEPS}
     sol = dx.simulate(system, request.param("midpoint"), **start)
     return {name: np.asarray(sol.fields[name]) for name in ("x", "w", "mu", "g", "vertical")}
 

@@ -114,7 +114,7 @@ def test_systems_without_translations(name):
 def in_own_coordinates(example, point, start):
     """The system where its symmetry is a translation, and the initial data there."""
     system: Any = example.system
-    if hasattr(system, "lagrange_dirac"):
+    if isinstance(system, dx.PhaseSpaceLagrangian):
         system = system.lagrange_dirac()
     if point is None:
         return system, start

@@ -68,3 +68,11 @@ def test_constraints_and_forces():
         found = verdicts(skate)
         for line in (STRUCTURE[2], "saved p and multipliers", "momentum map μ", "constraint"):
             assert found[line] == "ok", line
+
+
+def test_a_composition_comes_back_as_one_on_q():
+    lifted = dx.reconstruct(particle(dx.Composition(dx.DiscreteRouth(), "suzuki4"), steps=5))
+    assert isinstance(lifted.scheme, dx.Composition) and isinstance(lifted.scheme.scheme, dx.LagrangeDAlembert)
+    whole = dx.simulate(PARTICLE.system, lifted.scheme, params=PARTICLE.params, step=0.1, steps=5, engine="native",
+                        **PARTICLE.initial)  # fmt: skip
+    assert np.abs(lifted.q - whole.q).max() < 1e-13
