@@ -38,6 +38,7 @@ from dirax.geometry.tulczyjew import (
     plus_legendre,
 )
 from dirax.reconstruction import reconstruct
+from dirax.reduction.actions import GroupAction, Translations
 from dirax.reduction.connection import DiscreteConnection, LinearConnection
 from dirax.reduction.coordinates import adapted_basis, in_coordinates
 from dirax.reduction.euler_poincare import EulerPoincare
@@ -45,7 +46,7 @@ from dirax.reduction.left_translation import LeftTranslation
 from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
-from dirax.reduction.symmetry import GroupAction, Translations, check_invariance, cyclic_coordinates, translation_symmetries
+from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.schemes.charted import InCharts
 from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
 from dirax.schemes.discrete_constraints import DiscreteConstraintChain, discrete_constraint_algorithm

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.reduction.symmetry import GroupAction, Translations, check_invariance, cyclic_coordinates, translation_symmetries
+from dirax import GroupAction, Translations, check_invariance, cyclic_coordinates, translation_symmetries
 
 
 def turned(g, q):

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from dirax.functions import is_traced
 from dirax.geometry.lie_groups import AbstractLieGroup
-from dirax.reduction.symmetry import AbstractAction
+from dirax.reduction.actions import AbstractAction
 
 
 class LeftTranslation(AbstractAction):

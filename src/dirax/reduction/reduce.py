@@ -3,11 +3,11 @@
 from typing import Any, overload
 
 from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.reduction.actions import Translations
 from dirax.reduction.connection import AbstractConnection
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.left_invariant import reduced_by_left_translations
 from dirax.reduction.reduced import ReducedLagrangeDirac
-from dirax.reduction.symmetry import Translations
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 from dirax.systems.nonholonomic import as_lagrange_dirac

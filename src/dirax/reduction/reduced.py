@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction, evaluated, is_traced
+from dirax.reduction.actions import Translations
 from dirax.reduction.connection import AbstractConnection
-from dirax.reduction.symmetry import TOLERANCE, Translations, discrete_invariance, invariance, times
+from dirax.reduction.symmetry import TOLERANCE, discrete_invariance, invariance, times
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem

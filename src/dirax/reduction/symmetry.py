@@ -1,116 +1,21 @@
-"""Abelian group actions, their generators, lifts and momentum maps, and the search for symmetries of a system ([RL] §2)."""
+"""Whether a system is invariant under an action, and the search for symmetries that are translations."""
 
-from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
-from dirax.reduction.connection import check_fibre, fibre_indices
+from dirax.reduction.actions import AbstractAction
 from dirax.systems.constraints import Constraints
 from dirax.systems.nonholonomic import as_lagrange_dirac
 
 TOLERANCE = 1e-9
 """Largest defect, relative to the size of L and of its derivatives, of a symmetry."""
-
-
-class AbstractAction(eqx.Module):
-    """An abelian group R^k (or a torus, in angles) acting on Q ⊂ R^n: Φ_{g+h} = Φ_g ∘ Φ_h."""
-
-    @abstractmethod
-    def dimension(self) -> int:
-        """k."""
-
-    @abstractmethod
-    def check(self, q: Float[Array, " n"]) -> None:
-        """Raise `ValueError` where it does not act on points like q."""
-
-    @abstractmethod
-    def __call__(self, g: Float[Array, " k"], q: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Φ_g(q)."""
-
-    def generator(self, xi: Float[Array, " k"], q: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The infinitesimal generator ξ_Q(q) = d/dε Φ_{εξ}(q) at ε = 0."""
-        return jax.jvp(lambda g: self(g, q), (jnp.zeros_like(xi),), (xi,))[1]
-
-    def tangent_lift(self, g: Float[Array, " k"], q: Float[Array, " n"], v: Float[Array, " n"]) -> tuple[Array, Array]:
-        """TΦ_g(q, v)."""
-        return jax.jvp(lambda q: self(g, q), (q,), (v,))
-
-    def cotangent_lift(self, g: Float[Array, " k"], q: Float[Array, " n"], p: Float[Array, " n"]) -> tuple[Array, Array]:
-        """T*Φ_{−g}(q, p): the pairing with lifted velocities stays the same."""
-        derivative = jax.jacfwd(lambda q: self(g, q))(q)
-        return self(g, q), jnp.linalg.solve(derivative.T, p)
-
-    def momentum_map(self, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " k"]:
-        """J(q, p), with ⟨J, ξ⟩ = ⟨p, ξ_Q(q)⟩."""
-        return jax.vjp(lambda g: self(g, q), jnp.zeros(self.dimension()))[1](p)[0]
-
-
-class Translations(AbstractAction):
-    """Addition to the coordinates `fibre` of q: a vector subgroup, or a torus where they are angles."""
-
-    fibre: tuple[int, ...] = eqx.field(static=True)
-
-    def __init__(self, fibre: Sequence[int]):
-        self.fibre = fibre_indices(fibre)
-
-    def dimension(self) -> int:
-        """k."""
-        return len(self.fibre)
-
-    def check(self, q: Float[Array, " n"]) -> None:
-        """Raise `ValueError` for an index that q does not have."""
-        check_fibre(self.fibre, q.shape[-1])
-
-    def __call__(self, g: Float[Array, " k"], q: Float[Array, " n"]) -> Float[Array, " n"]:
-        """q with g added in the fibre."""
-        return jnp.asarray(q).at[np.array(self.fibre)].add(g)
-
-
-class GroupAction(AbstractAction):
-    """An action of R^k or a torus by a function `action(g, q) -> (n,)`, g of shape (k,).
-
-    That Φ_0 is the identity and Φ_{g+h} = Φ_g ∘ Φ_h is checked at random g as soon as a point is known; `ValueError`
-    tells the defect.
-
-        turn = dx.GroupAction(lambda g, q: jnp.array([[jnp.cos(g[0]), -jnp.sin(g[0])], [jnp.sin(g[0]), jnp.cos(g[0])]]) @ q, 1)
-    """
-
-    action: UserFunction
-    size: int = eqx.field(static=True)
-
-    def __init__(self, action: Callable, dimension: int):
-        self.action, self.size = UserFunction(action, "action", ("g", "q")), int(dimension)
-
-    def dimension(self) -> int:
-        """k."""
-        return self.size
-
-    def __call__(self, g: Float[Array, " k"], q: Float[Array, " n"]) -> Float[Array, " n"]:
-        """action(g, q)."""
-        return self.action(g, q, None)
-
-    def check(self, q: Float[Array, " n"]) -> None:
-        """Raise `ValueError` where the function is no action of an abelian group at q."""
-        random, act = np.random.default_rng(0), jax.jit(self.__call__)
-        shape = self.action.shape(jnp.zeros(self.size), q, None).shape
-        if shape != q.shape:
-            raise ValueError(f"action(g, q) must return a point like q, of shape {q.shape}, but it returned shape {shape}.")
-        g, h = random.normal(size=(2, self.size))
-        for law, found, wanted in (
-            ("action(0, q) = q", act(0 * g, q), q),
-            ("action(g + h, q) = action(g, action(h, q))", act(g + h, q), act(g, act(h, q))),
-        ):
-            defect = float(np.max(np.abs(np.asarray(found) - np.asarray(wanted))))
-            if not defect <= 1e-9 * (1 + float(np.max(np.abs(np.asarray(wanted))))):
-                raise ValueError(f"action is none of an abelian group: {law} fails by {defect:.3g} at q = {np.asarray(q)}.")
 
 
 @dataclass(frozen=True)
