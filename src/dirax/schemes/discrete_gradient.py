@@ -24,7 +24,8 @@ class DiscreteGradient(AbstractScheme):
         ⟨∇̄H(x_k, x_{k+1}), x_{k+1} − x_k⟩ = H(x_{k+1}) − H(x_k),
 
     so that H(x_{k+1}) − H(x_k) = h⟨ȳ, ū⟩ − h⟨∇̄H, R∇̄H⟩ exactly: [BLM] (20) with the midpoint map, whose own balance
-    ⟨dH(x̄), ẋ_d⟩ is not the change of H. On a DiracSystem (ẋ_d, ∇̄H) ∈ D(x̄), and H is conserved. Second order.
+    ⟨dH(x̄), ẋ_d⟩ is not the change of H. On a DiracSystem (ẋ_d, ∇̄H) ∈ D(x̄), and H is conserved; with holonomic constraints
+    (ẋ_d, ∇̄H − Gᵀλ) ∈ D(x̄) and G(x̄) ẋ_d = 0, as in Method 1. Second order.
 
     `kind`: "gonzalez", dH(x̄) corrected along the step, or "mean-value", the mean of dH over the step by Gauss–Legendre
     quadrature with `nodes` points, corrected in the same way by what the quadrature leaves. What roundoff takes from the

@@ -20,7 +20,8 @@ class PortHamiltonian(AbstractSystem):
     `hamiltonian(x[, params])` a scalar; `J(x[, params])` (N, N) skew; `B(x[, params])` (N, m), no ports by default;
     `R(x[, params])` (N, N) symmetric, positive semidefinite, no dissipation by default. J, B and R may be constant arrays.
     Open (default): u = `inputs(t, x[, params])` (m,), zero without it. Closed: u is the multiplier that keeps y = 0
-    ([BLM] (23), a Dirac system); `closed` may also name the columns of B that are closed, the others stay open.
+    ([BLM] (23), a Dirac system); `closed` may also name the columns of B that are closed, the others stay open. A closed
+    port imposes y = 0 alone: for constraints g(x) = 0 on positions, not on their rates only, see `DiracSystem`.
 
     Raises `ValueError` at the start of a run where J is not skew or R not symmetric positive semidefinite, with the defect.
     """
