@@ -31,11 +31,11 @@ class DiscreteDirac(AbstractScheme):
     "discretize" ([BLM] Method 1) discretizes the implicit system S_0 as it stands; "resolve" ([BLM] Method 2) runs the
     constraint algorithm first and discretizes on M_f, so that its constraints hold at the nodes to roundoff. Of holonomic
     constraints g = 0, Method 1 imposes the distribution G q̇ + ∂g/∂t = 0 at the base point, which keeps quadratic g for the
-    midpoint map and others to O(h²); Method 2 keeps g and G q̇ + ∂g/∂t at the nodes, to roundoff. With either kind of constraint the
-    multipliers of Method 1 alternate around those of the system by O(h), and means of neighbours are of the order of q.
-    Method 2 of a DiracSystem with `holonomic` is stated here for graphs of two-forms and bivectors with {g_i, g_j} = 0, and
-    by its resolved chain for others. Multipliers are forces at the base point, ṗ = … + Wᵀλ; those of `dx.LagrangeDAlembert`
-    are impulses of the opposite sign.
+    midpoint map and others to O(h²); Method 2 keeps g and G q̇ + ∂g/∂t at the nodes, to roundoff. With either kind of
+    constraint the multipliers of Method 1 alternate around those of the system by O(h), and means of neighbours are of the
+    order of q. Method 2 of a DiracSystem with `holonomic` is stated here for graphs of two-forms and bivectors with
+    {g_i, g_j} = 0, and by its resolved chain for others. Multipliers are forces at the base point, ṗ = … + Wᵀλ; those of
+    `dx.LagrangeDAlembert` are impulses of the opposite sign.
 
     Takes DiracSystem, PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian
     systems, and what `ConstraintChain.resolved` returns, on which it is Method 2 for any system; raises `TypeError` for
