@@ -97,3 +97,20 @@ def test_finite_translations_agree_with_the_derivative():
     q, v = jnp.array(found.q), jnp.array(found.v)
     finite = float((pulled(q + 1e-5, v) - pulled(q - 1e-5, v)) / 2e-5)
     assert not found and found.defect == pytest.approx(abs(finite), rel=1e-6)
+
+
+def test_small_units_hide_no_asymmetry():
+    """Masses of 1e-27, as in SI units of atoms."""
+    falling = dx.LagrangeDirac(lambda q, v: 1e-27 * (v @ v / 2 - q[1]))
+    assert cyclic_coordinates(falling, [0.1, 0.2]) == (0,)
+    assert check_invariance(falling, Translations([0]), q=[0.1, 0.2])
+    assert not check_invariance(falling, Translations([1]), q=[0.1, 0.2])
+    free = lambda q, v: 1e-27 * (v[0] ** 2 + (1 + q[0] ** 2) * v[1] ** 2) / 2
+    for along, message in ((0.1, "f has the part .*e-29 along"), (0.0, "")):
+        pushed = dx.LagrangeDirac(free, forces=lambda t, q, v, along=along: -1e-27 * jnp.stack([v[0], along * v[1]]))
+        reduced, start = dx.reduce(pushed, dx.LinearConnection([1])), {"q": [0.1, 0.2], "v": [0.3, 0.4], "step": 0.1, "steps": 3}
+        if message:
+            with pytest.raises(ValueError, match=message):
+                dx.simulate(reduced, dx.DiscreteRouth(), **start)
+        else:
+            assert dx.simulate(reduced, dx.DiscreteRouth(), **start).ok

@@ -75,12 +75,13 @@ def momentum(sol: Solution, name: str, generator: Callable, tolerance: float | N
 
 
 def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
-    """μ of a run on the quotient by an abelian symmetry, relative to its largest value."""
+    """μ of a run on the quotient by an abelian symmetry, relative to the largest momentum, w and μ."""
     if not isinstance(sol.system, ReducedLagrangeDirac):
         return []
     title, mu = "momentum map μ", np.asarray(sol.fields["mu"]).reshape(-1, *np.shape(sol.fields["mu"])[-2:])
     change = np.nanmax(np.abs(mu - mu[:, :1]), axis=(1, 2))
-    scale = np.nanmax(np.abs(mu), axis=(1, 2))
+    w = np.asarray(sol.fields["w"]).reshape(*mu.shape[:2], -1)
+    scale = np.nanmax(np.abs(np.concatenate([mu, w], axis=2)), axis=(1, 2))
     lane = int(np.argmax(change))
     text = f"{np.array2string(mu[lane, 0], precision=6)} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
     if _moved(sol):

@@ -63,7 +63,8 @@ class ReducedLagrangeDirac(AbstractSystem):
             return ""
         _, q, v = sampled(data)
         parts, sizes = (np.asarray(a) for a in evaluated(self._parts_along, *sampled(data), params))
-        defects = np.abs(parts) / np.maximum(1.0, sizes)[..., None]
+        largest = np.max(np.where(np.isfinite(sizes), sizes, 0.0), axis=0)
+        defects = np.abs(parts) / np.where(largest > 0, largest, 1.0)[:, None]
         where, row, column = np.unravel_index(int(np.argmax(np.where(np.isfinite(defects), defects, 0.0))), defects.shape)
         if not defects[where, row, column] > TOLERANCE:
             return ""

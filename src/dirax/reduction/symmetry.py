@@ -173,11 +173,14 @@ def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: An
         def at(t, q, v, moved=moved):
             rate = jax.jacfwd(moved)(zero, t, q, v)
             value, slope = moved(zero, t, q, v), jax.jacfwd(moved, argnums=2)(zero, t, q, v)
-            size = jnp.maximum(1.0, jnp.maximum(jnp.max(jnp.abs(value)), jnp.max(jnp.abs(slope))))
+            size = jnp.maximum(jnp.max(jnp.abs(value)), jnp.max(jnp.abs(slope)))
             return jnp.max(jnp.abs(jnp.reshape(rate, (-1, zero.shape[0]))), axis=0), size
 
         defect, size = (np.asarray(a) for a in jax.jit(jax.vmap(at))(*map(jnp.asarray, (t, q, v))))
         known = np.isfinite(defect) & np.isfinite(size)[:, None]
+        # one-forms less their span are 0 where they are looked at: they have the unit 1, functions of small units their own
+        unit = np.max(size, where=np.isfinite(size), initial=0.0)
+        size = np.maximum(size, 1.0 if name == "one_forms" or unit == 0.0 else min(1.0, unit))
         relative = np.where(known, defect / np.where(known, size[:, None], 1.0), 0.0)
         row, column = np.unravel_index(int(np.argmax(relative)), relative.shape)
         largest = float(relative[row, column])
@@ -217,11 +220,13 @@ def translation_symmetries(
         return jnp.concatenate([*(jnp.reshape(jax.jacfwd(function)(q), (-1, q.size)) for function in along), inside])
 
     slopes = np.asarray(jax.jit(jax.vmap(at))(jnp.asarray(random.uniform(0, 1, samples)), *points))
-    slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))][:, :-1].reshape(-1, q.size)
+    slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))]
+    unit = min(1.0, np.max(np.abs(slopes[:, -1]), initial=0.0))  # L in small units has small derivatives
+    slopes = slopes[:, :-1].reshape(-1, q.size)
     if not len(slopes):
         raise ValueError("L is finite at none of the points around q: choose q inside its domain, or a smaller radius.")
     _, values, directions = np.linalg.svd(slopes, full_matrices=True)
-    rank = int(np.sum(values > TOLERANCE * max(1.0, values[0])))
+    rank = int(np.sum(values > TOLERANCE * max(unit, values[0])))
     return directions[rank:]
 
 

@@ -18,7 +18,7 @@ from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.schemes.vertical import vertical_velocity
 
 SINGULAR = 1e-13
-"""A group inertia with singular values below this, relative to the largest or to 1, is singular."""
+"""A group inertia with singular values below this, when its rows and columns have unit size, is singular."""
 
 
 class DiscreteRouth(AbstractScheme):
@@ -134,8 +134,10 @@ def discrete_routh(system: ReducedLagrangeDirac, shape: Shape, reduced: StepEqua
     def check(data, h, params):
         reduced.check(data, h, params)
         matrix = np.asarray(evaluated(inertia, data, h, params))
-        rank = int(np.linalg.matrix_rank(matrix, tol=SINGULAR * max(1.0, np.max(np.abs(matrix))))) if k else 0
-        if np.all(np.isfinite(matrix)) and rank < k:
+        units = np.sqrt(np.max(np.abs(matrix), axis=1))
+        scaled = matrix / np.outer(units, units) if np.all(units > 0) else matrix
+        rank = int(np.linalg.matrix_rank(scaled, tol=SINGULAR)) if np.all(np.isfinite(scaled)) else k
+        if rank < k:
             raise ValueError(
                 f"μ has a singular value at the initial data: the group inertia ∂²l_d/∂γ² = {matrix.tolist()} has rank {rank} of "
                 f"{k} there, so that ∂l_d/∂γ = μ does not determine γ. Start elsewhere, or use dx.LagrangeDAlembert, which "
