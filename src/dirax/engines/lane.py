@@ -1,6 +1,7 @@
 """One step of one trajectory: solve every stage, advance, and judge; what an engine carries from step to step."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -69,11 +70,12 @@ def take_step(
     """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns.
 
     With `differentiable` it can be differentiated in reverse mode too, and no derivative passes through a step that failed."""
-    state, lost, history, unknowns = lane.state, lane.lost, [], []
-    status, updates, worst = lane.status, 0, lane.max_residual
     nothing = (None,) * len(equation.stages)
     increments, jacobians = (found or nothing for found in derived or Derived())
-    for (stage, fraction), before, increment, jacobian in zip(equation.stages, lane.history, increments, jacobians, strict=True):
+    stages, fractions = zip(*equation.stages, strict=True)
+
+    def solved(carry, fraction, before, stage, increment, jacobian):
+        state, lost, t, status, updates, worst = carry
         running = status == OK
         args = (state, t, fraction * h, params)
         fixed = passing(args, False) if differentiable else args
@@ -95,9 +97,20 @@ def take_step(
             new, left_out = compensated_sum(state, lost, increment(u, *args), new)
             lost = jnp.where(status == OK, left_out, lost)
         state = jnp.where(status == OK, new, state)
-        history.append(_remembered(u, before, lane.completed))
-        unknowns.append(u)
-        t = t + fraction * h
+        return (state, lost, t + fraction * h, status, updates, worst), (_remembered(u, before, lane.completed), u)
+
+    carry = (lane.state, lane.lost, jnp.asarray(t, float), lane.status, jnp.zeros_like(lane.iterations), lane.max_residual)
+    if len(stages) > 1 and len({(stage.residual, stage.advance, stage.guess) for stage in stages}) == 1:
+        one = lambda carry, given: solved(carry, given[0], given[1], stages[0], increments[0], jacobians[0])
+        given, loop = (jnp.array(fractions), jnp.stack(lane.history)), jax.lax.scan if differentiable else partial(_loop, h)
+        carry, (histories, solutions) = loop(one, carry, given)
+        history, unknowns = tuple(histories), tuple(solutions)
+    else:
+        history, unknowns = (), ()
+        for i, before in enumerate(lane.history):
+            carry, (remembered, u) = solved(carry, fractions[i], before, stages[i], increments[i], jacobians[i])
+            history, unknowns = (*history, remembered), (*unknowns, u)
+    state, lost, _, status, updates, worst = carry
     good = status == OK
     after = Lane(
         jnp.where(good, state, lane.state),
@@ -106,7 +119,22 @@ def take_step(
         worst,
         jnp.where(good, lost, lane.lost),
     )
-    return after, tuple(unknowns)
+    return after, unknowns
+
+
+def _loop(h, step: Callable, carry: Any, given: tuple) -> tuple[Any, Any]:
+    """`jax.lax.scan(step, carry, given)` as a loop whose length XLA does not know, or it would write out short ones and compile
+    every turn."""
+    count = jnp.where(jnp.isnan(h), 0, len(given[0]))
+    shapes = jax.eval_shape(step, carry, jax.tree.map(lambda a: a[0], given))[1]
+    rows = jax.tree.map(lambda a: jnp.zeros((len(given[0]), *a.shape), a.dtype), shapes)
+
+    def body(i, carried):
+        carry, rows = carried
+        carry, row = step(carry, jax.tree.map(lambda a: a[i], given))
+        return carry, jax.tree.map(lambda a, b: jax.lax.dynamic_update_index_in_dim(a, b, i, 0), rows, row)
+
+    return jax.lax.fori_loop(0, count, body, (carry, rows))
 
 
 def passing(numbers: Any, pass_on: Any) -> Any:
