@@ -6,6 +6,8 @@ import numpy as np
 
 import dirax as dx
 from dirax.engines import xla
+from dirax.engines.lane import first_lane, take_step
+from dirax.schemes.step import Shape, make_step_equation
 
 SYSTEM = dx.LagrangeDirac(
     lambda q, v, c: (v[0] ** 2 + v[1] ** 2) / 2 + v[2] ** 2 / 8 + v[3] ** 2 / 4 - c["g"] * jnp.sin(q[2]) * jnp.hypot(q[0], 2.0),
@@ -42,3 +44,29 @@ def test_derivatives_through_scalars(monkeypatch):
     monkeypatch.setattr(xla, "fast_loops_asked_for", lambda: True)
     scalar = jax.jit(jax.grad(lambda g: end(g)))(9.81)
     np.testing.assert_allclose(scalar, plain, rtol=1e-11)
+
+
+def test_method_2_in_large_batches_with_the_jacobian_of_the_graph():
+    """Against the native engine, to roundoff: one stage and five equal ones, which are compiled once."""
+    metric = lambda q: jnp.diag(jnp.stack([1.0 + q[1] ** 2, jnp.ones(())]))
+    forms = lambda q: jnp.stack([jnp.stack([jnp.sin(q[1]), jnp.ones(())])])
+    system = dx.NonholonomicMechanics(metric, lambda q: -jnp.cos(q[0]), forms)
+    q = np.stack([np.linspace(0.1, 1.0, xla.SCALAR_BATCH), np.full(xla.SCALAR_BATCH, 0.7)], axis=1)
+    run_2 = {"q": q, "v": np.ones_like(q), "project": True, "step": 0.05, "steps": 20}
+    scheme = dx.DiscreteDirac(constraints="resolve")
+    for made in (scheme, dx.Composition(scheme, "suzuki4")):
+        ours, theirs = (dx.simulate(system, made, **run_2, engine=engine) for engine in ("xla", "native"))
+        assert np.all(ours.ok) and np.max(np.abs(theirs.multipliers)) > 0.1
+        for name, values in theirs.fields.items():
+            np.testing.assert_allclose(ours.fields[name], values, rtol=1e-12, atol=1e-12)
+
+
+def test_equal_stages_are_compiled_once():
+    scheme, shape = dx.LagrangeDAlembert(), Shape(4, 2)
+    sizes = []
+    for made in (scheme, dx.Composition(scheme, "suzuki4")):
+        equation = make_step_equation(made, SYSTEM, shape)
+        lane = first_lane(jnp.ones(8), (jnp.ones(6),) * len(equation.stages))
+        step = lambda lane, h, c, equation=equation: take_step(equation, lane, 0.0, h, c, 50, False)
+        sizes.append(len(jax.jit(step).lower(lane, 0.1, {"g": 9.81}).as_text()))
+    assert sizes[1] < 1.5 * sizes[0]
