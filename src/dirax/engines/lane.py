@@ -1,7 +1,6 @@
 """One step of one trajectory: solve every stage, advance, and judge; what an engine carries from step to step."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -102,8 +101,7 @@ def take_step(
     carry = (lane.state, lane.lost, jnp.asarray(t, float), lane.status, jnp.zeros_like(lane.iterations), lane.max_residual)
     if len(stages) > 1 and len({(stage.residual, stage.advance, stage.guess) for stage in stages}) == 1:
         one = lambda carry, given: solved(carry, given[0], given[1], stages[0], increments[0], jacobians[0])
-        given, loop = (jnp.array(fractions), jnp.stack(lane.history)), jax.lax.scan if differentiable else partial(_loop, h)
-        carry, (histories, solutions) = loop(one, carry, given)
+        carry, (histories, solutions) = jax.lax.scan(one, carry, (jnp.array(fractions), jnp.stack(lane.history)))
         history, unknowns = tuple(histories), tuple(solutions)
     else:
         history, unknowns = (), ()
@@ -120,21 +118,6 @@ def take_step(
         jnp.where(good, lost, lane.lost),
     )
     return after, unknowns
-
-
-def _loop(h, step: Callable, carry: Any, given: tuple) -> tuple[Any, Any]:
-    """`jax.lax.scan(step, carry, given)` as a loop whose length XLA does not know, or it would write out short ones and compile
-    every turn."""
-    count = jnp.where(jnp.isnan(h), 0, len(given[0]))
-    shapes = jax.eval_shape(step, carry, jax.tree.map(lambda a: a[0], given))[1]
-    rows = jax.tree.map(lambda a: jnp.zeros((len(given[0]), *a.shape), a.dtype), shapes)
-
-    def body(i, carried):
-        carry, rows = carried
-        carry, row = step(carry, jax.tree.map(lambda a: a[i], given))
-        return carry, jax.tree.map(lambda a, b: jax.lax.dynamic_update_index_in_dim(a, b, i, 0), rows, row)
-
-    return jax.lax.fori_loop(0, count, body, (carry, rows))
 
 
 def passing(numbers: Any, pass_on: Any) -> Any:
