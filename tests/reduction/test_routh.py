@@ -137,3 +137,19 @@ def test_mistakes():
     twice = DiscreteConnection(lambda q0, q1: 2 * (q1[3:] - q0[3:]), fibre=[3])
     with pytest.raises(ValueError, match=r"ω_d\(q0 \+ g0, q1 \+ g1\)"):
         run(PARTICLE, dx.reduce(PARTICLE.system, twice), DiscreteRouth(), 3)
+
+
+@pytest.mark.parametrize("scheme", [dx.DiscreteRouth("left"), dx.PlusLagrangeDirac("left")])
+def test_symmetric_compositions_on_the_quotient(scheme):
+    """Φ_{h/2} ∘ Φ*_{h/2} of the scheme of order 1 has order 2, and is that of the unreduced system."""
+    reduced, ends = dx.reduce(KEPLER, dx.LinearConnection([1])), []
+    symmetric = dx.SymmetricComposition(scheme)
+    data = {"q": [1.0, 0.0], "v": [0.1, 1.1], "params": 1.0}
+    for steps in (20, 40, 80):
+        sol = dx.reconstruct(dx.simulate(reduced, symmetric, step=1.0 / steps, steps=steps, **data))
+        ends.append(np.concatenate([sol.q[-1], sol.p[-1]]))
+    unreduced = dx.SymmetricComposition(dx.LagrangeDAlembert("left", "left"))
+    plain = dx.simulate(KEPLER, unreduced, step=1.0 / 80, steps=80, **data)
+    np.testing.assert_allclose(ends[-1], np.concatenate([plain.q[-1], plain.p[-1]]), rtol=0, atol=1e-12)
+    order = np.log2(np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1] - ends[2]))
+    assert abs(order - 2) < 0.1

@@ -6,8 +6,10 @@ from typing import Any
 import jax.numpy as jnp
 
 from dirax.functions import UserFunction
+from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.discrete_lagrangian import LD_ARGUMENTS
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
+from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation, StepSequence, make_step_equation
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import as_lagrange_dirac
@@ -111,10 +113,10 @@ class Composition(AbstractScheme):
 class Adjoint(AbstractScheme):
     """The adjoint Φ*_h = (Φ_{−h})⁻¹ of a scheme: x1 = Φ*_h(x0) iff x0 = Φ_{−h}(x1).
 
-    A scheme is self-adjoint where it equals its adjoint. A discrete Lagrange–d'Alembert scheme has one of the same family,
-    with L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h): with constraints its p matters only
-    modulo the forces Wᵀμ, so that the inverse as a map of (q, p) does not exist. The unknowns of any other scheme are its
-    own and the increment of the state.
+    A scheme is self-adjoint where it equals its adjoint. A discrete Lagrange–d'Alembert or Routh scheme has one of the same
+    family, with L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h): with constraints its p matters
+    only modulo the forces Wᵀμ, so that the inverse as a map of (q, p) does not exist. The unknowns of any other scheme are
+    its own and the increment of the state.
     """
 
     scheme: AbstractScheme
@@ -135,7 +137,7 @@ class SymmetricComposition(AbstractScheme):
 
 
 def _adjoint_of(scheme: AbstractScheme, system: Any, shape: Shape, refusal: str) -> StepEquation:
-    if isinstance(as_lagrange_dirac(system), LagrangeDirac) and isinstance(scheme, FAMILY):
+    if isinstance(as_lagrange_dirac(system), LagrangeDirac | ReducedLagrangeDirac) and isinstance(scheme, FAMILY):
         return _one_stage(adjoint_scheme(scheme), system, shape, refusal)
     return adjoint_equation(_one_stage(scheme, system, shape, refusal))
 
@@ -147,19 +149,20 @@ def _one_stage(scheme: AbstractScheme, system: Any, shape: Shape, refusal: str) 
     return equation
 
 
-FAMILY = (LagrangeDAlembert, PlusLagrangeDirac, MinusLagrangeDirac)
+FAMILY = (LagrangeDAlembert, PlusLagrangeDirac, MinusLagrangeDirac, DiscreteRouth)
 MIRRORED = {"left": "right", "right": "left", "midpoint": "midpoint", "trapezoidal": "trapezoidal"}
 
 
-def adjoint_scheme(scheme: AbstractScheme) -> LagrangeDAlembert:
-    """The adjoint of a discrete Lagrange–d'Alembert scheme within the family."""
-    if isinstance(scheme, LagrangeDAlembert):
+def adjoint_scheme(scheme: AbstractScheme) -> LagrangeDAlembert | DiscreteRouth:
+    """The adjoint of a discrete Lagrange–d'Alembert or Routh scheme within the family."""
+    if isinstance(scheme, LagrangeDAlembert | DiscreteRouth):
         rule, constraint = scheme.discrete_lagrangian, scheme.constraint
     elif isinstance(scheme, PlusLagrangeDirac | MinusLagrangeDirac):
         rule, constraint = scheme.discrete_lagrangian, "right" if isinstance(scheme, PlusLagrangeDirac) else "left"
     else:
         raise TypeError(f"adjoint_scheme takes a discrete Lagrange–d'Alembert scheme, but {scheme!r} was given.")
-    return LagrangeDAlembert(_mirror(rule, -1.0), _mirror(constraint, 1.0), "incoming")
+    kind = DiscreteRouth if isinstance(scheme, DiscreteRouth) else LagrangeDAlembert
+    return kind(_mirror(rule, -1.0), _mirror(constraint, 1.0), "incoming")
 
 
 def _mirror(rule: str | UserFunction, sign: float) -> str | Callable:

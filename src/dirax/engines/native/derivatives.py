@@ -10,7 +10,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from dirax.engines.native.graph import Graph
 from dirax.engines.native.interpret import Interpreter, Nodes, Unavailable, Unsupported, elementwise, rule
-from dirax.engines.native.operations import partials
+from dirax.engines.native.operations import gradient, jacobian
 
 KEPT = 256
 """Derivatives kept in memory."""
@@ -61,12 +61,11 @@ def pushed_forward(equation: Any, k: int) -> ClosedJaxpr:
 class Derived:
     """A graph in which powers and functions with rules of their own are single nodes, as long as it is differentiated.
 
-    `slopes[node]` are the derivatives of such a function's value by its operands, `written[node]` is the value in other nodes.
+    `written[node]` is the value of such a function in other nodes.
     """
 
     def __init__(self, jaxpr: Any, wanted: tuple[int, ...], limit: int):
         self.graph = Graph(limit)
-        self.slopes: dict[int, dict[int, int]] = {}
         self.written: dict[int, int] = {}
         rules = {"integer_pow": _power, "pow": _power, "custom_jvp_call": self._custom}
         inputs = [self._fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
@@ -75,7 +74,12 @@ class Derived:
         if isinstance(value, Unavailable):
             raise Unsupported(f"of a function with {value.error}")
         columns = [node for k in wanted for node in inputs[k].ravel().tolist()]
-        table = np.array(self._rows(value.ravel().tolist(), columns), np.int64).reshape(value.size, len(columns))
+        outputs, zero = value.ravel().tolist(), self.graph.zero
+        if len(outputs) == 1:  # backward from a single number, else forward
+            rows = [gradient(self.graph, {outputs[0]: self.graph.one}, columns)]
+        else:
+            rows = [[row.get(j, zero) for j in range(len(columns))] for row in jacobian(self.graph, outputs, columns)]
+        table = np.array(rows, np.int64).reshape(value.size, len(columns))
         parts = np.split(table, np.cumsum([inputs[k].size for k in wanted])[:-1], axis=1)
         shapes = [(*value.shape, *inputs[k].shape) for k in wanted]
         self.results: list[Nodes] = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
@@ -90,79 +94,28 @@ class Derived:
         (written,) = interpreter.run(p["call_jaxpr"], *operands)
         if isinstance(written, Unavailable) or g.is_constant(written.item()):
             return [written]
-        node = g.input(f"value{len(self.slopes)}")
-        self.written[node], self.slopes[node] = written.item(), {}
+        slopes: list[int | None] = []
         for k, operand in enumerate(operands):
             if g.is_constant(operand.item()):
+                slopes.append(None)
                 continue
             (slope,) = Interpreter(g).run(pushed_forward(equation, k), *operands)
             if isinstance(slope, Unavailable):
                 return [slope]
-            known = self.slopes[node]
-            known[operand.item()] = g.add(known.get(operand.item(), g.zero), slope.item())
+            slopes.append(slope.item())
+        node = g.opaque([operand.item() for operand in operands], slopes)
+        self.written[node] = written.item()
         return [np.array(node, np.int64)]
 
-    def _rows(self, outputs: list[int], inputs: list[int]) -> list[list[int]]:
-        """The derivatives of each output by each input: backward from a single number, else forward."""
-        return [self._gradient(outputs[0], inputs)] if len(outputs) == 1 else self._forward(outputs, inputs)
-
-    def _gradient(self, output: int, inputs: list[int]) -> list[int]:
-        """The derivatives of a node, backward over the graph."""
-        g, flow = self.graph, {output: self.graph.one}
-        for node in reversed(self._needed([output])):
-            if node not in flow:
-                continue
-            for a, slope in self._slopes(node):
-                if (term := g.mul(slope, flow[node])) != g.zero:
-                    flow[a] = g.add(flow[a], term) if a in flow else term
-        return [flow.get(node, g.zero) for node in inputs]
-
-    def _forward(self, outputs: list[int], inputs: list[int]) -> list[list[int]]:
-        """The derivatives of nodes, forward over the graph."""
-        g, zero = self.graph, self.graph.zero
-        rows = {node: {j: g.one} for j, node in enumerate(inputs)}
-        for node in self._needed(outputs):
-            if node in rows:
-                continue
-            if g.op[node] == "select":
-                which, yes, no = g.args[node]
-                entries = {*rows[yes], *rows[no]}
-                rows[node] = {j: g.select(which, rows[yes].get(j, zero), rows[no].get(j, zero)) for j in sorted(entries)}
-                continue
-            rows[node] = {}
-            for a, slope in self._slopes(node):
-                for j, inner in rows[a].items():
-                    term = g.mul(slope, inner)
-                    rows[node][j] = g.add(rows[node][j], term) if j in rows[node] else term
-        return [[rows[node].get(j, zero) for j in range(len(inputs))] for node in outputs]
-
-    def _slopes(self, node: int) -> list[tuple[int, int]]:
-        """(operand, derivative by it) of a node, where there is one."""
-        if node in self.slopes:
-            return list(self.slopes[node].items())
-        args = self.graph.args[node]
-        pairs = zip(args, partials(self.graph, node), strict=True) if args else ()
-        return [(a, slope) for a, slope in pairs if slope is not None]
-
-    def _needed(self, outputs: list[int], written: bool = False) -> list[int]:
-        """Every node that the outputs are made of, operands first."""
-        g, seen, stack = self.graph, set(), list(outputs)
+    def made_in(self, target: Graph, outputs: list[int], known: dict[int, int]) -> list[int]:
+        """The nodes of `outputs` made again in another graph, inputs replaced as `known` says."""
+        source, there, seen, stack = self.graph, dict(known), set(known), list(outputs)
         while stack:
             node = stack.pop()
             if node not in seen:
                 seen.add(node)
-                if node not in self.slopes:
-                    stack.extend(g.args[node])
-                else:
-                    stack.extend([self.written[node]] if written else self.slopes[node])
-        return sorted(seen)
-
-    def made_in(self, target: Graph, outputs: list[int], known: dict[int, int]) -> list[int]:
-        """The nodes of `outputs` made again in another graph, inputs replaced as `known` says."""
-        source, there = self.graph, dict(known)
-        for node in self._needed(outputs, written=True):
-            if node in there:
-                continue
+                stack.extend([self.written[node]] if node in self.written else source.args[node])
+        for node in sorted(seen - set(known)):  # operands first
             if node in self.written:
                 there[node] = there[self.written[node]]
             elif source.is_constant(node):

@@ -136,9 +136,14 @@ class Lanes:
     def _blocked(self, table: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(table[self.source].reshape(self.blocks, self.width, -1).swapaxes(1, 2))
 
+    def columns(self, first: int, count: int) -> np.ndarray:
+        """Consecutive quantities of every trajectory, (B, count)."""
+        chosen = self.records[:, first : first + count].swapaxes(1, 2)
+        return chosen.reshape(-1, count)[: self.lanes].copy()
+
     def column(self, index: int) -> np.ndarray:
         """One quantity of every trajectory."""
-        return self.records[:, index].reshape(-1)[: self.lanes].copy()
+        return self.columns(index % self.plan.record, 1)[:, 0]
 
     @property
     def completed(self) -> np.ndarray:
@@ -150,13 +155,11 @@ class Lanes:
 
     @property
     def state(self) -> np.ndarray:
-        return np.stack([self.column(i) for i in range(self.plan.state_size)], axis=1)
+        return self.columns(0, self.plan.state_size)
 
     @property
     def unknowns(self) -> np.ndarray:
-        s = self.plan.state_size
-        columns = [self.column(s + i) for i in range(self._first_unknowns)]
-        return np.stack(columns, axis=1) if columns else np.zeros((self.lanes, 0))
+        return self.columns(self.plan.state_size, self._first_unknowns)
 
     def arrays(self, rows: int) -> dict[str, np.ndarray]:
         """Room for the saved arrays of so many rows."""

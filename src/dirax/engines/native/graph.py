@@ -29,6 +29,7 @@ class Graph:
         self.args: list[tuple[int, ...]] = []
         self.value: dict[int, float | bool | str] = {}
         self.limit = limit
+        self.slopes: dict[int, list[int | None]] = {}
         self._known: dict[tuple, int] = {}
         self.zero, self.one = self.constant(0.0), self.constant(1.0)
         self.false, self.true = self.constant(False), self.constant(True)
@@ -48,6 +49,12 @@ class Graph:
     def input(self, name: str) -> int:
         """The node of a named scalar that is known at run time."""
         return self._intern("input", (), name, ("input", name))
+
+    def opaque(self, operands: list[int], slopes: list[int | None]) -> int:
+        """The node of a function of these operands of which only its derivatives by them, `slopes`, are known here."""
+        node = self._intern("opaque", tuple(operands), None, ("opaque", len(self.slopes)))
+        self.slopes[node] = slopes
+        return node
 
     def is_constant(self, node: int) -> bool:
         return self.op[node] in ("const", "bool")

@@ -113,6 +113,8 @@ def partials(g: "Graph", node: int) -> list[int | None]:
             positive = g.make("lt", g.zero, x)
             by_y = g.select(positive, g.mul(node, g.make("log", g.select(positive, x, g.one))), g.zero)
             return [by_x, None if g.is_constant(y) else by_y]
+        case "opaque":
+            return list(g.slopes[node])
         case "atan2":
             r = g.recip(g.add(g.mul(x, x), g.mul(args[1], args[1])))
             return [g.mul(args[1], r), g.neg(g.mul(x, r))]
