@@ -139,7 +139,7 @@ class Lanes:
     def columns(self, first: int, count: int) -> np.ndarray:
         """Consecutive quantities of every trajectory, (B, count)."""
         chosen = self.records[:, first : first + count].swapaxes(1, 2)
-        return chosen.reshape(-1, count)[: self.lanes].copy()
+        return chosen.reshape(self.blocks * self.width, count)[: self.lanes].copy()
 
     def column(self, index: int) -> np.ndarray:
         """One quantity of every trajectory."""
