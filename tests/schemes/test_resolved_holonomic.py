@@ -160,6 +160,7 @@ def test_engines_and_batches_agree():
     np.testing.assert_array_equal(alone.p, native.p[0])
 
 
+@pytest.mark.soak
 def test_a_gradient_against_finite_differences():
     def end(scale):
         sol = dx.simulate(FLAT, METHOD_2, q=FLAT_START["q"], v=scale * FLAT_START["v"], step=0.1, steps=10)

@@ -110,6 +110,7 @@ def test_method_1_is_that_of_the_lagrangian():
     assert report.ok and report["constraint"].verdict == "ok", report
 
 
+@pytest.mark.soak
 def test_the_explicit_equations_of_the_benchmarks_are_those_of_the_constrained_system():
     ode = explicit_ode(PENDULUM, {"x": jnp.asarray(START)}, None)
     np.testing.assert_allclose(ode.derivative(0.0, jnp.asarray(START)), PENDULUM.constrained_field(START)[0], atol=1e-13)

@@ -53,6 +53,7 @@ def test_a_driven_pendulum_has_the_time_as_its_last_coordinate():
     assert np.log2(np.array(errors)[:-1] / np.array(errors)[1:]) == pytest.approx(2.0, abs=0.15)
 
 
+@pytest.mark.soak
 def test_constraints_that_move():
     """The pivot at x = .3 cos 2t: g, then G q̇ + ∂g/∂t; projections leave t alone; λ is that of Method 2."""
     pivot = lambda t: 0.3 * jnp.cos(2 * t)
