@@ -74,7 +74,7 @@ RUNS = {
 }
 
 
-QUICK = ("batch of parameters", "time and inputs")
+QUICK = ("batch of parameters",)
 
 
 @pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.soak) for name in RUNS])

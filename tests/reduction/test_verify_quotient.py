@@ -55,6 +55,7 @@ def test_damage_is_seen():
     assert dx.verify(sol)[STRUCTURE[0]].verdict == "VIOLATED"
 
 
+@pytest.mark.soak
 def test_constraints_and_forces():
     """Where they move μ, that is no fault; where they do not, it is judged."""
     settings: dict[str, Any] = {"params": DISK.params, "step": 1e-3, "steps": 40, "engine": "native", **DISK.initial}
