@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import dirax as dx
 from dirax.engines import xla
@@ -38,6 +39,7 @@ def test_steps_written_in_scalars_are_the_steps(monkeypatch):
             np.testing.assert_allclose(scalar.fields[name], values, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.soak
 def test_derivatives_through_scalars(monkeypatch):
     end = lambda g: jnp.sum(jnp.cos(run(dx.PlusLagrangeDirac(), params={"g": g}, steps=10).p[-1]))
     plain = jax.jit(jax.grad(end))(9.81)

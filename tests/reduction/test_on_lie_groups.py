@@ -120,6 +120,7 @@ def test_left_invariance_is_found_and_its_momentum_is_the_spatial_one():
         dx.check_invariance(on_the_group(0.0), left, q=q[:3], v=v[:3])
 
 
+@pytest.mark.soak
 def test_verify_measures_the_poisson_structure_and_spatial_momenta():
     body = run(BODY, x=BODY.state(OMEGA), steps=20)
     poisson = next(line for line in dx.verify(body).lines if line.quantity == "symplecticity of one step")

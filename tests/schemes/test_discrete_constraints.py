@@ -35,6 +35,7 @@ def test_method_2_of_two_vortices_stays_on_the_graph():
     assert "the nodes stay on it" in chain.comparison
 
 
+@pytest.mark.soak
 def test_a_secondary_constraint_of_the_difference_equations():
     """L = (q̇_0 − q_1)²/2, midpoint: with w = Δq_0/h − q̄_1, p = (w, hw/2) and p' = (w, −hw/2). So p_1 = h p_0/2 on M_d,0,
     p'_1 = h p'_0/2 gives w = 0 on M_d,1, and q̄_1 stays free: M_d,f is M_f = {p = 0} although M_d,0 is not M_0 = {p_1 = 0}."""

@@ -259,6 +259,7 @@ def test_a_redundant_constraint_is_left_out_and_reported():
     assert np.max(np.abs(sol.constraint_residual())) < 5e-14
 
 
+@pytest.mark.soak
 def test_verify_finds_the_discrete_dirac_structure_of_mechanics_and_its_hidden_constraint():
     for scheme in (dx.LagrangeDAlembert(), METHOD_2):
         report = dx.verify(dx.simulate(FLAT, scheme, **FLAT_START, step=0.02, steps=100))

@@ -158,6 +158,7 @@ def test_a_gradient_against_finite_differences():
     assert slope == pytest.approx((float(end(0.7 + 1e-5)) - float(end(0.7 - 1e-5))) / 2e-5, rel=1e-7)
 
 
+@pytest.mark.soak
 def test_the_chain_finds_the_same_final_manifold_field_and_multipliers():
     chain = dx.constraint_algorithm(FLAT, near=FLAT_START)
     assert [level.dimension for level in chain.levels] == [3, 2, 2] and chain.verdict == "determined"

@@ -41,6 +41,7 @@ def test_energy_of_a_relativistic_particle():
     )
 
 
+@pytest.mark.soak
 def test_derivatives_of_the_inverse_legendre_transform():
     q, p, m = jnp.zeros(2), jnp.array([0.7, -0.4]), 1.5
     exact = lambda p, m: p / jnp.sqrt(m**2 + p @ p)
