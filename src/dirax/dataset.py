@@ -6,7 +6,6 @@ from difflib import get_close_matches
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from dirax.functions import is_traced
@@ -122,9 +121,10 @@ def with_code(sol: Solution, system: Any, scheme: Any) -> Solution:
     if sol.system is None or sol.scheme is None or not sol.initial:
         return sol
     one = {name: a[0] if a.ndim == 2 else a for name, a in sol.initial.items()}
-    params = jax.tree.map(lambda leaf: leaf[0], sol.params) if sol.batch_params else sol.params
     redundant = tuple(sol.stats.get("redundant_constraints", ()))
-    sol.equation = make_step_equation(sol.scheme, sol.system, Shape(*sol.system.sizes(one, params), redundant=redundant))
+    sol.equation = make_step_equation(
+        sol.scheme, sol.system, Shape(*sol.system.sizes(one, sol.params_of_one), redundant=redundant)
+    )
     made = {name: tuple(field.shape) for name, field in sol.equation.stages[0][0].fields.items()}
     saved = {name: tuple(field.shape) for name, field in sol.field_info.items()}
     if made != saved:

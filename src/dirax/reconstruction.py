@@ -66,7 +66,7 @@ def _multipliers_at(solution: Solution, q: Any) -> Any:
     """The λ of the one-forms W(q): on the quotient they are those of W(x, 0), whose rows span the same after the translation
     but may be others, so that W(q)ᵀλ is the same force."""
     system, multipliers = solution.system, solution.fields["multipliers"]
-    m, _ = system.constraints.sizes(jnp.zeros(np.shape(q)[-1]), _of_one_run(solution))
+    m, _ = system.constraints.sizes(jnp.zeros(np.shape(q)[-1]), solution.params_of_one)
     kept = np.array([i for i in range(m) if i not in solution.stats.get("redundant_constraints", ())], int)
 
     def at(t, q, given, params):
@@ -83,10 +83,6 @@ def _multipliers_at(solution: Solution, q: Any) -> Any:
     rows = jnp.asarray(q)[..., :-1, :]
     found = jax.jit(along)(jnp.asarray(solution.t)[:-1], rows, jnp.asarray(multipliers), solution.params)
     return found if is_traced(found) else np.asarray(found)
-
-
-def _of_one_run(solution: Solution) -> Any:
-    return jax.tree.map(lambda leaf: leaf[0], solution.params) if solution.batch_params else solution.params
 
 
 def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> Solution:

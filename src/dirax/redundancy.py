@@ -60,9 +60,7 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
             f"constraint {zero[0]} (in the order of the multipliers: one_forms, then holonomic) has no direction at the "
             f"initial data{where}: its row of [W; ∂g/∂q] is zero there. Leave it out, or start elsewhere."
         )
-    if isinstance(system, DiracSystem) and "x" not in data:
-        data = {"x": jnp.concatenate([data["q"], data["p"]])}
-    q = jnp.asarray(next(data[name] for name in ("x", "q", "q0") if name in data))
+    q = jnp.asarray(system.point(data) if isinstance(system, DiracSystem) else data["q"] if "q" in data else data["q0"])
     near, positions, velocities = map(np.asarray, _nearby(system, q, params, jnp.asarray(t0, float)))
     worst = max((positions, velocities), key=lambda residual: np.max(np.abs(residual), initial=0.0))
     if np.max(np.abs(worst), initial=0.0) > CONSISTENT * (1 + np.max(np.abs(q))):

@@ -79,6 +79,11 @@ class Solution:
         return values.shape[0] if np.ndim(values) == len(self.field_info[name].shape) + 2 else None
 
     @property
+    def params_of_one(self) -> Any:
+        """The params of a run, of the first trajectory where they have a batch axis."""
+        return jax.tree.map(lambda leaf: leaf[0], self.params) if self.batch_params else self.params
+
+    @property
     def rows(self) -> int:
         """Number of saved rows."""
         return len(self.t)

@@ -8,66 +8,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 import dirax as dx
+from curved_pendulum import along, exact, metric, place, slopes, sphere
 
 METHOD_2 = dx.DiscreteDirac(constraints="resolve")
 
 
-def slopes(errors) -> np.ndarray:
-    """log2 of successive ratios, for halved steps."""
-    errors = np.asarray(errors)
-    return np.log2(errors[:-1] / errors[1:])
-
-
-def along(field, start, times):
-    return solve_ivp(field, (0.0, times[-1]), start, method="DOP853", rtol=1e-13, atol=1e-13, t_eval=times).y
-
-
-# ------------------------------------------------------------------------- a spherical pendulum in curved coordinates
-
-
-def place(y):
-    """Cartesian coordinates of the curved ones y (3,)."""
-    return jnp.stack([y[0], y[1] + 0.2 * y[0] ** 2, y[2] + 0.3 * jnp.sin(y[1])])
-
-
-def unplace(x):
-    """The curved coordinates of points x (…, 3)."""
-    y1 = x[..., 1] - 0.2 * x[..., 0] ** 2
-    return np.stack([x[..., 0], y1, x[..., 2] - 0.3 * np.sin(y1)], -1)
-
-
-def metric(y):
-    jacobian = jax.jacfwd(place)(y)
-    return jacobian.T @ jacobian
-
-
 height = lambda y: place(y)[2]
-sphere = lambda y: jnp.stack([place(y) @ place(y) - 1.0])
 SPHERICAL = dx.NonholonomicMechanics(metric, height, holonomic=sphere)
-ANGLES = np.array([1.1, 0.4, 0.3, 0.9])
-
-
-def swing(t, z):
-    """(θ, φ) from the downward vertical, unit length and gravity."""
-    s, c = np.sin(z[0]), np.cos(z[0])
-    return [z[2], z[3], s * c * z[3] ** 2 - s, -2 * c / s * z[2] * z[3]]
 
 
 def exact_pendulum(times, middle):
-    """(y, p, λ) with λ at the times `middle`, where 2λx is the force of the rod: λ = −(|ẋ|² − z)/2."""
-    both = np.concatenate([times, middle])
-    ordered, place_of = np.unique(both, return_inverse=True)
-    z = along(swing, ANGLES, ordered)[:, place_of]
-    s, c, u, w = np.sin(z[0]), np.cos(z[0]), np.cos(z[1]), np.sin(z[1])
-    x = np.stack([s * u, s * w, -c], -1)
-    v = np.stack([c * u * z[2] - s * w * z[3], c * w * z[2] + s * u * z[3], s * z[2]], -1)
-    y = unplace(x)
-    p = np.asarray(jax.vmap(lambda y, v: jax.jacfwd(place)(y).T @ v)(jnp.asarray(y), jnp.asarray(v)))
-    n = len(times)
-    return y[:n], p[:n], -(np.sum(v * v, -1) - x[:, 2])[n:, None] / 2
+    """(y, p, λ) with λ at the times `middle`."""
+    return (*exact(times)[:2], exact(middle)[2])
 
 
 Y0, P0, _ = (a[0] for a in exact_pendulum(np.array([0.0, 1.0]), np.array([0.5])))
@@ -107,7 +61,7 @@ def test_the_lagrangian_and_its_mechanics_are_one_system(scheme):
 
 def test_multipliers_projector_and_residual_at_a_point():
     y, p = jnp.asarray(Y0), jnp.asarray(P0)
-    _, _, tension = exact_pendulum(np.array([0.0, 1.0]), np.array([0.0]))
+    _, _, tension = exact(np.array([0.0, 1.0]))
     assert SPHERICAL.multipliers(y, p) == pytest.approx(tension[0], abs=1e-12)
     x, jacobian = place(y), jax.jacfwd(place)(y)
     off = p + jnp.array([0.1, -0.3, 0.2])

@@ -11,67 +11,34 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dirax as dx
+from curved_pendulum import exact, metric, place, slopes, sphere
 from dirax import gallery
 from dirax.diagnostics.bench.ode import explicit_ode
 
 METHOD_1, METHOD_2 = dx.DiscreteDirac(), dx.DiscreteDirac(constraints="resolve")
 
 
-def place(y):
-    """Cartesian coordinates of the curved ones y (3,)."""
-    return jnp.stack([y[0], y[1] + 0.2 * y[0] ** 2, y[2] + 0.3 * jnp.sin(y[1])])
-
-
-def unplace(x):
-    """The curved coordinates of points x (…, 3)."""
-    y1 = x[..., 1] - 0.2 * x[..., 0] ** 2
-    return np.stack([x[..., 0], y1, x[..., 2] - 0.3 * np.sin(y1)], -1)
-
-
-def metric(y):
-    jacobian = jax.jacfwd(place)(y)
-    return jacobian.T @ jacobian
-
-
 def hamiltonian(x):
     return x[3:] @ jnp.linalg.solve(metric(x[:3]), x[3:]) / 2 + place(x[:3])[2]
 
 
-sphere = lambda x: jnp.stack([place(x[:3]) @ place(x[:3]) - 1.0])
-PENDULUM = dx.DiracSystem(dx.induced_dirac(None, 3), hamiltonian, holonomic=sphere)
-ANGLES = np.array([1.1, 0.4, 0.3, 0.9])
+on_sphere = lambda x: sphere(x[:3])
+PENDULUM = dx.DiracSystem(dx.induced_dirac(None, 3), hamiltonian, holonomic=on_sphere)
 
 
-def slopes(errors) -> np.ndarray:
-    """log2 of successive ratios, for halved steps."""
-    errors = np.asarray(errors)
-    return np.log2(errors[:-1] / errors[1:])
+def exact_state(times):
+    """(x, λ) with x = (y, p) on T*R³."""
+    y, p, multipliers = exact(times)
+    return np.concatenate([y, p], 1), multipliers
 
 
-def swing(t, z):
-    """(θ, φ) from the downward vertical, unit length and gravity."""
-    s, c = np.sin(z[0]), np.cos(z[0])
-    return [z[2], z[3], s * c * z[3] ** 2 - s, -2 * c / s * z[2] * z[3]]
-
-
-def exact(times):
-    """(x, λ): x = (y, p) on T*R³, λ = −(|v|² − z)/2, so that 2λ times the Cartesian position is the force of the rod."""
-    z = solve_ivp(swing, (0.0, times[-1]), ANGLES, method="DOP853", rtol=1e-13, atol=1e-13, t_eval=times).y
-    s, c, u, w = np.sin(z[0]), np.cos(z[0]), np.cos(z[1]), np.sin(z[1])
-    x = np.stack([s * u, s * w, -c], -1)
-    v = np.stack([c * u * z[2] - s * w * z[3], c * w * z[2] + s * u * z[3], s * z[2]], -1)
-    y = unplace(x)
-    p = np.asarray(jax.vmap(lambda y, v: jax.jacfwd(place)(y).T @ v)(jnp.asarray(y), jnp.asarray(v)))
-    return np.concatenate([y, p], 1), -(np.sum(v * v, -1) - x[:, 2])[:, None] / 2
-
-
-START = exact(np.array([0.0, 1.0]))[0][0]
+START = exact_state(np.array([0.0, 1.0]))[0][0]
 
 
 def pendulum_errors(scheme, steps):
     """Errors of q, p, of λ at the middle of each step and of the mean of two neighbours at their node."""
     sol = dx.simulate(PENDULUM, scheme, x=START, step=2.0 / steps, steps=steps)
-    (x, at_nodes), (_, in_steps) = exact(sol.t), exact((sol.t[1:] + sol.t[:-1]) / 2)
+    (x, at_nodes), (_, in_steps) = exact_state(sol.t), exact_state((sol.t[1:] + sol.t[:-1]) / 2)
     means = (sol.multipliers[1:] + sol.multipliers[:-1]) / 2
     parts = ((sol.x[:, :3], x[:, :3]), (sol.x[:, 3:], x[:, 3:]), (sol.multipliers, in_steps), (means, at_nodes[1:-1]))
     return [np.max(np.abs(found - known)) for found, known in parts], sol

@@ -59,8 +59,7 @@ def _flow(sol: Solution) -> float:
     system: Any = sol.system
     if not isinstance(system, PortHamiltonian):
         return 0.0
-    x = jnp.asarray(sol.fields["x"])
-    params = jax.tree.map(lambda leaf: leaf[0], sol.params) if sol.batch_params else sol.params
+    x, params = jnp.asarray(sol.fields["x"]), sol.params_of_one
 
     def terms(x):
         dh = jnp.abs(system.differential(x, params))

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.judging import judged, of_lane, roundoff_limit, steps_of
+from dirax.diagnostics.judging import judged, of_lane, relative_changes, roundoff_limit, steps_of
 from dirax.diagnostics.one_step import over_rows
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.geometry.group_retractions import coadjoint
@@ -79,8 +79,7 @@ def _isotropy(moved: np.ndarray) -> np.ndarray:
 def _conserved(sol: Solution, name: str, values: np.ndarray, scale: np.ndarray, tolerance: float | None, more: str = "") -> Line:
     """The line of values (…, rows, c) that should not change, relative to the largest scale (…, rows)."""
     values, scale = values.reshape(-1, *values.shape[-2:]), np.nanmax(scale.reshape(-1, scale.shape[-1]), axis=1)
-    change = np.nanmax(np.abs(values - values[:, :1]), axis=(1, 2))
-    relative = np.divide(change, scale, out=np.zeros_like(change), where=scale > 0)
+    change, relative = relative_changes(values, scale)
     lane = int(np.argmax(relative))
     first = np.array2string(values[lane, 0], precision=6) if values.shape[-1] > 1 else f"{values[lane, 0, 0]:.6g}"
     text = f"{first} changed by at most {change[lane]:.2g}{more}{of_lane(sol, lane)}"

@@ -37,6 +37,12 @@ def roundoff_limit(tolerance: float | None, growth: float) -> float:
     return ROUNDINGS * EPSILON * growth if tolerance is None else float(tolerance)
 
 
+def relative_changes(values: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The largest change of values (B, rows, c) since the first row, (B,), and the same relative to a scale (B,)."""
+    change = np.nanmax(np.abs(values - values[:, :1]), axis=(1, 2))
+    return change, np.divide(change, scale, out=np.zeros_like(change), where=scale > 0)
+
+
 def worst_place(values: np.ndarray) -> tuple[int, int]:
     """(trajectory, row) of the largest value; NaN, in rows that were not reached, does not count."""
     lane, row = np.unravel_index(int(np.argmax(np.where(np.isfinite(values), values, -1.0))), values.shape)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.judging import judged, of_lane, roundoff_limit, steps_of
+from dirax.diagnostics.judging import judged, of_lane, relative_changes, roundoff_limit, steps_of
 from dirax.diagnostics.one_step import over_rows
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.reduction.reduced import ReducedLagrangeDirac
@@ -66,9 +66,7 @@ def momentum(sol: Solution, name: str, generator: Callable, tolerance: float | N
     if "p" not in sol.fields or "q" not in sol.fields:
         return Line(title, None, None, NOT_CHECKED, "the solution has no q and p")
     values = over_rows(eqx.Partial(_momentum_terms, generator), sol, (jnp.asarray(sol.q), jnp.asarray(sol.p)))
-    change = np.nanmax(np.abs(values[..., 0] - values[:, :1, 0]), axis=1)
-    scale = np.nanmax(values[..., 1], axis=1)
-    relative = np.divide(change, scale, out=np.zeros_like(change), where=scale > 0)
+    change, relative = relative_changes(values[..., :1], np.nanmax(values[..., 1], axis=1))
     lane = int(np.argmax(relative))
     text = f"⟨p, ξ⟩ = {values[lane, 0, 0]:.6g} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
     return judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)
@@ -79,22 +77,20 @@ def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
     if not isinstance(sol.system, ReducedLagrangeDirac):
         return []
     title, mu = "momentum map μ", np.asarray(sol.fields["mu"]).reshape(-1, *np.shape(sol.fields["mu"])[-2:])
-    change = np.nanmax(np.abs(mu - mu[:, :1]), axis=(1, 2))
     w = np.asarray(sol.fields["w"]).reshape(*mu.shape[:2], -1)
     scale = np.nanmax(np.abs(np.concatenate([mu, w], axis=2)), axis=(1, 2))
+    change, relative = relative_changes(mu, scale)
     lane = int(np.argmax(change))
     text = f"{np.array2string(mu[lane, 0], precision=6)} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
     if _moved(sol):
         return [Line(title, float(change[lane]), None, NOT_CHECKED, f"forces with a part along the group move it; {text}")]
-    relative = np.divide(change, scale, out=np.zeros_like(change), where=scale > 0)
     return [judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)]
 
 
 def _moved(sol: Solution) -> bool:
     """Whether something of the system has a part along the group."""
     one = {name: jnp.asarray(a)[0] if np.ndim(a) == 2 else jnp.asarray(a) for name, a in sol.initial.items()}
-    params = jax.tree.map(lambda leaf: leaf[0], sol.params) if sol.batch_params else sol.params
-    return bool(sol.system.moves_momentum(one, params))
+    return bool(sol.system.moves_momentum(one, sol.params_of_one))
 
 
 def _momentum_terms(generator: Callable, q, p, params: Any):

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.geometry.lie_groups import AbstractLieGroup, Algebra, _cross, _quarter_turn
+from dirax.geometry.lie_groups import AbstractLieGroup, Algebra, cross, quarter_turn
 from dirax.geometry.manifolds import Vector
 from dirax.tracing import gradient
 
@@ -24,11 +24,11 @@ def cayley(group: AbstractLieGroup, zeta: Algebra) -> Vector:
     velocity, omega = zeta[: group.translations], zeta[group.translations :]
     size = 1.0 + jnp.sum(omega * omega) / 4.0
     if omega.shape[0] == 1:
-        rotation, turned = jnp.concatenate([2.0 - size[None], omega]) / size, _quarter_turn
+        rotation, turned = jnp.concatenate([2.0 - size[None], omega]) / size, quarter_turn
         shift = lambda: (velocity + omega / 2.0 * turned(velocity)) / size
     else:
         rotation = jnp.concatenate([jnp.ones(1), omega / 2.0]) / jnp.sqrt(size)
-        shift = lambda: (velocity + _cross(omega, velocity) / 2.0 + omega * jnp.sum(omega * velocity) / 4.0) / size
+        shift = lambda: (velocity + cross(omega, velocity) / 2.0 + omega * jnp.sum(omega * velocity) / 4.0) / size
     return jnp.concatenate([rotation, shift()]) if group.translations else rotation
 
 
@@ -38,8 +38,8 @@ def rotate(group: AbstractLieGroup, g: Vector, vector: Float[Array, " k"]) -> Fl
     if rotation.shape[0] == 2:
         return group._product(rotation, vector)
     # unlike r v r*, this is wrong by |sin|² of the error of |r| only, which adds up over many small steps
-    twice = 2.0 * _cross(rotation[1:], vector)
-    return vector + rotation[0] * twice + _cross(rotation[1:], twice)
+    twice = 2.0 * cross(rotation[1:], vector)
+    return vector + rotation[0] * twice + cross(rotation[1:], twice)
 
 
 def coadjoint(group: AbstractLieGroup, g: Vector, momentum: Algebra) -> Algebra:
@@ -48,7 +48,7 @@ def coadjoint(group: AbstractLieGroup, g: Vector, momentum: Algebra) -> Algebra:
     back = group._join(group._conjugate(group._split(g)[0]), lambda: g[-k:])
     shift, linear, angular = g[g.shape[0] - k :], momentum[:k], momentum[k:]
     if k:
-        moment = _cross(linear, shift) if k == 3 else (linear[0:1] * shift[1:2] - linear[1:2] * shift[0:1])
+        moment = cross(linear, shift) if k == 3 else (linear[0:1] * shift[1:2] - linear[1:2] * shift[0:1])
         angular = angular + moment
     if angular.shape[0] == 3:
         angular = rotate(group, back, angular)

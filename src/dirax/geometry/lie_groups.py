@@ -237,12 +237,12 @@ class SE2(AbstractLieGroup):
         velocity, angle = xi[:2], xi[2]
         along, across = radial(1, angle**2), angle / 2.0 * radial(1, angle**2 / 4.0) ** 2
         rotation = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-        return jnp.concatenate([rotation, along * velocity + across * _quarter_turn(velocity)])
+        return jnp.concatenate([rotation, along * velocity + across * quarter_turn(velocity)])
 
     def group_log(self, g):
         angle, translation = jnp.arctan2(g[1], g[0]), g[2:]
         s = angle**2 / 4.0
-        velocity = radial(0, s) / radial(1, s) * translation - angle / 2.0 * _quarter_turn(translation)
+        velocity = radial(0, s) / radial(1, s) * translation - angle / 2.0 * quarter_turn(translation)
         return jnp.concatenate([velocity, angle[None]])
 
 
@@ -282,14 +282,14 @@ class SE3(AbstractLieGroup):
         sinc = radial(1, s)
         # (1 − cos θ)/θ² and (θ − sin θ)/θ³ by half angles, without the cancellation.
         second, third = sinc**2 / 2.0, (sinc**2 - radial(0, s) * radial(2, s)) / 4.0
-        once = _cross(omega, velocity)
-        return jnp.concatenate([_quaternion_exp(omega), velocity + second * once + third * _cross(omega, once)])
+        once = cross(omega, velocity)
+        return jnp.concatenate([_quaternion_exp(omega), velocity + second * once + third * cross(omega, once)])
 
     def group_log(self, g):
         omega, translation = _quaternion_log(g[:4]), g[4:]
         s = jnp.dot(omega, omega) / 4.0
-        once = _cross(omega, translation)
-        velocity = translation - once / 2.0 + radial(2, s) / (4.0 * radial(1, s)) * _cross(omega, once)
+        once = cross(omega, translation)
+        velocity = translation - once / 2.0 + radial(2, s) / (4.0 * radial(1, s)) * cross(omega, once)
         return jnp.concatenate([velocity, omega])
 
 
@@ -305,9 +305,9 @@ def _quaternion_log(q: Float[Array, " 4"]) -> Float[Array, " 3"]:
     return 2.0 * arc_over_sine(0, sine_squared / (2.0 * (1.0 + cosine)), (1.0 + cosine) / 2.0) * q[1:]
 
 
-def _quarter_turn(v: Float[Array, " 2"]) -> Float[Array, " 2"]:
+def quarter_turn(v: Float[Array, " 2"]) -> Float[Array, " 2"]:
     return jnp.stack([-v[1], v[0]])
 
 
-def _cross(a: Float[Array, " 3"], b: Float[Array, " 3"]) -> Float[Array, " 3"]:
+def cross(a: Float[Array, " 3"], b: Float[Array, " 3"]) -> Float[Array, " 3"]:
     return jnp.sum(_LEVI_CIVITA * (a[None, :, None] * b[None, None, :]), axis=(1, 2))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.geometry.group_retractions import coadjoint, rotate
-from dirax.geometry.lie_groups import AbstractLieGroup, Algebra, _cross, _quarter_turn
+from dirax.geometry.lie_groups import AbstractLieGroup, Algebra, cross, quarter_turn
 from dirax.geometry.manifolds import Vector
 
 Advected = Float[Array, " r"]
@@ -97,11 +97,11 @@ class SemidirectProduct(eqx.Module):
     def _turned(self, xi: Algebra, vector: Float[Array, " k"]) -> Float[Array, " k"]:
         """ω × v with the angular velocity ω of ξ."""
         omega = xi[self.group.translations :]
-        return omega * _quarter_turn(vector) if self.vector_size == 2 else _cross(omega, vector)
+        return omega * quarter_turn(vector) if self.vector_size == 2 else cross(omega, vector)
 
     def _moment(self, vector: Float[Array, " k"], force: Float[Array, " k"]) -> Float[Array, " d"]:
         """v × f, with ⟨v × f, ω⟩ = ⟨f, ω × v⟩."""
-        return jnp.sum(force * _quarter_turn(vector))[None] if self.vector_size == 2 else _cross(vector, force)
+        return jnp.sum(force * quarter_turn(vector))[None] if self.vector_size == 2 else cross(vector, force)
 
     def ad_star(self, xi: Algebra, momentum: Algebra) -> Algebra:
         """ad*_ξ μ, the derivative of Ad*_{exp(εξ)} μ at ε = 0."""

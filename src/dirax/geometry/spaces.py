@@ -10,14 +10,8 @@ from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import TINY, arc_over_sine, norm, radial
 
 
-class Euclidean(AbstractGeodesicManifold):
-    """The vector space R^n."""
-
-    dimension: int = eqx.field(static=True)
-    ambient_dimension: int = eqx.field(static=True)
-
-    def __init__(self, dimension: int):
-        self.dimension = self.ambient_dimension = dimension
+class AbstractFlat(AbstractGeodesicManifold):
+    """R^n, or R^n modulo a lattice: geodesics are the straight lines x + tv, and every vector is tangent everywhere."""
 
     def defect(self, x):
         return jnp.zeros(())
@@ -27,9 +21,6 @@ class Euclidean(AbstractGeodesicManifold):
 
     def projection(self, x, v):
         return v
-
-    def representative(self, x, near):
-        return x
 
     def local_parametrization(self, x):
         return lambda r: x + r
@@ -42,65 +33,6 @@ class Euclidean(AbstractGeodesicManifold):
 
     def exp(self, x, v):
         return x + v
-
-    def log(self, x, y):
-        return y - x
-
-    def distance(self, x, y):
-        return norm(y - x)
-
-    def transport(self, x, v, y):
-        return v
-
-    def retraction(self, x, v):
-        return x + v
-
-    def inverse_retraction(self, x, y):
-        return y - x
-
-    def exp_reach(self, x, v):
-        return jnp.zeros(())
-
-    def retraction_reach(self, x, v):
-        return jnp.zeros(())
-
-
-class Torus(AbstractGeodesicManifold):
-    """The torus T^n, a point being n angles in radians, any real numbers, equal modulo 2π; `log` is in [−π, π]."""
-
-    dimension: int = eqx.field(static=True)
-    ambient_dimension: int = eqx.field(static=True)
-
-    def __init__(self, dimension: int):
-        self.dimension = self.ambient_dimension = dimension
-
-    def defect(self, x):
-        return jnp.zeros(())
-
-    def nearest(self, x):
-        return x
-
-    def projection(self, x, v):
-        return v
-
-    def representative(self, x, near):
-        return near + self.log(near, x)
-
-    def local_parametrization(self, x):
-        return lambda r: x + r
-
-    def frame(self, x):
-        return jnp.eye(self.dimension)
-
-    def coordinates(self, x, v):
-        return v
-
-    def exp(self, x, v):
-        return x + v
-
-    def log(self, x, y):
-        turns = jnp.round((y - x) / (2.0 * jnp.pi))
-        return (y - x) - 2.0 * jnp.pi * turns
 
     def distance(self, x, y):
         return norm(self.log(x, y))
@@ -114,10 +46,46 @@ class Torus(AbstractGeodesicManifold):
     def inverse_retraction(self, x, y):
         return self.log(x, y)
 
-    def exp_reach(self, x, v):
-        return jnp.max(jnp.abs(v)) / jnp.pi
-
     def retraction_reach(self, x, v):
+        return self.exp_reach(x, v)
+
+
+class Euclidean(AbstractFlat):
+    """The vector space R^n."""
+
+    dimension: int = eqx.field(static=True)
+    ambient_dimension: int = eqx.field(static=True)
+
+    def __init__(self, dimension: int):
+        self.dimension = self.ambient_dimension = dimension
+
+    def representative(self, x, near):
+        return x
+
+    def log(self, x, y):
+        return y - x
+
+    def exp_reach(self, x, v):
+        return jnp.zeros(())
+
+
+class Torus(AbstractFlat):
+    """The torus T^n, a point being n angles in radians, any real numbers, equal modulo 2π; `log` is in [−π, π]."""
+
+    dimension: int = eqx.field(static=True)
+    ambient_dimension: int = eqx.field(static=True)
+
+    def __init__(self, dimension: int):
+        self.dimension = self.ambient_dimension = dimension
+
+    def representative(self, x, near):
+        return near + self.log(near, x)
+
+    def log(self, x, y):
+        turns = jnp.round((y - x) / (2.0 * jnp.pi))
+        return (y - x) - 2.0 * jnp.pi * turns
+
+    def exp_reach(self, x, v):
         return jnp.max(jnp.abs(v)) / jnp.pi
 
 

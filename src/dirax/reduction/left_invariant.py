@@ -9,7 +9,7 @@ import numpy as np
 from dirax.functions import UserFunction, evaluated
 from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.reduction.euler_poincare import EulerPoincare
-from dirax.reduction.symmetry import TOLERANCE
+from dirax.reduction.symmetry import TOLERANCE, off_span
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 
@@ -75,8 +75,7 @@ def _refuse_asymmetry(system: Any, group: AbstractLieGroup, params: Any) -> None
         defects = [jnp.abs(there - here)[None] / jnp.maximum(1.0, jnp.maximum(jnp.abs(here), jnp.abs(there)))]
         if one_forms is not None:
             fixed, moved = (_on_the_algebra(one_forms, group, h, params) for h in (identity, g))
-            missed = moved - moved @ jnp.linalg.pinv(fixed) @ fixed
-            defects.append(jnp.max(jnp.abs(missed))[None] / jnp.maximum(1.0, jnp.max(jnp.abs(moved))))
+            defects.append(jnp.max(jnp.abs(off_span(moved, fixed)))[None] / jnp.maximum(1.0, jnp.max(jnp.abs(moved))))
         if holonomic is not None:
             defects.append(jnp.max(jnp.abs(holonomic(g, params)))[None])
         return jnp.concatenate([there[None] - here[None], *defects]), g

@@ -61,8 +61,8 @@ class ReducedLagrangeDirac(AbstractSystem):
         concrete; empty where nothing does."""
         if self.conserves_momentum:
             return ""
-        _, q, v = sampled(data)
-        parts, sizes = (np.asarray(a) for a in evaluated(self._parts_along, *sampled(data), params))
+        t, q, v = sampled(data)
+        parts, sizes = (np.asarray(a) for a in evaluated(self._parts_along, t, q, v, params))
         largest = np.max(np.where(np.isfinite(sizes), sizes, 0.0), axis=0)
         defects = np.abs(parts) / np.where(largest > 0, largest, 1.0)[:, None]
         where, row, column = np.unravel_index(int(np.argmax(np.where(np.isfinite(defects), defects, 0.0))), defects.shape)

@@ -45,7 +45,7 @@ def of_constrained_hamiltonian(system: DiracSystem, shape: Shape) -> FinalManifo
         return jnp.concatenate([system.constraints.position_defect(0.0, x, params), system.hidden_defect(x, params)])
 
     def check(data, h, params):
-        x = np.asarray(data["x"] if "x" in data else np.concatenate([data["q"], data["p"]]))
+        x = np.asarray(system.point(data))
         brackets, rows = (np.asarray(evaluated(f, x, params)) for f in (system.brackets, system.holonomic_matrix))
         if np.max(np.abs(brackets)) > TINY_BRACKET * np.sum(rows**2):
             raise ValueError(

@@ -139,11 +139,17 @@ class DiracSystem(AbstractSystem):
 
     # ------------------------------------------------------------------ AbstractSystem
 
+    def point(self, data: dict[str, Array]) -> Float[Array, " N"]:
+        """x of initial data; raises `ValueError` for others than x, or q and p."""
+        if "x" in data:
+            return data["x"]
+        if "p" not in data:
+            raise ValueError(f"a DiracSystem starts from x= (or q=, p= with x = (q, p)), but {', '.join(data)} were given.")
+        return jnp.concatenate([data["q"], data["p"]])
+
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
         """(N, 0), or (N, 0, c) with holonomic constraints."""
-        x = data["x"] if "x" in data else jnp.concatenate([data["q"], data["p"]]) if "p" in data else None
-        if x is None:
-            raise ValueError(f"a DiracSystem starts from x= (or q=, p= with x = (q, p)), but {', '.join(data)} were given.")
+        x = self.point(data)
         out = self.hamiltonian.shape(x, params)
         if out.shape != ():
             raise ValueError(f"hamiltonian must return a scalar, but for x of shape {x.shape} it returned shape {out.shape}.")
@@ -157,7 +163,7 @@ class DiracSystem(AbstractSystem):
 
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
         """x, ẋ and λ; `project` moves x to M_f where D is a graph."""
-        x = data["x"] if "x" in data else jnp.concatenate([data["q"], data["p"]])
+        x = self.point(data)
         if project and self.holonomic is not None and self.is_graph:
             x = self.project(x, params)
         matrix, right = self.equations(x, params)

@@ -1,5 +1,6 @@
 """The rule of a derivative that tracing left to the graph."""
 
+import functools
 import math
 from collections import OrderedDict
 from typing import Any
@@ -27,17 +28,10 @@ def derivative(interpreter: Interpreter, equation: Any, *operands: Nodes):
     return [part.reshape(result.shape) for part, result in zip(parts, own.results, strict=True)]
 
 
-_derived: OrderedDict[tuple, tuple[Any, "Derived"]] = OrderedDict()
-
-
+@functools.lru_cache(KEPT)
 def derived(jaxpr: Any, wanted: tuple[int, ...], limit: int) -> "Derived":
     """The derivatives of a jaxpr on a graph of their own, the same object for the same jaxpr. Raises `Unsupported`."""
-    key = id(jaxpr), wanted
-    if key not in _derived:
-        _derived[key] = jaxpr, Derived(jaxpr, wanted, limit)  # the jaxpr is kept alive, so that its id stays its own
-        if len(_derived) > KEPT:
-            _derived.popitem(last=False)
-    return _derived[key][1]
+    return Derived(jaxpr, wanted, limit)
 
 
 _pushed: OrderedDict[tuple, tuple[Any, ClosedJaxpr]] = OrderedDict()

@@ -18,6 +18,7 @@ from jax.core import Tracer
 from dirax.engines.native.graph import Graph, GraphTooLarge
 from dirax.engines.native.interpret import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
 from dirax.engines.native.program import program
+from dirax.engines.native.reductions import factors_of_product
 from dirax.engines.native.trace import NODE_LIMIT
 from dirax.tracing import in_scalars
 
@@ -114,15 +115,11 @@ def interpreted(jaxpr: Any) -> HostFunction:
 
 def _dot_general(made: HostFunction, interpreter: Interpreter, equation: Any, a: Nodes, b: Nodes) -> list[Nodes]:
     """Large products stay products of arrays; summed in one order, so that an entry's bits do not depend on the others."""
-    (ac, bc), (ab, bb) = equation.params["dimension_numbers"]
-    shape, length = equation.outvars[0].aval.shape, math.prod(a.shape[axis] for axis in ac)
+    shape, (rows, columns) = equation.outvars[0].aval.shape, factors_of_product(equation, a, b)
+    length = rows.shape[-1]
     if math.prod(shape) * length < LARGE_PRODUCT or equation.outvars[0].aval.dtype != np.float64:
         return list(RULES["dot_general"](interpreter, equation, a, b))
-    free_a = [axis for axis in range(a.ndim) if axis not in (*ac, *ab)]
-    free_b = [axis for axis in range(b.ndim) if axis not in (*bc, *bb)]
-    batch, rows = math.prod(a.shape[axis] for axis in ab), math.prod(a.shape[axis] for axis in free_a)
-    left = np.transpose(a, (*ac, *ab, *free_a)).reshape(length, batch, rows, 1)
-    right = np.transpose(b, (*bc, *bb, *free_b)).reshape(length, batch, 1, -1)
+    left, right = np.moveaxis(rows, -1, 0)[..., None], np.moveaxis(columns, -1, 0)[:, :, None]
 
     def product(arrays: list[np.ndarray]) -> list[np.ndarray]:
         x, y = arrays

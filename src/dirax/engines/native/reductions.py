@@ -1,5 +1,6 @@
 """Rules of reductions, products of arrays and cumulative sums."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -75,14 +76,7 @@ def position_of_extreme(interpreter: Interpreter, equation: Any, x):
 @rule("dot_general")
 def dot_general(interpreter: Interpreter, equation: Any, a, b):
     g = interpreter.graph
-    (ca, cb), (ba, bb) = equation.params["dimension_numbers"]
-    free_a = [i for i in range(a.ndim) if i not in (*ca, *ba)]
-    free_b = [i for i in range(b.ndim) if i not in (*cb, *bb)]
-    batch = tuple(a.shape[i] for i in ba)
-    size = lambda array, axes: int(np.prod([array.shape[i] for i in axes]))
-    count, length = int(np.prod(batch)), size(a, ca)
-    rows = np.transpose(a, (*ba, *free_a, *ca)).reshape(count, size(a, free_a), length)
-    columns = np.transpose(b, (*bb, *free_b, *cb)).reshape(count, size(b, free_b), length)
+    rows, columns = factors_of_product(equation, a, b)
     out = [
         fold(interpreter, "add", [g.mul(x, y) for x, y in zip(row, column, strict=True)])
         for one, other in zip(rows.tolist(), columns.tolist(), strict=True)
@@ -90,3 +84,15 @@ def dot_general(interpreter: Interpreter, equation: Any, a, b):
         for column in other
     ]
     return [np.array(out, dtype=np.int64).reshape(equation.outvars[0].aval.shape)]
+
+
+def factors_of_product(equation: Any, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The operands of a `dot_general` as rows (batch, i, length) and columns (batch, j, length), to be summed over the last."""
+    (ca, cb), (ba, bb) = equation.params["dimension_numbers"]
+
+    def arranged(array: np.ndarray, contracted, batched) -> np.ndarray:
+        free = [i for i in range(array.ndim) if i not in (*contracted, *batched)]
+        sizes = (math.prod(array.shape[i] for i in axes) for axes in (batched, free, contracted))
+        return np.transpose(array, (*batched, *free, *contracted)).reshape(*sizes)
+
+    return arranged(a, ca, ba), arranged(b, cb, bb)
