@@ -6,13 +6,15 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.interpreters import ad
 from jaxtyping import Array, Float
 
-from dirax.tracing import call, jacobian
+from dirax.deferred import deferred
+from dirax.linear_solves import scaled_pseudo_inverse
+from dirax.tracing import becomes_scalars, closed_over, jacobian
 
 EPSILON = 2.220446049250313e-16
-RANK_TOLERANCE = 1e-12
-"""Singular values below this, relative to the largest of the equilibrated matrix, count as zero."""
 SHORTEST = 2.0**-30
 """Smallest fraction of a Newton step that is tried."""
 
@@ -24,6 +26,11 @@ def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int =
     matter and the domain of `residual` is not left. Where there is no root, the last point that was an improvement comes
     back, so check the residual if that can happen. Differentiable any number of times, by the implicit function theorem.
     """
+    guess = jnp.asarray(guess)
+    if becomes_scalars(guess):
+        closed, captured, result = closed_over(residual, [guess])
+        if all(jnp.result_type(x) == jnp.float64 for x in (result, *captured)):
+            return root_p.bind(*captured, guess, residual=closed, max_steps=max_steps)[0]
     residual, captured = jax.closure_convert(residual, guess)
     return _root(jax.jit(residual), max_steps, guess, *captured)
 
@@ -60,25 +67,32 @@ def _root(residual: Callable, max_steps: int, guess, *captured):
 
 @_root.defjvp
 def _root_jvp(residual, max_steps, primals, tangents):
-    """By the implicit function theorem; the guess has no influence."""
-    guess, *captured = primals
-    u = _root(residual, max_steps, guess, *captured)
-    along = jax.jvp(lambda *values: residual(u, *values), tuple(captured), tuple(tangents[1:]))[1] if captured else 0.0 * u
-    inverse, _ = scaled_pseudo_inverse(jax.jacfwd(residual)(u, *captured))
-    return u, -(inverse @ along)
+    u = _root(residual, max_steps, *primals)
+    return u, _tangent(residual, u, primals[1:], tangents[1:])
 
 
-def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> tuple[Float[Array, "l k"], Float[Array, " l"]]:
-    """The pseudo-inverse of a matrix with rows and columns scaled to unit size, and the units that this gives the columns."""
-    return call(_scaled_pseudo_inverse, matrix)
+def _tangent(residual: Callable, u, captured, tangents):
+    """The root's derivative by the implicit function theorem; the guess has no influence."""
+    along = jax.jvp(lambda *values: residual(u, *values), tuple(captured), tuple(tangents))[1] if captured else 0.0 * u
+    inverse, _ = scaled_pseudo_inverse(jacobian(residual)(u, *captured))
+    return -(inverse @ along)
 
 
-def _scaled_pseudo_inverse(matrix):
-    rows, columns = jnp.ones((matrix.shape[0], 1)), jnp.ones((1, matrix.shape[1]))
-    fitting = lambda sizes: jnp.sqrt(jnp.where(sizes > 0.0, sizes, 1.0))
-    for _ in range(3):
-        left = jnp.abs(lax.stop_gradient(matrix)) / rows / columns  # units have no derivative, which would be ∞ at zero
-        rows = rows * fitting(jnp.max(left, axis=1, keepdims=True))
-        columns = columns * fitting(jnp.max(left, axis=0, keepdims=True))
-    inverse = jnp.linalg.pinv(matrix / rows / columns, rtol=RANK_TOLERANCE)
-    return inverse / columns.T / rows.T, 1.0 / columns[0]
+def _unknowns_first(residual: ClosedJaxpr) -> Callable:
+    return lambda u, *captured: jaxpr_as_fun(residual)(*captured, u)[0]
+
+
+def _by_jax(*operands, residual: ClosedJaxpr, max_steps: int):
+    *captured, guess = operands
+    return [_root(_unknowns_first(residual), max_steps, guess, *captured)]
+
+
+def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, max_steps: int):
+    u = root_p.bind(*primals, residual=residual, max_steps=max_steps)[0]
+    along = map(ad.instantiate_zeros, tangents[:-1])
+    return [u], [_tangent(_unknowns_first(residual), u, primals[:-1], tuple(along))]
+
+
+root_p = deferred("dirax_root", _by_jax, lambda *operands, **_: [operands[-1]])
+"""The root of a jaxpr of (*captured, unknowns) from the last operand on, the others being what it captured."""
+ad.primitive_jvps[root_p] = _root_p_tangents

@@ -11,10 +11,12 @@ from contextvars import ContextVar
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray, Tracer
-from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun, jaxprs_in_params
-from jax.interpreters import ad, batching, mlir
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, jaxprs_in_params
+
+from dirax.deferred import deferred
 
 _traced: ContextVar[dict | None] = ContextVar("functions of the user that were traced", default=None)
 _in_scalars: ContextVar[bool] = ContextVar("whether what is traced becomes a scalar graph", default=False)
@@ -66,6 +68,11 @@ def in_scalars() -> Iterator[None]:
             _in_scalars.reset(token)
 
 
+def becomes_scalars(*values: Any) -> bool:
+    """Whether what is traced becomes a scalar graph, and the values are arrays of floats."""
+    return _in_scalars.get() and all(jnp.result_type(x) == jnp.float64 for x in values)
+
+
 def call(function: Callable, *values: Any) -> Any:
     """`function(*values)`, which within `once` is traced once for values of one kind."""
     known = _traced.get()
@@ -105,7 +112,7 @@ def _derivative(function: Callable, argnums: int | tuple[int, ...], by_jax: Call
             places.append(at)
             at += len(jax.tree.leaves(value))
         flat = lambda *leaves: function(*jax.tree.unflatten(structure, leaves))
-        jaxpr, captured, result = _closed(flat, leaves)
+        jaxpr, captured, result = closed_over(flat, leaves)
         operands = [x if isinstance(x, Tracer) else np.asarray(x) for x in (*captured, *leaves)]
         one = isinstance(result, jax.ShapeDtypeStruct) and not (by_jax is jax.grad and result.shape)
         floats = one and all(x.dtype == np.float64 for x in (result, *operands))
@@ -118,7 +125,7 @@ def _derivative(function: Callable, argnums: int | tuple[int, ...], by_jax: Call
     return derivative
 
 
-def _closed(function: Callable, values: list) -> tuple[ClosedJaxpr, list, Any]:
+def closed_over(function: Callable, values: list) -> tuple[ClosedJaxpr, list, Any]:
     """The jaxpr of a function, with the traced values that it captures as its first arguments; these; what it returns."""
     closed, result = jax.make_jaxpr(function, return_shape=True)(*values)
     moves = [isinstance(value, Tracer) for value in closed.consts]
@@ -145,11 +152,6 @@ def _numbers(equation: Any) -> bool:
     return len(equation.outvars) == 1 and all(v.aval.shape == () and v.aval.dtype == np.float64 for v in variables)
 
 
-derivative_p = Primitive("dirax_derivative")
-derivative_p.multiple_results = True
-"""The derivatives of a jaxpr of floats with one result by the operands numbered `wanted`, one result each."""
-
-
 def _by_jax(*operands, jaxpr: ClosedJaxpr, wanted: tuple[int, ...]):
     (result,) = jaxpr.out_avals
     function = lambda *values: jaxpr_as_fun(jaxpr)(*values)[0]
@@ -161,18 +163,5 @@ def _shapes(*operands, jaxpr: ClosedJaxpr, wanted: tuple[int, ...]):
     return [ShapedArray((*result.shape, *operands[k].shape), result.dtype) for k in wanted]
 
 
-def _tangents(primals, tangents, *, jaxpr, wanted):
-    function = lambda *values: list(_by_jax(*values, jaxpr=jaxpr, wanted=wanted))
-    return jax.jvp(function, tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))
-
-
-def _batched(operands, axes, *, jaxpr, wanted):
-    function = lambda *values: list(_by_jax(*values, jaxpr=jaxpr, wanted=wanted))
-    return jax.vmap(function, in_axes=tuple(axes))(*operands), [0] * len(wanted)
-
-
-derivative_p.def_impl(lambda *operands, **p: list(jax.jit(lambda *values: _by_jax(*values, **p))(*operands)))
-derivative_p.def_abstract_eval(_shapes)
-ad.primitive_jvps[derivative_p] = _tangents
-batching.primitive_batchers[derivative_p] = _batched
-mlir.register_lowering(derivative_p, mlir.lower_fun(lambda *operands, **p: list(_by_jax(*operands, **p)), multiple_results=True))
+derivative_p = deferred("dirax_derivative", _by_jax, _shapes)
+"""The derivatives of a jaxpr of floats with one result by the operands numbered `wanted`, one result each."""

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.engines.native import on_host as module
+from dirax.engines.native import host_function as module
 from dirax.engines.native.on_host import linearized, on_host
-from dirax.roots import nearest_root, scaled_pseudo_inverse
+from dirax.linear_solves import scaled_pseudo_inverse, solve
+from dirax.roots import nearest_root
 from dirax.schemes.step import Shape, make_step_equation
 
 symmetric = lambda a: a + a.T
@@ -18,6 +19,14 @@ CASES = {
     "singular values": lambda a, x: (scaled_pseudo_inverse(a @ a.T)[0] @ x, jnp.linalg.svd(a, compute_uv=False)),
     "eigenvalues": lambda a, x: jnp.linalg.eigh(symmetric(a))[0] + jnp.linalg.pinv(symmetric(a)) @ x,
     "a root": lambda a, x: nearest_root(lambda u: jnp.sinh(u) + 0.1 * jnp.sin(a @ u) - x, jnp.zeros(3)),
+    "a root by halved steps": lambda a, x: nearest_root(lambda u: jnp.arctan(9.0 * (u - x)) + a[0, 0] ** 2 * (u - x), x + 2.0),
+    "the best point where there is no root": lambda a, x: nearest_root(lambda u: u * u + x[:1] * a[0, :1], jnp.ones(1)),
+    "linear equations": lambda a, x: (
+        solve(a, x),
+        solve(a @ a, a.T),
+        jnp.isfinite(solve(a * jnp.maximum(a[0, 0], 0.0), x)).astype(float),
+    ),
+    "a derivative of linear equations": lambda a, x: jax.jacfwd(lambda x: solve(a + jnp.diag(x), x**2))(x),
     "a loop of unknown length": lambda a, x: jax.lax.while_loop(
         lambda c: jnp.max(jnp.abs(c[0])) > 1e-3, lambda c: (c[0] / 3, c[1] + 1), (a @ x, 0)
     ),

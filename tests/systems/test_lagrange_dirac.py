@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 import dirax as dx
 from dirax.initial import numerical_rank
-from dirax.roots import nearest_root, scaled_pseudo_inverse
+from dirax.linear_solves import scaled_pseudo_inverse
+from dirax.roots import nearest_root
 
 numbers = st.floats(-3, 3, allow_subnormal=False)
 vectors = st.tuples(*[numbers] * 3).map(np.array)

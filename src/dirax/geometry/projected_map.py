@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.numerics import newton_root, norm
+from dirax.linear_solves import solve
 
 
 class Submanifold(AbstractManifold):
@@ -46,7 +47,7 @@ class Submanifold(AbstractManifold):
     def projection(self, x, v):
         # A the projection DP(x), oblique: the orthogonal projection with the same image is A (A + Aᵀ − 1)⁻¹.
         oblique = jax.jacfwd(self.projector)(x)
-        return oblique @ jnp.linalg.solve(oblique + oblique.T - jnp.eye(self.ambient_dimension), v)
+        return oblique @ solve(oblique + oblique.T - jnp.eye(self.ambient_dimension), v)
 
     def representative(self, x, near):
         return x

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
+from dirax.linear_solves import solve
 from dirax.reduction.connection import check_fibre, fibre_indices
 
 
@@ -39,7 +40,7 @@ class AbstractAction(eqx.Module):
     def cotangent_lift(self, g: Float[Array, " k"], q: Float[Array, " n"], p: Float[Array, " n"]) -> tuple[Array, Array]:
         """T*Φ_{−g}(q, p): the pairing with lifted velocities stays the same."""
         derivative = jax.jacfwd(lambda q: self(g, q))(q)
-        return self(g, q), jnp.linalg.solve(derivative.T, p)
+        return self(g, q), solve(derivative.T, p)
 
     def momentum_map(self, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " k"]:
         """J(q, p), with ⟨J, ξ⟩ = ⟨p, ξ_Q(q)⟩."""

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from dirax.linear_solves import solve
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.step import Field, Shape, StepEquation
 from dirax.schemes.work import WorkBook, work_field
@@ -97,8 +98,8 @@ def resolved_nonholonomic(system: NonholonomicMechanics, shape: Shape, theta: fl
         turning = along(lambda q: system.metric.at(0.0, q, params), (q,), (v,))
         drift = along(lambda q: one_forms(q, params), (q,), (v,))
         rate = gradient(lambda q: system.lagrangian(q, v, params))(q)  # −∂H/∂q at p = g v
-        solved = jnp.linalg.solve(metric, jnp.concatenate([forms.T, (rate - turning @ v)[:, None]], axis=1))
-        multipliers = -jnp.linalg.solve(forms @ solved[:, :m], drift @ v + forms @ solved[:, m])  # (μ v)˙ = 0
+        solved = solve(metric, jnp.concatenate([forms.T, (rate - turning @ v)[:, None]], axis=1))
+        multipliers = -solve(forms @ solved[:, :m], drift @ v + forms @ solved[:, m])  # (μ v)˙ = 0
         return q, metric @ v, rate + forms.T @ multipliers, multipliers
 
     def residual(u, state, t, h, params):
@@ -147,13 +148,13 @@ def resolved_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) -> St
         w = rows.matrix(t, q, params)
         coupling = _along(system, lambda t, q: system.legendre(q, v, params, t), t, q, v)
         turning = _along(system, lambda t, q: rows.velocity_defect(t, q, v, params), t, q, v)
-        lifted = jnp.linalg.solve(mass(t, q, v, params), w.T)
-        multipliers = -jnp.linalg.solve(w @ lifted, turning + lifted.T @ (rate - coupling))
+        lifted = solve(mass(t, q, v, params), w.T)
+        multipliers = -solve(w @ lifted, turning + lifted.T @ (rate - coupling))
         return p, rate + w.T @ multipliers, multipliers
 
     def pushed(t, q, v, s, params):
         """v + M⁻¹G(q)ᵀs, the direction of the projection onto g = 0 at q."""
-        return v + jnp.linalg.solve(mass(t, q, v, params), rows.holonomic_matrix(t, q, params).T @ s)
+        return v + solve(mass(t, q, v, params), rows.holonomic_matrix(t, q, params).T @ s)
 
     def base(u, state, t, h, params):
         """The base point, its time, and where the second half ends."""

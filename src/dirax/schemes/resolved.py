@@ -1,9 +1,9 @@
 """Method 2 of [BLM] on a final constraint manifold in coordinates x: the projected θ map."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,6 +12,7 @@ from dirax.schemes.constraint_rows import independent_constraints
 from dirax.schemes.step import Field, Shape, StepEquation
 from dirax.systems.constraint_chain import ResolvedSystem
 from dirax.systems.dirac_system import TINY_BRACKET, DiracSystem
+from dirax.tracing import call, gradient
 
 
 class FinalManifold(NamedTuple):
@@ -54,8 +55,9 @@ def of_constrained_hamiltonian(system: DiracSystem, shape: Shape) -> FinalManifo
                 ".resolved() instead of the system."
             )
 
-    field = lambda x, params: system.constrained_field(x, params)[0]
-    multipliers = lambda x, params: all_of_them(system.constrained_field(x, params)[1])
+    both = partial(call, lambda x, params: system.constrained_field(x, params))
+    field = lambda x, params: both(x, params)[0]
+    multipliers = lambda x, params: all_of_them(both(x, params)[1])
     return FinalManifold(constraints, 2 * count, field, multipliers, shape.c, system.hamiltonian_vector, check)
 
 
@@ -69,21 +71,23 @@ def projected_field(manifold: FinalManifold, n: int, theta: float) -> StepEquati
     to roundoff. Self-adjoint and of second order for θ = ½.
     """
     k = n + manifold.size
+    constraints, field_at, multipliers, normal = (  # each is used several times in a step
+        partial(call, f) for f in (manifold.constraints, manifold.field, manifold.multipliers, manifold.normal)
+    )
 
     def parts(u, state, h):
         x = state + theta * h * u[:n]
         return x, x + (1.0 - theta) * h * u[k : k + n]
 
     def half(w, s, at, there, field, fraction, params):
-        phi = lambda y: manifold.constraints(y, params)
-        value, pull = jax.vjp(phi, at)
+        covector = gradient(lambda y: constraints(y, params) @ s)(at)
         # a half of length zero moves nothing, and needs no force
-        on = s if fraction == 0.0 else (value if there is at else phi(there))
-        return jnp.concatenate([w - field - manifold.normal(at, pull(s)[0], params), on])
+        on = s if fraction == 0.0 else constraints(there, params)
+        return jnp.concatenate([w - field - normal(at, covector, params), on])
 
     def residual(u, state, t, h, params):
         x, end = parts(u, state, h)
-        field = manifold.field(x, params)
+        field = field_at(x, params)
         first = half(u[:n], u[n:k], state, x, field, theta, params)
         return jnp.concatenate([first, half(u[k : k + n], u[k + n :], end, end, field, 1.0 - theta, params)])
 
@@ -92,7 +96,7 @@ def projected_field(manifold: FinalManifold, n: int, theta: float) -> StepEquati
         return data["x"], jnp.concatenate([u, u])
 
     def unpack(state, u, t, h, params):
-        return {"x": state, "multipliers": manifold.multipliers(parts(u, state, h)[0], params)}
+        return {"x": state, "multipliers": multipliers(parts(u, state, h)[0], params)}
 
     about = "multipliers at the base point"
     return StepEquation(

@@ -10,6 +10,7 @@ from jax.extend.core import jaxprs_in_params
 from jaxtyping import Array, Float
 
 from dirax.functions import is_traced
+from dirax.linear_solves import solve
 
 NEWTON_STEPS = 6
 """Newton steps for γ where ∂l/∂γ is not linear in it; the step that carries h ẋ carries their error with it."""
@@ -61,7 +62,7 @@ def vertical_velocity(momentum: Callable, k: int) -> Callable:
 def solve_small(columns: list[Float[Array, " k"]], right: Float[Array, " k"]) -> Float[Array, " k"]:
     """The solution of the equations with a matrix of these columns; one equation by the reciprocal, whose derivatives need
     no other division."""
-    return right * (1.0 / columns[0]) if len(columns) == 1 else jnp.linalg.solve(jnp.stack(columns, axis=1), right)
+    return right * (1.0 / columns[0]) if len(columns) == 1 else solve(jnp.stack(columns, axis=1), right)
 
 
 def independent(function: Callable, argument: int, values: tuple) -> bool:

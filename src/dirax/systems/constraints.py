@@ -4,15 +4,15 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
-from dirax.roots import nearest_root, scaled_pseudo_inverse
+from dirax.linear_solves import scaled_pseudo_inverse
+from dirax.roots import nearest_root
 from dirax.systems.system import no_constraint
-from dirax.tracing import jacobian
+from dirax.tracing import along, jacobian
 
 
 class Constraints(eqx.Module):
@@ -96,17 +96,17 @@ class Constraints(eqx.Module):
 
     def nonholonomic_defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " m"]:
         """W v + b."""
-        along = self.one_forms_at(t, q, params) @ v
-        return along if self.affine is None else along + self.affine.at(t, q, params)
+        rate = self.one_forms_at(t, q, params) @ v
+        return rate if self.affine is None else rate + self.affine.at(t, q, params)
 
     def hidden_defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " c"]:
         """G v + ∂g/∂t, the rate of change of g."""
         if self.holonomic is None:
             return no_constraint()
-        along = lambda t, q: self.position_defect(t, q, params)
+        g = lambda t, q: self.position_defect(t, q, params)
         if self.holonomic.takes_time:
-            return jax.jvp(along, (jnp.asarray(t, float), q), (jnp.ones(()), v))[1]
-        return jax.jvp(lambda q: along(t, q), (q,), (v,))[1]
+            return along(g, (jnp.asarray(t, float), q), (jnp.ones(()), v))
+        return along(lambda q: g(t, q), (q,), (v,))
 
     def velocity_defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
         """(W v + b, G v + ∂g/∂t)."""

@@ -9,10 +9,11 @@ from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
 from dirax.geometry.structures import DiracStructure
+from dirax.linear_solves import solve
 from dirax.roots import nearest_root
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
-from dirax.tracing import gradient
+from dirax.tracing import gradient, jacobian
 
 RANK_TOLERANCE = 1e-10
 """Singular values of the kernel matrix F below this, relative to the largest, count as zero in the initial check."""
@@ -106,7 +107,7 @@ class DiracSystem(AbstractSystem):
             return jnp.concatenate([p, -q])
         F, E = self.structure.kernel(x, params)
         v = jnp.asarray(-E @ covector)
-        return v if self.structure.representation == "bivector" else jnp.linalg.solve(F, v)
+        return v if self.structure.representation == "bivector" else solve(jnp.asarray(F), v)
 
     def hidden_defect(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " c"]:
         """{g, H} = G ẋ for the ẋ of dH, the rate of change of g."""
@@ -127,14 +128,14 @@ class DiracSystem(AbstractSystem):
         hidden, brackets = self.hidden_defect(x, params), self.brackets(x, params)
         size = jnp.sum(self.holonomic_matrix(x, params) ** 2)
         normal = brackets.T @ brackets + (TINY_BRACKET * size) ** 2 * jnp.eye(hidden.shape[0])
-        return hidden - brackets @ jnp.linalg.solve(normal, brackets.T @ hidden)
+        return hidden - brackets @ solve(normal, brackets.T @ hidden)
 
     def constrained_field(self, x: Float[Array, " N"], params: Any = None) -> tuple[Float[Array, " N"], Float[Array, " c"]]:
         """(ẋ, λ) at a point of M_f = {g = 0, {g, H} = 0}, where the brackets {g_i, g_j} are zero: λ keeps {g, H} = 0."""
         free = self.hamiltonian_vector(x, self.differential(x, params), params)
         forces = self.forces(x, params)
-        slope = jax.jacfwd(lambda x: self.hidden_defect(x, params))(x)
-        multipliers = jnp.linalg.solve(slope @ forces, slope @ free)
+        slope = jacobian(lambda x: self.hidden_defect(x, params))(x)
+        multipliers = solve(slope @ forces, slope @ free)
         return free - forces @ multipliers, multipliers
 
     # ------------------------------------------------------------------ AbstractSystem

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from dirax.functions import UserFunction
 from dirax.geometry.structures import canonical_two_form
+from dirax.linear_solves import solve
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -194,7 +195,7 @@ def _on_cotangent_bundle(
         zero = jnp.zeros(n)
         mass = jax.hessian(lambda v: system.lagrangian.at(t, q, v, params))(zero)
         bordered = jnp.block([[mass, null], [null.T, jnp.zeros((k, k))]])
-        solution = jnp.linalg.solve(bordered, jnp.concatenate([p - system.legendre(q, zero, params, t), jnp.zeros(k)]))
+        solution = solve(bordered, jnp.concatenate([p - system.legendre(q, zero, params, t), jnp.zeros(k)]))
         return solution[:n], solution[n:]
 
     def hamiltonian(t, x, params):

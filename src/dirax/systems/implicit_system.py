@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
-from dirax.roots import scaled_pseudo_inverse
+from dirax.linear_solves import scaled_pseudo_inverse
 from dirax.systems.system import AbstractSystem
 
 

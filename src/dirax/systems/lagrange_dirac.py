@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
-from dirax.roots import nearest_root, scaled_pseudo_inverse
+from dirax.linear_solves import scaled_pseudo_inverse, solve
+from dirax.roots import nearest_root
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem, no_constraint
 from dirax.tracing import gradient, jacobian
@@ -153,7 +154,7 @@ class LagrangeDirac(AbstractSystem):
         hessian = jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v)
         values = jnp.linalg.eigvalsh(hessian)
         regular = values[0] > 1e-12 * jnp.abs(values[-1])
-        return jnp.linalg.solve(jnp.where(regular, hessian, jnp.eye(q.shape[0])), rows.T)
+        return solve(jnp.where(regular, hessian, jnp.eye(q.shape[0])), rows.T)
 
     def project_velocity(
         self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0

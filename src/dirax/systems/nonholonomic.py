@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction, evaluated, is_traced
+from dirax.linear_solves import solve
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
@@ -111,12 +112,12 @@ class NonholonomicMechanics(AbstractSystem):
 
     def velocity(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " n"]:
         """g(q)⁻¹ p."""
-        return jnp.linalg.solve(self.metric.at(t, q, params), p)
+        return solve(self.metric.at(t, q, params), p)
 
     def _lifted(self, q, params, t):
         """(μ, g⁻¹μᵀ) with the rows of all constraints, one-forms and derivatives of holonomic ones."""
         rows = self.constraints.matrix(t, q, params)
-        return rows, jnp.linalg.solve(self.metric.at(t, q, params), rows.T)
+        return rows, solve(self.metric.at(t, q, params), rows.T)
 
     def projector(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " n"]:
         """P_q(p) = p − C_ab (g^{ij} p_j μ^a_i) μ^b: onto the momenta with μ g⁻¹ p = 0 ([BLM] §8), for independent constraints.
@@ -126,7 +127,7 @@ class NonholonomicMechanics(AbstractSystem):
         """
         rows, lifted = self._lifted(q, params, t)
         defect = self.constraints.velocity_defect(t, q, self.velocity(q, p, params, t), params)
-        return p - rows.T @ jnp.linalg.solve(rows @ lifted, defect)
+        return p - rows.T @ solve(rows @ lifted, defect)
 
     def multipliers(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " k"]:
         """λ(q, p) (m + c,) that keeps μ g⁻¹ p = 0 along the flow ([BLM] (39)): derivatives of the constraints along (ṫ, q̇, ṗ)."""
@@ -141,7 +142,7 @@ class NonholonomicMechanics(AbstractSystem):
             _, rate = jax.jvp(constraint, (jnp.asarray(t, float), q, p), (jnp.ones(()), v, rate))
         else:
             _, rate = jax.jvp(lambda q, p: constraint(t, q, p), (q, p), (v, rate))
-        return -jnp.linalg.solve(rows @ lifted, rate)
+        return -solve(rows @ lifted, rate)
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """H(q, p)."""

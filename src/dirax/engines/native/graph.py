@@ -1,15 +1,21 @@
 """Scalar expressions, each built once: constants folded, zeros and ones simplified away, equal expressions shared."""
 
 import math
-from collections.abc import Container, Iterable, Sequence
-from typing import Any
+import struct
+from collections.abc import Callable, Container, Iterable, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 
 from dirax.engines.native.operations import BOOLEAN, COMMUTATIVE, OPERATIONS, evaluate_one
 
+CONSTANT = frozenset({"const", "bool"})
+
 MAX_POWER = 64
 """Largest whole exponent written out as multiplications."""
+
+
+_bits = struct.Struct("d").pack
 
 
 class GraphTooLarge(Exception):
@@ -44,7 +50,7 @@ class Graph:
         if isinstance(value, bool | np.bool_):
             return self._intern("bool", (), bool(value), ("bool", bool(value)))
         number = float(value)
-        return self._intern("const", (), number, ("const", np.float64(number).tobytes()))
+        return self._intern("const", (), number, ("const", _bits(number)))
 
     def input(self, name: str) -> int:
         """The node of a named scalar that is known at run time."""
@@ -57,7 +63,7 @@ class Graph:
         return node
 
     def is_constant(self, node: int) -> bool:
-        return self.op[node] in ("const", "bool")
+        return self.op[node] in CONSTANT
 
     def is_boolean(self, node: int) -> bool:
         return self.op[node] in BOOLEAN
@@ -81,10 +87,14 @@ class Graph:
 
     def make(self, op: str, *args: int) -> int:
         """The node op(args), simplified."""
-        if all(self.is_constant(a) for a in args):
+        ops = self.op
+        for a in args:
+            if ops[a] not in CONSTANT:
+                break
+        else:
             return self.constant(evaluate_one(op, *(self.value[a] for a in args)))
-        special = getattr(self, f"_{op}", None)
-        return special(*args) if special else self._plain(op, *args)
+        simplified = self._simplified.get(op)
+        return simplified(self, *args) if simplified else self._plain(op, *args)
 
     def _plain(self, op: str, *args: int) -> int:
         if op in COMMUTATIVE and args[1] < args[0]:
@@ -238,6 +248,11 @@ class Graph:
 
     def _min(self, a: int, b: int) -> int:
         return a if a == b else self._plain("min", a, b)
+
+    _simplified: ClassVar[dict[str, Callable[..., int]]] = {
+        **{"add": _add, "sub": _sub, "neg": _neg, "mul": _mul, "recip": _recip, "pow": _pow},
+        **{"select": _select, "and": _and, "or": _or, "not": _not, "max": _max, "min": _min},
+    }
 
     # ------------------------------------------------------------------ the whole
 

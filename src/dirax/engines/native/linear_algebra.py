@@ -77,12 +77,21 @@ def custom_linear_solve(interpreter: Interpreter, equation: Any, *operands):
         if lost := next((o for o in image if isinstance(o, Unavailable)), None):
             return [lost] * len(equation.outvars)
         columns.append(np.concatenate([o.ravel() for o in image]))
-    matrix = np.stack(columns, axis=1)
-    x = np.empty(n, dtype=np.int64)
-    right = np.concatenate([s.ravel() for s in sides])
-    for block in _independent(matrix != g.zero):
-        x[block] = solve(g, matrix[np.ix_(block, block)], right[block, None])[:, 0]
+    x = solve_blocks(g, np.stack(columns, axis=1), np.concatenate([s.ravel() for s in sides])[:, None])[:, 0]
     return [a.reshape(s) for a, s in zip(np.split(x, np.cumsum(sizes)[:-1]), shapes, strict=True)]
+
+
+@rule("dirax_solve")
+def small_solve(interpreter: Interpreter, equation: Any, matrix, right):
+    return [solve_blocks(interpreter.graph, matrix, right.reshape(len(right), -1)).reshape(right.shape)]
+
+
+def solve_blocks(g: Graph, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """x with matrix x = right, (n, r), for every group of equations by itself."""
+    x = np.empty_like(right)
+    for block in _independent(matrix != g.zero):
+        x[block] = solve(g, matrix[np.ix_(block, block)], right[block])
+    return x
 
 
 def _independent(pattern: np.ndarray) -> list[list[int]]:

@@ -1,6 +1,7 @@
 """The operations of the scalar graph, what they mean on NumPy arrays, and their derivatives."""
 
 import math
+import operator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -69,6 +70,9 @@ OPERATIONS: dict[str, Any] = {
     "not": np.logical_not,
 }
 
+EXACT = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "neg": operator.neg}
+"""Operations that Python's numbers do as NumPy's do, without a warning or an error."""
+
 BOOLEAN = frozenset({"bool", "lt", "le", "eq", "ne", "finite", "and", "or", "not"})
 COMMUTATIVE = frozenset({"add", "mul", "max", "min", "eq", "ne", "and", "or"})
 STEPWISE = frozenset({"floor", "ceil", "round", "trunc", "sign"})
@@ -77,6 +81,8 @@ STEPWISE = frozenset({"floor", "ceil", "round", "trunc", "sign"})
 
 def evaluate_one(op: str, *values):
     """The value of one operation on constants."""
+    if op in EXACT and all(type(v) is float for v in values):
+        return EXACT[op](*values)
     with np.errstate(all="ignore"):
         return OPERATIONS[op](*(np.bool_(v) if isinstance(v, bool) else np.float64(v) for v in values)).item()
 

@@ -1,0 +1,60 @@
+"""Linear equations of a few unknowns: with one solution, and with the smallest of many."""
+
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+from jax import lax
+from jax.core import ShapedArray
+from jax.interpreters import ad
+from jaxtyping import Array, Float
+
+from dirax.deferred import deferred
+from dirax.tracing import becomes_scalars
+
+RANK_TOLERANCE = 1e-12
+"""Singular values below this, relative to the largest of the equilibrated matrix, count as zero."""
+
+
+def solve(matrix: Float[Array, "n n"], right: Array) -> Array:
+    """`jnp.linalg.solve` of a matrix (n, n) and a right-hand side (n,) or (n, k)."""
+    if not becomes_scalars(matrix, right):
+        return jnp.linalg.solve(matrix, right)
+    return solve_p.bind(matrix, right)[0]
+
+
+def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> tuple[Float[Array, "l k"], Float[Array, " l"]]:
+    """The pseudo-inverse of a matrix with rows and columns scaled to unit size, and the units that this gives the columns."""
+    inverse, units = pseudo_inverse_p.bind(matrix) if becomes_scalars(matrix) else equilibrated_inverse(jnp, matrix)
+    return inverse, units
+
+
+def equilibrated_inverse(xp: ModuleType, matrix: Any) -> tuple[Any, Any]:
+    """The same by JAX, or by NumPy with leading axes."""
+    lead = matrix.shape[:-2]
+    rows, columns = xp.ones((*lead, matrix.shape[-2], 1)), xp.ones((*lead, 1, matrix.shape[-1]))
+    fitting = lambda sizes: xp.sqrt(xp.where(sizes > 0.0, sizes, 1.0))
+    sizes = xp.abs(lax.stop_gradient(matrix) if xp is jnp else matrix)  # units have no derivative, which would be ∞ at zero
+    for _ in range(3):
+        left = sizes / rows / columns
+        rows = rows * fitting(xp.max(left, axis=-1, keepdims=True))
+        columns = columns * fitting(xp.max(left, axis=-2, keepdims=True))
+    inverse = xp.linalg.pinv(matrix / rows / columns, RANK_TOLERANCE)
+    turned = lambda a: xp.swapaxes(a, -1, -2)
+    return inverse / turned(columns) / turned(rows), 1.0 / columns[..., 0, :]
+
+
+def _turned(matrix):
+    return [ShapedArray(matrix.shape[::-1], matrix.dtype), ShapedArray(matrix.shape[1:], matrix.dtype)]
+
+
+def _solve_tangents(primals, tangents):
+    """x' = A⁻¹ (b' − A' x), by the same elimination."""
+    (matrix, right), (along_matrix, along_right) = primals, map(ad.instantiate_zeros, tangents)
+    (x,) = solve_p.bind(matrix, right)
+    return [x], solve_p.bind(matrix, along_right - along_matrix @ x)
+
+
+solve_p = deferred("dirax_solve", lambda a, b: [jnp.linalg.solve(a, b)], lambda a, b: [ShapedArray(b.shape, b.dtype)])
+ad.primitive_jvps[solve_p] = _solve_tangents
+pseudo_inverse_p = deferred("dirax_pseudo_inverse", lambda matrix: equilibrated_inverse(jnp, matrix), _turned)
