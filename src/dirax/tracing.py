@@ -28,7 +28,7 @@ PLAIN = frozenset(
         *("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite", "convert_element_type", "copy", "reshape"),
         *("squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "concatenate", "stack", "unstack", "tile", "split"),
         *("slice", "pad", "iota", "gather", "dynamic_slice", "dynamic_update_slice", "scatter", "scatter-add", "reduce_sum"),
-        *("dot_general", "add_any", "jit", "pjit", "closed_call", "dirax_derivative"),
+        *("dot_general", "add_any", "jit", "pjit", "closed_call", "dirax_derivative", "dirax_formula"),
     )
 )
 """Primitives whose derivative is the same for JAX and for the graph, and as accurate: no corners (of an absolute value, a
@@ -74,13 +74,21 @@ def becomes_scalars(*values: Any) -> bool:
 
 
 def call(function: Callable, *values: Any) -> Any:
-    """`function(*values)`, which within `once` is traced once for values of one kind."""
+    """`function(*values)`, which within `once` is traced once for values of one kind; equal functions count as one."""
     known = _traced.get()
-    if known is None:
+    if known is None or not _hashable(function):
         return function(*values)
     if function not in known:
         known[function] = jax.jit(function)
     return known[function](*values)
+
+
+def _hashable(function: Callable) -> bool:
+    try:
+        hash(function)
+    except TypeError:  # the method of an object that holds arrays
+        return False
+    return True
 
 
 def gradient(function: Callable, argnums: int | tuple[int, ...] = 0) -> Callable:

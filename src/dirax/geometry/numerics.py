@@ -6,15 +6,15 @@ own derivative, so that derivatives of any order are accurate and finite, and co
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from dirax.tracing import call
+from dirax.formulas import Formula, apply
 
 Scalar: TypeAlias = Float[Array, ""]
 
@@ -29,39 +29,36 @@ def radial(order: int, s: Scalar) -> Scalar:
 
     f_n(x²) = j_{n−1}(x)/x^{n−1} with the spherical Bessel functions j, so f_{n+1} = ((2n − 1) f_n − f_{n−1})/s.
     """
-    return call(_of_order(_radial, order), s)
+    return apply(Radial(order), s)
 
 
-@lru_cache
-def _of_order(function: Callable, order: int) -> Callable:
-    """The same object for the same order, so that the function of an order is traced once."""
-    return partial(function, order)
+@dataclass(frozen=True)
+class Radial(Formula):
+    order: int
 
+    def value(self, xp, x):
+        (s,), order = x, self.order
+        if order <= 1:
+            # finite also for a derivative that is taken through the root, as that of a scalar graph is
+            none = s < NO_ANGLE
+            root = xp.sqrt(xp.where(none, 1.0, s))
+            return xp.where(none, 1.0, xp.cos(root) if order == 0 else xp.sin(root) / root)
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _radial(order: int, s: Scalar) -> Scalar:
-    if order <= 1:
-        # finite also for a derivative that is taken through the root, as that of a scalar graph is
-        none = s < NO_ANGLE
-        root = jnp.sqrt(jnp.where(none, 1.0, s))
-        return jnp.where(none, 1.0, jnp.cos(root) if order == 0 else jnp.sin(root) / root)
+        def by_recurrence(s):
+            root = xp.sqrt(s)
+            before, value = xp.cos(root), xp.sin(root) / root
+            for n in range(1, order):
+                before, value = value, ((2.0 * n - 1.0) * value - before) / s
+            return value
 
-    def by_recurrence(s):
-        before, value = jnp.cos(jnp.sqrt(s)), jnp.sin(jnp.sqrt(s)) / jnp.sqrt(s)
-        for n in range(1, order):
-            before, value = value, ((2 * n - 1) * value - before) / s
-        return value
+        odd_factorial = math.prod(range(1, 2 * order, 2))
+        coefficients = [1.0 / odd_factorial]
+        for k in range(1, 13):
+            coefficients.append(coefficients[-1] * -0.5 / (k * (2 * order - 1 + 2 * k)))
+        return _piecewise(xp, s, RADIAL_SERIES_BELOW, coefficients, by_recurrence)
 
-    odd_factorial = math.prod(range(1, 2 * order, 2))
-    coefficients = [1.0 / odd_factorial]
-    for k in range(1, 13):
-        coefficients.append(coefficients[-1] * -0.5 / (k * (2 * order - 1 + 2 * k)))
-    return _piecewise(s, RADIAL_SERIES_BELOW, coefficients, by_recurrence)
-
-
-@_radial.defjvp
-def _radial_jvp(order, primals, tangents):
-    return radial(order, *primals), -0.5 * radial(order + 1, *primals) * tangents[0]
+    def slopes(self):
+        return ((-0.5, Radial(self.order + 1)),)
 
 
 def arc_over_sine(order: int, near: Scalar, far: Scalar) -> Scalar:
@@ -70,41 +67,43 @@ def arc_over_sine(order: int, near: Scalar, far: Scalar) -> Scalar:
     For points of a unit sphere near and far are |y − x|²/4 and |y + x|²/4, each accurate at its own end of the arc.
     F is the hypergeometric function F(1, 1; 3/2; near). Right up to φ = π − 10⁻¹⁵, and some finite number beyond.
     """
-    return call(_of_order(_arc_over_sine, order), near, far)
+    return apply(ArcOverSine(order), near, far)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _arc_over_sine(order: int, near: Scalar, far: Scalar) -> Scalar:
-    far = jnp.where(far < TINY, 1.0, far)
+@dataclass(frozen=True)
+class ArcOverSine(Formula):
+    order: int
 
-    def by_recurrence(near):
-        root = jnp.sqrt(near * far)
-        before = jnp.arctan2(jnp.sqrt(near), jnp.sqrt(far)) / root
-        value = (1.0 - (far - near) * before) / (2.0 * near * far)
-        for n in range(order - 1):
-            slope = (1.5 + n) - (3.0 + 2.0 * n) * near
-            before, value = value, ((1.0 + n) ** 2 * before - slope * value) / (near * far)
-        return before if order == 0 else value
+    def value(self, xp, x):
+        (near, far), order = x, self.order
+        far = xp.where(far < TINY, 1.0, far)
 
-    if order == 0:
-        return jnp.where(near == 0.0, 1.0, by_recurrence(jnp.where(near == 0.0, 1.0, near)))
-    taylor = [4.0**k * math.factorial(k) ** 2 / math.factorial(2 * k + 1) for k in range(18 + order)]
-    coefficients = [taylor[k] * math.perm(k, order) for k in range(order, len(taylor))]
-    return _piecewise(near, ARC_SERIES_BELOW, coefficients, by_recurrence)
+        def by_recurrence(near):
+            root = xp.sqrt(near * far)
+            before = xp.arctan2(xp.sqrt(near), xp.sqrt(far)) / root
+            value = (1.0 - (far - near) * before) / (2.0 * near * far)
+            for n in range(order - 1):
+                slope = (1.5 + n) - (3.0 + 2.0 * n) * near
+                before, value = value, ((1.0 + n) ** 2 * before - slope * value) / (near * far)
+            return before if order == 0 else value
+
+        if order == 0:
+            zero = xp.equal(near, 0.0)
+            return xp.where(zero, 1.0, by_recurrence(xp.where(zero, 1.0, near)))
+        taylor = [4.0**k * math.factorial(k) ** 2 / math.factorial(2 * k + 1) for k in range(18 + order)]
+        coefficients = [taylor[k] * math.perm(k, order) for k in range(order, len(taylor))]
+        return _piecewise(xp, near, ARC_SERIES_BELOW, coefficients, by_recurrence)
+
+    def slopes(self):
+        return (1.0, ArcOverSine(self.order + 1)), None  # near + far = 1, so F is a function of near alone
 
 
-@_arc_over_sine.defjvp
-def _arc_over_sine_jvp(order, primals, tangents):
-    # near + far = 1, so F is a function of near alone.
-    return arc_over_sine(order, *primals), arc_over_sine(order + 1, *primals) * tangents[0]
-
-
-def _piecewise(s: Scalar, below: float, coefficients: Sequence[float], otherwise: Callable) -> Scalar:
-    near, far = jnp.where(s < below, s, 0.0), jnp.where(s < below, below, s)
-    series = jnp.full_like(near, coefficients[-1])
+def _piecewise(xp: Any, s: Any, below: float, coefficients: Sequence[float], otherwise: Callable) -> Any:
+    near, far = xp.where(s < below, s, 0.0), xp.where(s < below, below, s)
+    series = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         series = series * near + coefficient
-    return jnp.where(s < below, series, otherwise(far))
+    return xp.where(s < below, series, otherwise(far))
 
 
 def norm(v: Float[Array, " n"]) -> Scalar:

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import TINY, arc_over_sine, norm, radial
+from dirax.tracing import call
 
 
 class AbstractFlat(AbstractGeodesicManifold):
@@ -187,8 +188,9 @@ class Product(AbstractGeodesicManifold):
         return jnp.split(x, np.cumsum([factor.ambient_dimension for factor in self.factors])[:-1].tolist())
 
     def _blocks(self, method: str, *arguments):
+        """The method of every factor on its blocks; factors that are equal are traced once where that can be."""
         rows = zip(self.factors, *(self.split(argument) for argument in arguments), strict=True)
-        return [getattr(factor, method)(*blocks) for factor, *blocks in rows]
+        return [call(getattr(factor, method), *blocks) for factor, *blocks in rows]
 
     def defect(self, x):
         return jnp.max(jnp.stack(self._blocks("defect", x)))
@@ -203,7 +205,7 @@ class Product(AbstractGeodesicManifold):
         return jnp.concatenate(self._blocks("representative", x, near))
 
     def local_parametrization(self, x):
-        maps = self._blocks("local_parametrization", x)
+        maps = [factor.local_parametrization(block) for factor, block in zip(self.factors, self.split(x), strict=True)]
         ends = np.cumsum([factor.dimension for factor in self.factors])[:-1].tolist()
         return lambda r: jnp.concatenate([f(block) for f, block in zip(maps, jnp.split(r, ends), strict=True)])
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
+from dirax.engines.native import formulas
 from dirax.engines.native.graph import Graph
 from dirax.engines.native.interpret import Interpreter, Nodes, Unavailable, Unsupported, elementwise, rule
 from dirax.engines.native.operations import gradient, jacobian
@@ -61,7 +62,7 @@ class Derived:
     def __init__(self, jaxpr: Any, wanted: tuple[int, ...], limit: int):
         self.graph = Graph(limit)
         self.written: dict[int, int] = {}
-        rules = {"integer_pow": _power, "pow": _power, "custom_jvp_call": self._custom}
+        rules = {"integer_pow": _power, "pow": _power, "custom_jvp_call": self._custom, "dirax_formula": self._formula}
         inputs = [self._fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
         self.inputs = [node for nodes in inputs for node in nodes.ravel().tolist()]
         (value,) = Interpreter(self.graph, rules).run(jaxpr, *inputs)
@@ -97,8 +98,19 @@ class Derived:
             if isinstance(slope, Unavailable):
                 return [slope]
             slopes.append(slope.item())
-        node = g.opaque([operand.item() for operand in operands], slopes)
-        self.written[node] = written.item()
+        return self._single([operand.item() for operand in operands], slopes, written.item())
+
+    def _formula(self, interpreter: Interpreter, equation: Any, *operands: Nodes):
+        """A formula, which says what its derivatives are."""
+        g, formula, nodes = self.graph, equation.params["formula"], [operand.item() for operand in operands]
+        return self._single(nodes, formulas.slopes(g, formula, nodes), formulas.written(g, formula, nodes))
+
+    def _single(self, operands: list[int], slopes: list[int | None], written: int):
+        """A function of the operands as one node."""
+        if self.graph.is_constant(written):
+            return [np.array(written, np.int64)]
+        node = self.graph.opaque(operands, slopes)
+        self.written[node] = written
         return [np.array(node, np.int64)]
 
     def made_in(self, target: Graph, outputs: list[int], known: dict[int, int]) -> list[int]:
