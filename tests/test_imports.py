@@ -11,7 +11,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "dirax"
 
 # A module may import from its own room and from those before it. "__init__" is the package itself: its public names.
 ROOMS = (
-    ("configure", "functions", "representation", "roots", "tables", "tracing"),
+    ("configure", "deferred", "formulas", "functions", "linear_solves", "representation", "roots", "tables", "tracing"),
     ("geometry",),
     ("systems",),
     ("reduction",),

@@ -4,10 +4,12 @@ JAX takes a few milliseconds to differentiate what it traces, and the graph some
 `jacobian` are `jax.grad` and `jax.jacfwd`.
 """
 
+import functools
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -83,6 +85,25 @@ def call(function: Callable, *values: Any) -> Any:
     return known[function](*values)
 
 
+@dataclass(frozen=True)
+class _Bound:
+    method: Callable
+    owner: Any
+
+    def __call__(self, *values):
+        return self.method(self.owner, *values)
+
+
+def traced_once(method: Callable) -> Callable:
+    """A method that within `once` is traced once for values of one kind and equal objects."""
+
+    @functools.wraps(method)
+    def bound(self, *values, **named):
+        return method(self, *values, **named) if named else call(_Bound(method, self), *values)
+
+    return bound
+
+
 def _hashable(function: Callable) -> bool:
     try:
         hash(function)
@@ -107,6 +128,13 @@ def along(function: Callable, point: tuple, direction: tuple) -> Any:
         return jax.jvp(function, point, direction)[1]
     shifted = lambda s: function(*(x + s * v for x, v in zip(point, direction, strict=True)))
     return jacobian(shifted)(np.zeros(()))
+
+
+def value_along(function: Callable, point: tuple, direction: tuple) -> tuple[Any, Any]:
+    """`jax.jvp(function, point, direction)` of a function with one array, its derivative by the graph as above."""
+    if not _in_scalars.get():
+        return jax.jvp(function, point, direction)
+    return function(*point), along(function, point, direction)
 
 
 def _derivative(function: Callable, argnums: int | tuple[int, ...], by_jax: Callable) -> Callable:

@@ -4,6 +4,8 @@ A system on a manifold is computed in the chart at a point, (r, ṙ) or (r, p) w
 leaves the domain. Everything here is traceable, so a chart may be changed inside a compiled loop.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import Scalar
+from dirax.tracing import call, gradient, value_along
 
 Local = Float[Array, " d"]
 
@@ -30,31 +33,30 @@ class RetractionChart(eqx.Module):
 
     def to_manifold(self, r: Local) -> Vector:
         """The point φ⁻¹(r) (N,)."""
-        v = self.frame @ r
-        return self.manifold.exp(self.base, v) if self.exponential else self.manifold.retraction(self.base, v)
+        return call(_to_manifold, self, r)
 
     def to_local(self, x: Vector) -> Local:
         """The coordinates r = φ(x) (d,) of a point of the domain."""
-        return self._coframe() @ self._inverse(self.manifold.representative(x, self.base))
+        return call(_to_local, self, x)
 
     def velocity_to_manifold(self, r: Local, velocity: Local) -> tuple[Vector, Vector]:
         """The point and the tangent vector with coordinates (r, ṙ)."""
-        return jax.jvp(self.to_manifold, (r,), (velocity,))
+        return value_along(self.to_manifold, (r,), (velocity,))
 
     def velocity_to_local(self, x: Vector, v: Vector) -> tuple[Local, Local]:
         """The coordinates (r, ṙ) of a tangent vector v at x."""
-        return jax.jvp(self.to_local, (x,), (v,))
+        return value_along(self.to_local, (x,), (v,))
 
     def momentum_to_manifold(self, r: Local, momentum: Local) -> tuple[Vector, Vector]:
         """The point and the covector (N,), as a tangent vector, with coordinates (r, p)."""
         x = self.to_manifold(r)
-        return x, self.manifold.projection(x, jax.vjp(self.to_local, x)[1](momentum)[0])
+        return x, self.manifold.projection(x, _pulled(self.to_local, x, momentum))
 
     def momentum_to_local(self, x: Vector, p: Vector) -> tuple[Local, Local]:
         """The coordinates (r, p) (d,) of a covector p (N,) at x, given by any vector with the right pairing."""
-        x, p = jax.jvp(lambda x: self.manifold.representative(x, self.base), (x,), (p,))
+        x, p = value_along(lambda x: self.manifold.representative(x, self.base), (x,), (p,))
         r = self.to_local(x)
-        return r, jax.vjp(self.to_manifold, r)[1](p)[0]
+        return r, _pulled(self.to_manifold, r, p)
 
     def transition(self, r: Local, other: "RetractionChart") -> Local:
         """The coordinates in another chart of the point with coordinates r in this one."""
@@ -62,12 +64,12 @@ class RetractionChart(eqx.Module):
 
     def transition_velocity(self, r: Local, velocity: Local, other: "RetractionChart") -> tuple[Local, Local]:
         """The tangent vector (r, ṙ) in another chart."""
-        return jax.jvp(lambda r: self.transition(r, other), (r,), (velocity,))
+        return value_along(lambda r: self.transition(r, other), (r,), (velocity,))
 
     def transition_momentum(self, r: Local, momentum: Local, other: "RetractionChart") -> tuple[Local, Local]:
         """The covector (r, p) in another chart: p' = Dτ(r)^{−T} p, through the derivative of the way back τ⁻¹."""
         there = self.transition(r, other)
-        return there, jax.vjp(lambda r: other.transition(r, self), there)[1](momentum)[0]
+        return there, _pulled(lambda r: other.transition(r, self), there, momentum)
 
     def reach(self, r: Local) -> Scalar:
         """How much of the domain is used at r: 0 at m, 1 at the border, where the coordinates end."""
@@ -79,13 +81,22 @@ class RetractionChart(eqx.Module):
         """Whether it is time to change chart: `reach(r) > at`, or r is not finite."""
         return ~(self.reach(r) <= at)
 
-    def _inverse(self, x: Vector) -> Vector:
-        manifold = self.manifold
-        return manifold.log(self.base, x) if self.exponential else manifold.inverse_retraction(self.base, x)
 
-    def _coframe(self) -> Float[Array, "d N"]:
-        # Frames of all manifolds here have orthogonal columns.
-        return self.frame.T / jnp.sum(self.frame**2, axis=0)[:, None]
+def _to_manifold(chart: RetractionChart, r: Local) -> Vector:
+    v = chart.frame @ r
+    return chart.manifold.exp(chart.base, v) if chart.exponential else chart.manifold.retraction(chart.base, v)
+
+
+def _to_local(chart: RetractionChart, x: Vector) -> Local:
+    x = chart.manifold.representative(x, chart.base)
+    v = chart.manifold.log(chart.base, x) if chart.exponential else chart.manifold.inverse_retraction(chart.base, x)
+    # frames of all manifolds here have orthogonal columns
+    return (v @ chart.frame) / jnp.sum(chart.frame**2, axis=0)
+
+
+def _pulled(function: Callable, at: Float[Array, " k"], covector: Float[Array, " l"]) -> Float[Array, " k"]:
+    """The covector pulled back by the derivative of a function."""
+    return gradient(lambda x: function(x) @ covector)(at)
 
 
 def chart_at(

@@ -17,6 +17,7 @@ from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold, Vector
 from dirax.geometry.numerics import Scalar, norm
 from dirax.geometry.spaces import Euclidean, Product, Sphere
+from dirax.tracing import value_along
 
 Pair = tuple[Vector, Vector]
 
@@ -135,7 +136,7 @@ class RiemannianExp(AbstractDiscretizationMap):
         # One geodesic t ↦ exp(x0, t log(x0, x1)): x and v are its point and its velocity at t = θ.
         direction = self.space.log(x0, x1)
         time = jnp.asarray(self.theta)
-        return jax.jvp(lambda t: self.space.exp(x0, t * direction), (time,), (jnp.ones_like(time),))
+        return value_along(lambda t: self.space.exp(x0, t * direction), (time,), (jnp.ones_like(time),))
 
     def reach(self, x, v):
         return self.space.exp_reach(x, v)

@@ -14,7 +14,7 @@ from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.reduction.lie_poisson import LiePoisson, checked_point
 from dirax.roots import nearest_root
 from dirax.systems.system import AbstractSystem, no_constraint
-from dirax.tracing import gradient
+from dirax.tracing import gradient, jacobian, traced_once
 
 SINGULAR = 1e-13
 """An inertia with singular values below this, relative to the largest, is singular."""
@@ -66,6 +66,7 @@ class EulerPoincare(AbstractSystem):
         """l(ξ, a)."""
         return self.lagrangian(*self._given(xi, a), params)
 
+    @traced_once
     def slopes(self, xi: Algebra, a: Advected, params: Any = None) -> tuple[Algebra, Advected]:
         """(∂l/∂ξ, ∂l/∂a)."""
         return gradient(lambda xi, a: self.value(xi, a, params), (0, 1))(xi, a)
@@ -152,7 +153,7 @@ class EulerPoincare(AbstractSystem):
     def _inertia_and_forms(self, momentum, a, params):
         """∂²l/∂ξ² at the ξ of μ, and A."""
         xi = self.inverse_legendre(momentum, a, params)
-        return jax.hessian(lambda xi: self.value(xi, a, params))(xi), self.constraint_forms(a, params)
+        return jacobian(lambda xi: self.legendre(xi, a, params))(xi), self.constraint_forms(a, params)
 
     def _on_the_dual(self, data: dict[str, Array], params: Any) -> dict[str, Array]:
         """x = μ of data q with v or p on the group; other data as they are."""

@@ -9,6 +9,7 @@ from dirax.schemes.constraint_rows import independent_constraints
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.port_hamiltonian import PortHamiltonian
+from dirax.tracing import call
 
 KINDS = ("gonzalez", "mean-value")
 EPSILON = 2.220446049250313e-16
@@ -74,6 +75,9 @@ def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, poi
         return first, (supplied - dissipated) + (lost_supplied - lost_dissipated)
 
     def discrete_gradient(u, state, h, params):
+        return call(whole_gradient, u, state, h, params)
+
+    def whole_gradient(u, state, h, params):
         """∇̄H, with ⟨∇̄H, Δx⟩ = H(x + Δx) − account, and x̄."""
         x, change = state[:n], h * u[:n]
         at = lambda s: system.differential(x + s * change, params)
@@ -85,6 +89,9 @@ def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, poi
         return gradient + (stored - gradient @ change) / length * change, x + change / 2
 
     def ports(u, state, t, h, params):
+        return call(all_ports, u, state, t, h, params)
+
+    def all_ports(u, state, t, h, params):
         """(ū, ȳ, dissipated power) of the step."""
         gradient, middle = discrete_gradient(u, state, h, params)
         if ported is None:

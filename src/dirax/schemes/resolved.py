@@ -45,9 +45,12 @@ def of_constrained_hamiltonian(system: DiracSystem, shape: Shape) -> FinalManifo
     def constraints(x, params):
         return jnp.concatenate([system.constraints.position_defect(0.0, x, params), system.hidden_defect(x, params)])
 
+    def brackets_and_rows(x, params):
+        return system.brackets(x, params), system.holonomic_matrix(x, params)
+
     def check(data, h, params):
         x = np.asarray(system.point(data))
-        brackets, rows = (np.asarray(evaluated(f, x, params)) for f in (system.brackets, system.holonomic_matrix))
+        brackets, rows = map(np.asarray, evaluated(brackets_and_rows, x, params))
         if np.max(np.abs(brackets)) > TINY_BRACKET * np.sum(rows**2):
             raise ValueError(
                 f"Method 2 takes holonomic constraints whose brackets {{g_i, g_j}} vanish, as those of functions of q on T*Q do, "

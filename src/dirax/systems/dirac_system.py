@@ -13,7 +13,7 @@ from dirax.linear_solves import solve
 from dirax.roots import nearest_root
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
-from dirax.tracing import gradient, jacobian
+from dirax.tracing import gradient, jacobian, traced_once
 
 RANK_TOLERANCE = 1e-10
 """Singular values of the kernel matrix F below this, relative to the largest, count as zero in the initial check."""
@@ -62,6 +62,7 @@ class DiracSystem(AbstractSystem):
         """The constraints g(x) = 0, as functions of (t, x, params)."""
         return Constraints(None, None, self.holonomic)
 
+    @traced_once
     def holonomic_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "c N"]:
         """G(x) = ∂g/∂x; (0, N) without constraints."""
         return self.constraints.holonomic_matrix(0.0, x, params)
@@ -109,6 +110,7 @@ class DiracSystem(AbstractSystem):
         v = jnp.asarray(-E @ covector)
         return v if self.structure.representation == "bivector" else solve(jnp.asarray(F), v)
 
+    @traced_once
     def hidden_defect(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " c"]:
         """{g, H} = G ẋ for the ẋ of dH, the rate of change of g."""
         velocity = self.hamiltonian_vector(x, self.differential(x, params), params)
@@ -118,6 +120,7 @@ class DiracSystem(AbstractSystem):
         """{g_i, g_j}: zero for functions of q on T*Q, and wherever N is coisotropic."""
         return self.holonomic_matrix(x, params) @ self.forces(x, params)
 
+    @traced_once
     def forces(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N c"]:
         """The velocities of the rows of G, by columns: λ changes ẋ by −forces λ."""
         rows = self.holonomic_matrix(x, params)

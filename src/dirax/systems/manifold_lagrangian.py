@@ -11,6 +11,7 @@ from dirax.functions import UserFunction
 from dirax.geometry.manifolds import AbstractManifold
 from dirax.roots import nearest_root
 from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.tracing import gradient
 
 
 class ManifoldLagrangian(AbstractSystem):
@@ -32,14 +33,14 @@ class ManifoldLagrangian(AbstractSystem):
 
     def legendre(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
         """The covector ∂L/∂v restricted to the tangent space at q."""
-        return self.manifold.projection(q, jax.grad(lambda v: self.lagrangian(q, v, params))(v))
+        return self.manifold.projection(q, gradient(lambda v: self.lagrangian(q, v, params))(v))
 
     def inverse_legendre(self, q: Float[Array, " N"], p: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
         """The tangent vector v at q with legendre(q, v) = p."""
         frame = self.manifold.frame(q)
 
         def defect(s):
-            return frame.T @ (jax.grad(lambda v: self.lagrangian(q, v, params))(frame @ s) - p)
+            return frame.T @ (gradient(lambda v: self.lagrangian(q, v, params))(frame @ s) - p)
 
         return frame @ nearest_root(defect, jnp.zeros(self.manifold.dimension))
 

@@ -1,6 +1,7 @@
 """The native engine's `run`: the same Problem and Outcome as the xla engine's."""
 
 import itertools
+import math
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +22,9 @@ SHARES = 4
 
 FIRST_CHUNK = 20_000
 """Lane-steps of the first call, from which the speed is estimated."""
+
+TOGETHER = 2**17
+"""Numbers to save up to which all arrays are parts of one, since it takes a microsecond to find where an array begins."""
 
 
 def supported(problem: Problem) -> str | None:
@@ -43,12 +47,11 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
     kernel, cached = made.kernel(lanes.width)
     compile_seconds, started = time.perf_counter() - started, time.perf_counter()
 
-    fields = lanes.arrays(p.rows)
-    outs = lanes.addresses(fields)
+    fields, outs = lanes.arrays(p.rows)
     done, interrupted, threads = 0, False, 1
     count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
     try:
-        while done < p.steps and np.any(lanes.status == OK):
+        while done < p.steps and (done == 0 or lanes.going):
             count = min(count, p.steps - done)
             tick = time.perf_counter()
             lanes.call(kernel, lanes.records, outs, done, done + count, p.save_every, threads)
@@ -60,12 +63,14 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
                 progress(done, p.steps)
     except KeyboardInterrupt:
         interrupted = True
-    closing_arrays = lanes.arrays(2)
-    lanes.call(kernel, lanes.records.copy(), lanes.addresses(closing_arrays), 0, 1, 1, threads)
+    closing_arrays, closing_outs = lanes.arrays(2)
+    lanes.call(kernel, lanes.records.copy(), closing_outs, 0, 1, 1, threads)
     closing = {name: a[:, 0] for name, a in closing_arrays.items()}
-    completed = lanes.completed
+    table = lanes.table()
+    completed, status, iterations = (table[:, k].astype(np.int64) for k in (-4, -3, -2))
+    ended = np.nonzero(completed < p.steps)[0].tolist()
     for name, values in fields.items():
-        for lane in np.nonzero(completed < p.steps)[0]:
+        for lane in ended:
             values[lane, completed[lane] // p.save_every + 1 :] = np.nan
         if done == p.steps and lanes.place[name] == "node":
             values[:, -1] = closing[name]
@@ -73,11 +78,11 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
         fields=fields,
         closing=closing,
         completed=completed,
-        status=lanes.status.astype(np.int64),
-        iterations=lanes.column(-2).astype(np.int64),
-        max_residual=lanes.column(-1),
-        last_state=lanes.state,
-        last_unknowns=lanes.unknowns,
+        status=status,
+        iterations=iterations,
+        max_residual=table[:, -1].copy(),
+        last_state=table[:, : lanes.states].copy(),
+        last_unknowns=table[:, lanes.states : lanes.states + lanes.first_unknowns].copy(),
         interrupted=interrupted,
         compile_seconds=compile_seconds,
         run_seconds=time.perf_counter() - started,
@@ -106,6 +111,11 @@ def thread_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def address(array: np.ndarray) -> int:
+    """Where an array begins."""
+    return array.ctypes.data
+
+
 class Lanes:
     """The records of all trajectories in blocks of `width` lanes: (blocks, quantities, width) doubles.
 
@@ -130,57 +140,56 @@ class Lanes:
         leaves = made.parameters.flatten(p.params, p.batch if p.batch_params else None)
         self.params = self._blocked(np.broadcast_to(leaves, (self.lanes, leaves.shape[-1])))
         first = p.equation.stages[0][0]
-        self.place = {name: first.fields[name].place for name, _ in self.plan.fields}
-        self._first_unknowns = first.unknowns
+        rows = self.plan.equations[self.plan.stages[0][0]].rows
+        self.shapes = {name: rows[name].shape for name in sorted(rows)}
+        self.place = {name: first.fields[name].place for name in self.shapes}
+        self.ends_before = [place == "step" for place in self.place.values()]
+        self.sizes = [math.prod(shape) for shape in self.shapes.values()]
+        self._at = address(self.params), self.params.strides[0]
+        self.states, self.first_unknowns = s, first.unknowns
 
     def _blocked(self, table: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(table[self.source].reshape(self.blocks, self.width, -1).swapaxes(1, 2))
 
-    def columns(self, first: int, count: int) -> np.ndarray:
-        """Consecutive quantities of every trajectory, (B, count)."""
-        chosen = self.records[:, first : first + count].swapaxes(1, 2)
-        return chosen.reshape(self.blocks * self.width, count)[: self.lanes].copy()
-
-    def column(self, index: int) -> np.ndarray:
-        """One quantity of every trajectory."""
-        return self.columns(index % self.plan.record, 1)[:, 0]
+    def table(self) -> np.ndarray:
+        """The records of all trajectories, (B, quantities)."""
+        return self.records.swapaxes(1, 2).reshape(self.blocks * self.width, -1)[: self.lanes]
 
     @property
-    def completed(self) -> np.ndarray:
-        return self.column(-4).astype(np.int64)
+    def going(self) -> bool:
+        """Whether a trajectory has neither failed nor ended before its time."""
+        return bool((self.records[:, -3] == OK).any())
 
-    @property
-    def status(self) -> np.ndarray:
-        return self.column(-3)
-
-    @property
-    def state(self) -> np.ndarray:
-        return self.columns(0, self.plan.state_size)
-
-    @property
-    def unknowns(self) -> np.ndarray:
-        return self.columns(self.plan.state_size, self._first_unknowns)
-
-    def arrays(self, rows: int) -> dict[str, np.ndarray]:
-        """Room for the saved arrays of so many rows."""
-        rows_of = lambda name: rows - (self.place[name] == "step")
-        shapes = {name: self.plan.equations[self.plan.stages[0][0]].rows[name].shape for name in self.place}
-        return {name: np.empty((self.lanes, rows_of(name), *shape)) for name, shape in shapes.items()}
-
-    def addresses(self, arrays: dict[str, np.ndarray]) -> np.ndarray:
-        """(blocks, fields, width) addresses of row 0."""
-        columns = [arrays[name].ctypes.data + arrays[name].strides[0] * self.source for name, _ in self.plan.fields]
-        table = np.array(columns, dtype=np.int64).reshape(len(columns), self.blocks, self.width)
-        return np.ascontiguousarray(table.swapaxes(0, 1))
+    def arrays(self, rows: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Room for the saved arrays of so many rows, and the (blocks, fields, width) addresses of their rows 0."""
+        lanes, counts = self.lanes, [rows - step for step in self.ends_before]
+        sizes = [lanes * count * size for count, size in zip(counts, self.sizes, strict=True)]
+        ends = list(itertools.accumulate(sizes, initial=0))
+        if ends[-1] <= TOGETHER:
+            whole = np.empty(ends[-1])
+            parts, first = [whole[a:b] for a, b in itertools.pairwise(ends)], address(whole)
+            begins = [first + 8 * end for end in ends[:-1]]
+        else:
+            parts = [np.empty(size) for size in sizes]
+            begins = [address(part) for part in parts]
+        made = {
+            name: part.reshape(lanes, count, *shape)
+            for (name, shape), part, count in zip(self.shapes.items(), parts, counts, strict=True)
+        }
+        if len(self.source) == 1:
+            return made, np.array(begins).reshape(1, -1, 1)
+        steps = 8 * np.array(sizes)[:, None] // lanes
+        table = np.array(begins)[:, None] + steps * self.source
+        return made, np.ascontiguousarray(table.reshape(-1, self.blocks, self.width).swapaxes(0, 1))
 
     def call(self, kernel, records: np.ndarray, outs: np.ndarray, first: int, stop: int, every: int, threads: int) -> None:
         """Steps `first` to `stop` − 1 of every trajectory, blocks shared among threads; Ctrl-C waits for their end."""
         p = self.problem
         numbers = (p.t0, p.h, p.first_step, first, stop, every, p.max_iterations)
+        places = (address(records), records.strides[0]), self._at, (address(outs), outs.strides[0])
 
         def part(low: int, high: int) -> None:
-            pointers = (a.ctypes.data + low * a.strides[0] for a in (records, self.params, outs))
-            kernel(*pointers, high - low, *numbers)
+            kernel(*[place + low * stride for place, stride in places], high - low, *numbers)
 
         if threads == 1:
             part(0, self.blocks)

@@ -182,13 +182,12 @@ def jacobian(g: "Graph", outputs: list[int], inputs: list[int]) -> list[dict[int
     """Rows of ∂outputs/∂inputs as {column: node}, zeros left out: forward over the graph, sparse in the columns."""
     column = {node: j for j, node in enumerate(inputs)}
     rows: dict[int, dict[int, int]] = {}
+    none: dict[int, int] = {}
     for node in g.reachable(outputs):
         if node in column:
             rows[node] = {column[node]: g.one}
-        elif any(rows.get(a) for a in g.args[node]):
-            rows[node] = _chain(g, node, rows)
         else:
-            rows[node] = {}
+            rows[node] = _chain(g, node, rows) if any([rows[a] for a in g.args[node]]) else none
     return [rows[node] for node in outputs]
 
 

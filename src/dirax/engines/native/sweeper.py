@@ -41,8 +41,8 @@ class Sweeper:
         return found
 
     def _run(self, records: np.ndarray, count: int) -> dict[str, np.ndarray]:
-        arrays = self.lanes.arrays(count * self.stages)
-        self.lanes.call(self.kernel, records, self.lanes.addresses(arrays), 0, count, 1, self.lanes.threads)
+        arrays, outs = self.lanes.arrays(count * self.stages)
+        self.lanes.call(self.kernel, records, outs, 0, count, 1, self.lanes.threads)
         return arrays
 
     def rows(self, count: int, records: np.ndarray) -> np.ndarray:
