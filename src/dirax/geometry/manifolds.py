@@ -60,6 +60,9 @@ class AbstractManifold(eqx.Module):
         """The norm of the part of v that is not tangent at x."""
         return norm(v - self.projection(x, v))
 
+    def _tangent_defect_and_size(self, x: Vector, v: Vector) -> tuple[Scalar, Scalar]:
+        return self.tangent_defect(x, v), norm(v)
+
     def contains(self, x: Vector, tolerance: float = 1e-9) -> Bool[Array, ""]:
         """Whether x is on the manifold: `defect(x) <= tolerance`."""
         return self.defect(x) <= tolerance
@@ -83,7 +86,7 @@ class AbstractManifold(eqx.Module):
         self._check_shape(v, name)
         if is_traced(x, v):
             return
-        defect, size = evaluated(self.tangent_defect, x, v), evaluated(norm, v)
+        defect, size = evaluated(self._tangent_defect_and_size, x, v)
         if is_traced(defect, size):
             return
         if not float(defect) <= tolerance * (1.0 + float(size)):

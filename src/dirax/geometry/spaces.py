@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import TINY, arc_over_sine, norm, radial
-from dirax.tracing import call
+from dirax.tracing import Method, call
 
 
 class AbstractFlat(AbstractGeodesicManifold):
@@ -190,7 +190,7 @@ class Product(AbstractGeodesicManifold):
     def _blocks(self, method: str, *arguments):
         """The method of every factor on its blocks; factors that are equal are traced once where that can be."""
         rows = zip(self.factors, *(self.split(argument) for argument in arguments), strict=True)
-        return [call(getattr(factor, method), *blocks) for factor, *blocks in rows]
+        return [call(Method(getattr(type(factor), method), factor), *blocks) for factor, *blocks in rows]
 
     def defect(self, x):
         return jnp.max(jnp.stack(self._blocks("defect", x)))

@@ -43,6 +43,13 @@ class Graph:
     def __len__(self) -> int:
         return len(self.op)
 
+    def copy(self) -> "Graph":
+        """A graph of the same nodes, to which others can be added."""
+        other = Graph()
+        other.op, other.args, other.value = self.op.copy(), self.args.copy(), self.value.copy()
+        other.slopes, other._known = self.slopes.copy(), self._known.copy()
+        return other
+
     # ------------------------------------------------------------------ leaves
 
     def constant(self, value) -> int:

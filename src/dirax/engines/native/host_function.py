@@ -9,6 +9,7 @@ import numpy as np
 
 from dirax.engines.native.graph import Graph
 from dirax.engines.native.interpret import Interpreter, Nodes, Unavailable
+from dirax.engines.native.operations import partials
 from dirax.engines.native.trace import NODE_LIMIT
 
 LANES = 1024
@@ -41,6 +42,30 @@ class Values:
             for row, value in enumerate(self.graph.evaluate(nodes.ravel().tolist(), {}, values=self._known)):
                 table[row] = value
         return table.T.reshape(self.entries, *nodes.shape)
+
+    def slopes(self, nodes: list[int], inputs: list[int]) -> np.ndarray:
+        """The derivatives of nodes by inputs, (entries, nodes, inputs): forward over the graph, which only gains the
+        derivatives of single operations."""
+        g, values = self.graph, self._known
+        none = np.zeros((len(inputs), self.entries))
+        unit = np.eye(len(inputs))[:, :, None] * np.ones(self.entries)
+        rows = dict(zip(inputs, unit, strict=True))
+        needed = g.reachable(nodes)
+        g.evaluate(needed, {}, values=values)
+        with np.errstate(all="ignore"):
+            for node in needed:
+                args = g.args[node]
+                if node in rows or not any([a in rows for a in args]):
+                    continue
+                if g.op[node] == "select":
+                    rows[node] = np.where(values[args[0]], rows.get(args[1], none), rows.get(args[2], none))
+                    continue
+                along = [(slope, rows[a]) for a, slope in zip(args, partials(g, node), strict=True) if a in rows]
+                chosen = [(slope, row) for slope, row in along if slope is not None]
+                factors = g.evaluate([slope for slope, _ in chosen], {}, values=values)
+                terms = [factor * row for factor, (_, row) in zip(factors, chosen, strict=True)]
+                rows[node] = sum(terms[1:], terms[0]) if terms else none
+        return np.stack([rows.get(node, none) for node in nodes]).transpose(2, 0, 1)
 
 
 def in_parts(function: Callable, leaves: list[np.ndarray]) -> list[np.ndarray]:

@@ -54,20 +54,17 @@ def linearized(equation: Any, params: Any, batch_params: bool, u, state, t, h) -
     engine compiles; arguments have an axis of entries, `params` with `batch_params`. None where it does not compile the step."""
     try:
         made, _ = program(equation, params, batch_params)
-        first = made.equations[0]
-        rows = made.jacobian(0)
-    except (UnsupportedPrimitive, GraphTooLarge):
+    except UnsupportedPrimitive:
         return None
-    k, node = len(first.unknowns), lambda nodes: np.asarray(nodes, dtype=np.int64)
-    entries = node([[row.get(j, made.graph.zero) for j in range(k)] for row in rows]).reshape(k, k)
+    first, shared, graph = made.equations[0], made.shared, made.graph.copy()
+    node = lambda nodes: np.asarray(nodes, dtype=np.int64)
     leaves = np.broadcast_to(made.parameters.flatten(params, len(u) if batch_params else None), (len(u), made.parameters.size))
-    shared = made.shared
 
     def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
-        known = Values(made.graph, len(arguments[0]))
+        known = Values(graph, len(arguments[0]))
         for nodes, array in zip((first.unknowns, first.state, shared.t, shared.h, shared.params), arguments, strict=True):
             known.bind(node(nodes), array)
-        return [known.read(node(first.residual)), known.read(entries)]
+        return [known.read(node(first.residual)), known.slopes(first.residual, first.unknowns)]
 
     residual, jacobian = in_parts(part, [u, state, t, h, leaves])
     return residual, jacobian
