@@ -23,9 +23,16 @@ def solve(matrix: Float[Array, "n n"], right: Array) -> Array:
     return solve_p.bind(matrix, right)[0]
 
 
+def pseudo_inverse(matrix: Float[Array, "k l"], tolerance: float) -> Float[Array, "l k"]:
+    """`jnp.linalg.pinv`; singular values below `tolerance`, relative to the largest, count as zero."""
+    if not becomes_scalars(matrix):
+        return jnp.linalg.pinv(matrix, tolerance)
+    return pseudo_inverse_p.bind(matrix, tolerance=tolerance)[0]
+
+
 def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> tuple[Float[Array, "l k"], Float[Array, " l"]]:
     """The pseudo-inverse of a matrix with rows and columns scaled to unit size, and the units that this gives the columns."""
-    inverse, units = pseudo_inverse_p.bind(matrix) if becomes_scalars(matrix) else equilibrated_inverse(jnp, matrix)
+    inverse, units = scaled_inverse_p.bind(matrix) if becomes_scalars(matrix) else equilibrated_inverse(jnp, matrix)
     return inverse, units
 
 
@@ -57,4 +64,9 @@ def _solve_tangents(primals, tangents):
 
 solve_p = deferred("dirax_solve", lambda a, b: [jnp.linalg.solve(a, b)], lambda a, b: [ShapedArray(b.shape, b.dtype)])
 ad.primitive_jvps[solve_p] = _solve_tangents
-pseudo_inverse_p = deferred("dirax_pseudo_inverse", lambda matrix: equilibrated_inverse(jnp, matrix), _turned)
+pseudo_inverse_p = deferred(
+    "dirax_pseudo_inverse",
+    lambda matrix, tolerance: [jnp.linalg.pinv(matrix, tolerance)],
+    lambda matrix, **_: _turned(matrix)[:1],
+)
+scaled_inverse_p = deferred("dirax_scaled_inverse", lambda matrix: equilibrated_inverse(jnp, matrix), _turned)

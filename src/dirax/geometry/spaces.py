@@ -124,14 +124,14 @@ class Sphere(AbstractGeodesicManifold):
 
     def local_parametrization(self, x):
         # The frame is only a choice of coordinates, so it is held fixed under differentiation in x.
-        frame = jax.lax.stop_gradient(orthonormal_complement(x))
+        frame = jax.lax.stop_gradient(call(orthonormal_complement, x))
         return lambda r: self.nearest(x + frame @ r)
 
     def frame(self, x):
-        return orthonormal_complement(x)
+        return call(orthonormal_complement, x)
 
     def coordinates(self, x, v):
-        return orthonormal_complement(x).T @ v
+        return call(orthonormal_complement, x).T @ v
 
     def exp(self, x, v):
         s = jnp.dot(v, v)

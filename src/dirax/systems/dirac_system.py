@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from dirax.functions import UserFunction
 from dirax.geometry.structures import DiracStructure
-from dirax.linear_solves import solve
+from dirax.linear_solves import pseudo_inverse, solve
 from dirax.roots import nearest_root
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
@@ -174,7 +174,7 @@ class DiracSystem(AbstractSystem):
         rows = self.holonomic_matrix(x, params)
         count = rows.shape[0]
         matrix = jnp.concatenate([matrix, jnp.concatenate([rows, jnp.zeros((count, count))], axis=1)])
-        rates = jnp.linalg.pinv(matrix, rtol=RANK_TOLERANCE) @ jnp.concatenate([right, jnp.zeros(count)])
+        rates = pseudo_inverse(matrix, RANK_TOLERANCE) @ jnp.concatenate([right, jnp.zeros(count)])
         return {"x": x, "velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
 
     def project(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:

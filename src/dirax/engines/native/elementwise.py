@@ -1,5 +1,6 @@
 """Rules of elementwise primitives."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,7 @@ SAME = {  # primitive name → operation of the graph
     "ne": "ne",
     "is_finite": "finite",
 }
+DIRECT = {"add": Graph.add, "sub": Graph.sub, "mul": Graph.mul}
 BY_LEMMA = {
     "square": lambda g, x: g.mul(x, x),
     "rsqrt": lambda g, x: g.recip(g.make("sqrt", x)),
@@ -64,7 +66,7 @@ def same(interpreter: Interpreter, equation: Any, *operands):
     graph, op = interpreter.graph, SAME[equation.primitive.name]
     if op in ("eq", "ne") and equation.invars[0].aval.dtype == np.bool_:
         return [elementwise(lambda a, b: _exclusive_or(graph, a, b, op == "eq"), *operands)]
-    return [elementwise(lambda *nodes: graph.make(op, *nodes), *operands)]
+    return [elementwise(DIRECT[op].__get__(graph) if op in DIRECT else functools.partial(graph.make, op), *operands)]
 
 
 @rule(*BY_LEMMA)

@@ -94,6 +94,8 @@ class Graph:
 
     def make(self, op: str, *args: int) -> int:
         """The node op(args), simplified."""
+        if op == "select":
+            return self._select(*args)
         ops = self.op
         for a in args:
             if ops[a] not in CONSTANT:

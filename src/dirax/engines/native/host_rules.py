@@ -1,5 +1,6 @@
 """What is computed by NumPy between parts of a graph: decompositions, roots, loops whose length depends on their values."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -46,10 +47,7 @@ def svd(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nod
         raise Unsupported("finds some singular values only")
 
     def decompose(operands: list[np.ndarray]) -> list[np.ndarray]:
-        (a,) = operands
-        good = np.all(np.isfinite(a), axis=(-2, -1))[..., None, None]
-        found = np.linalg.svd(np.where(good, a, 0.0), full_matrices=p["full_matrices"])
-        left, values, right = (np.where(good if x.ndim == a.ndim else good[..., 0], x, np.nan) for x in found)
+        left, values, right = _of_finite(lambda a: np.linalg.svd(a, full_matrices=p["full_matrices"]), *operands)
         return [values, left, right] if p["compute_uv"] else [values]
 
     return made.between([matrix], [v.aval.shape for v in equation.outvars], decompose)
@@ -62,10 +60,8 @@ def eigh(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: No
         raise Unsupported("finds some eigenvalues only")
 
     def decompose(operands: list[np.ndarray]) -> list[np.ndarray]:
-        (a,) = operands
-        good = np.all(np.isfinite(a), axis=(-2, -1))[..., None, None]
-        values, vectors = np.linalg.eigh(np.where(good, a, 0.0), UPLO="L" if p["lower"] else "U")
-        return [np.where(good, vectors, np.nan), np.where(good[..., 0], values, np.nan)]
+        values, vectors = _of_finite(lambda a: np.linalg.eigh(a, UPLO="L" if p["lower"] else "U"), *operands)
+        return [vectors, values]
 
     return made.between([matrix], [v.aval.shape for v in equation.outvars], decompose)
 
@@ -113,14 +109,27 @@ def _solved(matrices: np.ndarray, sides: np.ndarray) -> np.ndarray:
 
 @host_rule("dirax_pseudo_inverse")
 def pseudo_inverse(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
+    inverse = functools.partial(np.linalg.pinv, rcond=equation.params["tolerance"])
+    return made.between(
+        [matrix], [equation.outvars[0].aval.shape], lambda operands: _of_finite(lambda a: [inverse(a)], *operands)
+    )
+
+
+@host_rule("dirax_scaled_inverse")
+def scaled_inverse(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
     return made.between([matrix], [v.aval.shape for v in equation.outvars], lambda operands: _inverted(*operands))
 
 
 def _inverted(matrices: np.ndarray) -> list[np.ndarray]:
-    """The scaled pseudo-inverses and their units; NaN for a matrix that is not finite."""
+    """The scaled pseudo-inverses and their units."""
+    return _of_finite(functools.partial(equilibrated_inverse, np), matrices)
+
+
+def _of_finite(function: Callable, matrices: np.ndarray) -> list[np.ndarray]:
+    """The arrays that `function` gives for matrices with leading axes; NaN for a matrix that is not finite."""
     good = np.all(np.isfinite(matrices), axis=(-2, -1))
-    inverse, units = equilibrated_inverse(np, np.where(good[:, None, None], matrices, 0.0))
-    return [np.where(good[:, None, None], inverse, np.nan), np.where(good[:, None], units, np.nan)]
+    spread = lambda a: good.reshape(*good.shape, *(1,) * (a.ndim - good.ndim))
+    return [np.where(spread(a), a, np.nan) for a in function(np.where(spread(matrices), matrices, 0.0))]
 
 
 @host_rule("dirax_root")

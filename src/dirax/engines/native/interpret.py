@@ -133,6 +133,9 @@ def is_integer(variable: Any) -> bool:
 
 def elementwise(function: Callable[..., int], *operands: Nodes) -> Nodes:
     """`function` on nodes, entry by entry, scalars spread."""
-    spread = np.broadcast_arrays(*operands)
-    flat = [function(*entry) for entry in zip(*(a.ravel().tolist() for a in spread), strict=True)]
-    return np.array(flat, dtype=np.int64).reshape(spread[0].shape)
+    shape = operands[0].shape
+    if any(a.shape != shape for a in operands):
+        operands = tuple(np.broadcast_arrays(*operands))
+        shape = operands[0].shape
+    flat = list(map(function, *(a.ravel().tolist() for a in operands)))
+    return np.array(flat, dtype=np.int64).reshape(shape)

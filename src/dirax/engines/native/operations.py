@@ -70,7 +70,10 @@ OPERATIONS: dict[str, Any] = {
     "not": np.logical_not,
 }
 
-EXACT = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "neg": operator.neg}
+EXACT = {
+    **{"add": operator.add, "sub": operator.sub, "mul": operator.mul, "neg": operator.neg, "abs": abs},
+    **{"lt": operator.lt, "le": operator.le, "eq": operator.eq, "ne": operator.ne},
+}
 """Operations that Python's numbers do as NumPy's do, without a warning or an error."""
 
 BOOLEAN = frozenset({"bool", "lt", "le", "eq", "ne", "finite", "and", "or", "not"})
