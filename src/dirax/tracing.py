@@ -40,7 +40,7 @@ graph loses digits or meets ∞·0 (an arcsine, a logistic function)."""
 RULE = "custom_jvp_call"
 """A function with a rule of its own for its derivative, which the graph knows how to take where it is one of numbers."""
 
-PATIENCE = 50_000
+PATIENCE = 200_000
 """New objects after which Python looks for garbage while something is traced; it takes a tenth of the time as it comes."""
 
 
