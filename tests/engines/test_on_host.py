@@ -9,6 +9,7 @@ import pytest
 
 import dirax as dx
 from dirax.engines.native import host_function as module
+from dirax.engines.native import on_host as on_host_module
 from dirax.engines.native.on_host import linearized, on_host
 from dirax.linear_solves import scaled_pseudo_inverse, solve
 from dirax.roots import nearest_root
@@ -52,8 +53,13 @@ def test_what_has_no_rule_is_left_to_the_compiler():
     assert jax.jit(lambda y: jnp.zeros(()) if on_host(lambda x: x * y, [x], ()) is None else y)(2.0) == 0.0
 
 
-def test_the_first_step_is_linearized_as_jax_does_it():
-    system = dx.LagrangeDirac(lambda q, v, g: v @ v / 2 * (1 + q[0] ** 2) + g * jnp.cos(q[1]), lambda q: jnp.stack([jnp.sin(q)]))
+@pytest.mark.parametrize("limit", [0, 10**9], ids=["on the graph", "in numbers"])
+def test_the_first_step_is_linearized_as_jax_does_it(limit, monkeypatch):
+    monkeypatch.setattr(on_host_module, "IN_NUMBERS", limit)
+    system = dx.LagrangeDirac(
+        lambda q, v, g: v @ v / 2 * (1 + q[0] ** 2) + g * jnp.where(q[1] > 0, jnp.cos(q[1]), 1 - q[1] ** 2 / 2),
+        lambda q: jnp.stack([jnp.sin(q)]),
+    )
     equation: Any = make_step_equation(dx.LagrangeDAlembert(), system, Shape(2, 1))
     u, state = np.random.default_rng(1).normal(size=(2, 5, 4))
     u, t, h, g = u[:, :3], np.zeros(5), np.full(5, 0.1), np.linspace(1, 2, 5)

@@ -47,23 +47,22 @@ class Values:
         """The derivatives of nodes by inputs, (entries, nodes, inputs): forward over the graph, which only gains the
         derivatives of single operations."""
         g, values = self.graph, self._known
-        none = np.zeros((len(inputs), self.entries))
-        unit = np.eye(len(inputs))[:, :, None] * np.ones(self.entries)
-        rows = dict(zip(inputs, unit, strict=True))
-        needed = g.reachable(nodes)
-        g.evaluate(needed, {}, values=values)
+        moving, factors = set(inputs), {}
+        for node in g.reachable(nodes):
+            args = g.args[node]
+            if node not in moving and any([a in moving for a in args]):
+                moving.add(node)
+                factors[node] = [] if g.op[node] == "select" else partials(g, node)
         with np.errstate(all="ignore"):
-            for node in needed:
+            g.evaluate([*nodes, *(f for slopes in factors.values() for f in slopes if f is not None)], {}, values=values)
+            none = np.zeros((len(inputs), self.entries))
+            rows = dict(zip(inputs, np.eye(len(inputs))[:, :, None] * np.ones(self.entries), strict=True))
+            for node, slopes in factors.items():
                 args = g.args[node]
-                if node in rows or not any([a in rows for a in args]):
-                    continue
                 if g.op[node] == "select":
                     rows[node] = np.where(values[args[0]], rows.get(args[1], none), rows.get(args[2], none))
                     continue
-                along = [(slope, rows[a]) for a, slope in zip(args, partials(g, node), strict=True) if a in rows]
-                chosen = [(slope, row) for slope, row in along if slope is not None]
-                factors = g.evaluate([slope for slope, _ in chosen], {}, values=values)
-                terms = [factor * row for factor, (_, row) in zip(factors, chosen, strict=True)]
+                terms = [values[f] * rows[a] for a, f in zip(args, slopes, strict=True) if f is not None and a in rows]
                 rows[node] = sum(terms[1:], terms[0]) if terms else none
         return np.stack([rows.get(node, none) for node in nodes]).transpose(2, 0, 1)
 

@@ -18,6 +18,9 @@ from dirax.tracing import in_scalars
 KEPT = 128
 """Functions kept in memory."""
 
+IN_NUMBERS = 2**22
+"""Derivatives of nodes up to which a Jacobian is found in numbers, which is quicker once than to write it as nodes."""
+
 _functions: OrderedDict[tuple, tuple[Any, tuple[HostFunction, Any] | None]] = OrderedDict()
 
 
@@ -54,9 +57,12 @@ def linearized(equation: Any, params: Any, batch_params: bool, u, state, t, h) -
     engine compiles; arguments have an axis of entries, `params` with `batch_params`. None where it does not compile the step."""
     try:
         made, _ = program(equation, params, batch_params)
-    except UnsupportedPrimitive:
+        first, shared, graph, k = made.equations[0], made.shared, made.graph, equation.stages[0][0].unknowns
+        few = len(u) * k * len(graph) <= IN_NUMBERS
+        entries = [] if few else [row.get(j, graph.zero) for row in made.jacobian(0) for j in range(k)]
+    except (UnsupportedPrimitive, GraphTooLarge):
         return None
-    first, shared, graph = made.equations[0], made.shared, made.graph.copy()
+    graph = graph.copy() if few else graph
     node = lambda nodes: np.asarray(nodes, dtype=np.int64)
     leaves = np.broadcast_to(made.parameters.flatten(params, len(u) if batch_params else None), (len(u), made.parameters.size))
 
@@ -64,7 +70,8 @@ def linearized(equation: Any, params: Any, batch_params: bool, u, state, t, h) -
         known = Values(graph, len(arguments[0]))
         for nodes, array in zip((first.unknowns, first.state, shared.t, shared.h, shared.params), arguments, strict=True):
             known.bind(node(nodes), array)
-        return [known.read(node(first.residual)), known.slopes(first.residual, first.unknowns)]
+        slopes = known.slopes(first.residual, first.unknowns) if few else known.read(node(entries).reshape(k, k))
+        return [known.read(node(first.residual)), slopes]
 
     residual, jacobian = in_parts(part, [u, state, t, h, leaves])
     return residual, jacobian
