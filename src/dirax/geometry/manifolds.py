@@ -60,9 +60,6 @@ class AbstractManifold(eqx.Module):
         """The norm of the part of v that is not tangent at x."""
         return norm(v - self.projection(x, v))
 
-    def _tangent_defect_and_size(self, x: Vector, v: Vector) -> tuple[Scalar, Scalar]:
-        return self.tangent_defect(x, v), norm(v)
-
     def contains(self, x: Vector, tolerance: float = 1e-9) -> Bool[Array, ""]:
         """Whether x is on the manifold: `defect(x) <= tolerance`."""
         return self.defect(x) <= tolerance
@@ -73,26 +70,35 @@ class AbstractManifold(eqx.Module):
         if is_traced(x):
             return
         defect = evaluated(self.defect, x)
-        if is_traced(defect):  # a constant inside a traced function
-            return
-        if not float(defect) <= tolerance:
-            raise ValueError(
-                f"{name} is not on {self}: its defect is {float(defect):.3g}, more than {tolerance:.1g}. "
-                "Use `nearest` to put it there."
-            )
+        if not is_traced(defect):  # a constant inside a traced function
+            self._refuse_off(float(defect), name, tolerance)
 
-    def check_tangent(self, x: Vector, v: Vector, name: str = "v", tolerance: float = 1e-8) -> None:
-        """Raise `ValueError` for a wrong shape, and for a concrete v that is not tangent at x, with the defect."""
+    def check_tangent(self, x: Vector, v: Vector, name: str = "v", tolerance: float = 1e-8, point: str | None = None) -> None:
+        """Raise `ValueError` for a wrong shape, and for a concrete v that is not tangent at x, with the defect; and, where it
+        has a name, for a `point` x off the manifold."""
+        if point is not None:
+            self._check_shape(x, point)
         self._check_shape(v, name)
         if is_traced(x, v):
             return
-        defect, size = evaluated(self._tangent_defect_and_size, x, v)
-        if is_traced(defect, size):
+        off, defect, size = evaluated(self._defects, x, v)
+        if is_traced(off, defect, size):
             return
+        if point is not None:
+            self._refuse_off(float(off), point, tolerance)
         if not float(defect) <= tolerance * (1.0 + float(size)):
             raise ValueError(
                 f"{name} is not tangent to {self} at the given point: its normal part has norm {float(defect):.3g}. "
                 "Use `projection` to take it away."
+            )
+
+    def _defects(self, x: Vector, v: Vector) -> tuple[Scalar, Scalar, Scalar]:
+        return self.defect(x), self.tangent_defect(x, v), norm(v)
+
+    def _refuse_off(self, defect: float, name: str, tolerance: float) -> None:
+        if not defect <= tolerance:
+            raise ValueError(
+                f"{name} is not on {self}: its defect is {defect:.3g}, more than {tolerance:.1g}. Use `nearest` to put it there."
             )
 
     def _check_shape(self, x: Vector, name: str) -> None:

@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from dirax.formulas import Formula, apply
+from dirax.tracing import call
 
 Scalar: TypeAlias = Float[Array, ""]
 
@@ -108,6 +109,10 @@ def _piecewise(xp: Any, s: Any, below: float, coefficients: Sequence[float], oth
 
 def norm(v: Float[Array, " n"]) -> Scalar:
     """Euclidean norm with derivative 0, instead of NaN, at v = 0."""
+    return call(_norm, v)
+
+
+def _norm(v: Float[Array, " n"]) -> Scalar:
     s = jnp.sum(v * v)
     return jnp.where(s == 0.0, 0.0, jnp.sqrt(jnp.where(s == 0.0, 1.0, s)))
 

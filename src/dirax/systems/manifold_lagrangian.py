@@ -53,10 +53,11 @@ class ManifoldLagrangian(AbstractSystem):
         if "q" not in data:
             raise ValueError(f"a system on a manifold starts from q= with v= or p=, but {', '.join(data)} were given.")
         q = data["q"]
-        self.manifold.check_point(q, "q")
-        for name in ("v", "p"):
-            if name in data:
-                self.manifold.check_tangent(q, data[name], name)
+        vectors = [name for name in ("v", "p") if name in data]
+        for name in vectors:
+            self.manifold.check_tangent(q, data[name], name, point="q")
+        if not vectors:
+            self.manifold.check_point(q, "q")
         if self.lagrangian.shape(q, q, params).shape != ():
             raise ValueError(f"lagrangian must return a scalar, not shape {self.lagrangian.shape(q, q, params).shape}.")
         return q.shape[0], 0
