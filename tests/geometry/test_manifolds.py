@@ -341,8 +341,9 @@ def test_errors_say_what_is_wrong_and_by_how_much():
         sphere.check_point(jnp.zeros((2, 3)))
     with pytest.raises(ValueError, match="defect is nan"):
         sphere.check_point(jnp.full(3, jnp.nan))
-    with pytest.raises(ValueError, match="n ≥ 2"):
-        Sphere(1)
+    for space, n in ((Sphere, 1), (Sphere, 2.5), (Torus, [1.0, 2.0]), (Euclidean, -1), (Torus, True)):
+        with pytest.raises(ValueError, match="needs a whole number n ≥"):
+            space(n)
     with pytest.raises(TypeError, match="factors of Product"):
         Product(Sphere(3), 3)  # pyright: ignore[reportArgumentType]
     jax.jit(lambda x: sphere.check_point(x))(2.0 * x)  # traced values are not looked at

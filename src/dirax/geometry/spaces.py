@@ -1,5 +1,7 @@
 """Vector spaces, tori, spheres and products as manifolds."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -52,13 +54,13 @@ class AbstractFlat(AbstractGeodesicManifold):
 
 
 class Euclidean(AbstractFlat):
-    """The vector space R^n."""
+    """The vector space R^n. Raises `ValueError` for n that is no whole number ≥ 0."""
 
     dimension: int = eqx.field(static=True)
     ambient_dimension: int = eqx.field(static=True)
 
     def __init__(self, dimension: int):
-        self.dimension = self.ambient_dimension = dimension
+        self.dimension = self.ambient_dimension = _whole("Euclidean(n), the vector space R^n", dimension, 0)
 
     def representative(self, x, near):
         return x
@@ -71,13 +73,16 @@ class Euclidean(AbstractFlat):
 
 
 class Torus(AbstractFlat):
-    """The torus T^n, a point being n angles in radians, any real numbers, equal modulo 2π; `log` is in [−π, π]."""
+    """The torus T^n, a point being n angles in radians, any real numbers, equal modulo 2π; `log` is in [−π, π].
+
+    Raises `ValueError` for n that is no whole number ≥ 1.
+    """
 
     dimension: int = eqx.field(static=True)
     ambient_dimension: int = eqx.field(static=True)
 
     def __init__(self, dimension: int):
-        self.dimension = self.ambient_dimension = dimension
+        self.dimension = self.ambient_dimension = _whole("Torus(n), the torus of n angles", dimension, 1)
 
     def representative(self, x, near):
         return near + self.log(near, x)
@@ -99,15 +104,14 @@ class Sphere(AbstractGeodesicManifold):
     """The unit sphere S^{n−1} of R^n, n ≥ 2, in ambient coordinates, with the round metric.
 
     The retraction is (x + v)/‖x + v‖, and its inverse y/⟨x, y⟩ − x is defined on the open hemisphere around x.
-    Raises `ValueError` for n < 2.
+    Raises `ValueError` for n that is no whole number ≥ 2.
     """
 
     dimension: int = eqx.field(static=True)
     ambient_dimension: int = eqx.field(static=True)
 
     def __init__(self, n: int):
-        if n < 2:
-            raise ValueError(f"Sphere(n) is the unit sphere of R^n with n ≥ 2, but n = {n} came.")
+        n = _whole("Sphere(n), the unit sphere of R^n", n, 2)
         self.dimension, self.ambient_dimension = n - 1, n
 
     def defect(self, x):
@@ -238,6 +242,12 @@ class Product(AbstractGeodesicManifold):
 
     def retraction_reach(self, x, v):
         return jnp.max(jnp.stack(self._blocks("retraction_reach", x, v)))
+
+
+def _whole(what: str, n: Any, least: int) -> int:
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < least:
+        raise ValueError(f"{what}, needs a whole number n ≥ {least}, but n = {n!r} came.")
+    return int(n)
 
 
 def orthonormal_complement(x: Float[Array, " n"]) -> Float[Array, "n n-1"]:
