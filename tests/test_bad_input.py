@@ -382,7 +382,11 @@ def test_ctrl_c_keeps_what_was_computed(batch, engine):
     shape = (3, 1) if batch else (1,)
     q, v = np.ones(shape), np.zeros(shape)
     run = {"step": 1e-3, "steps": 10_000_000, "save_every": 5, "progress": stop, "engine": engine}
-    sol = dx.simulate(OSCILLATOR, PLUS, q=q, v=v, **run)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job ignores
+    try:
+        sol = dx.simulate(OSCILLATOR, PLUS, q=q, v=v, **run)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert seen[-1][1] == 10_000_000 and 0 < seen[-1][0] < 10_000_000
     assert not np.any(sol.ok)
     message = sol.message[2] if batch else sol.message
