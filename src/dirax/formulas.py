@@ -44,10 +44,6 @@ def _by_jax(formula: Formula, *x):
 
 
 @_by_jax.defjvp
-def _by_jax_tangent(formula, primals, tangents):
-    return _value_and_tangent(formula, primals, tangents)
-
-
 def _value_and_tangent(formula, primals, tangents):
     slopes = zip(formula.slopes(), tangents, strict=True)
     parts = [slope[0] * apply(slope[1], *primals) * along for slope, along in slopes if slope is not None]

@@ -111,11 +111,6 @@ def thread_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def address(array: np.ndarray) -> int:
-    """Where an array begins."""
-    return array.ctypes.data
-
-
 class Lanes:
     """The records of all trajectories in blocks of `width` lanes: (blocks, quantities, width) doubles.
 
@@ -145,7 +140,7 @@ class Lanes:
         self.place = {name: first.fields[name].place for name in self.shapes}
         self.ends_before = [place == "step" for place in self.place.values()]
         self.sizes = [math.prod(shape) for shape in self.shapes.values()]
-        self._at = address(self.params), self.params.strides[0]
+        self._at = self.params.ctypes.data, self.params.strides[0]
         self.states, self.first_unknowns = s, first.unknowns
 
     def _blocked(self, table: np.ndarray) -> np.ndarray:
@@ -167,11 +162,11 @@ class Lanes:
         ends = list(itertools.accumulate(sizes, initial=0))
         if ends[-1] <= TOGETHER:
             whole = np.empty(ends[-1])
-            parts, first = [whole[a:b] for a, b in itertools.pairwise(ends)], address(whole)
+            parts, first = [whole[a:b] for a, b in itertools.pairwise(ends)], whole.ctypes.data
             begins = [first + 8 * end for end in ends[:-1]]
         else:
             parts = [np.empty(size) for size in sizes]
-            begins = [address(part) for part in parts]
+            begins = [part.ctypes.data for part in parts]
         made = {
             name: part.reshape(lanes, count, *shape)
             for (name, shape), part, count in zip(self.shapes.items(), parts, counts, strict=True)
@@ -186,7 +181,7 @@ class Lanes:
         """Steps `first` to `stop` − 1 of every trajectory, blocks shared among threads; Ctrl-C waits for their end."""
         p = self.problem
         numbers = (p.t0, p.h, p.first_step, first, stop, every, p.max_iterations)
-        places = (address(records), records.strides[0]), self._at, (address(outs), outs.strides[0])
+        places = (records.ctypes.data, records.strides[0]), self._at, (outs.ctypes.data, outs.strides[0])
 
         def part(low: int, high: int) -> None:
             kernel(*[place + low * stride for place, stride in places], high - low, *numbers)

@@ -66,7 +66,7 @@ def same(interpreter: Interpreter, equation: Any, *operands):
     graph, op = interpreter.graph, SAME[equation.primitive.name]
     if op in ("eq", "ne") and equation.invars[0].aval.dtype == np.bool_:
         return [elementwise(lambda a, b: _exclusive_or(graph, a, b, op == "eq"), *operands)]
-    return [elementwise(DIRECT[op].__get__(graph) if op in DIRECT else functools.partial(graph.make, op), *operands)]
+    return [elementwise(functools.partial(DIRECT[op], graph) if op in DIRECT else functools.partial(graph.make, op), *operands)]
 
 
 @rule(*BY_LEMMA)

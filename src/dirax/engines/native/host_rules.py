@@ -43,27 +43,28 @@ def dot_general(made: HostFunction, interpreter: Interpreter, equation: Any, a: 
 @host_rule("svd")
 def svd(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
     p = equation.params
-    if p.get("subset_by_index") is not None:
-        raise Unsupported("finds some singular values only")
 
-    def decompose(operands: list[np.ndarray]) -> list[np.ndarray]:
-        left, values, right = _of_finite(lambda a: np.linalg.svd(a, full_matrices=p["full_matrices"]), *operands)
+    def decompose(a: np.ndarray) -> list[np.ndarray]:
+        left, values, right = np.linalg.svd(a, full_matrices=p["full_matrices"])
         return [values, left, right] if p["compute_uv"] else [values]
 
-    return made.between([matrix], [v.aval.shape for v in equation.outvars], decompose)
+    return _decomposed(made, equation, matrix, decompose, "singular values")
 
 
 @host_rule("eigh")
 def eigh(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
-    p = equation.params
-    if p.get("subset_by_index") is not None:
-        raise Unsupported("finds some eigenvalues only")
-
-    def decompose(operands: list[np.ndarray]) -> list[np.ndarray]:
-        values, vectors = _of_finite(lambda a: np.linalg.eigh(a, UPLO="L" if p["lower"] else "U"), *operands)
+    def decompose(a: np.ndarray) -> list[np.ndarray]:
+        values, vectors = np.linalg.eigh(a, UPLO="L" if equation.params["lower"] else "U")
         return [vectors, values]
 
-    return made.between([matrix], [v.aval.shape for v in equation.outvars], decompose)
+    return _decomposed(made, equation, matrix, decompose, "eigenvalues")
+
+
+def _decomposed(made: HostFunction, equation: Any, matrix: Nodes, decompose: Callable, what: str) -> list[Nodes]:
+    if equation.params.get("subset_by_index") is not None:
+        raise Unsupported(f"finds some {what} only")
+    shapes = [v.aval.shape for v in equation.outvars]
+    return made.between([matrix], shapes, lambda operands: _of_finite(decompose, *operands))
 
 
 @host_rule("while")
@@ -171,9 +172,8 @@ def _newton(residual: Callable, linear: Callable, u: np.ndarray) -> tuple[np.nda
 
     fraction = np.ones(len(u))
     with np.errstate(all="ignore"):
-        better = at_floor.copy()
-        better[~at_floor] = shorter(fraction)[~at_floor] if not np.all(at_floor) else False
+        better = at_floor if np.all(at_floor) else at_floor | shorter(fraction)
         while np.any(searching := ~better & (fraction > SHORTEST)):
             fraction = np.where(searching, fraction / 2.0, fraction)
-            better |= searching & shorter(fraction)
+            better = better | searching & shorter(fraction)
         return np.where(better[:, None], u - fraction[:, None] * change, u), better & ~at_floor
