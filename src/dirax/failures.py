@@ -30,7 +30,7 @@ def explain(problem: Problem, outcome: Outcome, lane: int, kept: int | None = No
 
 def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     """The stages of the failing step are replayed one by one, to see where it breaks."""
-    params = jax.tree.map(lambda a: a[lane], p.params) if p.batch_params else p.params
+    params = jax.tree.map(lambda a: jnp.asarray(a[lane] if p.batch_params else a), p.params)
     state, last = jnp.asarray(outcome.last_state[lane]), jnp.asarray(outcome.last_unknowns[lane])
     solved = []
     for stage, fraction in p.equation.stages:

@@ -34,8 +34,9 @@ class Start(NamedTuple):
     jacobian: Any
 
 
-def initial_data(given: dict[str, Any]) -> tuple[dict[str, jax.Array], int | None]:
-    """The initial data as float64 arrays of shape (n,) or (B, n), and B (None for one trajectory)."""
+def initial_data(given: dict[str, Any]) -> tuple[dict[str, Any], int | None]:
+    """The initial data as float64 arrays of shape (n,) or (B, n), NumPy's where no value is traced, and B (None for one
+    trajectory)."""
     if set(given) not in KINDS:
         came = ", ".join(f"{name}=" for name in sorted(given)) + (" alone" if len(given) == 1 else "")
         raise ValueError(
@@ -54,11 +55,15 @@ def initial_data(given: dict[str, Any]) -> tuple[dict[str, jax.Array], int | Non
         )
     batch = batches.pop() if batches else None
     if batch is not None:
-        arrays = {name: jnp.broadcast_to(a, (batch, a.shape[-1])) for name, a in arrays.items()}
+        arrays = {name: _spread(a, batch) for name, a in arrays.items()}
     return arrays, batch
 
 
-def _real_array(name: str, value: Any) -> jax.Array:
+def _spread(array: Any, batch: int) -> Any:
+    return (jnp if is_traced(array) else np).broadcast_to(array, (batch, array.shape[-1]))
+
+
+def _real_array(name: str, value: Any) -> Any:
     try:
         array = jnp.asarray(value) if is_traced(value) else np.asarray(value)
     except ValueError as error:
@@ -69,7 +74,7 @@ def _real_array(name: str, value: Any) -> jax.Array:
     if array.ndim not in (1, 2) or 0 in array.shape:
         raise ValueError(f"{name} must have shape (n,), or (B, n) for a batch of B trajectories, but its shape is {array.shape}.")
     check_finite(name, array)
-    return jnp.asarray(array, dtype=jnp.float64)
+    return array.astype(np.float64)
 
 
 def prepared(system, equation, data, params, h, t0, batch, batch_params: bool, project: bool) -> Start:
@@ -78,7 +83,7 @@ def prepared(system, equation, data, params, h, t0, batch, batch_params: bool, p
         raise ValueError("a composition cannot start from q0= and q1=, which belong to one step: give q= with v= or p=.")
     axes = None if batch is None else (0, 0 if batch_params else None, None, None)
     if batch is not None:  # the batch axis can be that of the parameters alone
-        data = {name: jnp.broadcast_to(a, (batch, a.shape[-1])) for name, a in data.items()}
+        data = {name: _spread(a, batch) for name, a in data.items()}
     start = None
     if not is_traced(data, params, h, t0):
         start = _begin_on_host(system, equation, data, params, h, t0, batch, batch_params, project)

@@ -76,10 +76,8 @@ def simulate(
     batch = _batch_size(batch, params, batch_params)
     system = system if inputs is None else _driven(system, inputs)
 
-    # NumPy's arrays where they can be: an entry or a part of JAX's is a program to compile
-    plain = lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf)
-    one: dict[str, Any] = {k: a[0] if a.ndim == 2 else a for k, a in ((k, plain(a)) for k, a in data.items())}
-    one_params = jax.tree.map(lambda leaf: plain(leaf)[0], params) if batch_params else params
+    one: dict[str, Any] = {k: a[0] if a.ndim == 2 else a for k, a in data.items()}
+    one_params = jax.tree.map(lambda leaf: leaf[0], params) if batch_params else params
 
     def begin(shape: Shape):
         equation = make_step_equation(scheme, system, shape)
@@ -105,7 +103,7 @@ def simulate(
         steps=steps - start.first_step,
         save_every=save_every,
         first_step=start.first_step,
-        params=params,
+        params=jax.tree.map(jnp.asarray, params) if traced else params,
         batch=batch,
         batch_params=batch_params,
         max_iterations=max_iterations,
@@ -267,15 +265,14 @@ def _is_boolean(leaf) -> bool:
 
 
 def _arrays(params):
-    """The pytree with arrays for its leaves."""
+    """The pytree with arrays for its leaves: NumPy's where they can be, for JAX's start JAX and compile what takes a part."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if not _is_number(leaf) and not _is_boolean(leaf):
             raise TypeError(
                 f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {leaf!r:.60}: "
                 "use such a value in the system's functions directly."
             )
-    # device_put takes a number as it is, where jnp.asarray compiles a program
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf) if is_traced(leaf) else jax.device_put(np.asarray(leaf)), params)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf) if is_traced(leaf) else np.array(leaf), params)
 
 
 def _batch_size(batch: int | None, params, batch_params: bool) -> int | None:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -59,7 +60,7 @@ class Solution:
         self.step, self.save_every, self.stats = step, save_every, stats
         self.ok, self.message = ok, message
         self.system, self.scheme, self.equation = system, scheme, equation
-        self.params, self.batch_params = params, batch_params
+        self._params, self.batch_params = params, batch_params
         self.initial = initial or {}
         self.metadata = metadata or {}
         self.derived = dict(derived or {})
@@ -77,6 +78,11 @@ class Solution:
         """Number of trajectories, None for a single one without a batch axis."""
         name, values = next(iter(self.fields.items()))
         return values.shape[0] if np.ndim(values) == len(self.field_info[name].shape) + 2 else None
+
+    @cached_property
+    def params(self) -> Any:
+        """The params of a run, as JAX's arrays."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, self._params)
 
     @property
     def params_of_one(self) -> Any:

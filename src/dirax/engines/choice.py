@@ -1,5 +1,7 @@
 """Which engine runs a problem: native for small systems on a CPU, xla for everything."""
 
+from functools import cache
+from importlib.util import find_spec
 from typing import Any
 
 import jax
@@ -12,6 +14,9 @@ ENGINES = ("auto", "xla", "native")
 
 LARGEST_NATIVE = 32
 """Unknowns of a stage, or entries of the state, up to which "auto" takes the native engine."""
+
+PLUGINS = ("jax_plugins", "libtpu")
+"""The packages without which JAX has no device but CPUs."""
 
 
 def run_on(engine: str, problem: Problem, progress: Progress | None = None) -> Outcome:
@@ -59,8 +64,15 @@ def _too_large(problem: Problem) -> str | None:
 
 def _other_device() -> str | None:
     device: Any = getattr(jax.config, "jax_default_device", None)
-    platform = getattr(device, "platform", device) or jax.default_backend()
+    # asking JAX starts it, which takes 10 ms
+    known = "cpu" if jax.config.jax_platforms == "cpu" or not _plugins() else None
+    platform = getattr(device, "platform", device) or known or jax.default_backend()
     return None if platform == "cpu" else f"JAX computes on {platform}"
+
+
+@cache
+def _plugins() -> bool:
+    return any(map(find_spec, PLUGINS))
 
 
 def _native_host() -> Any:

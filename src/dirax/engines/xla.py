@@ -134,14 +134,14 @@ def run(problem: Problem, progress: Progress | None = None) -> Outcome:
     started = time.perf_counter()
     p, derived, notes = _derived(problem)
     chunk = _compiled(jax.default_backend())
-    axes, capacity = _axes(p), _capacity(p)
+    axes, capacity, params = _axes(p), _capacity(p), jax.device_put(p.params)
     lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, derived.increments is not None)
 
     def call(lanes, start, stop, closing=False):
         t0, h, first_step = map(np.float64, (p.t0, p.h, p.first_step))
         every, start, stop = map(np.int64, (p.save_every, start, stop))
         clock = Clock(t0, h, first_step, every, start, stop, np.bool_(closing))
-        after, rows = chunk(p.equation, lanes, p.params, clock, capacity, axes, p.max_iterations, derived)
+        after, rows = chunk(p.equation, lanes, params, clock, capacity, axes, p.max_iterations, derived)
         return after, {name: _by_lane(np.asarray(values), p.batch, np) for name, values in rows.items()}
 
     _, empty = call(lanes, 0, 0)  # compile
