@@ -13,17 +13,21 @@ from dirax.configure import with_option
 FAST = """
 import dirax as dx
 from dirax.configure import small_loops_are_one_kernel
+system = dx.LagrangeDirac(lambda q, v, params: (v @ v - params["k"] * q @ q) / 2)
+run = {"q": [1.0], "v": [0.0], "params": {"k": 1.0}, "step": 0.5, "steps": 2}
+sol = dx.simulate(system, dx.PlusLagrangeDirac(), **run)
+assert sol.stats["engine"] == "native"
+assert abs(sol.q[-1, 0] - 0.3125) < 1e-14, sol.q
 dx.configure(fast_loops=True)
 assert small_loops_are_one_kernel()
-system = dx.LagrangeDirac(lambda q, v: (v @ v - q @ q) / 2)
-sol = dx.simulate(system, dx.PlusLagrangeDirac(), q=[1.0], v=[0.0], step=0.5, steps=2, engine="xla")
+sol = dx.simulate(system, dx.PlusLagrangeDirac(), **run, engine="xla")
 assert abs(sol.q[-1, 0] - 0.3125) < 1e-14, sol.q
 """
 
 
 def test_before_the_first_computation():
-    """Importing dirax computes nothing. Two steps of p −= q/2, q += p/2 from (1, 0): q = 1, 3/4, 5/16."""
-    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    """Importing dirax computes nothing, and a run of the native engine nothing by JAX. Two steps of p −= q/2, q += p/2 from (1, 0): q = 1, 3/4, 5/16."""
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"} | {"JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", FAST], env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
 

@@ -31,6 +31,19 @@ def test_indices_and_truth_values(engine):
     assert sol.ok.all() and sol.stats["engine"] == ("native" if engine == "auto" else engine)
     exact = cayley(TABLE[k] * np.where(stiff, 3.0, 1.0), 0.1, 30)
     np.testing.assert_allclose(sol.q[:, -1, 0], exact, atol=1e-12)
+    np.testing.assert_allclose(np.ptp(sol.energy(), axis=1), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("engine", ["xla", "auto"])
+def test_a_table_read_where_the_params_are_captured(engine):
+    """sol.params can be closed over and read by an index that JAX traces, as can what a failed step is explained from."""
+    chosen = oscillator(lambda p: p["table"][p["k"]])
+    once = {"q": np.ones(1), "v": np.zeros(1), "params": {"table": TABLE, "k": 2}, "step": 0.1, "steps": 3, "engine": engine}
+    sol = dx.simulate(chosen, MIDPOINT, **once)
+    assert jax.jit(lambda k: sol.params["table"][k])(1) == 2.0
+    limited = dx.LagrangeDirac(lambda q, v, p: v @ v / 2 + p["table"][p["k"]] * jnp.sum(jnp.log(1.1 - q)))
+    failed = dx.simulate(limited, MIDPOINT, **once | {"v": np.full(1, 5.0), "steps": 30})
+    assert not failed.ok and "step" in failed.message and len(failed.t) < 31
 
 
 @pytest.mark.parametrize("engine", ["xla", "auto"])

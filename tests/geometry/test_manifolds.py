@@ -55,7 +55,8 @@ def manifold_laws(name):
         y = manifold.exp(x, v)
         log = manifold.log(x, y)
         near = inside(manifold, x, v, 0.45)
-        zero = jnp.zeros_like(v)
+        zero, time = jnp.zeros_like(v), jnp.asarray(0.3)
+        curve = lambda t: manifold.exp(x, t * v)
         point = manifold.local_parametrization(x)
         origin = jnp.zeros(manifold.dimension)
         frame = manifold.frame(x)
@@ -64,6 +65,8 @@ def manifold_laws(name):
             "projection idempotent": manifold.projection(x, w) - w,
             "projection symmetric": jnp.dot(w, b) - jnp.dot(w, manifold.projection(x, b)),
             "exp on the manifold": manifold.defect(y),
+            "point of a geodesic": manifold.geodesic(x, v, time)[0] - manifold.exp(x, time * v),
+            "velocity of a geodesic": manifold.geodesic(x, v, time)[1] - jax.jvp(curve, (time,), (1.0,))[1],
             "log tangent": manifold.tangent_defect(x, log),
             "log of exp": log - v,
             "exp of log": manifold.representative(manifold.exp(x, log), y) - y,

@@ -39,6 +39,10 @@ class RetractionChart(eqx.Module):
         """The coordinates r = φ(x) (d,) of a point of the domain."""
         return call(_to_local, self, x)
 
+    def components(self, v: Vector) -> Local:
+        """The components (d,) in `frame` of a tangent vector v (N,) at m."""
+        return (v @ self.frame) / jnp.sum(self.frame**2, axis=0)  # frames of all manifolds have orthogonal columns
+
     def velocity_to_manifold(self, r: Local, velocity: Local) -> tuple[Vector, Vector]:
         """The point and the tangent vector with coordinates (r, ṙ)."""
         return value_along(self.to_manifold, (r,), (velocity,))
@@ -90,8 +94,7 @@ def _to_manifold(chart: RetractionChart, r: Local) -> Vector:
 def _to_local(chart: RetractionChart, x: Vector) -> Local:
     x = chart.manifold.representative(x, chart.base)
     v = chart.manifold.log(chart.base, x) if chart.exponential else chart.manifold.inverse_retraction(chart.base, x)
-    # frames of all manifolds here have orthogonal columns
-    return (v @ chart.frame) / jnp.sum(chart.frame**2, axis=0)
+    return chart.components(v)
 
 
 def _pulled(function: Callable, at: Float[Array, " k"], covector: Float[Array, " l"]) -> Float[Array, " k"]:
@@ -143,12 +146,20 @@ class Atlas(eqx.Module):
             base = self.centres[jnp.argmin(jax.vmap(self.manifold.distance, (0, None))(self.centres, base))]
         return RetractionChart(self.manifold, base, self.manifold.frame(base), self.exponential)
 
+    def enter(self, x: Vector, p: Vector) -> tuple[RetractionChart, Local, Local]:
+        """(chart, r, p): the chart at x and the coordinates of a covector p (N,) at x, given by any vector with the right
+        pairing. At its own centre a chart has the derivative `frame`."""
+        chart = self.chart_at(x)
+        if self.centres is None:
+            return chart, jnp.zeros(self.manifold.dimension), chart.frame.T @ p
+        return chart, *chart.momentum_to_local(x, p)
+
     def follow(self, chart: RetractionChart, r: Local, momentum: Local) -> tuple[RetractionChart, Local, Local]:
         """(chart, r, p) as it is while inside the chart, else the same covector in the chart at its point."""
 
         def change():
-            new = self.chart_at(self.manifold.nearest(chart.to_manifold(r)))
-            return new, *chart.transition_momentum(r, momentum, new)
+            x, p = chart.momentum_to_manifold(r, momentum)
+            return self.enter(self.manifold.nearest(x), p)
 
         return jax.lax.cond(chart.leaving(r, self.leave_at), change, lambda: (chart, r, momentum))
 

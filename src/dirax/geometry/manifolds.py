@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from dirax.functions import evaluated, is_traced
 from dirax.geometry.numerics import Scalar, norm
+from dirax.tracing import value_along
 
 Vector: TypeAlias = Float[Array, " N"]
 
@@ -115,6 +116,10 @@ class AbstractGeodesicManifold(AbstractManifold):
     @abstractmethod
     def exp(self, x: Vector, v: Vector) -> Vector:
         """The point at time 1 on the geodesic that leaves x with velocity v."""
+
+    def geodesic(self, x: Vector, v: Vector, t: Scalar) -> tuple[Vector, Vector]:
+        """The point exp(x, t v) and the velocity there, at time t on the geodesic that leaves x with velocity v."""
+        return value_along(lambda t: self.exp(x, t * v), (t,), (jnp.ones_like(t),))
 
     @abstractmethod
     def log(self, x: Vector, y: Vector) -> Vector:

@@ -17,7 +17,6 @@ from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold, Vector
 from dirax.geometry.numerics import Scalar, norm
 from dirax.geometry.spaces import Euclidean, Product, Sphere
-from dirax.tracing import value_along
 
 Pair = tuple[Vector, Vector]
 
@@ -133,10 +132,7 @@ class RiemannianExp(AbstractDiscretizationMap):
         return tuple(jax.vmap(lambda time: self.space.exp(x, time * v))(_times(self.theta)))
 
     def backward(self, x0, x1):
-        # One geodesic t ↦ exp(x0, t log(x0, x1)): x and v are its point and its velocity at t = θ.
-        direction = self.space.log(x0, x1)
-        time = jnp.asarray(self.theta)
-        return value_along(lambda t: self.space.exp(x0, t * direction), (time,), (jnp.ones_like(time),))
+        return self.space.geodesic(x0, self.space.log(x0, x1), jnp.asarray(self.theta))
 
     def reach(self, x, v):
         return self.space.exp_reach(x, v)

@@ -37,6 +37,9 @@ class AbstractFlat(AbstractGeodesicManifold):
     def exp(self, x, v):
         return x + v
 
+    def geodesic(self, x, v, t):
+        return x + t * v, v
+
     def distance(self, x, y):
         return norm(self.log(x, y))
 
@@ -141,6 +144,11 @@ class Sphere(AbstractGeodesicManifold):
         s = jnp.dot(v, v)
         return radial(0, s) * x + radial(1, s) * v
 
+    def geodesic(self, x, v, t):
+        s = jnp.dot(v, v)
+        cosine, sine = radial(0, t * t * s), t * radial(1, t * t * s)
+        return cosine * x + sine * v, cosine * v - (s * sine) * x
+
     def log(self, x, y):
         difference, sum_ = y - x, y + x
         near, far = jnp.dot(difference, difference) / 4.0, jnp.dot(sum_, sum_) / 4.0
@@ -221,6 +229,11 @@ class Product(AbstractGeodesicManifold):
 
     def exp(self, x, v):
         return jnp.concatenate(self._blocks("exp", x, v))
+
+    def geodesic(self, x, v, t):
+        rows = zip(self.factors, self.split(x), self.split(v), strict=True)
+        points, velocities = zip(*(call(Method(type(f).geodesic, f), *blocks, t) for f, *blocks in rows), strict=True)
+        return jnp.concatenate(points), jnp.concatenate(velocities)
 
     def log(self, x, y):
         return jnp.concatenate(self._blocks("log", x, y))

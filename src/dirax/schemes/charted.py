@@ -67,10 +67,8 @@ def _charted(system, manifold, map, atlas: Atlas, size: int) -> StepEquation:
         return {"q": q, "p": momentum, "chart": state[:size]}
 
     def start(data, h, params):
-        here = atlas.chart_at(data["q"])
-        r, p = here.momentum_to_local(data["q"], data["p"])
-        _, v = here.velocity_to_local(data["q"], data["v"])
-        return jnp.concatenate([here.base, r, p]), v
+        here, r, p = atlas.enter(data["q"], data["p"])
+        return jnp.concatenate([here.base, r, p]), here.components(data["v"])  # a first guess of the velocity
 
     fields = {
         "q": Field((size,)),
