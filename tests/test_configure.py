@@ -26,8 +26,10 @@ assert abs(sol.q[-1, 0] - 0.3125) < 1e-14, sol.q
 
 
 def test_before_the_first_computation():
-    """Importing dirax computes nothing, and a run of the native engine nothing by JAX. Two steps of p −= q/2, q += p/2 from (1, 0): q = 1, 3/4, 5/16."""
-    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"} | {"JAX_PLATFORMS": "cpu"}
+    """Importing dirax computes nothing, and a run of the native engine nothing by JAX. Two steps of p −= q/2, q += p/2
+    from (1, 0): q = 1, 3/4, 5/16."""
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    environment["JAX_PLATFORMS"] = "cpu"
     done = subprocess.run([sys.executable, "-c", FAST], env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
 
