@@ -65,7 +65,7 @@ def _too_large(problem: Problem) -> str | None:
 def _other_device() -> str | None:
     device: Any = getattr(jax.config, "jax_default_device", None)
     # asking JAX starts it, which takes 10 ms
-    known = "cpu" if jax.config.jax_platforms == "cpu" or not _plugins() else None
+    known = "cpu" if getattr(jax.config, "jax_platforms", None) == "cpu" or not _plugins() else None
     platform = getattr(device, "platform", device) or known or jax.default_backend()
     return None if platform == "cpu" else f"JAX computes on {platform}"
 
