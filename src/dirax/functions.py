@@ -135,6 +135,12 @@ def evaluated(function: Callable, *values: Any) -> Any:
     return _compiled(function, *values) if found is None else found[0]
 
 
+def constant_entries(function: Callable, *values: Any) -> np.ndarray | None:
+    """The array `function(*values)` with NaN for the entries that depend on the values; None where that is not found."""
+    host = _host()
+    return None if host is None else host.constant_entries(function, values)
+
+
 @eqx.filter_jit
 def _compiled(function: Callable, *values: Any) -> Any:
     return function(*values)
@@ -149,8 +155,8 @@ _host = _no_host
 
 def evaluate_on(host: Callable[[], Any]) -> None:
     """Have concrete values found without a compiler by what `host` returns: a module with `evaluated(function, values)`, a
-    tuple of one result, and `reads_inside(jaxpr, values)`, whether every index is inside its array; None and False where it
-    cannot say."""
+    tuple of one result, `constant_entries(function, values)`, an array, and `reads_inside(jaxpr, values)`, whether every
+    index is inside its array; None and False where it cannot say."""
     global _host
     _host = host
 

@@ -62,8 +62,13 @@ def _solve_tangents(primals, tangents):
     return [x], solve_p.bind(matrix, along_right - along_matrix @ x)
 
 
+def _solve_transposed(along, matrix, right):
+    return [None, solve_p.bind(jnp.swapaxes(matrix, -1, -2), along[0])[0]]
+
+
 solve_p = deferred("dirax_solve", lambda a, b: [jnp.linalg.solve(a, b)], lambda a, b: [ShapedArray(b.shape, b.dtype)])
 ad.primitive_jvps[solve_p] = _solve_tangents
+ad.primitive_transposes[solve_p] = _solve_transposed
 pseudo_inverse_p = deferred(
     "dirax_pseudo_inverse",
     lambda matrix, tolerance: [jnp.linalg.pinv(matrix, tolerance)],

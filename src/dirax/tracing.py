@@ -85,6 +85,12 @@ def call(function: Callable, *values: Any) -> Any:
     return known[function](*values)
 
 
+def shared(function: Callable) -> Callable:
+    """A function that is traced once wherever it is used, with derivatives by the graph and by JAX apart."""
+    by_jax, by_graph = jax.jit(function), jax.jit(lambda *values: function(*values))
+    return lambda *values: (by_graph if _in_scalars.get() else by_jax)(*values)
+
+
 @dataclass(frozen=True)
 class Method:
     """A method of an object, equal for equal objects; quicker to make and to compare than those of equinox."""
@@ -129,7 +135,8 @@ def along(function: Callable, point: tuple, direction: tuple) -> Any:
     if not _in_scalars.get():
         return jax.jvp(function, point, direction)[1]
     shifted = lambda s: function(*(x + s * v for x, v in zip(point, direction, strict=True)))
-    return jacobian(shifted)(np.zeros(()))
+    by_jax = lambda function, _: lambda s: jax.jvp(function, (s,), (jnp.ones(()),))[1]
+    return _derivative(shifted, 0, by_jax)(np.zeros(()))
 
 
 def value_along(function: Callable, point: tuple, direction: tuple) -> tuple[Any, Any]:

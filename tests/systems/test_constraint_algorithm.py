@@ -171,11 +171,22 @@ def test_secondary_constraints_that_exist_only_on_the_manifold():
     assert (dimensions(chain), chain.verdict) == ([2, 1, 1], "determined")
     assert "appears only on M_0: off it the rank is 3" in str(chain)
     assert chain.field(chain.point) == pytest.approx([1.0, 0.0, 1.0], abs=1e-13)
-    # the same by a rank of E that drops where the first condition vanishes: refused, with the way out
+    # the same by a rank of E that drops where the first condition vanishes
     dropping = ImplicitSystem(
         E=lambda x: jnp.diag(jnp.stack([1.0, 0.0, x[1]])), f=lambda x: jnp.array([1.0, x[1], x[0] - x[2]])
     )  # fmt: skip
     chain = constraint_algorithm(dropping, np.array([0.5, 0.2, 0.3]))
+    assert (dimensions(chain), chain.verdict) == ([2, 1, 1], "determined")
+    assert chain.field(chain.point) == pytest.approx([1.0, 0.0, 1.0], abs=1e-13)
+
+
+def test_conditions_that_end_where_they_vanish_are_refused_with_the_way_out():
+    """x_1 ẋ_2 = x_0 − x_2, said twice, the second time off by x_1: where that vanishes, there is no ẋ_2 to compare."""
+    system = ImplicitSystem(
+        E=lambda x: jnp.array([[1.0, 0, 0], [0, 0, 0], [0, 0, 0]]).at[1:, 2].set(x[1]),
+        f=lambda x: jnp.array([1.0, x[0] - x[2], x[0] - x[2] + x[1]]),
+    )
+    chain = constraint_algorithm(system, np.array([0.5, 0.2, 0.3]))
     assert chain.verdict == "irregular" and "hold only there" in chain.explanation
 
 

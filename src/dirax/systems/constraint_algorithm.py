@@ -1,26 +1,24 @@
 """The constraint algorithm: M_k = τ(S_k), S_{k+1} = S_k ∩ TM_k, until it repeats or nothing is left ([BLM] §3).
 
 S_0 is A_0(x)(ẋ, u) = b_0(x). A left null vector of A_0 gives a condition on x; all of them, M_0. The derivatives of these
-conditions are appended as rows, which gives A_1, and so on. With bases Z, N of the left and right kernels of A_k at one
-point of M_{k−1}, the bordered equations
-
-    A_k w + Z s = b_k,   Nᵀ w = 0
-
-are regular around it, smooth in x, and s(x) = 0 is the condition b_k ∈ im A_k wherever A_k keeps its rank.
+conditions are appended as rows, which gives A_1, and so on. Rows that restrict no rate on M_k leave nothing but their
+conditions, and are not asked again.
 """
 
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.functions import check_finite, is_traced
+from dirax.functions import check_finite, constant_entries, evaluated, is_traced
+from dirax.linear_solves import solve
+from dirax.systems.affine_equations import Solved, explicit, solved
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
 from dirax.systems.implicit_form import ImplicitForm, implicit_form
 from dirax.systems.system import AbstractSystem
+from dirax.tracing import along, jacobian, shared
 
 RANK_TOLERANCE = 1e-8
 ZERO = 1e-10
@@ -72,30 +70,47 @@ class _Search:
         self.parts: list[Callable] = []
         self.levels: list[ConstraintLevel] = []
         self.phi_and_slope: Callable = lambda x: (np.zeros(0), np.zeros((0, self.size)))
-        compiled = jax.jit(form.equations)
-        self.given = lambda x: tuple(np.asarray(a) for a in compiled(jnp.asarray(x), params))
+        self.given = self.at_points(form.equations)
+        self.explicit = explicit(form.equations, self.constant_entries(form.equations), self.size)
+        self.rows = [self.explicit.rest]
+        """Equations of c, where (ẋ, u) = w + K c solves the explicit ones."""
 
     # ------------------------------------------------------------------ functions of the current level
+
+    def at_points(self, function: Callable) -> Callable:
+        """A function of (x, params) as one of points, with NumPy's arrays."""
+        return lambda x: tuple(np.asarray(a) for a in evaluated(function, x, self.params))
+
+    def constant_entries(self, equations: Callable) -> np.ndarray:
+        """A of the equations (A, b), with NaN for what depends on x or is not known not to."""
+        matrix = lambda x, params: equations(x, params)[0]
+        found = constant_entries(matrix, self.x, self.params)
+        return np.full(jax.eval_shape(matrix, self.x, self.params).shape, np.nan) if found is None else found
 
     def constraints(self) -> Callable:
         parts = tuple(self.parts)
         if not parts:
             return lambda x, params: jnp.zeros(0)
-        return lambda x, params: jnp.concatenate([part(x, params) for part in parts])
+        return shared(lambda x, params: jnp.concatenate([part(x, params) for part in parts]))
 
     def equations(self) -> Callable:
-        """(A_k, b_k), traceable: S_0 and the tangency to all constraints so far."""
-        phi, form, free = self.constraints(), self.form, self.unknowns - self.size
-        if not self.parts:
-            return form.equations
+        """(x, params) ↦ the equations (A, b) of c that are still asked, one below the other."""
+        rows = tuple(self.rows)
+        return lambda x, params: tuple(jnp.concatenate(a) for a in zip(*(row(x, params) for row in rows), strict=True))
 
-        def stacked(x, params):
-            matrix, right = form.equations(x, params)
-            slope = jax.jacfwd(lambda x: phi(x, params))(x)
-            rows = jnp.concatenate([slope, jnp.zeros((slope.shape[0], free))], axis=1)
-            return jnp.concatenate([matrix, rows]), jnp.concatenate([right, jnp.zeros(slope.shape[0])])
+    def tangency(self, part: Callable) -> Callable:
+        """Dφ ẋ = 0 as equations of c."""
+        family, size = self.explicit.family, self.size
 
-        return stacked
+        @shared
+        def rows(x, params):
+            w, basis = family(x, params)
+            rate = lambda y: along(lambda x: part(x, params), (x,), (y[:size],))
+            columns = [rate(basis[:, j]) for j in range(basis.shape[1])]
+            right = -rate(w)
+            return jnp.stack(columns, axis=1) if columns else jnp.zeros((*right.shape, 0)), right
+
+        return rows
 
     def matrix(self, x: np.ndarray) -> np.ndarray:
         """A_k at a point."""
@@ -105,9 +120,8 @@ class _Search:
     def with_conditions(self, conditions: Callable) -> Callable:
         """x ↦ (φ, Dφ) of the constraints so far and the conditions after them, as numpy arrays."""
         phi = self.constraints()
-        both = lambda x, params: jnp.concatenate([phi(x, params), conditions(x, params)])
-        compiled = jax.jit(lambda x, params: (both(x, params), jax.jacfwd(lambda x: both(x, params))(x)))
-        return lambda x: tuple(np.asarray(a) for a in compiled(jnp.asarray(x), self.params))
+        both = shared(lambda x, params: jnp.concatenate([phi(x, params), conditions(x, params)]))
+        return self.at_points(lambda x, params: (both(x, params), jacobian(lambda x: both(x, params))(x)))
 
     # ------------------------------------------------------------------ points
 
@@ -129,6 +143,7 @@ class _Search:
             if np.abs(change).max() <= 1e-15 * (1.0 + np.abs(x).max()):
                 break
         value, _ = function(x)
+        self.singular = not np.all(np.isfinite(value))
         return x if np.abs(value).max() <= ZERO * max(first, 1e-300) * (1.0 + np.abs(x).max()) else None
 
     def around(self, function: Callable | None = None) -> list[np.ndarray]:
@@ -158,20 +173,21 @@ class _Search:
                     f"the rank of the equations of (ẋ, u) is {ranks[0]} at the point and {sorted(set(ranks[1:]))} around it on "
                     f"{place}: it is not constant, and the algorithm does not apply across such a point. Give another `near`.",
                 )
-            matrix, rank = matrices[0], ranks[0]
-            left, _, right = np.linalg.svd(matrix)
-            solve = _bordered(self.equations(), left[:, rank:], right[rank:].T)
-            if rank == matrix.shape[0]:
-                return self.finish(solve, right[rank:].T, rank)
-            conditions = lambda x, params, solve=solve: solve(x, params)[self.unknowns :]
-            function = self.with_conditions(conditions)
-            values = np.array([function(x)[0] for x in points])
+            rank, equations = ranks[0], self.equations()
+            here, entries = self.at_points(equations)(self.x)[0], self.constant_entries(equations)
+            found = solved(equations, here, rank - self.explicit.rank, entries)
+            null = np.linalg.svd(matrices[0])[2][rank:].T
+            if not found.count:
+                return self.finish(found, null, rank)
+            missed = self.at_points(lambda x, params, found=found: (found.conditions(x, params),))
             size = 1.0 + np.abs(self.given(self.x)[1]).max(initial=0.0) + np.abs(self.x).max()
-            if np.all(np.abs(values) <= ZERO * size):
-                return self.finish(solve, right[rank:].T, rank)
-            outcome = self.add(conditions, function, points, rank, self._off_manifold(rank, place))
+            if all(np.all(np.abs(missed(x)[0]) <= ZERO * size) for x in points):
+                return self.finish(found, null, rank)
+            function = self.with_conditions(found.conditions)
+            outcome = self.add(found.conditions, function, points, rank, self._off_manifold(rank, place))
             if outcome is not None:
                 return outcome
+            self.rows = [*(self.rows if rank > self.explicit.rank else ()), self.tangency(self.parts[-1])]
 
     def _off_manifold(self, rank: int, place: str) -> str:
         """A remark where conditions exist on the manifold only, because the rank is larger off it."""
@@ -212,7 +228,7 @@ class _Search:
                 "regular zero set. State such a constraint by a function whose derivative does not vanish.",
             )
         select = _independent(slope[old:], slope[:old], reference[old:], new)
-        part = jax.jit(lambda x, params: jnp.asarray(select) @ conditions(x, params))
+        part = shared(lambda x, params: select @ conditions(x, params))
 
         def constraints_of_level(x):
             value, slope = function(x)
@@ -235,7 +251,7 @@ class _Search:
 
     # ------------------------------------------------------------------ ends
 
-    def finish(self, solve: "_bordered", null: np.ndarray, rank: int) -> ConstraintChain:
+    def finish(self, found: Solved, null: np.ndarray, rank: int) -> ConstraintChain:
         n = self.size
         freedom = rank_of(null[:n].T, np.ones(null.shape[1])) if null.size else 0
         redundant = null.shape[1] - freedom
@@ -251,9 +267,19 @@ class _Search:
         words.append(f"{freedom} direction{'s' * (freedom > 1)} of ẋ undetermined" if freedom else "ẋ is determined")
         if redundant:
             words.append(f"{redundant} multiplier{'s' * (redundant > 1)} undetermined: constraints are redundant, consistently")
-        rows = self.unknowns
-        solution = lambda x, params: solve(x, params)[:rows]
-        kernel = lambda x, params: solve.kernel(x, params)
+        family = self.explicit.family
+
+        @shared
+        def kernel(x, params):
+            free = family(x, params)[1] @ found.kernel(x, params)
+            return free @ solve(null.T @ free, jnp.eye(null.shape[1]))
+
+        @shared
+        def solution(x, params):
+            w, basis = family(x, params)
+            rates = w + basis @ found.solution(x, params)
+            return rates - kernel(x, params) @ (null.T @ rates) if null.size else rates
+
         return self.end(GAUGE if freedom else DETERMINED, "; ".join(words) + ".", index, freedom, redundant, solution, kernel)
 
     def end(self, verdict, explanation, index=None, freedom=0, redundant=0, solution=None, kernel=None) -> ConstraintChain:
@@ -269,37 +295,11 @@ class _Search:
             multiplier_names=self.form.multipliers,
             clock=self.form.clock,
             params=self.params,
-            _constraints=eqx.filter_jit(self.constraints()),
-            _solution=None if solution is None else eqx.filter_jit(solution),
-            _kernel=None if kernel is None else eqx.filter_jit(kernel),
+            _constraints=self.constraints(),
+            _solution=solution,
+            _kernel=kernel,
             _energy=self.form.energy,
         )
-
-
-class _bordered:
-    """(x, params) ↦ (w, s) of the bordered equations, and the smooth kernel basis of A that they give."""
-
-    def __init__(self, equations: Callable, left: np.ndarray, right: np.ndarray):
-        # jitted, so that the levels above, which differentiate this one, trace it once
-        self.equations, self.left, self.right = jax.jit(equations), jnp.asarray(left), jnp.asarray(right)
-        self._solve = jax.jit(self._solved)
-
-    def _matrix(self, matrix):
-        corner = jnp.zeros((self.right.shape[1], self.left.shape[1]))
-        return jnp.block([[matrix, self.left], [self.right.T, corner]])
-
-    def __call__(self, x, params):
-        return self._solve(x, params)
-
-    def _solved(self, x, params):
-        matrix, right = self.equations(x, params)
-        return jnp.linalg.solve(self._matrix(matrix), jnp.concatenate([right, jnp.zeros(self.right.shape[1])]))
-
-    def kernel(self, x, params):
-        matrix, right = self.equations(x, params)
-        free = self.right.shape[1]
-        sides = jnp.concatenate([jnp.zeros((right.shape[0], free)), jnp.eye(free)])
-        return jnp.linalg.solve(self._matrix(matrix), sides)[: matrix.shape[1]]
 
 
 def _independent(slope: np.ndarray, old: np.ndarray, reference: np.ndarray, count: int) -> np.ndarray:

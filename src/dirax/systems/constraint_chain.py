@@ -5,14 +5,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import is_traced
+from dirax.functions import evaluated, is_traced
 from dirax.roots import nearest_root
 from dirax.systems.system import AbstractSystem
+from dirax.tracing import Method, gradient, jacobian
 
 DETERMINED, GAUGE, EMPTY, IRREGULAR = "determined", "gauge freedom", "empty", "irregular"
 OFF = 1e-8
@@ -78,31 +78,29 @@ class ConstraintChain:
 
     def constraints(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " c"]:
         """All constraint functions of M_f at x, level by level."""
-        return self._constraints(x, self._with(params))
+        return self._at(self._constraints, x, params)
 
     def field(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
         """The tangent field ẋ on M_f; where it is not unique, the one whose undetermined part was zero at `point`.
 
         Raises `ValueError` for a chain that ended empty or irregular.
         """
-        return self._solved()(x, self._with(params))[: len(self.coordinates)]
+        return self._at(self._solved(), x, params)[: len(self.coordinates)]
 
     def multipliers(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " m"]:
         """The multipliers u that keep x on M_f, in the order of `multiplier_names`. Raises as `field`."""
-        return self._solved()(x, self._with(params))[len(self.coordinates) :]
+        return self._at(self._solved(), x, params)[len(self.coordinates) :]
 
     def gauge(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N freedom"]:
         """A basis, by columns, of the directions of ẋ that the equations leave free. Raises as `field`."""
         if self._kernel is None:
             raise ValueError(f"this constraint chain has no final manifold: {self.explanation}")
-        kernel = self._kernel(x, self._with(params))[: len(self.coordinates)]
-        return _span(kernel, self.freedom)
+        return self._at(self._free_directions, x, params)
 
     def project(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
         """The point y of M_f nearest to x: y + Dφ(y)ᵀσ = x, φ(y) = 0. Differentiable."""
         self._solved()
-        multipliers = jnp.zeros(sum(level.count for level in self.levels))
-        return _nearest(self._constraints, self.normal, jnp.asarray(x, dtype=float), multipliers, self._with(params))
+        return self._at(self._nearest, x, params)
 
     def normal(self, covector: Float[Array, " N"]) -> Float[Array, " N"]:
         """The vector that a combination of the dφ pushes points along: the same numbers, without the time's."""
@@ -110,11 +108,13 @@ class ConstraintChain:
 
     def check(self, x: Float[Array, " N"], params: Any = None) -> None:
         """Raise `ValueError` for a point off M_f, with the first level it is off, the values, and its projection."""
-        x, params = jnp.asarray(x, dtype=float), self._with(params)
+        params = self._with(params)
         if is_traced(x, params):
             return
-        if x.shape != (len(self.coordinates),):
-            raise ValueError(f"x must have shape ({len(self.coordinates)},) = {self.coordinates}, but it has shape {x.shape}.")
+        if np.shape(x) != (len(self.coordinates),):
+            raise ValueError(
+                f"x must have shape ({len(self.coordinates)},) = {self.coordinates}, but it has shape {np.shape(x)}."
+            )
         if text := self.off(x, params):
             raise ValueError(f"{text}: start from chain.project(x).")
 
@@ -122,8 +122,8 @@ class ConstraintChain:
         """The first level that x is off, the values of its constraints and the nearest point of M_f, in words; "" on M_f."""
         params = self._with(params)
         for level in self.levels:
-            value = np.asarray(level.constraints(x, params))
-            slope = np.abs(_slope(level.constraints, x, params)).max(initial=0.0)
+            value, slope = map(np.asarray, self._at(Method(_with_slope, level.constraints), x, params))
+            slope = np.abs(slope).max(initial=0.0)
             if np.abs(value).max(initial=0.0) > OFF * slope * (1.0 + np.abs(np.asarray(x)).max()):
                 where = np.asarray(self.project(x, params))
                 return (
@@ -150,6 +150,27 @@ class ConstraintChain:
     def _with(self, params):
         return self.params if params is None else params
 
+    def _at(self, function: Callable, x, params):
+        """A function of (x, params), at concrete values without a compiler."""
+        params = self._with(params)
+        return function(x, params) if is_traced(x, params) else evaluated(function, np.asarray(x, dtype=float), params)
+
+    def _nearest(self, x, params):
+        multipliers = jnp.zeros(sum(level.count for level in self.levels))
+
+        def residual(u):
+            y, sigma = u[: x.shape[0]], u[x.shape[0] :]
+            pull = gradient(lambda y: self._constraints(y, params) @ sigma)(y)
+            return jnp.concatenate([y + self.normal(pull) - x, self._constraints(y, params)])
+
+        return nearest_root(residual, jnp.concatenate([x, multipliers]))[: x.shape[0]]
+
+    def _free_directions(self, x, params):
+        """An orthonormal basis of them."""
+        assert self._kernel is not None
+        kernel = self._kernel(x, params)[: len(self.coordinates)]
+        return jnp.linalg.svd(kernel, full_matrices=False)[0][:, : self.freedom]
+
     # ------------------------------------------------------------------ how it shows itself
 
     def to_dict(self) -> dict[str, Any]:
@@ -168,26 +189,8 @@ class ConstraintChain:
         return "\n".join([lines[0], "─" * (sum(widths) + 6), *lines[1:], end])
 
 
-@eqx.filter_jit
-def _nearest(constraints: Callable, normal: Callable, x, multipliers, params):
-    size = x.shape[0]
-
-    def residual(u):
-        phi, pull = jax.vjp(lambda y: constraints(y, params), u[:size])
-        return jnp.concatenate([u[:size] + normal(pull(u[size:])[0]) - x, phi])
-
-    return nearest_root(residual, jnp.concatenate([x, multipliers]))[:size]
-
-
-@eqx.filter_jit
-def _span(kernel, count: int):
-    """An orthonormal basis (N, count) of the columns of `kernel`."""
-    return jnp.linalg.svd(kernel, full_matrices=False)[0][:, :count]
-
-
-@eqx.filter_jit
-def _slope(constraints: Callable, x, params):
-    return jax.jacfwd(lambda x: constraints(x, params))(x)
+def _with_slope(constraints: Callable, x, params):
+    return constraints(x, params), jacobian(lambda x: constraints(x, params))(x)
 
 
 class ResolvedSystem(AbstractSystem):

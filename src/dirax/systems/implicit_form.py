@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dirax.functions import UserFunction
+from dirax.functions import UserFunction, constant_entries
 from dirax.geometry.structures import canonical_two_form
 from dirax.linear_solves import solve
 from dirax.systems.dirac_system import DiracSystem
@@ -18,6 +18,7 @@ from dirax.systems.nonholonomic import NonholonomicMechanics
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 from dirax.systems.port_hamiltonian import PortHamiltonian
 from dirax.systems.system import AbstractSystem
+from dirax.tracing import gradient, jacobian, shared
 
 RANK_TOLERANCE = 1e-9
 
@@ -185,17 +186,23 @@ def _on_cotangent_bundle(
     """x = (q, p): ẋ = X_H + X_φ u + (0, f + Wᵀλ), φ = 0, W q̇ = −b, with the primary constraints φ and H = ⟨p, v⟩ − L."""
     n = x.size // 2
     m, c = system.constraints.sizes(jnp.asarray(x[:n]), params)
-    null = jnp.asarray(_kernel(hessian))
+    null = _kernel(hessian)
     k = null.shape[1]
     J = canonical_two_form(n)  # as the Poisson matrix: (q̇, ṗ) = J dH
 
+    def bordered(t, q, params):
+        mass = jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(jnp.zeros(n))
+        return jnp.concatenate([jnp.concatenate([mass, null], axis=1), np.pad(null.T, ((0, 0), (0, k)))])
+
+    constant = constant_entries(bordered, t, x[:n], params)
+    inverse = None if constant is None or np.any(np.isnan(constant)) else np.linalg.inv(constant)
+
+    @shared
     def legendre_inverse(t, x, params):
         """(v, φ) with ∂L/∂v (q, v) = p − Zφ and Zᵀv = 0, Z a basis of the Hessian's kernel at the point of the chain."""
         q, p = x[:n], x[n:]
-        zero = jnp.zeros(n)
-        mass = jax.hessian(lambda v: system.lagrangian.at(t, q, v, params))(zero)
-        bordered = jnp.block([[mass, null], [null.T, jnp.zeros((k, k))]])
-        solution = solve(bordered, jnp.concatenate([p - system.legendre(q, zero, params, t), jnp.zeros(k)]))
+        right = jnp.concatenate([p - system.legendre(q, jnp.zeros(n), params, t), np.zeros(k)])
+        solution = solve(bordered(t, q, params), right) if inverse is None else inverse @ right
         return solution[:n], solution[n:]
 
     def hamiltonian(t, x, params):
@@ -204,9 +211,11 @@ def _on_cotangent_bundle(
 
     def equations(t, x, params):
         primary = lambda x: legendre_inverse(t, x, params)[1]
-        flow, dphi = J @ jax.grad(lambda x: hamiltonian(t, x, params))(x), jax.jacfwd(primary)(x)
-        if system.forces is not None:
-            flow = flow.at[n:].add(system.forces(t, x[:n], legendre_inverse(t, x, params)[0], params))
+        v, dphi = legendre_inverse(t, x, params)[0], jacobian(primary)(x)
+        # dH = (−∂L/∂q, v): p − ∂L/∂v is in the kernel, to which v is orthogonal, so that it does not matter how v varies
+        rate = gradient(lambda q: system.lagrangian.at(t, q, v, params))(x[:n])
+        rate = rate if system.forces is None else rate + system.forces(t, x[:n], v, params)
+        flow = jnp.concatenate([v, rate])
         w, moving = system.constraints.matrix(t, x[:n], params), _moving(system, t, x[:n], params)
         forces = jnp.concatenate([J @ dphi.T, jnp.concatenate([jnp.zeros((n, m + c)), w.T])], axis=1)
         top = jnp.concatenate([jnp.eye(2 * n), -forces], axis=1)
@@ -226,7 +235,7 @@ def _on_pontryagin_bundle(system: LagrangeDirac, x: np.ndarray, params, timed: b
 
     def equations(t, x, params):
         q, v, p = x[:n], x[n : 2 * n], x[2 * n :]
-        dq, dv = jax.grad(lambda q, v: system.lagrangian.at(t, q, v, params), argnums=(0, 1))(q, v)
+        dq, dv = gradient(lambda q, v: system.lagrangian.at(t, q, v, params), (0, 1))(q, v)
         rate = dq if system.forces is None else dq + system.forces(t, q, v, params)
         w, (minus_b, g) = system.constraints.matrix(t, q, params), _moving(system, t, q, params)
         eye, zero = jnp.eye(n), jnp.zeros((n, n))

@@ -7,9 +7,11 @@ import jax
 import numpy as np
 
 from dirax.engines.native.graph import Graph, GraphTooLarge
-from dirax.engines.native.interpret import RULES, Interpreter, Nodes, Unavailable
+from dirax.engines.native.host_function import interpreted
+from dirax.engines.native.interpret import RULES, Interpreter, Nodes, Unavailable, UnsupportedPrimitive
 from dirax.engines.native.on_host import on_host
 from dirax.engines.native.trace import NODE_LIMIT
+from dirax.tracing import in_scalars
 
 
 def evaluated(function: Callable, values: tuple) -> tuple | None:
@@ -25,6 +27,20 @@ def evaluated(function: Callable, values: tuple) -> tuple | None:
     flat = lambda *leaves: function(*jax.tree.unflatten(structure, leaves))
     found = on_host(flat, arrays or [np.zeros(1)], (), (function, structure)) if arrays else None
     return None if found is None else (jax.tree.map(lambda leaf: leaf[0], found),)
+
+
+def constant_entries(function: Callable, values: tuple) -> np.ndarray | None:
+    """The array that `function(*values)` is, NaN in entries that are no constants of the graph; None where it has none."""
+    leaves, structure = jax.tree.flatten(values)
+    with in_scalars():
+        closed = jax.make_jaxpr(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))(*leaves)
+    try:
+        made = interpreted(closed)
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return None
+    (nodes,), graph = made.results, made.graph
+    entries = [graph.value[node] if graph.is_constant(node) else np.nan for node in nodes.ravel().tolist()]
+    return np.array(entries, dtype=float).reshape(nodes.shape)
 
 
 def reads_inside(jaxpr: Any, values: tuple) -> bool:

@@ -1,0 +1,121 @@
+"""Linear equations A(x) y = b(x) for the rates y = (ẋ, u) of a system: their solutions, and the conditions on x for one.
+
+What of A is constant is eliminated once and for all. Of the other equations, rows R and columns P whose square part is regular at
+one point, as many as the rank, give the solution around it, and the other rows Z what is left over,
+
+    A_RP y_P = b_R,   s = b_Z − A_ZP y_P,
+
+smooth in x; s(x) = 0 is the condition b ∈ im A wherever A keeps its rank.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.linear_solves import solve
+from dirax.tracing import shared
+
+THRESHOLD = 0.1
+"""A pivot is at least this fraction of the largest entry left, in units of the rows and columns; among these, a sparse one."""
+
+NEGLIGIBLE = 1e-10
+"""Entries below this, in the same units, count as zero."""
+
+
+class Explicit(NamedTuple):
+    """Equations with their constant part solved: y = w + K c with c (f,) free, functions of (x, params).
+
+    `family` gives (w, K), `rest` the other equations (A', b') of c; `rank` counts those that were solved.
+    """
+
+    family: Callable
+    rest: Callable
+    rank: int
+
+
+def explicit(equations: Callable, entries: np.ndarray, size: int) -> Explicit:
+    """The equations (x, params) ↦ (A, b) solved for those of the first `size` unknowns that rows with constant coefficients
+    of these determine. `entries` (r, n) are those of A, NaN where they depend on x."""
+    constant = np.flatnonzero(np.all(np.isfinite(entries[:, :size]), axis=1))
+    rows, columns = pivots(entries[constant, :size])
+    rows = constant[rows]
+    others, free = (np.setdiff1d(np.arange(n), taken) for n, taken in zip(entries.shape, (rows, columns), strict=True))
+    inverse, order = np.linalg.inv(entries[np.ix_(rows, columns)]), np.argsort(np.concatenate([columns, free]))
+
+    @shared
+    def family(x, params):
+        matrix, right = equations(x, params)
+        top = inverse @ jnp.concatenate([right[rows, None], -matrix[rows][:, free]], axis=1)
+        whole = jnp.concatenate([top, np.eye(free.size, free.size + 1, 1)])[order]
+        return whole[:, 0], whole[:, 1:]
+
+    @shared
+    def rest(x, params):
+        (matrix, right), (w, basis) = equations(x, params), family(x, params)
+        return matrix[others] @ basis, right[others] - matrix[others] @ w
+
+    return Explicit(family, rest, len(rows))
+
+
+def pivots(matrix: np.ndarray, rank: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns, as many as the rank of the matrix, whose square part is regular; sparse ones first (Markowitz)."""
+    left, rows, columns = _equilibrated(matrix), [], []
+    while left.size and (rank is None or len(rows) < rank):
+        sizes = np.abs(left)
+        if sizes.max() <= (NEGLIGIBLE if rank is None else 0.0):
+            break
+        there = sizes > NEGLIGIBLE
+        fill = (there.sum(axis=1, keepdims=True) - 1) * (there.sum(axis=0, keepdims=True) - 1)
+        i, j = np.unravel_index(np.argmin(np.where(sizes >= THRESHOLD * sizes.max(), fill, np.inf)), left.shape)
+        rows.append(i)
+        columns.append(j)
+        left = left - np.outer(left[:, j], left[i] / left[i, j])
+        left[i], left[:, j] = 0.0, 0.0
+    return np.array(rows, int), np.array(columns, int)
+
+
+def _equilibrated(matrix: np.ndarray) -> np.ndarray:
+    for axis in (1, 0):
+        sizes = np.abs(matrix).max(axis=axis, keepdims=True, initial=0.0)
+        matrix = matrix / np.where(sizes > 0, sizes, 1.0)
+    return matrix
+
+
+@dataclass(frozen=True)
+class Solved:
+    """Equations of c (f,) with constant rank around a point, functions of (x, params): a `solution`, zero where it is free;
+    the `conditions` s for there to be one, `count` of them; `kernel`, a basis (f, f − rank) of what is left free."""
+
+    solution: Callable
+    conditions: Callable
+    count: int
+    kernel: Callable
+
+
+def solved(equations: Callable, matrix: np.ndarray, rank: int, entries: np.ndarray) -> Solved:
+    """The equations (x, params) ↦ (A, b) around a point where A is `matrix` (r, f) and has this rank; `entries` (r, f) are
+    those of A, NaN where they depend on x."""
+    (r, f), (rows, columns) = matrix.shape, pivots(matrix, rank)
+    others, free = np.setdiff1d(np.arange(r), rows), np.setdiff1d(np.arange(f), columns)
+    order, zero = np.argsort(np.concatenate([columns, free])), np.all(entries[others] == 0.0, axis=1)
+
+    @shared
+    def whole(x, params):
+        """(solution and kernel (f, 1 + f − rank), conditions)."""
+        matrix, right = equations(x, params)
+        sides = jnp.concatenate([right[rows, None], -matrix[rows][:, free]], axis=1)
+        core = matrix[rows][:, columns]
+        top = solve(core, sides) if rank > 1 else sides / core if rank else sides
+        both = jnp.concatenate([top, np.eye(free.size, free.size + 1, 1)])[order]
+        missed = matrix[others][:, columns] @ top[:, 0] if rank else jnp.zeros(others.size)
+        return both, right[others] - jnp.where(zero, 0.0, missed)
+
+    return Solved(
+        lambda x, params: whole(x, params)[0][:, 0],
+        lambda x, params: whole(x, params)[1],
+        r - rank,
+        lambda x, params: whole(x, params)[0][:, 1:],
+    )
