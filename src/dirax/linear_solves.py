@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import lax
 from jax.core import ShapedArray
-from jax.interpreters import ad
+from jax.interpreters import ad, batching
 from jaxtyping import Array, Float
 
 from dirax.deferred import deferred
@@ -66,9 +66,20 @@ def _solve_transposed(along, matrix, right):
     return [None, solve_p.bind(jnp.swapaxes(matrix, -1, -2), along[0])[0]]
 
 
+def _solve_batched(operands, axes):
+    """Right-hand sides side by side for one matrix; else each group of equations by itself."""
+    (matrix, right), (of_matrix, of_right) = operands, axes
+    if of_matrix is not None:
+        return solve_each_batched(operands, axes)
+    columns = jnp.moveaxis(right, of_right, -1)
+    (found,) = solve_p.bind(matrix, columns.reshape(len(columns), -1))
+    return [jnp.moveaxis(found.reshape(columns.shape), -1, 0)], [0]
+
+
 solve_p = deferred("dirax_solve", lambda a, b: [jnp.linalg.solve(a, b)], lambda a, b: [ShapedArray(b.shape, b.dtype)])
 ad.primitive_jvps[solve_p] = _solve_tangents
 ad.primitive_transposes[solve_p] = _solve_transposed
+solve_each_batched, batching.primitive_batchers[solve_p] = batching.primitive_batchers[solve_p], _solve_batched
 pseudo_inverse_p = deferred(
     "dirax_pseudo_inverse",
     lambda matrix, tolerance: [jnp.linalg.pinv(matrix, tolerance)],

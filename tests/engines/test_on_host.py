@@ -27,6 +27,11 @@ CASES = {
         solve(a @ a, a.T),
         jnp.isfinite(solve(a * jnp.maximum(a[0, 0], 0.0), x)).astype(float),
     ),
+    "linear equations side by side": lambda a, x: (
+        jax.vmap(lambda row: solve(a, row))(a),
+        jax.vmap(lambda s: solve(a + s * jnp.eye(3), x))(jnp.arange(2.0)),
+        jax.grad(lambda x: solve(a, x**2) @ x)(x),
+    ),
     "a derivative of linear equations": lambda a, x: jax.jacfwd(lambda x: solve(a + jnp.diag(x), x**2))(x),
     "a loop of unknown length": lambda a, x: jax.lax.while_loop(
         lambda c: jnp.max(jnp.abs(c[0])) > 1e-3, lambda c: (c[0] / 3, c[1] + 1), (a @ x, 0)

@@ -12,8 +12,14 @@ from dirax.functions import evaluate_on
 
 ENGINES = ("auto", "xla", "native")
 
-LARGEST_NATIVE = 32
-"""Unknowns of a stage, or entries of the state, up to which "auto" takes the native engine."""
+LARGEST_NATIVE = 96
+"""Unknowns of a stage, or entries of the state, up to which "auto" takes the native engine for steps that are sparse enough."""
+
+LARGEST_FULL = 32
+"""The same up to which it takes it for any step."""
+
+MOST_OPERATIONS = 10_000
+"""Scalar operations of a step that is sparse enough: a second of compiling, which 20 000 steps get back."""
 
 PLUGINS = ("jax_plugins", "libtpu")
 """The packages without which JAX has no device but CPUs."""
@@ -30,7 +36,8 @@ def run_on(engine: str, problem: Problem, progress: Progress | None = None) -> O
 
     if engine == "native":
         return native.run(problem, progress)
-    reason = _too_large(problem) or _other_device() or native.supported(problem)
+    most = None if problem.size <= LARGEST_FULL else MOST_OPERATIONS
+    reason = _too_large(problem, LARGEST_NATIVE) or _other_device() or native.supported(problem, most)
     if reason is None:
         return native.run(problem, progress)
     outcome = xla.run(problem, progress)
@@ -46,7 +53,7 @@ def run_traced_on(engine: str, problem: Problem) -> Outcome:
 
     if engine == "native":
         return native.run_traced(problem)
-    reason = _too_large(problem) or _other_device()
+    reason = _too_large(problem, LARGEST_FULL) or _other_device()
     if reason is None:
         try:
             return native.run_traced(problem)
@@ -57,9 +64,8 @@ def run_traced_on(engine: str, problem: Problem) -> Outcome:
     return outcome
 
 
-def _too_large(problem: Problem) -> str | None:
-    size = max(max(stage.unknowns, stage.state_size) for stage, _ in problem.equation.stages)
-    return None if size <= LARGEST_NATIVE else f"{size} numbers a step, more than {LARGEST_NATIVE}"
+def _too_large(problem: Problem, largest: int) -> str | None:
+    return None if problem.size <= largest else f"{problem.size} numbers a step, more than {largest}"
 
 
 def _other_device() -> str | None:

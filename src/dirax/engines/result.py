@@ -34,6 +34,11 @@ class Problem:
     compensated: bool = False
 
     @property
+    def size(self) -> int:
+        """The most unknowns of a stage, or entries of the state."""
+        return max(max(stage.unknowns, stage.state_size) for stage, _ in self.equation.stages)
+
+    @property
     def rows(self) -> int:
         """Number of saved rows, the first and the last included."""
         return -(-self.steps // self.save_every) + 1

@@ -35,6 +35,12 @@ LARGEST_SCALAR = 16
 SCALAR_BATCH = 64
 """Trajectories from which on it is, whatever XLA does with its loops."""
 
+NESTED = 4
+"""Derivatives of derivatives from which on it is: each more takes the array program times 2.6, and the graph hardly any."""
+
+LARGEST_NESTED = 96
+"""Unknowns of a stage, or entries of the state, up to which it is looked for them."""
+
 QUICK_TO_COMPILE = {"xla_cpu_use_fusion_emitters": False}
 """Halves the time of compilation on a CPU, where the steps were measured to take the same time or less."""
 
@@ -196,7 +202,7 @@ def _derived(p: Problem) -> tuple[Problem, Derived, dict[str, Any]]:
     if p.compensated:
         found = in_jax.increments_of(*key)
         increments, notes = (None, {"not_compensated": found}) if isinstance(found, str) else (found, {})
-    if _small(p):
+    if _small(p) or (p.size <= LARGEST_NESTED and in_jax.nesting(*key) >= NESTED):
         equation, jacobians = in_jax.in_scalars(*key)
         p = dataclasses.replace(p, equation=equation)
     return p, Derived(increments, jacobians), notes
@@ -205,9 +211,8 @@ def _derived(p: Problem) -> tuple[Problem, Derived, dict[str, Any]]:
 def _small(p: Problem) -> bool:
     """Whether the step should be written in scalars: small ones on a CPU, in batches, and in loops that XLA makes one kernel
     (`dirax.configure`)."""
-    size = max(max(stage.unknowns, stage.state_size) for stage, _ in p.equation.stages)
     many = p.batch is not None and p.batch >= SCALAR_BATCH
-    return size <= LARGEST_SCALAR and (many or fast_loops_asked_for()) and jax.default_backend() == "cpu"
+    return p.size <= LARGEST_SCALAR and (many or fast_loops_asked_for()) and jax.default_backend() == "cpu"
 
 
 def run_traced(problem: Problem) -> Outcome:

@@ -99,6 +99,7 @@ def solved(equations: Callable, matrix: np.ndarray, rank: int, entries: np.ndarr
     """The equations (x, params) ↦ (A, b) around a point where A is `matrix` (r, f) and has this rank; `entries` (r, f) are
     those of A, NaN where they depend on x."""
     (r, f), (rows, columns) = matrix.shape, pivots(matrix, rank)
+    rank = len(rows)
     others, free = np.setdiff1d(np.arange(r), rows), np.setdiff1d(np.arange(f), columns)
     order, zero = np.argsort(np.concatenate([columns, free])), np.all(entries[others] == 0.0, axis=1)
 

@@ -27,10 +27,15 @@ TOGETHER = 2**17
 """Numbers to save up to which all arrays are parts of one, since it takes a microsecond to find where an array begins."""
 
 
-def supported(problem: Problem) -> str | None:
-    """None if the native engine takes the problem; else why not, naming the primitive and the user's source line."""
+def supported(problem: Problem, most_operations: int | None = None) -> str | None:
+    """None if the native engine takes the problem; else why not, naming the primitive and the user's source line, or how many
+    operations a step has more than `most_operations`."""
     try:
-        program(problem.equation, problem.params, problem.batch_params, problem.compensated)
+        made, _ = program(problem.equation, problem.params, problem.batch_params, problem.compensated)
+        if most_operations is not None:
+            made.check()
+            if made.operations > most_operations:
+                return f"{made.operations} scalar operations a step, more than {most_operations}"
     except UnsupportedPrimitive as error:
         return str(error)
     return None

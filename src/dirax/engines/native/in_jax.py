@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dirax.engines.native.compensation import increments
 from dirax.engines.native.graph import GraphTooLarge
@@ -68,8 +69,8 @@ def increments_of(equation: Any, params: Any, batch_params: bool) -> tuple[Calla
 
 
 def in_scalars(equation: Any, params: Any, batch_params: bool) -> tuple[Any, tuple[Callable, ...] | None]:
-    """The equation with its residual and its advance as scalar programs, and the Jacobian (k, k) of the residual of each stage
-    as one, (u, state, t, h, params) ↦ J; the same objects for the same program.
+    """The equation with its functions as scalar programs, and the Jacobian (k, k) of the residual of each stage as one,
+    (u, state, t, h, params) ↦ J; the same objects for the same program.
 
     The equation itself, and None, where it is no scalar program or one of more than MOST_OPERATIONS."""
     try:
@@ -79,6 +80,14 @@ def in_scalars(equation: Any, params: Any, batch_params: bool) -> tuple[Any, tup
         return made.as_scalars or (equation, None)
     except (UnsupportedPrimitive, GraphTooLarge):
         return equation, None
+
+
+def nesting(equation: Any, params: Any, batch_params: bool) -> int:
+    """How deep derivatives of derivatives go in a step, 0 where it is no scalar program."""
+    try:
+        return max(e.nesting for e in program(equation, params, batch_params)[0].equations)
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return 0
 
 
 def _in_scalars(equation: Any, made: Program) -> tuple:
@@ -102,12 +111,23 @@ def _dense(made: Program, equation: TracedEquation, rows: list[dict[int, int]]) 
     return lambda *args: entries(*args).reshape(k, k)
 
 
+def _unpacked(made: Program, traced: TracedEquation) -> Callable:
+    sizes = np.cumsum([nodes.size for nodes in traced.rows.values()])[:-1].tolist()
+    flat = function_of(made, traced, [node for nodes in traced.rows.values() for node in nodes.ravel().tolist()])
+
+    def unpack(state, u, t, h, params):
+        parts = jnp.split(flat(u, state, t, h, params), sizes)
+        return {name: part.reshape(nodes.shape) for part, (name, nodes) in zip(parts, traced.rows.items(), strict=True)}
+
+    return unpack
+
+
 def _replaced(stage: StepEquation, made: Program, traced: TracedEquation) -> StepEquation:
     return StepEquation(
         start=stage.start,
         residual=function_of(made, traced, traced.residual) if stage.unknowns else stage.residual,
         advance=function_of(made, traced, traced.advance),
-        unpack=stage.unpack,
+        unpack=_unpacked(made, traced),
         state_size=stage.state_size,
         unknowns=stage.unknowns,
         fields=stage.fields,

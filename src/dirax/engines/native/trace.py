@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend.core import jaxprs_in_params
 
 from dirax.engines.native import (
     control,  # noqa: F401  (these six register their rules)
@@ -90,6 +91,8 @@ class TracedEquation:
     advance: list[int]
     rows: dict[str, Nodes]
     scale: tuple[float, ...]
+    nesting: int
+    """How deep derivatives of derivatives go in its functions."""
 
 
 @dataclass
@@ -147,5 +150,18 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
         raise UnsupportedPrimitive("unpack", f"returns {len(rows)} arrays for {len(names)} fields", "the scheme")
     return TracedEquation(
         state, unknowns, previous, guess.tolist(), residual.tolist(), advance.tolist(),
-        dict(zip(names, rows, strict=True)), tuple(equation.scale),
+        dict(zip(names, rows, strict=True)), tuple(equation.scale), nesting(closed.jaxpr),
     )  # fmt: skip
+
+
+def nesting(jaxpr: Any) -> int:
+    """How deep derivatives that tracing left to the graph lie in one another."""
+    known: dict[int, int] = {}
+
+    def depth(jaxpr: Any) -> int:
+        if id(jaxpr) not in known:
+            inner = [(e.primitive.name == "dirax_derivative", j) for e in jaxpr.eqns for j in jaxprs_in_params(e.params)]
+            known[id(jaxpr)] = max((derives + depth(getattr(j, "jaxpr", j)) for derives, j in inner), default=0)
+        return known[id(jaxpr)]
+
+    return depth(jaxpr)
