@@ -9,7 +9,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, batching
 from jaxtyping import Array, Float
 
-from dirax.deferred import deferred
+from dirax.deferred import deferred, each
 from dirax.tracing import becomes_scalars
 
 RANK_TOLERANCE = 1e-12
@@ -70,16 +70,20 @@ def _solve_batched(operands, axes):
     """Right-hand sides side by side for one matrix; else each group of equations by itself."""
     (matrix, right), (of_matrix, of_right) = operands, axes
     if of_matrix is not None:
-        return solve_each_batched(operands, axes)
+        return each(_solve_by_jax, operands, axes)
     columns = jnp.moveaxis(right, of_right, -1)
     (found,) = solve_p.bind(matrix, columns.reshape(len(columns), -1))
     return [jnp.moveaxis(found.reshape(columns.shape), -1, 0)], [0]
 
 
-solve_p = deferred("dirax_solve", lambda a, b: [jnp.linalg.solve(a, b)], lambda a, b: [ShapedArray(b.shape, b.dtype)])
+def _solve_by_jax(matrix, right):
+    return [jnp.linalg.solve(matrix, right)]
+
+
+solve_p = deferred("dirax_solve", _solve_by_jax, lambda a, b: [ShapedArray(b.shape, b.dtype)])
 ad.primitive_jvps[solve_p] = _solve_tangents
 ad.primitive_transposes[solve_p] = _solve_transposed
-solve_each_batched, batching.primitive_batchers[solve_p] = batching.primitive_batchers[solve_p], _solve_batched
+batching.primitive_batchers[solve_p] = _solve_batched
 pseudo_inverse_p = deferred(
     "dirax_pseudo_inverse",
     lambda matrix, tolerance: [jnp.linalg.pinv(matrix, tolerance)],
