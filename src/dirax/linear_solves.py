@@ -16,11 +16,15 @@ RANK_TOLERANCE = 1e-12
 """Singular values below this, relative to the largest of the equilibrated matrix, count as zero."""
 
 
-def solve(matrix: Float[Array, "n n"], right: Array) -> Array:
-    """`jnp.linalg.solve` of a matrix (n, n) and a right-hand side (n,) or (n, k)."""
+def solve(matrix: Float[Array, "n n"], right: Array, apart: bool = False) -> Array:
+    """`jnp.linalg.solve` of a matrix (n, n) and a right-hand side (n,) or (n, k).
+
+    `apart`: the graph may differentiate the elimination itself, which it does quickly however deep derivatives lie in one
+    another; else a derivative is another solve.
+    """
     if not becomes_scalars(matrix, right):
         return jnp.linalg.solve(matrix, right)
-    return solve_p.bind(matrix, right)[0]
+    return solve_p.bind(matrix, right, apart=apart)[0]
 
 
 def pseudo_inverse(matrix: Float[Array, "k l"], tolerance: float) -> Float[Array, "l k"]:
@@ -55,32 +59,32 @@ def _turned(matrix):
     return [ShapedArray(matrix.shape[::-1], matrix.dtype), ShapedArray(matrix.shape[1:], matrix.dtype)]
 
 
-def _solve_tangents(primals, tangents):
+def _solve_tangents(primals, tangents, **p):
     """x' = A⁻¹ (b' − A' x), by the same elimination."""
     (matrix, right), (along_matrix, along_right) = primals, map(ad.instantiate_zeros, tangents)
-    (x,) = solve_p.bind(matrix, right)
-    return [x], solve_p.bind(matrix, along_right - along_matrix @ x)
+    (x,) = solve_p.bind(matrix, right, **p)
+    return [x], solve_p.bind(matrix, along_right - along_matrix @ x, **p)
 
 
-def _solve_transposed(along, matrix, right):
-    return [None, solve_p.bind(jnp.swapaxes(matrix, -1, -2), along[0])[0]]
+def _solve_transposed(along, matrix, right, **p):
+    return [None, solve_p.bind(jnp.swapaxes(matrix, -1, -2), along[0], **p)[0]]
 
 
-def _solve_batched(operands, axes):
+def _solve_batched(operands, axes, **p):
     """Right-hand sides side by side for one matrix; else each group of equations by itself."""
     (matrix, right), (of_matrix, of_right) = operands, axes
     if of_matrix is not None:
-        return each(_solve_by_jax, operands, axes)
+        return each(_solve_by_jax, operands, axes, **p)
     columns = jnp.moveaxis(right, of_right, -1)
-    (found,) = solve_p.bind(matrix, columns.reshape(len(columns), -1))
+    (found,) = solve_p.bind(matrix, columns.reshape(len(columns), -1), **p)
     return [jnp.moveaxis(found.reshape(columns.shape), -1, 0)], [0]
 
 
-def _solve_by_jax(matrix, right):
+def _solve_by_jax(matrix, right, **_):
     return [jnp.linalg.solve(matrix, right)]
 
 
-solve_p = deferred("dirax_solve", _solve_by_jax, lambda a, b: [ShapedArray(b.shape, b.dtype)])
+solve_p = deferred("dirax_solve", _solve_by_jax, lambda a, b, **_: [ShapedArray(b.shape, b.dtype)])
 ad.primitive_jvps[solve_p] = _solve_tangents
 ad.primitive_transposes[solve_p] = _solve_transposed
 batching.primitive_batchers[solve_p] = _solve_batched

@@ -188,7 +188,8 @@ def _plain(jaxpr: Any) -> bool:
 
 
 def _plain_one(equation: Any) -> bool:
-    return equation.primitive.name in PLAIN and all(map(_plain, jaxprs_in_params(equation.params)))
+    known = equation.primitive.name in PLAIN or equation.params.get("apart", False)
+    return known and all(map(_plain, jaxprs_in_params(equation.params)))
 
 
 def _numbers(equation: Any) -> bool:

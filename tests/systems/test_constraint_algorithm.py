@@ -71,6 +71,46 @@ def test_method_2_on_a_chain_follows_the_pendulum_and_keeps_both_constraints(pen
     assert np.ptp(sol.energy()) < 1e-3
 
 
+@pytest.fixture(scope="module")
+def tension():
+    """The same pendulum with its tension as a third coordinate: L = m |q̇|²/2 − m y + λ (|q|² − 1), of index 4."""
+    lagrangian = lambda q, v, m: m * (v[:2] @ v[:2] / 2 - q[1]) + q[2] * (q[:2] @ q[:2] - 1.0)
+    return constraint_algorithm(dx.LagrangeDirac(lagrangian), {"q": [0.6, -0.81, 0.3], "v": [0.3, 0.2, 0.0]}, params=2.0)
+
+
+def state_of_the_pendulum(angle, rate, m):
+    """x = (q, λ, p) on M_f: q̈ = −e_y + 2λ q/m with |q| = 1 gives 2λ/m = y − |q̇|²."""
+    q, v = np.array([np.sin(angle), -np.cos(angle)]), rate * np.array([np.cos(angle), np.sin(angle)])
+    return np.concatenate([q, [m * (q[1] - rate**2) / 2], m * v, [0.0]])
+
+
+@pytest.mark.parametrize("m", [2.0, 0.7])
+def test_a_tension_that_is_a_coordinate(tension, m):
+    """Four levels: p_λ = 0, |q| = 1, q·p = 0, the tension; λ̇ = 3 m ẏ/2 from differentiating that. For other params too."""
+    assert (dimensions(tension), tension.index, tension.verdict) == ([5, 4, 3, 2, 2], 4, "determined")
+    x = state_of_the_pendulum(0.9, 0.4, m)
+    assert tension.constraints(x, m) == pytest.approx(np.zeros(4), abs=1e-14)
+    v = x[3:5] / m
+    expected = [*v, 1.5 * m * v[1], *(m * np.array([0.0, -1.0]) + 2 * x[2] * x[:2]), 0.0]
+    assert tension.field(x, m) == pytest.approx(expected, abs=1e-12)
+    assert tension.multipliers(x, m) == pytest.approx([1.5 * m * v[1]], abs=1e-12)  # u = λ̇, of the primary constraint
+    away = x + 0.01 * np.cos(np.arange(6.0))
+    assert tension.constraints(tension.project(away, m), m) == pytest.approx(np.zeros(4), abs=1e-14)
+
+
+def test_engines_agree_on_a_chain_of_four_levels(tension):
+    start = state_of_the_pendulum(0.9, 0.4, 2.0)
+    run = {"x": start, "params": 2.0, "step": 0.02, "steps": 50}
+    ours, theirs = (dx.simulate(tension.resolved(), dx.DiscreteDirac(), engine=engine, **run) for engine in ("native", "xla"))
+    for name in ("x", "multipliers"):
+        np.testing.assert_allclose(theirs.fields[name], ours.fields[name], atol=1e-12)
+    assert np.abs(ours.constraint_residual()).max() < 1e-14
+    exact = solve_ivp(lambda t, y: [y[1], -np.sin(y[0])], (0, 1.0), [0.9, 0.4], rtol=1e-12, atol=1e-12).y[:, -1]
+    half = dx.simulate(tension.resolved(), dx.DiscreteDirac(), **run | {"step": 0.01, "steps": 100})
+    errors = [np.abs(sol.x[-1] - state_of_the_pendulum(*exact, 2.0)).max() for sol in (ours, half)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+
+
 def test_rolling_disk_as_nonholonomic_mechanics():
     system = dx.NonholonomicMechanics(
         lambda q: jnp.diag(jnp.array([1.0, 1.0, 0.25, 0.5])),

@@ -109,7 +109,7 @@ def solved(equations: Callable, matrix: np.ndarray, rank: int, entries: np.ndarr
         matrix, right = equations(x, params)
         sides = jnp.concatenate([right[rows, None], -matrix[rows][:, free]], axis=1)
         core = matrix[rows][:, columns]
-        top = solve(core, sides) if rank > 1 else sides / core if rank else sides
+        top = solve(core, sides, apart=True) if rank > 1 else sides / core if rank else sides
         both = jnp.concatenate([top, np.eye(free.size, free.size + 1, 1)])[order]
         missed = matrix[others][:, columns] @ top[:, 0] if rank else jnp.zeros(others.size)
         return both, right[others] - jnp.where(zero, 0.0, missed)

@@ -272,7 +272,7 @@ class _Search:
         @shared
         def kernel(x, params):
             free = family(x, params)[1] @ found.kernel(x, params)
-            return free @ solve(null.T @ free, jnp.eye(null.shape[1]))
+            return free @ solve(null.T @ free, jnp.eye(null.shape[1]), apart=True)
 
         @shared
         def solution(x, params):

@@ -202,7 +202,7 @@ def _on_cotangent_bundle(
         """(v, φ) with ∂L/∂v (q, v) = p − Zφ and Zᵀv = 0, Z a basis of the Hessian's kernel at the point of the chain."""
         q, p = x[:n], x[n:]
         right = jnp.concatenate([p - system.legendre(q, jnp.zeros(n), params, t), np.zeros(k)])
-        solution = solve(bordered(t, q, params), right) if inverse is None else inverse @ right
+        solution = solve(bordered(t, q, params), right, apart=True) if inverse is None else inverse @ right
         return solution[:n], solution[n:]
 
     def hamiltonian(t, x, params):
