@@ -35,11 +35,8 @@ LARGEST_SCALAR = 16
 SCALAR_BATCH = 64
 """Trajectories from which on it is, whatever XLA does with its loops."""
 
-NESTED = 4
-"""Derivatives of derivatives from which on it is: each more takes the array program times 2.6, and the graph hardly any."""
-
 LARGEST_NESTED = 96
-"""Unknowns of a stage, or entries of the state, up to which it is looked for them."""
+"""The same for a step that is nested (`engines/native/program.py`), whatever its batch and device."""
 
 QUICK_TO_COMPILE = {"xla_cpu_use_fusion_emitters": False}
 """Halves the time of compilation on a CPU, where the steps were measured to take the same time or less."""
@@ -202,7 +199,7 @@ def _derived(p: Problem) -> tuple[Problem, Derived, dict[str, Any]]:
     if p.compensated:
         found = in_jax.increments_of(*key)
         increments, notes = (None, {"not_compensated": found}) if isinstance(found, str) else (found, {})
-    if _small(p) or (p.size <= LARGEST_NESTED and in_jax.nesting(*key) >= NESTED):
+    if _small(p) or (p.size <= LARGEST_NESTED and in_jax.nested(*key)):
         equation, jacobians = in_jax.in_scalars(*key)
         p = dataclasses.replace(p, equation=equation)
     return p, Derived(increments, jacobians), notes

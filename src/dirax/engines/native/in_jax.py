@@ -72,7 +72,7 @@ def in_scalars(equation: Any, params: Any, batch_params: bool) -> tuple[Any, tup
     """The equation with its functions as scalar programs, and the Jacobian (k, k) of the residual of each stage as one,
     (u, state, t, h, params) ↦ J; the same objects for the same program.
 
-    The equation itself, and None, where it is no scalar program or one of more than MOST_OPERATIONS."""
+    The equation itself, and None, where it is no scalar program or one of more than MOST_OPERATIONS that is not nested."""
     try:
         made, _ = program(equation, params, batch_params)
         if made.as_scalars is None:
@@ -82,19 +82,20 @@ def in_scalars(equation: Any, params: Any, batch_params: bool) -> tuple[Any, tup
         return equation, None
 
 
-def nesting(equation: Any, params: Any, batch_params: bool) -> int:
-    """How deep derivatives of derivatives go in a step, 0 where it is no scalar program."""
+def nested(equation: Any, params: Any, batch_params: bool) -> bool:
+    """Whether an array program of the step would be far larger than its graph."""
     try:
-        return max(e.nesting for e in program(equation, params, batch_params)[0].equations)
+        return program(equation, params, batch_params)[0].nested
     except (UnsupportedPrimitive, GraphTooLarge):
-        return 0
+        return False
 
 
 def _in_scalars(equation: Any, made: Program) -> tuple:
     """Nothing for a program that is too large."""
     g, slopes = made.graph, [made.jacobian(i) for i in range(len(made.equations))]
     outputs = [[*e.residual, *(n for row in rows for n in row.values())] for e, rows in zip(made.equations, slopes, strict=True)]
-    if any(sum(1 for node in g.reachable(nodes) if g.args[node]) > MOST_OPERATIONS for nodes in outputs):
+    large = any(sum(1 for node in g.reachable(nodes) if g.args[node]) > MOST_OPERATIONS for nodes in outputs)
+    if large and not made.nested:
         return ()
     distinct = {index: stage for (index, _), (stage, _) in zip(made.stages, equation.stages, strict=True)}
     new = {i: _replaced(stage, made, made.equations[i]) for i, stage in distinct.items()}

@@ -28,6 +28,11 @@ SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, *[cty
 SWEEP_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3)
 
 
+NESTED = 4
+"""Derivatives of derivatives from which on a step is `nested`: each more takes the array program times 2.6, and the graph
+hardly any."""
+
+
 @dataclass
 class Program:
     """A step as nodes, and the kernels compiled from it so far, by width."""
@@ -47,6 +52,11 @@ class Program:
     increments: tuple[Callable, ...] | None = None
     as_scalars: tuple | None = None
     sweeps: dict[tuple[bool, int], tuple[Any, Any]] = field(default_factory=dict)
+
+    @property
+    def nested(self) -> bool:
+        """Whether derivatives lie in one another so deep that an array program is far larger than the graph."""
+        return any(e.nesting >= NESTED for e in self.equations)
 
     def jacobian(self, index: int) -> list[dict[int, int]]:
         """Rows {column: node} of the Jacobian of the equation of this index. Raises `GraphTooLarge`."""

@@ -1,0 +1,52 @@
+"""Which engine "auto" takes: by the size of a step and by what it holds."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.engines import choice
+from dirax.engines.native.program import program
+
+N = 20
+RUN = {"q": np.sin(np.arange(float(N))), "v": np.zeros(N), "step": 0.01, "steps": 5}
+
+
+def potential(differences):
+    """The same for neighbours alone and for all pairs."""
+    return dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(1 - jnp.cos(differences(q))) - q @ q / 2)
+
+
+def test_sparse_steps_beyond_the_size_of_full_ones_are_native():
+    neighbours = dx.simulate(potential(jnp.diff), dx.LagrangeDAlembert(), **RUN)
+    assert 2 * N > choice.LARGEST_FULL and neighbours.stats["engine"] == "native"
+    pairs = dx.simulate(potential(lambda q: q[:, None] - q[None]), dx.LagrangeDAlembert(), **RUN)
+    assert pairs.stats["engine"] == "xla" and "scalar operations a step, more than 10000" in pairs.stats["not_native"]
+    again = dx.simulate(potential(jnp.diff), dx.LagrangeDAlembert(), **RUN, engine="xla")
+    np.testing.assert_allclose(again.q, neighbours.q, atol=1e-12)
+
+
+def test_too_large_a_step_says_its_size():
+    size = choice.LARGEST_NATIVE // 2 + 1
+    large = dx.simulate(potential(jnp.diff), dx.LagrangeDAlembert(), q=np.zeros(size), v=np.ones(size), step=0.01, steps=1)
+    assert large.stats["engine"] == "xla" and large.stats["not_native"] == f"{2 * size} numbers a step, more than 96"
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_operations_do_not_matter_where_an_array_program_would_be_far_larger(nested, monkeypatch):
+    """L = v²/2 − x² − λ y in three coordinates: a chain whose steps differentiate its constraints again and again."""
+    monkeypatch.setattr(choice, "LARGEST_FULL", 3)
+    monkeypatch.setattr(choice, "MOST_OPERATIONS", 4)
+    plain = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] ** 2 - jnp.cos(q[1]))
+    hidden = dx.LagrangeDirac(lambda q, v: v[:2] @ v[:2] / 2 - q[0] ** 2 + q[2] * (q[1] - jnp.sin(q[0])))
+    run = {"q": [0.1, 0.2], "v": [0.3, 0.4]}
+    system: Any = plain
+    if nested:
+        chain = dx.constraint_algorithm(hidden, {"q": [0.1, 0.1, 0.0], "v": [0.3, 0.3, 0.0]})
+        assert chain.index == 4
+        system, run = chain.resolved(), {"x": chain.point}
+    sol = dx.simulate(system, dx.DiscreteDirac() if nested else dx.LagrangeDAlembert(), **run, step=0.01, steps=3)
+    assert program(sol.equation, sol.params, False)[0].nested == nested
+    assert sol.stats["engine"] == ("native" if nested else "xla")
