@@ -14,7 +14,7 @@ from jax.experimental import checkify
 from jax.extend.core import jaxprs_in_params
 
 from dirax.representation import value_text
-from dirax.tracing import call
+from dirax.tracing import becomes_scalars, call
 
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 INDEXING = ("dynamic_slice", "gather")
@@ -135,6 +135,14 @@ def evaluated(function: Callable, *values: Any) -> Any:
     return _compiled(function, *values) if found is None else found[0]
 
 
+def scalar_program(function: Callable, *values: Any) -> Any:
+    """`function(*values)` for traced values by the operations of its scalar graph where it has one: far fewer than those of
+    an array program where derivatives lie in one another."""
+    host = _host()
+    found = None if host is None or becomes_scalars() else host.scalar_program(function, values)
+    return function(*values) if found is None else found[0]
+
+
 def constant_entries(function: Callable, *values: Any) -> np.ndarray | None:
     """The array `function(*values)` with NaN for the entries that depend on the values; None where that is not found."""
     host = _host()
@@ -155,8 +163,8 @@ _host = _no_host
 
 def evaluate_on(host: Callable[[], Any]) -> None:
     """Have concrete values found without a compiler by what `host` returns: a module with `evaluated(function, values)`, a
-    tuple of one result, `constant_entries(function, values)`, an array, and `reads_inside(jaxpr, values)`, whether every
-    index is inside its array; None and False where it cannot say."""
+    tuple of one result, `scalar_program(function, values)`, the same of traced values, `constant_entries(function, values)`,
+    an array, and `reads_inside(jaxpr, values)`, whether every index is inside its array; None and False where it cannot say."""
     global _host
     _host = host
 

@@ -111,6 +111,21 @@ def test_engines_agree_on_a_chain_of_four_levels(tension):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
 
 
+def test_a_gradient_through_the_projection_and_a_run_against_finite_differences(tension):
+    """By the mass, which moves the start, the tension and the motion; of both engines."""
+    away = state_of_the_pendulum(0.9, 0.4, 2.0) + 0.01 * np.cos(np.arange(6.0))
+
+    def end(m, engine="auto"):
+        start = tension.project(away, m)
+        run = {"x": start, "params": m, "step": 0.02, "steps": 10, "engine": engine}
+        return dx.simulate(tension.resolved(), dx.DiscreteDirac(), **run).x[-1, 2]
+
+    slope = (end(2.0 + 1e-4) - end(2.0 - 1e-4)) / 2e-4
+    assert abs(slope) > 0.1
+    for engine in ("native", "xla"):
+        assert jax.jit(jax.grad(lambda m, engine=engine: end(m, engine)))(2.0) == pytest.approx(slope, rel=1e-7)
+
+
 def test_rolling_disk_as_nonholonomic_mechanics():
     system = dx.NonholonomicMechanics(
         lambda q: jnp.diag(jnp.array([1.0, 1.0, 0.25, 0.5])),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import evaluated, is_traced
+from dirax.functions import evaluated, is_traced, scalar_program
 from dirax.roots import nearest_root
 from dirax.systems.system import AbstractSystem
 from dirax.tracing import Method, gradient, jacobian
@@ -153,22 +153,23 @@ class ConstraintChain:
     def _at(self, function: Callable, x, params):
         """A function of (x, params), at concrete values without a compiler."""
         params = self._with(params)
-        return function(x, params) if is_traced(x, params) else evaluated(function, np.asarray(x, dtype=float), params)
+        traced = is_traced(x, params)
+        return scalar_program(function, x, params) if traced else evaluated(function, np.asarray(x, dtype=float), params)
 
     def _nearest(self, x, params):
         multipliers = jnp.zeros(sum(level.count for level in self.levels))
 
         def residual(u):
             y, sigma = u[: x.shape[0]], u[x.shape[0] :]
-            pull = gradient(lambda y: self._constraints(y, params) @ sigma)(y)
-            return jnp.concatenate([y + self.normal(pull) - x, self._constraints(y, params)])
+            pull = gradient(lambda y: self.constraints(y, params) @ sigma)(y)
+            return jnp.concatenate([y + self.normal(pull) - x, self.constraints(y, params)])
 
         return nearest_root(residual, jnp.concatenate([x, multipliers]))[: x.shape[0]]
 
     def _free_directions(self, x, params):
         """An orthonormal basis of them."""
         assert self._kernel is not None
-        kernel = self._kernel(x, params)[: len(self.coordinates)]
+        kernel = self._at(self._kernel, x, params)[: len(self.coordinates)]
         return jnp.linalg.svd(kernel, full_matrices=False)[0][:, : self.freedom]
 
     # ------------------------------------------------------------------ how it shows itself

@@ -1,15 +1,19 @@
-"""Functions of the user at concrete values, for the checks before a run: evaluated on the host, nothing is compiled."""
+"""Functions by their graph: at concrete values on the host, where nothing is compiled, and at traced ones as scalar programs."""
 
+import functools
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from dirax.engines.native.graph import Graph, GraphTooLarge
-from dirax.engines.native.host_function import interpreted
-from dirax.engines.native.interpret import RULES, Interpreter, Nodes, Unavailable, UnsupportedPrimitive
-from dirax.engines.native.on_host import on_host
+from dirax.engines.native.in_jax import by_jax
+from dirax.engines.native.interpret import RULES, Interpreter, Nodes, Unavailable
+from dirax.engines.native.on_host import KEPT, on_host
 from dirax.engines.native.trace import NODE_LIMIT
 from dirax.tracing import in_scalars
 
@@ -32,15 +36,68 @@ def evaluated(function: Callable, values: tuple) -> tuple | None:
 def constant_entries(function: Callable, values: tuple) -> np.ndarray | None:
     """The array that `function(*values)` is, NaN in entries that are no constants of the graph; None where it has none."""
     leaves, structure = jax.tree.flatten(values)
-    with in_scalars():
-        closed = jax.make_jaxpr(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)))(*leaves)
-    try:
-        made = interpreted(closed)
-    except (UnsupportedPrimitive, GraphTooLarge):
+    made = _graph_of(function, structure, [jax.ShapeDtypeStruct(np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves])
+    if made is None:
         return None
-    (nodes,), graph = made.results, made.graph
+    graph, (nodes,) = made.graph, made.results
     entries = [graph.value[node] if graph.is_constant(node) else np.nan for node in nodes.ravel().tolist()]
     return np.array(entries, dtype=float).reshape(nodes.shape)
+
+
+class GraphOf(NamedTuple):
+    """A function as nodes: those of its flat arguments and of its flat results, and the structure of these."""
+
+    graph: Graph
+    inputs: list[Nodes]
+    results: list[Nodes]
+    structure: Any
+
+
+def _graph_of(function: Callable, structure: Any, shapes: list) -> GraphOf | None:
+    """The graph of a function, None where it has none."""
+    with in_scalars():
+        flat = lambda *leaves: function(*jax.tree.unflatten(structure, leaves))
+        closed, result = jax.make_jaxpr(flat, return_shape=True)(*shapes)
+    if any(isinstance(c, Tracer) for c in closed.consts):
+        return None
+    graph = Graph(NODE_LIMIT)
+    inputs = [np.array([graph.input(f"x{i}.{k}") for k in range(math.prod(s.shape))], np.int64) for i, s in enumerate(shapes)]
+    inputs = [nodes.reshape(s.shape) for nodes, s in zip(inputs, shapes, strict=True)]
+    try:
+        results = Interpreter(graph).run(closed, *inputs)
+    except GraphTooLarge:
+        return None
+    lost = any(isinstance(nodes, Unavailable) for nodes in results)
+    return None if lost else GraphOf(graph, inputs, results, jax.tree.structure(result))
+
+
+def scalar_program(function: Callable, values: tuple) -> tuple | None:
+    """(`function(*values)`,) of traced values by the operations of its graph; None where it has none."""
+    leaves, structure = jax.tree.flatten(values)
+    if any(jnp.result_type(leaf) != jnp.float64 for leaf in leaves):
+        return None
+    program = _scalar_program(function, structure, tuple(jnp.shape(leaf) for leaf in leaves))
+    return None if program is None else (program(*leaves),)
+
+
+@functools.lru_cache(KEPT)
+def _scalar_program(function: Callable, structure: Any, shapes: tuple) -> Callable | None:
+    made = _graph_of(function, structure, [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes])
+    if made is None or not made.results:
+        return None
+    outputs = [node for nodes in made.results for node in nodes.ravel().tolist()]
+    ends = np.cumsum([nodes.size for nodes in made.results])[:-1].tolist()
+
+    @jax.jit
+    def program(*leaves):
+        values: dict[int, Any] = {}
+        for nodes, leaf in zip(made.inputs, leaves, strict=True):
+            values.update(zip(nodes.ravel().tolist(), jnp.ravel(leaf), strict=True))
+        parts = jnp.split(by_jax(made.graph, outputs, values), ends) if outputs else [jnp.zeros(0)] * len(made.results)
+        arrays = [part.reshape(nodes.shape) for part, nodes in zip(parts, made.results, strict=True)]
+        return jax.tree.unflatten(made.structure, arrays)
+
+    return program
 
 
 def reads_inside(jaxpr: Any, values: tuple) -> bool:

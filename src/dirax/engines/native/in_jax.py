@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.native.compensation import increments
-from dirax.engines.native.graph import GraphTooLarge
+from dirax.engines.native.graph import Graph, GraphTooLarge
 from dirax.engines.native.interpret import UnsupportedPrimitive
 from dirax.engines.native.program import Program, program
 from dirax.engines.native.trace import TracedEquation
@@ -34,6 +34,14 @@ OPERATIONS: dict[str, Callable] = {
 """What the operations of the graph are on scalars in JAX."""
 
 
+def by_jax(g: Graph, outputs: list[int], values: dict[int, Any]) -> Any:
+    """Nodes of a graph as one array, from the `values` of its inputs, to which those of all others are added."""
+    for node in g.reachable(outputs, values):
+        if g.is_constant(node):
+            values[node] = jnp.asarray(g.value[node])
+    return jnp.stack([jnp.asarray(x, float) for x in g.evaluate(outputs, {}, OPERATIONS, values)])
+
+
 def function_of(made: Program, equation: TracedEquation, outputs: list[int]) -> Callable:
     """(u, state, t, h, params) ↦ the nodes `outputs` of a traced equation, as one array."""
     g, shared = made.graph, made.shared
@@ -44,10 +52,7 @@ def function_of(made: Program, equation: TracedEquation, outputs: list[int]) -> 
         values: dict[int, Any] = {shared.t: jnp.asarray(t, float), shared.h: jnp.asarray(h, float)}
         values.update(zip(shared.params, numbers, strict=True))
         values.update(zip([*equation.unknowns, *equation.state], [*u, *state], strict=True))
-        for node in g.reachable(outputs, values):
-            if g.is_constant(node):
-                values[node] = jnp.asarray(g.value[node])
-        return jnp.stack([jnp.asarray(x, float) for x in g.evaluate(outputs, {}, OPERATIONS, values)])
+        return by_jax(g, outputs, values)
 
     return jax.jit(evaluated)  # so that JAX traces it once for all the places that a loop has it in
 
