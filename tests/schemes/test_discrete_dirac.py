@@ -197,3 +197,45 @@ def test_theta_maps_of_a_lagrangian_are_the_lifted_ones():
         sol = dx.simulate(system, dx.DiscreteDirac(map=Theta(theta)), q=[1.0], p=[0.5], step=0.1, steps=10)
         expected = np.linalg.matrix_power(np.array(matrix), 10) @ [1.0, 0.5]
         assert [sol.q[-1, 0], sol.p[-1, 0]] == pytest.approx(expected, abs=1e-14)
+
+
+FORMS = lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
+HIDDEN = {
+    "a Lagrangian": (
+        dx.LagrangeDirac(lambda q, v: v[:2] @ v[:2] / 2 - q[1] + q[2] * (q[:2] @ q[:2] - 1.0)),
+        {"q": [0.6, -0.8, 0.1], "v": [0.4, 0.3, 0.0]},
+        "∂²L/∂v² has rank 2 of 3",
+    ),
+    "its two points": (
+        dx.LagrangeDirac(lambda q, v: v[:2] @ v[:2] / 2 - q[1] + q[2] * (q[:2] @ q[:2] - 1.0)),
+        {"q0": [0.6, -0.8, 0.1], "q1": [0.604, -0.797, 0.1]},
+        "∂²L/∂v² has rank 2 of 3",
+    ),
+    "an implicit system": (
+        dx.ImplicitSystem(lambda x: jnp.diag(jnp.array([1.0, 0.0])), lambda x: jnp.stack([x[1], x[1] - x[0]])),
+        {"x": [1.0, 1.0]},
+        "the matrix of ẋ has rank 1 of 2",
+    ),
+    "an induced structure": (
+        dx.DiracSystem(dx.induced_dirac(FORMS, 3), lambda x: x[3:] @ x[3:] / 2),
+        {"x": [0.0, 0.0, 0.3, np.cos(0.3), np.sin(0.3), 1.0]},
+        "the matrix of ẋ has rank 5 of 6",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HIDDEN)
+def test_method_2_of_constraints_that_are_not_stated_needs_the_chain(name):
+    """Method 1 takes these systems; Method 2 says how to have them."""
+    system, data, words = HIDDEN[name]
+    run = {**data, "step": 0.01, "steps": 2}
+    assert dx.simulate(system, dx.DiscreteDirac(), **run).ok
+    with pytest.raises(ValueError, match=rf"{words}.*constraint_algorithm\(system, near=.*resolved\(\)"):
+        dx.simulate(system, dx.DiscreteDirac(constraints="resolve"), **run)
+
+
+def test_method_2_of_regular_systems_is_method_1():
+    oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(jnp.cos(q)))
+    run = {"q": [0.3], "v": [0.1], "step": 0.1, "steps": 5}
+    one, two = (dx.simulate(oscillator, dx.DiscreteDirac(constraints=kind), **run) for kind in ("discretize", "resolve"))
+    np.testing.assert_array_equal(one.q, two.q)

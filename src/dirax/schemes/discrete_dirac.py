@@ -1,9 +1,12 @@
 """Discrete Dirac systems by discretization maps ([BLM] §5): one scheme for Hamiltonian, Lagrangian and port systems."""
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
+from dirax.functions import evaluated
 from dirax.geometry.cotangent_lift import CotangentLift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
 from dirax.schemes.constraint_rows import independent_constraints
@@ -11,6 +14,7 @@ from dirax.schemes.discretized import stepping
 from dirax.schemes.lagrangian_methods import discretized_lagrangian, resolved_lagrangian, resolved_nonholonomic
 from dirax.schemes.resolved import of_chain, of_constrained_hamiltonian, projected_field
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
+from dirax.systems.constraint_algorithm import rank_of
 from dirax.systems.constraint_chain import ResolvedSystem
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.implicit_system import ImplicitSystem
@@ -18,6 +22,7 @@ from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import NonholonomicMechanics, as_lagrange_dirac
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 from dirax.systems.port_hamiltonian import PortHamiltonian
+from dirax.tracing import gradient, jacobian
 
 CONSTRAINTS = ("discretize", "resolve")
 
@@ -39,7 +44,8 @@ class DiscreteDirac(AbstractScheme):
 
     Takes DiracSystem, PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian
     systems, and what `ConstraintChain.resolved` returns, on which it is Method 2 for any system; raises `TypeError` for
-    others and `ValueError` for maps that do not fit the system's space.
+    others, and `ValueError` for maps that do not fit the system's space and for Method 2 of a system with constraints that
+    are not stated as such, those of a singular Lagrangian say.
     """
 
     map: AbstractDiscretizationMap
@@ -65,7 +71,7 @@ class DiscreteDirac(AbstractScheme):
                 "dx.constraint_algorithm(system, near=x).resolved() instead of the system."
             )
         if isinstance(system, DiracSystem | PortHamiltonian | ImplicitSystem):
-            return discretized_relation(system, shape, self.map)
+            return _nothing_hidden(system, discretized_relation(system, shape, self.map), resolve)
         if isinstance(system, PhaseSpaceLagrangian):
             if resolve:
                 return _on_graph(system, shape, self.map)
@@ -74,12 +80,42 @@ class DiscreteDirac(AbstractScheme):
             return resolved_nonholonomic(system, shape, _theta_of(self.map))
         system = as_lagrange_dirac(system)
         if isinstance(system, LagrangeDirac):
-            method = resolved_lagrangian if resolve and shape.m + shape.c else discretized_lagrangian
-            return method(system, shape, _theta_of(self.map))
+            if resolve and shape.m + shape.c:
+                return resolved_lagrangian(system, shape, _theta_of(self.map))
+            return _nothing_hidden(system, discretized_lagrangian(system, shape, _theta_of(self.map)), resolve)
         raise TypeError(
             "dx.DiscreteDirac discretizes DiracSystem, PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and "
             f"PhaseSpaceLagrangian systems, but a {type(system).__name__} was given."
         )
+
+
+def _nothing_hidden(system: Any, equation: StepEquation, resolve: bool) -> StepEquation:
+    """The equation, which for Method 2 refuses systems whose constraints are not stated as such: a Lagrangian with a singular
+    Hessian, equations of ẋ with a singular matrix."""
+    if not resolve:
+        return equation
+    hessian = lambda t, q, v, params: jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(v)
+
+    def check(data, h, params):
+        equation.check(data, h, params)
+        if isinstance(system, PortHamiltonian) or ("p" in data and isinstance(system, LagrangeDirac)):
+            return
+        if isinstance(system, LagrangeDirac):
+            q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if "q0" in data else (data["q"], data["v"])
+            matrix, what = np.asarray(evaluated(hessian, np.zeros(()), q, v, params)), "∂²L/∂v²"
+        else:
+            x = system.point(data) if isinstance(system, DiracSystem) else data["x"]
+            matrix, what = np.asarray(evaluated(system.equations, np.asarray(x), params)[0]), "the matrix of ẋ"
+        rank = rank_of(matrix)
+        if rank < matrix.shape[1] or matrix.shape[0] > rank:
+            near = '{"q": …, "v": …}' if isinstance(system, LagrangeDirac) else "x"
+            raise ValueError(
+                f"Method 2 of this {type(system).__name__} needs its final manifold, since {what} has rank {rank} of "
+                f"{max(matrix.shape)} at the initial data: simulate dx.constraint_algorithm(system, near={near}).resolved() "
+                "instead of the system, from x=chain.point."
+            )
+
+    return dataclasses.replace(equation, check=check)
 
 
 def discretized_relation(

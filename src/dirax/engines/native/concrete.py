@@ -1,9 +1,8 @@
 """Functions by their graph: at concrete values on the host, where nothing is compiled, and at traced ones as scalar programs."""
 
 import functools
-import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +10,9 @@ import numpy as np
 from jax.core import Tracer
 
 from dirax.engines.native.graph import Graph, GraphTooLarge
+from dirax.engines.native.host_function import HostFunction, interpreted
 from dirax.engines.native.in_jax import by_jax
-from dirax.engines.native.interpret import RULES, Interpreter, Nodes, Unavailable
+from dirax.engines.native.interpret import RULES, Interpreter, Nodes, Unavailable, UnsupportedPrimitive
 from dirax.engines.native.on_host import KEPT, on_host
 from dirax.engines.native.trace import NODE_LIMIT
 from dirax.tracing import in_scalars
@@ -36,39 +36,25 @@ def evaluated(function: Callable, values: tuple) -> tuple | None:
 def constant_entries(function: Callable, values: tuple) -> np.ndarray | None:
     """The array that `function(*values)` is, NaN in entries that are no constants of the graph; None where it has none."""
     leaves, structure = jax.tree.flatten(values)
-    made = _graph_of(function, structure, [jax.ShapeDtypeStruct(np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves])
-    if made is None:
+    found = _graph_of(function, structure, [jax.ShapeDtypeStruct(np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves])
+    if found is None:
         return None
-    graph, (nodes,) = made.graph, made.results
+    graph, (nodes,) = found[0].graph, found[0].results
     entries = [graph.value[node] if graph.is_constant(node) else np.nan for node in nodes.ravel().tolist()]
     return np.array(entries, dtype=float).reshape(nodes.shape)
 
 
-class GraphOf(NamedTuple):
-    """A function as nodes: those of its flat arguments and of its flat results, and the structure of these."""
-
-    graph: Graph
-    inputs: list[Nodes]
-    results: list[Nodes]
-    structure: Any
-
-
-def _graph_of(function: Callable, structure: Any, shapes: list) -> GraphOf | None:
-    """The graph of a function, None where it has none."""
+def _graph_of(function: Callable, structure: Any, shapes: list) -> tuple[HostFunction, Any] | None:
+    """The graph of a function of flat arguments, and the structure of its results; None where it has none."""
     with in_scalars():
         flat = lambda *leaves: function(*jax.tree.unflatten(structure, leaves))
         closed, result = jax.make_jaxpr(flat, return_shape=True)(*shapes)
     if any(isinstance(c, Tracer) for c in closed.consts):
         return None
-    graph = Graph(NODE_LIMIT)
-    inputs = [np.array([graph.input(f"x{i}.{k}") for k in range(math.prod(s.shape))], np.int64) for i, s in enumerate(shapes)]
-    inputs = [nodes.reshape(s.shape) for nodes, s in zip(inputs, shapes, strict=True)]
     try:
-        results = Interpreter(graph).run(closed, *inputs)
-    except GraphTooLarge:
+        return interpreted(closed, {}), jax.tree.structure(result)
+    except (UnsupportedPrimitive, GraphTooLarge):
         return None
-    lost = any(isinstance(nodes, Unavailable) for nodes in results)
-    return None if lost else GraphOf(graph, inputs, results, jax.tree.structure(result))
 
 
 def scalar_program(function: Callable, values: tuple) -> tuple | None:
@@ -82,9 +68,10 @@ def scalar_program(function: Callable, values: tuple) -> tuple | None:
 
 @functools.lru_cache(KEPT)
 def _scalar_program(function: Callable, structure: Any, shapes: tuple) -> Callable | None:
-    made = _graph_of(function, structure, [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes])
-    if made is None or not made.results:
+    found = _graph_of(function, structure, [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes])
+    if found is None or not found[0].results:
         return None
+    made, of_results = found
     outputs = [node for nodes in made.results for node in nodes.ravel().tolist()]
     ends = np.cumsum([nodes.size for nodes in made.results])[:-1].tolist()
 
@@ -95,7 +82,7 @@ def _scalar_program(function: Callable, structure: Any, shapes: tuple) -> Callab
             values.update(zip(nodes.ravel().tolist(), jnp.ravel(leaf), strict=True))
         parts = jnp.split(by_jax(made.graph, outputs, values), ends) if outputs else [jnp.zeros(0)] * len(made.results)
         arrays = [part.reshape(nodes.shape) for part, nodes in zip(parts, made.results, strict=True)]
-        return jax.tree.unflatten(made.structure, arrays)
+        return jax.tree.unflatten(of_results, arrays)
 
     return program
 

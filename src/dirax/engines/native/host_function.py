@@ -115,11 +115,11 @@ class HostFunction:
         return self.opaque[-1].results
 
 
-def interpreted(jaxpr: Any) -> HostFunction:
-    """A closed jaxpr as a HostFunction. Raises `UnsupportedPrimitive` and `GraphTooLarge`."""
+def interpreted(jaxpr: Any, host_rules: dict[str, Callable] = HOST_RULES) -> HostFunction:
+    """A closed jaxpr as a HostFunction, a graph alone without `host_rules`. Raises `UnsupportedPrimitive` and `GraphTooLarge`."""
     made = HostFunction([])
     made.inputs = [made.fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
-    rules = {name: functools.partial(rule, made) for name, rule in HOST_RULES.items()}
+    rules = {name: functools.partial(rule, made) for name, rule in host_rules.items()}
     made.results = Interpreter(made.graph, rules).run(jaxpr, *made.inputs)
     for result in made.results:
         if isinstance(result, Unavailable):
