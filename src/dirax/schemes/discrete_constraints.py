@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 
 from dirax.functions import check_finite, is_traced
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation, make_step_equation
+from dirax.systems.affine_equations import equilibrated
 from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
 from dirax.systems.system import AbstractSystem
@@ -326,10 +327,7 @@ def _rank(matrix: np.ndarray) -> int:
     if not matrix.size:
         return 0
     matrix = np.where(np.abs(matrix) > NOISE * np.abs(matrix).max(), matrix, 0.0)
-    for axis in (1, 0):
-        sizes = np.abs(matrix).max(axis=axis, keepdims=True)
-        matrix = matrix / np.where(sizes > 0, sizes, 1.0)
-    values = np.linalg.svd(matrix, compute_uv=False)
+    values = np.linalg.svd(equilibrated(matrix), compute_uv=False)
     return int(np.sum(values > RANK_TOLERANCE * max(1.0, values[0])))
 
 

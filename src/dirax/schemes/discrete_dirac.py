@@ -92,22 +92,22 @@ class DiscreteDirac(AbstractScheme):
 def _nothing_hidden(system: Any, equation: StepEquation, resolve: bool) -> StepEquation:
     """The equation, which for Method 2 refuses systems whose constraints are not stated as such: a Lagrangian with a singular
     Hessian, equations of ẋ with a singular matrix."""
-    if not resolve:
+    if not resolve or isinstance(system, PortHamiltonian):
         return equation
     hessian = lambda t, q, v, params: jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(v)
 
     def check(data, h, params):
         equation.check(data, h, params)
-        if isinstance(system, PortHamiltonian) or ("p" in data and isinstance(system, LagrangeDirac)):
-            return
         if isinstance(system, LagrangeDirac):
+            if "p" in data:
+                return
             q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if "q0" in data else (data["q"], data["v"])
             matrix, what = np.asarray(evaluated(hessian, np.zeros(()), q, v, params)), "∂²L/∂v²"
         else:
             x = system.point(data) if isinstance(system, DiracSystem) else data["x"]
             matrix, what = np.asarray(evaluated(system.equations, np.asarray(x), params)[0]), "the matrix of ẋ"
         rank = rank_of(matrix)
-        if rank < matrix.shape[1] or matrix.shape[0] > rank:
+        if rank < max(matrix.shape):
             near = '{"q": …, "v": …}' if isinstance(system, LagrangeDirac) else "x"
             raise ValueError(
                 f"Method 2 of this {type(system).__name__} needs its final manifold, since {what} has rank {rank} of "

@@ -43,13 +43,13 @@ def explicit(equations: Callable, entries: np.ndarray, size: int) -> Explicit:
     rows, columns = pivots(entries[constant, :size])
     rows = constant[rows]
     others, free = (np.setdiff1d(np.arange(n), taken) for n, taken in zip(entries.shape, (rows, columns), strict=True))
-    inverse, order = np.linalg.inv(entries[np.ix_(rows, columns)]), np.argsort(np.concatenate([columns, free]))
+    inverse = np.linalg.inv(entries[np.ix_(rows, columns)])
 
     @shared
     def family(x, params):
         matrix, right = equations(x, params)
         top = inverse @ jnp.concatenate([right[rows, None], -matrix[rows][:, free]], axis=1)
-        whole = jnp.concatenate([top, np.eye(free.size, free.size + 1, 1)])[order]
+        whole = _whole(top, columns, free)
         return whole[:, 0], whole[:, 1:]
 
     @shared
@@ -62,7 +62,7 @@ def explicit(equations: Callable, entries: np.ndarray, size: int) -> Explicit:
 
 def pivots(matrix: np.ndarray, rank: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns, as many as the rank of the matrix, whose square part is regular; sparse ones first (Markowitz)."""
-    left, rows, columns = _equilibrated(matrix), [], []
+    left, rows, columns = equilibrated(matrix), [], []
     while left.size and (rank is None or len(rows) < rank):
         sizes = np.abs(left)
         if sizes.max() <= (NEGLIGIBLE if rank is None else 0.0):
@@ -77,7 +77,13 @@ def pivots(matrix: np.ndarray, rank: int | None = None) -> tuple[np.ndarray, np.
     return np.array(rows, int), np.array(columns, int)
 
 
-def _equilibrated(matrix: np.ndarray) -> np.ndarray:
+def _whole(top, columns: np.ndarray, free: np.ndarray):
+    """Solution and kernel of all unknowns, (n, 1 + f), where those of the solved `columns` are `top` and the others free."""
+    return jnp.concatenate([top, np.eye(free.size, free.size + 1, 1)])[np.argsort(np.concatenate([columns, free]))]
+
+
+def equilibrated(matrix: np.ndarray) -> np.ndarray:
+    """The matrix with rows, then columns, of unit size where they are not zero."""
     for axis in (1, 0):
         sizes = np.abs(matrix).max(axis=axis, keepdims=True, initial=0.0)
         matrix = matrix / np.where(sizes > 0, sizes, 1.0)
@@ -101,7 +107,7 @@ def solved(equations: Callable, matrix: np.ndarray, rank: int, entries: np.ndarr
     (r, f), (rows, columns) = matrix.shape, pivots(matrix, rank)
     rank = len(rows)
     others, free = np.setdiff1d(np.arange(r), rows), np.setdiff1d(np.arange(f), columns)
-    order, zero = np.argsort(np.concatenate([columns, free])), np.all(entries[others] == 0.0, axis=1)
+    zero = np.all(entries[others] == 0.0, axis=1)
 
     @shared
     def whole(x, params):
@@ -110,9 +116,8 @@ def solved(equations: Callable, matrix: np.ndarray, rank: int, entries: np.ndarr
         sides = jnp.concatenate([right[rows, None], -matrix[rows][:, free]], axis=1)
         core = matrix[rows][:, columns]
         top = solve(core, sides, apart=True) if rank > 1 else sides / core if rank else sides
-        both = jnp.concatenate([top, np.eye(free.size, free.size + 1, 1)])[order]
         missed = matrix[others][:, columns] @ top[:, 0] if rank else jnp.zeros(others.size)
-        return both, right[others] - jnp.where(zero, 0.0, missed)
+        return _whole(top, columns, free), right[others] - jnp.where(zero, 0.0, missed)
 
     return Solved(
         lambda x, params: whole(x, params)[0][:, 0],

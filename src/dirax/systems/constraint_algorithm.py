@@ -70,8 +70,9 @@ class _Search:
         self.parts: list[Callable] = []
         self.levels: list[ConstraintLevel] = []
         self.phi_and_slope: Callable = lambda x: (np.zeros(0), np.zeros((0, self.size)))
-        self.given = self.at_points(form.equations)
-        self.explicit = explicit(form.equations, self.constant_entries(form.equations), self.size)
+        equations = shared(form.equations)
+        self.given = self.at_points(equations)
+        self.explicit = explicit(equations, self.constant_entries(equations), self.size)
         self.rows = [self.explicit.rest]
         """Equations of c, where (ẋ, u) = w + K c solves the explicit ones."""
 

@@ -7,15 +7,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from dirax.engines.native.graph import Graph, GraphTooLarge
-from dirax.engines.native.host_function import HostFunction, interpreted
+from dirax.engines.native.host_function import HostFunction
 from dirax.engines.native.in_jax import by_jax
-from dirax.engines.native.interpret import RULES, Interpreter, Nodes, Unavailable, UnsupportedPrimitive
-from dirax.engines.native.on_host import KEPT, on_host
+from dirax.engines.native.interpret import RULES, Interpreter, Nodes, Unavailable
+from dirax.engines.native.on_host import KEPT, on_host, traced
 from dirax.engines.native.trace import NODE_LIMIT
-from dirax.tracing import in_scalars
 
 
 def evaluated(function: Callable, values: tuple) -> tuple | None:
@@ -46,15 +44,7 @@ def constant_entries(function: Callable, values: tuple) -> np.ndarray | None:
 
 def _graph_of(function: Callable, structure: Any, shapes: list) -> tuple[HostFunction, Any] | None:
     """The graph of a function of flat arguments, and the structure of its results; None where it has none."""
-    with in_scalars():
-        flat = lambda *leaves: function(*jax.tree.unflatten(structure, leaves))
-        closed, result = jax.make_jaxpr(flat, return_shape=True)(*shapes)
-    if any(isinstance(c, Tracer) for c in closed.consts):
-        return None
-    try:
-        return interpreted(closed, {}), jax.tree.structure(result)
-    except (UnsupportedPrimitive, GraphTooLarge):
-        return None
+    return traced(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), shapes, {})
 
 
 def scalar_program(function: Callable, values: tuple) -> tuple | None:

@@ -10,7 +10,7 @@ from jax.core import Tracer
 
 from dirax.engines.native import host_rules  # noqa: F401  (registers its rules)
 from dirax.engines.native.graph import GraphTooLarge
-from dirax.engines.native.host_function import HostFunction, Values, in_parts, interpreted
+from dirax.engines.native.host_function import HOST_RULES, HostFunction, Values, in_parts, interpreted
 from dirax.engines.native.interpret import UnsupportedPrimitive
 from dirax.engines.native.program import program
 from dirax.tracing import in_scalars
@@ -33,7 +33,7 @@ def on_host(function: Callable, leaves: list[np.ndarray], kept: tuple, key: Any 
     shapes = [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves]
     known = (*map(id, kept), key, *((s.shape, s.dtype.str) for s in shapes))
     if known not in _functions:
-        _functions[known] = kept, _traced(function, shapes)
+        _functions[known] = kept, traced(function, shapes)
         if len(_functions) > KEPT:
             _functions.popitem(last=False)
     _functions.move_to_end(known)
@@ -41,13 +41,16 @@ def on_host(function: Callable, leaves: list[np.ndarray], kept: tuple, key: Any 
     return None if made is None else jax.tree.unflatten(made[1], made[0](leaves))
 
 
-def _traced(function: Callable, shapes: list[jax.ShapeDtypeStruct]) -> tuple[HostFunction, Any] | None:
+def traced(
+    function: Callable, shapes: list[jax.ShapeDtypeStruct], rules: dict[str, Callable] = HOST_RULES
+) -> tuple[HostFunction, Any] | None:
+    """`function` with these host rules, and the structure of its result; None as above."""
     with in_scalars():
         closed, result = jax.make_jaxpr(function, return_shape=True)(*shapes)
     if any(isinstance(c, Tracer) for c in closed.consts):
         return None
     try:
-        return interpreted(closed), jax.tree.structure(result)
+        return interpreted(closed, rules), jax.tree.structure(result)
     except (UnsupportedPrimitive, GraphTooLarge):
         return None
 
