@@ -37,6 +37,6 @@ def store(name: str, results: dict[str, Any]) -> Path:
 
 def table(header: tuple[str, ...], rows: list[tuple[str, ...]], title: str) -> str:
     """Aligned text."""
-    from dirax.tables import text_table
+    from dirax.text.tables import text_table
 
     return text_table(header, rows, title) + "\n"

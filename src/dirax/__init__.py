@@ -7,11 +7,11 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-from dirax.configure import configure
 from dirax.diagnostics.compare import compare
 from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
+from dirax.engines.configure import configure
 from dirax.geometry.charts import Atlas, RetractionChart, chart_at, check_chart
 from dirax.geometry.cotangent_lift import CotangentBundle, cotangent_lift, symplecticity_defect
 from dirax.geometry.discrete import (
@@ -37,7 +37,6 @@ from dirax.geometry.tulczyjew import (
     minus_legendre,
     plus_legendre,
 )
-from dirax.reconstruction import reconstruct
 from dirax.reduction.actions import GroupAction, Translations
 from dirax.reduction.connection import DiscreteConnection, LinearConnection
 from dirax.reduction.coordinates import adapted_basis, in_coordinates
@@ -47,6 +46,7 @@ from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
+from dirax.run.simulate import simulate
 from dirax.schemes.charted import InCharts
 from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
 from dirax.schemes.discrete_constraints import DiscreteConstraintChain, discrete_constraint_algorithm
@@ -56,9 +56,9 @@ from dirax.schemes.euler_poincare import DiscreteEulerPoincare
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
-from dirax.simulate import simulate
-from dirax.solution import Solution
-from dirax.storage import load
+from dirax.solution.reconstruction import reconstruct
+from dirax.solution.solution import Solution
+from dirax.solution.storage import load
 from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.dirac_system import DiracSystem

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.engines import choice
+from dirax.engines import policy as choice
 from dirax.engines.native.program import program
 
 N = 20

@@ -7,7 +7,7 @@ import pytest
 
 import dirax as dx
 from dirax.engines import xla
-from dirax.engines.lane import first_lane, take_step
+from dirax.engines.xla.lane import first_lane, take_step
 from dirax.schemes.step import Shape, make_step_equation
 
 SYSTEM = dx.LagrangeDirac(

@@ -14,8 +14,8 @@ import dirax as dx
 from dirax.engines import native, xla
 from dirax.engines.native import compile as llvm
 from dirax.engines.native import driver
+from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.native.program import program
-from dirax.engines.native.step_loop import kernel_module
 from dirax.engines.result import NOT_CONVERGED, NOT_FINITE, OK, Problem
 from dirax.schemes.step import Field, Shape, StepEquation, StepSequence, make_step_equation
 

@@ -4,9 +4,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from dirax.engines.native.function import compiled
-from dirax.engines.native.graph import Graph
-from dirax.engines.native.operations import OPERATIONS
+from dirax.engines.native.ir.compiled_function import compiled
+from dirax.program.graph import Graph
+from dirax.program.operations import OPERATIONS
 
 COUNT = 250
 rng = np.random.default_rng(20260331)

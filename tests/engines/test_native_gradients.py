@@ -9,7 +9,8 @@ import pytest
 
 import dirax as dx
 from dirax.engines import native
-from dirax.engines.native import UnsupportedPrimitive, sweeper
+from dirax.engines.native import UnsupportedPrimitive
+from dirax.engines.native.gradients import runs as sweeper
 from dirax.engines.result import Problem
 from dirax.schemes.step import Field, StepEquation
 

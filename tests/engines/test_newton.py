@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dirax.engines.newton import EPSILON, as_function, factorised, solve
+from dirax.engines.xla.newton import EPSILON, as_function, factorised, solve
 
 
 def root(equation, guess, args=(), scale=None, **keywords):

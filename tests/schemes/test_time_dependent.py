@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 import dirax as dx
 from dirax import gallery
 from dirax.diagnostics.verify import verify
-from dirax.functions import UserFunction
 from dirax.gallery import turntable
+from dirax.program.user_functions import UserFunction
 
 
 def slopes(errors) -> np.ndarray:

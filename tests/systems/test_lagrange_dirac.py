@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dirax as dx
-from dirax.initial import numerical_rank
-from dirax.linear_solves import scaled_pseudo_inverse
-from dirax.roots import nearest_root
+from dirax.program.linear_solves import scaled_pseudo_inverse
+from dirax.program.roots import nearest_root
+from dirax.run.start import numerical_rank
 
 numbers = st.floats(-3, 3, allow_subnormal=False)
 vectors = st.tuples(*[numbers] * 3).map(np.array)

@@ -9,9 +9,9 @@ from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
 from dirax.gallery.example import Example
 from dirax.schemes.step import AbstractScheme
-from dirax.solution import Solution
-from dirax.storage import ENDINGS
-from dirax.tables import plain
+from dirax.solution.solution import Solution
+from dirax.solution.storage import ENDINGS
+from dirax.text.tables import plain
 
 
 def run_and_verify(

@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.diagnostics.judging import roundoff_limit
 from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 from dirax.systems.port_hamiltonian import PortHamiltonian
 
 PORTS = 2

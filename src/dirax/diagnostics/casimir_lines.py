@@ -15,7 +15,7 @@ from dirax.geometry.semidirect import SemidirectProduct
 from dirax.reduction.casimirs import casimirs
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.lie_poisson import LiePoisson
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 
 ISOTROPY = 1e-10
 """A direction of the algebra that moves a by less than this, relative to |a|, leaves it alone."""

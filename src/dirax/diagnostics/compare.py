@@ -10,11 +10,11 @@ import numpy as np
 from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.energy_lines import energy_less_work
+from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
-from dirax.simulate import simulate
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
-from dirax.tables import html_table, number, plain, text_table
+from dirax.text.tables import html_table, number, plain, text_table
 
 HEADER = ("scheme", "order", "error", "energy band", "energy", "slope", "constraint", "µs/step", "Newton/step", "ended")
 ORDER_STEPS = 64

@@ -12,7 +12,7 @@ from dirax.diagnostics.judging import SAMPLED_ROWS, judged, of_lane, roundoff_li
 from dirax.diagnostics.one_step import DiscreteSystem, discrete_system, over_rows
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.schemes.discrete_dirac import DiscreteDirac
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import as_lagrange_dirac

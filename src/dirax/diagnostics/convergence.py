@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
-from dirax.simulate import simulate
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
-from dirax.tables import html_table, number, plain, text_table
+from dirax.text.tables import html_table, number, plain, text_table
 
 REFINEMENT = 16
 """A refined reference has so many times smaller steps than the smallest measured ones."""

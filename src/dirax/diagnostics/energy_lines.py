@@ -10,7 +10,7 @@ from dirax.diagnostics.books import balances, keeps_books
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.judging import EPSILON, ROUNDINGS, of_lane, sampled_terms, steps_of
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, Line
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import as_lagrange_dirac

@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.diagnostics.one_step import over_rows
 from dirax.diagnostics.report import OK, VIOLATED, Line
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 
 EPSILON = 2.0**-52
 ROUNDINGS = 32

@@ -12,7 +12,7 @@ from dirax.diagnostics.judging import judged, of_lane, relative_changes, roundof
 from dirax.diagnostics.one_step import over_rows
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.reduction.reduced import ReducedLagrangeDirac
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 
 Symmetries = Mapping[str, Callable] | Sequence[int] | None
 """{name: generator(q) -> (n,)}, or the numbers of cyclic coordinates."""

@@ -13,16 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.engines.lane import first_lane, take_step
-from dirax.functions import UserFunction
+from dirax.engines.xla.lane import first_lane, take_step
 from dirax.geometry.discrete import DiscretizationMapDirac
 from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.structures import canonical_two_form
 from dirax.geometry.tulczyjew import FiniteDifferenceTriple, slot_derivatives
+from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import as_lagrange_dirac

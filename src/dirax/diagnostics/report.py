@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from dirax.tables import html_table, number, plain, text_table
+from dirax.text.tables import html_table, number, plain, text_table
 
 OK, VIOLATED, BOUNDED, DRIFTS, NOT_CHECKED = "ok", "VIOLATED", "bounded", "drifts", "not checked"
 BAD = (VIOLATED, DRIFTS)

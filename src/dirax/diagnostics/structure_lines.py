@@ -21,7 +21,7 @@ from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.lie_poisson import LiePoisson
 from dirax.schemes.discrete_dirac import DiscreteDirac
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 from dirax.systems.dirac_system import DiracSystem
 
 SAMPLED_STEPS = 8

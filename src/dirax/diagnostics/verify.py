@@ -9,9 +9,9 @@ from dirax.diagnostics.judging import steps_of
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.report import OK, VIOLATED, Line, Report
 from dirax.diagnostics.structure_lines import membership, symplecticity
-from dirax.reconstruction import reconstruct
 from dirax.reduction.reduced import ReducedLagrangeDirac
-from dirax.solution import Solution
+from dirax.solution.reconstruction import reconstruct
+from dirax.solution.solution import Solution
 
 
 def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None = None) -> Report:

@@ -15,7 +15,7 @@ from dirax.gallery import rolling_disk, vortices
 from dirax.gallery.reproduction import AGREES, DIFFERS, NEW, WRONG, Progress, Reproduction, Row, compared
 from dirax.schemes.composition import Composition
 from dirax.schemes.discrete_dirac import DiscreteDirac
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 from dirax.systems.nonholonomic import NonholonomicMechanics
 
 TITLE = "Barbero Liñán, López Medel, Martín de Diego: Dirac systems and the constraint algorithm, §6 and §8"
@@ -202,7 +202,7 @@ def disk() -> NonholonomicMechanics:
 
 def disk_rows(end: float = 10.0) -> list[Row]:
     """Orders, errors and constraint of Methods 1 and 2 and of Method 2 composed, on the rolling disk."""
-    from dirax.simulate import simulate
+    from dirax.run.simulate import simulate
 
     system = disk()
     schemes = {

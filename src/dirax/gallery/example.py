@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from dirax.run.simulate import simulate
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.step import AbstractScheme
-from dirax.simulate import simulate
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
 
 

@@ -15,7 +15,7 @@ from dirax.gallery import heisenberg, rolling_disk
 from dirax.gallery.reproduction import AGREES, DIFFERS, NEW, WRONG, Progress, Reproduction, Row, compared
 from dirax.schemes.discrete_lagrangian import discrete_lagrangian, slot_derivatives
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 
 TITLE = "Peng, Yoshimura: discrete Lagrange–Dirac dynamical systems, §8"
 SCHEMES = {"+": PlusLagrangeDirac(), "-": MinusLagrangeDirac()}

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from dirax.gallery.peng_yoshimura import AXIS_END, SIGN, generalized_energy, path_energy
-from dirax.plotting import (
+from dirax.solution.plotting import (
     BLUE,
     ENERGY_ERROR,
     GREEN,
@@ -16,7 +16,7 @@ from dirax.plotting import (
     plot_trajectory,
     style,
 )
-from dirax.solution import Solution
+from dirax.solution.solution import Solution
 
 
 @style()

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from dirax.gallery.rolling_disk import EXAMPLE, exact
-from dirax.plotting import BLUE, ENERGY_ERROR, GREEN, INK, VERMILION, new_figure, plot_error, save_figure, style
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
+from dirax.solution.plotting import BLUE, ENERGY_ERROR, GREEN, INK, VERMILION, new_figure, plot_error, save_figure, style
 
 SCHEMES = {
     "(+) Lagrange–Dirac": (PlusLagrangeDirac(), VERMILION, 0.7),

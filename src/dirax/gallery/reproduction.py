@@ -8,7 +8,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-from dirax.tables import plain, text_table
+from dirax.text.tables import plain, text_table
 
 AGREES, DIFFERS, WRONG, NEW = "agrees", "DIFFERS", "paper is wrong", "not in paper"
 """Verdicts. DIFFERS is the one that must not occur: dirax does not reproduce what it should."""
@@ -78,7 +78,7 @@ class Reproduction:
 
     def save_figures(self, folder: Path) -> list[Path]:
         """Write every figure as PNG into `folder`, which is made if it is missing; returns the files."""
-        from dirax.plotting import save_figure
+        from dirax.solution.plotting import save_figure
 
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / f"{name}.png" for name in self.figures]

@@ -9,13 +9,13 @@ import numpy as np
 from dirax.diagnostics.verify import verify
 from dirax.gallery import charged_particle, double_spherical_pendulum
 from dirax.gallery.reproduction import AGREES, DIFFERS, NEW, WRONG, Progress, Reproduction, Row, compared
-from dirax.reconstruction import reconstruct
 from dirax.reduction.connection import LinearConnection
 from dirax.reduction.reduce import reduce
 from dirax.schemes.discrete_lagrangian import RULES, discrete_lagrangian
 from dirax.schemes.lagrange_dirac import PlusLagrangeDirac
 from dirax.schemes.routh import DiscreteRouth
-from dirax.solution import Solution
+from dirax.solution.reconstruction import reconstruct
+from dirax.solution.solution import Solution
 
 TITLE = "Rodríguez Abella, Leok: discrete Dirac reduction, §7"
 PARTICLE: Any = charged_particle.EXAMPLE
@@ -201,7 +201,7 @@ def speed_row(repeats: int = 3) -> Row:
 
 
 def _simulate(example: Any, system: Any, scheme: Any, step: float, steps: int, **settings: Any) -> Solution:
-    from dirax.simulate import simulate
+    from dirax.run.simulate import simulate
 
     return simulate(
         example.system if system is None else system,

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from dirax.gallery import charged_particle
-from dirax.plotting import BLUE, ENERGY_ERROR, INK, VERMILION, new_figure, plot_error, style
-from dirax.solution import Solution
+from dirax.solution.plotting import BLUE, ENERGY_ERROR, INK, VERMILION, new_figure, plot_error, style
+from dirax.solution.solution import Solution
 
 
 @style()

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import Scalar
-from dirax.tracing import call, gradient, value_along
+from dirax.program.tracing import call, gradient, value_along
 
 Local = Float[Array, " d"]
 

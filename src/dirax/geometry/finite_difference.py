@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from dirax.functions import UserFunction, is_traced
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.structures import canonical_two_form
 from dirax.geometry.subspaces import STRUCTURE_TOLERANCE, AnyArray
+from dirax.program.user_functions import UserFunction, is_traced
 
 Vector = Float[Array, " n"]
 Covector = Float[Array, " n"]

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.lie_groups import AbstractLieGroup, Algebra, cross, quarter_turn
 from dirax.geometry.manifolds import Vector
-from dirax.tracing import gradient
+from dirax.program.tracing import gradient
 
 RETRACTIONS = ("exp", "cayley")
 

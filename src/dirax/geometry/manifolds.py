@@ -13,9 +13,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from dirax.functions import evaluated, is_traced
 from dirax.geometry.numerics import Scalar, norm
-from dirax.tracing import value_along
+from dirax.program.tracing import value_along
+from dirax.program.user_functions import evaluated, is_traced
 
 Vector: TypeAlias = Float[Array, " N"]
 

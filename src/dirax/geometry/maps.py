@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from dirax.functions import is_traced
 from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold, Vector
 from dirax.geometry.numerics import Scalar, norm
 from dirax.geometry.spaces import Euclidean, Product, Sphere
+from dirax.program.user_functions import is_traced
 
 Pair = tuple[Vector, Vector]
 

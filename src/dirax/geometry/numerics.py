@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from dirax.formulas import Formula, apply
-from dirax.tracing import call
+from dirax.program.formula import Formula, apply
+from dirax.program.tracing import call
 
 Scalar: TypeAlias = Float[Array, ""]
 

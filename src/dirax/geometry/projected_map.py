@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.numerics import newton_root, norm
-from dirax.linear_solves import solve
+from dirax.program.linear_solves import solve
 
 
 class Submanifold(AbstractManifold):

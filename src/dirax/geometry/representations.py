@@ -13,7 +13,6 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from dirax.functions import is_traced
 from dirax.geometry.subspaces import (
     STRUCTURE_TOLERANCE,
     AnyArray,
@@ -23,6 +22,7 @@ from dirax.geometry.subspaces import (
     namespace,
     require_full_rank,
 )
+from dirax.program.user_functions import is_traced
 
 ROUNDOFF = 1e-14  # a product of matrices of order one that should vanish has entries of this size
 

@@ -4,7 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import is_traced
 from dirax.geometry.representations import KernelPair
 from dirax.geometry.subspaces import (
     AnyArray,
@@ -15,6 +14,7 @@ from dirax.geometry.subspaces import (
     pseudo_inverse,
     uniform_rank,
 )
+from dirax.program.user_functions import is_traced
 
 
 def block_diagonal(first: Float[AnyArray, "*batch i j"], second: Float[AnyArray, "*batch k l"]) -> Float[AnyArray, "*batch m n"]:

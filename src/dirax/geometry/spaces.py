@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import TINY, arc_over_sine, norm, radial
-from dirax.tracing import Method, call
+from dirax.program.tracing import Method, call
 
 
 class AbstractFlat(AbstractGeodesicManifold):

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.representations import KERNEL_PAIRS, KernelPair
 from dirax.geometry.scattering import block_diagonal, scattering_matrix
 from dirax.geometry.subspaces import AnyArray, known
+from dirax.program.user_functions import UserFunction
 
 Matrices = tuple[Float[AnyArray, "rows columns"], ...]
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from dirax.functions import is_traced
+from dirax.program.user_functions import is_traced
 
 AnyArray = Array | np.ndarray
 """Numbers that are known (numpy) or traced (JAX)."""

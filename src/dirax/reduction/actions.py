@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
-from dirax.linear_solves import solve
+from dirax.program.linear_solves import solve
+from dirax.program.user_functions import UserFunction
 from dirax.reduction.connection import check_fibre, fibre_indices
 
 

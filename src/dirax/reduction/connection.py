@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
+from dirax.program.user_functions import UserFunction
 
 AXIOM_TOLERANCE = 1e-10
 SAMPLES = 8

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dirax.functions import UserFunction
+from dirax.program.user_functions import UserFunction
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 

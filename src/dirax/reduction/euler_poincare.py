@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction, evaluated, is_traced
 from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
+from dirax.program.roots import nearest_root
+from dirax.program.tracing import gradient, jacobian, traced_once
+from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.lie_poisson import LiePoisson, checked_point
-from dirax.roots import nearest_root
 from dirax.systems.system import AbstractSystem, no_constraint
-from dirax.tracing import gradient, jacobian, traced_once
 
 SINGULAR = 1e-13
 """An inertia with singular values below this, relative to the largest, is singular."""

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.functions import UserFunction, evaluated
 from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.program.user_functions import UserFunction, evaluated
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.symmetry import TOLERANCE, off_span
 from dirax.systems.lagrange_dirac import LagrangeDirac

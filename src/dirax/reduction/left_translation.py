@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import is_traced
 from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.program.user_functions import is_traced
 from dirax.reduction.actions import AbstractAction
 
 

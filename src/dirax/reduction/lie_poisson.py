@@ -6,13 +6,13 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
 from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.geometry.structures import DiracStructure
+from dirax.program.tracing import gradient
+from dirax.program.user_functions import UserFunction
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.system import AbstractSystem, no_constraint
-from dirax.tracing import gradient
 
 
 class LiePoisson(AbstractSystem):

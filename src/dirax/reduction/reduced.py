@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction, evaluated, is_traced
+from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.actions import Translations
 from dirax.reduction.connection import AbstractConnection
 from dirax.reduction.symmetry import TOLERANCE, discrete_invariance, invariance, times

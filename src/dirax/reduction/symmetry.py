@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
+from dirax.program.user_functions import UserFunction
 from dirax.reduction.actions import AbstractAction
 from dirax.systems.constraints import Constraints
 from dirax.systems.nonholonomic import as_lagrange_dirac

@@ -4,10 +4,10 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from dirax.functions import UserFunction
 from dirax.geometry.charts import Atlas, RetractionChart
 from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
+from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import LD_ARGUMENTS
 from dirax.schemes.lagrange_dirac import discrete_lagrange_dalembert
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from dirax.functions import UserFunction
+from dirax.program.user_functions import UserFunction
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.discrete_lagrangian import LD_ARGUMENTS
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac

@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import check_finite, is_traced
+from dirax.program.user_functions import check_finite, is_traced
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation, make_step_equation
 from dirax.systems.affine_equations import equilibrated
 from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
 from dirax.systems.system import AbstractSystem
-from dirax.tables import text_table
+from dirax.text.tables import text_table
 
 RANK_TOLERANCE = 1e-11
 """Singular values below this, of the equilibrated Jacobian, count as zero: those of a constraint of index ν are of size h^ν."""

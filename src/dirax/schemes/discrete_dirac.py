@@ -6,9 +6,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.functions import evaluated
 from dirax.geometry.cotangent_lift import CotangentLift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
+from dirax.program.tracing import gradient, jacobian
+from dirax.program.user_functions import evaluated
 from dirax.schemes.constraint_rows import independent_constraints
 from dirax.schemes.discretized import stepping
 from dirax.schemes.lagrangian_methods import discretized_lagrangian, resolved_lagrangian, resolved_nonholonomic
@@ -22,7 +23,6 @@ from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import NonholonomicMechanics, as_lagrange_dirac
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 from dirax.systems.port_hamiltonian import PortHamiltonian
-from dirax.tracing import gradient, jacobian
 
 CONSTRAINTS = ("discretize", "resolve")
 

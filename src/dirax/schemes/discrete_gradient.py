@@ -5,11 +5,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.program.tracing import call
 from dirax.schemes.constraint_rows import independent_constraints
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.port_hamiltonian import PortHamiltonian
-from dirax.tracing import call
 
 KINDS = ("gonzalez", "mean-value")
 EPSILON = 2.220446049250313e-16

@@ -9,9 +9,9 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
+from dirax.program.tracing import gradient
+from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import Constraints
-from dirax.tracing import gradient
 
 LD_ARGUMENTS = ("q0", "q1", "h")
 RULES = ("left", "right", "midpoint", "trapezoidal")

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.geometry.group_retractions import RETRACTIONS, coadjoint, pulled_back, retraction
+from dirax.program.tracing import call
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.lie_poisson import LiePoisson
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
-from dirax.tracing import call
 
 
 class DiscreteEulerPoincare(AbstractScheme):

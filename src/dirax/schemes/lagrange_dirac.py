@@ -5,9 +5,10 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from dirax.functions import UserFunction
+from dirax.program.roots import nearest_root
+from dirax.program.tracing import call
+from dirax.program.user_functions import UserFunction
 from dirax.reduction.reduced import ReducedLagrangeDirac
-from dirax.roots import nearest_root
 from dirax.schemes.constraint_rows import ConstraintRows, step_constraints
 from dirax.schemes.discrete_lagrangian import (
     CONSTRAINTS,
@@ -23,7 +24,6 @@ from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.schemes.work import WorkBook, work_field
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import as_lagrange_dirac
-from dirax.tracing import call
 
 MOMENTA = ("incoming", "mean", "outgoing")
 

@@ -4,13 +4,13 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from dirax.linear_solves import solve
+from dirax.program.linear_solves import solve
+from dirax.program.tracing import along, call, gradient, jacobian
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.step import Field, Shape, StepEquation
 from dirax.schemes.work import WorkBook, work_field
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import NonholonomicMechanics
-from dirax.tracing import along, call, gradient, jacobian
 
 
 def _rates(system: LagrangeDirac, t, q, v, params):

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from dirax.functions import UserFunction
+from dirax.program.user_functions import UserFunction
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.quotient import Quotient
 from dirax.schemes.step import Shape, StepEquation

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
+from dirax.program.user_functions import UserFunction
 from dirax.reduction.connection import LinearConnection
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.discrete_lagrangian import discrete_lagrangian

@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.functions import evaluated
+from dirax.program.tracing import call, gradient
+from dirax.program.user_functions import evaluated
 from dirax.schemes.constraint_rows import independent_constraints
 from dirax.schemes.step import Field, Shape, StepEquation
 from dirax.systems.constraint_chain import ResolvedSystem
 from dirax.systems.dirac_system import TINY_BRACKET, DiracSystem
-from dirax.tracing import call, gradient
 
 
 class FinalManifold(NamedTuple):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.functions import UserFunction, evaluated
+from dirax.program.user_functions import UserFunction, evaluated
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, discrete_lagrange_dalembert

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.representation import counted, html_table, module_html, module_text
+from dirax.text.representation import counted, html_table, module_html, module_text
 
 
 class Field(eqx.Module):

@@ -9,8 +9,8 @@ import numpy as np
 from jax.extend.core import jaxprs_in_params
 from jaxtyping import Array, Float
 
-from dirax.functions import is_traced
-from dirax.linear_solves import solve
+from dirax.program.linear_solves import solve
+from dirax.program.user_functions import is_traced
 
 NEWTON_STEPS = 6
 """Newton steps for γ where ∂l/∂γ is not linear in it; the step that carries h ẋ carries their error with it."""

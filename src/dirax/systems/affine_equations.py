@@ -15,8 +15,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.linear_solves import solve
-from dirax.tracing import shared
+from dirax.program.linear_solves import solve
+from dirax.program.tracing import shared
 
 THRESHOLD = 0.1
 """A pivot is at least this fraction of the largest entry left, in units of the rows and columns; among these, a sparse one."""

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.functions import check_finite, constant_entries, evaluated, is_traced
-from dirax.linear_solves import solve
+from dirax.program.linear_solves import solve
+from dirax.program.tracing import along, jacobian, shared
+from dirax.program.user_functions import check_finite, constant_entries, evaluated, is_traced
 from dirax.systems.affine_equations import Solved, explicit, solved
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
 from dirax.systems.implicit_form import ImplicitForm, implicit_form
 from dirax.systems.system import AbstractSystem
-from dirax.tracing import along, jacobian, shared
 
 RANK_TOLERANCE = 1e-8
 ZERO = 1e-10

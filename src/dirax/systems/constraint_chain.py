@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import evaluated, is_traced, scalar_program
-from dirax.roots import nearest_root
+from dirax.program.roots import nearest_root
+from dirax.program.tracing import Method, gradient, jacobian
+from dirax.program.user_functions import evaluated, is_traced, scalar_program
 from dirax.systems.system import AbstractSystem
-from dirax.tracing import Method, gradient, jacobian
 
 DETERMINED, GAUGE, EMPTY, IRREGULAR = "determined", "gauge freedom", "empty", "irregular"
 OFF = 1e-8

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
-from dirax.linear_solves import scaled_pseudo_inverse
-from dirax.roots import nearest_root
+from dirax.program.linear_solves import scaled_pseudo_inverse
+from dirax.program.roots import nearest_root
+from dirax.program.tracing import along, jacobian
+from dirax.program.user_functions import UserFunction
 from dirax.systems.system import no_constraint
-from dirax.tracing import along, jacobian
 
 
 class Constraints(eqx.Module):

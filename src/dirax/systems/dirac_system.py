@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
 from dirax.geometry.structures import DiracStructure
-from dirax.linear_solves import pseudo_inverse, solve
-from dirax.roots import nearest_root
+from dirax.program.linear_solves import pseudo_inverse, solve
+from dirax.program.roots import nearest_root
+from dirax.program.tracing import gradient, jacobian, traced_once
+from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
-from dirax.tracing import gradient, jacobian, traced_once
 
 RANK_TOLERANCE = 1e-10
 """Singular values of the kernel matrix F below this, relative to the largest, count as zero in the initial check."""

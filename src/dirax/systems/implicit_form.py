@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from dirax.functions import UserFunction, constant_entries
 from dirax.geometry.structures import canonical_two_form
-from dirax.linear_solves import solve
+from dirax.program.linear_solves import solve
+from dirax.program.tracing import gradient, jacobian, shared
+from dirax.program.user_functions import UserFunction, constant_entries
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -18,7 +19,6 @@ from dirax.systems.nonholonomic import NonholonomicMechanics
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 from dirax.systems.port_hamiltonian import PortHamiltonian
 from dirax.systems.system import AbstractSystem
-from dirax.tracing import gradient, jacobian, shared
 
 RANK_TOLERANCE = 1e-9
 

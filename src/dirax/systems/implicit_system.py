@@ -6,8 +6,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
-from dirax.linear_solves import scaled_pseudo_inverse
+from dirax.program.linear_solves import scaled_pseudo_inverse
+from dirax.program.user_functions import UserFunction
 from dirax.systems.system import AbstractSystem
 
 

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
-from dirax.linear_solves import scaled_pseudo_inverse, solve
-from dirax.roots import nearest_root
+from dirax.program.linear_solves import scaled_pseudo_inverse, solve
+from dirax.program.roots import nearest_root
+from dirax.program.tracing import gradient, jacobian
+from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem, no_constraint
-from dirax.tracing import gradient, jacobian
 
 
 class LagrangeDirac(AbstractSystem):

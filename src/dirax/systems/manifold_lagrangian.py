@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
 from dirax.geometry.manifolds import AbstractManifold
-from dirax.roots import nearest_root
+from dirax.program.roots import nearest_root
+from dirax.program.tracing import gradient
+from dirax.program.user_functions import UserFunction
 from dirax.systems.system import AbstractSystem, no_constraint
-from dirax.tracing import gradient
 
 
 class ManifoldLagrangian(AbstractSystem):

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction, evaluated, is_traced
-from dirax.linear_solves import solve
+from dirax.program.linear_solves import solve
+from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem

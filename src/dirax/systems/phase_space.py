@@ -5,12 +5,12 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction
 from dirax.geometry.structures import DiracStructure
+from dirax.program.tracing import jacobian
+from dirax.program.user_functions import UserFunction
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem, no_constraint
-from dirax.tracing import jacobian
 
 
 class PhaseSpaceLagrangian(AbstractSystem):

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.functions import UserFunction, evaluated, is_traced
+from dirax.program.tracing import gradient
+from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.systems.system import AbstractSystem, no_constraint
-from dirax.tracing import gradient
 
 SKEW_TOLERANCE = 1e-10
 

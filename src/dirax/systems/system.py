@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.representation import module_html, module_text
+from dirax.text.representation import module_html, module_text
 
 
 class AbstractSystem(eqx.Module):

@@ -1,7 +1,7 @@
 """The step in C: CasADi differentiates it and writes the code, a C compiler compiles it, Newton's loop in C runs it.
 
 CasADi is given the scalar expressions of the step (residual, predictor, next state), and makes the Jacobian and the code
-its own way. The loop stops as `dirax.engines.newton` does and begins from the same quadratic extrapolation, but renews the
+its own way. The loop stops as `dirax.engines.xla.newton` does and begins from the same quadratic extrapolation, but renews the
 Jacobian in every update.
 """
 
@@ -17,10 +17,10 @@ import numpy as np
 
 from dirax.diagnostics.bench.subject import Program, Skipped, Subject, library
 from dirax.diagnostics.bench.timing import compiler
-from dirax.engines.native.graph import Graph
-from dirax.engines.native.interpret import UnsupportedPrimitive
-from dirax.engines.native.trace import inputs, parameters, trace
 from dirax.engines.result import Problem
+from dirax.engines.step_program import inputs, parameters, trace
+from dirax.program.graph import Graph
+from dirax.program.interpreter import UnsupportedPrimitive
 
 FLAGS = ("-O3", "-march=native")
 MOST_SECONDS = 60

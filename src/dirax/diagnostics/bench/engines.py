@@ -10,8 +10,8 @@ import numpy as np
 
 from dirax.diagnostics.bench.subject import Program, Skipped, Subject
 from dirax.engines import native, xla
-from dirax.engines.native.interpret import UnsupportedPrimitive
 from dirax.engines.result import Problem
+from dirax.program.interpreter import UnsupportedPrimitive
 
 BATCH, BATCH_STEPS = 1024, 50
 """Size of the batches and the steps that each of their trajectories takes."""

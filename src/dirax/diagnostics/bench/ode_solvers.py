@@ -15,9 +15,9 @@ import numpy as np
 
 from dirax.diagnostics.bench.ode import ExplicitODE
 from dirax.diagnostics.bench.subject import Program, Skipped, library
-from dirax.engines.native.function import loaded
-from dirax.engines.native.graph import Graph
-from dirax.engines.native.interpret import Interpreter, Unavailable, UnsupportedPrimitive
+from dirax.engines.native.ir.compiled_function import loaded
+from dirax.program.graph import Graph
+from dirax.program.interpreter import Interpreter, Unavailable, UnsupportedPrimitive
 
 TOLERANCES = tuple(10 ** (-k / 2) for k in range(2, 30))
 REFERENCE, FINEST = 1e-13, 3e-14

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.result import Outcome, Problem
-from dirax.initial import initial_data, prepared
+from dirax.run.start import initial_data, prepared
 from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
 from dirax.systems.system import AbstractSystem
 

@@ -6,8 +6,8 @@ step_loop.py, lower.py, emitter.py     graph → LLVM IR; the elementary functio
 compile.py, program.py, driver.py        IR → machine code, caches, calls
 """
 
-from dirax.engines.native.differentiate import run_traced
 from dirax.engines.native.driver import run, supported
-from dirax.engines.native.interpret import UnsupportedPrimitive
+from dirax.engines.native.gradients.differentiate import run_traced
+from dirax.program.interpreter import UnsupportedPrimitive
 
 __all__ = ["UnsupportedPrimitive", "run", "run_traced", "supported"]

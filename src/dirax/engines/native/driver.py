@@ -9,9 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from dirax.engines.native import compile as llvm
-from dirax.engines.native.interpret import UnsupportedPrimitive
 from dirax.engines.native.program import Program, program
 from dirax.engines.result import OK, Outcome, Problem, Progress
+from dirax.program.interpreter import UnsupportedPrimitive
 
 CHUNK_SECONDS = 0.1
 WORTH_THREADS = 2e-3

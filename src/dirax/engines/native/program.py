@@ -11,15 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dirax.engines.compensation import increments
 from dirax.engines.native import compile as llvm
-from dirax.engines.native.compensation import increments
-from dirax.engines.native.graph import Graph, GraphTooLarge
-from dirax.engines.native.interpret import UnsupportedPrimitive
-from dirax.engines.native.newton_step import newton_correction
-from dirax.engines.native.operations import jacobian
-from dirax.engines.native.step_loop import Plan, kernel_module
-from dirax.engines.native.sweep import Sweep, backward, forward
-from dirax.engines.native.trace import NODE_LIMIT, Inputs, Parameters, TracedEquation, inputs, parameters, trace
+from dirax.engines.native.gradients.linearized_loop import Sweep, backward, forward
+from dirax.engines.native.loops.newton_step import newton_correction
+from dirax.engines.native.loops.step_loop import Plan, kernel_module
+from dirax.engines.step_program import Inputs, Parameters, TracedEquation, inputs, parameters, trace
+from dirax.program import graph as graph_module
+from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.interpreter import UnsupportedPrimitive
+from dirax.program.operations import jacobian
 
 KEPT = 128
 """Programs kept in memory."""
@@ -142,7 +143,8 @@ def count_operations(plan: Plan) -> int:
 def source_digest() -> str:
     """A digest of the engine's own source: kernels made by another version of it are not reused."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    rooms = Path(__file__).parents[1], Path(graph_module.__file__).parent
+    for path in sorted(path for room in rooms for path in room.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

@@ -1,0 +1,125 @@
+"""Tangents and cotangents of a run on the host: the run again, segment by segment, and a sweep over each segment."""
+
+import itertools
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dirax.engines.native.driver import Lanes, width_for
+from dirax.engines.native.program import program
+
+if TYPE_CHECKING:
+    from dirax.engines.native.gradients.differentiate import Recorded
+
+SEGMENT_BYTES = 2**26
+"""Memory for the steps that a sweep goes over at a time."""
+
+
+class Sweeper:
+    """A recorded run whose stages are gone over in either direction."""
+
+    def __init__(self, task: "Recorded", inputs: tuple[np.ndarray, ...], reverse: bool):
+        self.task, self.problem = task, task.problem(*inputs)
+        p = self.problem
+        self.stages = len(p.equation.stages)
+        made, _ = program(p.equation, p.params, True, p.compensated, self.stages > 1)
+        self.lanes = Lanes(p, made, width_for(p.batch or 1))
+        self.kernel, _ = made.kernel(self.lanes.width)
+        self.sweep = made.sweep(reverse, self.lanes.width)
+        row_bytes = 8 * (p.batch or 1) * self.stages * (task.state_size + task.unknowns)
+        self.length = max(1, SEGMENT_BYTES // row_bytes)
+
+    def segments(self) -> list[tuple[int, int, np.ndarray]]:
+        """(first step, number of steps, lanes there); the last segment ends with the step leaving the last row."""
+        found, records = [], self.lanes.records
+        for first in range(0, self.problem.steps + 1, self.length):
+            count = min(self.length, self.problem.steps + 1 - first)
+            found.append((first, count, records.copy()))
+            if first + count <= self.problem.steps:
+                self._run(records, count)
+        return found
+
+    def _run(self, records: np.ndarray, count: int) -> dict[str, np.ndarray]:
+        arrays, outs = self.lanes.arrays(count * self.stages)
+        self.lanes.call(self.kernel, records, outs, 0, count, 1, self.lanes.threads)
+        return arrays
+
+    def rows(self, count: int, records: np.ndarray) -> np.ndarray:
+        """State and unknowns of every stage of a segment, (blocks, rows, quantities, width)."""
+        arrays = self._run(records, count)
+        return self.blocked(np.concatenate([arrays["state"], arrays["unknowns"]], axis=2))
+
+    def blocked(self, rows: np.ndarray) -> np.ndarray:
+        """(blocks, …, width) from (B, …)."""
+        lanes = self.lanes
+        shaped = rows[lanes.source].reshape(lanes.blocks, lanes.width, *rows.shape[1:])
+        return np.ascontiguousarray(np.moveaxis(shaped, 1, -1))
+
+    def unblocked(self, rows: np.ndarray) -> np.ndarray:
+        """(B, …) from (blocks, …, width)."""
+        lanes = self.lanes
+        return np.moveaxis(rows, -1, 1).reshape(lanes.blocks * lanes.width, *rows.shape[1:-1])[: lanes.lanes]
+
+    def call(self, carry: np.ndarray, rows: np.ndarray, flow: np.ndarray, first: int, count: int) -> None:
+        """One sweep over a segment, blocks shared among threads."""
+        p, lanes = self.problem, self.lanes
+
+        def part(low: int, high: int) -> None:
+            pointers = (a.ctypes.data + low * a.strides[0] for a in (carry, lanes.params, rows, flow))
+            self.sweep(*pointers, high - low, p.t0, p.h, p.first_step, first, count)
+
+        bounds = np.linspace(0, lanes.blocks, lanes.threads + 1).astype(int).tolist()
+        if lanes.threads == 1:
+            part(0, lanes.blocks)
+            return
+        with ThreadPoolExecutor(lanes.threads) as pool:
+            for future in [pool.submit(part, a, b) for a, b in itertools.pairwise(bounds)]:
+                future.result()
+
+    def saved(self, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Which saved rows are in a segment, and at which of its rows."""
+        numbers = np.minimum(np.arange(self.problem.rows) * self.problem.save_every, self.problem.steps)
+        chosen = np.flatnonzero((numbers >= first) & (numbers < first + count))
+        return chosen, (numbers[chosen] - first) * self.stages
+
+    def limits(self, completed: np.ndarray, closing: np.ndarray) -> np.ndarray:
+        """The step before which each trajectory ended (B, 1): with the one that leaves the last row where that matters."""
+        steps = self.problem.steps
+        return np.where((completed == steps) & closing, steps + 1.0, completed)[:, None]
+
+
+def push(task: "Recorded", *arrays: np.ndarray) -> list[np.ndarray]:
+    """Tangents of states and unknowns from (state, guess, c, t0, h, completed, ẋ, ċ, ṫ0, ḣ)."""
+    *inputs, completed, state, c, t0, h = arrays
+    batch, s = state.shape
+    sweeper = Sweeper(task, tuple(inputs), reverse=False)
+    limits = sweeper.limits(completed, np.ones(batch, bool))
+    carry = sweeper.blocked(np.concatenate([state, c, t0[:, None], h[:, None], limits], axis=1))
+    states, unknowns = np.zeros((batch, task.rows, s)), np.zeros((batch, task.rows, task.unknowns))
+    for first, count, records in sweeper.segments():
+        rows = sweeper.rows(count, records)
+        flow = np.zeros_like(rows)
+        sweeper.call(carry, rows, flow, first, count)
+        chosen, at = sweeper.saved(first, count)
+        found = sweeper.unblocked(flow[:, at])
+        states[:, chosen], unknowns[:, chosen] = found[..., :s], found[..., s:]
+    return [states, unknowns]
+
+
+def pull(task: "Recorded", *arrays: np.ndarray) -> list[np.ndarray]:
+    """Cotangents of (state, c, t0, h) from (state, guess, c, t0, h, completed, those of the states, of the unknowns)."""
+    *inputs, completed, states, unknowns = arrays
+    batch, s, m = len(states), task.state_size, inputs[2].shape[1]
+    sweeper = Sweeper(task, tuple(inputs), reverse=True)
+    limits = sweeper.limits(completed, np.any(unknowns[:, -1] != 0, axis=1))
+    carry = sweeper.blocked(np.concatenate([np.zeros((batch, s + m + 2)), limits], axis=1))
+    given = np.concatenate([states, unknowns], axis=2)
+    for first, count, records in reversed(sweeper.segments()):
+        rows = sweeper.rows(count, records)
+        flow = np.zeros((batch, count * sweeper.stages, given.shape[2]))
+        chosen, at = sweeper.saved(first, count)
+        flow[:, at] = given[:, chosen]
+        sweeper.call(carry, rows, sweeper.blocked(flow), first, count)
+    out = sweeper.unblocked(carry)
+    return [out[:, :s], out[:, s : s + m], out[:, s + m], out[:, s + m + 1]]

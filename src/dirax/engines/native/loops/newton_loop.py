@@ -1,0 +1,159 @@
+"""Newton's iteration in IR: `dirax.engines.xla.newton` written out, lanes that are done frozen.
+
+A Jacobian serves several updates while they contract quickly: a first kind of update computes residual, Jacobian and
+factors together, a second kind the residual alone. Where a pivot was too small the correction comes from partial
+pivoting, and the factors are not used again.
+"""
+
+from dirax.engines.native.ir.emitter import Body, Emitter
+from dirax.engines.native.ir.lower import Region
+from dirax.engines.native.loops.newton_step import Correction
+from dirax.engines.step_program import TracedEquation
+from dirax.engines.xla.newton import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, STALLED
+
+
+class NewtonLoop:
+    """The iteration of one equation, from the guess in `unknowns` to its root there.
+
+    After `emit`, `converged` and `count` are, by lane, whether the floor was reached and the number of updates.
+    """
+
+    def __init__(self, equation: TracedEquation, correction: Correction, around: Region, unknowns: list[str]):
+        self.equation, self.correction, self.around, self.unknowns = equation, correction, around, unknowns
+        self.e: Emitter = around.emitter
+        self.body: Body = self.e.body
+        self.converged = self.count = ""
+
+    def emit(self, active: str) -> None:
+        b, e = self.body, self.e
+        self._going, self._contracting, self._floor = (b.alloca(e.bool) for _ in range(3))
+        self._update, self._number = b.alloca(e.real), b.alloca(e.real)
+        b.store(e.bool, active, self._going, 1)
+        b.store(e.bool, e.false, self._floor, 1)
+        b.store(e.real, e.const(float("inf")), self._update)
+        b.store(e.real, e.const(0.0), self._number)
+        with self._while(self._going) as now:
+            factors = self._first_kind(now)
+            with self._while(self._contracting) as now:
+                self._second_kind(factors, now)
+        self.converged, self.count = b.load(e.bool, self._floor, 1), b.load(e.real, self._number)
+
+    def _while(self, flag: str):
+        """Repeat while a lane's flag is up; gives the flags."""
+        return _While(self.body, self.e, flag)
+
+    def _bound(self, region: Region) -> list[str]:
+        """The present unknowns, bound in a region."""
+        old = [self.body.load(self.e.real, u) for u in self.unknowns]
+        for node, value in zip(self.equation.unknowns, old, strict=True):
+            region.bind(node, value)
+        return old
+
+    def _first_kind(self, now: str) -> Region:
+        """An update with a new Jacobian; the region that knows its factors."""
+        g, correction = self.around.graph, self.correction
+        inner = Region(self.e, g, self.around)
+        old = self._bound(inner)
+        inner.require([*correction.change, *correction.factors, correction.stable])
+        change = [inner.value(n) for n in correction.change]
+        stable = inner.value(correction.stable)
+        if correction.stable != g.true:
+            change = by_partial_pivoting(inner, correction.jacobian, self.equation.residual, change, stable, now)
+        self._apply(old, change, stable, now)
+        return inner
+
+    def _second_kind(self, factors: Region, now: str) -> None:
+        """An update with the Jacobian of an earlier one."""
+        g = self.around.graph
+        here = Region(self.e, g, self.around)
+        old = self._bound(here)
+        here.require(self.equation.residual)
+        inner = Region(self.e, g, factors)
+        for node, value in zip(self.correction.right, self.equation.residual, strict=True):
+            inner.bind(node, here.value(value))
+        inner.require(self.correction.again)
+        self._apply(old, [inner.value(n) for n in self.correction.again], self.e.true, now)
+
+    def _apply(self, old: list[str], change: list[str], stable: str, now: str) -> None:
+        """Subtract the change, measure it, and decide which lanes go on and how."""
+        b, e = self.body, self.e
+        new = [e.sub(a, d) for a, d in zip(old, change, strict=True)]
+        update, total = e.const(0.0), e.const(0.0)
+        for a, d, scale in zip(new, change, self.equation.scale, strict=True):
+            update = e.max(e.div(e.abs(d), e.add(e.abs(a), e.const(scale))), update)
+            total = e.add(total, d)
+        update = e.select(e.compare("uno", total, total), e.const(float("nan")), update)
+        count = b.load(e.real, self._number)
+        first = e.compare("oeq", count, e.const(0.0))
+        ratio = e.select(first, e.const(float("nan")), e.div(update, b.load(e.real, self._update)))
+        for pointer, a, c in zip(self.unknowns, new, old, strict=True):
+            b.store(e.real, e.select(now, a, c), pointer)
+        b.store(e.real, e.select(now, update, b.load(e.real, self._update)), self._update)
+        count = e.select(now, e.add(count, e.const(1.0)), count)
+        b.store(e.real, count, self._number)
+        floor = self._at_floor(update, ratio)
+        b.store(e.bool, e.body.put(f"select {e.bool} {now}, {e.bool} {floor}, {e.bool} {b.load(e.bool, self._floor, 1)}"),
+                self._floor, 1)  # fmt: skip
+        cap = e.splat(b.put("sitofp i64 %cap to double"))
+        allowed = e.both(e.compare("ord", update, update), e.compare("olt", count, cap))
+        unfinished = e.both(e.invert(floor), allowed)
+        going = b.load(e.bool, self._going, 1)
+        going = e.both(going, e.either(e.invert(now), unfinished))
+        b.store(e.bool, going, self._going, 1)
+        near = e.both(first, e.compare("olt", update, e.const(NEAR)))
+        quick = e.either(near, e.compare("olt", ratio, e.const(CONTRACTING)))
+        b.store(e.bool, e.both(e.both(now, unfinished), e.both(quick, stable)), self._contracting, 1)
+
+    def _at_floor(self, update: str, ratio: str) -> str:
+        """`dirax.engines.xla.newton.at_floor`."""
+        e = self.e
+        left = e.mul(e.mul(e.const(2.0), ratio), update)
+        stalled = e.both(e.compare("oge", ratio, e.const(0.5)), e.compare("olt", update, e.const(STALLED)))
+        small = e.either(e.compare("ole", update, e.const(FLOOR)), e.compare("ole", left, e.const(NEGLIGIBLE)))
+        return e.either(small, stalled)
+
+
+def by_partial_pivoting(
+    region: Region, matrix: list[list[int]], right: list[int], change: list[str], stable: str, now: str
+) -> list[str]:
+    """The solution `change` of matrix·x = right, in lanes with a pivot that was too small solved for anew, one at a time."""
+    e, k = region.emitter, len(change)
+    b = e.body
+    slots = lambda base, count: [b.at(e.real, base, i) for i in range(count)]
+    memory, entries, side = b.alloca(e.real, k), b.alloca(e.real, k * k), b.alloca(e.real, k)
+    scratch = b.alloca("double", k * (k + 1))
+    store = lambda values, base: [b.store(e.real, value, p) for value, p in zip(values, slots(base, len(values)), strict=True)]
+    store(change, memory)
+    weak = e.both(e.invert(stable), now)
+    with b.when(e.any(weak)):
+        nodes = [node for row in matrix for node in row]
+        cold = Region(e, region.graph, region)
+        cold.require([*nodes, *right])
+        store([cold.value(n) for n in nodes], entries)
+        store([cold.value(n) for n in right], side)
+        for lane in range(e.width):
+            with b.when(e.extract(weak, lane, e.bool)):
+                pointers = ", ".join(f"ptr {b.at('double', m, lane)}" for m in (entries, side, memory))
+                b.line(f"call void @dense_solve({pointers}, ptr {scratch}, i64 {k}, i64 {e.width})")
+    return [b.load(e.real, p) for p in slots(memory, k)]
+
+
+class _While:
+    """A loop that repeats while a flag in memory is up in one lane at least."""
+
+    def __init__(self, body: Body, e: Emitter, flag: str):
+        self.body, self.e, self.flag = body, e, flag
+
+    def __enter__(self) -> str:
+        b = self.body
+        self._head, inside, self._out = b.fresh(), b.fresh(), b.fresh()
+        b.branch(self._head)
+        b.label(self._head)
+        now = b.load(self.e.bool, self.flag, 1)
+        b.branch_if(self.e.any(now), inside, self._out)
+        b.label(inside)
+        return now
+
+    def __exit__(self, *_) -> None:
+        self.body.branch(self._head)
+        self.body.label(self._out)

@@ -1,0 +1,163 @@
+"""One step of one trajectory: solve every stage, advance, and judge; what an engine carries from step to step."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from dirax.engines.result import NOT_CONVERGED, NOT_FINITE, OK
+from dirax.engines.xla.newton import as_function, solve
+
+
+class Derived(NamedTuple):
+    """What is known of an equation besides its functions, one function of (u, state, t, h, params) per stage or None:
+    what the step adds to the state (NaN: unknown), and the Jacobian (k, k) of the residual."""
+
+    increments: tuple[Callable, ...] | None = None
+    jacobians: tuple[Callable, ...] | None = None
+
+
+class Lane(eqx.Module):
+    """What is carried from step to step of one trajectory, in few arrays, because every array costs XLA kernels and copies.
+
+    `history` holds for each stage the unknowns of the step before and their first and second differences over the steps
+    before, (3, k); `counts` (3,) the good steps, the outcome, and Newton's updates. `max_residual` is the largest entry of
+    the residual that was left at the unknowns of any good step; `lost` (s,) what rounding took from the state, with
+    compensated summation, else (0,).
+    """
+
+    state: Any
+    history: tuple
+    counts: Any
+    max_residual: Any
+    lost: Any
+
+    @property
+    def unknowns(self) -> tuple:
+        """Those of the step before, per stage."""
+        return tuple(stage[..., 0, :] for stage in self.history)
+
+    @property
+    def completed(self):
+        """Number of good steps."""
+        return self.counts[..., 0]
+
+    @property
+    def status(self):
+        """The outcome of the last attempted step."""
+        return self.counts[..., 1]
+
+    @property
+    def iterations(self):
+        """Updates of Newton's method so far."""
+        return self.counts[..., 2]
+
+
+def first_lane(state, guess: tuple, xp=jnp, compensated: bool = False) -> Lane:
+    """The lane at the initial state, with one guess per stage; a leading batch axis is kept. `xp`: numpy or jax.numpy."""
+    batch = state.shape[:-1]
+    history = tuple(xp.stack([u, xp.zeros_like(u), xp.zeros_like(u)], axis=-2) for u in guess)
+    lost = xp.zeros((*batch, state.shape[-1] if compensated else 0))
+    return Lane(state, history, xp.full((*batch, 3), OK), xp.zeros(batch), lost)
+
+
+def take_step(
+    equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True, derived: Derived | None = None
+) -> tuple[Lane, tuple]:
+    """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns.
+
+    With `differentiable` it can be differentiated in reverse mode too, and no derivative passes through a step that failed."""
+    nothing = (None,) * len(equation.stages)
+    increments, jacobians = (found or nothing for found in derived or Derived())
+    stages, fractions = zip(*equation.stages, strict=True)
+
+    def solved(carry, fraction, before, stage, increment, jacobian):
+        state, lost, t, status, updates, worst = carry
+        running = status == OK
+        args = (state, t, fraction * h, params)
+        fixed = passing(args, False) if differentiable else args
+        guess = stage.guess(fixed[0], jnp.sum(before, axis=0), *fixed[2:])
+        guess = jax.lax.stop_gradient(guess) if differentiable else guess
+        u, count, converged = solve(stage.residual, stage.scale, guess, fixed, max_iterations, running, jacobian)
+        new, left = stage.advance(u, *fixed), stage.residual(u, *fixed)
+        # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
+        finite = jnp.isfinite(jnp.sum(0.0 * jnp.concatenate([new, left])))
+        outcome = jnp.where(finite, jnp.where(converged, OK, NOT_CONVERGED), NOT_FINITE)
+        status = jnp.where(running, outcome, status)
+        updates = updates + jnp.where(running, count, 0)
+        worst = jnp.where(status == OK, jnp.maximum(worst, jnp.max(jnp.abs(left), initial=0.0)), worst)
+        if differentiable:
+            args = passing(args, status == OK)
+            u = as_function(stage.residual, u, args)
+            new = stage.advance(u, *args)
+        if increment is not None:
+            new, left_out = compensated_sum(state, lost, increment(u, *args), new)
+            lost = jnp.where(status == OK, left_out, lost)
+        state = jnp.where(status == OK, new, state)
+        return (state, lost, t + fraction * h, status, updates, worst), (_remembered(u, before, lane.completed), u)
+
+    carry = (lane.state, lane.lost, jnp.asarray(t, float), lane.status, jnp.zeros_like(lane.iterations), lane.max_residual)
+    if len(stages) > 1 and len({(stage.residual, stage.advance, stage.guess) for stage in stages}) == 1:
+        one = lambda carry, given: solved(carry, given[0], given[1], stages[0], increments[0], jacobians[0])
+        carry, (histories, solutions) = jax.lax.scan(one, carry, (jnp.array(fractions), jnp.stack(lane.history)))
+        history, unknowns = tuple(histories), tuple(solutions)
+    else:
+        history, unknowns = (), ()
+        for i, before in enumerate(lane.history):
+            carry, (remembered, u) = solved(carry, fractions[i], before, stages[i], increments[i], jacobians[i])
+            history, unknowns = (*history, remembered), (*unknowns, u)
+    state, lost, _, status, updates, worst = carry
+    good = status == OK
+    after = Lane(
+        jnp.where(good, state, lane.state),
+        tuple(jnp.where(good, new, old) for new, old in zip(history, lane.history, strict=True)),
+        jnp.stack([lane.completed + good.astype(int), status, lane.iterations + updates]),
+        worst,
+        jnp.where(good, lost, lane.lost),
+    )
+    return after, unknowns
+
+
+def passing(numbers: Any, pass_on: Any) -> Any:
+    """The same numbers, through which derivatives, NaNs among them, go on where `pass_on` is true and not otherwise."""
+    stop = jax.lax.stop_gradient
+    one = lambda x: stop(x) if pass_on is False else jnp.where(pass_on, x, stop(x))
+    return jax.tree.map(lambda x: one(x) if eqx.is_inexact_array(x) else x, numbers)
+
+
+def compensated_sum(state, lost, increment, new):
+    """state + increment and what rounding takes from it: what was taken before is given back to the increment (Kahan).
+    Where the increment is not known, the new state as it is."""
+    small = increment + lost
+    total = state + small
+    back = total - state
+    error = (state - (total - back)) + (small - back)
+    known = jnp.isfinite(increment)
+    return jnp.where(known, total, new), jnp.where(known, error, 0.0)
+
+
+def _remembered(u, before, completed):
+    """The unknowns with their differences, which are zero until there are enough steps: the first guess is none of them."""
+    slope = jnp.where(completed >= 1, u - before[0], 0.0)
+    bend = jnp.where(completed >= 2, slope - before[1], 0.0)
+    return jnp.stack([u, slope, bend])
+
+
+def time_of(lane: Lane, t0, h, first_step):
+    """The time that the lane is at."""
+    return t0 + (first_step + lane.completed.astype(jnp.float64)) * h
+
+
+def packed_row(lane: Lane, unknowns) -> Any:
+    """All that the row at `lane` depends on as one array (s + k + 1,), `unknowns` being those of the step leaving it."""
+    finite = jnp.where(jnp.isfinite(unknowns[0]), unknowns[0], lane.unknowns[0])
+    return jnp.concatenate([lane.state, finite, lane.counts[:1].astype(lane.state.dtype)])
+
+
+def unpacked_row(equation, packed, t0, h, first_step, params) -> dict:
+    """The named arrays of the row."""
+    stage, fraction = equation.stages[0]
+    state, unknowns, completed = jnp.split(packed, [stage.state_size, stage.state_size + stage.unknowns])
+    return stage.unpack(state, unknowns, t0 + (first_step + completed[0]) * h, fraction * h, params)

@@ -1,0 +1,141 @@
+"""Interprets a jaxpr on arrays of graph nodes: every array of a user's function becomes an array of scalar expressions."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jax._src import source_info_util
+from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr, Literal
+
+from dirax.program.graph import Graph
+
+Nodes = np.ndarray
+"""An integer array of node numbers, in the shape of the array that it stands for."""
+
+LOOP_LIMIT = 4096
+"""Most iterations of one loop that are written out."""
+
+
+class UnsupportedPrimitive(Exception):
+    """A primitive that the native engine does not know, with the user's source line."""
+
+    def __init__(self, primitive: str, reason: str, line: str):
+        self.primitive, self.reason, self.line = primitive, reason, line
+        super().__init__(f"primitive '{primitive}' {reason} ({line})")
+
+
+class Unavailable:
+    """The result of an equation that could not be interpreted; an error only if something needs it."""
+
+    def __init__(self, error: UnsupportedPrimitive):
+        self.error = error
+
+
+Rule = Callable[..., Sequence[Any]]
+RULES: dict[str, Rule] = {}
+"""Primitive name → rule(interpreter, equation, *operands) returning one Nodes array per result."""
+
+LAZY: set[str] = set()
+"""Primitives whose rule looks at its operands itself: an unavailable one matters only where it is used."""
+
+
+def rule(*names: str, lazy: bool = False) -> Callable[[Rule], Rule]:
+    """Register a rule for primitives of these names."""
+
+    def register(function: Rule) -> Rule:
+        for name in names:
+            RULES[name] = function
+            if lazy:
+                LAZY.add(name)
+        return function
+
+    return register
+
+
+class Unsupported(Exception):
+    """Raised by a rule that meets a case it does not know; the interpreter adds the primitive and the line."""
+
+
+class Interpreter:
+    """Runs jaxprs on node arrays of one graph; `rules` are used before those in `RULES`."""
+
+    def __init__(self, graph: Graph, rules: Mapping[str, Rule] | None = None):
+        self.graph, self.rules = graph, {**RULES, **(rules or {})}
+        self._equations: list[Any] = []
+        self.called: dict[tuple, tuple[Any, list[Any]]] = {}
+
+    def run(self, closed: ClosedJaxpr, *operands: Any) -> list[Any]:
+        """The results of a closed jaxpr; each a Nodes array or Unavailable."""
+        jaxpr = closed.jaxpr
+        values: dict[Any, Any] = dict(zip(jaxpr.constvars, map(self.constants, closed.consts), strict=True))
+        values.update(zip(jaxpr.invars, operands, strict=True))
+        read = lambda atom: self.constants(atom.val) if isinstance(atom, Literal) else values[atom]
+        for equation in jaxpr.eqns:
+            results = self._equation(equation, [read(atom) for atom in equation.invars])
+            values.update(zip(equation.outvars, results, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def constants(self, value: Any) -> Nodes | Unavailable:
+        """The nodes of a concrete array."""
+        if isinstance(value, Tracer):
+            return Unavailable(UnsupportedPrimitive("constant", "is a value that JAX traces", "a captured array"))
+        array = np.asarray(value)
+        if not (array.dtype == np.bool_ or np.issubdtype(array.dtype, np.integer) or array.dtype == np.float64):
+            return Unavailable(UnsupportedPrimitive("constant", f"has dtype {array.dtype}", "a captured array"))
+        nodes = [self.graph.constant(item) for item in array.ravel().tolist()]
+        return np.array(nodes, dtype=np.int64).reshape(array.shape)
+
+    def static(self, nodes: Nodes) -> np.ndarray | None:
+        """The whole numbers that constant nodes hold, None when one is not constant."""
+        graph = self.graph
+        flat = [graph.value[n] if graph.is_constant(n) else None for n in nodes.ravel().tolist()]
+        return None if None in flat else np.array(flat, dtype=np.int64).reshape(nodes.shape)
+
+    def _equation(self, equation: Any, operands: list[Any]) -> Sequence[Any]:
+        name = equation.primitive.name
+        lost = next((o for o in operands if isinstance(o, Unavailable)), None)
+        if lost is not None and name not in LAZY:
+            return [lost] * len(equation.outvars)
+        self._equations.append(equation)
+        try:
+            if name not in self.rules:
+                raise Unsupported("is not supported")
+            check_dtypes(equation)
+            return self.rules[name](self, equation, *operands)
+        except Unsupported as error:
+            # equations inside a library's jitted functions have no line of the user's: the calling equation has it
+            line = next(filter(None, map(source_line, reversed(self._equations))), "unknown line")
+            failure = UnsupportedPrimitive(name, str(error), line)
+            return [Unavailable(failure)] * len(equation.outvars)
+        finally:
+            self._equations.pop()
+
+
+def check_dtypes(equation: Any) -> None:
+    """Raise `Unsupported` for results that are neither float64, nor whole numbers, nor booleans."""
+    for variable in equation.outvars:
+        dtype = getattr(variable.aval, "dtype", None)
+        known = dtype is not None and (dtype == np.float64 or dtype == np.bool_ or np.issubdtype(dtype, np.integer))
+        if not known:
+            raise Unsupported(f"has a result of dtype {dtype}")
+
+
+def source_line(equation: Any) -> str:
+    """Where in the user's code an equation comes from."""
+    return source_info_util.summarize(equation.source_info)
+
+
+def is_integer(variable: Any) -> bool:
+    """Whether a jaxpr variable holds whole numbers."""
+    return bool(np.issubdtype(variable.aval.dtype, np.integer))
+
+
+def elementwise(function: Callable[..., int], *operands: Nodes) -> Nodes:
+    """`function` on nodes, entry by entry, scalars spread."""
+    shape = operands[0].shape
+    if any(a.shape != shape for a in operands):
+        operands = tuple(np.broadcast_arrays(*operands))
+        shape = operands[0].shape
+    flat = list(map(function, *(a.ravel().tolist() for a in operands)))
+    return np.array(flat, dtype=np.int64).reshape(shape)

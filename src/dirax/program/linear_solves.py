@@ -1,0 +1,96 @@
+"""Linear equations of a few unknowns: with one solution, and with the smallest of many."""
+
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+from jax import lax
+from jax.core import ShapedArray
+from jax.interpreters import ad, batching
+from jaxtyping import Array, Float
+
+from dirax.program.primitives import deferred, each
+from dirax.program.tracing import becomes_scalars
+
+RANK_TOLERANCE = 1e-12
+"""Singular values below this, relative to the largest of the equilibrated matrix, count as zero."""
+
+
+def solve(matrix: Float[Array, "n n"], right: Array, apart: bool = False) -> Array:
+    """`jnp.linalg.solve` of a matrix (n, n) and a right-hand side (n,) or (n, k).
+
+    `apart`: the graph may differentiate the elimination itself, which it does quickly however deep derivatives lie in one
+    another; else a derivative is another solve.
+    """
+    if not becomes_scalars(matrix, right):
+        return jnp.linalg.solve(matrix, right)
+    return solve_p.bind(matrix, right, apart=apart)[0]
+
+
+def pseudo_inverse(matrix: Float[Array, "k l"], tolerance: float) -> Float[Array, "l k"]:
+    """`jnp.linalg.pinv`; singular values below `tolerance`, relative to the largest, count as zero."""
+    if not becomes_scalars(matrix):
+        return jnp.linalg.pinv(matrix, tolerance)
+    return pseudo_inverse_p.bind(matrix, tolerance=tolerance)[0]
+
+
+def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> tuple[Float[Array, "l k"], Float[Array, " l"]]:
+    """The pseudo-inverse of a matrix with rows and columns scaled to unit size, and the units that this gives the columns."""
+    inverse, units = scaled_inverse_p.bind(matrix) if becomes_scalars(matrix) else equilibrated_inverse(jnp, matrix)
+    return inverse, units
+
+
+def equilibrated_inverse(xp: ModuleType, matrix: Any) -> tuple[Any, Any]:
+    """The same by JAX, or by NumPy with leading axes."""
+    lead = matrix.shape[:-2]
+    rows, columns = xp.ones((*lead, matrix.shape[-2], 1)), xp.ones((*lead, 1, matrix.shape[-1]))
+    fitting = lambda sizes: xp.sqrt(xp.where(sizes > 0.0, sizes, 1.0))
+    sizes = xp.abs(lax.stop_gradient(matrix) if xp is jnp else matrix)  # units have no derivative, which would be ∞ at zero
+    for _ in range(3):
+        left = sizes / rows / columns
+        rows = rows * fitting(xp.max(left, axis=-1, keepdims=True))
+        columns = columns * fitting(xp.max(left, axis=-2, keepdims=True))
+    inverse = xp.linalg.pinv(matrix / rows / columns, RANK_TOLERANCE)
+    turned = lambda a: xp.swapaxes(a, -1, -2)
+    return inverse / turned(columns) / turned(rows), 1.0 / columns[..., 0, :]
+
+
+def _turned(matrix):
+    return [ShapedArray(matrix.shape[::-1], matrix.dtype), ShapedArray(matrix.shape[1:], matrix.dtype)]
+
+
+def _solve_tangents(primals, tangents, **p):
+    """x' = A⁻¹ (b' − A' x), by the same elimination."""
+    (matrix, right), (along_matrix, along_right) = primals, map(ad.instantiate_zeros, tangents)
+    (x,) = solve_p.bind(matrix, right, **p)
+    return [x], solve_p.bind(matrix, along_right - along_matrix @ x, **p)
+
+
+def _solve_transposed(along, matrix, right, **p):
+    return [None, solve_p.bind(jnp.swapaxes(matrix, -1, -2), along[0], **p)[0]]
+
+
+def _solve_batched(operands, axes, **p):
+    """Right-hand sides side by side for one matrix; else each group of equations by itself."""
+    (matrix, right), (of_matrix, of_right) = operands, axes
+    if of_matrix is not None:
+        return each(_solve_by_jax, operands, axes, **p)
+    columns = jnp.moveaxis(right, of_right, -1)
+    (found,) = solve_p.bind(matrix, columns.reshape(len(columns), -1), **p)
+    return [jnp.moveaxis(found.reshape(columns.shape), -1, 0)], [0]
+
+
+def _solve_by_jax(matrix, right, **_):
+    return [jnp.linalg.solve(matrix, right)]
+
+
+solve_p = deferred("dirax_solve", _solve_by_jax, lambda a, b, **_: [ShapedArray(b.shape, b.dtype)])
+ad.primitive_jvps[solve_p] = _solve_tangents
+ad.primitive_transposes[solve_p] = _solve_transposed
+batching.primitive_batchers[solve_p] = _solve_batched
+pseudo_inverse_p = deferred(
+    "dirax_pseudo_inverse",
+    lambda matrix, tolerance: [jnp.linalg.pinv(matrix, tolerance)],
+    lambda matrix, **_: _turned(matrix)[:1],
+)
+scaled_inverse_p = deferred("dirax_scaled_inverse", lambda matrix: equilibrated_inverse(jnp, matrix), _turned)

@@ -1,0 +1,162 @@
+"""Rules of elementwise primitives."""
+
+import functools
+from typing import Any
+
+import numpy as np
+
+from dirax.program.graph import Graph
+from dirax.program.interpreter import Interpreter, Unsupported, elementwise, is_integer, rule
+
+SAME = {  # primitive name → operation of the graph
+    "add": "add",
+    "add_any": "add",
+    "sub": "sub",
+    "mul": "mul",
+    "neg": "neg",
+    "abs": "abs",
+    "sqrt": "sqrt",
+    "floor": "floor",
+    "ceil": "ceil",
+    "sign": "sign",
+    "max": "max",
+    "min": "min",
+    "rem": "rem",
+    "sin": "sin",
+    "cos": "cos",
+    "tan": "tan",
+    "asin": "asin",
+    "acos": "acos",
+    "atan": "atan",
+    "atan2": "atan2",
+    "sinh": "sinh",
+    "cosh": "cosh",
+    "tanh": "tanh",
+    "asinh": "asinh",
+    "acosh": "acosh",
+    "atanh": "atanh",
+    "exp": "exp",
+    "exp2": "exp2",
+    "expm1": "expm1",
+    "log": "log",
+    "log1p": "log1p",
+    "pow": "pow",
+    "cbrt": "cbrt",
+    "erf": "erf",
+    "erfc": "erfc",
+    "lt": "lt",
+    "le": "le",
+    "eq": "eq",
+    "ne": "ne",
+    "is_finite": "finite",
+}
+DIRECT = {"add": Graph.add, "sub": Graph.sub, "mul": Graph.mul}
+BY_LEMMA = {
+    "square": lambda g, x: g.mul(x, x),
+    "rsqrt": lambda g, x: g.recip(g.make("sqrt", x)),
+    "logistic": lambda g, x: g.recip(g.add(g.one, g.make("exp", g.neg(x)))),
+    "gt": lambda g, x, y: g.make("lt", y, x),
+    "ge": lambda g, x, y: g.make("le", y, x),
+    "clamp": lambda g, low, x, high: g.make("min", g.make("max", x, low), high),
+}
+
+
+@rule(*SAME)
+def same(interpreter: Interpreter, equation: Any, *operands):
+    graph, op = interpreter.graph, SAME[equation.primitive.name]
+    if op in ("eq", "ne") and equation.invars[0].aval.dtype == np.bool_:
+        return [elementwise(lambda a, b: _exclusive_or(graph, a, b, op == "eq"), *operands)]
+    return [elementwise(functools.partial(DIRECT[op], graph) if op in DIRECT else functools.partial(graph.make, op), *operands)]
+
+
+@rule(*BY_LEMMA)
+def by_lemma(interpreter: Interpreter, equation: Any, *operands):
+    graph, function = interpreter.graph, BY_LEMMA[equation.primitive.name]
+    return [elementwise(lambda *nodes: function(graph, *nodes), *operands)]
+
+
+def _exclusive_or(g: Graph, a: int, b: int, inverted: bool) -> int:
+    differ = g.make("or", g.make("and", a, g.make("not", b)), g.make("and", b, g.make("not", a)))
+    return g.make("not", differ) if inverted else differ
+
+
+@rule("div")
+def divide(interpreter: Interpreter, equation: Any, a, b):
+    g = interpreter.graph
+    if is_integer(equation.outvars[0]):
+        x, y = interpreter.static(a), interpreter.static(b)
+        if x is None or y is None or np.any(y == 0):
+            raise Unsupported("divides whole numbers that depend on the state")
+        quotient = np.abs(x) // np.abs(y) * np.sign(x) * np.sign(y)
+        return [interpreter.constants(quotient)]
+    return [elementwise(g.div, a, b)]
+
+
+@rule("integer_pow")
+def integer_power(interpreter: Interpreter, equation: Any, x):
+    g, n = interpreter.graph, equation.params["y"]
+    return [elementwise(lambda a: g.power(a, n), x)]
+
+
+@rule("round")
+def rounded(interpreter: Interpreter, equation: Any, x):
+    g = interpreter.graph
+    to_even = "EVEN" in str(equation.params["rounding_method"])
+    if to_even:
+        return [elementwise(lambda a: g.make("round", a), x)]
+    half = lambda a: g.mul(g.make("sign", a), g.make("floor", g.add(g.make("abs", a), g.constant(0.5))))
+    return [elementwise(half, x)]
+
+
+@rule("and", "or", "xor", "not")
+def logical(interpreter: Interpreter, equation: Any, *operands):
+    g, name = interpreter.graph, equation.primitive.name
+    if equation.outvars[0].aval.dtype != np.bool_:
+        values = [interpreter.static(o) for o in operands]
+        if any(v is None for v in values):
+            raise Unsupported("acts on bits that depend on the state")
+        bitwise = {"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "not": np.invert}
+        return [interpreter.constants(bitwise[name](*values))]
+    if name == "xor":
+        return [elementwise(lambda a, b: _exclusive_or(g, a, b, False), *operands)]
+    return [elementwise(lambda *nodes: g.make(name, *nodes), *operands)]
+
+
+@rule("select_n")
+def select_n(interpreter: Interpreter, equation: Any, which, *cases):
+    g = interpreter.graph
+    if equation.invars[0].aval.dtype == np.bool_:
+        no, yes = cases
+        return [elementwise(g.select, which, yes, no)]
+
+    def choose(index, *options):
+        result = options[-1]
+        for k in reversed(range(len(options) - 1)):
+            result = g.select(g.make("le", index, g.constant(float(k))), options[k], result)
+        return result
+
+    return [elementwise(choose, which, *cases)]
+
+
+@rule("convert_element_type")
+def convert(interpreter: Interpreter, equation: Any, x):
+    g, old, new = interpreter.graph, equation.invars[0].aval.dtype, equation.outvars[0].aval.dtype
+    if old == np.bool_ and new != np.bool_:
+        return [elementwise(lambda a: g.select(a, g.one, g.zero), x)]
+    if new == np.bool_ and old != np.bool_:
+        return [elementwise(lambda a: g.make("ne", a, g.zero), x)]
+    if np.issubdtype(new, np.integer) and np.issubdtype(old, np.floating):
+        return [elementwise(lambda a: g.make("trunc", a), x)]
+    return [x]
+
+
+@rule("copy", "copy_p", "stop_gradient", "optimization_barrier", "pvary", "sharding_constraint", "mesh_cast")
+def identity(interpreter: Interpreter, equation: Any, *operands):
+    return operands
+
+
+@rule("reduce_precision")
+def reduce_precision(interpreter: Interpreter, equation: Any, x):
+    if equation.params["exponent_bits"] < 11 or equation.params["mantissa_bits"] < 52:
+        raise Unsupported("rounds to less than float64")
+    return [x]

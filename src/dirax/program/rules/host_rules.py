@@ -1,0 +1,179 @@
+"""What is computed by NumPy between parts of a graph: decompositions, roots, loops whose length depends on their values."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+
+from dirax.program.evaluation.host_function import HostFunction, host_rule, interpreted
+from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported
+from dirax.program.linear_solves import equilibrated_inverse
+from dirax.program.roots import EPSILON, SHORTEST
+from dirax.program.rules.reductions import factors_of_product
+from dirax.program.tracing import in_scalars, jacobian
+
+LARGE_PRODUCT = 256
+"""Multiplications of a product of arrays from which on it is no graph of them."""
+
+
+@host_rule("dot_general")
+def dot_general(made: HostFunction, interpreter: Interpreter, equation: Any, a: Nodes, b: Nodes) -> list[Nodes]:
+    """Large products stay products of arrays; summed in one order, so that an entry's bits do not depend on the others."""
+    shape, (rows, columns) = equation.outvars[0].aval.shape, factors_of_product(equation, a, b)
+    length = rows.shape[-1]
+    if math.prod(shape) * length < LARGE_PRODUCT or equation.outvars[0].aval.dtype != np.float64:
+        return list(RULES["dot_general"](interpreter, equation, a, b))
+    left, right = np.moveaxis(rows, -1, 0)[..., None], np.moveaxis(columns, -1, 0)[:, :, None]
+
+    def product(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        x, y = arrays
+        with np.errstate(all="ignore"):
+            total = x[:, 0] * y[:, 0]
+            for k in range(1, length):
+                total = total + x[:, k] * y[:, k]
+        return [total.reshape(len(x), *shape)]
+
+    return made.between([left, right], [shape], product)
+
+
+@host_rule("svd")
+def svd(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
+    p = equation.params
+
+    def decompose(a: np.ndarray) -> list[np.ndarray]:
+        left, values, right = np.linalg.svd(a, full_matrices=p["full_matrices"])
+        return [values, left, right] if p["compute_uv"] else [values]
+
+    return _decomposed(made, equation, matrix, decompose, "singular values")
+
+
+@host_rule("eigh")
+def eigh(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
+    def decompose(a: np.ndarray) -> list[np.ndarray]:
+        values, vectors = np.linalg.eigh(a, UPLO="L" if equation.params["lower"] else "U")
+        return [vectors, values]
+
+    return _decomposed(made, equation, matrix, decompose, "eigenvalues")
+
+
+def _decomposed(made: HostFunction, equation: Any, matrix: Nodes, decompose: Callable, what: str) -> list[Nodes]:
+    if equation.params.get("subset_by_index") is not None:
+        raise Unsupported(f"finds some {what} only")
+    shapes = [v.aval.shape for v in equation.outvars]
+    return made.between([matrix], shapes, lambda operands: _of_finite(decompose, *operands))
+
+
+@host_rule("while")
+def while_(made: HostFunction, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
+    try:
+        return list(RULES["while"](interpreter, equation, *operands))
+    except Unsupported:
+        pass
+    if lost := next((o for o in operands if isinstance(o, Unavailable)), None):
+        return [lost] * len(equation.outvars)
+    p = equation.params
+    condition, body = interpreted(p["cond_jaxpr"]), interpreted(p["body_jaxpr"])
+    a, b = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
+
+    def loop(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        for_condition, for_body, carry = arrays[:a], arrays[a:b], arrays[b:]
+        while True:
+            going = condition([*for_condition, *carry])[0] != 0
+            if not np.any(going):
+                return carry
+            after = body([*for_body, *carry])
+            carry = [np.where(going.reshape(-1, *(1,) * (x.ndim - 1)), x, y) for x, y in zip(after, carry, strict=True)]
+
+    return made.between(list(operands), [v.aval.shape for v in equation.outvars], loop)
+
+
+@host_rule("dirax_solve")
+def solve(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes, right: Nodes) -> list[Nodes]:
+    return made.between([matrix, right], [right.shape], lambda operands: [_solved(*operands)])
+
+
+def _solved(matrices: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    columns = sides if sides.ndim == matrices.ndim else sides[..., None]
+    try:
+        found = np.linalg.solve(matrices, columns)
+    except np.linalg.LinAlgError:  # one of them is singular
+        found = np.full(columns.shape, np.nan)
+        for k, (matrix, column) in enumerate(zip(matrices, columns, strict=True)):
+            if np.all(np.isfinite(matrix)) and np.linalg.det(matrix) != 0.0:
+                found[k] = np.linalg.solve(matrix, column)
+    return found.reshape(sides.shape)
+
+
+@host_rule("dirax_pseudo_inverse")
+def pseudo_inverse(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
+    inverse = functools.partial(np.linalg.pinv, rcond=equation.params["tolerance"])
+    return made.between(
+        [matrix], [equation.outvars[0].aval.shape], lambda operands: _of_finite(lambda a: [inverse(a)], *operands)
+    )
+
+
+@host_rule("dirax_scaled_inverse")
+def scaled_inverse(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
+    return made.between([matrix], [v.aval.shape for v in equation.outvars], lambda operands: _inverted(*operands))
+
+
+def _inverted(matrices: np.ndarray) -> list[np.ndarray]:
+    """The scaled pseudo-inverses and their units."""
+    return _of_finite(functools.partial(equilibrated_inverse, np), matrices)
+
+
+def _of_finite(function: Callable, matrices: np.ndarray) -> list[np.ndarray]:
+    """The arrays that `function` gives for matrices with leading axes; NaN for a matrix that is not finite."""
+    good = np.all(np.isfinite(matrices), axis=(-2, -1))
+    spread = lambda a: good.reshape(*good.shape, *(1,) * (a.ndim - good.ndim))
+    return [np.where(spread(a), a, np.nan) for a in function(np.where(spread(matrices), matrices, 0.0))]
+
+
+@host_rule("dirax_root")
+def root(made: HostFunction, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
+    """The method of `dirax.program.roots`, for all entries side by side."""
+    closed: ClosedJaxpr = equation.params["residual"]
+    function = lambda *values: jaxpr_as_fun(closed)(*values)[0]
+    with in_scalars():
+        slope = jax.make_jaxpr(jacobian(function, len(operands) - 1))(*(v.aval for v in closed.jaxpr.invars))
+    residual, linear, most = interpreted(closed), interpreted(slope), equation.params["max_steps"]
+
+    def find(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        *captured, found = arrays
+        found, going = found.copy(), np.arange(len(found))
+        for _ in range(most):
+            if not len(going):
+                break
+            known = [a[going] for a in captured]
+            found[going], more = _newton(
+                lambda u, k=known: residual([*k, u])[0], lambda u, k=known: linear([*k, u])[0], found[going]
+            )
+            going = going[more]
+        return [found]
+
+    return made.between(list(operands), [equation.outvars[0].aval.shape], find)
+
+
+def _newton(residual: Callable, linear: Callable, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(u, whether to go on) after a step that is halved until the next one would be shorter."""
+    inverse, unit = _inverted(linear(u))
+    change = np.einsum("blk,bk->bl", inverse, residual(u))
+    size = lambda v: np.max(np.abs(v) / unit, axis=-1)
+    here = size(change)
+    at_floor = here <= 4.0 * EPSILON * size(u)
+
+    def shorter(fraction):
+        following = np.einsum("blk,bk->bl", inverse, residual(u - fraction[:, None] * change))
+        return np.all(np.isfinite(following), axis=-1) & (size(following) <= (1.0 - fraction / 4.0) * here)
+
+    fraction = np.ones(len(u))
+    with np.errstate(all="ignore"):
+        better = at_floor if np.all(at_floor) else at_floor | shorter(fraction)
+        while np.any(searching := ~better & (fraction > SHORTEST)):
+            fraction = np.where(searching, fraction / 2.0, fraction)
+            better = better | searching & shorter(fraction)
+        return np.where(better[:, None], u - fraction[:, None] * change, u), better & ~at_floor

@@ -1,0 +1,98 @@
+"""Rules of reductions, products of arrays and cumulative sums."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dirax.program.interpreter import Interpreter, rule
+
+FOLDS = {
+    "reduce_sum": "add",
+    "reduce_prod": "mul",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_and": "and",
+    "reduce_or": "or",
+    "cumsum": "add",
+    "cumprod": "mul",
+    "cummax": "max",
+    "cummin": "min",
+}
+EMPTY = {"add": 0.0, "mul": 1.0, "max": -np.inf, "min": np.inf, "and": True, "or": False}
+
+
+def fold(interpreter: Interpreter, op: str, nodes) -> int:
+    """op over the nodes from the left."""
+    g, total = interpreter.graph, None
+    for node in nodes:
+        total = node if total is None else g.make(op, total, node)
+    return g.constant(EMPTY[op]) if total is None else total
+
+
+def along_axes(x: np.ndarray, axes, function: Callable[[list[int]], int]) -> np.ndarray:
+    """`function` of the entries along `axes`, for every position of the other axes."""
+    kept = [a for a in range(x.ndim) if a not in axes]
+    shape = tuple(x.shape[a] for a in kept)
+    rows = np.transpose(x, (*kept, *axes)).reshape(int(np.prod(shape)), -1).tolist()
+    return np.array([function(row) for row in rows], dtype=np.int64).reshape(shape)
+
+
+@rule("reduce_sum", "reduce_prod", "reduce_max", "reduce_min", "reduce_and", "reduce_or")
+def reduce(interpreter: Interpreter, equation: Any, x):
+    op = FOLDS[equation.primitive.name]
+    return [along_axes(x, tuple(equation.params["axes"]), lambda row: fold(interpreter, op, row))]
+
+
+@rule("cumsum", "cumprod", "cummax", "cummin")
+def cumulative(interpreter: Interpreter, equation: Any, x):
+    g, op, axis = interpreter.graph, FOLDS[equation.primitive.name], equation.params["axis"]
+    out = np.moveaxis(x, axis, 0).copy()
+    order = range(len(out) - 1, -1, -1) if equation.params["reverse"] else range(len(out))
+    previous = None
+    for i in order:
+        if previous is not None:
+            for index in np.ndindex(*out[i].shape):
+                out[(i, *index)] = g.make(op, int(out[(previous, *index)]), int(out[(i, *index)]))
+        previous = i
+    return [np.moveaxis(out, 0, axis)]
+
+
+@rule("argmax", "argmin")
+def position_of_extreme(interpreter: Interpreter, equation: Any, x):
+    g, largest = interpreter.graph, equation.primitive.name == "argmax"
+
+    def position(row):
+        best, where = row[0], g.zero
+        for i, node in enumerate(row[1:], 1):
+            better = g.make("lt", *((best, node) if largest else (node, best)))
+            best, where = g.select(better, node, best), g.select(better, g.constant(float(i)), where)
+        return where
+
+    return [along_axes(x, tuple(equation.params["axes"]), position)]
+
+
+@rule("dot_general")
+def dot_general(interpreter: Interpreter, equation: Any, a, b):
+    g = interpreter.graph
+    rows, columns = factors_of_product(equation, a, b)
+    out = [
+        fold(interpreter, "add", [g.mul(x, y) for x, y in zip(row, column, strict=True)])
+        for one, other in zip(rows.tolist(), columns.tolist(), strict=True)
+        for row in one
+        for column in other
+    ]
+    return [np.array(out, dtype=np.int64).reshape(equation.outvars[0].aval.shape)]
+
+
+def factors_of_product(equation: Any, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The operands of a `dot_general` as rows (batch, i, length) and columns (batch, j, length), to be summed over the last."""
+    (ca, cb), (ba, bb) = equation.params["dimension_numbers"]
+
+    def arranged(array: np.ndarray, contracted, batched) -> np.ndarray:
+        free = [i for i in range(array.ndim) if i not in (*contracted, *batched)]
+        sizes = (math.prod(array.shape[i] for i in axes) for axes in (batched, free, contracted))
+        return np.transpose(array, (*batched, *free, *contracted)).reshape(*sizes)
+
+    return arranged(a, ca, ba), arranged(b, cb, bb)

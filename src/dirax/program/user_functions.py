@@ -1,0 +1,256 @@
+"""User functions: plain JAX-traceable callables, with or without a leading `t` and a trailing `params`, checked once and
+called uniformly."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.experimental import checkify
+from jax.extend.core import jaxprs_in_params
+
+from dirax.program.tracing import becomes_scalars, call
+from dirax.text.representation import value_text
+
+POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+INDEXING = ("dynamic_slice", "gather")
+"""What JAX turns an index into when it is not known to be inside the array."""
+
+
+class UserFunction(eqx.Module):
+    """A user's function under a name, called as `f(*arguments, params)` whether or not the user wrote `params`.
+
+    A `timed` function may have the time as its first argument, which is then called `t`: `at(t, *arguments, params)` calls
+    it either way, and `f(t, *arguments, params)` is its call where it takes time.
+    Raises `TypeError` at construction when the function is not callable or its signature takes neither the named
+    arguments nor the named arguments and `params`.
+    """
+
+    function: Callable = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    arguments: tuple[str, ...] = eqx.field(static=True)
+    takes_params: bool = eqx.field(static=True)
+    takes_time: bool = eqx.field(static=True)
+
+    def __init__(self, function: Callable, name: str, arguments: tuple[str, ...], timed: bool = False):
+        expected = f"{name}({', '.join(arguments)}[, params])"
+        expected += f" or {name}(t, {', '.join(arguments)}[, params])" * timed
+        if not callable(function):
+            raise TypeError(
+                f"{name} must be a function {expected}, but {value_text(function)} was given: "
+                "wrap the value in a function, e.g. a lambda."
+            )
+        self.takes_time = timed and _takes_time(function, len(arguments))
+        self.arguments = ("t", *arguments) if self.takes_time else tuple(arguments)
+        self.takes_params = _takes_params(function, name, expected, len(self.arguments))
+        self.function, self.name = _hashable(function), name
+
+    def __call__(self, *values: Any):
+        *args, params = values
+        return call(self.function, *args, *((params,) if self.takes_params else ()))
+
+    def at(self, t: Any, *values: Any):
+        """The function of `(*arguments, params)` at time t, which is passed on where the function takes it."""
+        return self(*self.given(t, *values))
+
+    def given(self, t: Any, *values: Any) -> tuple:
+        """What the function is called with at time t: `(t, *values)` or `values`."""
+        return (t, *values) if self.takes_time else values
+
+    @property
+    def signature(self) -> str:
+        """The function's own name with the arguments it is called with, e.g. `pendulum(q, v, params)`."""
+        own = getattr(self.function, "__name__", type(self.function).__name__).replace("<lambda>", "lambda")
+        return f"{own}({', '.join((*self.arguments, 'params') if self.takes_params else self.arguments)})"
+
+    def shape(self, *values: Any) -> jax.ShapeDtypeStruct:
+        """Shape and dtype of the result, by abstract evaluation on `(*arguments, params)`.
+
+        Raises `TypeError` if the function cannot be traced or does not return one array of float64, and `ValueError` if
+        it reads an entry that its arguments do not have (JAX itself would silently read another one).
+        """
+        call = f"{self.name}({', '.join(self.arguments)})"
+        shapes = ", ".join(str(jnp.shape(v)) for v in values[:-1])
+        try:
+            jaxpr, out = jax.make_jaxpr(lambda *v: self(*v), return_shape=True)(*values)
+        except Exception as error:
+            raise TypeError(
+                f"{call} could not be traced by JAX on float64 arrays of shapes {shapes}{self._without_params(values)}: "
+                f"{type(error).__name__}: {_first_line(error)}{_way_out(error)}"
+            ) from error
+        if not isinstance(out, jax.ShapeDtypeStruct) or out.dtype != jnp.float64:
+            what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
+            raise TypeError(f"{call} must return one array of real numbers (float64), but it returned {what}.")
+        if _indexes(jaxpr.jaxpr) and not is_traced(values, jaxpr.consts) and not _reads_inside(jaxpr, values):
+            outside = _compiled(_Indexing(self), *values)[0].get()
+            if outside:
+                raise ValueError(
+                    f"{call} reads an entry that its arguments, of shapes {shapes}, do not have "
+                    f"({_first_line(outside)}): check the length of the initial data and the indices."
+                )
+        return out
+
+    def returning(self, shape: tuple[int, ...]) -> Callable:
+        """The same function, which raises `ValueError` when it is traced and its result does not have this shape."""
+
+        def checked(*values):
+            result = self(*values)
+            if jnp.shape(result) != shape:
+                what = "a scalar" if shape == () else f"an array of shape {shape}"
+                raise ValueError(
+                    f"{self.name}({', '.join(self.arguments)}) must return {what}, but it returned shape "
+                    f"{jnp.shape(result)}{': sum or index its result' if shape == () else ''}."
+                )
+            return result
+
+        return checked
+
+    def __repr__(self) -> str:
+        return self.signature
+
+    def _without_params(self, values) -> str:
+        missing = self.takes_params and values[-1] is None
+        return " and params=None (it takes params, which were not given: pass params=…)" if missing else ""
+
+
+def _takes_time(function: Callable, count: int) -> bool:
+    """Whether the first argument is called `t` and `count` others follow."""
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return False
+    positional = [p for p in parameters if p.kind in POSITIONAL]
+    return len(positional) > count and positional[0].name == "t"
+
+
+def evaluated(function: Callable, *values: Any) -> Any:
+    """`function(*values)` for checks of concrete values: without a compiler where that can be, else by one compiled program
+    instead of one an operation; either is kept for later calls with equal functions."""
+    host = _host()
+    found = None if host is None or is_traced(values) else host.evaluated(function, values)
+    return _compiled(function, *values) if found is None else found[0]
+
+
+def scalar_program(function: Callable, *values: Any) -> Any:
+    """`function(*values)` for traced values by the operations of its scalar graph where it has one: far fewer than those of
+    an array program where derivatives lie in one another."""
+    host = _host()
+    found = None if host is None or becomes_scalars() else host.scalar_program(function, values)
+    return function(*values) if found is None else found[0]
+
+
+def constant_entries(function: Callable, *values: Any) -> np.ndarray | None:
+    """The array `function(*values)` with NaN for the entries that depend on the values; None where that is not found."""
+    host = _host()
+    return None if host is None else host.constant_entries(function, values)
+
+
+@eqx.filter_jit
+def _compiled(function: Callable, *values: Any) -> Any:
+    return function(*values)
+
+
+def _no_host() -> Any:
+    return None
+
+
+_host = _no_host
+
+
+def evaluate_on(host: Callable[[], Any]) -> None:
+    """Have concrete values found without a compiler by what `host` returns: a module with `evaluated(function, values)`, a
+    tuple of one result, `scalar_program(function, values)`, the same of traced values, `constant_entries(function, values)`,
+    an array, and `reads_inside(jaxpr, values)`, whether every index is inside its array; None and False where it cannot say."""
+    global _host
+    _host = host
+
+
+class _Indexing(eqx.Module):
+    """A user's function with its indices checked: (error, result)."""
+
+    function: UserFunction
+
+    def __call__(self, *values: Any):
+        return checkify.checkify(lambda *v: self.function(*v), errors=checkify.index_checks)(*values)
+
+
+def _takes_params(function: Callable, name: str, expected: str, count: int) -> bool:
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return False
+    if any(p.kind is p.VAR_POSITIONAL for p in parameters):
+        return False
+    positional = [p for p in parameters if p.kind in POSITIONAL]
+    keywords = [p for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is p.empty]
+    required = [p for p in positional if p.default is p.empty] + keywords
+    if not keywords:
+        if len(required) == count + 1:
+            return True
+        if len(required) <= count <= len(positional):
+            return len(positional) > count and positional[count].name == "params"
+    raise TypeError(
+        f"{name} must have the signature {expected}, but {getattr(function, '__name__', 'it')} takes "
+        f"{len(required)} argument{'s' if len(required) != 1 else ''}"
+        f" ({', '.join(p.name for p in required) or 'none'})."
+    )
+
+
+def _hashable(function: Callable) -> Callable:
+    """The function, under another identity if it has no hash (an object that holds arrays, say)."""
+    try:
+        hash(function)
+    except TypeError:
+        return lambda *values: function(*values)
+    return function
+
+
+def _indexes(jaxpr) -> bool:
+    """Whether an index occurs that JAX could not see to be inside its array."""
+    inner = [sub for equation in jaxpr.eqns for sub in jaxprs_in_params(equation.params)]
+    return any(e.primitive.name in INDEXING for e in jaxpr.eqns) or any(map(_indexes, inner))
+
+
+def _reads_inside(jaxpr, values) -> bool:
+    host = _host()
+    return host is not None and host.reads_inside(jaxpr, values)
+
+
+def _first_line(message: Any) -> str:
+    return (str(message).splitlines() or ["no message"])[0].split(" (`")[0].rstrip(". ")
+
+
+def _way_out(error: Exception) -> str:
+    if isinstance(error, jax.errors.TracerArrayConversionError):
+        return "; write it with jax.numpy instead of numpy."
+    if isinstance(error, jax.errors.ConcretizationTypeError):
+        return "; write it without Python's if and float(), e.g. with jnp.where."
+    return "."
+
+
+def at_time(function: Callable, t: Any, *values: Any):
+    """`function.at(t, *values)` of a user's function, `function(*values)` of any other."""
+    return function.at(t, *values) if isinstance(function, UserFunction) else function(*values)
+
+
+def is_traced(*trees: Any) -> bool:
+    """Whether any leaf is a JAX tracer: then values cannot be inspected and value checks are skipped."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def check_finite(name: str, value: Any) -> None:
+    """Raise `ValueError`, naming the entry, when a concrete numerical leaf of `value` holds NaN or infinity."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(value):
+        if is_traced(leaf) or not np.issubdtype(np.asarray(leaf).dtype, np.number):
+            continue
+        array = np.asarray(leaf)
+        if not np.all(np.isfinite(array)):
+            index = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
+            entry = f"{name}{jax.tree_util.keystr(path)}{index if index else ''}"
+            raise ValueError(
+                f"{name} must be finite, but {entry} is {array[tuple(index)]}: remove or replace the entry before the run."
+            )

@@ -1,0 +1,98 @@
+"""Why a trajectory ended early, in words: which step, which equation, how near to singular."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.engines.result import OK, Outcome, Problem
+from dirax.engines.xla.newton import EPSILON, STALLED
+
+SINGULAR = 1e15
+"""Condition number from which a Jacobian counts as singular."""
+
+SMALLER = "a smaller step may help"
+
+
+def explain(problem: Problem, outcome: Outcome, lane: int, kept: int | None = None) -> str:
+    """One or two sentences on the step at which trajectory `lane` failed, or on the interruption.
+
+    `kept` counts the steps up to the last row that was kept: all good ones by default.
+    """
+    p, completed = problem, int(outcome.completed[lane])
+    time_of = lambda steps: p.t0 + (p.first_step + steps) * p.h
+    kept = completed if kept is None else kept
+    rows = f"kept up to step {p.first_step + kept} (t = {time_of(kept):.6g})"
+    if int(outcome.status[lane]) == OK:
+        return f"interrupted by the user; {rows}."
+    reason = _reason(p, outcome, lane, time_of(completed))
+    return f"step {p.first_step + completed + 1} (from t = {time_of(completed):.6g}) failed: {reason}; {rows}."
+
+
+def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
+    """The stages of the failing step are replayed one by one, to see where it breaks."""
+    params = jax.tree.map(lambda a: jnp.asarray(a[lane] if p.batch_params else a), p.params)
+    state, last = jnp.asarray(outcome.last_state[lane]), jnp.asarray(outcome.last_unknowns[lane])
+    solved = []
+    for stage, fraction in p.equation.stages:
+        args = (state, jnp.asarray(t), fraction * p.h, params)
+        guess = jnp.asarray(stage.guess(state, last if len(last) == stage.unknowns else jnp.zeros(stage.unknowns), *args[2:]))
+        reason, u = _replay_newton(stage, guess, args, p.max_iterations)
+        if reason:
+            return reason
+        solved.append((stage, guess, args))
+        state, t = stage.advance(u, *args), t + fraction * p.h
+        if not np.all(np.isfinite(state)):
+            return "the new state is not finite: it has left the domain of the system's functions, or overflowed"
+    advice = next((found for place in solved if (found := _advice(*place)) != SMALLER), SMALLER)
+    return f"Newton did not converge from the values extrapolated from the steps before: {advice}"
+
+
+def _replay_newton(stage, guess, args, max_iterations: int):
+    """(what went wrong or nothing, unknowns) of one stage."""
+    u = guess
+    if not stage.unknowns:
+        return "", u
+    evaluate = jax.jit(lambda u: (stage.residual(u, *args), jax.jacfwd(stage.residual)(u, *args)))
+    size, worst, condition = np.inf, 0, np.nan
+    for iteration in range(max_iterations):
+        residual, jacobian = (np.asarray(a) for a in evaluate(u))
+        broken = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
+        if np.any(broken):
+            label = stage.labels[int(np.argmax(broken))]
+            return f"{label} is not finite (outside the domain of the system's functions) in Newton iteration {iteration + 1}", u
+        worst, condition = int(np.argmax(np.abs(residual))), np.linalg.cond(jacobian)
+        if not condition < SINGULAR:
+            return f"the Jacobian of the step is singular (condition number {condition:.2g})", u
+        change = np.linalg.solve(jacobian, residual)
+        u, size = u - change, np.max(np.abs(change) / (np.abs(u) + np.asarray(stage.scale)))
+    if size < STALLED:
+        return "", u
+    return (
+        f"Newton did not converge in {max_iterations} iterations (largest residual in {stage.labels[worst]}, "
+        f"condition number {condition:.2g}): {_advice(stage, guess, args)}"
+    ), u
+
+
+def _advice(stage, u, args) -> str:
+    """What to do about a stage without a root: a larger step where roundoff hides it, and hides less of it in a larger one."""
+    state, t, h, params = args
+    if not stage.unknowns:
+        return SMALLER
+    here, there = (_roundoff(stage, u, (state, t, step, params)) for step in (h, 10 * h))
+    if not (here > STALLED and there < here / 2):
+        return SMALLER
+    return (
+        f"the step h = {float(h):.3g} is too small for double precision, in which the rounding of the state and of the unknowns "
+        f"changes these by {here:.1g} of their size: take a larger step"
+    )
+
+
+def _roundoff(stage, u, args) -> float:
+    """The change of the unknowns, relative to their size, that follows from a last place of every number that the residual
+    is a function of."""
+    by_u, by_state = map(np.asarray, jax.jacfwd(stage.residual, argnums=(0, 1))(u, *args))
+    left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
+    if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and np.linalg.cond(by_u) < SINGULAR):
+        return np.inf
+    change = EPSILON * np.abs(np.linalg.inv(by_u)) @ left
+    return float(np.max(change / (np.abs(u) + np.asarray(stage.scale))))

@@ -1,0 +1,92 @@
+"""Constraints that follow from others: found where a run begins, left out of its equations, and reported."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.run.start import numerical_rank
+from dirax.systems.constraints import Constraints
+from dirax.systems.dirac_system import DiracSystem
+
+CONSISTENT = 1e-9
+"""Largest residual of constraints, relative to 1 or to the velocity, that counts as satisfied."""
+
+AWAY = 1e-3
+"""How far from the initial point, relative to it, the rank of the constraints is compared."""
+
+
+def redundant_constraints(system: Any, matrices: Any, data: dict, params: Any, t0: float) -> tuple[int, ...]:
+    """The numbers of the constraints, in the order of `Solution.multipliers`, that follow from those before them, given the
+    matrices [W; G] (m + c, n), or (B, m + c, n), at the initial points; `data` and `params` are those of the first trajectory.
+
+    Raises `ValueError` where constraints contradict each other, where their rank is larger near the initial point than
+    at it, where one of them has no direction, and where the trajectories of a batch differ in what is redundant.
+    """
+    if matrices is None or not np.size(matrices):
+        return ()
+    matrices = np.asarray(matrices)
+    matrices = matrices if matrices.ndim == 3 else matrices[None]
+    if not np.all(np.isfinite(matrices)):
+        return ()
+    ranks, _ = numerical_rank(matrices)
+    total = matrices.shape[1]
+    if np.all(ranks == total):
+        return ()
+    where = f" of trajectory {int(np.argmax(ranks < total))}" if len(ranks) > 1 else ""
+    _refuse_singular_point(system, matrices, ranks, where, data, params, t0)
+    kept: list[int] = []
+    for row in range(total):
+        if numerical_rank(matrices[:1, [*kept, row]])[0][0] > len(kept):
+            kept.append(row)
+    if np.any(ranks != len(kept)) or np.any(numerical_rank(matrices[:, kept])[0] < len(kept)):
+        raise ValueError(
+            f"the constraints that follow from others are not the same in all trajectories of the batch (ranks from "
+            f"{np.min(ranks)} to {np.max(ranks)} of {total}): run the trajectories in groups."
+        )
+    return tuple(row for row in range(total) if row not in kept)
+
+
+def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> None:
+    """Raise where the dependence is not one of the constraints as functions, or where they have no common solution."""
+    system = system.lagrange_dirac() if hasattr(system, "lagrange_dirac") else system
+    constraints: Constraints = system.constraints
+    total = matrices.shape[1]
+    zero = np.flatnonzero(np.any(np.all(matrices == 0.0, axis=2), axis=0))
+    if len(zero):
+        raise ValueError(
+            f"constraint {zero[0]} (in the order of the multipliers: one_forms, then holonomic) has no direction at the "
+            f"initial data{where}: its row of [W; ∂g/∂q] is zero there. Leave it out, or start elsewhere."
+        )
+    q = jnp.asarray(system.point(data) if isinstance(system, DiracSystem) else data["q"] if "q" in data else data["q0"])
+    near, positions, velocities = map(np.asarray, _nearby(system, q, params, jnp.asarray(t0, float)))
+    worst = max((positions, velocities), key=lambda residual: np.max(np.abs(residual), initial=0.0))
+    if np.max(np.abs(worst), initial=0.0) > CONSISTENT * (1 + np.max(np.abs(q))):
+        raise ValueError(
+            f"the constraints ({constraints.names}) contradict each other at the initial data: their rank is {np.min(ranks)} "
+            f"of {total}, and the nearest point and velocity leave the residual {np.array2string(worst, precision=4)}. Take "
+            "out those that cannot hold."
+        )
+    nearby = int(numerical_rank(near[None])[0][0])
+    if nearby > np.min(ranks):
+        raise ValueError(
+            f"the constraints ({constraints.names}) are dependent at the initial data{where}, with rank {np.min(ranks)} of "
+            f"{total}, but have rank {nearby} nearby: a singular configuration, where the multipliers are not determined. "
+            "Start elsewhere."
+        )
+
+
+@eqx.filter_jit
+def _nearby(system, q, params, t):
+    """[W; G] at an admissible point near q, and the residuals of g and of the velocities' constraints that no point and no
+    velocity nearest to q makes zero."""
+    constraints: Constraints = system.constraints
+    still = jnp.zeros_like(q)
+    nearest = system.project_position(q, still, params, t)
+    v = system.project_velocity(nearest, still, params, t)
+    residuals = constraints.position_defect(t, nearest, params), constraints.velocity_defect(t, nearest, v, params)
+    direction = jax.random.uniform(jax.random.key(0), q.shape, minval=0.5)
+    away = nearest + AWAY * (1.0 + jnp.max(jnp.abs(q))) * direction
+    return constraints.matrix(t, system.project_position(away, still, params, t), params), *residuals

@@ -1,0 +1,157 @@
+"""From a trajectory on the quotient back to the configuration space."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.geometry.group_retractions import coadjoint
+from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.program.user_functions import is_traced
+from dirax.reduction.euler_poincare import EulerPoincare
+from dirax.reduction.lie_poisson import LiePoisson
+from dirax.reduction.reduced import ReducedLagrangeDirac
+from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.schemes.routh import DiscreteRouth
+from dirax.schemes.step import Field
+from dirax.solution.dataset import with_code
+from dirax.solution.solution import Solution
+
+
+def reconstruct(solution: Solution, g0: Any = None) -> Solution:
+    """The motion (q, p) on T*Q over a reduced solution, as a Solution of the system that was reduced by the scheme whose
+    equations on Q × Q it satisfies (of Routh's, `dx.LagrangeDAlembert`).
+
+    Of a system made by `dx.reduce`: q = (x, g) with g_{k+1} = g_k + ω_d + A(x_{k+1} − x_k), p = (w − h*_{d,Σ}(μ), μ)
+    ([RL] §4), multipliers those of the one-forms at q, work as it was. Of a `dx.EulerPoincare` or `dx.LiePoisson` system: q
+    the group element g_k = g0 f_0 ⋯ f_{k−1} (N,), p the covector at it with the body momentum μ, `spatial_momentum`
+    Ad*_{g⁻¹} μ (d,), and the reduced fields as they were; `g0` is an element (N,), a matrix (k, k), in a batch also (B, N),
+    or the identity, as for a run that started from q=.
+
+    Raises `TypeError` for a solution of another system, `ValueError` for a g0 that is no element of the group.
+    """
+    system = solution.system
+    if isinstance(system, EulerPoincare | LiePoisson):
+        return _on_group(solution, system.space.group, system.space.dimension, g0)
+    if not isinstance(system, ReducedLagrangeDirac):
+        raise TypeError(
+            "dx.reconstruct takes a solution of a dx.EulerPoincare, dx.LiePoisson or dx.reduce system, but this one is of "
+            f"{system!r}."
+        )
+    if g0 is not None:
+        raise ValueError("g0 is for systems on a Lie group: here the initial data name the group coordinate already.")
+    reduced = ("x", "w", "mu", "g", "vertical")
+    lifted = _each_row(solution, system.unreduced_row, reduced[:-1])
+    lifted |= {name: a for name, a in solution.fields.items() if name not in reduced}
+    if system.system.one_forms is not None:
+        lifted["multipliers"] = _multipliers_at(solution, lifted["q"])
+    n = lifted["q"].shape[-1]
+    info = {"q": Field((n,)), "p": Field((n,))}
+    about = {name: info.get(name) or solution.field_info[name] for name in lifted}
+    whole = _lifted(solution, system.system, lifted, about)
+    whole.scheme = jax.tree.map(_on_q, solution.scheme, is_leaf=lambda part: isinstance(part, DiscreteRouth))
+    return whole if is_traced(lifted) or solution.equation is None else with_code(whole, whole.system, whole.scheme)
+
+
+def _on_q(part: Any) -> Any:
+    """The scheme on Q × Q whose trajectories those of Routh's equations are, also inside a composition."""
+    if not isinstance(part, DiscreteRouth):
+        return part
+    return LagrangeDAlembert(part.discrete_lagrangian, part.constraint, part.momentum)
+
+
+def _multipliers_at(solution: Solution, q: Any) -> Any:
+    """The λ of the one-forms W(q): on the quotient they are those of W(x, 0), whose rows span the same after the translation
+    but may be others, so that W(q)ᵀλ is the same force."""
+    system, multipliers = solution.system, solution.fields["multipliers"]
+    m, _ = system.constraints.sizes(jnp.zeros(np.shape(q)[-1]), solution.params_of_one)
+    kept = np.array([i for i in range(m) if i not in solution.stats.get("redundant_constraints", ())], int)
+
+    def at(t, q, given, params):
+        fixed, moved = (
+            system.constraints.one_forms_at(t, point, params)[kept]
+            for point in (system.connection.join(system.connection.split(q)[0], jnp.zeros(len(system.connection.fibre))), q)
+        )
+        force = moved @ (fixed.T @ given[kept])
+        return given.at[kept].set(jnp.linalg.solve(moved @ moved.T, force))
+
+    along = jax.vmap(at, in_axes=(0, 0, 0, None))
+    if solution.batch is not None:
+        along = jax.vmap(along, in_axes=(None, 0, 0, 0 if solution.batch_params else None))
+    rows = jnp.asarray(q)[..., :-1, :]
+    found = jax.jit(along)(jnp.asarray(solution.t)[:-1], rows, jnp.asarray(multipliers), solution.params)
+    return found if is_traced(found) else np.asarray(found)
+
+
+def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> Solution:
+    start = _element(group, g0, solution.batch)
+    batched = start.ndim == 2
+
+    def rows(lane, g, x):
+        q = group.nearest(group.multiply(lane, g))
+        return {"q": q, "p": group.covector(q, x[:d]), "spatial_momentum": coadjoint(group, group.inverse(q), x[:d])}
+
+    along = jax.vmap(rows, in_axes=(None, 0, 0))
+    if solution.batch is not None:
+        along = jax.vmap(along, in_axes=(0 if batched else None, 0, 0))
+    lifted = _plain(jax.jit(along)(start, jnp.asarray(solution.fields["g"]), jnp.asarray(solution.fields["x"])))
+    kept = {name: a for name, a in solution.fields.items() if name != "g"}
+    about = {
+        "q": Field((group.ambient_dimension,), dims=("group",), description="group element"),
+        "p": Field((group.ambient_dimension,), dims=("group",), description="covector at q, as a tangent vector"),
+        "spatial_momentum": Field((d,), dims=("algebra",), description="Ad*_{g⁻¹} μ"),
+    }
+    about |= {name: solution.field_info[name] for name in kept}
+    return _lifted(solution, solution.system, lifted | kept, about, solution.equation)
+
+
+def _element(group: AbstractLieGroup, g0: Any, batch: int | None) -> jax.Array:
+    if g0 is None:
+        return group.identity()
+    g, size = jnp.asarray(g0, float), group.ambient_dimension
+    matrix = jax.eval_shape(group.matrix, group.identity()).shape
+    if g.shape == matrix:
+        element = group.from_matrix(g)
+        defect = jnp.max(jnp.abs(group.matrix(element) - g))
+    elif g.shape == (size,) or (batch is not None and g.shape == (batch, size)):
+        element, defect = g, jnp.max(jax.vmap(group.defect)(jnp.atleast_2d(g)))
+    else:
+        many = f", or ({batch}, {size})" if batch is not None else ""
+        raise ValueError(
+            f"g0 must be an element of {type(group).__name__} of shape ({size},){many}, or a matrix {matrix}, but it has shape "
+            f"{g.shape}."
+        )
+    if not is_traced(g) and not float(defect) < 1e-9:
+        raise ValueError(f"g0 is no element of {type(group).__name__}: it is off by {float(defect):.3g}.")
+    return element
+
+
+def _each_row(solution: Solution, function: Callable, names: tuple[str, ...]) -> dict[str, Any]:
+    for _ in range(np.ndim(solution.fields["x"]) - 1):
+        function = jax.vmap(function)
+    return _plain(function({name: solution.fields[name] for name in names}))
+
+
+def _plain(fields: dict[str, Any]) -> dict[str, Any]:
+    return {name: np.asarray(a) if not is_traced(a) else a for name, a in fields.items()}
+
+
+def _lifted(solution: Solution, system: Any, fields: dict[str, Any], info: dict[str, Field], equation: Any = None) -> Solution:
+    return Solution(
+        t=solution.t,
+        fields=fields,
+        field_info=info,
+        step=solution.step,
+        save_every=solution.save_every,
+        stats=solution.stats,
+        ok=solution.ok,
+        message=solution.message,
+        system=system,
+        scheme=solution.scheme,
+        equation=equation,
+        params=solution.params,
+        batch_params=solution.batch_params,
+        initial=solution.initial,
+    )

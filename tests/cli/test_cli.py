@@ -1,0 +1,224 @@
+"""The command line, as a user types it."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import dirax as dx
+from dirax import gallery
+from dirax.cli import app
+from dirax.cli.schemes import scheme_from_text
+from dirax.cli.subject import changed
+from dirax.gallery import peng_yoshimura, reproduction
+from dirax.solution.plotting import new_figure
+
+SPRING = """
+import dirax as dx
+system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["k"] * (q @ q) / 2)
+initial = dict(q=[1.0], v=[0.0])
+params = {"k": 4.0}
+step, steps = 0.05, 40
+"""
+FALLING = """
+import jax.numpy as jnp
+import dirax as dx
+system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sqrt(q[0]) - 2 * q[0])
+initial = dict(q=[0.1], v=[-1.0])
+scheme = dx.PlusLagrangeDirac()
+"""
+
+
+def call(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture
+def spring(tmp_path):
+    path = tmp_path / "spring.py"
+    path.write_text(SPRING, encoding="utf-8")
+    return path
+
+
+def test_list_shows_every_system_and_paper():
+    text, described = call("list").stdout, json.loads(call("list", "--json").stdout)
+    assert [system["name"] for system in described["systems"]] == list(gallery.names())
+    assert described["papers"] == list(reproduction.papers())
+    assert all(name in text for name in (*gallery.names(), *reproduction.papers()))
+
+
+def test_run_prints_the_report_and_saves_once(tmp_path):
+    path = tmp_path / "kepler.zarr"
+    arguments = ("run", "kepler", "--set", "steps=200", "--out", path)
+    result = call(*arguments)
+    assert result.exit_code == 0, result.output
+    assert "symplecticity" in result.stdout and "angular momentum" in result.stdout
+    loaded = dx.load(path)
+    assert loaded.q.shape == (201, 2) and loaded.metadata["coordinates"] == ["x", "y"]
+    again = call(*arguments)
+    assert again.exit_code == 1 and "exists" in again.stderr and "--overwrite" in again.stderr
+    assert call(*arguments[:3], "steps=10", *arguments[4:], "--overwrite").exit_code == 0
+    assert dx.load(path).q.shape == (11, 2)
+
+
+def test_run_a_file_as_json(spring, tmp_path):
+    out = tmp_path / "spring.nc"
+    result = call("run", spring, "--set", "k=1", "--set", "q=[2.0]", "--scheme", "plus", "--json", "--out", out)
+    assert result.exit_code == 0, result.output
+    described = json.loads(result.stdout)
+    x, p, expected = 2.0, 0.0, []
+    for _ in range(41):  # p_{k+1} = (q_{k+1} − q_k)/h and p_k − h q_k = p_{k+1}: symplectic Euler
+        expected.append(x)
+        p -= 0.05 * x
+        x += 0.05 * p
+    assert dx.load(out).q[:, 0] == pytest.approx(expected, abs=1e-12)
+    assert described["q"] == pytest.approx([expected[-1]], abs=1e-12)
+    assert described["ok"] is True and described["t"] == pytest.approx(2.0) and described["saved"] == str(out)
+    assert {line["quantity"] for line in described["report"]["lines"]} >= {"energy", "symplecticity of one step"}
+
+
+def test_a_failed_trajectory_has_a_message_and_a_status(tmp_path):
+    path = tmp_path / "falling.py"
+    path.write_text(FALLING, encoding="utf-8")
+    result = call("run", path)
+    assert result.exit_code == 1 and "kept up to step" in result.stderr
+    described = call("run", path, "--json")
+    assert described.exit_code == 1 and json.loads(described.stdout)["ok"] is False
+    compared = call("compare", path, "--scheme", "plus")
+    assert compared.exit_code == 1 and "stopped at t" in compared.stderr
+
+
+def test_compare_measures_the_orders_of_named_schemes(spring):
+    result = call("compare", spring, "--scheme", "plus", "--scheme", "midpoint", "--json")
+    assert result.exit_code == 0, result.output
+    orders = {entry["scheme"]: entry["order"] for entry in json.loads(result.stdout)["schemes"]}
+    assert orders == pytest.approx({"plus": 1, "midpoint": 2}, abs=0.1)
+
+
+def test_compare_finds_the_schemes_that_suit_a_system():
+    result = call("compare", "vortices", "--set", "steps=20", "--json")
+    assert result.exit_code == 0, result.output  # the (+) scheme and its kind take Lagrange–Dirac systems only
+    assert [entry["scheme"] for entry in json.loads(result.stdout)["schemes"]] == ["method1", "method2"]
+
+
+def test_compare_finds_every_lagrangian_scheme_for_nonholonomic_mechanics():
+    result = call("compare", "knife-edge", "--set", "steps=20", "--json")
+    assert result.exit_code == 0, result.output
+    orders = {entry["scheme"]: entry["order"] for entry in json.loads(result.stdout)["schemes"]}
+    expected = {"plus": 1, "minus": 1, "midpoint": 2, "trapezoidal": 2, "method1": 2, "method2": 2}
+    assert orders == pytest.approx(expected, abs=0.1)
+
+
+def test_compare_has_the_exact_energy_of_discrete_gradients_where_there_is_a_hamiltonian():
+    result = call("compare", "magnetic-spherical-pendulum", "--set", "steps=200", "--json")
+    assert result.exit_code == 0, result.output
+    entries = {entry["scheme"]: entry for entry in json.loads(result.stdout)["schemes"]}
+    assert list(entries) == ["method1", "method2", "gradient"] and entries["gradient"]["energy_band"] < 1e-14
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("run", "keplr"), "did you mean 'kepler'"),
+        (("run", "nowhere.py"), "there is no file nowhere.py"),
+        (("run", "kepler", "--set", "steps"), "key=value"),
+        (("run", "kepler", "--set", "stpes=3"), "did you mean steps"),
+        (("run", "kepler", "--set", "steps=0"), "steps must be a whole number"),
+        (("run", "kepler", "--set", "step=1 2"), "cannot read the value '1 2' of step"),
+        (("run", "kepler", "--set", "q[2]=1"), "q has no entry '2'"),
+        (("run", "kepler", "--set", "q=[[]"), "cannot read the value"),
+        (("run", "kepler", "--set", "q=['a']"), "q must be a list of numbers"),
+        (("run", "kepler", "--set", "q=[0,0]"), "domain"),
+        (("run", "rolling-disk", "--set", "v=[1,0,0,0]"), "off the constraint"),
+        (("run", "kepler", "--scheme", "plsu"), "did you mean 'plus'"),
+        (("run", "kepler", "--scheme", "plus()("), "cannot read the scheme"),
+        (("run", "vortices", "--scheme", "plus"), "PhaseSpaceLagrangian"),
+        (("run", "kepler", "--out", "somewhere.txt"), ".zarr or .nc"),
+        (("run", "kepler", "--out", "no/such/folder.nc"), "the folder no/such does not exist"),
+        (("compare", "kepler", "--scheme", "midpiont"), "did you mean 'midpoint'"),
+        (("reproduce", "XY"), "choose one of PY"),
+    ],
+)
+def test_mistakes_end_with_a_sentence_and_a_status(arguments, message):
+    result = call(*arguments)
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
+    assert message in result.stderr and result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("x = (", "line 1"),
+        ("\nimport dirax\n1 / 0\n", "line 3: ZeroDivisionError"),
+        ("initial = {}", "does not define `system`"),
+        ("system = 3\ninitial = dict(q=[0.0])", "`system`"),
+        ("import dirax as dx\nsystem = dx.LagrangeDirac(lambda q, v: v @ v)\ninitial = dict(q=[0.0], w=[1.0])", "`initial`"),
+        (
+            "import dirax as dx\nsystem = dx.LagrangeDirac(lambda q, v: v @ v)\ninitial = dict(q=[0.], v=[0.])\nscheme = 1",
+            "`scheme`",
+        ),
+    ],
+)
+def test_a_file_that_does_not_fit_is_explained(tmp_path, text, message):
+    path = tmp_path / "bad.py"
+    path.write_text(text, encoding="utf-8")
+    result = call("run", path)
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
+    assert message in result.stderr and "bad.py" in result.stderr and len(result.stderr.splitlines()) == 1
+
+
+def test_schemes_are_read_without_evaluating_anything():
+    scheme = scheme_from_text("DiscreteDirac(map=Theta(0.25), constraints='resolve')")
+    assert isinstance(scheme, dx.DiscreteDirac) and (scheme.map.theta, scheme.constraints) == (0.25, "resolve")
+    composed = scheme_from_text("Composition(midpoint, [0.5, 0.5])")
+    assert isinstance(composed, dx.Composition) and composed.coefficients == (0.5, 0.5)
+    assert scheme_from_text("LagrangeDAlembert") == dx.LagrangeDAlembert()
+    with pytest.raises(ValueError, match=r"cannot read .*__import__"):
+        scheme_from_text("LagrangeDAlembert(__import__('os').name)")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["print(1)", "Theta(0.5)", "(lambda: 0)()", "LagrangeDAlembert(**{})", "dx.PlusLagrangeDirac()", "midpoint.scheme", "3", ""],
+)
+def test_what_is_not_a_scheme_is_refused(text):
+    with pytest.raises(ValueError, match=r"scheme|write every argument"):
+        scheme_from_text(text)
+
+
+def test_settings_change_data_params_and_run():
+    disk = gallery.get("rolling-disk")
+    example, options = changed(disk, ["q[φ]=0.5", "v[0]=-1", "m=2", "steps=1e3", "step=0.01", "save_every=5", "engine=xla"])
+    assert example.initial["q"].tolist() == [0.0, 0.0, 0.0, 0.5] and example.initial["v"][0] == -1.0
+    assert example.params == {**disk.params, "m": 2.0} and isinstance(example.params["m"], float)
+    assert (example.steps, example.step, options) == (1000, 0.01, {"save_every": 5, "engine": "xla"})
+    assert disk.initial["q"][3] == pytest.approx(np.pi / 3) and disk.params["m"] == 1.0  # the gallery's own stays as it was
+    example, _ = changed(disk, ["p=[1, 2, 3, 4]"])
+    assert set(example.initial) == {"q", "p"}
+    example, _ = changed(disk, ["q0=[0,0,0,0]", "q1=[0,0,0,1]"])
+    assert set(example.initial) == {"q0", "q1"}
+
+
+@pytest.mark.parametrize("name", gallery.names())
+def test_settings_keep_what_is_not_a_number(name):
+    example, _ = changed(gallery.get(name), ())
+    for key, value in gallery.get(name).initial.items():
+        assert type(example.initial[key]) is type(value) if isinstance(value, bool) else np.all(example.initial[key] == value)
+
+
+def test_reproduce_writes_and_prints_and_fails_where_a_number_differs(tmp_path, monkeypatch):
+    def paper(verdict):
+        row = reproduction.Row("a quantity", "1", "2", verdict, "a note", {"value": np.float64(2.0)})
+        return reproduction.Reproduction("PY", "A paper", (row, row), {"figure_1": new_figure()[0]})
+
+    monkeypatch.setattr(peng_yoshimura, "reproduction", lambda progress: paper(reproduction.WRONG))
+    good = call("reproduce", "py", "--out", tmp_path)
+    assert good.exit_code == 0 and "paper is wrong" in good.stdout and good.stdout.count("[1] a note") == 1
+    assert (tmp_path / "PY" / "figure_1.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads((tmp_path / "table.json").read_text("utf-8"))[0]["rows"][0]["numbers"] == {"value": 2.0}
+    assert "a quantity" in (tmp_path / "table.txt").read_text("utf-8")
+    monkeypatch.setattr(peng_yoshimura, "reproduction", lambda progress: paper(reproduction.DIFFERS))
+    bad = call("reproduce", "PY", "--out", tmp_path, "--json")
+    assert bad.exit_code == 1 and json.loads(bad.stdout)[0]["ok"] is False and "DIFFERS" in bad.stderr

@@ -1,0 +1,148 @@
+"""Derivatives left to the scalar graph are JAX's; functions of the user are traced once; outside a graph nothing changes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.geometry.numerics import arc_over_sine, norm, radial
+from dirax.program.evaluation.on_host import on_host
+from dirax.program.roots import nearest_root
+from dirax.program.tracing import along, call, gradient, in_scalars, jacobian, once
+
+POINT = np.array([0.3, 0.9, -0.4])
+SCALARS = {
+    "polynomial": lambda q: q[0] ** 2 * q[1] - q[1] ** 3 / 3 + q[2] ** 5 + q[0] ** -3,
+    "powers": lambda q: q[1] ** 2.5 / q[0] ** 0.5 + (q @ q) ** 1.5 + q[1] ** q[0],
+    "functions": lambda q: jnp.sin(q[0]) * jnp.exp(q[1]) / jnp.cosh(q[2]) + jnp.arctan2(q[0], q[2]) * jnp.log1p(q[1]),
+    "matrices": lambda q: q @ jnp.outer(q, jnp.tanh(q)) @ q + jnp.sum(jnp.linalg.norm(jnp.stack([q, 2 * q]), axis=1)),
+    "indices": lambda q: q[jnp.array([2, 0, 1])] @ q.at[1].set(q[0] * q[2]),
+    "branches": lambda q: (
+        jnp.where(q[0] > 0.1, jnp.sqrt(jnp.where(q[0] > 0.1, q[0], 1.0)), q[1]) + jnp.where(q[2] > 0, q[0], q[1])
+    ),
+    "a rule of its own": lambda q: radial(1, q @ q) * radial(0, 2 * q[0] ** 2) + norm(q) ** 3,
+    "two arguments with a rule": lambda q: arc_over_sine(0, q[0] ** 2, 1 - q[0] ** 2) * q[1],
+    "a corner": lambda q: jnp.abs(q[2]) * jnp.maximum(q[0], q[1]),
+    "a solve": lambda q: q @ jnp.linalg.solve(jnp.diag(1 + q**2) + 0.1, q),
+    "no dependence": lambda q: jnp.ones(()) + 0.0 * jnp.floor(q[0]),
+}
+VECTORS = {
+    "wide": lambda q: jnp.stack([q @ q, q[0] * q[1]]),
+    "tall": lambda q: jnp.concatenate([q * q[0], jnp.sin(q), jnp.where(q > 0, q**3, -q)]),
+    "a matrix": lambda q: jnp.outer(q, jnp.exp(q)),
+}
+
+
+def by_jax(function, *point):
+    """The same by XLA."""
+    return np.asarray(jax.jit(function)(*(point or (POINT,))))
+
+
+def on_graph(function, *point):
+    """The value of a function that is traced in scalars, at one point."""
+    found = on_host(function, [np.asarray(x, float)[None] for x in point], (function,))
+    assert found is not None
+    return jax.tree.map(lambda leaf: leaf[0], found)
+
+
+@pytest.mark.parametrize("name", SCALARS)
+def test_gradients_are_those_of_jax(name):
+    f = SCALARS[name]
+    assert on_graph(gradient(f), POINT) == pytest.approx(by_jax(jax.grad(f)), rel=1e-14, abs=1e-14)
+
+
+@pytest.mark.parametrize("name", ["polynomial", "powers", "branches", "a rule of its own", "a corner"])
+def test_second_derivatives_are_those_of_jax(name):
+    f = SCALARS[name]
+    assert on_graph(jacobian(gradient(f)), POINT) == pytest.approx(by_jax(jax.hessian(f)), rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", VECTORS)
+@pytest.mark.parametrize("reverse", [False, True])
+def test_jacobians_and_directions_are_those_of_jax(name, reverse):
+    f, v = VECTORS[name], np.array([1.0, -2.0, 0.5])
+    expected = by_jax(jax.jacfwd(f))
+    assert on_graph(jacobian(f, reverse=reverse), POINT) == pytest.approx(expected, rel=1e-14, abs=1e-14)
+    assert on_graph(lambda q, v: along(f, (q,), (v,)), POINT, v) == pytest.approx(expected @ v, rel=1e-14, abs=1e-14)
+
+
+def test_a_function_of_several_arguments_and_of_what_it_captured():
+    def slopes(q, h, k):
+        double = 2 * q  # captured, and traced
+        return gradient(lambda q, h: k * jnp.sum(jnp.sin(q * double)) * h**3, (0, 1))(q, h)
+
+    dq, dh = on_graph(slopes, POINT, 0.5, 3.0)
+    assert dq == pytest.approx(3 * 0.125 * 2 * POINT * np.cos(2 * POINT**2), rel=1e-14)
+    assert dh == pytest.approx(3 * 3 * 0.25 * np.sum(np.sin(2 * POINT**2)), rel=1e-14)
+
+
+def test_an_operand_that_is_itself_an_expression_is_not_looked_into():
+    """d/dy (−y z) at y = −x is −z, though −(−x) z is x z on the graph."""
+    f = lambda x, z: gradient(lambda y: -y * z)(-x)
+    assert on_graph(f, 2.0, 3.0) == -3.0
+
+
+def test_the_primitive_is_differentiated_and_vectorized_by_jax():
+    """A function that was traced in scalars may come under any transformation."""
+    f = SCALARS["functions"]
+    with in_scalars():
+        jaxpr = jax.make_jaxpr(gradient(f))(POINT)
+    assert "dirax_derivative" in str(jaxpr)
+    evaluated = lambda q: jax.extend.core.jaxpr_as_fun(jaxpr)(q)[0]
+    rows = jnp.stack([POINT, POINT + 0.1])
+    assert jax.jit(evaluated)(POINT) == pytest.approx(by_jax(jax.grad(f)), rel=1e-14)
+    assert evaluated(POINT) == pytest.approx(by_jax(jax.grad(f)), rel=1e-14)
+    assert by_jax(jax.vmap(evaluated), rows) == pytest.approx(by_jax(jax.vmap(jax.grad(f)), rows), rel=1e-14)
+    assert by_jax(jax.jacfwd(evaluated)) == pytest.approx(by_jax(jax.hessian(f)), rel=1e-12)
+    assert by_jax(jax.jacrev(evaluated)) == pytest.approx(by_jax(jax.hessian(f)), rel=1e-12)
+
+
+def test_outside_a_graph_jax_differentiates():
+    assert "dirax_derivative" not in str(jax.make_jaxpr(gradient(SCALARS["polynomial"]))(POINT))
+    with pytest.raises(TypeError, match="scalar"), in_scalars():
+        jax.make_jaxpr(gradient(lambda q: q))(POINT)
+
+
+def test_a_function_is_traced_once_within_a_run_and_again_in_the_next():
+    traced = []
+
+    def lagrangian(q, v):
+        traced.append(1)
+        return v @ v / 2 - jnp.sum(1 - jnp.cos(q)) * SLOPE[0]
+
+    def end():
+        system = dx.LagrangeDirac(lambda q, v: lagrangian(q, v))
+        return dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.0], step=0.1, steps=20, engine="native").q[-1, 0]
+
+    SLOPE = [1.0]
+    first, count = end(), len(traced)
+    assert count == 1
+    SLOPE[0] = 4.0  # what a function reads from elsewhere is read again for a new system
+    assert end() != first
+    assert len(traced) == 2 * count
+
+
+def test_calls_outside_a_run_are_plain():
+    seen = []
+    function = lambda x: seen.append(x) or x
+    assert call(function, 1.0) == 1.0
+    with once():
+        call(function, 1.0), call(function, 1.0)
+    assert len(seen) == 2
+
+
+def test_derivatives_of_a_root_of_first_and_second_order():
+    """u = the root of u³ + a u = b: u' = 1/(3u² + a) by b, −u/(3u² + a) by a; second derivatives from these."""
+
+    def root(a, b):
+        return nearest_root(lambda u: u**3 + a * u - b, jnp.ones(1))[0]
+
+    a, b = 0.7, 2.1
+    u = float(by_jax(root, a, b))
+    assert u**3 + a * u == pytest.approx(b, rel=1e-15)
+    slope = 1 / (3 * u**2 + a)
+    assert by_jax(jax.grad(root), a, b) == pytest.approx(-u * slope, rel=1e-14)
+    assert by_jax(jax.jacfwd(root, 1), a, b) == pytest.approx(slope, rel=1e-14)
+    assert by_jax(jax.grad(jax.grad(root, 1), 1), a, b) == pytest.approx(-6 * u * slope**3, rel=1e-13)
+    assert jax.jit(jax.vmap(jax.grad(root, 1), (None, 0)))(a, jnp.array([b, b])) == pytest.approx([slope] * 2, rel=1e-14)

@@ -1,0 +1,77 @@
+"""Functions through the scalar graph and NumPy against JAX itself: what a start computes without a compiler."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.engines import linearization
+from dirax.engines.linearization import linearized
+from dirax.program.evaluation import host_function as module
+from dirax.program.evaluation.on_host import on_host
+from dirax.program.linear_solves import scaled_pseudo_inverse, solve
+from dirax.program.roots import nearest_root
+from dirax.schemes.step import Shape, make_step_equation
+
+symmetric = lambda a: a + a.T
+CASES = {
+    "singular values": lambda a, x: (scaled_pseudo_inverse(a @ a.T)[0] @ x, jnp.linalg.svd(a, compute_uv=False)),
+    "eigenvalues": lambda a, x: jnp.linalg.eigh(symmetric(a))[0] + jnp.linalg.pinv(symmetric(a)) @ x,
+    "a root": lambda a, x: nearest_root(lambda u: jnp.sinh(u) + 0.1 * jnp.sin(a @ u) - x, jnp.zeros(3)),
+    "a root by halved steps": lambda a, x: nearest_root(lambda u: jnp.arctan(9.0 * (u - x)) + a[0, 0] ** 2 * (u - x), x + 2.0),
+    "the best point where there is no root": lambda a, x: nearest_root(lambda u: u * u + x[:1] * a[0, :1], jnp.ones(1)),
+    "linear equations": lambda a, x: (
+        solve(a, x),
+        solve(a @ a, a.T),
+        jnp.isfinite(solve(a * jnp.maximum(a[0, 0], 0.0), x)).astype(float),
+    ),
+    "linear equations side by side": lambda a, x: (
+        jax.vmap(lambda row: solve(a, row))(a),
+        jax.vmap(lambda s: solve(a + s * jnp.eye(3), x))(jnp.arange(2.0)),
+        jax.grad(lambda x: solve(a, x**2) @ x)(x),
+    ),
+    "a derivative of linear equations": lambda a, x: jax.jacfwd(lambda x: solve(a + jnp.diag(x), x**2))(x),
+    "a loop of unknown length": lambda a, x: jax.lax.while_loop(
+        lambda c: jnp.max(jnp.abs(c[0])) > 1e-3, lambda c: (c[0] / 3, c[1] + 1), (a @ x, 0)
+    ),
+    "a derivative through a root": lambda a, x: jax.jacfwd(
+        lambda x: nearest_root(lambda u: u**3 + u + 0.1 * (a @ u) - x, jnp.zeros(3))
+    )(x),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_entries_of_a_batch_are_what_jax_computes(name, monkeypatch):
+    monkeypatch.setattr(module, "LANES", 4)
+    rng = np.random.default_rng(3)
+    a, x = rng.normal(size=(7, 3, 3)), rng.normal(size=(7, 3))
+    found, expected = on_host(CASES[name], [a, x], (), name), jax.jit(jax.vmap(CASES[name]))(a, x)
+    for mine, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-11, atol=1e-12)
+
+
+def test_what_has_no_rule_is_left_to_the_compiler():
+    x = np.ones((2, 3))
+    assert on_host(jnp.sort, [x], ()) is None
+    assert jax.jit(lambda y: jnp.zeros(()) if on_host(lambda x: x * y, [x], ()) is None else y)(2.0) == 0.0
+
+
+@pytest.mark.parametrize("limit", [0, 10**9], ids=["on the graph", "in numbers"])
+def test_the_first_step_is_linearized_as_jax_does_it(limit, monkeypatch):
+    monkeypatch.setattr(linearization, "IN_NUMBERS", limit)
+    system = dx.LagrangeDirac(
+        lambda q, v, g: v @ v / 2 * (1 + q[0] ** 2) + g * jnp.where(q[1] > 0, jnp.cos(q[1]), 1 - q[1] ** 2 / 2),
+        lambda q: jnp.stack([jnp.sin(q)]),
+    )
+    equation: Any = make_step_equation(dx.LagrangeDAlembert(), system, Shape(2, 1))
+    u, state = np.random.default_rng(1).normal(size=(2, 5, 4))
+    u, t, h, g = u[:, :3], np.zeros(5), np.full(5, 0.1), np.linspace(1, 2, 5)
+    found = linearized(equation, g, True, u, state, t, h)
+    assert found is not None
+    expected = jax.vmap(lambda u, x, g: equation.residual(u, x, 0.0, 0.1, g))(u, state, g)
+    slopes = jax.vmap(lambda u, x, g: jax.jacfwd(lambda u: equation.residual(u, x, 0.0, 0.1, g))(u))(u, state, g)
+    np.testing.assert_allclose(found[0], expected, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(found[1], slopes, rtol=1e-12, atol=1e-12)

@@ -1,0 +1,103 @@
+"""User functions: with or without params, named in errors; more of their errors in test_bad_input.py."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dirax.program.user_functions import UserFunction, check_finite, is_traced
+
+Q = jnp.array([1.0, 2.0])
+
+
+def named(q, v, params):
+    return params * (q @ v)
+
+
+class Callable:
+    def __call__(self, q, v):
+        return q @ v
+
+
+class Learned(eqx.Module):
+    """Holds an array, so it has no hash."""
+
+    weight: jax.Array
+
+    def __call__(self, q, v):
+        return self.weight * (q @ v)
+
+
+@pytest.mark.parametrize(
+    "function, takes_params, value",
+    [
+        (lambda q, v: q @ v, False, 5.0),
+        (lambda q, v, params: params * (q @ v), True, 15.0),
+        (lambda q, v, whatever: whatever * (q @ v), True, 15.0),  # the last of three required ones is params
+        (lambda q, v, params=2.0: params * (q @ v), True, 15.0),
+        (lambda q, v, scale=2.0: scale * (q @ v), False, 10.0),  # an option of the user's own, not params
+        (lambda *all: all[0] @ all[1], False, 5.0),
+        (functools.partial(lambda k, q, v: k * (q @ v), 4.0), False, 20.0),
+        (named, True, 15.0),
+        (Callable(), False, 5.0),
+        (Learned(jnp.array(7.0)), False, 35.0),
+        (jax.jit(lambda q, v: q @ v), False, 5.0),
+        (jnp.dot, False, 5.0),
+    ],
+)
+def test_params_are_passed_to_those_who_take_them(function, takes_params, value):
+    wrapped = UserFunction(function, "lagrangian", ("q", "v"))
+    assert wrapped.takes_params is takes_params
+    assert wrapped(Q, Q, 3.0) == value
+    assert wrapped.shape(Q, Q, 3.0).shape == ()
+    hash(wrapped)
+
+
+def test_equal_functions_are_equal():
+    """So that compiled code is reused when a system is made again from the same functions."""
+    one, other = (UserFunction(named, "lagrangian", ("q", "v")) for _ in range(2))
+    assert one == other and hash(one) == hash(other)
+    assert one != UserFunction(named, "hamiltonian", ("q", "v"))
+
+
+def test_it_shows_the_users_own_name():
+    assert repr(UserFunction(named, "lagrangian", ("q", "v"))) == "named(q, v, params)"
+    assert repr(UserFunction(lambda q, v: 0.0, "lagrangian", ("q", "v"))) == "lambda(q, v)"
+    assert repr(UserFunction(Callable(), "lagrangian", ("q", "v"))) == "Callable(q, v)"
+
+
+def test_indices_are_checked_inside_control_flow_and_not_refused_when_right():
+    wrap = lambda f: UserFunction(f, "potential", ("q",))
+    last = wrap(lambda q: jax.lax.cond(q[0] > 0, lambda: q[-1], lambda: q[jnp.array([1, 0])].sum()))
+    assert last.shape(Q, None).shape == ()
+    loop = wrap(lambda q: jax.lax.fori_loop(0, 3, lambda i, s: s + q[i], 0.0))
+    with pytest.raises(ValueError, match=r"potential\(q\) reads an entry .* \(2,\).*out-of-bounds"):
+        loop.shape(Q, None)
+    assert wrap(lambda q: jax.lax.fori_loop(0, 2, lambda i, s: s + q[i], 0.0)).shape(Q, None).shape == ()
+
+
+def test_shapes_can_be_had_inside_transformations():
+    function = UserFunction(lambda q: q * q[1], "field", ("q",))
+    shapes = []
+    jax.jit(lambda q: shapes.append(function.shape(q, None).shape))(Q)
+    assert shapes == [(2,)]
+
+
+def test_returning_checks_the_shape_where_it_is_called():
+    checked = UserFunction(lambda q: q, "field", ("q",)).returning((2,))
+    np.testing.assert_array_equal(jax.jit(checked)(Q, None), Q)
+    with pytest.raises(ValueError, match=r"field\(q\) must return an array of shape \(2,\), but it returned shape \(3,\)"):
+        checked(jnp.ones(3), None)
+
+
+def test_finite_values_pass_and_traced_ones_are_not_looked_at():
+    check_finite("params", {"a": [1, 2.0, np.ones(3)], "b": None, "c": "text", "d": jnp.arange(2)})
+    jax.jit(lambda x: check_finite("x", x))(jnp.nan)
+
+
+def test_tracers_are_recognized_anywhere_in_a_tree():
+    assert not is_traced({"a": (1.0, Q)}, None)
+    assert jax.jit(lambda x: is_traced({"a": (1.0, [x])}))(Q).item() is True

@@ -1,0 +1,108 @@
+"""Plots show the solution's own numbers, labelled, and leave matplotlib as they found it."""
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from dirax import gallery
+from dirax.solution import plotting
+
+DISK = gallery.get("rolling-disk").simulate(step=0.01, steps=300)
+BATCH_Q = np.array([[0.0, 0.1 + 0.01 * k] for k in range(14)])
+BATCH = gallery.get("henon-heiles").simulate(q=BATCH_Q, v=np.full((14, 2), 0.2), steps=50)
+
+
+def lines(ax):
+    return [np.asarray(line.get_data()) for line in ax.lines if len(line.get_xdata()) > 1]
+
+
+def test_trajectory_in_the_plane_of_named_or_numbered_coordinates():
+    ax = plotting.plot_trajectory(DISK, "x", "y")
+    assert np.array_equal(lines(ax)[0], DISK.q[:, :2].T)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$x$", "$y$") and ax.get_aspect() == 1.0
+    ax = plotting.plot_trajectory(DISK, 3, -2)
+    assert np.array_equal(lines(ax)[0], DISK.q[:, [3, 2]].T)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$φ$ (rad)", "$θ$ (rad)") and ax.get_aspect() == "auto"
+
+
+def test_coordinates_momenta_and_phase_plane():
+    ax = plotting.plot_coordinate(DISK, "φ", field="p")
+    assert np.array_equal(lines(ax)[0], [DISK.t, DISK.p[:, 3]]) and ax.get_ylabel() == "$p_{φ}$"
+    ax = plotting.plot_phase(DISK, "θ")
+    assert np.array_equal(lines(ax)[0], [DISK.q[:, 2], DISK.p[:, 2]])
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$θ$ (rad)", "$p_{θ}$")
+
+
+def test_energy_with_its_error_on_a_logarithmic_scale():
+    figure = plotting.plot_energy(DISK)
+    left, right = figure.axes
+    energy = DISK.energy()
+    assert np.array_equal(lines(left)[0], [DISK.t, energy]) and right.get_yscale() == "log"
+    error = lines(right)[0][1]
+    assert np.isnan(error[0]) and error[1:] == pytest.approx(np.abs(energy[1:] / energy[0] - 1), rel=1e-9)
+
+
+def test_constraint_and_the_envelope_of_long_series():
+    ax = plotting.plot_constraint(DISK, ax=plotting.new_figure()[1])
+    residual = np.abs(DISK.constraint_residual()).max(axis=1)
+    shown = lines(ax)[0][1]
+    assert np.array_equal(shown[residual > 0], residual[residual > 0]) and np.all(np.isnan(shown[residual == 0]))
+    values = np.concatenate([[1.0], 1.0 + np.random.default_rng(0).random(12_345)])
+    _, ax = plotting.new_figure()
+    plotting.plot_error(ax, np.arange(values.size), values)
+    t, error = lines(ax)[0]
+    assert t.size == plotting.ENVELOPE and np.nanmax(error) == np.max(values - 1)
+    assert np.all(np.diff(t) >= 12) and np.all(np.diff(t) <= 13)
+    with pytest.raises(ValueError, match="no constraints"):
+        plotting.plot_constraint(BATCH)
+
+
+def test_a_batch_is_drawn_whole():
+    ax = plotting.plot_trajectory(BATCH, label="stars")
+    assert len(lines(ax)) == 14 and np.array_equal(lines(ax)[5], BATCH.q[5].T)
+    assert [text for text in ax.get_legend_handles_labels()[1]] == ["stars"]
+    assert all(line.get_alpha() for line in ax.lines if len(line.get_xdata()) > 1)
+
+
+def test_a_solution_without_names_shows_numbers_and_unknown_names_are_refused():
+    bare = gallery.get("kepler").simulate(steps=5)
+    bare.metadata.clear()
+    assert plotting.plot_trajectory(bare).get_xlabel() == "$q_{0}$"
+    with pytest.raises(ValueError, match="no coordinate 'z': give an index from 0 to 3 or one of x, y, θ, φ"):
+        plotting.plot_trajectory(DISK, "z")
+    with pytest.raises(ValueError, match="no coordinate 7"):
+        plotting.plot_coordinate(DISK, 7)
+
+
+def test_state_vectors_are_drawn_too():
+    body = gallery.get("rigid-body").simulate(steps=20)
+    assert np.array_equal(lines(plotting.plot_trajectory(body))[0], body.x[:, :2].T)
+    with pytest.raises(ValueError, match="phase plane"):
+        plotting.plot_phase(body)
+
+
+def test_no_global_state_is_touched(tmp_path):
+    before = dict(matplotlib.rcParams)
+    figure = plotting.plot_energy(DISK, label="disk")
+    figure.axes[0].legend()
+    plotting.save_figure(figure, tmp_path / "energy.png")
+    assert isinstance(figure, Figure) and dict(matplotlib.rcParams) == before
+    assert (tmp_path / "energy.png").read_bytes().startswith(b"\x89PNG")
+    again = plotting.plot_energy(DISK, figure=figure)
+    assert again is figure and len(figure.axes[0].lines) == 2
+
+
+def test_methods_of_the_solution_are_these_functions():
+    assert np.array_equal(lines(DISK.plot_trajectory("θ", "φ"))[0], DISK.q[:, [2, 3]].T)
+    assert len(DISK.plot_energy().axes) == 2 and DISK.plot_constraint().get_yscale() == "log"
+
+
+def test_picture_of_the_readme(tmp_path):
+    from dirax.gallery.picture import draw, picture
+
+    picture(tmp_path / "disk.png", step=0.02, end=2.0)
+    assert (tmp_path / "disk.png").stat().st_size > 10_000
+    left, right = draw(0.02, 2.0).axes
+    assert [line.get_label() for line in left.lines][-1] == "exact" and len(lines(left)) == 4
+    assert np.nanmax(lines(right)[2][1]) < 1e-3 < 1e-2 < min(np.nanmax(lines(right)[k][1]) for k in (0, 1))
