@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.engines import xla
+from dirax.engines.xla import engine as xla
 from dirax.engines.xla.lane import first_lane, take_step
 from dirax.schemes.step import Shape, make_step_equation
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.engines import xla
 from dirax.engines.result import NOT_FINITE, OK, Problem
+from dirax.engines.xla import engine as xla
 from dirax.schemes.step import Field, Shape, StepEquation, explicit_step, make_step_equation
 
 MIDPOINT = dx.LagrangeDAlembert()

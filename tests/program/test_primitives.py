@@ -132,7 +132,7 @@ UNSUPPORTED = {
 def test_unsupported_primitives_are_named_with_the_users_line(name):
     from dirax.engines.native import UnsupportedPrimitive
 
-    with pytest.raises(UnsupportedPrimitive, match=r"test_native_primitives\.py:\d+") as caught:
+    with pytest.raises(UnsupportedPrimitive, match=r"test_primitives\.py:\d+") as caught:
         traced(UNSUPPORTED[name], V)
     assert caught.value.primitive == name
 
