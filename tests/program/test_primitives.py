@@ -10,9 +10,10 @@ from jax.extend.core import ClosedJaxpr
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines.native.ir.compiled_function import compiled
+from dirax.program.derivatives import jacobian
 from dirax.program.graph import Graph
 from dirax.program.interpreter import Interpreter, Unavailable
-from dirax.program.operations import OPERATIONS, jacobian
+from dirax.program.operations import OPERATIONS
 
 
 def traced(function, *shapes):
@@ -132,7 +133,7 @@ UNSUPPORTED = {
 def test_unsupported_primitives_are_named_with_the_users_line(name):
     from dirax.engines.native import UnsupportedPrimitive
 
-    with pytest.raises(UnsupportedPrimitive, match=r"test_native_primitives\.py:\d+") as caught:
+    with pytest.raises(UnsupportedPrimitive, match=r"test_primitives\.py:\d+") as caught:
         traced(UNSUPPORTED[name], V)
     assert caught.value.primitive == name
 
