@@ -10,9 +10,10 @@ from jax.extend.core import ClosedJaxpr
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines.native.ir.compiled_function import compiled
+from dirax.program.derivatives import jacobian
 from dirax.program.graph import Graph
 from dirax.program.interpreter import Interpreter, Unavailable
-from dirax.program.operations import OPERATIONS, jacobian
+from dirax.program.operations import OPERATIONS
 
 
 def traced(function, *shapes):

@@ -18,9 +18,9 @@ from dirax.engines.native.loops.newton_step import newton_correction
 from dirax.engines.native.loops.step_loop import Plan, kernel_module
 from dirax.engines.step_program import Inputs, Parameters, TracedEquation, inputs, parameters, trace
 from dirax.program import graph as graph_module
+from dirax.program.derivatives import jacobian
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
-from dirax.program.operations import jacobian
 
 KEPT = 128
 """Programs kept in memory."""

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from dirax.program.derivatives import partials
 from dirax.program.graph import NODE_LIMIT, Graph
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable
-from dirax.program.operations import partials
 
 LANES = 1024
 """Entries of a batch that are computed at a time, which bounds the memory that the nodes' values take."""

@@ -9,9 +9,9 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
+from dirax.program.derivatives import gradient, jacobian
 from dirax.program.graph import Graph
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, Unsupported, elementwise, rule
-from dirax.program.operations import gradient, jacobian
 from dirax.program.rules import formulas
 
 KEPT = 256
