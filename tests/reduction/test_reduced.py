@@ -96,7 +96,7 @@ def test_mistakes():
         dx.simulate(dx.reduce(tied, dx.LinearConnection([1])), scheme, **run)
     for other, way in (
         (3, "int was given"),
-        (dx.PhaseSpaceLagrangian(lambda q: q, lambda q: q @ q), r"give system\.lagrange_dirac"),
+        (dx.PortHamiltonian(lambda x: x @ x, np.zeros((2, 2))), "PortHamiltonian was given"),
     ):
         with pytest.raises(TypeError, match=r"dx\.reduce takes a dx\.LagrangeDirac .*" + way):
             dx.reduce(other, dx.LinearConnection([0]))

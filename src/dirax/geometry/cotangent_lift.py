@@ -87,6 +87,10 @@ class CotangentLift(AbstractDiscretizationMap):
             raise TypeError("Only maps on vector spaces can be lifted twice: covectors of T*Q have no representation.")
         return Euclidean(ambient_dimension) if isinstance(base, Euclidean) else CotangentBundle(base)
 
+    @property
+    def base_fraction(self):
+        return self.map.base_fraction
+
     def forward(self, x, v):
         (q, p), (q_dot, p_dot) = jnp.split(x, 2), jnp.split(v, 2)
         base = self.map.manifold(q.shape[0])

@@ -41,6 +41,12 @@ class AbstractDiscretizationMap(eqx.Module):
     def backward(self, x0: Vector, x1: Vector) -> Pair:
         """R_d⁻¹(x0, x1)."""
 
+    @property
+    def base_fraction(self) -> float:
+        """The fraction of a step at which the base point x of R_d⁻¹(x0, x1) lies: ½, the choice for symmetric maps, unless the
+        map says otherwise. Explicit time is taken there."""
+        return 0.5
+
     @abstractmethod
     def reach(self, x: Vector, v: Vector) -> Scalar:
         """‖v‖ in units of the injectivity radius at x: the map and its inverse are used where this is below 1."""
@@ -90,6 +96,10 @@ class Theta(AbstractDiscretizationMap):
     def manifold(self, ambient_dimension):
         return Euclidean(ambient_dimension)
 
+    @property
+    def base_fraction(self):
+        return self.theta
+
     def forward(self, x, v):
         return x - self.theta * v, x + (1.0 - self.theta) * v
 
@@ -128,6 +138,10 @@ class RiemannianExp(AbstractDiscretizationMap):
     def manifold(self, ambient_dimension):
         return _same_size(self.space, ambient_dimension)
 
+    @property
+    def base_fraction(self):
+        return self.theta
+
     def forward(self, x, v):
         return tuple(jax.vmap(lambda time: self.space.exp(x, time * v))(_times(self.theta)))
 
@@ -154,6 +168,10 @@ class LieGroupExp(AbstractDiscretizationMap):
 
     def manifold(self, ambient_dimension):
         return _same_size(self.group, ambient_dimension)
+
+    @property
+    def base_fraction(self):
+        return self.theta
 
     def forward(self, x, v):
         xi = self.group.to_algebra(x, v)
@@ -208,6 +226,12 @@ class ProductMap(AbstractDiscretizationMap):
     def manifold(self, ambient_dimension):
         factors = [map.manifold(size) for map, size in zip(self.maps, self.sizes, strict=True)]
         return _same_size(Product(*factors), ambient_dimension)  # pyright: ignore[reportArgumentType]
+
+    @property
+    def base_fraction(self):
+        """That of its maps where they agree, else ½."""
+        fractions = {map.base_fraction for map in self.maps}
+        return fractions.pop() if len(fractions) == 1 else 0.5
 
     def forward(self, x, v):
         return self._joined("forward", x, v)

@@ -80,6 +80,10 @@ class ProjectedMap(AbstractDiscretizationMap):
     def manifold(self, ambient_dimension):
         return Submanifold(self.projector, ambient_dimension, self.dimension)
 
+    @property
+    def base_fraction(self):
+        return self.map.base_fraction
+
     def forward(self, x, v):
         x0, x1 = self.map.forward(x, v)
         return self.projector(x0), self.projector(x1)

@@ -232,11 +232,6 @@ def _way_out(error: Exception) -> str:
     return "."
 
 
-def at_time(function: Callable, t: Any, *values: Any):
-    """`function.at(t, *values)` of a user's function, `function(*values)` of any other."""
-    return function.at(t, *values) if isinstance(function, UserFunction) else function(*values)
-
-
 def is_traced(*trees: Any) -> bool:
     """Whether any leaf is a JAX tracer: then values cannot be inspected and value checks are skipped."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))

@@ -14,7 +14,8 @@ from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, traced_once
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.lie_poisson import LiePoisson, checked_point
-from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.systems.constraints import no_constraint
+from dirax.systems.system import AbstractSystem, refuse_start
 
 SINGULAR = 1e-13
 """An inertia with singular values below this, relative to the largest, is singular."""
@@ -118,6 +119,8 @@ class EulerPoincare(AbstractSystem):
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
         """(d + r, m)."""
+        if set(data) - {"t"} == {"q"}:
+            refuse_start(self, data, "x", "q, v", "q, p")
         data = self._on_the_dual(data, params)
         momentum, a = checked_point(self.space, data, "EulerPoincare", "body.state(xi, a)")
         d, given = self.space.dimension, self._given(momentum, a)

@@ -11,8 +11,11 @@ from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.geometry.structures import DiracStructure
 from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction
+from dirax.systems.constraints import no_constraint
 from dirax.systems.dirac_system import DiracSystem
-from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.systems.forms import RelationForm
+from dirax.systems.shape import Shape
+from dirax.systems.system import AbstractSystem
 
 
 class LiePoisson(AbstractSystem):
@@ -51,6 +54,9 @@ class LiePoisson(AbstractSystem):
         hamiltonian = lambda x, params: self.value(*self.space.split(x), params)
         return DiracSystem(DiracStructure.from_bivector(self.space.bivector), hamiltonian)
 
+    def relation_form(self, shape: Shape) -> RelationForm:
+        return self.dirac_system().relation_form(shape)
+
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
         """(d + r, 0)."""
         momentum, a = checked_point(self.space, data, "LiePoisson", "jnp.concatenate([mu, a])")
@@ -60,7 +66,9 @@ class LiePoisson(AbstractSystem):
         return self.space.size, 0
 
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
-        return {"x": data["x"], "v": self.slopes(*self.space.split(data["x"]), params)[0]}
+        x, dirac = data["x"], self.dirac_system()
+        velocity = dirac.hamiltonian_vector(x, dirac.differential(x, params), params)
+        return {"x": x, "velocity": velocity, "v": self.slopes(*self.space.split(x), params)[0]}
 
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, "0"]:
         return no_constraint()

@@ -8,9 +8,6 @@ from dirax.reduction.connection import AbstractConnection
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.left_invariant import reduced_by_left_translations
 from dirax.reduction.reduced import ReducedLagrangeDirac
-from dirax.systems.lagrange_dirac import LagrangeDirac
-from dirax.systems.manifold_lagrangian import ManifoldLagrangian
-from dirax.systems.nonholonomic import as_lagrange_dirac
 from dirax.systems.system import AbstractSystem
 
 
@@ -40,10 +37,10 @@ def reduce(system: Any, connection: Any, params: Any = None) -> ReducedLagrangeD
     """
     if isinstance(connection, AbstractLieGroup):
         return reduced_by_left_translations(system, connection, params)
-    system = as_lagrange_dirac(system)
-    if not isinstance(system, LagrangeDirac):
-        way = ": give system.lagrange_dirac()." if hasattr(system, "lagrange_dirac") else "."
-        way = ": write it in coordinates of its manifold, dx.in_coordinates." if isinstance(system, ManifoldLagrangian) else way
+    lagrangian = system.lagrangian_form() if isinstance(system, AbstractSystem) else None
+    if lagrangian is None:
+        on_manifold = isinstance(system, AbstractSystem) and system.manifold_form() is not None
+        way = ": write it in coordinates of its manifold, dx.in_coordinates." if on_manifold else "."
         raise TypeError(f"dx.reduce takes a dx.LagrangeDirac system, but one of type {type(system).__name__} was given{way}")
     if not isinstance(connection, AbstractConnection):
         way = f": dx.LinearConnection(fibre={list(connection.fibre)})." if isinstance(connection, Translations) else "."
@@ -52,4 +49,4 @@ def reduce(system: Any, connection: Any, params: Any = None) -> ReducedLagrangeD
             "the symmetry must be a connection such as dx.LinearConnection(fibre=[…]), or a Lie group such as dx.SO3(), but "
             f"{connection!r} was given{way}"
         )
-    return ReducedLagrangeDirac(system, connection)
+    return ReducedLagrangeDirac(lagrangian, connection)

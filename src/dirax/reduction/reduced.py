@@ -29,9 +29,15 @@ class ReducedLagrangeDirac(AbstractSystem):
     system: LagrangeDirac
     connection: AbstractConnection
 
-    def lagrange_dirac(self) -> LagrangeDirac:
-        """The unreduced system."""
+    def unreduced(self) -> LagrangeDirac:
+        """The system on Q that this one is the quotient of."""
         return self.system
+
+    def project_position(self, q: Array, v: Array, params: Any = None, t: Any = 0.0) -> Array:
+        return self.system.project_position(q, v, params, t)
+
+    def project_velocity(self, q: Array, v: Array, params: Any = None, t: Any = 0.0) -> Array:
+        return self.system.project_velocity(q, v, params, t)
 
     @property
     def constraints(self) -> Constraints:

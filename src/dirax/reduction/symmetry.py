@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from dirax.program.user_functions import UserFunction
 from dirax.reduction.actions import AbstractAction
 from dirax.systems.constraints import Constraints
-from dirax.systems.nonholonomic import as_lagrange_dirac
+from dirax.systems.system import AbstractSystem
 
 TOLERANCE = 1e-9
 """Largest defect, relative to the size of L and of its derivatives, of a symmetry."""
@@ -97,9 +97,17 @@ def checked_state(q: Any, v: Any) -> tuple[np.ndarray, np.ndarray]:
     return q, v
 
 
+def with_lagrangian(system: Any) -> Any:
+    """The system as one with a Lagrangian L(q, v), in coordinates or on a manifold; itself where it has none."""
+    if not isinstance(system, AbstractSystem):
+        return system
+    forms = (system.lagrangian_form(), system.manifold_form())
+    return next((form for form in forms if form is not None), system)
+
+
 def check_lagrangian(system: Any, q: np.ndarray, v: np.ndarray, params: Any) -> None:
     """Raise `TypeError` for a system without a Lagrangian L(q, v) that takes such q and v."""
-    lagrangian = getattr(as_lagrange_dirac(system), "lagrangian", None)
+    lagrangian = getattr(with_lagrangian(system), "lagrangian", None)
     if not isinstance(lagrangian, UserFunction) or lagrangian.arguments[-2:] != ("q", "v"):
         raise TypeError(
             "system must be one with a Lagrangian L(q, v), such as a dx.LagrangeDirac, but one of type "
@@ -121,7 +129,7 @@ def discrete_invariance(
 
 def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, params: Any) -> Invariance:
     """`check_invariance` at given times (samples,), points q and velocities v, (samples, n)."""
-    system = as_lagrange_dirac(system)
+    system = with_lagrangian(system)
     constraints: Any = getattr(system, "constraints", None)
 
     def pulled_back(g, t, q, v):
@@ -199,7 +207,7 @@ def translation_symmetries(
 
     Found from ∂L/∂q at `samples` random points within `radius` of (q, v); `cyclic_coordinates` are those along the axes.
     """
-    system = as_lagrange_dirac(system)
+    system = with_lagrangian(system)
     q, v = checked_state(q, np.zeros_like if v is None else v)
     check_lagrangian(system, q, v, params)
     random = np.random.default_rng(0)

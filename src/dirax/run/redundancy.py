@@ -9,7 +9,7 @@ import numpy as np
 
 from dirax.run.start import numerical_rank
 from dirax.systems.constraints import Constraints
-from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.system import AbstractSystem
 
 CONSISTENT = 1e-9
 """Largest residual of constraints, relative to 1 or to the velocity, that counts as satisfied."""
@@ -18,7 +18,7 @@ AWAY = 1e-3
 """How far from the initial point, relative to it, the rank of the constraints is compared."""
 
 
-def redundant_constraints(system: Any, matrices: Any, data: dict, params: Any, t0: float) -> tuple[int, ...]:
+def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, params: Any, t0: float) -> tuple[int, ...]:
     """The numbers of the constraints, in the order of `Solution.multipliers`, that follow from those before them, given the
     matrices [W; G] (m + c, n), or (B, m + c, n), at the initial points; `data` and `params` are those of the first trajectory.
 
@@ -51,7 +51,6 @@ def redundant_constraints(system: Any, matrices: Any, data: dict, params: Any, t
 
 def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> None:
     """Raise where the dependence is not one of the constraints as functions, or where they have no common solution."""
-    system = system.lagrange_dirac() if hasattr(system, "lagrange_dirac") else system
     constraints: Constraints = system.constraints
     total = matrices.shape[1]
     zero = np.flatnonzero(np.any(np.all(matrices == 0.0, axis=2), axis=0))
@@ -60,7 +59,7 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
             f"constraint {zero[0]} (in the order of the multipliers: one_forms, then holonomic) has no direction at the "
             f"initial data{where}: its row of [W; ∂g/∂q] is zero there. Leave it out, or start elsewhere."
         )
-    q = jnp.asarray(system.point(data) if isinstance(system, DiracSystem) else data["q"] if "q" in data else data["q0"])
+    q = jnp.asarray(system.point(data))
     near, positions, velocities = map(np.asarray, _nearby(system, q, params, jnp.asarray(t0, float)))
     worst = max((positions, velocities), key=lambda residual: np.max(np.abs(residual), initial=0.0))
     if np.max(np.abs(worst), initial=0.0) > CONSISTENT * (1 + np.max(np.abs(q))):

@@ -74,7 +74,7 @@ def simulate(
     params = _arrays(params)
     check_finite("params", params)
     batch = _batch_size(batch, params, batch_params)
-    system = system if inputs is None else _driven(system, inputs)
+    system = system if inputs is None else system.with_inputs(inputs)
 
     one: dict[str, Any] = {k: a[0] if a.ndim == 2 else a for k, a in data.items()}
     one_params = jax.tree.map(lambda leaf: leaf[0], params) if batch_params else params
@@ -224,14 +224,6 @@ def _check_kinds(system, scheme, engine) -> None:
             raise TypeError(f"{name} must be a dirax {name} such as {example}, but {came} was given{hint}.")
     if engine not in ENGINES:
         raise ValueError(f"engine must be one of {', '.join(map(repr, ENGINES))}, but {engine!r} was given.")
-
-
-def _driven(system, inputs):
-    if not hasattr(system, "with_inputs"):
-        raise TypeError(
-            f"inputs= drives an open dx.PortHamiltonian system, but the system is a {type(system).__name__}: leave it out."
-        )
-    return system.with_inputs(inputs)
 
 
 def _finite(value, name: str):

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.program.user_functions import at_time, check_finite, is_traced
+from dirax.program.user_functions import check_finite, is_traced
 
-KINDS = ({"q", "v"}, {"q", "p"}, {"q0", "q1"}, {"x"})
+KINDS = ({"q", "v"}, {"q", "p"}, {"q0", "q1"}, {"x"}, {"q"})
 OFF_CONSTRAINT = 1e-9
 """Largest admissible |W v|, relative to |v| where that is above 1, for initial data that are to satisfy the constraint."""
 
@@ -146,10 +146,8 @@ def _beginning(system, equation, two_points: bool, project: bool, first_step: bo
         elif "v" in complete:
             size = jnp.max(jnp.abs(complete["v"]))
         q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if two_points else (complete.get("q"), complete.get("v"))
-        known = lambda name, *given: hasattr(system, name) and all(x is not None for x in given)
-        lagrangian = at_time(system.lagrangian, t0, q, v, params) if known("lagrangian", q, v) else None
-        at = complete.get("x", q)
-        constraints = system.constraints.matrix(t0, at, params) if known("constraints", at) else None
+        lagrangian = None if q is None or v is None else system.lagrangian_value(t0, q, v, params)
+        constraints = system.constraints.matrix(t0, system.point(complete), params) if system.constraints.any else None
         t = t0 + int(two_points) * h
         solved = lambda u: stage.residual(u, state, t, fraction * h, params)
         residual, jacobian = (solved(u), jax.jacfwd(solved)(u)) if stage.unknowns and first_step else (None, None)
@@ -210,10 +208,10 @@ def _refuse_off_constraint(system: Any, start: Start) -> None:
             if start.first_step
             else "pass project=True to project them, or check_initial=False to take them as they are"
         )
-        more = f" {system.explained(_lanes(start.state, 1)[lane])}." if hasattr(system, "explained") else ""
+        more = system.explain(_lanes(start.state, 1)[lane])
         raise ValueError(
             f"the initial data{_which(bad)} are off the constraint, whose residual is "
-            f"{np.array2string(defect[lane], precision=4)} (largest {worst[lane]:.3g}); {way}.{more}"
+            f"{np.array2string(defect[lane], precision=4)} (largest {worst[lane]:.3g}); {way}.{more and f' {more}.'}"
         )
 
 

@@ -7,17 +7,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.schemes.step import Field, Shape
-from dirax.systems.dirac_system import DiracSystem
-from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.system import AbstractSystem
 
 
 class ConstraintRows:
     """The rows of [W; G] that enter the equations of a step, with their multipliers: `count` of them, the first
     `nonholonomic` from W and the last `holonomic` from G. Saved arrays have all m + c entries."""
 
-    def __init__(self, system: LagrangeDirac | DiracSystem, shape: Shape):
-        self.constraints, self.m, self.c = system.constraints, shape.m, shape.c
-        self.kept = tuple(i for i in range(shape.m + shape.c) if i not in shape.redundant)
+    def __init__(self, system: AbstractSystem, shape: Shape):
+        self.constraints, self.shape, self.m, self.c = system.constraints, shape, shape.m, shape.c
+        self.kept = shape.kept
         self.count = len(self.kept)
         self.nonholonomic = sum(i < shape.m for i in self.kept)
         self.holonomic = self.count - self.nonholonomic
@@ -44,15 +43,11 @@ class ConstraintRows:
 
     def pick(self, values: Array, first: int = 0) -> Array:
         """The kept ones of all constraints from number `first` on."""
-        kept = [i - first for i in self.kept if i >= first]
-        return values if len(kept) == values.shape[0] else jnp.stack([values[i] for i in kept])
+        return self.shape.pick(values, first)
 
     def all(self, multipliers: Float[Array, " k"]) -> Float[Array, " m+c"]:
         """The multipliers of all constraints: zero for the redundant ones."""
-        if self.count == self.m + self.c:
-            return multipliers
-        of = {row: multipliers[number] for number, row in enumerate(self.kept)}
-        return jnp.stack([of.get(i, jnp.zeros(())) for i in range(self.m + self.c)])
+        return self.shape.spread(multipliers)
 
     def fields(self) -> dict[str, Field]:
         """What a constrained run saves of each step."""
@@ -78,9 +73,7 @@ def independent_constraints(system: Any, shape: Shape) -> tuple[Any, int, Callab
     function that puts them among all of them."""
     if not shape.redundant:
         return system, shape.m + shape.c, lambda multipliers: multipliers
-    rows, g = ConstraintRows(system, shape), system.holonomic
-    picked = lambda x, params: rows.pick(g(x, params))
-    return DiracSystem(system.structure, system.hamiltonian.function, holonomic=picked), rows.count, rows.all
+    return system.independent(shape), len(shape.kept), shape.spread
 
 
 def step_constraints(rows: ConstraintRows, wd: Callable) -> Callable:

@@ -1,4 +1,4 @@
-"""A discretization map as a way to step: from a point and unknown velocity to the base point, velocity and end point."""
+"""A relation of (x, ẋ) discretized by a discretization map: the map as a way to step, and the equation of one step."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from dirax.geometry.cotangent_lift import CotangentLift
 from dirax.geometry.maps import AbstractDiscretizationMap, Theta
 from dirax.geometry.spaces import Euclidean
+from dirax.schemes.step import Field, StepEquation
+from dirax.systems.forms import RelationForm
 
 
 class Stepping(NamedTuple):
@@ -64,3 +66,52 @@ def _theta(map) -> tuple[float, ...] | None:
 
 def _weights(theta: tuple[float, ...], size: int):
     return theta[0] if len(set(theta)) == 1 else jnp.repeat(jnp.array(theta), size // 2)
+
+
+def discretized_relation(form: RelationForm, size: int, map: AbstractDiscretizationMap) -> StepEquation:
+    """The relation between (x, ẋ) of a system on M, discretized by a map on M: state x (`size`,), unknowns (ẋ, multipliers).
+
+    Explicit time and ports are taken at t + `map.base_fraction` h, the time of the base point.
+    """
+    step, m, fraction = stepping(map, size), form.multipliers, map.base_fraction
+    d = step.dimension
+
+    def residual(u, state, t, h, params):
+        x, velocity, _ = step.move(state, u[:d], h)
+        r = form.residual(x, velocity, u[d:], t + fraction * h, params)
+        if step.tangent is None:
+            return r
+        return jnp.concatenate([step.tangent(state, x) @ r[:size], r[size:]])
+
+    def advance(u, state, t, h, params):
+        return step.move(state, u[:d], h)[2]
+
+    def unpack(state, u, t, h, params):
+        row = form.node(state, params)
+        if form.saved:
+            row["multipliers"] = form.spread(u[d:])
+        if form.observed:
+            x, velocity, _ = step.move(state, u[:d], h)
+            row |= {seen.name: seen.at(x, velocity, t + fraction * h, params) for seen in form.observed}
+        return row
+
+    def start(data, h, params):
+        if "x" not in data:
+            raise ValueError("this scheme is a one-step method in x: start it from one point, not from two.")
+        return data["x"], jnp.concatenate([step.initial(data["x"], data["velocity"]), jnp.zeros(m)])
+
+    fields = {name: Field((size,)) for name in form.names}
+    if form.saved:
+        fields["multipliers"] = Field((form.saved,), "step", (form.axis,), "multipliers at the base point")
+    fields |= {seen.name: Field(seen.shape, "step", seen.dims, seen.description) for seen in form.observed}
+    return StepEquation(
+        start=start,
+        residual=residual,
+        advance=advance,
+        unpack=unpack,
+        state_size=size,
+        unknowns=d + m,
+        fields=fields,
+        labels=tuple(f"component {i} of the Dirac condition" for i in range(d)) + form.labels,
+        canonical=form.canonical,
+    )

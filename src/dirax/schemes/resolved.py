@@ -1,67 +1,13 @@
 """Method 2 of [BLM] on a final constraint manifold in coordinates x: the projected θ map."""
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 from dirax.program.tracing import call, gradient
-from dirax.program.user_functions import evaluated
-from dirax.schemes.constraint_rows import independent_constraints
-from dirax.schemes.step import Field, Shape, StepEquation
-from dirax.systems.constraint_chain import ResolvedSystem
-from dirax.systems.dirac_system import TINY_BRACKET, DiracSystem
-
-
-class FinalManifold(NamedTuple):
-    """M_f = {φ = 0} with what a step needs, functions of (x, params): constraints φ, `size` of them; the `field` ẋ = X(x); the
-    `multipliers`, as many as `forces`; and `normal(x, α, params)`, the vector by which a combination α of the dφ moves a
-    point onto M_f. `check(data, params)` refuses initial data for which this is not M_f."""
-
-    constraints: Callable
-    size: int
-    field: Callable
-    multipliers: Callable
-    forces: int
-    normal: Callable
-    check: Callable | None = None
-
-
-def of_chain(system: ResolvedSystem) -> FinalManifold:
-    """M_f of a constraint chain, projected onto by the nearest point."""
-    chain = system.chain
-    count = sum(level.count for level in chain.levels)
-    nearest = lambda x, covector, params: chain.normal(covector)
-    return FinalManifold(chain.constraints, count, chain.field, chain.multipliers, len(chain.multiplier_names), nearest)
-
-
-def of_constrained_hamiltonian(system: DiracSystem, shape: Shape) -> FinalManifold:
-    """M_f = {g = 0, {g, H} = 0} of a Hamiltonian system with holonomic constraints, projected onto along the Hamiltonian
-    vectors of φ, which on a symplectic manifold are the vectors ω-orthogonal to M_f."""
-    system, count, all_of_them = independent_constraints(system, shape)
-
-    def constraints(x, params):
-        return jnp.concatenate([system.constraints.position_defect(0.0, x, params), system.hidden_defect(x, params)])
-
-    def brackets_and_rows(x, params):
-        return system.brackets(x, params), system.holonomic_matrix(x, params)
-
-    def check(data, h, params):
-        x = np.asarray(system.point(data))
-        brackets, rows = map(np.asarray, evaluated(brackets_and_rows, x, params))
-        if np.max(np.abs(brackets)) > TINY_BRACKET * np.sum(rows**2):
-            raise ValueError(
-                f"Method 2 takes holonomic constraints whose brackets {{g_i, g_j}} vanish, as those of functions of q on T*Q do, "
-                f"but they are up to {np.max(np.abs(brackets)):.3g} here: simulate dx.constraint_algorithm(system, near=x)"
-                ".resolved() instead of the system."
-            )
-
-    both = partial(call, lambda x, params: system.constrained_field(x, params))
-    field = lambda x, params: both(x, params)[0]
-    multipliers = lambda x, params: all_of_them(both(x, params)[1])
-    return FinalManifold(constraints, 2 * count, field, multipliers, shape.c, system.hamiltonian_vector, check)
+from dirax.schemes.step import Field, StepEquation
+from dirax.systems.forms import FinalManifold
 
 
 def projected_field(manifold: FinalManifold, n: int, theta: float) -> StepEquation:

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.systems.shape import Shape
 from dirax.text.representation import counted, html_table, module_html, module_text
 
 
@@ -119,19 +120,6 @@ class StepSequence(eqx.Module):
     def __repr__(self) -> str:
         fractions = ", ".join(f"{fraction:.6g}" for _, fraction in self.stages)
         return f"StepSequence({counted(len(self.stages), 'stage')} of h·({fractions}); first {self.first!r})"
-
-
-class Shape(eqx.Module):
-    """Sizes of a system: n coordinates, m constraints on velocities and c holonomic ones.
-
-    `redundant`: those of the m + c constraints that follow from the others where a run begins, and are left out of its
-    equations.
-    """
-
-    n: int = eqx.field(static=True)
-    m: int = eqx.field(static=True, default=0)
-    c: int = eqx.field(static=True, default=0)
-    redundant: tuple[int, ...] = eqx.field(static=True, default=(), kw_only=True)
 
 
 class AbstractScheme(eqx.Module):

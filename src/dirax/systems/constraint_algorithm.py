@@ -17,7 +17,7 @@ from dirax.program.tracing import along, jacobian, shared
 from dirax.program.user_functions import check_finite, constant_entries, evaluated, is_traced
 from dirax.systems.affine_equations import Solved, explicit, solved
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
-from dirax.systems.implicit_form import ImplicitForm, implicit_form
+from dirax.systems.forms import ImplicitForm
 from dirax.systems.system import AbstractSystem
 
 RANK_TOLERANCE = 1e-8
@@ -36,15 +36,17 @@ def constraint_algorithm(system: AbstractSystem, near: Any, params: Any = None, 
         chain = dx.constraint_algorithm(system, near=x)
         print(chain)
 
-    Raises `ValueError` and `TypeError` as `implicit_form` does; what the algorithm finds is never an exception but the
+    Raises `ValueError` and `TypeError` as `system.implicit_form` does; what the algorithm finds is never an exception but the
     `verdict` and `explanation` of the chain: an inconsistent system ends empty, one whose rank changes ends irregular.
     """
     if is_traced(near, params):
         raise TypeError("constraint_algorithm inspects values: call it outside jax.jit, and use the chain's functions inside.")
     if not 0 < radius < 1:
         raise ValueError(f"radius must lie between 0 and 1, but {radius!r} was given.")
+    if not isinstance(system, AbstractSystem):
+        raise TypeError(f"system must be a dirax system, but {system!r:.80} was given: state it as dx.ImplicitSystem(E, f, B).")
     check_finite("near", near)
-    return _Search(implicit_form(system, near, params), params, radius).run()
+    return _Search(system.implicit_form(near, params), params, radius).run()
 
 
 def rank_of(matrix: np.ndarray, reference: np.ndarray | None = None) -> int:

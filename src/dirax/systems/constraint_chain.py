@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import Method, gradient, jacobian
 from dirax.program.user_functions import evaluated, is_traced, scalar_program
+from dirax.systems.forms import FinalManifold
+from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
 DETERMINED, GAUGE, EMPTY, IRREGULAR = "determined", "gauge freedom", "empty", "irregular"
@@ -213,9 +215,16 @@ class ResolvedSystem(AbstractSystem):
         """φ(x)."""
         return self.chain.constraints(data["x"], params)
 
-    def explained(self, state: Float[Array, " N"]) -> str:
+    def final_manifold(self, shape: Shape) -> FinalManifold:
+        """M_f, projected onto by the nearest point."""
+        chain = self.chain
+        count, forces = sum(level.count for level in chain.levels), len(chain.multiplier_names)
+        nearest = lambda x, covector, params: chain.normal(covector)
+        return FinalManifold(chain.constraints, count, chain.field, chain.multipliers, forces, nearest)
+
+    def explain(self, x: Float[Array, " N"]) -> str:
         """Which manifold of the chain a point is off, and the nearest point of M_f."""
-        return self.chain.off(state)
+        return self.chain.off(x)
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """The energy of the system that the chain came from."""

@@ -12,7 +12,11 @@ from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import along, jacobian
 from dirax.program.user_functions import UserFunction
-from dirax.systems.system import no_constraint
+
+
+def no_constraint() -> Float[Array, "0"]:
+    """The value of the constraints of a system without any."""
+    return jnp.zeros((0,))
 
 
 class Constraints(eqx.Module):

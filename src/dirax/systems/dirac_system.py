@@ -1,18 +1,23 @@
 """Dirac systems: a Dirac structure and a Hamiltonian, ẋ ⊕ dH(x) ∈ D_x."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.geometry.structures import DiracStructure
 from dirax.program.linear_solves import pseudo_inverse, solve
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import gradient, jacobian, traced_once
-from dirax.program.user_functions import UserFunction
+from dirax.program.tracing import call, gradient, jacobian, traced_once
+from dirax.program.user_functions import UserFunction, evaluated
 from dirax.systems.constraints import Constraints
+from dirax.systems.forms import FinalManifold, ImplicitForm, RelationForm
+from dirax.systems.implicit_form import energy_of_x, names, point_of
+from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
 RANK_TOLERANCE = 1e-10
@@ -84,6 +89,32 @@ class DiracSystem(AbstractSystem):
         rows = self.holonomic_matrix(x, params)
         return jnp.concatenate([F @ velocity + E @ (dh - rows.T @ multipliers), rows @ velocity])
 
+    def relation_form(self, shape: Shape) -> RelationForm:
+        labels = tuple(f"rate of constraint {a}" for a in range(len(shape.kept)))
+        saved = shape.m + shape.c
+        relation = self.independent(shape).relation
+        return RelationForm(relation, len(shape.kept), labels, saved, shape.spread, canonical=self.canonical)
+
+    def independent(self, shape: Shape) -> "DiracSystem":
+        """The same system with the holonomic constraints that are not redundant."""
+        if not shape.redundant or self.holonomic is None:
+            return self
+        g = self.holonomic
+        picked = lambda x, params: shape.pick(g(x, params))
+        return DiracSystem(self.structure, self.hamiltonian.function, holonomic=picked)
+
+    def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
+        x = point_of(near, ("x",), self)
+        c = sum(self.sizes({"x": jnp.asarray(x)}, params)[1:])
+
+        def equations(x, params):
+            matrix, right = self.equations(x, params)
+            right = jnp.concatenate([right, self.constraints.position_defect(0.0, x, params)])
+            return jnp.concatenate([matrix, jnp.zeros((c, x.size + c))]), right
+
+        about = "F ẋ = −E (dH − Gᵀλ), g = 0" if c else "F ẋ = −E dH"
+        return ImplicitForm(equations, x, names("x", x.size), names("λ", c), energy_of_x(self), about)
+
     def equations(self, x: Float[Array, " N"], params: Any = None) -> tuple[Array, Array]:
         """([F, −E Gᵀ], −E dH), of shapes (N, N + c) and (N,): the linear equations of (ẋ, λ)."""
         F, E = map(jnp.asarray, self.structure.kernel(x, params))
@@ -141,6 +172,34 @@ class DiracSystem(AbstractSystem):
         multipliers = solve(slope @ forces, slope @ free)
         return free - forces @ multipliers, multipliers
 
+    def final_manifold(self, shape: Shape) -> FinalManifold | None:
+        """M_f = {g = 0, {g, H} = 0} of a system with holonomic constraints whose D is a graph, projected onto along the
+        Hamiltonian vectors of φ, which on a symplectic manifold are the vectors ω-orthogonal to M_f."""
+        if not (self.is_graph and shape.c):
+            return None
+        system = self.independent(shape)
+
+        def constraints(x, params):
+            return jnp.concatenate([system.constraints.position_defect(0.0, x, params), system.hidden_defect(x, params)])
+
+        def check(data, h, params):
+            brackets, rows = map(np.asarray, evaluated(system._brackets_and_rows, np.asarray(system.point(data)), params))
+            if np.max(np.abs(brackets)) > TINY_BRACKET * np.sum(rows**2):
+                raise ValueError(
+                    f"Method 2 takes holonomic constraints whose brackets {{g_i, g_j}} vanish, as those of functions of q on "
+                    f"T*Q do, but they are up to {np.max(np.abs(brackets)):.3g} here: simulate "
+                    "dx.constraint_algorithm(system, near=x).resolved() instead of the system."
+                )
+
+        both = partial(call, lambda x, params: system.constrained_field(x, params))
+        field = lambda x, params: both(x, params)[0]
+        multipliers = lambda x, params: shape.spread(both(x, params)[1])
+        size = 2 * len(shape.kept)
+        return FinalManifold(constraints, size, field, multipliers, shape.c, system.hamiltonian_vector, check)
+
+    def _brackets_and_rows(self, x, params):
+        return self.brackets(x, params), self.holonomic_matrix(x, params)
+
     # ------------------------------------------------------------------ AbstractSystem
 
     def point(self, data: dict[str, Array]) -> Float[Array, " N"]:
@@ -183,16 +242,6 @@ class DiracSystem(AbstractSystem):
         along, rows = self.forces(x, params), self.holonomic_matrix(x, params)
         end = x + along @ nearest_root(lambda s: self.hidden_defect(x + along @ s, params), jnp.zeros(along.shape[1]))
         return jnp.where(jnp.max(jnp.abs(rows @ along)) <= TINY_BRACKET * jnp.sum(rows**2), end, x)
-
-    def project_position(self, x: Float[Array, " N"], v: Any, params: Any = None, t: Any = 0.0) -> Float[Array, " N"]:
-        """A point with g = 0 near x, moved along Gᵀ."""
-        return self.constraints.nearest_position(t, x, self.holonomic_matrix(x, params).T, params)
-
-    def project_velocity(
-        self, x: Float[Array, " N"], v: Float[Array, " N"], params: Any = None, t: Any = 0.0
-    ) -> Float[Array, " N"]:
-        """The ẋ with G ẋ = 0 nearest to v."""
-        return self.constraints.nearest_velocity(t, x, v, self.holonomic_matrix(x, params).T, params)
 
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " k"]:
         """The part of F ẋ + E dH that no velocity makes zero: x is on M_0 where it vanishes. With holonomic constraints g and

@@ -1,101 +1,47 @@
-"""The implicit form E(x) ẋ = f(x) + B(x) u of every system, on which the constraint algorithm works; the time as a coordinate."""
+"""Implicit forms E(x) ẋ = f(x) + B(x) u, on which the constraint algorithm works; the time as a coordinate."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from dirax.geometry.structures import canonical_two_form
-from dirax.program.linear_solves import solve
-from dirax.program.tracing import gradient, jacobian, shared
-from dirax.program.user_functions import UserFunction, constant_entries
-from dirax.systems.dirac_system import DiracSystem
-from dirax.systems.implicit_system import ImplicitSystem
-from dirax.systems.lagrange_dirac import LagrangeDirac
-from dirax.systems.nonholonomic import NonholonomicMechanics
-from dirax.systems.phase_space import PhaseSpaceLagrangian
-from dirax.systems.port_hamiltonian import PortHamiltonian
-from dirax.systems.system import AbstractSystem
-
-RANK_TOLERANCE = 1e-9
+from dirax.program.tracing import jacobian
+from dirax.systems.forms import ImplicitForm
+from dirax.systems.shape import Shape
 
 
-class ImplicitForm(NamedTuple):
-    """A system as linear equations matrix (ẋ, u) = right at every x, and the point it was asked for.
+def of_relation(system: Any, near: Any, params: Any) -> ImplicitForm:
+    """The implicit form of a system whose relation form is affine in (ẋ, u), with the constraints g = 0 beside it."""
+    at, t = without_time(near)
+    form = x = None
+    if not isinstance(at, dict) or "x" in at or set(at) == {"q", "p"}:
+        x = point_of(at, ("x",), system)
+        shape = Shape(*system.sizes({"x": jnp.asarray(x)}, params))
+        form = system.relation_form(shape)
+    if form is None or x is None:
+        raise TypeError(
+            "the constraint algorithm takes systems with an implicit form, such as dx.ImplicitSystem, dx.DiracSystem, "
+            f"dx.PortHamiltonian and dx.LagrangeDirac, but a {type(system).__name__} was given"
+            f"{'' if x is None else ' that has none'}: state it as dx.ImplicitSystem(E, f, B)."
+        )
+    n, unknowns = x.size, np.zeros(x.size + form.multipliers)
 
-    `multipliers` names the entries of u, `coordinates` those of x; with a `clock` the last of them is the time, ṫ = 1.
-    """
-
-    equations: Callable
-    point: np.ndarray
-    coordinates: tuple[str, ...]
-    multipliers: tuple[str, ...]
-    energy: Callable
-    about: str
-    clock: bool = False
-
-
-def implicit_form(system: AbstractSystem, near: Any, params: Any) -> ImplicitForm:
-    """The implicit form of a system around the point `near`: an array x, or a dict of initial data such as {"q": …, "v": …}.
-
-    Systems on T*Q have x = (q, p). A Lagrangian whose momenta are affine in the velocities is put on T*Q with its primary
-    constraints and their multipliers (Dirac, Bergmann); any other on the Pontryagin bundle, x = (q, v, p), and a singular
-    one with forces f(q, v) too. What depends on time has t as its last coordinate; `near` has it as "t", zero by default.
-    Raises `TypeError` for systems without an implicit form, `ValueError` for open ports and points of the wrong length.
-    """
-    if isinstance(system, ImplicitSystem):
-        x = _point(near, ("x",), system)
-        _, m = system.sizes({"x": jnp.asarray(x)}, params)
-        return ImplicitForm(system.equations, x, _names("x", x.size), _names("u", m), _of_x(system), "as stated")
-    if isinstance(system, DiracSystem):
-        return _dirac(system, near, params)
-    if isinstance(system, PortHamiltonian):
-        return _port_hamiltonian(system, near, params)
-    if isinstance(system, NonholonomicMechanics | PhaseSpaceLagrangian):
-        return _lagrangian(system.lagrange_dirac(), system, near, params)
-    if isinstance(system, LagrangeDirac):
-        return _lagrangian(system, system, near, params)
-    raise TypeError(
-        "the constraint algorithm takes ImplicitSystem, DiracSystem, PortHamiltonian, LagrangeDirac, NonholonomicMechanics "
-        f"and PhaseSpaceLagrangian systems, but a {type(system).__name__} was given: state it as dx.ImplicitSystem(E, f, B)."
-    )
-
-
-def _dirac(system: DiracSystem, near, params) -> ImplicitForm:
-    x = _point(near, ("x",), system)
-    c = sum(system.sizes({"x": jnp.asarray(x)}, params)[1:])
-
-    def equations(x, params):
-        matrix, right = system.equations(x, params)
-        right = jnp.concatenate([right, system.constraints.position_defect(0.0, x, params)])
-        return jnp.concatenate([matrix, jnp.zeros((c, x.size + c))]), right
-
-    about = "F ẋ = −E (dH − Gᵀλ), g = 0" if c else "F ẋ = −E dH"
-    return ImplicitForm(equations, x, _names("x", x.size), _names("λ", c), _of_x(system), about)
-
-
-def _port_hamiltonian(system: PortHamiltonian, near, params) -> ImplicitForm:
-    near, t = _without_time(near)
-    x = _point(near, ("x",), system)
-    n, m = system.sizes({"x": jnp.asarray(x)}, params)
+    def defect(t, x, y, params):
+        positions = system.constraints.position_defect(t, x, params)
+        return jnp.concatenate([form.residual(x, y[:n], y[n:], t, params), positions])
 
     def equations(t, x, params):
-        dh = system.differential(x, params)
-        closed = system.closed_matrix(x, params)
-        right = system.flow_matrix(x, params) @ dh + system.open_matrix(x, params) @ system.input(t, x, params)
-        matrix = jnp.block([[jnp.eye(n), -closed], [jnp.zeros((m, n + m))]])
-        return matrix, jnp.concatenate([right, closed.T @ dh])
+        y = jnp.asarray(unknowns)
+        return jacobian(lambda y: defect(t, x, y, params))(y), -defect(t, x, y, params)
 
-    about = "closed ports: u keeps y = 0" if m else "no closed ports"
-    energy = lambda t, x, params: system.energy_at({"x": x}, params)
-    timed = _uses_time(system.inputs, x, params)
-    return _in_time(timed, t, equations, x, _names("x", n), _names("u", m), energy, about)
+    energy = lambda t, x, params: system.energy_at({"x": x, "t": t}, params)
+    timed = uses_time(defect, x, unknowns, params)
+    return in_time(timed, t, equations, x, names("x", n), names("u", form.multipliers), energy, "its relation of x and ẋ")
 
 
-def _in_time(timed: bool, t: float, equations: Callable, x: np.ndarray, coordinates, multipliers, energy, about) -> ImplicitForm:
+def in_time(timed: bool, t: float, equations: Callable, x: np.ndarray, coordinates, multipliers, energy, about) -> ImplicitForm:
     """The form of `equations(t, x, params)` and `energy(t, x, params)`: those at t = 0, or with t as the last coordinate."""
     if not timed:
         autonomous = lambda x, params: equations(0.0, x, params)
@@ -113,14 +59,14 @@ def _in_time(timed: bool, t: float, equations: Callable, x: np.ndarray, coordina
     return ImplicitForm(extended, np.append(x, t), (*coordinates, "t"), multipliers, of_x, words, clock=True)
 
 
-def _without_time(near) -> tuple[Any, float]:
+def without_time(near) -> tuple[Any, float]:
     """(near without its time, the time)."""
     if not isinstance(near, dict) or "t" not in near:
         return near, 0.0
     return {name: value for name, value in near.items() if name != "t"}, float(near["t"])
 
 
-def _uses_time(function: UserFunction | None, *values) -> bool:
+def uses_time(function: Callable | None, *values) -> bool:
     """Whether the result of a function of (t, …) depends on t as it is written."""
     if function is None:
         return False
@@ -130,134 +76,7 @@ def _uses_time(function: UserFunction | None, *values) -> bool:
     return any(v is t for v in (*used, *jaxpr.outvars))
 
 
-def _lagrangian(system: LagrangeDirac, stated, near, params) -> ImplicitForm:
-    near, t = _without_time(near)
-    data: Any = {k: jnp.asarray(v, float) for k, v in near.items()} if isinstance(near, dict) else None
-    if data is not None and set(data) not in ({"q", "v"}, {"q", "p"}, {"q"}):
-        raise ValueError(f"near must hold q with v or p for a Lagrangian system, but it holds {', '.join(data)}.")
-    x = None if data is not None else np.asarray(near, float)
-    if x is not None and (x.ndim != 1 or (x.size % 2 and x.size % 3)):
-        raise ValueError(f"near must be x = (q, p), or {{'q': q, 'v': v}}, but an array of shape {x.shape} was given.")
-    given = np.zeros(0) if x is None else x
-    q = data["q"] if data is not None else jnp.asarray(given[: given.size // (2 if given.size % 2 == 0 else 3)])
-    zero = jnp.zeros_like(q)
-    stated.sizes({"q": q, "v": zero}, params)
-    timed = system.depends_on_time or _uses_time(system.forces, q, zero, params)
-    affine, hessian = _momenta(system, q, data.get("v", zero) if data is not None else zero, params, t)
-    regular = not _kernel(hessian).shape[1]
-    if affine and (regular or system.forces is None):
-        if data is not None:
-            p = data["p"] if "p" in data else system.legendre(q, data.get("v", zero), params, t)
-            x = np.concatenate([q, p])
-        return _on_cotangent_bundle(system, np.asarray(x), hessian, params, timed, t)
-    why = "the momenta of this Lagrangian are not affine in the velocities"
-    why = "this Lagrangian is singular and has forces, which are functions of v" if affine else why
-    if data is None and (x is None or x.size % 3):
-        raise ValueError(f'{why}: give near={{"q": …, "v": …}}.')
-    if data is not None:
-        if "v" not in data:
-            raise ValueError(f'{why}: give near={{"q": …, "v": …}}.')
-        x = np.concatenate([q, data["v"], system.legendre(q, data["v"], params, t)])
-    return _on_pontryagin_bundle(system, np.asarray(x), params, timed, t, f"{why.split(': ')[0]}: x = (q, v, p)")
-
-
-def _momenta(system: LagrangeDirac, q, v, params, t) -> tuple[bool, np.ndarray]:
-    """Whether ∂L/∂v is affine in v (at three points around q), and the Hessian ∂²L/∂v² at q."""
-    hessian = jax.jit(lambda q, v: jax.hessian(lambda v: system.lagrangian.at(t, q, v, params))(v))
-    rng, q, v = np.random.default_rng(0), np.asarray(q), np.asarray(v)
-    here, scale = np.asarray(hessian(q, v)), 1.0 + np.abs(q).max()
-    for _ in range(3):
-        at = q + 1e-2 * scale * rng.normal(size=q.shape)
-        one, other = (np.asarray(hessian(at, v + r * rng.normal(size=q.shape))) for r in (0.0, 0.5))
-        if np.abs(one - other).max() > 1e-9 * (1e-300 + np.abs(one).max()):
-            return False, here
-    return True, here
-
-
-def _kernel(hessian: np.ndarray) -> np.ndarray:
-    """A basis (n, k) of the kernel of a symmetric matrix."""
-    values, vectors = np.linalg.eigh(hessian)
-    return vectors[:, np.abs(values) <= RANK_TOLERANCE * max(np.abs(values).max(initial=0.0), 1e-300)]
-
-
-def _on_cotangent_bundle(
-    system: LagrangeDirac, x: np.ndarray, hessian: np.ndarray, params, timed: bool, t: float
-) -> ImplicitForm:
-    """x = (q, p): ẋ = X_H + X_φ u + (0, f + Wᵀλ), φ = 0, W q̇ = −b, with the primary constraints φ and H = ⟨p, v⟩ − L."""
-    n = x.size // 2
-    m, c = system.constraints.sizes(jnp.asarray(x[:n]), params)
-    null = _kernel(hessian)
-    k = null.shape[1]
-    J = canonical_two_form(n)  # as the Poisson matrix: (q̇, ṗ) = J dH
-
-    def bordered(t, q, params):
-        mass = jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(jnp.zeros(n))
-        return jnp.concatenate([jnp.concatenate([mass, null], axis=1), np.pad(null.T, ((0, 0), (0, k)))])
-
-    constant = constant_entries(bordered, t, x[:n], params)
-    inverse = None if constant is None or np.any(np.isnan(constant)) else np.linalg.inv(constant)
-
-    @shared
-    def legendre_inverse(t, x, params):
-        """(v, φ) with ∂L/∂v (q, v) = p − Zφ and Zᵀv = 0, Z a basis of the Hessian's kernel at the point of the chain."""
-        q, p = x[:n], x[n:]
-        right = jnp.concatenate([p - system.legendre(q, jnp.zeros(n), params, t), np.zeros(k)])
-        solution = solve(bordered(t, q, params), right, apart=True) if inverse is None else inverse @ right
-        return solution[:n], solution[n:]
-
-    def hamiltonian(t, x, params):
-        v, _ = legendre_inverse(t, x, params)
-        return x[n:] @ v - system.lagrangian.at(t, x[:n], v, params)
-
-    def equations(t, x, params):
-        primary = lambda x: legendre_inverse(t, x, params)[1]
-        v, dphi = legendre_inverse(t, x, params)[0], jacobian(primary)(x)
-        # dH = (−∂L/∂q, v): p − ∂L/∂v is in the kernel, to which v is orthogonal, so that it does not matter how v varies
-        rate = gradient(lambda q: system.lagrangian.at(t, q, v, params))(x[:n])
-        rate = rate if system.forces is None else rate + system.forces(t, x[:n], v, params)
-        flow = jnp.concatenate([v, rate])
-        w, moving = system.constraints.matrix(t, x[:n], params), _moving(system, t, x[:n], params)
-        forces = jnp.concatenate([J @ dphi.T, jnp.concatenate([jnp.zeros((n, m + c)), w.T])], axis=1)
-        top = jnp.concatenate([jnp.eye(2 * n), -forces], axis=1)
-        constrained = jnp.concatenate([w[:m], jnp.zeros((m, n + k + m + c))], axis=1)
-        matrix = jnp.concatenate([top, jnp.zeros((k, 2 * n + k + m + c)), constrained, jnp.zeros((c, 2 * n + k + m + c))])
-        return matrix, jnp.concatenate([flow, primary(x), *moving])
-
-    names, multipliers = (*_names("q", n), *_names("p", n)), (*_names("u", k), *_names("λ", m + c))
-    rank = f"Hessian of rank {n - k} of {n}" + (f": {k} primary constraint{'s' * (k > 1)}" if k else ", regular")
-    return _in_time(timed, t, equations, x, names, multipliers, hamiltonian, rank)
-
-
-def _on_pontryagin_bundle(system: LagrangeDirac, x: np.ndarray, params, timed: bool, t: float, about: str) -> ImplicitForm:
-    """x = (q, v, p): q̇ = v, ṗ = ∂L/∂q + f + Wᵀλ, 0 = p − ∂L/∂v, 0 = W v + b."""
-    n = x.size // 3
-    m, c = system.constraints.sizes(jnp.asarray(x[:n]), params)
-
-    def equations(t, x, params):
-        q, v, p = x[:n], x[n : 2 * n], x[2 * n :]
-        dq, dv = gradient(lambda q, v: system.lagrangian.at(t, q, v, params), (0, 1))(q, v)
-        rate = dq if system.forces is None else dq + system.forces(t, q, v, params)
-        w, (minus_b, g) = system.constraints.matrix(t, q, params), _moving(system, t, q, params)
-        eye, zero = jnp.eye(n), jnp.zeros((n, n))
-        position = jnp.concatenate([eye, zero, zero, jnp.zeros((n, m + c))], axis=1)
-        momentum = jnp.concatenate([zero, zero, eye, -w.T], axis=1)
-        matrix = jnp.concatenate([position, momentum, jnp.zeros((n + m + c, 3 * n + m + c))])
-        return matrix, jnp.concatenate([v, rate, p - dv, w[:m] @ v - minus_b, g])
-
-    def energy(t, x, params):
-        return system.generalized_energy(x[:n], x[n : 2 * n], x[2 * n :], params, t)
-
-    names = (*_names("q", n), *_names("v", n), *_names("p", n))
-    return _in_time(timed, t, equations, x, names, _names("λ", m + c), energy, about)
-
-
-def _moving(system: LagrangeDirac, t, q, params) -> tuple[Array, Array]:
-    """(−b, g): the right-hand sides of W q̇ = −b and 0 = g."""
-    constraints = system.constraints
-    return -constraints.nonholonomic_defect(t, q, jnp.zeros_like(q), params), constraints.position_defect(t, q, params)
-
-
-def _point(near, keys: tuple[str, ...], system) -> np.ndarray:
+def point_of(near, keys: tuple[str, ...], system) -> np.ndarray:
     if isinstance(near, dict):
         if set(near) == {"q", "p"}:
             near = np.concatenate([np.asarray(near["q"]), np.asarray(near["p"])])
@@ -271,9 +90,9 @@ def _point(near, keys: tuple[str, ...], system) -> np.ndarray:
     return x
 
 
-def _names(letter: str, count: int) -> tuple[str, ...]:
+def names(letter: str, count: int) -> tuple[str, ...]:
     return tuple(f"{letter}{i}" for i in range(count))
 
 
-def _of_x(system):
+def energy_of_x(system):
     return lambda x, params: system.energy_at({"x": x}, params)

@@ -8,6 +8,9 @@ from jaxtyping import Array, Float
 
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.user_functions import UserFunction
+from dirax.systems.forms import ImplicitForm, RelationForm
+from dirax.systems.implicit_form import energy_of_x, names, point_of
+from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
 
@@ -48,6 +51,15 @@ class ImplicitSystem(AbstractSystem):
         """E ẋ − f − B u."""
         matrix, f = self.equations(x, params)
         return matrix @ jnp.concatenate([velocity, multipliers]) - f
+
+    def relation_form(self, shape: Shape) -> RelationForm:
+        labels = tuple(f"output y[{a}]" for a in range(shape.m))
+        return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port")
+
+    def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
+        x = point_of(near, ("x",), self)
+        _, m = self.sizes({"x": jnp.asarray(x)}, params)
+        return ImplicitForm(self.equations, x, names("x", x.size), names("u", m), energy_of_x(self), "as stated")
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
         if "x" not in data:

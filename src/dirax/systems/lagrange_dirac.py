@@ -12,8 +12,10 @@ from dirax.program.linear_solves import scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import UserFunction
-from dirax.systems.constraints import Constraints
-from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.systems.constraints import Constraints, no_constraint
+from dirax.systems.forms import ImplicitForm
+from dirax.systems.implicit_lagrangian import implicit_lagrangian
+from dirax.systems.system import AbstractSystem, refuse_start
 
 
 class LagrangeDirac(AbstractSystem):
@@ -103,10 +105,16 @@ class LagrangeDirac(AbstractSystem):
 
     # ------------------------------------------------------------------ AbstractSystem
 
+    def lagrangian_form(self) -> "LagrangeDirac":
+        """The system itself."""
+        return self
+
+    def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
+        return implicit_lagrangian(self, self, near, params)
+
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
         """(n, m), or (n, m, c) with holonomic constraints."""
-        if "x" in data:
-            raise ValueError("a LagrangeDirac system starts from q=, v= · q=, p= · q0=, q1=, but x= was given.")
+        refuse_start(self, data, "q, v", "q, p", "q0, q1")
         q = data["q"] if "q" in data else data["q0"]
         n, t = q.shape[0], np.zeros(())
         out = self.lagrangian.shape(*self.lagrangian.given(t, q, q, params))

@@ -11,7 +11,8 @@ from dirax.geometry.manifolds import AbstractManifold
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction
-from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.systems.constraints import no_constraint
+from dirax.systems.system import AbstractSystem, refuse_start
 
 
 class ManifoldLagrangian(AbstractSystem):
@@ -30,6 +31,13 @@ class ManifoldLagrangian(AbstractSystem):
             raise TypeError(f"manifold must be a dirax manifold such as dx.Sphere(3), but {manifold!r} was given.")
         self.lagrangian = UserFunction(lagrangian, "lagrangian", ("q", "v"))
         self.manifold = manifold
+
+    def manifold_form(self) -> "ManifoldLagrangian":
+        """The system itself."""
+        return self
+
+    def lagrangian_value(self, t: Any, q: Float[Array, " N"], v: Float[Array, " N"], params: Any) -> Float[Array, ""]:
+        return self.lagrangian(q, v, params)
 
     def legendre(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
         """The covector ∂L/∂v restricted to the tangent space at q."""
@@ -50,6 +58,8 @@ class ManifoldLagrangian(AbstractSystem):
         return derivative @ v - value
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+        if set(data) - {"t"} == {"q"}:
+            refuse_start(self, data, "q, v", "q, p")
         if "q" not in data:
             raise ValueError(f"a system on a manifold starts from q= with v= or p=, but {', '.join(data)} were given.")
         q = data["q"]

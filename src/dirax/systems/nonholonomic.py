@@ -11,8 +11,10 @@ from jaxtyping import Array, Float
 from dirax.program.linear_solves import solve
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.systems.constraints import Constraints
+from dirax.systems.forms import ImplicitForm
+from dirax.systems.implicit_lagrangian import implicit_lagrangian
 from dirax.systems.lagrange_dirac import LagrangeDirac
-from dirax.systems.system import AbstractSystem
+from dirax.systems.system import AbstractSystem, refuse_start
 
 SYMMETRIC = 1e-10
 """Smallest eigenvalue and largest asymmetry of a metric, relative to its largest entry."""
@@ -73,6 +75,26 @@ class NonholonomicMechanics(AbstractSystem):
             affine=own(self.affine),
         )
 
+    def lagrangian_form(self) -> LagrangeDirac:
+        return self.lagrange_dirac()
+
+    def metric_form(self) -> "NonholonomicMechanics | None":
+        """The system itself, where λ and the projector of Method 2 have their closed form."""
+        return self if self.closed_form else None
+
+    def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
+        return implicit_lagrangian(self.lagrange_dirac(), self, near, params)
+
+    def project_position(
+        self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Array, " n"]:
+        return self.lagrange_dirac().project_position(q, v, params, t)
+
+    def project_velocity(
+        self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Array, " n"]:
+        return self.lagrange_dirac().project_velocity(q, v, params, t)
+
     @property
     def closed_form(self) -> bool:
         """Whether λ and the projector of Method 2 have their closed form ([BLM] §8): one-forms alone, without time."""
@@ -86,8 +108,7 @@ class NonholonomicMechanics(AbstractSystem):
         return Constraints(self.one_forms, self.affine, self.holonomic)
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
-        if "x" in data:
-            raise ValueError("a NonholonomicMechanics system starts from q=, v= · q=, p= · q0=, q1=, but x= was given.")
+        refuse_start(self, data, "q, v", "q, p", "q0, q1")
         q = data["q"] if "q" in data else data["q0"]
         n, t = q.shape[0], np.zeros(())
         metric = self.metric.shape(*self.metric.given(t, q, params))

@@ -8,9 +8,13 @@ from jaxtyping import Array, Float
 from dirax.geometry.structures import DiracStructure
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import UserFunction
+from dirax.systems.constraints import no_constraint
 from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.forms import ImplicitForm, RelationForm
+from dirax.systems.implicit_lagrangian import implicit_lagrangian
 from dirax.systems.lagrange_dirac import LagrangeDirac
-from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.systems.shape import Shape
+from dirax.systems.system import AbstractSystem, refuse_start
 
 
 class PhaseSpaceLagrangian(AbstractSystem):
@@ -35,6 +39,18 @@ class PhaseSpaceLagrangian(AbstractSystem):
         """The same system as a degenerate Lagrangian on TQ, for schemes on Q × Q and Method 1."""
         return LagrangeDirac(self.lagrangian)
 
+    def lagrangian_form(self) -> LagrangeDirac:
+        return self.lagrange_dirac()
+
+    def final_relation(self, shape: Shape) -> RelationForm:
+        """The Dirac system (dα, H) on M_f = graph α ≅ Q ([BLM] (14)); p = α(q) is saved beside q."""
+        form = self.dirac_system().relation_form(Shape(shape.n))
+        node = lambda q, params: {"q": q, "p": self.one_form(q, params)}
+        return form._replace(names=("q", "p"), node=node)
+
+    def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
+        return implicit_lagrangian(self.lagrange_dirac(), self, near, params)
+
     def two_form(self, q: Float[Array, " n"], params: Any = None) -> Float[Array, "n n"]:
         """The matrix of dα: (dα)_ij = ∂_i α_j − ∂_j α_i."""
         derivative = jacobian(lambda q: self.one_form(q, params))(q)
@@ -48,7 +64,8 @@ class PhaseSpaceLagrangian(AbstractSystem):
         )
 
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
-        q = data["q"] if "q" in data else data["q0"]
+        refuse_start(self, data, "q", "x", "q, v", "q, p", "q0, q1")
+        q = self.point(data)
         form, energy = self.one_form.shape(q, params), self.hamiltonian.shape(q, params)
         if form.shape != q.shape:
             raise ValueError(f"one_form must return shape {q.shape} like q, but it returned shape {form.shape}.")
@@ -59,9 +76,10 @@ class PhaseSpaceLagrangian(AbstractSystem):
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
         if "q0" in data:
             return dict(data)
-        q, p = data["q"], self.one_form(data["q"], params)
-        dirac = self.dirac_system().complete({"x": q}, params, False)
-        return {"q": q, "v": dirac["velocity"], "p": p if project or "p" not in data else data["p"]}
+        q = self.point(data)
+        p, velocity = self.one_form(q, params), self.dirac_system().complete({"x": q}, params, False)["velocity"]
+        p = p if project or "p" not in data else data["p"]
+        return {"q": q, "v": velocity, "p": p, "x": q, "velocity": velocity}
 
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " n"]:
         """p − α(q): the primary constraints."""

@@ -9,7 +9,11 @@ from jaxtyping import Array, Float
 
 from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
-from dirax.systems.system import AbstractSystem, no_constraint
+from dirax.systems.constraints import no_constraint
+from dirax.systems.forms import ImplicitForm, Observed, RelationForm
+from dirax.systems.implicit_form import in_time, names, point_of, uses_time, without_time
+from dirax.systems.shape import Shape
+from dirax.systems.system import AbstractSystem
 
 SKEW_TOLERANCE = 1e-10
 
@@ -111,6 +115,36 @@ class PortHamiltonian(AbstractSystem):
             balance = balance - self.open_matrix(x, params) @ self.input(t, x, params)
         return jnp.concatenate([balance, closed.T @ dh]) if self.closed else balance
 
+    def power(self, x: Float[Array, " N"], velocity: Float[Array, " N"], t: Any, params: Any = None) -> Float[Array, " 3"]:
+        """(⟨dH, ẋ⟩, ⟨y, u⟩ of the open ports, ⟨dH, R dH⟩); the first is the second less the third ([BLM] §7.1)."""
+        dh = self.differential(x, params)
+        supplied = self.input(t, x, params) @ (self.open_matrix(x, params).T @ dh)
+        dissipated = jnp.zeros(()) if self.R is None else dh @ self.R(x, params) @ dh
+        return jnp.stack([dh @ velocity, supplied, dissipated])
+
+    def relation_form(self, shape: Shape) -> RelationForm:
+        labels = tuple(f"output y[{a}]" for a in range(shape.m))
+        about = "power stored ⟨dH, ẋ⟩, supplied and dissipated at the base point"
+        observed = (Observed("power", self.power, (3,), ("power",), about),)
+        return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port", observed=observed)
+
+    def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
+        near, t = without_time(near)
+        x = point_of(near, ("x",), self)
+        n, m = self.sizes({"x": jnp.asarray(x)}, params)
+
+        def equations(t, x, params):
+            dh = self.differential(x, params)
+            closed = self.closed_matrix(x, params)
+            right = self.flow_matrix(x, params) @ dh + self.open_matrix(x, params) @ self.input(t, x, params)
+            matrix = jnp.block([[jnp.eye(n), -closed], [jnp.zeros((m, n + m))]])
+            return matrix, jnp.concatenate([right, closed.T @ dh])
+
+        about = "closed ports: u keeps y = 0" if m else "no closed ports"
+        energy = lambda t, x, params: self.energy_at({"x": x}, params)
+        timed = uses_time(self.inputs, x, params)
+        return in_time(timed, t, equations, x, names("x", n), names("u", m), energy, about)
+
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
         if "x" not in data:
             raise ValueError(f"a PortHamiltonian starts from x=, but {', '.join(data)} were given.")
@@ -165,7 +199,7 @@ class PortHamiltonian(AbstractSystem):
         x = data["x"]
         velocity = self.flow_matrix(x, params) @ self.differential(x, params)
         if self.inputs is not None:
-            velocity = velocity + self.open_matrix(x, params) @ self.input(0.0, x, params)
+            velocity = velocity + self.open_matrix(x, params) @ self.input(data.get("t", 0.0), x, params)
         return {"x": x, "velocity": velocity}
 
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:

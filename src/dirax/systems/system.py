@@ -1,19 +1,32 @@
-"""What every system offers to schemes and to `simulate`: sizes, initial data made complete, energy, constraint."""
+"""AbstractSystem: what every system says of itself to schemes, to the constraint algorithm, to `simulate` and to `verify`."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.systems.constraints import Constraints
+from dirax.systems.forms import FinalManifold, ImplicitForm, RelationForm
+from dirax.systems.implicit_form import of_relation
+from dirax.systems.shape import Shape
 from dirax.text.representation import module_html, module_text
 
 
 class AbstractSystem(eqx.Module):
     """A mechanical system as the user states it; no time step in here.
 
-    All methods act on one trajectory (no batch axis) and are traceable.
+    A system of one's own subclasses this one. It must say its sizes, complete initial data, and say how far they are off the
+    constraints, its energy and its constraint at a saved row: the five abstract methods. It should say in what forms it can
+    be discretized, at least one of these:
+
+    - `relation_form`: a relation between x and ẋ, for Method 1 of `dx.DiscreteDirac` with any discretization map; and where
+      it is affine in ẋ and in the multipliers, for `dx.constraint_algorithm`;
+    - `lagrangian_form`: a Lagrangian with constraints, for every scheme that takes a `dx.LagrangeDirac`;
+    - `final_manifold`: its final constraint manifold, for Method 2.
+
+    All methods act on one trajectory (no batch axis); those of data, rows and points are traceable.
     """
 
     def __repr__(self) -> str:
@@ -22,28 +35,125 @@ class AbstractSystem(eqx.Module):
     def _repr_html_(self) -> str:
         return module_html(self)
 
+    # ------------------------------------------------------------------ what every system says
+
     @abstractmethod
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
-        """(n, m) or (n, m, c): the number of coordinates, of constraints and of holonomic constraints; raises when
-        the user's functions have wrong shapes."""
+        """(n, m) or (n, m, c): the number of coordinates, of constraints and of holonomic constraints.
+
+        `data` are the initial data as they were given: x · q, v · q, p · q0, q1 · q. Raises `ValueError` where they are not
+        among those that the system starts from, and when the user's functions have wrong shapes.
+        """
 
     @abstractmethod
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
-        """The initial data with everything a scheme may start from, projected to the constraint when `project`."""
+        """The initial data, which hold the time `t` too, with everything a scheme may start from.
+
+        - From x: x and `velocity`, the ẋ there (a first guess of it, where the equations do not determine it).
+        - From q with v or p, and from q alone where the system determines the rest: q, v, p; and x, `velocity` too where the
+          system has a relation form.
+        - From q0, q1: these two.
+
+        Other keys are the system's own, for its `initial_defect`. With `project` the data are moved onto the constraints.
+        """
 
     @abstractmethod
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
-        """By how much completed initial data violate the constraint, one number a constraint."""
+    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " k"]:
+        """By how much completed initial data violate the constraints, one number a constraint."""
 
     @abstractmethod
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
-        """The energy at one saved row (its node fields)."""
+        """The energy at one saved row (its node fields, and the time `t`)."""
 
     @abstractmethod
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
-        """The constraint at one saved row (its node fields), zero where it holds."""
+    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
+        """The constraints at one saved row (its node fields, and the time `t`), zero where they hold."""
+
+    # ------------------------------------------------------------------ the forms in which it can be discretized
+
+    def relation_form(self, shape: Shape) -> RelationForm | None:
+        """The relation between x and ẋ that a discretization map discretizes; None for a system without one."""
+        return None
+
+    def lagrangian_form(self) -> Any:
+        """The same system as a Lagrangian with constraints in coordinates, a `dx.LagrangeDirac`; None where there is none."""
+        return None
+
+    def manifold_form(self) -> Any:
+        """The same system as a Lagrangian on a manifold in R^N, a `dx.ManifoldLagrangian`; None where there is none."""
+        return None
+
+    def metric_form(self) -> Any:
+        """The same system as a metric, a potential and one-forms alone, a `dx.NonholonomicMechanics`, for which Method 2 has
+        closed forms ([BLM] §8); None where there is none."""
+        return None
+
+    def final_manifold(self, shape: Shape) -> FinalManifold | None:
+        """The final constraint manifold M_f = {φ = 0} in coordinates x, for Method 2; None where it is not known.
+
+        Raises `ValueError` where it is known to be out of reach, with the way out.
+        """
+        return None
+
+    def final_relation(self, shape: Shape) -> RelationForm | None:
+        """The system on M_f in coordinates of M_f itself, for Method 2; None where it is not known."""
+        return None
+
+    def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
+        """The system around the point `near` as linear equations of (ẋ, u), for the constraint algorithm.
+
+        `near` is an array x, or a dict of initial data such as {"q": …, "v": …}, with the time as "t". By default that of the
+        relation form, with the positions' constraints g = 0. Raises `TypeError` for a system without an implicit form, and
+        `ValueError` for points of the wrong length.
+        """
+        return of_relation(self, near, params)
+
+    # ------------------------------------------------------------------ constraints
+
+    @property
+    def constraints(self) -> Constraints:
+        """The constraints that are stated as functions of (t, q), or of (t, x); none by default."""
+        return Constraints(None, None, None)
+
+    def point(self, data: dict[str, Array]) -> Array:
+        """The point in initial data at which the constraints hold: x, q or q0."""
+        return next(data[name] for name in ("x", "q", "q0") if name in data)
+
+    def project_position(self, q: Array, v: Array, params: Any = None, t: Any = 0.0) -> Array:
+        """A point with g = 0 near q, moved along Gᵀ, G = ∂g/∂q."""
+        if self.constraints.holonomic is None:
+            return q
+        return self.constraints.nearest_position(t, q, self.constraints.holonomic_matrix(t, q, params).T, params)
+
+    def project_velocity(self, q: Array, v: Array, params: Any = None, t: Any = 0.0) -> Array:
+        """The velocity nearest to v with W v + b = 0 and G v + ∂g/∂t = 0."""
+        return self.constraints.nearest_velocity(t, q, v, self.constraints.matrix(t, q, params).T, params)
+
+    # ------------------------------------------------------------------ the rest
+
+    def lagrangian_value(self, t: Any, q: Array, v: Array, params: Any) -> Float[Array, ""] | None:
+        """L(t, q, v), by which data outside its domain are found; None for a system without a Lagrangian."""
+        form = self.lagrangian_form()
+        return None if form is None else form.lagrangian.at(t, q, v, params)
+
+    def with_inputs(self, inputs: Callable) -> "AbstractSystem":
+        """The same system driven by u = inputs(t, x[, params]) through its open ports; raises `TypeError` without ports."""
+        raise TypeError(
+            f"inputs= drives an open dx.PortHamiltonian system, but the system is a {type(self).__name__}: leave it out."
+        )
+
+    def explain(self, x: Array) -> str:
+        """Which constraint the point x is off, and the way back, in words for a message; "" where there is no more to say."""
+        return ""
 
 
-def no_constraint() -> Float[Array, "0"]:
-    """The value of the constraint of an unconstrained system."""
-    return jnp.zeros((0,))
+def refuse_start(system: AbstractSystem, data: dict[str, Array], *kinds: str) -> None:
+    """Raise `ValueError` for initial data that are none of `kinds`, such as "q, v"."""
+    given = set(data) - {"t"}
+    if given in [set(kind.split(", ")) for kind in kinds]:
+        return
+    known = " · ".join(f"{kind.replace(',', '=,')}=" for kind in kinds)
+    own = f"a {type(system).__name__} system starts from {known}"
+    if given == {"q"}:
+        raise ValueError(f"initial data must be one of q=, v= · q=, p= · q0=, q1= · x=, but q= alone was given: {own}.")
+    raise ValueError(f"{own}, but {', '.join(f'{name}=' for name in data)} was given.")

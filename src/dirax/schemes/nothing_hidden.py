@@ -1,0 +1,59 @@
+"""The premise of Method 2 that a system without stated constraints has none: refused at initial data where it does not hold."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.program.tracing import gradient, jacobian
+from dirax.program.user_functions import evaluated
+from dirax.schemes.step import StepEquation
+from dirax.systems.constraint_algorithm import rank_of
+from dirax.systems.forms import RelationForm
+from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.system import AbstractSystem
+
+
+def nothing_hidden_in_relation(system: AbstractSystem, form: RelationForm, equation: StepEquation) -> StepEquation:
+    """The equation, which refuses initial data at which the matrix of ẋ is singular."""
+
+    def matrix(x, t, params):
+        none = jnp.zeros(0)
+        return jacobian(lambda velocity: form.residual(x, velocity, none, t, params))(jnp.zeros_like(x))
+
+    def at(data, h, params):
+        x = np.asarray(system.point(data))
+        return evaluated(matrix, x, np.asarray(data.get("t", 0.0), float), params), "the matrix of ẋ"
+
+    return _refusing(system, "x", at, equation)
+
+
+def nothing_hidden_in_lagrangian(system: LagrangeDirac, equation: StepEquation) -> StepEquation:
+    """The equation, which refuses initial data at which the Hessian ∂²L/∂v² is singular."""
+    hessian = lambda t, q, v, params: jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(v)
+
+    def at(data, h, params):
+        if "p" in data:
+            return None
+        q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if "q0" in data else (data["q"], data["v"])
+        return evaluated(hessian, np.zeros(()), q, v, params), "∂²L/∂v²"
+
+    return _refusing(system, '{"q": …, "v": …}', at, equation)
+
+
+def _refusing(system: AbstractSystem, near: str, at: Callable, equation: StepEquation) -> StepEquation:
+    def check(data, h, params):
+        equation.check(data, h, params)
+        if (found := at(data, h, params)) is None:
+            return
+        matrix, what = np.asarray(found[0]), found[1]
+        rank = rank_of(matrix)
+        if rank < max(matrix.shape):
+            raise ValueError(
+                f"Method 2 of this {type(system).__name__} needs its final manifold, since {what} has rank {rank} of "
+                f"{max(matrix.shape)} at the initial data: simulate dx.constraint_algorithm(system, near={near}).resolved() "
+                "instead of the system, from x=chain.point."
+            )
+
+    return dataclasses.replace(equation, check=check)

@@ -1,0 +1,67 @@
+"""The forms in which a system shows itself to schemes and to the constraint algorithm: plain records of functions."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+
+class ImplicitForm(NamedTuple):
+    """A system as linear equations matrix (ẋ, u) = right at every x, and the point it was asked for.
+
+    `equations(x, params)` gives (matrix, right), `energy(x, params)` a scalar. `multipliers` names the entries of u,
+    `coordinates` those of x; with a `clock` the last of them is the time, ṫ = 1. `about` says in words what they are.
+    """
+
+    equations: Callable
+    point: np.ndarray
+    coordinates: tuple[str, ...]
+    multipliers: tuple[str, ...]
+    energy: Callable
+    about: str
+    clock: bool = False
+
+
+class Observed(NamedTuple):
+    """What a run saves of every step beside the state, under `name`: `at(x, ẋ, t, params)` at the base point, of `shape`."""
+
+    name: str
+    at: Callable
+    shape: tuple[int, ...]
+    dims: tuple[str, ...]
+    description: str
+
+
+class RelationForm(NamedTuple):
+    """A system as a relation between points x (N,) of a manifold M and their velocities: what a discretization map on M needs.
+
+    `residual(x, ẋ, u, t, params)` is zero where (x, ẋ) satisfies the system with multipliers u (k,): N numbers, which are
+    paired with the tangent space where M is a submanifold of R^N, and k more, named by `labels`. `spread(u)` puts the
+    multipliers among all `saved` ones, whose axis is called `axis`. `observed` is what else is saved.
+    `canonical`: x is (q, p) on T*Q. A node is saved as `node(x, params)`, a dict with the keys `names`, arrays (N,) each.
+    """
+
+    residual: Callable
+    multipliers: int = 0
+    labels: tuple[str, ...] = ()
+    saved: int = 0
+    spread: Callable = lambda multipliers: multipliers
+    axis: str = "constraint"
+    observed: tuple[Observed, ...] = ()
+    canonical: bool = False
+    names: tuple[str, ...] = ("x",)
+    node: Callable = lambda x, params: {"x": x}
+
+
+class FinalManifold(NamedTuple):
+    """M_f = {φ = 0} with what a step needs, functions of (x, params): constraints φ, `size` of them; the `field` ẋ = X(x); the
+    `multipliers`, as many as `forces`; and `normal(x, α, params)`, the vector by which a combination α of the dφ moves a
+    point onto M_f. `check(data, h, params)` refuses initial data for which this is not M_f."""
+
+    constraints: Callable
+    size: int
+    field: Callable
+    multipliers: Callable
+    forces: int
+    normal: Callable
+    check: Callable | None = None
