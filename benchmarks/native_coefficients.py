@@ -1,6 +1,6 @@
-"""Fits the polynomials of the native engine's elementary functions with mpmath and prints src/…/native/coefficients.py.
+"""Fits the polynomials of the native engine's elementary functions with mpmath and prints src/…/native/functions/coefficients.py.
 
-    python benchmarks/native_coefficients.py > src/dirax/engines/native/coefficients.py
+    python benchmarks/native_coefficients.py > src/dirax/engines/native/functions/coefficients.py
 
 Each is the interpolant in Chebyshev points of a smooth function, rounded to float64; a comment gives its largest error.
 """

@@ -4,9 +4,12 @@ import mpmath
 import numpy as np
 import pytest
 
+from dirax.engines.native.functions import MACHINE_CODE
 from dirax.engines.native.ir.compiled_function import compiled
+from dirax.program.derivatives import partials
+from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.graph import Graph
-from dirax.program.operations import OPERATIONS
+from dirax.program.operations import NUMPY, OPERATIONS
 
 COUNT = 250
 rng = np.random.default_rng(20260331)
@@ -100,7 +103,7 @@ SPECIAL = np.array([0, -0.0, 1, -1, 2, -2, 3, -3, 0.5, -0.5, np.inf, -np.inf, np
 @pytest.mark.parametrize("name", [*POINTS, "floor", "ceil", "round", "trunc", "sign", "recip"])
 def test_special_values_are_numpys(name):
     with np.errstate(all="ignore"):
-        expected = OPERATIONS[name](SPECIAL)
+        expected = NUMPY[name](SPECIAL)
     tolerance = 2e-15 if name == "erfc" else 4e-16
     np.testing.assert_allclose(at_every_width(name, SPECIAL), expected, rtol=tolerance, atol=5e-324)
 
@@ -109,5 +112,62 @@ def test_special_values_are_numpys(name):
 def test_special_pairs_are_numpys(name):
     x, y = (grid.ravel() for grid in np.meshgrid(SPECIAL, SPECIAL))
     with np.errstate(all="ignore"):
-        expected = OPERATIONS[name](x, y)
+        expected = NUMPY[name](x, y)
     np.testing.assert_allclose(at_every_width(name, x, y), expected, rtol=4e-16, atol=5e-324)
+
+
+# ---------------------------------------------------------------------- every operation is whole
+
+PLAIN = [name for name, operation in OPERATIONS.items() if name not in ("select", "and", "or", "not")]
+OPERANDS = {"acosh": (1.7,), "pow": (1.7, -0.6), "recip": (0.4,)}
+PAIRS = ("add", "sub", "mul", "max", "min", "rem", "atan2", "pow", "lt", "le", "eq", "ne")
+
+
+def of_numbers(name: str) -> tuple[Graph, list[int], int, np.ndarray]:
+    """A graph, its inputs, an operation of them, and numbers at which it is smooth."""
+    point = np.array(OPERANDS.get(name, (0.7, 0.3) if name in PAIRS else (0.35,)))
+    g = Graph()
+    inputs = [g.input(f"x{i}") for i in range(len(point))]
+    return g, inputs, g.make(name, *inputs), point
+
+
+def test_every_operation_has_machine_code_or_a_formula():
+    assert OPERATIONS.keys() == MACHINE_CODE.keys() | {name for name, o in OPERATIONS.items() if o.formula}
+    assert not [name for name in MACHINE_CODE if OPERATIONS[name].formula]
+    assert all(name == operation.name for name, operation in OPERATIONS.items())
+
+
+@pytest.mark.parametrize("name", PLAIN)
+def test_jax_and_machine_code_mean_what_numpy_does(name):
+    g, inputs, node, point = of_numbers(name)
+    expected = float(NUMPY[name](*point))
+    assert compiled(g, inputs, [node])(point[:, None]).item() == pytest.approx(expected, rel=4e-16)
+    assert by_jax(g, [node], dict(zip(inputs, point, strict=True))).item() == pytest.approx(expected, rel=2e-15)
+
+
+@pytest.mark.parametrize("name", [name for name in PLAIN if OPERATIONS[name].derivative])
+def test_derivatives_are_those_of_numpys_values(name):
+    g, inputs, node, point = of_numbers(name)
+    values = {f"x{i}": x for i, x in enumerate(point)}
+    slopes = g.evaluate([slope for slope in partials(g, node) if slope is not None], values)
+    assert len(slopes) == len(inputs)
+    for i, slope in enumerate(slopes):
+        step = np.eye(len(point))[i] * 1e-5
+        difference = (NUMPY[name](*(point + step)) - NUMPY[name](*(point - step))) / 2e-5
+        assert slope == pytest.approx(float(difference), rel=1e-8, abs=1e-9)
+
+
+def test_operations_without_a_derivative_are_steps_or_truth_values():
+    none = {name for name, operation in OPERATIONS.items() if operation.derivative is None}
+    assert none == {name for name, operation in OPERATIONS.items() if operation.stepwise or operation.boolean}
+
+
+def test_the_choice_and_logic_are_whole():
+    g = Graph()
+    x, y = g.input("x0"), g.input("x1")
+    a, b = g.make("lt", x, y), g.make("lt", g.zero, x)
+    nodes = [g.select(a, x, y), g.make("and", a, b), g.make("or", a, b), g.make("not", a)]
+    for point in ([0.5, 0.7], [0.7, 0.5], [-0.5, 0.7], [-0.5, -0.7]):
+        expected = [float(v) for v in g.evaluate(nodes, {"x0": point[0], "x1": point[1]})]
+        assert compiled(g, [x, y], nodes)(np.array(point)[:, None])[:, 0].tolist() == expected
+        assert by_jax(g, nodes, {x: point[0], y: point[1]}).tolist() == expected

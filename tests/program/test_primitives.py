@@ -13,7 +13,7 @@ from dirax.engines.native.ir.compiled_function import compiled
 from dirax.program.derivatives import jacobian
 from dirax.program.graph import Graph
 from dirax.program.interpreter import Interpreter, Unavailable
-from dirax.program.operations import OPERATIONS
+from dirax.program.operations import NUMPY
 
 
 def traced(function, *shapes):
@@ -222,7 +222,7 @@ def with_numpy(expression, points: np.ndarray, rng, noise: float):
     values = [*points, *(np.full(points.shape[1], c) for c in CONSTANTS)]
     fine = np.ones(points.shape[1], dtype=bool)
     for op, args in expression:
-        result = np.asarray(OPERATIONS[op](*(values[a] for a in args)))
+        result = np.asarray(NUMPY[op](*(values[a] for a in args)))
         if result.dtype != np.bool_:
             result = result * (1 + noise * rng.uniform(-1, 1, result.shape))
             if noise:

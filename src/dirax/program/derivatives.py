@@ -1,100 +1,16 @@
 """Derivatives of nodes of the scalar graph, as nodes of it."""
 
-import math
-
 from dirax.program.graph import Graph
-from dirax.program.operations import BOOLEAN, STEPWISE
+from dirax.program.operations import OPERATIONS
 
 
 def partials(g: Graph, node: int) -> list[int | None]:
     """The derivative of a node with respect to each of its operands; None where there is none."""
     op, args = g.op[node], g.args[node]
-    x = args[0]
-    match op:
-        case "add":
-            return [g.one, g.one]
-        case "sub":
-            return [g.one, g.constant(-1.0)]
-        case "mul":
-            return [args[1], x]
-        case "neg":
-            return [g.constant(-1.0)]
-        case "recip":
-            return [g.neg(g.mul(node, node))]
-        case "abs":
-            return [g.select(g.make("lt", x, g.zero), g.constant(-1.0), g.one)]
-        case "sqrt":
-            return [g.mul(g.constant(0.5), g.recip(node))]
-        case "max" | "min":
-            first = g.make("le", *(args[::-1] if op == "max" else args))
-            return [g.select(first, g.one, g.zero), g.select(first, g.zero, g.one)]
-        case "rem":
-            return [g.one, g.neg(g.make("trunc", g.div(x, args[1])))]
-        case "select":
-            return [None, g.select(x, g.one, g.zero), g.select(x, g.zero, g.one)]
-        case "pow":
-            y = args[1]
-            by_x = g.mul(y, g.make("pow", x, g.sub(y, g.one)))
-            positive = g.make("lt", g.zero, x)
-            by_y = g.select(positive, g.mul(node, g.make("log", g.select(positive, x, g.one))), g.zero)
-            return [by_x, None if g.is_constant(y) else by_y]
-        case "opaque":
-            return list(g.slopes[node])
-        case "atan2":
-            r = g.recip(g.add(g.mul(x, x), g.mul(args[1], args[1])))
-            return [g.mul(args[1], r), g.neg(g.mul(x, r))]
-        case _ if op in STEPWISE or op in BOOLEAN:
-            return [None] * len(args)
-        case _:
-            return [_elementary(g, op, x, node)]
-
-
-def _elementary(g: Graph, op: str, x: int, f: int) -> int:
-    """f' of f = op(x)."""
-    square = lambda a: g.mul(a, a)
-    root = lambda a: g.make("sqrt", a)
-    one = g.one
-    match op:
-        case "sin":
-            return g.make("cos", x)
-        case "cos":
-            return g.neg(g.make("sin", x))
-        case "tan":
-            return g.add(one, square(f))
-        case "asin":
-            return g.recip(root(g.sub(one, square(x))))
-        case "acos":
-            return g.neg(g.recip(root(g.sub(one, square(x)))))
-        case "atan":
-            return g.recip(g.add(one, square(x)))
-        case "sinh":
-            return g.make("cosh", x)
-        case "cosh":
-            return g.make("sinh", x)
-        case "tanh":
-            return g.sub(one, square(f))
-        case "asinh":
-            return g.recip(root(g.add(square(x), one)))
-        case "acosh":
-            return g.recip(root(g.sub(square(x), one)))
-        case "atanh":
-            return g.recip(g.sub(one, square(x)))
-        case "exp":
-            return f
-        case "exp2":
-            return g.mul(g.constant(math.log(2)), f)
-        case "expm1":
-            return g.add(f, one)
-        case "log":
-            return g.recip(x)
-        case "log1p":
-            return g.recip(g.add(one, x))
-        case "cbrt":
-            return g.recip(g.mul(g.constant(3.0), square(f)))
-        case "erf" | "erfc":
-            slope = 2 / math.sqrt(math.pi) * (1 if op == "erf" else -1)
-            return g.mul(g.constant(slope), g.make("exp", g.neg(square(x))))
-    raise AssertionError(f"{op} has no derivative rule")
+    if op == "opaque":
+        return list(g.slopes[node])
+    rule = OPERATIONS[op].derivative
+    return [None] * len(args) if rule is None else rule(g, node, *args)
 
 
 def jacobian(g: Graph, outputs: list[int], inputs: list[int]) -> list[dict[int, int]]:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from dirax.program.operations import BOOLEAN, COMMUTATIVE, OPERATIONS, evaluate_one
+from dirax.program.operations import BOOLEAN, COMMUTATIVE, NUMPY, evaluate_one
 
 CONSTANT = frozenset({"const", "bool"})
 
@@ -292,7 +292,7 @@ class Graph:
 
         `values` holds nodes that are known from before, and then those that were needed.
         """
-        functions = table or OPERATIONS
+        functions = table or NUMPY
         values = {} if values is None else values
         for node in self.reachable(outputs, values):
             op, args = self.op[node], self.args[node]

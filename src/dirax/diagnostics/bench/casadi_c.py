@@ -21,6 +21,7 @@ from dirax.engines.result import Problem
 from dirax.engines.step_program import inputs, parameters, trace
 from dirax.program.graph import Graph
 from dirax.program.interpreter import UnsupportedPrimitive
+from dirax.program.operations import EXACT, OPERATIONS
 
 FLAGS = ("-O3", "-march=native")
 MOST_SECONDS = 60
@@ -184,27 +185,16 @@ def _write(casadi: Any, p: Problem, folder: Path) -> None:
 
 
 def operations(casadi: Any) -> dict[str, Callable]:
-    """The operations of the scalar graph in CasADi."""
-    same = ("sqrt", "floor", "ceil", "sign", "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "expm1", "log", "log1p", "erf")
-    inverse = ("asin", "acos", "atan", "atan2", "asinh", "acosh", "atanh")
+    """The operations of the scalar graph in CasADi: Python's operators, the names of C, and what it says its own way."""
+    named = {name: getattr(casadi, o.c) for name, o in OPERATIONS.items() if o.c is not None and hasattr(casadi, o.c)}
     return {
-        **{name: getattr(casadi, name) for name in (*same, *inverse)},
-        "add": lambda a, b: a + b,
-        "sub": lambda a, b: a - b,
-        "mul": lambda a, b: a * b,
-        "neg": lambda a: -a,
+        **EXACT,
+        **named,
         "recip": lambda a: 1 / a,
-        "abs": casadi.fabs,
-        "max": casadi.fmax,
-        "min": casadi.fmin,
-        "rem": casadi.fmod,
         "pow": lambda a, b: a**b,
         "exp2": lambda a: 2.0**a,
+        "sign": casadi.sign,
         "select": casadi.if_else,
-        "lt": casadi.lt,
-        "le": casadi.le,
-        "eq": casadi.eq,
-        "ne": casadi.ne,
         "and": casadi.logic_and,
         "or": casadi.logic_or,
         "not": casadi.logic_not,

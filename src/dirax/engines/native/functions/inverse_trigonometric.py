@@ -100,3 +100,6 @@ def acos(e: Emitter, x: str) -> str:
     left = e.add(head, e.add(more, e.fma(e.const(-2.0), rest, e.const(c.PI[1]))))
     end = e.select(e.compare("olt", x, e.const(0.0)), left, right)
     return e.select(near, middle, end)
+
+
+MACHINE_CODE = {"asin": asin, "acos": acos, "atan": atan, "atan2": atan2}

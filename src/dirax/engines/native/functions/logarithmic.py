@@ -1,26 +1,13 @@
-"""log, log1p, pow and cbrt, from x = 2^n m with √½ ≤ m < √2; and the inverse hyperbolic functions."""
+"""log, log1p, pow and cbrt, from x = 2^n m with √½ ≤ m < √2."""
 
 from dirax.engines.native.functions import coefficients as c
-from dirax.engines.native.functions.exponential import clamp, scale, split
-from dirax.engines.native.functions.trigonometric import MAGIC
+from dirax.engines.native.functions.exponential import split
+from dirax.engines.native.functions.powers_of_two import clamp, exponent_and_fraction, scale
 from dirax.engines.native.ir.emitter import Emitter
 
-SQRT_HALF_BITS = 0x3FE6A09E667F3BCD
 LN2_HIGH, LN2_LOW = c.LN2
 LN2_THIRD = -1.3124698417785255e-27
 TWO_THIRDS = (0.6666666666666666, 3.700743415417188e-17)
-
-
-def _exponent_and_fraction(e: Emitter, x: str) -> tuple[str, str]:
-    """(n, m) as doubles for positive finite x, subnormal ones included."""
-    tiny = e.compare("olt", x, e.const(2.2250738585072014e-308))
-    bits = e.bits(e.select(tiny, e.mul(x, e.const(2.0**54)), x))
-    shifted = e.ints("sub", bits, e.integer(SQRT_HALF_BITS))
-    n = e.ints("ashr", shifted, e.integer(52))
-    m = e.from_bits(e.ints("sub", bits, e.ints("shl", n, e.integer(52))))
-    magic_bits = 0x4338000000000000
-    as_double = e.sub(e.from_bits(e.ints("add", n, e.integer(magic_bits))), e.const(MAGIC))
-    return e.select(tiny, e.sub(as_double, e.const(54.0)), as_double), m
 
 
 def _log_of(e: Emitter, n: str, f: str) -> str:
@@ -41,14 +28,14 @@ def _outside(e: Emitter, x: str, value: str, zero_at: float) -> str:
 
 
 def log(e: Emitter, x: str) -> str:
-    n, m = _exponent_and_fraction(e, x)
+    n, m = exponent_and_fraction(e, x)
     return _outside(e, x, _log_of(e, n, e.sub(m, e.const(1.0))), 0.0)
 
 
 def log1p(e: Emitter, x: str) -> str:
     """log(1 + x), with what 1 + x rounds off added to the fraction."""
     total, lost = e.two_sum(e.const(1.0), x)
-    n, m = _exponent_and_fraction(e, total)
+    n, m = exponent_and_fraction(e, total)
     f = e.add(e.sub(m, e.const(1.0)), scale(e, lost, clamp(e, e.neg(n), -1020.0, 1020.0)))
     tiny = e.compare("olt", e.abs(x), e.const(2.0**-54))
     return e.select(tiny, x, _outside(e, x, _log_of(e, n, f), -1.0))
@@ -56,7 +43,7 @@ def log1p(e: Emitter, x: str) -> str:
 
 def _log_two(e: Emitter, x: str) -> tuple[str, str]:
     """log x for positive finite x, in two doubles, relative error about 2^−65."""
-    n, m = _exponent_and_fraction(e, x)
+    n, m = exponent_and_fraction(e, x)
     f = e.sub(m, e.const(1.0))
     below, below_low = e.two_sum(e.const(2.0), f)
     s = e.div(f, below)
@@ -121,7 +108,7 @@ def cbrt(e: Emitter, x: str) -> str:
     """2^(n/3) by thirds, a polynomial start on [1, 8), two Halley steps and one Newton step with an exact residual."""
     size = e.abs(x)
     inside = e.both(e.compare("ogt", size, e.const(0.0)), e.compare("olt", size, e.const(float("inf"))))
-    n, m = _exponent_and_fraction(e, e.select(inside, size, e.const(1.0)))
+    n, m = exponent_and_fraction(e, e.select(inside, size, e.const(1.0)))
     n, m = e.sub(n, e.const(1.0)), e.mul(m, e.const(2.0))  # now √2 ≤ m < 2√2
     third = e.intrinsic("floor", e.mul(e.add(n, e.const(0.5)), e.const(1 / 3)))
     rest = e.sub(n, e.mul(third, e.const(3.0)))
@@ -162,3 +149,6 @@ def atanh(e: Emitter, x: str) -> str:
     size = e.abs(x)
     value = e.mul(e.const(0.5), log1p(e, e.div(e.add(size, size), e.sub(e.const(1.0), size))))
     return e.copysign(value, x)
+
+
+MACHINE_CODE = {"log": log, "log1p": log1p, "pow": power, "cbrt": cbrt}

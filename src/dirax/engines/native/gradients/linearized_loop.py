@@ -11,7 +11,7 @@ trajectory ended. Rows hold the state and the unknowns of a stage, then what flo
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from dirax.engines.native.functions.trigonometric import add_far_reduction
+from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.dense import add_dense_solve

@@ -1,42 +1,21 @@
-"""From graph nodes to instructions: emits what a set of nodes needs, where it is first needed.
+"""From graph nodes to instructions: which nodes are computed where, and in what order.
 
 A `Region` is a stretch of the kernel with the values that are known in it; regions nest, and an inner one sees the outer
-one's values. The instructions and their order depend on the graph alone, never on the width, so that every lane of every
-width rounds alike: products are fused into sums here and not by LLVM.
+one's values. What an operation is in instructions stands in `dirax.engines.native.functions`. The instructions and their order
+depend on the graph alone, never on the width, so that every lane of every width rounds alike: products are fused into sums
+here and not by LLVM.
 """
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
-from dirax.engines.native.functions import exponential, inverse_trigonometric, logarithmic, trigonometric
-from dirax.engines.native.functions.trigonometric import Reduced
-from dirax.engines.native.ir.emitter import Body, Emitter
+from dirax.engines.native.functions import MACHINE_CODE, trigonometric
+from dirax.engines.native.ir.emitter import Emitter
 from dirax.program.graph import Graph
+from dirax.program.operations import OPERATIONS
 
-CIRCULAR = ("sin", "cos", "tan")
-COMPARISONS = {"lt": "olt", "le": "ole", "eq": "oeq", "ne": "une"}
-INTRINSICS = {"abs": "fabs", "sqrt": "sqrt", "floor": "floor", "ceil": "ceil", "round": "roundeven", "trunc": "trunc"}
-FUNCTIONS = {
-    "exp": exponential.exp,
-    "exp2": exponential.exp2,
-    "expm1": exponential.expm1,
-    "sinh": exponential.sinh,
-    "cosh": exponential.cosh,
-    "tanh": exponential.tanh,
-    "erf": exponential.erf,
-    "erfc": exponential.erfc,
-    "log": logarithmic.log,
-    "log1p": logarithmic.log1p,
-    "pow": logarithmic.power,
-    "cbrt": logarithmic.cbrt,
-    "asinh": logarithmic.asinh,
-    "acosh": logarithmic.acosh,
-    "atanh": logarithmic.atanh,
-    "atan": inverse_trigonometric.atan,
-    "atan2": inverse_trigonometric.atan2,
-    "asin": inverse_trigonometric.asin,
-    "acos": inverse_trigonometric.acos,
-}
+CIRCULAR = tuple(trigonometric.MACHINE_CODE)
+"""Operations that are made together, for all arguments that are known at the same time."""
 
 
 class Region:
@@ -100,7 +79,7 @@ class Region:
             if g.op[node] in CIRCULAR:
                 if depth[node] > done_circular:
                     done_circular = depth[node]
-                    self._circular([n for n in waiting if g.op[n] in CIRCULAR and depth[n] == done_circular])
+                    self._together([n for n in waiting if g.op[n] in CIRCULAR and depth[n] == done_circular])
             elif node in divisions:
                 a, b = divisions[node]
                 self.bind(node, self.emitter.div(self.value(a), self.value(b)))
@@ -136,101 +115,29 @@ class Region:
         return e.fma(e.neg(a), b, other) if k == 1 else e.fma(a, b, e.neg(other))
 
     def _instruction(self, node: int) -> str:
-        e, g, op = self.emitter, self.graph, self.graph.op[node]
-        args = [self.value(a) for a in g.args[node]]
-        match op:
-            case "add" | "sub" | "mul" | "neg" | "rem":
-                return getattr(e, op)(*args)
-            case "recip":
-                return e.div(e.const(1.0), args[0])
-            case "max" | "min":
-                larger = e.compare("ogt" if op == "max" else "olt", *args)
-                return e.select(e.either(larger, e.compare("uno", args[0], args[0])), *args)
-            case "sign":
-                x, zero = args[0], e.const(0.0)
-                below = e.select(e.compare("olt", x, zero), e.const(-1.0), x)
-                return e.select(e.compare("ogt", x, zero), e.const(1.0), below)
-            case "finite":
-                return e.compare("olt", e.abs(args[0]), e.const(float("inf")))
-            case "select":
-                return e.select(*args)
-            case "and":
-                return e.both(*args)
-            case "or":
-                return e.either(*args)
-            case "not":
-                return e.invert(*args)
-            case _ if op in COMPARISONS:
-                if g.is_boolean(g.args[node][0]):
-                    raise AssertionError("booleans are compared by logic")
-                return e.compare(COMPARISONS[op], *args)
-            case _ if op in INTRINSICS:
-                return e.intrinsic(INTRINSICS[op], *args)
-        return FUNCTIONS[op](e, *args)
+        op, args = self.graph.op[node], [self.value(a) for a in self.graph.args[node]]
+        formula = OPERATIONS[op].formula
+        return by_formula(self.emitter, formula, args) if formula else MACHINE_CODE[op](self.emitter, *args)
 
-    # ------------------------------------------------------------------ sines and cosines, a group at a time
-
-    def _circular(self, nodes: list[int]) -> None:
-        """The sines, cosines and tangents of one depth; in scalar code their arguments share vectors."""
-        g, e = self.graph, self.emitter
+    def _together(self, nodes: list[int]) -> None:
+        """The sines, cosines and tangents of one depth."""
+        g = self.graph
         arguments = sorted({g.args[n][0] for n in nodes})
-        values = [self.value(a) for a in arguments]
-        group = Emitter(e.body, _group_width(len(values))) if e.width == 1 else e
-        packed = values
-        if group.width > 1 and e.width == 1:
-            padded = values + values[:1] * (-len(values) % group.width)
-            packed = [group.pack(padded[i : i + group.width]) for i in range(0, len(padded), group.width)]
-        reductions = reduce_all(group, packed)
-        wanted = {(g.op[n], g.args[n][0]): n for n in nodes}
-        for i, r in enumerate(reductions):
-            here = arguments[i * group.width : (i + 1) * group.width] if e.width == 1 else arguments[i : i + 1]
-            needed = {op for op, a in wanted if a in here}
-            s = trigonometric.sine_kernel(group, r) if needed & {"sin", "cos"} else ""
-            c = trigonometric.cosine_kernel(group, r) if needed & {"sin", "cos"} else ""
-            makers = {
-                "sin": lambda r=r, s=s, c=c: trigonometric.sine(group, r, s, c),
-                "cos": lambda r=r, s=s, c=c: trigonometric.cosine(group, r, s, c),
-                "tan": lambda r=r: trigonometric.tangent(group, r),
-            }
-            for op in sorted(needed):
-                result = makers[op]()
-                for lane, a in enumerate(here):
-                    if (op, a) in wanted:
-                        single = group.extract(result, lane) if e.width == 1 else result
-                        self.bind(wanted[op, a], single)
+        wanted = {(g.args[n][0], g.op[n]): n for n in nodes}
+        names = [{op for a, op in wanted if a == argument} for argument in arguments]
+        made = trigonometric.together(self.emitter, names, [self.value(a) for a in arguments])
+        for argument, results in zip(arguments, made, strict=True):
+            for op, value in results.items():
+                self.bind(wanted[argument, op], value)
 
 
-def _group_width(count: int) -> int:
-    return 1 if count == 1 else 2 if count == 2 else 4 if count <= 4 else 8
-
-
-def reduce_all(e: Emitter, values: list[str]) -> list[Reduced]:
-    """The reductions of several arguments, with one branch for all of them to the slow way."""
-    body: Body = e.body
-    near = [trigonometric.reduce_near(e, x) for x in values]
-    far = e.false
-    for x in values:
-        far = e.either(far, trigonometric.is_far(e, x))
-    before, slow, join = body.block, body.fresh(), body.fresh()
-    body.branch_if(e.any(far), slow, join)
-    body.label(slow)
-    count = len(values)
-    columns = [values, *([getattr(r, part) for r in near] for part in ("high", "low", "quadrant"))]
-    kinds = (e.real, e.real, e.real, e.int)
-    memory = [body.alloca(kind, count) for kind in kinds]
-    for kind, place, column in zip(kinds, memory, columns, strict=True):
-        for i, value in enumerate(column):
-            body.store(kind, value, body.at(kind, place, i))
-    pointers = ", ".join(f"ptr {m}" for m in memory)
-    body.line(f"call void @{trigonometric.FAR_NAME}({pointers}, i64 {count * e.width})")
-    after = [
-        [body.load(kind, body.at(kind, place, i)) for i in range(count)]
-        for kind, place in zip(kinds[1:], memory[1:], strict=True)
-    ]
-    body.branch(join)
-    body.label(join)
-    merged = [
-        [body.put(f"phi {kind} [ {old}, %{before} ], [ {new}, %{slow} ]") for old, new in zip(column, changed, strict=True)]
-        for kind, column, changed in zip(kinds[1:], columns[1:], after, strict=True)
-    ]
-    return [Reduced(*parts) for parts in zip(*merged, strict=True)]
+def by_formula(e: Emitter, formula: Callable[..., int], operands: list[str]) -> str:
+    """The value of a formula of operations that have machine code."""
+    g = Graph()
+    inputs = [g.input(f"x{i}") for i in range(len(operands))]
+    region = Region(e, g)
+    for node, value in zip(inputs, operands, strict=True):
+        region.bind(node, value)
+    result = formula(g, *inputs)
+    region.require([result])
+    return region.value(result)

@@ -8,7 +8,7 @@ state (with compensated summation) · steps done · status · updates of Newton'
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from dirax.engines.native.functions.trigonometric import add_far_reduction
+from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.dense import add_dense_solve
