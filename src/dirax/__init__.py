@@ -12,6 +12,8 @@ from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
 from dirax.engines.configure import configure
+from dirax.engines.engine import AbstractEngine
+from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.geometry.charts import Atlas, RetractionChart, chart_at, check_chart
 from dirax.geometry.cotangent_lift import CotangentBundle, cotangent_lift, symplecticity_defect
 from dirax.geometry.discrete import (
@@ -77,6 +79,8 @@ __all__ = [
     "SE3",
     "SO2",
     "SO3",
+    "AbstractEngine",
+    "AbstractLinearSolver",
     "AbstractScheme",
     "Adjoint",
     "Atlas",

@@ -1,22 +1,37 @@
-"""Which engine runs a problem: native for small systems on a CPU, xla for everything."""
+"""Which engine takes what: the engines by name, and every number that decides between them, with its measurement.
+
+Times are of two cores of an AMD EPYC with AVX-512; docs/native-engine.md has the tables.
+"""
 
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
 import jax
 
-from dirax.engines import xla
-from dirax.engines.result import Outcome, Problem, Progress
+from dirax.engines.configure import fast_loops_asked_for
+from dirax.engines.contract import Problem
+from dirax.engines.engine import AbstractEngine
 from dirax.program.user_functions import evaluate_on
 
-ENGINES = ("auto", "xla", "native")
+ENGINES = {
+    "auto": "dirax.engines.auto:Auto",
+    "xla": "dirax.engines.xla:Xla",
+    "native": "dirax.engines.native:Native",
+}
+"""Name → the class, imported when it is used."""
 
-LARGEST_NATIVE = 96
-"""Unknowns of a stage, or entries of the state, up to which "auto" takes the native engine for steps that are sparse enough."""
+# ---------------------------------------------------------------------------------------------- what "auto" gives to native
 
 LARGEST_FULL = 32
-"""The same up to which it takes it for any step."""
+"""Unknowns of a stage, or entries of the state, up to which "auto" takes the native engine for any step.
+
+A chain of 32 pendulums, each coupled to all: 44 220 operations a step, compiled in 5.0 s (xla: 2.0 s), 9.9 µs a step (xla: 94),
+which pays after 35 000 steps. At 40 there are more than 60 000 operations, which is where tracing ends."""
+
+LARGEST_NATIVE = 96
+"""The same for steps that are sparse enough: 40 pendulums with forces between neighbours have 2 372 operations, compiled in .5 s."""
 
 MOST_OPERATIONS = 10_000
 """Scalar operations of a step that is sparse enough: a second of compiling, which 20 000 steps get back."""
@@ -24,47 +39,45 @@ MOST_OPERATIONS = 10_000
 PLUGINS = ("jax_plugins", "libtpu")
 """The packages without which JAX has no device but CPUs."""
 
+# ------------------------------------------------------------------------------------ what the xla engine writes in scalars
 
-def run_on(engine: str, problem: Problem, progress: Progress | None = None) -> Outcome:
-    """Run `problem` on the named engine; "auto" takes native where it can, and notes why where it cannot.
+LARGEST_SCALAR = 16
+"""Unknowns of a stage, or entries of the state, up to which the xla engine writes a step in scalars, in large batches and in
+loops that XLA makes one kernel: the rolling disk as arrays and as scalars 4.2 and 1.4 µs a step in such a loop, the double
+spherical pendulum 5.5 and 4.3 in a batch of 512, vortices of 8 unknowns 8.4 and 8.3."""
 
-    Raises `UnsupportedPrimitive` for `engine="native"` and a step that it cannot compile.
-    """
-    if engine == "xla":
-        return xla.run(problem, progress)
-    from dirax.engines import native  # the compiler is imported when it is used
+SCALAR_BATCH = 64
+"""Trajectories from which on a batch is large: on a CPU an array program calls LAPACK once for each small matrix of a batch. For
+one trajectory, as JAX comes, scalars may be slower: the double spherical pendulum takes 6.9 µs a step as arrays and 11 as scalars."""
 
-    if engine == "native":
-        return native.run(problem, progress)
-    most = None if problem.size <= LARGEST_FULL else MOST_OPERATIONS
-    reason = _too_large(problem, LARGEST_NATIVE) or _other_device() or native.supported(problem, most)
-    if reason is None:
-        return native.run(problem, progress)
-    outcome = xla.run(problem, progress)
-    outcome.notes["not_native"] = reason
-    return outcome
+LARGEST_NESTED = 96
+"""The same as LARGEST_SCALAR for a step that is nested, whatever its batch and device: the array program of a pendulum with its
+tension as a coordinate has 500 000 operations and took XLA 160 s to compile, its graph has 1 263."""
 
 
-def run_traced_on(engine: str, problem: Problem) -> Outcome:
-    """The same under `jax.grad`, `jit` or `vmap`: differentiable on every engine."""
-    if engine == "xla":
-        return xla.run_traced(problem)
-    from dirax.engines import native
-
-    if engine == "native":
-        return native.run_traced(problem)
-    reason = _too_large(problem, LARGEST_FULL) or _other_device()
-    if reason is None:
-        try:
-            return native.run_traced(problem)
-        except native.UnsupportedPrimitive as error:
-            reason = str(error)
-    outcome = xla.run_traced(problem)
-    outcome.notes["not_native"] = reason
-    return outcome
+def engine_of(name: str) -> AbstractEngine:
+    """The engine of that name, with its options as they come. Raises `KeyError`."""
+    module, _, kind = ENGINES[name].partition(":")
+    return getattr(import_module(module), kind)()
 
 
-def _too_large(problem: Problem, largest: int) -> str | None:
+def kept_from_native(problem: Problem, traced: bool = False) -> str | None:
+    """Why "auto" does not ask the native engine, where it does not."""
+    return _larger_than(LARGEST_FULL if traced else LARGEST_NATIVE, problem) or _other_device()
+
+
+def most_operations(problem: Problem) -> int | None:
+    """Scalar operations of a step up to which "auto" takes the native engine; None for any number."""
+    return None if problem.size <= LARGEST_FULL else MOST_OPERATIONS
+
+
+def small_for_scalars(problem: Problem) -> bool:
+    """Whether the xla engine writes the step in scalars because that is quicker than arrays."""
+    many = problem.batch is not None and problem.batch >= SCALAR_BATCH
+    return problem.size <= LARGEST_SCALAR and (many or fast_loops_asked_for()) and jax.default_backend() == "cpu"
+
+
+def _larger_than(largest: int, problem: Problem) -> str | None:
     return None if problem.size <= largest else f"{problem.size} numbers a step, more than {largest}"
 
 

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.result import OK, Outcome, Problem
-from dirax.engines.xla.newton import EPSILON, STALLED
+from dirax.engines.contract import OK, Outcome, Problem
+from dirax.engines.stopping import EPSILON, STALLED
 
 SINGULAR = 1e15
 """Condition number from which a Jacobian counts as singular."""
@@ -64,7 +64,7 @@ def _replay_newton(stage, guess, args, max_iterations: int):
         if not condition < SINGULAR:
             return f"the Jacobian of the step is singular (condition number {condition:.2g})", u
         change = np.linalg.solve(jacobian, residual)
-        u, size = u - change, np.max(np.abs(change) / (np.abs(u) + np.asarray(stage.scale)))
+        u, size = u - change, np.max(np.abs(change) / (np.abs(u) + 1.0))
     if size < STALLED:
         return "", u
     return (
@@ -95,4 +95,4 @@ def _roundoff(stage, u, args) -> float:
     if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and np.linalg.cond(by_u) < SINGULAR):
         return np.inf
     change = EPSILON * np.abs(np.linalg.inv(by_u)) @ left
-    return float(np.max(change / (np.abs(u) + np.asarray(stage.scale))))
+    return float(np.max(change / (np.abs(u) + 1.0)))

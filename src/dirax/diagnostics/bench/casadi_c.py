@@ -17,7 +17,7 @@ import numpy as np
 
 from dirax.diagnostics.bench.subject import Program, Skipped, Subject, library
 from dirax.diagnostics.bench.timing import compiler
-from dirax.engines.result import Problem
+from dirax.engines.contract import Problem
 from dirax.engines.step_program import inputs, parameters, trace
 from dirax.program.graph import Graph
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -181,7 +181,7 @@ def _write(casadi: Any, p: Problem, folder: Path) -> None:
         generator.add(casadi.Function(name, arguments, casadi.cse([casadi.densify(r) for r in results])))
     generator.generate(f"{folder}/")
     sizes = f"#define K {e.unknowns}\n#define S {e.state_size}\n"
-    (folder / "driver.c").write_text(sizes + DRIVER % {"scale": ", ".join(map(repr, e.scale))})
+    (folder / "driver.c").write_text(sizes + DRIVER % {"scale": ", ".join(["1.0"] * len(e.unknowns))})
 
 
 def operations(casadi: Any) -> dict[str, Callable]:

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.bench.subject import Program, Skipped, Subject
-from dirax.engines import native, xla
-from dirax.engines.result import Problem
+from dirax.engines.contract import Outcome, Problem
+from dirax.engines.engine import AbstractEngine
+from dirax.engines.native import Native
+from dirax.engines.xla import Xla
 from dirax.program.interpreter import UnsupportedPrimitive
 
 BATCH, BATCH_STEPS = 1024, 50
@@ -21,29 +23,29 @@ TOLERANCE, MOST_UPDATES = 1e-14, 20
 
 def native_one(subject: Subject) -> Program:
     """One trajectory in one lane of the native engine."""
-    return _one(subject, native.run)
+    return _one(subject, Native())
 
 
 def xla_one(subject: Subject) -> Program:
     """One trajectory on the xla engine."""
-    return _one(subject, xla.run)
+    return _one(subject, Xla())
 
 
 def native_batch(subject: Subject) -> Program:
     """A batch on the native engine, in all its lanes and threads."""
-    return _batch(subject, native.run)
+    return _batch(subject, Native())
 
 
 def xla_batch(subject: Subject) -> Program:
     """A batch on the xla engine."""
-    return _batch(subject, xla.run)
+    return _batch(subject, Xla())
 
 
-def _one(subject: Subject, engine: Callable) -> Program:
+def _one(subject: Subject, engine: AbstractEngine) -> Program:
     problem, last = subject.one, {}
 
     def run() -> float:
-        last["outcome"] = outcome = engine(problem)
+        last["outcome"] = outcome = engine.run(problem)
         _refuse_failure(outcome, problem)
         return outcome.run_seconds
 
@@ -51,11 +53,11 @@ def _one(subject: Subject, engine: Callable) -> Program:
     return Program(run, lambda: np.asarray(last["outcome"].fields[subject.shown][0, -1]), {})
 
 
-def _batch(subject: Subject, engine: Callable) -> Program:
+def _batch(subject: Subject, engine: AbstractEngine) -> Program:
     problem, share = _many(subject)
 
     def run() -> float:
-        outcome = engine(problem)
+        outcome = engine.run(problem)
         _refuse_failure(outcome, problem)
         return outcome.run_seconds * share
 
@@ -65,7 +67,7 @@ def _batch(subject: Subject, engine: Callable) -> Program:
 
 def _many(subject: Subject) -> tuple[Problem, float]:
     """A batch from points along the trajectory, and the share of its time that is that of one run of the subject."""
-    rows = native.run(Problem(**{**vars(subject.one), "save_every": max(1, subject.steps // BATCH)}))
+    rows = Native().run(Problem(**{**vars(subject.one), "save_every": max(1, subject.steps // BATCH)}))
     return subject.batch(rows, BATCH, BATCH_STEPS), subject.steps / (BATCH * BATCH_STEPS)
 
 
@@ -77,7 +79,7 @@ def run_once(run: Callable[[], float]) -> None:
         raise Skipped(str(error)) from None
 
 
-def _refuse_failure(outcome: Any, problem: Problem) -> None:
+def _refuse_failure(outcome: Outcome, problem: Problem) -> None:
     if np.any(np.asarray(outcome.completed) < problem.steps):
         raise Skipped("a trajectory ended early")
 

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.result import Outcome, Problem
-from dirax.run.start import initial_data, prepared
+from dirax.engines.contract import Outcome, Problem
+from dirax.run.start import begun, completed
+from dirax.run.validate import Case, initial_data
 from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
 from dirax.systems.system import AbstractSystem
 
@@ -95,16 +96,17 @@ class Subject:
         return self._problem({name: jnp.asarray(values[chosen]) for name, values in rows.items()}, size, steps)
 
     def _problem(self, data: dict[str, jax.Array], batch: int | None, steps: int) -> Problem:
-        start = prepared(self.system, self.equation, data, self.leaves, self.step, 0.0, batch, False, False)
+        case = Case(data, self.leaves, self.step, 0.0, batch)
+        start = begun(self.equation, case, completed(self.system, case, project=False))
         return Problem(
             equation=self.equation,
             state=np.asarray(start.state),
             guess=tuple(np.asarray(u) for u in start.guess),
             h=self.step,
             t0=0.0,
-            steps=steps - start.first_step,
+            steps=steps - int(case.two_points),
             save_every=steps,
-            first_step=start.first_step,
+            first_step=int(case.two_points),
             params=self.leaves,
             batch=batch,
         )

@@ -1,13 +1,14 @@
 """The native engine: a step traced to scalars, compiled by LLVM, run on vectors of trajectories and several threads.
 
-trace.py, interpret.py and the rules   StepEquation → jaxpr → graph.py
-newton_step.py                         Jacobian and elimination on the graph
-step_loop.py, lower.py, emitter.py     graph → LLVM IR; the elementary functions in IR
-compile.py, program.py, driver.py        IR → machine code, caches, calls
+program.py            StepEquation → its scalar program, and the kernels compiled from it, by width
+loops/                scalar program → the loop over rows, steps, stages and Newton's iterations as LLVM IR
+ir/                   the writer of LLVM IR, and nodes written with it
+functions/            the elementary functions in LLVM IR
+compile.py            IR → machine code, and its cache
+engine.py, lanes.py   the run: memory, chunks, threads
+gradients/            derivatives of a run: the loops of tangents and cotangents, and the run as JAX's primitives
 """
 
-from dirax.engines.native.driver import run, supported
-from dirax.engines.native.gradients.differentiate import run_traced
-from dirax.program.interpreter import UnsupportedPrimitive
+from dirax.engines.native.engine import Native
 
-__all__ = ["UnsupportedPrimitive", "run", "run_traced", "supported"]
+__all__ = ["Native"]

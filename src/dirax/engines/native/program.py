@@ -15,7 +15,8 @@ from dirax.engines.compensation import increments
 from dirax.engines.native import compile as llvm
 from dirax.engines.native.gradients.linearized_loop import Sweep, backward, forward
 from dirax.engines.native.loops.newton_step import newton_correction
-from dirax.engines.native.loops.step_loop import Plan, kernel_module
+from dirax.engines.native.loops.plan import Plan
+from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.step_program import Inputs, Parameters, TracedEquation, inputs, parameters, trace
 from dirax.program import graph as graph_module
 from dirax.program.derivatives import jacobian

@@ -1,5 +1,12 @@
-"""The xla engine: jitted steps on arrays, on any device; the oracle."""
+"""The xla engine: jitted steps on arrays, on any device; the oracle.
 
-from dirax.engines.xla.engine import first_lane, run, run_traced, take_step, unpacked_rows
+newton.py, dense.py   one equation solved, its linear equations; derivatives by the implicit function theorem
+lane.py               one step of one trajectory, and what it carries
+loop.py               many steps of all trajectories as one compiled function, and the rows saved on the way
+engine.py             the run: chunks from the host, or one scan under a transformation
+"""
 
-__all__ = ["first_lane", "run", "run_traced", "take_step", "unpacked_rows"]
+from dirax.engines.xla.dense import Dense
+from dirax.engines.xla.engine import Xla
+
+__all__ = ["Dense", "Xla"]

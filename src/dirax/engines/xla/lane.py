@@ -7,14 +7,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from dirax.engines.result import NOT_CONVERGED, NOT_FINITE, OK
+from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
+from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.engines.xla.newton import as_function, solve
 
 
-class Derived(NamedTuple):
-    """What is known of an equation besides its functions, one function of (u, state, t, h, params) per stage or None:
-    what the step adds to the state (NaN: unknown), and the Jacobian (k, k) of the residual."""
+class Numerics(NamedTuple):
+    """How a step is computed, besides the functions of its equation.
 
+    `linear_solver` solves the equations of Newton's method. Where they are known, each stage has a function of
+    (u, state, t, h, params) for what the step adds to the state (NaN: unknown), and for the Jacobian (k, k) of the residual.
+    """
+
+    linear_solver: AbstractLinearSolver | None = None
     increments: tuple[Callable, ...] | None = None
     jacobians: tuple[Callable, ...] | None = None
 
@@ -64,13 +69,13 @@ def first_lane(state, guess: tuple, xp=jnp, compensated: bool = False) -> Lane:
 
 
 def take_step(
-    equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True, derived: Derived | None = None
+    equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True, numerics: Numerics | None = None
 ) -> tuple[Lane, tuple]:
     """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns.
 
     With `differentiable` it can be differentiated in reverse mode too, and no derivative passes through a step that failed."""
-    nothing = (None,) * len(equation.stages)
-    increments, jacobians = (found or nothing for found in derived or Derived())
+    linear_solver, *known = numerics or Numerics()
+    increments, jacobians = (functions or (None,) * len(equation.stages) for functions in known)
     stages, fractions = zip(*equation.stages, strict=True)
 
     def solved(carry, fraction, before, stage, increment, jacobian):
@@ -80,7 +85,7 @@ def take_step(
         fixed = passing(args, False) if differentiable else args
         guess = stage.guess(fixed[0], jnp.sum(before, axis=0), *fixed[2:])
         guess = jax.lax.stop_gradient(guess) if differentiable else guess
-        u, count, converged = solve(stage.residual, stage.scale, guess, fixed, max_iterations, running, jacobian)
+        u, count, converged = solve(stage.residual, guess, fixed, max_iterations, running, jacobian, linear_solver)
         new, left = stage.advance(u, *fixed), stage.residual(u, *fixed)
         # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
         finite = jnp.isfinite(jnp.sum(0.0 * jnp.concatenate([new, left])))
@@ -90,7 +95,7 @@ def take_step(
         worst = jnp.where(status == OK, jnp.maximum(worst, jnp.max(jnp.abs(left), initial=0.0)), worst)
         if differentiable:
             args = passing(args, status == OK)
-            u = as_function(stage.residual, u, args)
+            u = as_function(stage.residual, u, args, linear_solver)
             new = stage.advance(u, *args)
         if increment is not None:
             new, left_out = compensated_sum(state, lost, increment(u, *args), new)

@@ -17,12 +17,13 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from dirax.engines import xla
-from dirax.engines.native.driver import run
+from dirax.engines.contract import Outcome, Problem, finished, saved_steps
+from dirax.engines.native.engine import run
 from dirax.engines.native.gradients.runs import pull, push
 from dirax.engines.native.program import program
-from dirax.engines.result import Outcome, Problem, saved_steps
 from dirax.engines.step_program import Parameters, parameters
+from dirax.engines.xla import Xla
+from dirax.engines.xla.loop import unpacked_rows
 from dirax.schemes.step import Field, StepEquation, StepSequence
 
 KEPT = 128
@@ -94,7 +95,6 @@ def _recording(equation: Any, leaves: Parameters) -> tuple[Any, int]:
             state_size=stage.state_size,
             unknowns=stage.unknowns,
             fields={"state": Field((stage.state_size,)), "unknowns": Field((size,))},
-            scale=stage.scale,
             labels=stage.labels,
         )
 
@@ -106,19 +106,17 @@ def _recording(equation: Any, leaves: Parameters) -> tuple[Any, int]:
 
 
 def _run(task: Recorded, *arrays: np.ndarray) -> list[np.ndarray]:
-    out = run(task.problem(*arrays))
+    p = task.problem(*arrays)
+    out = finished(p, run(p), held=True)
     table = np.stack([out.completed, out.status, out.iterations, out.max_residual], axis=1)
     last = np.zeros((len(table), task.unknowns))
     last[:, : out.last_unknowns.shape[1]] = out.last_unknowns
-    for name, values in out.fields.items():  # as the xla engine has them, which goes on in the same place
-        for lane in np.flatnonzero(out.completed < task.steps):
-            values[lane, -(-out.completed[lane] // task.numbers["save_every"]) :] = out.closing[name][lane]
     return [out.fields["state"], out.fields["unknowns"], table, last]
 
 
 def _reference(task: Recorded, *inputs):
     """States and unknowns by the xla engine, for derivatives of derivatives."""
-    fields = xla.run_traced(task.problem(*inputs)).fields
+    fields = Xla().run_traced(task.problem(*inputs)).fields
     return [fields["state"], fields["unknowns"]]
 
 
@@ -238,9 +236,9 @@ def run_traced(problem: Problem) -> Outcome:
     stage = p.equation.stages[0][0]
     completed = jnp.minimum(saved_steps(p)[None, :, None], table[:, None, :1])
     packed = jnp.concatenate([states, unknowns[..., : stage.unknowns], completed], axis=2)
-    rows = xla.unpacked_rows(p, packed)
-    return Outcome(
-        fields={name: a if stage.fields[name].place == "node" else a[:, :-1] for name, a in rows.items()},
+    rows = unpacked_rows(p, packed)
+    outcome = Outcome(
+        fields={name: a if p.is_node(name) else a[:, :-1] for name, a in rows.items()},
         closing={name: a[:, -1] for name, a in rows.items()},
         completed=table[:, 0].astype(int),
         status=table[:, 1].astype(int),
@@ -250,3 +248,4 @@ def run_traced(problem: Problem) -> Outcome:
         last_unknowns=last[:, : stage.unknowns],
         engine="native",
     )
+    return finished(p, outcome)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dirax.engines.native.driver import Lanes, width_for
+from dirax.engines.native.lanes import Lanes, width_for
 from dirax.engines.native.program import program
 
 if TYPE_CHECKING:

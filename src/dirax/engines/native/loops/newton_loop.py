@@ -1,4 +1,4 @@
-"""Newton's iteration in IR: `dirax.engines.xla.newton` written out, lanes that are done frozen.
+"""Newton's iteration in IR: that of `engines/xla/newton.py` written out, lanes that are done frozen.
 
 A Jacobian serves several updates while they contract quickly: a first kind of update computes residual, Jacobian and
 factors together, a second kind the residual alone. Where a pivot was too small the correction comes from partial
@@ -9,7 +9,7 @@ from dirax.engines.native.ir.emitter import Body, Emitter
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.newton_step import Correction
 from dirax.engines.step_program import TracedEquation
-from dirax.engines.xla.newton import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, STALLED
+from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, STALLED
 
 
 class NewtonLoop:
@@ -79,8 +79,8 @@ class NewtonLoop:
         b, e = self.body, self.e
         new = [e.sub(a, d) for a, d in zip(old, change, strict=True)]
         update, total = e.const(0.0), e.const(0.0)
-        for a, d, scale in zip(new, change, self.equation.scale, strict=True):
-            update = e.max(e.div(e.abs(d), e.add(e.abs(a), e.const(scale))), update)
+        for a, d in zip(new, change, strict=True):
+            update = e.max(e.div(e.abs(d), e.add(e.abs(a), e.const(1.0))), update)
             total = e.add(total, d)
         update = e.select(e.compare("uno", total, total), e.const(float("nan")), update)
         count = b.load(e.real, self._number)
@@ -105,7 +105,7 @@ class NewtonLoop:
         b.store(e.bool, e.both(e.both(now, unfinished), e.both(quick, stable)), self._contracting, 1)
 
     def _at_floor(self, update: str, ratio: str) -> str:
-        """`dirax.engines.xla.newton.at_floor`."""
+        """Whether another update would gain nothing: `dirax/engines/stopping.py`."""
         e = self.e
         left = e.mul(e.mul(e.const(2.0), ratio), update)
         stalled = e.both(e.compare("oge", ratio, e.const(0.5)), e.compare("olt", update, e.const(STALLED)))

@@ -1,0 +1,45 @@
+"""The engine "auto": native for small systems on a CPU, xla for everything else."""
+
+from dirax.engines import policy
+from dirax.engines.contract import Outcome, Problem, Progress
+from dirax.engines.engine import AbstractEngine
+from dirax.engines.xla import Xla
+from dirax.program.interpreter import UnsupportedPrimitive
+
+
+class Auto(AbstractEngine):
+    """Takes the native engine where that is quicker, by the numbers in `policy.py`; `stats["not_native"]` says why where not."""
+
+    name = "auto"
+
+    def supports(self, problem: Problem) -> str | None:
+        """The xla engine takes what the native one does not."""
+        return None
+
+    def run(self, problem: Problem, progress: Progress | None = None) -> Outcome:
+        """By the native engine or by the xla engine."""
+        reason = policy.kept_from_native(problem)
+        if reason is None:
+            from dirax.engines.native import Native  # the compiler is imported when it is used
+
+            native = Native(most_operations=policy.most_operations(problem))
+            reason = native.supports(problem)
+            if reason is None:
+                return native.run(problem, progress)
+        outcome = Xla().run(problem, progress)
+        outcome.notes["not_native"] = reason
+        return outcome
+
+    def run_traced(self, problem: Problem) -> Outcome:
+        """The same, for smaller systems: their derivatives are compiled, too."""
+        reason = policy.kept_from_native(problem, traced=True)
+        if reason is None:
+            from dirax.engines.native import Native
+
+            try:
+                return Native().run_traced(problem)
+            except UnsupportedPrimitive as error:
+                reason = str(error)
+        outcome = Xla().run_traced(problem)
+        outcome.notes["not_native"] = reason
+        return outcome

@@ -1,0 +1,37 @@
+"""AbstractEngine: what runs a problem. One package each beside this module, and one line in `policy.py`."""
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import equinox as eqx
+
+from dirax.engines.contract import Outcome, Problem, Progress
+
+
+class AbstractEngine(eqx.Module):
+    """Runs problems: solves step after step and saves rows. Its options are its fields.
+
+    `dx.simulate(…, engine=…)` takes an engine, of dirax or of your own, or the name of one. What an engine owes to
+    trajectories that fail is said in `dirax/engines/contract.py`, and asked by `tests/engines/test_contract.py`.
+    """
+
+    name: eqx.AbstractClassVar[str]
+    """What `stats["engine"]` says."""
+
+    compiles_start: ClassVar[bool] = False
+    """Whether the start of a run is to be compiled by JAX, too, and not found from scalar programs in NumPy."""
+
+    @abstractmethod
+    def supports(self, problem: Problem) -> str | None:
+        """None if the engine takes the problem, else why it does not, in words that go on after "because"."""
+
+    @abstractmethod
+    def run(self, problem: Problem, progress: Progress | None = None) -> Outcome:
+        """Run `problem`, saving into NumPy arrays; Ctrl-C and failing steps keep what was computed.
+
+        `progress` is called now and then. Raises `UnsupportedPrimitive` for a problem that the engine does not support.
+        """
+
+    @abstractmethod
+    def run_traced(self, problem: Problem) -> Outcome:
+        """The same under `jax.grad`, `jit` or `vmap`, with derivatives: arrays of JAX, nothing is known of their values."""

@@ -1,0 +1,38 @@
+"""AbstractLinearSolver: what solves the linear equations of Newton's method."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+
+class AbstractLinearSolver(eqx.Module):
+    """Solves J x = b for the Jacobian J of a step: `Xla(linear_solver=…)`, of your own as one class.
+
+        class QR(dx.AbstractLinearSolver):
+            def factorise(self, matrix):
+                return jnp.linalg.qr(matrix)
+
+            def solve(self, factors, right):
+                q, r = factors
+                return jax.scipy.linalg.solve_triangular(r, q.T @ right)
+
+    Both act on one trajectory and are traced by JAX. Derivatives of a run need no more: they solve with J and its transpose, and
+    nothing is differentiated through. What is known of all matrices, a pattern and what follows from it alone, belongs in the
+    fields of the solver.
+    """
+
+    @abstractmethod
+    def factorise(self, matrix: Float[Array, "k k"]) -> Any:
+        """What has to be done once for a matrix: any pytree of arrays, the matrix itself for an iterative method."""
+
+    @abstractmethod
+    def solve(self, factors: Any, right: Float[Array, " k"]) -> Float[Array, " k"]:
+        """x with matrix·x = right."""
+
+    def solve_transposed(self, factors: Any, right: Float[Array, " k"]) -> Float[Array, " k"]:
+        """x with matrixᵀ·x = right, which reverse mode needs: JAX transposes `solve`, unless a solver knows better, or has to
+        say it because its `solve` is a loop or a call of a library."""
+        return jax.linear_transpose(lambda b: self.solve(factors, b), right)(right)[0]

@@ -1,0 +1,107 @@
+"""The engine "native": the run of a kernel, chunk by chunk, and the run as a function that JAX differentiates."""
+
+import time
+
+import numpy as np
+
+from dirax.engines.contract import Outcome, Problem, Progress, finished
+from dirax.engines.engine import AbstractEngine
+from dirax.engines.native.lanes import Lanes, width_for
+from dirax.engines.native.program import program
+from dirax.program.interpreter import UnsupportedPrimitive
+
+CHUNK_SECONDS = 0.1
+WORTH_THREADS = 2e-3
+"""Seconds of work from which on it is shared among threads."""
+
+FIRST_CHUNK = 20_000
+"""Lane-steps of the first call, from which the speed is estimated."""
+
+
+class Native(AbstractEngine):
+    """Small systems on a CPU: the step traced to scalars, compiled by LLVM, run on vectors of trajectories and several threads.
+
+    `most_operations` bounds the scalar operations of a step, except of one that is nested; None: as many as can be traced.
+    """
+
+    most_operations: int | None = None
+    name = "native"
+
+    def supports(self, problem: Problem) -> str | None:
+        """None if the step is a scalar program, of so many operations; else the primitive and the line of the user's source, or
+        how many operations there are."""
+        try:
+            made, _ = program(problem.equation, problem.params, problem.batch_params, problem.compensated)
+            if self.most_operations is not None and not made.nested:
+                made.check()
+                if made.operations > self.most_operations:
+                    return f"{made.operations} scalar operations a step, more than {self.most_operations}"
+        except UnsupportedPrimitive as error:
+            return str(error)
+        return None
+
+    def run(self, problem: Problem, progress: Progress | None = None) -> Outcome:
+        """Run `problem`, saving into NumPy arrays; Ctrl-C and failing steps keep what was computed.
+
+        Raises `UnsupportedPrimitive` for a step that cannot be compiled.
+        """
+        return run(problem, progress)
+
+    def run_traced(self, problem: Problem) -> Outcome:
+        """The same as one primitive of JAX, with derivatives by loops over the steps; those of the second order and higher are
+        by the xla engine. Raises `UnsupportedPrimitive` as well."""
+        from dirax.engines.native.gradients.differentiate import run_traced  # imported when it is used
+
+        return run_traced(problem)
+
+
+def run(p: Problem, progress: Progress | None = None) -> Outcome:
+    """The run of a problem, as `Native.run` has it."""
+    started = time.perf_counter()
+    made, _ = program(p.equation, p.params, p.batch_params, p.compensated)
+    lanes = Lanes(p, made, width_for(p.batch or 1))
+    kernel, cached = made.kernel(lanes.width)
+    compile_seconds, started = time.perf_counter() - started, time.perf_counter()
+
+    fields, outs = lanes.arrays(p.rows)
+    done, interrupted, threads = 0, False, 1
+    count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
+    try:
+        while done < p.steps and (done == 0 or lanes.going):
+            count = min(count, p.steps - done)
+            tick = time.perf_counter()
+            lanes.call(kernel, lanes.records, outs, done, done + count, p.save_every, threads)
+            done += count
+            rate = count / max(time.perf_counter() - tick, 1e-9)
+            count = max(1, int(rate * CHUNK_SECONDS))
+            threads = lanes.threads if threads > 1 or p.steps - done > rate * WORTH_THREADS else 1
+            if progress:
+                progress(done, p.steps)
+    except KeyboardInterrupt:
+        interrupted = True
+    closing, outs = lanes.arrays(2)
+    lanes.call(kernel, lanes.records.copy(), outs, 0, 1, 1, threads)
+    table, record = lanes.table(), lanes.record
+    whole = lambda quantity: table[:, quantity].astype(np.int64)
+    outcome = Outcome(
+        fields=fields,
+        closing={name: rows[:, 0] for name, rows in closing.items()},
+        completed=whole(record.completed),
+        status=whole(record.status),
+        iterations=whole(record.iterations),
+        max_residual=table[:, record.max_residual].copy(),
+        last_state=table[:, record.state].copy(),
+        last_unknowns=table[:, record.unknowns(0, p.equation.stages[0][0].unknowns)].copy(),
+        interrupted=interrupted,
+        compile_seconds=compile_seconds,
+        run_seconds=time.perf_counter() - started,
+        engine="native",
+        notes={
+            "unknowns": sum(len(made.equations[i].unknowns) for i, _ in made.stages),
+            "operations": made.operations,
+            "lanes": lanes.width,
+            "threads": lanes.threads,
+            "kernel_cached": cached,
+        },
+    )
+    return finished(p, outcome)

@@ -1,0 +1,25 @@
+"""When Newton's method stops, in every engine: at the roundoff floor, and not at a tolerance.
+
+An update is measured by its largest |change_i| / (|u_i| + 1), and its ratio to the one before says how the iteration contracts.
+With a Jacobian from a distance e of the root the error shrinks by 2Ce in an update, C the curvature, and Ce is the ratio of the
+first two updates: what an update leaves is at most 2·ratio·update. The iteration has reached its floor where
+
+    update ≤ FLOOR   or   2·ratio·update ≤ NEGLIGIBLE   or   ratio ≥ ½ and update < STALLED.
+
+It is written out in array operations in `xla/newton.py` and in machine code in `native/loops/newton_loop.py`.
+"""
+
+EPSILON = 2.220446049250313e-16
+"""The distance from 1 to the next number."""
+
+FLOOR = 8 * EPSILON
+"""A relative update of this size is roundoff: the unknowns cannot be known better."""
+
+NEGLIGIBLE = 1e-5 * EPSILON
+"""Error left by the last update that even 10¹⁰ steps do not add up to more than their roundoff."""
+
+STALLED = 1e-9
+"""Updates below this that no longer shrink have reached the floor of an ill-conditioned equation."""
+
+NEAR, CONTRACTING = 1e-3, 1e-2
+"""The Jacobian is used again after a first update below NEAR, and as long as updates shrink by the factor CONTRACTING."""

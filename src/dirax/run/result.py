@@ -1,0 +1,91 @@
+"""From what an engine gives back to a Solution: rows, times, messages, and what is reported of the run."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.engines.contract import Outcome, Problem, cut, saved_steps
+from dirax.run.failures import explain
+from dirax.run.validate import Case
+from dirax.schemes.step import AbstractScheme
+from dirax.solution.solution import Solution
+from dirax.systems.system import AbstractSystem
+
+
+def solution_of(
+    system: AbstractSystem,
+    scheme: AbstractScheme,
+    case: Case,
+    problem: Problem,
+    outcome: Outcome,
+    row0: dict[str, Any] | None,
+    traced: bool,
+) -> Solution:
+    """The Solution of a run; `row0` is the given row 0 of a two-point start."""
+    p, fields, numbers = problem, outcome.fields, saved_steps(problem)
+    ok, message = outcome.completed == p.steps, ""
+    if traced:
+        ok = ok if p.batch is not None else ok[0]
+    else:
+        message = _messages(p, outcome, numbers)
+        if p.batch is None:
+            ok, message = bool(ok[0]), message[0]
+            numbers, fields = cut(p, outcome)
+    if row0 is not None:
+        join = jnp.concatenate if traced else np.concatenate
+        lead = lambda a: a if p.batch is not None else a[None]
+        for name in list(fields):  # one after the other, so that only one array is in memory twice
+            first = lead(row0[name])[:, None]
+            fields[name] = join([first if traced else np.asarray(first), fields.pop(name)], axis=1)
+        numbers = np.concatenate([[-1.0], numbers])
+    if p.batch is None:
+        fields = {name: a[0] for name, a in fields.items()}
+    return Solution(
+        t=_times(p, numbers, traced),
+        fields={name: fields[name] for name in p.fields},
+        field_info=p.fields,
+        step=p.h,
+        save_every=p.save_every,
+        stats=_stats(p, outcome, traced),
+        ok=ok,
+        message=message,
+        system=system,
+        scheme=scheme,
+        equation=p.equation,
+        params=p.params,
+        batch_params=p.batch_params,
+        initial=dict(case.data),
+    )
+
+
+def _messages(p: Problem, outcome: Outcome, numbers: np.ndarray) -> list[str]:
+    """Why each trajectory ended, "" where it did not."""
+    good = np.asarray(outcome.completed)
+    kept = good if p.batch is None else numbers[np.searchsorted(numbers, good, side="right") - 1]
+    lanes = range(len(good))
+    return [explain(p, outcome, lane, kept=int(kept[lane])) if good[lane] < p.steps else "" for lane in lanes]
+
+
+def _times(p: Problem, numbers: np.ndarray, traced: bool):
+    """The times of the steps of the given numbers, in the same array where nothing that is traced can hold it."""
+    if traced:
+        return p.t0 + (numbers + p.first_step) * p.h
+    numbers += p.first_step
+    numbers *= p.h
+    numbers += p.t0
+    return numbers
+
+
+def _stats(p: Problem, outcome: Outcome, traced: bool) -> dict[str, Any]:
+    xp = jnp if traced else np
+    total, worst = xp.sum(outcome.iterations), xp.max(outcome.max_residual)
+    return {
+        "engine": outcome.engine,
+        "steps": p.steps + p.first_step,
+        "newton_iterations": total if traced else int(total),
+        "max_residual": worst if traced else float(worst),
+        "compile_seconds": outcome.compile_seconds,
+        "run_seconds": outcome.run_seconds,
+        **outcome.notes,
+    }

@@ -1,0 +1,181 @@
+"""The arguments of a run, checked: each mistake is one error that names the argument, what came and what was expected."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.engines.engine import AbstractEngine
+from dirax.engines.policy import ENGINES, engine_of
+from dirax.program.user_functions import check_finite, is_traced
+from dirax.schemes.step import AbstractScheme
+from dirax.systems.system import AbstractSystem
+
+KINDS = ({"q", "v"}, {"q", "p"}, {"q0", "q1"}, {"x"}, {"q"})
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a run begins with: initial data (n,) or (B, n) by name, parameters (with a leading axis B if `batch_params`), the
+    step h and the time t0 of the first row. Arrays are NumPy's where no value is traced; `batch` is B, None for one trajectory."""
+
+    data: Mapping[str, Any]
+    params: Any
+    h: Any
+    t0: Any
+    batch: int | None = None
+    batch_params: bool = False
+
+    @property
+    def first(self) -> tuple[dict[str, Any], Any]:
+        """Data and parameters of the first trajectory."""
+        params = jax.tree.map(lambda leaf: leaf[0], self.params) if self.batch_params else self.params
+        return {name: a[0] if a.ndim == 2 else a for name, a in self.data.items()}, params
+
+    @property
+    def two_points(self) -> bool:
+        """Whether rows 0 and 1 are given, so that the first step leaves row 1."""
+        return "q0" in self.data
+
+    @property
+    def traced(self) -> bool:
+        """Whether any value is traced by JAX."""
+        return is_traced(self.data, self.params, self.h, self.t0)
+
+
+def validated_case(given: dict[str, Any], params: Any, batch_params: bool, step: Any, t0: Any) -> Case:
+    """The case of initial data by name, None for those that were not given."""
+    h, t0 = positive(step, "step"), finite(t0, "t0")
+    data, batch = initial_data({name: a for name, a in given.items() if a is not None})
+    params = _arrays(params)
+    check_finite("params", params)
+    return Case(data, params, h, t0, _batch_size(batch, params, batch_params), batch_params)
+
+
+def check_kinds(system: Any, scheme: Any) -> None:
+    """Raise `TypeError` for a system or a scheme that is none."""
+    for value, kind, name, example in (
+        (system, AbstractSystem, "system", "dx.LagrangeDirac(…)"),
+        (scheme, AbstractScheme, "scheme", "dx.PlusLagrangeDirac()"),
+    ):
+        if not isinstance(value, kind):
+            came = f"the class {value.__name__} itself" if isinstance(value, type) else f"{value!r:.80}"
+            hint = ": add parentheses" if isinstance(value, type) else ""
+            raise TypeError(f"{name} must be a dirax {name} such as {example}, but {came} was given{hint}.")
+
+
+def engine_from(engine: str | AbstractEngine) -> AbstractEngine:
+    """The engine that is meant by its name, or itself."""
+    if isinstance(engine, AbstractEngine):
+        return engine
+    if isinstance(engine, str) and engine in ENGINES:
+        return engine_of(engine)
+    if isinstance(engine, type) and issubclass(engine, AbstractEngine):
+        raise TypeError(f"engine must be a name or an engine, but the class {engine.__name__} itself was given: add parentheses.")
+    names = ", ".join(map(repr, ENGINES))
+    raise ValueError(f"engine must be one of {names}, or a dx.AbstractEngine, but {engine!r} was given.")
+
+
+def initial_data(given: dict[str, Any]) -> tuple[dict[str, Any], int | None]:
+    """The initial data as float64 arrays of shape (n,) or (B, n), NumPy's where no value is traced, and B (None for one
+    trajectory)."""
+    if set(given) not in KINDS:
+        came = ", ".join(f"{name}=" for name in sorted(given)) + (" alone" if len(given) == 1 else "")
+        raise ValueError(
+            f"initial data must be one of q=, v= · q=, p= · q0=, q1= · x=, but {came if given else 'none'} was given."
+        )
+    arrays = {name: _real_array(name, value) for name, value in given.items()}
+    shapes = {name: array.shape for name, array in arrays.items()}
+    if len({shape[-1] for shape in shapes.values()}) > 1:
+        a, b = shapes
+        raise ValueError(f"{a} and {b} must have the same length n, but their shapes are {shapes[a]} and {shapes[b]}.")
+    batches = {shape[0] for shape in shapes.values() if len(shape) == 2}
+    if len(batches) > 1:
+        a, b = shapes
+        raise ValueError(
+            f"{a} and {b} must hold the same number of trajectories, but their shapes are {shapes[a]} and {shapes[b]}."
+        )
+    batch = batches.pop() if batches else None
+    if batch is not None:
+        arrays = {name: spread(a, batch) for name, a in arrays.items()}
+    return arrays, batch
+
+
+def spread(array: Any, batch: int) -> Any:
+    """With an axis of the batch."""
+    return (jnp if is_traced(array) else np).broadcast_to(array, (batch, array.shape[-1]))
+
+
+def _real_array(name: str, value: Any) -> Any:
+    try:
+        array = jnp.asarray(value) if is_traced(value) else np.asarray(value)
+    except ValueError as error:
+        reason = str(error).split(". ")[0].rstrip(".")
+        raise ValueError(f"{name} must be an array of numbers, but it could not be made one: {reason}.") from error
+    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+        raise TypeError(f"{name} must hold real numbers, but its dtype is {array.dtype}.")
+    if array.ndim not in (1, 2) or 0 in array.shape:
+        raise ValueError(f"{name} must have shape (n,), or (B, n) for a batch of B trajectories, but its shape is {array.shape}.")
+    check_finite(name, array)
+    return array.astype(np.float64)
+
+
+def finite(value, name: str):
+    if is_traced(value):
+        return value
+    if not _is_number(value) or np.ndim(value) != 0 or not np.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, but {value!r} was given.")
+    return float(value)
+
+
+def positive(value, name: str):
+    if not is_traced(value) and (not _is_number(value) or np.ndim(value) != 0 or not 0 < value < np.inf):
+        raise ValueError(f"{name} must be a positive finite number, but {value!r} was given.")
+    return value if is_traced(value) else float(value)
+
+
+def count(value, name: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ValueError(f"{name} must be a whole number ≥ 1, but {value!r} was given.")
+    return int(value)
+
+
+def _is_number(leaf) -> bool:
+    if isinstance(leaf, np.ndarray | np.generic | jax.Array):
+        return jnp.issubdtype(leaf.dtype, jnp.number)
+    return isinstance(leaf, int | float) and not isinstance(leaf, bool)
+
+
+def _is_boolean(leaf) -> bool:
+    return isinstance(leaf, bool) or jnp.issubdtype(getattr(leaf, "dtype", object), jnp.bool_)
+
+
+def _arrays(params):
+    """The pytree with arrays for its leaves: NumPy's where they can be, for JAX's start JAX and compile what takes a part."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if not _is_number(leaf) and not _is_boolean(leaf):
+            raise TypeError(
+                f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {leaf!r:.60}: "
+                "use such a value in the system's functions directly."
+            )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf) if is_traced(leaf) else np.array(leaf), params)
+
+
+def _batch_size(batch: int | None, params, batch_params: bool) -> int | None:
+    if not batch_params:
+        return batch
+    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(params)]
+    if not shapes or () in shapes or len({shape[0] for shape in shapes}) > 1:
+        raise ValueError(
+            "with batch_params=True every leaf of params needs the same leading batch axis, but "
+            + (f"their shapes are {', '.join(map(str, shapes))}." if shapes else "params has no leaves.")
+        )
+    size = shapes[0][0]
+    if batch not in (None, size):
+        raise ValueError(
+            f"the initial data are a batch of {batch} and the leaves of params a batch of {size}: they must be equal."
+        )
+    return size
