@@ -27,7 +27,7 @@ SYSTEM = dx.LagrangeDirac(lagrangian)
 SCHEME = dx.LagrangeDAlembert("midpoint")
 
 # p + D1 L_d = p + h/2 L_q − L_v = 0 at the midpoint, p' = D2 L_d = h/2 L_q + L_v; every update with its own Jacobian,
-# extrapolation and stopping rule as in dirax.engines.xla.newton
+# extrapolation and stopping rule as in dirax.engines.stopping
 C_SOURCE = r"""
 #include <math.h>
 #define G 9.81

@@ -19,8 +19,8 @@ from dirax import gallery
 from dirax.cli.bench import subject
 from dirax.diagnostics.bench.casadi_c import c_run
 from dirax.diagnostics.bench.subject import Skipped
-from dirax.engines import native
-from dirax.engines.result import Problem
+from dirax.engines.contract import Problem
+from dirax.engines.native import Native
 
 STEPS, BATCH, BATCH_STEPS = 10_000, 8192, 50
 SUBJECT = subject(gallery.get("double-spherical-pendulum"), STEPS)
@@ -29,7 +29,7 @@ SUBJECT = subject(gallery.get("double-spherical-pendulum"), STEPS)
 def problems() -> tuple[Problem, Problem]:
     """One trajectory with every row saved, and a batch from points along it with every tenth."""
     one = Problem(**{**vars(SUBJECT.one), "save_every": 1})
-    batch = SUBJECT.batch(native.run(one), BATCH, BATCH_STEPS)
+    batch = SUBJECT.batch(Native().run(one), BATCH, BATCH_STEPS)
     return one, Problem(**{**vars(batch), "save_every": 10})
 
 
@@ -47,8 +47,8 @@ def timed(run, threads: int, clock):
 
 def measure(repeats: int) -> dict:
     one, many = problems()
-    outcome = native.run(one)
-    programs = {"native": lambda: native.run(one), "native batch, one thread": lambda: native.run(many)}
+    outcome = Native().run(one)
+    programs = {"native": lambda: Native().run(one), "native batch, one thread": lambda: Native().run(many)}
     work = {"native batch, one thread": BATCH * BATCH_STEPS}
     try:
         programs["CasADi C"] = c = c_run(one)
@@ -60,7 +60,7 @@ def measure(repeats: int) -> dict:
     for name, entry in found.items():
         ratio = f"   {entry['median'] / found['CasADi C']['median']:.3f} of CasADi C" if "CasADi C" in found else ""
         print(f"{name:26s} {entry['median']:8.4f} µs of processor time a step{ratio}")
-    wall = interleaved({str(n): timed(lambda: native.run(many), n, time.perf_counter) for n in (1, 2)}, repeats)
+    wall = interleaved({str(n): timed(lambda: Native().run(many), n, time.perf_counter) for n in (1, 2)}, repeats)
     gain = summary(wall["1"])["median"] / summary(wall["2"])["median"]
     print(f"two threads are {gain:.2f} times as fast as one (wall time)")
     return {"microseconds_of_processor_time_per_step": found, "two_threads": gain}

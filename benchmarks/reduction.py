@@ -26,9 +26,10 @@ import jax.numpy as jnp
 import dirax as dx
 from benchmarks.harness import interleaved, store, summary, table
 from dirax.diagnostics.bench.engines import plain_run
-from dirax.engines import native, xla
+from dirax.engines.contract import Problem
+from dirax.engines.native import Native
 from dirax.engines.native.program import program
-from dirax.engines.result import Problem
+from dirax.engines.xla import Xla
 from dirax.gallery import double_spherical_pendulum, planar_n_body
 from dirax.gallery.rodriguez_leok import FASTER
 from dirax.schemes.step import Shape, make_step_equation
@@ -104,12 +105,12 @@ def measure(repeats: int, steps: int, batch: int) -> dict[str, dict[str, dict[st
     os.environ["DIRAX_THREADS"] = "1"
     few = max(1, steps // 100)
     settings = {
-        "pendulum, native": ("pendulum", native.run, steps, None),
-        f"pendulum, native, {batch} at once": ("pendulum", native.run, few, batch),
-        "pendulum, xla": ("pendulum", xla.run, steps // 4, None),
+        "pendulum, native": ("pendulum", Native().run, steps, None),
+        f"pendulum, native, {batch} at once": ("pendulum", Native().run, few, batch),
+        "pendulum, xla": ("pendulum", Xla().run, steps // 4, None),
         "pendulum, JAX as one writes it": ("pendulum", None, steps // 4, None),
-        "three bodies, native": ("three bodies", native.run, steps, None),
-        f"three bodies, native, {batch} at once": ("three bodies", native.run, few, batch),
+        "three bodies, native": ("three bodies", Native().run, steps, None),
+        f"three bodies, native, {batch} at once": ("three bodies", Native().run, few, batch),
     }
     found = {}
     for label, (subject, engine, count, size) in settings.items():

@@ -20,7 +20,7 @@ from dirax.diagnostics.bench.measure import PROGRAMS, SAME_STEPS, Bench, Row, be
 from dirax.diagnostics.bench.ode import eliminate, explicit_ode, pivot_order
 from dirax.diagnostics.bench.subject import Skipped, Subject
 from dirax.diagnostics.bench.timing import compiler, interleaved
-from dirax.engines import native
+from dirax.engines.native import Native
 
 
 def call(*arguments):
@@ -43,7 +43,7 @@ def ode_of(example):
 def test_plain_jax_takes_the_steps_of_the_native_engine(name):
     s = short(name)
     state, _ = plain_run(s.one)()
-    np.testing.assert_allclose(state, native.run(s.one).last_state[0], rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(state, Native().run(s.one).last_state[0], rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("casadi") is None or compiler() is None, reason="needs casadi and a C compiler")
@@ -51,15 +51,15 @@ def test_plain_jax_takes_the_steps_of_the_native_engine(name):
 def test_casadi_c_takes_the_steps_of_the_native_engine(name):
     s = short(name)
     _, state, _ = casadi_c.c_run(s.one)()
-    np.testing.assert_allclose(state, native.run(s.one).last_state[0], rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(state, Native().run(s.one).last_state[0], rtol=1e-11, atol=1e-11)
 
 
 def test_batches_begin_along_the_trajectory():
     s = short("kepler", 20)
-    rows = native.run(dx_problem(s, save_every=1))
+    rows = Native().run(dx_problem(s, save_every=1))
     batch = s.batch(rows, 5, 3)
     np.testing.assert_allclose(batch.state[:, :2], rows.fields["q"][0, [0, 5, 10, 15, 20]])
-    after = native.run(batch).last_state
+    after = Native().run(batch).last_state
     np.testing.assert_allclose(after[1], np.concatenate([rows.fields["q"][0, 8], rows.fields["p"][0, 8]]), rtol=1e-12)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.engines.xla import engine as xla
+from dirax.engines import policy
 from dirax.engines.xla.lane import first_lane, take_step
 from dirax.schemes.step import Shape, make_step_equation
 
@@ -32,7 +32,7 @@ def test_steps_written_in_scalars_are_the_steps(monkeypatch):
     ]
     arrays = [r() for r in runs]
     assert np.max(np.abs(arrays[0].multipliers)) > 1e-3
-    monkeypatch.setattr(xla, "fast_loops_asked_for", lambda: True)
+    monkeypatch.setattr(policy, "fast_loops_asked_for", lambda: True)
     for plain, scalar in zip(arrays, [r() for r in runs], strict=True):
         assert np.all(scalar.ok)
         for name, values in plain.fields.items():
@@ -43,7 +43,7 @@ def test_steps_written_in_scalars_are_the_steps(monkeypatch):
 def test_derivatives_through_scalars(monkeypatch):
     end = lambda g: jnp.sum(jnp.cos(run(dx.PlusLagrangeDirac(), params={"g": g}, steps=10).p[-1]))
     plain = jax.jit(jax.grad(end))(9.81)
-    monkeypatch.setattr(xla, "fast_loops_asked_for", lambda: True)
+    monkeypatch.setattr(policy, "fast_loops_asked_for", lambda: True)
     scalar = jax.jit(jax.grad(lambda g: end(g)))(9.81)
     np.testing.assert_allclose(scalar, plain, rtol=1e-11)
 
@@ -53,7 +53,7 @@ def test_method_2_in_large_batches_with_the_jacobian_of_the_graph():
     metric = lambda q: jnp.diag(jnp.stack([1.0 + q[1] ** 2, jnp.ones(())]))
     forms = lambda q: jnp.stack([jnp.stack([jnp.sin(q[1]), jnp.ones(())])])
     system = dx.NonholonomicMechanics(metric, lambda q: -jnp.cos(q[0]), forms)
-    q = np.stack([np.linspace(0.1, 1.0, xla.SCALAR_BATCH), np.full(xla.SCALAR_BATCH, 0.7)], axis=1)
+    q = np.stack([np.linspace(0.1, 1.0, policy.SCALAR_BATCH), np.full(policy.SCALAR_BATCH, 0.7)], axis=1)
     run_2 = {"q": q, "v": np.ones_like(q), "project": True, "step": 0.05, "steps": 20}
     scheme = dx.DiscreteDirac(constraints="resolve")
     for made in (scheme, dx.Composition(scheme, "suzuki4")):

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.engines.result import NOT_FINITE, OK, Problem
-from dirax.engines.xla import engine as xla
+from dirax.engines.contract import NOT_FINITE, OK, Problem
+from dirax.engines.xla import Xla, engine, loop
 from dirax.schemes.step import Field, Shape, StepEquation, explicit_step, make_step_equation
 
+XLA = Xla()
 MIDPOINT = dx.LagrangeDAlembert()
 OSCILLATOR = dx.LagrangeDirac(lambda q, v, omega: (v @ v - omega**2 * q @ q) / 2)
 
@@ -109,9 +110,9 @@ def test_saving_less_is_subsampling():
 def test_chunks_leave_no_trace(monkeypatch, save_every):
     """The bits of a run do not depend on where its chunks end, within rows or between them, nor on how many there are."""
     whole = dx.simulate(PENDULUMS, MIDPOINT, **SWING, steps=200, save_every=save_every)
-    monkeypatch.setattr(xla, "CHUNK_ROWS", 16)
-    monkeypatch.setattr(xla, "FIRST_CHUNK", 7)
-    monkeypatch.setattr(xla, "CHUNK_SECONDS", 1e-9)
+    monkeypatch.setattr(loop, "CHUNK_ROWS", 16)
+    monkeypatch.setattr(engine, "FIRST_CHUNK", 7)
+    monkeypatch.setattr(engine, "CHUNK_SECONDS", 1e-9)
     calls = []
     pieces = dx.simulate(
         PENDULUMS, MIDPOINT, **SWING, steps=200, save_every=save_every, progress=lambda done, _: calls.append(done)
@@ -139,7 +140,7 @@ def test_time_is_the_number_of_steps_times_the_step(batch):
     """Not a running sum: k·h to the last bit, in the step and in the rows, after a two-point start as well."""
     state = np.zeros(2) if batch is None else np.zeros((batch, 2))
     guess = (np.zeros((*state.shape[:-1], 0)),)
-    out = xla.run(Problem(clock_equation(), state, guess, 0.1, 0.0, 1000, save_every=9, first_step=1, batch=batch))
+    out = XLA.run(Problem(clock_equation(), state, guess, 0.1, 0.0, 1000, save_every=9, first_step=1, batch=batch))
     rows = 1 + np.append(np.arange(0, 1000, 9), 1000)
     for lane in range(batch or 1):
         np.testing.assert_array_equal(out.fields["now"][lane, :, 0], rows * 0.1)
@@ -159,13 +160,13 @@ def falling_problem(states, steps, **keywords) -> Problem:
 def test_a_batch_is_its_trajectories_and_failures_stay_alone():
     """The others of a batch do not change a bit when one fails, and agree with single runs to roundoff."""
     healthy, failing = [1.0, 40.0], [0.5, -1.0]
-    sound = xla.run(falling_problem([healthy, [2.0, 30.0], healthy], 200, batch=3))
-    mixed = xla.run(falling_problem([healthy, failing, healthy], 200, batch=3))
+    sound = XLA.run(falling_problem([healthy, [2.0, 30.0], healthy], 200, batch=3))
+    mixed = XLA.run(falling_problem([healthy, failing, healthy], 200, batch=3))
     assert mixed.status.tolist() == [OK, NOT_FINITE, OK] and mixed.completed[[0, 2]].tolist() == [200, 200]
     for lane in (0, 2):
         for name in ("q", "p"):
             np.testing.assert_array_equal(mixed.fields[name][lane], sound.fields[name][lane])
-    alone = xla.run(falling_problem(failing, 200))
+    alone = XLA.run(falling_problem(failing, 200))
     good = alone.completed[0]
     assert mixed.completed[1] == good
     assert good == pytest.approx((np.sqrt(2.0) - 1.0) / 0.01, abs=3)  # where q = 1/2 − t − t²/2 is zero
@@ -187,14 +188,14 @@ def test_one_failure_in_a_large_batch_is_seen():
 
 def test_dead_trajectories_cost_nothing():
     """10¹⁵ steps would take a lifetime: the run ends with the last living trajectory."""
-    out = xla.run(falling_problem([[0.5, -1.0], [0.3, 0.0]], 10**15, save_every=10**14, batch=2))
+    out = XLA.run(falling_problem([[0.5, -1.0], [0.3, 0.0]], 10**15, save_every=10**14, batch=2))
     assert out.status.tolist() == [NOT_FINITE] * 2 and np.all(out.completed < 100)
     np.testing.assert_array_equal(out.closing["q"], out.last_state[:, :1])
 
 
 def test_an_interrupted_run_keeps_what_was_computed(monkeypatch):
-    monkeypatch.setattr(xla, "FIRST_CHUNK", 50)
-    monkeypatch.setattr(xla, "CHUNK_SECONDS", 1e-9)
+    monkeypatch.setattr(engine, "FIRST_CHUNK", 50)
+    monkeypatch.setattr(engine, "CHUNK_SECONDS", 1e-9)
     swing = problem(OSCILLATOR, [1.0, 0.0], [0.0], 0.1, 10_000, params=1.0)
     seen = []
 
@@ -203,7 +204,7 @@ def test_an_interrupted_run_keeps_what_was_computed(monkeypatch):
         if len(seen) == 3:
             raise KeyboardInterrupt
 
-    out = xla.run(swing, stop)
+    out = XLA.run(swing, stop)
     done = seen[-1]
     assert out.interrupted and out.completed[0] == done == 52
     np.testing.assert_allclose(out.fields["q"][0, :done, 0], cayley(1.0, 0.0, 1.0, 0.1, 0.1 * np.arange(done)), atol=1e-13)

@@ -13,7 +13,7 @@ from typing import Any
 
 from dirax.engines.compensation import increments
 from dirax.engines.native import compile as llvm
-from dirax.engines.native.gradients.linearized_loop import Sweep, backward, forward
+from dirax.engines.native.gradients.linearized_loop import LinearizedLoop, backward, forward
 from dirax.engines.native.loops.newton_step import newton_correction
 from dirax.engines.native.loops.plan import Plan
 from dirax.engines.native.loops.step_loop import kernel_module
@@ -27,7 +27,7 @@ KEPT = 128
 """Programs kept in memory."""
 
 SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 5)
-SWEEP_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3)
+LINEARIZED_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3)
 
 
 NESTED = 4
@@ -53,7 +53,7 @@ class Program:
     jacobians: dict[int, list[dict[int, int]]] = field(default_factory=dict)
     increments: tuple[Callable, ...] | None = None
     as_scalars: tuple | None = None
-    sweeps: dict[tuple[bool, int], tuple[Any, Any]] = field(default_factory=dict)
+    linearizations: dict[tuple[bool, int], tuple[Any, Any]] = field(default_factory=dict)
 
     @property
     def nested(self) -> bool:
@@ -80,13 +80,13 @@ class Program:
         self.kernels[width] = library, SIGNATURE(library["run"])
         return self.kernels[width][1], cached
 
-    def sweep(self, reverse: bool, width: int) -> Any:
-        """The compiled `sweep` for a width: of tangents forward or of cotangents backward. Raises `UnsupportedPrimitive`."""
-        if (reverse, width) not in self.sweeps:
+    def linearized(self, reverse: bool, width: int) -> Any:
+        """The compiled `linearized` for a width: tangents forward or cotangents backward. Raises `UnsupportedPrimitive`."""
+        if (reverse, width) not in self.linearizations:
             text = lambda: self._linearized(reverse).module(width, llvm.has_fma())
-            library, _ = self._library("sweep", width, text, "backward" if reverse else "forward")
-            self.sweeps[reverse, width] = library, SWEEP_SIGNATURE(library["sweep"])
-        return self.sweeps[reverse, width][1]
+            library, _ = self._library("linearized", width, text, "backward" if reverse else "forward")
+            self.linearizations[reverse, width] = library, LINEARIZED_SIGNATURE(library["linearized"])
+        return self.linearizations[reverse, width][1]
 
     def check(self) -> None:
         """Raise `UnsupportedPrimitive` for a step with too many operations."""
@@ -105,13 +105,13 @@ class Program:
             llvm.write_cached(key, len(header).to_bytes(4, "little") + header + code)
         return llvm.load(code, (name,)), stored is not None
 
-    def _linearized(self, reverse: bool) -> Sweep:
+    def _linearized(self, reverse: bool) -> LinearizedLoop:
         g, stage = self.graph, backward if reverse else forward
         try:
             linear = [stage(g, e, self.shared, self.jacobian(i)) for i, e in enumerate(self.equations)]
         except GraphTooLarge as error:
             raise too_large(error) from None
-        return Sweep(g, self.shared, self.equations, linear, self.stages, reverse)
+        return LinearizedLoop(g, self.shared, self.equations, linear, self.stages, reverse)
 
     def _planned(self) -> Plan:
         if self.plan is None:

@@ -1,14 +1,12 @@
 """Runs of the native engine under JAX transformations: three primitives whose derivatives are each other.
 
 A run's states and unknowns at the saved rows are functions of the first state, the parameters, t0 and h. `run` computes
-them, `push` their tangents, `pull` the cotangents of what they depend on, each on the host (sweep.py). Derivatives of the
+them, `jvp` their tangents, `vjp` the cotangents of what they depend on, each on the host (host.py). Derivatives of the
 second order and higher are those of the xla engine's run.
 """
 
 import functools
-from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,88 +17,12 @@ from jax.interpreters import ad, batching, mlir
 
 from dirax.engines.contract import Outcome, Problem, finished, saved_steps
 from dirax.engines.native.engine import run
-from dirax.engines.native.gradients.runs import pull, push
+from dirax.engines.native.gradients.host import jvp, vjp
+from dirax.engines.native.gradients.recording import INPUTS, Recorded
 from dirax.engines.native.program import program
-from dirax.engines.step_program import Parameters, parameters
+from dirax.engines.step_program import parameters
 from dirax.engines.xla import Xla
 from dirax.engines.xla.loop import unpacked_rows
-from dirax.schemes.step import Field, StepEquation, StepSequence
-
-KEPT = 128
-"""Equations kept in memory."""
-
-INPUTS = 5
-"""State (B, s), guess (B, stages, k), parameters (B, m), t0 and h (B,): what the three primitives begin with."""
-
-
-class Recorded:
-    """A run as a function of arrays, the five inputs. Its results are (B, rows, s) and (B, rows, k): states and unknowns of
-    the first stage; then good steps, status, Newton updates and largest residual (B, 4), and the last unknowns (B, k)."""
-
-    def __init__(self, problem: Problem, leaves: Parameters):
-        p = problem
-        self.equation, self.unknowns = recording(p.equation, leaves)
-        self.state_size, self.rows, self.steps = p.equation.stages[0][0].state_size, p.rows, p.steps
-        self.numbers: dict[str, Any] = {
-            "steps": p.steps,
-            "save_every": p.save_every,
-            "first_step": p.first_step,
-            "max_iterations": p.max_iterations,
-            "compensated": p.compensated,
-        }
-
-    def problem(self, state, guess, c, t0, h) -> Problem:
-        """The run of equal t0 and h."""
-        guesses = tuple(guess[:, i, : stage.unknowns] for i, (stage, _) in enumerate(self.equation.stages))
-        h, t0, batch = h[0], t0[0], state.shape[0]
-        return Problem(self.equation, state, guesses, h, t0, params=c, batch=batch, batch_params=True, **self.numbers)
-
-
-_recordings: OrderedDict[tuple, tuple[Any, tuple[Any, int]]] = OrderedDict()
-
-
-def recording(equation: Any, leaves: Parameters) -> tuple[Any, int]:
-    """The equation with parameters as one array (m,), whose rows are the state and the unknowns, and their number, 1 at
-    least; the same object for the same arguments."""
-    key = (id(equation), leaves.key)
-    if key not in _recordings:
-        _recordings[key] = (equation, leaves), _recording(equation, leaves)
-        if len(_recordings) > KEPT:
-            _recordings.popitem(last=False)
-    _recordings.move_to_end(key)
-    return _recordings[key][1]
-
-
-def _recording(equation: Any, leaves: Parameters) -> tuple[Any, int]:
-    size = max(1, *(stage.unknowns for stage, _ in equation.stages))
-
-    def split(c):
-        parts, at = [], 0
-        for shape in leaves.shapes:
-            count = int(np.prod(shape))
-            parts.append(c[at : at + count].reshape(shape))
-            at += count
-        return leaves.rebuild(parts)
-
-    def one(stage: StepEquation) -> StepEquation:
-        def unpack(state, u, t, h, c):
-            return {"state": state, "unknowns": jnp.concatenate([u, jnp.zeros(size - stage.unknowns)])}
-
-        return StepEquation(
-            start=stage.start,
-            guess=lambda state, previous, h, c: stage.guess(state, previous, h, split(c)),
-            residual=lambda u, state, t, h, c: stage.residual(u, state, t, h, split(c)),
-            advance=lambda u, state, t, h, c: stage.advance(u, state, t, h, split(c)),
-            unpack=unpack,
-            state_size=stage.state_size,
-            unknowns=stage.unknowns,
-            fields={"state": Field((stage.state_size,)), "unknowns": Field((size,))},
-            labels=stage.labels,
-        )
-
-    made = {id(stage): one(stage) for stage, _ in equation.stages}
-    return StepSequence(tuple((made[id(stage)], fraction) for stage, fraction in equation.stages)), size
-
 
 # ----------------------------------------------------------------------------------------------------- the primitives
 
@@ -120,12 +42,12 @@ def _reference(task: Recorded, *inputs):
     return [fields["state"], fields["unknowns"]]
 
 
-def _reference_push(task: Recorded, *arrays):
+def _reference_jvp(task: Recorded, *arrays):
     inputs, (state, c, t0, h) = arrays[:INPUTS], arrays[INPUTS + 1 :]
     return jax.jvp(functools.partial(_reference, task), inputs, (state, jnp.zeros_like(inputs[1]), c, t0, h))[1]
 
 
-def _reference_pull(task: Recorded, *arrays):
+def _reference_vjp(task: Recorded, *arrays):
     state, _, *rest = jax.vjp(functools.partial(_reference, task), *arrays[:INPUTS])[1](list(arrays[INPUTS + 1 :]))
     return [state, *rest]
 
@@ -175,14 +97,14 @@ def _rows(task: Recorded, state, *_) -> list[tuple[int, ...]]:
 run_p = _primitive(
     "run", _run, lambda task, state, *a: [*_rows(task, state), (state.shape[0], 4), (state.shape[0], task.unknowns)]
 )
-push_p = _primitive("push", push, _rows)
-pull_p = _primitive("pull", pull, lambda task, state, guess, c, t0, h, *_: [state.shape, c.shape, t0.shape, h.shape])
+jvp_p = _primitive("jvp", jvp, _rows)
+vjp_p = _primitive("vjp", vjp, lambda task, state, guess, c, t0, h, *_: [state.shape, c.shape, t0.shape, h.shape])
 
 
 def _run_jvp(primals, tangents, *, task):
     found = run_p.bind(*primals, task=task)
     state, _, c, t0, h = map(ad.instantiate_zeros, tangents)
-    rows = push_p.bind(*primals, found[2][:, 0], state, c, t0, h, task=task)
+    rows = jvp_p.bind(*primals, found[2][:, 0], state, c, t0, h, task=task)
     return found, [*rows, *(ad.zeros_like_aval(jax.typeof(x)) for x in found[2:])]
 
 
@@ -207,10 +129,10 @@ def _transposed(other: Primitive) -> Callable:
 
 
 ad.primitive_jvps[run_p] = _run_jvp
-ad.primitive_jvps[push_p] = _linear_jvp(push_p, _reference_push)
-ad.primitive_jvps[pull_p] = _linear_jvp(pull_p, _reference_pull)
-ad.primitive_transposes[push_p] = _transposed(pull_p)
-ad.primitive_transposes[pull_p] = _transposed(push_p)
+ad.primitive_jvps[jvp_p] = _linear_jvp(jvp_p, _reference_jvp)
+ad.primitive_jvps[vjp_p] = _linear_jvp(vjp_p, _reference_vjp)
+ad.primitive_transposes[jvp_p] = _transposed(vjp_p)
+ad.primitive_transposes[vjp_p] = _transposed(jvp_p)
 
 
 # ------------------------------------------------------------------------------------------------------------ the run

@@ -85,7 +85,7 @@ def _seeds(g: Graph, nodes: Iterable[int], weights: Iterable[int]) -> dict[int, 
 
 
 @dataclass
-class Sweep:
+class LinearizedLoop:
     """A loop over the stages of a run, forward or backward, as IR."""
 
     graph: Graph
@@ -110,7 +110,7 @@ class Sweep:
         return self.state_size + max(1, *(len(e.unknowns) for e in self.equations))
 
     def module(self, width: int, fma: bool) -> str:
-        """IR of `sweep(carry, params, rows, flow, blocks, …)` for consecutive blocks of `width` lanes."""
+        """IR of `linearized(carry, params, rows, flow, blocks, …)` for consecutive blocks of `width` lanes."""
         module = Module(fma)
         add_far_reduction(module)
         add_dense_solve(module)
@@ -125,35 +125,35 @@ class Sweep:
             ]
             body.line(f"call void @block({', '.join(f'ptr {m}' for m in moved)}, {NUMBERS})")
         body.line("ret void")
-        module.define(f"define void @sweep(ptr %carry, ptr %params, ptr %rows, ptr %flow, i64 %blocks, {NUMBERS})", body)
+        module.define(f"define void @linearized(ptr %carry, ptr %params, ptr %rows, ptr %flow, i64 %blocks, {NUMBERS})", body)
         return module.text()
 
 
 class _Block:
     """Emits the loop for one block of lanes."""
 
-    def __init__(self, sweep: Sweep, module: Module, width: int):
-        self.sweep, self.body = sweep, Body(module)
+    def __init__(self, loop: LinearizedLoop, module: Module, width: int):
+        self.loop, self.body = loop, Body(module)
         self.e = Emitter(self.body, width)
 
     def define(self) -> None:
-        b, e, sweep = self.body, self.e, self.sweep
-        size, count = sweep.carry, len(sweep.stages)
-        self.run = Region(e, sweep.graph)
-        for i, node in enumerate(sweep.shared.params):
+        b, e, loop = self.body, self.e, self.loop
+        size, count = loop.carry, len(loop.stages)
+        self.run = Region(e, loop.graph)
+        for i, node in enumerate(loop.shared.params):
             self.run.bind(node, b.load(e.real, b.at(e.real, "%params", i)))
         self.carry = [b.at(e.real, "%carry", i) for i in range(size)]
         scalar = Emitter(b, 1)
         before, total = [], 0.0
-        for _, fraction in sweep.stages:
+        for _, fraction in loop.stages:
             before.append(total)
             total += fraction
-        self._table("equation", "i64", [str(i) for i, _ in sweep.stages])
-        self._table("fraction", "double", [scalar.const(f) for _, f in sweep.stages])
+        self._table("equation", "i64", [str(i) for i, _ in loop.stages])
+        self._table("fraction", "double", [scalar.const(f) for _, f in loop.stages])
         self._table("before", "double", [scalar.const(x) for x in before])
         stages = b.put(f"mul i64 %count, {count}")
         with b.loop(0, stages) as n:
-            i = b.put(f"sub i64 {b.put(f'sub i64 {stages}, 1')}, {n}") if sweep.reverse else n
+            i = b.put(f"sub i64 {b.put(f'sub i64 {stages}, 1')}, {n}") if loop.reverse else n
             stage, step = b.put(f"srem i64 {i}, {count}"), b.put(f"add i64 %first, {b.put(f'sdiv i64 {i}, {count}')}")
             number = b.put(f"sitofp i64 {b.put(f'add i64 %offset, {step}')} to double")
             steps = scalar.add(number, b.load("double", b.at("double", "@before", stage)))
@@ -161,17 +161,17 @@ class _Block:
             time = e.splat(scalar.add("%t0", scalar.mul(steps, "%h")))
             limit = b.load(e.real, self.carry[-1])
             active = e.compare("ogt", limit, e.splat(b.put(f"sitofp i64 {step} to double")))
-            place = b.put(f"mul i64 {i}, {sweep.row}")
+            place = b.put(f"mul i64 {i}, {loop.row}")
             row, flow = b.at(e.real, "%rows", place), b.at(e.real, "%flow", place)
             which = b.load("i64", b.at("i64", "@equation", stage))
-            for index, (equation, linear) in enumerate(zip(sweep.equations, sweep.linearized, strict=True)):
+            for index, (equation, linear) in enumerate(zip(loop.equations, loop.linearized, strict=True)):
                 with b.when(b.put(f"icmp eq i64 {which}, {index}")):
-                    region = Region(e, sweep.graph, self.run)
-                    region.bind(sweep.shared.t, time)
-                    region.bind(sweep.shared.h, e.splat(scalar.mul(fraction, "%h")))
+                    region = Region(e, loop.graph, self.run)
+                    region.bind(loop.shared.t, time)
+                    region.bind(loop.shared.h, e.splat(scalar.mul(fraction, "%h")))
                     for j, node in enumerate([*equation.state, *equation.unknowns]):
                         region.bind(node, b.load(e.real, b.at(e.real, row, j)))
-                    stage_of = self._backward if sweep.reverse else self._forward
+                    stage_of = self._backward if loop.reverse else self._forward
                     stage_of(region, equation, linear, flow, e.splat(steps), e.splat(fraction), active)
         b.line("ret void")
         pointers = "ptr noalias %carry, ptr noalias %params, ptr noalias %rows, ptr noalias %flow"
@@ -190,7 +190,7 @@ class _Block:
         return change
 
     def _forward(self, region: Region, equation: TracedEquation, linear: Linearized, flow, steps, fraction, active) -> None:
-        b, e, s = self.body, self.e, self.sweep.state_size
+        b, e, s = self.body, self.e, self.loop.state_size
         *known, of_t0, of_h, _ = [b.load(e.real, p) for p in self.carry]
         tangents = [*known, e.add(of_t0, e.mul(steps, of_h)), e.mul(fraction, of_h)]
         for node, value in zip(linear.flow, tangents, strict=True):
@@ -205,7 +205,7 @@ class _Block:
             b.store(e.real, e.select(active, region.value(node), old), pointer)
 
     def _backward(self, region: Region, equation: TracedEquation, linear: Linearized, flow, steps, fraction, active) -> None:
-        b, e, s = self.body, self.e, self.sweep.state_size
+        b, e, s = self.body, self.e, self.loop.state_size
         carry = [b.load(e.real, p) for p in self.carry[:-1]]
         incoming = [b.load(e.real, b.at(e.real, flow, j)) for j in range(s + len(equation.unknowns))]
         for node, value in zip(linear.flow, [*carry[:s], *incoming[s:]], strict=True):

@@ -1,32 +1,30 @@
-"""Tangents and cotangents of a run on the host: the run again, segment by segment, and a sweep over each segment."""
+"""Tangents and cotangents of a run on the host: the run again, segment by segment, and the linearized loop over each."""
 
 import itertools
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
 
 import numpy as np
+
+from dirax.engines.native.gradients.recording import Recorded
 
 from dirax.engines.native.lanes import Lanes, width_for
 from dirax.engines.native.program import program
 
-if TYPE_CHECKING:
-    from dirax.engines.native.gradients.differentiate import Recorded
-
 SEGMENT_BYTES = 2**26
-"""Memory for the steps that a sweep goes over at a time."""
+"""Memory for the steps that are gone over at a time."""
 
 
-class Sweeper:
-    """A recorded run whose stages are gone over in either direction."""
+class Segments:
+    """A recorded run whose stages are gone over in either direction, segment by segment."""
 
-    def __init__(self, task: "Recorded", inputs: tuple[np.ndarray, ...], reverse: bool):
+    def __init__(self, task: Recorded, inputs: tuple[np.ndarray, ...], reverse: bool):
         self.task, self.problem = task, task.problem(*inputs)
         p = self.problem
         self.stages = len(p.equation.stages)
         made, _ = program(p.equation, p.params, True, p.compensated, self.stages > 1)
         self.lanes = Lanes(p, made, width_for(p.batch or 1))
         self.kernel, _ = made.kernel(self.lanes.width)
-        self.sweep = made.sweep(reverse, self.lanes.width)
+        self.linearized = made.linearized(reverse, self.lanes.width)
         row_bytes = 8 * (p.batch or 1) * self.stages * (task.state_size + task.unknowns)
         self.length = max(1, SEGMENT_BYTES // row_bytes)
 
@@ -62,12 +60,12 @@ class Sweeper:
         return np.moveaxis(rows, -1, 1).reshape(lanes.blocks * lanes.width, *rows.shape[1:-1])[: lanes.lanes]
 
     def call(self, carry: np.ndarray, rows: np.ndarray, flow: np.ndarray, first: int, count: int) -> None:
-        """One sweep over a segment, blocks shared among threads."""
+        """The linearized loop over a segment, blocks shared among threads."""
         p, lanes = self.problem, self.lanes
 
         def part(low: int, high: int) -> None:
             pointers = (a.ctypes.data + low * a.strides[0] for a in (carry, lanes.params, rows, flow))
-            self.sweep(*pointers, high - low, p.t0, p.h, p.first_step, first, count)
+            self.linearized(*pointers, high - low, p.t0, p.h, p.first_step, first, count)
 
         bounds = np.linspace(0, lanes.blocks, lanes.threads + 1).astype(int).tolist()
         if lanes.threads == 1:
@@ -89,37 +87,37 @@ class Sweeper:
         return np.where((completed == steps) & closing, steps + 1.0, completed)[:, None]
 
 
-def push(task: "Recorded", *arrays: np.ndarray) -> list[np.ndarray]:
+def jvp(task: Recorded, *arrays: np.ndarray) -> list[np.ndarray]:
     """Tangents of states and unknowns from (state, guess, c, t0, h, completed, ẋ, ċ, ṫ0, ḣ)."""
     *inputs, completed, state, c, t0, h = arrays
     batch, s = state.shape
-    sweeper = Sweeper(task, tuple(inputs), reverse=False)
-    limits = sweeper.limits(completed, np.ones(batch, bool))
-    carry = sweeper.blocked(np.concatenate([state, c, t0[:, None], h[:, None], limits], axis=1))
+    parts = Segments(task, tuple(inputs), reverse=False)
+    limits = parts.limits(completed, np.ones(batch, bool))
+    carry = parts.blocked(np.concatenate([state, c, t0[:, None], h[:, None], limits], axis=1))
     states, unknowns = np.zeros((batch, task.rows, s)), np.zeros((batch, task.rows, task.unknowns))
-    for first, count, records in sweeper.segments():
-        rows = sweeper.rows(count, records)
+    for first, count, records in parts.segments():
+        rows = parts.rows(count, records)
         flow = np.zeros_like(rows)
-        sweeper.call(carry, rows, flow, first, count)
-        chosen, at = sweeper.saved(first, count)
-        found = sweeper.unblocked(flow[:, at])
+        parts.call(carry, rows, flow, first, count)
+        chosen, at = parts.saved(first, count)
+        found = parts.unblocked(flow[:, at])
         states[:, chosen], unknowns[:, chosen] = found[..., :s], found[..., s:]
     return [states, unknowns]
 
 
-def pull(task: "Recorded", *arrays: np.ndarray) -> list[np.ndarray]:
+def vjp(task: Recorded, *arrays: np.ndarray) -> list[np.ndarray]:
     """Cotangents of (state, c, t0, h) from (state, guess, c, t0, h, completed, those of the states, of the unknowns)."""
     *inputs, completed, states, unknowns = arrays
     batch, s, m = len(states), task.state_size, inputs[2].shape[1]
-    sweeper = Sweeper(task, tuple(inputs), reverse=True)
-    limits = sweeper.limits(completed, np.any(unknowns[:, -1] != 0, axis=1))
-    carry = sweeper.blocked(np.concatenate([np.zeros((batch, s + m + 2)), limits], axis=1))
+    parts = Segments(task, tuple(inputs), reverse=True)
+    limits = parts.limits(completed, np.any(unknowns[:, -1] != 0, axis=1))
+    carry = parts.blocked(np.concatenate([np.zeros((batch, s + m + 2)), limits], axis=1))
     given = np.concatenate([states, unknowns], axis=2)
-    for first, count, records in reversed(sweeper.segments()):
-        rows = sweeper.rows(count, records)
-        flow = np.zeros((batch, count * sweeper.stages, given.shape[2]))
-        chosen, at = sweeper.saved(first, count)
+    for first, count, records in reversed(parts.segments()):
+        rows = parts.rows(count, records)
+        flow = np.zeros((batch, count * parts.stages, given.shape[2]))
+        chosen, at = parts.saved(first, count)
         flow[:, at] = given[:, chosen]
-        sweeper.call(carry, rows, sweeper.blocked(flow), first, count)
-    out = sweeper.unblocked(carry)
+        parts.call(carry, rows, parts.blocked(flow), first, count)
+    out = parts.unblocked(carry)
     return [out[:, :s], out[:, s : s + m], out[:, s + m], out[:, s + m + 1]]

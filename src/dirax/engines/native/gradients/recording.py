@@ -1,0 +1,86 @@
+"""A run as a function of arrays: what its derivatives are derivatives of, and the equation that saves what they need."""
+
+from collections import OrderedDict
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.engines.contract import Problem
+from dirax.engines.step_program import Parameters
+from dirax.schemes.step import Field, StepEquation, StepSequence
+
+KEPT = 128
+"""Equations kept in memory."""
+
+INPUTS = 5
+"""State (B, s), guess (B, stages, k), parameters (B, m), t0 and h (B,): what a recorded run is a function of."""
+
+
+class Recorded:
+    """A run as a function of arrays, the five inputs. Its results are (B, rows, s) and (B, rows, k): states and unknowns of
+    the first stage; then good steps, status, Newton updates and largest residual (B, 4), and the last unknowns (B, k)."""
+
+    def __init__(self, problem: Problem, leaves: Parameters):
+        p = problem
+        self.equation, self.unknowns = recording(p.equation, leaves)
+        self.state_size, self.rows, self.steps = p.equation.stages[0][0].state_size, p.rows, p.steps
+        self.numbers: dict[str, Any] = {
+            "steps": p.steps,
+            "save_every": p.save_every,
+            "first_step": p.first_step,
+            "max_iterations": p.max_iterations,
+            "compensated": p.compensated,
+        }
+
+    def problem(self, state, guess, c, t0, h) -> Problem:
+        """The run of equal t0 and h."""
+        guesses = tuple(guess[:, i, : stage.unknowns] for i, (stage, _) in enumerate(self.equation.stages))
+        h, t0, batch = h[0], t0[0], state.shape[0]
+        return Problem(self.equation, state, guesses, h, t0, params=c, batch=batch, batch_params=True, **self.numbers)
+
+
+_recordings: OrderedDict[tuple, tuple[Any, tuple[Any, int]]] = OrderedDict()
+
+
+def recording(equation: Any, leaves: Parameters) -> tuple[Any, int]:
+    """The equation with parameters as one array (m,), whose rows are the state and the unknowns, and their number, 1 at
+    least; the same object for the same arguments."""
+    key = (id(equation), leaves.key)
+    if key not in _recordings:
+        _recordings[key] = (equation, leaves), _recording(equation, leaves)
+        if len(_recordings) > KEPT:
+            _recordings.popitem(last=False)
+    _recordings.move_to_end(key)
+    return _recordings[key][1]
+
+
+def _recording(equation: Any, leaves: Parameters) -> tuple[Any, int]:
+    size = max(1, *(stage.unknowns for stage, _ in equation.stages))
+
+    def split(c):
+        parts, at = [], 0
+        for shape in leaves.shapes:
+            count = int(np.prod(shape))
+            parts.append(c[at : at + count].reshape(shape))
+            at += count
+        return leaves.rebuild(parts)
+
+    def one(stage: StepEquation) -> StepEquation:
+        def unpack(state, u, t, h, c):
+            return {"state": state, "unknowns": jnp.concatenate([u, jnp.zeros(size - stage.unknowns)])}
+
+        return StepEquation(
+            start=stage.start,
+            guess=lambda state, previous, h, c: stage.guess(state, previous, h, split(c)),
+            residual=lambda u, state, t, h, c: stage.residual(u, state, t, h, split(c)),
+            advance=lambda u, state, t, h, c: stage.advance(u, state, t, h, split(c)),
+            unpack=unpack,
+            state_size=stage.state_size,
+            unknowns=stage.unknowns,
+            fields={"state": Field((stage.state_size,)), "unknowns": Field((size,))},
+            labels=stage.labels,
+        )
+
+    made = {id(stage): one(stage) for stage, _ in equation.stages}
+    return StepSequence(tuple((made[id(stage)], fraction) for stage, fraction in equation.stages)), size
