@@ -25,10 +25,7 @@ def in_coordinates(system: LagrangeDirac | ManifoldLagrangian, coordinates: Call
     Raises `TypeError` for another kind of system, or a function of other arguments.
     """
     point = UserFunction(coordinates, "coordinates", ("y",))
-    if isinstance(system, ManifoldLagrangian):
-        on_manifold = system.lagrangian
-        return LagrangeDirac(lambda y, v, params: on_manifold(*jax.jvp(lambda y: point(y, params), (y,), (v,)), params))
-    if not isinstance(system, LagrangeDirac):
+    if not isinstance(system, LagrangeDirac | ManifoldLagrangian):
         raise TypeError(
             f"in_coordinates takes a dx.LagrangeDirac or a dx.ManifoldLagrangian system, but a {type(system).__name__} was given."
         )
@@ -63,7 +60,7 @@ def in_coordinates(system: LagrangeDirac | ManifoldLagrangian, coordinates: Call
     }
     given: dict[str, Any] = {}
     for name, (timed, timeless) in functions.items():
-        own = getattr(system, name)
+        own = getattr(system, name, None)
         if own is not None:
             given[name] = timed if own.takes_time else timeless
     forces = system.forces

@@ -47,8 +47,7 @@ def _refuse_other_systems(system: Any, group: AbstractLieGroup) -> None:
     if isinstance(system, ManifoldLagrangian):
         if type(system.manifold) is not type(group):
             raise ValueError(f"the Lagrangian is one on {system.manifold}, and dx.reduce by {name} takes one on {name} itself.")
-        return
-    if not isinstance(system, LagrangeDirac):
+    elif not isinstance(system, LagrangeDirac):
         raise TypeError(
             f"dx.reduce by {name} takes a dx.ManifoldLagrangian on {name}, or a dx.LagrangeDirac in the coordinates of its "
             f"elements, but a {type(system).__name__} was given."

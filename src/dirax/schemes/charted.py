@@ -30,6 +30,8 @@ class InCharts(AbstractScheme):
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         if not isinstance(system, ManifoldLagrangian):
             raise TypeError(f"dx.InCharts steps a dx.ManifoldLagrangian, but a {type(system).__name__} was given.")
+        if system.constraints.any or system.forces is not None:
+            raise ValueError("dx.InCharts steps a Lagrangian without one_forms and forces: use dx.DiscreteDirac(map).")
         manifold = system.manifold
         if not isinstance(manifold, AbstractGeodesicManifold):
             raise TypeError(f"dx.InCharts needs a manifold with a retraction, and {manifold!r} has none.")

@@ -4,6 +4,7 @@ from dirax.geometry.cotangent_lift import CotangentLift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
 from dirax.schemes.discretized import discretized_relation
 from dirax.schemes.lagrangian_methods import discretized_lagrangian, resolved_lagrangian, resolved_nonholonomic
+from dirax.schemes.lifted_lagrangian import lift_of, lifted_lagrangian, projected_lagrangian
 from dirax.schemes.nothing_hidden import nothing_hidden_in_lagrangian, nothing_hidden_in_relation
 from dirax.schemes.resolved import projected_field
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
@@ -17,7 +18,9 @@ class DiscreteDirac(AbstractScheme):
 
         (R_d⁻¹(x_k, x_{k+1})/h, α_x) ∈ D_x,   x the base point of R_d⁻¹(x_k, x_{k+1}).
 
-    `map`: any discretization map; on T*Q of a Lagrangian system a map on Q is lifted. `constraints`:
+    `map`: any discretization map; for a Lagrangian system one on Q, in its coordinates or on the manifold of a
+    `dx.ManifoldLagrangian`, which is lifted to T*Q. Explicit time is that of the base point, t + `map.base_fraction` h.
+    `constraints`:
     "discretize" ([BLM] Method 1) discretizes the implicit system S_0 as it stands; "resolve" ([BLM] Method 2) runs the
     constraint algorithm first and discretizes on M_f, so that its constraints hold at the nodes to roundoff. Of holonomic
     constraints g = 0, Method 1 imposes the distribution G q̇ + ∂g/∂t = 0 at the base point, which keeps quadratic g for the
@@ -28,10 +31,10 @@ class DiscreteDirac(AbstractScheme):
     `dx.LagrangeDAlembert` are impulses of the opposite sign.
 
     Takes systems with a relation form or a Lagrangian form: DiracSystem, PortHamiltonian, ImplicitSystem, LiePoisson,
-    LagrangeDirac, NonholonomicMechanics, PhaseSpaceLagrangian and systems of one's own; and what `ConstraintChain.resolved`
-    returns, on which it is Method 2 for any system. Raises `TypeError` for others, and `ValueError` for maps that do not fit
-    the system's space and for Method 2 of a system with constraints that are not stated as such, those of a singular
-    Lagrangian say.
+    LagrangeDirac, NonholonomicMechanics, PhaseSpaceLagrangian, ManifoldLagrangian and systems of one's own; and what
+    `ConstraintChain.resolved` returns, on which it is Method 2 for any system. Raises `TypeError` for others, and `ValueError`
+    for maps that do not fit the system's space and for Method 2 of a system with constraints that are not stated as such,
+    those of a singular Lagrangian say.
     """
 
     map: AbstractDiscretizationMap
@@ -62,42 +65,54 @@ class DiscreteDirac(AbstractScheme):
         """Method 1."""
         if (relation := system.relation_form(shape)) is not None:
             return discretized_relation(relation, shape.n, self.map)
-        if (lagrangian := system.lagrangian_form()) is not None:
-            return discretized_lagrangian(lagrangian, shape, _theta_of(self.map))
+        lagrangian, theta = system.lagrangian_form(), _theta_of(self.map)
+        if lagrangian is not None and theta is not None:
+            return discretized_lagrangian(lagrangian, shape, theta)
+        lagrangian = system.manifold_form() if lagrangian is None else lagrangian
+        if lagrangian is not None:
+            return lifted_lagrangian(lagrangian, shape, lift_of(_map_on_q(self.map), lagrangian, shape.n))
         return None
 
     def _resolved(self, system: AbstractSystem, shape: Shape) -> StepEquation | None:
         """Method 2."""
-        constrained = shape.m + shape.c > 0
         if (manifold := system.final_manifold(shape)) is not None:
             return projected_field(manifold, shape.n, _theta_of_points(self.map))
         if (relation := system.final_relation(shape)) is not None:
             return discretized_relation(relation, shape.n, self.map)
         if (relation := system.relation_form(shape)) is not None:
-            if constrained:
+            if shape.m + shape.c:
                 raise ValueError(
                     f"Method 2 of this {type(system).__name__} with multipliers needs its final manifold: simulate "
                     "dx.constraint_algorithm(system, near=x).resolved() instead of the system."
                 )
             return nothing_hidden_in_relation(system, relation, discretized_relation(relation, shape.n, self.map))
-        if (metric := system.metric_form()) is not None and not shape.redundant:
-            return resolved_nonholonomic(metric, shape, _theta_of(self.map))
-        if (lagrangian := system.lagrangian_form()) is not None:
-            if constrained:
-                return resolved_lagrangian(lagrangian, shape, _theta_of(self.map))
-            return nothing_hidden_in_lagrangian(lagrangian, discretized_lagrangian(lagrangian, shape, _theta_of(self.map)))
-        return None
+        return self._resolved_lagrangian(system, shape)
+
+    def _resolved_lagrangian(self, system: AbstractSystem, shape: Shape) -> StepEquation | None:
+        theta, metric, lagrangian = _theta_of(self.map), system.metric_form(), system.lagrangian_form()
+        if metric is not None and theta is not None and not shape.redundant:
+            return resolved_nonholonomic(metric, shape, theta)
+        lagrangian = system.manifold_form() if lagrangian is None else lagrangian
+        if lagrangian is None:
+            return None
+        if not shape.m + shape.c:
+            equation = self._discretized(system, shape)
+            assert equation is not None
+            return nothing_hidden_in_lagrangian(lagrangian, equation)
+        if theta is not None and system.manifold_form() is None:
+            return resolved_lagrangian(lagrangian, shape, theta)
+        return projected_lagrangian(lagrangian, shape, lift_of(_map_on_q(self.map), lagrangian, shape.n))
 
 
-def _theta_of(map: AbstractDiscretizationMap) -> float:
-    """θ of a θ map (or of its lift): the Lagrangian methods are written for vector spaces."""
-    base = getattr(map, "map", map)
-    if not isinstance(base, Theta):
-        raise ValueError(
-            f"a Lagrangian system is discretized by a θ map on its coordinates, but {type(map).__name__} was given: state "
-            "the system on its manifold as a dx.DiracSystem on T*Q, with dx.cotangent_lift(map)."
-        )
-    return base.theta
+def _map_on_q(map: AbstractDiscretizationMap) -> AbstractDiscretizationMap:
+    """The map on Q of a Lagrangian system: the map itself, or the one that was lifted."""
+    return map.map if isinstance(map, CotangentLift) else map
+
+
+def _theta_of(map: AbstractDiscretizationMap) -> float | None:
+    """θ of a θ map on Q, or of its lift, for which the Lagrangian methods have a form without differences of points."""
+    base = _map_on_q(map)
+    return base.theta if isinstance(base, Theta) else None
 
 
 def _theta_of_points(map: AbstractDiscretizationMap) -> float:

@@ -10,16 +10,18 @@ from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.step import Field, Shape, StepEquation
 from dirax.schemes.work import WorkBook, work_field
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 from dirax.systems.nonholonomic import NonholonomicMechanics
 
 
-def _rates(system: LagrangeDirac, t, q, v, params):
+def rates(system: LagrangeDirac | ManifoldLagrangian, t, q, v, params):
     """(∂L/∂q + f, ∂L/∂v) at (t, q, v)."""
     dq, dv = gradient(lambda q, v: system.lagrangian.at(t, q, v, params), (0, 1))(q, v)
     return (dq if system.forces is None else dq + system.forces(t, q, v, params)), dv
 
 
-def _fields(system: Any, n: int, k: int) -> dict[str, Field]:
+def lagrangian_fields(system: Any, n: int, k: int) -> dict[str, Field]:
+    """What a run in (q, p) with k multipliers saves."""
     fields = {"q": Field((n,)), "p": Field((n,))}
     if k:
         fields["multipliers"] = Field((k,), "step", ("constraint",), "Lagrange multipliers of the constraints")
@@ -38,7 +40,7 @@ def discretized_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) ->
 
     def base(u, state, t, h, params):
         q, v = state[:n] + theta * h * u[:n], u[:n]
-        rate, momentum = _rates(system, t + theta * h, q, v, params)
+        rate, momentum = rates(system, t + theta * h, q, v, params)
         return (q, rate + rows.matrix(t + theta * h, q, params).T @ u[n:], momentum) if k else (q, rate, momentum)
 
     def residual(u, state, t, h, params):
@@ -73,7 +75,7 @@ def discretized_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) ->
         unpack=unpack,
         state_size=2 * n + book.size,
         unknowns=n + k,
-        fields=_fields(system, n, shape.m + shape.c),
+        fields=lagrangian_fields(system, n, shape.m + shape.c),
         labels=tuple(f"momentum balance {i}" for i in range(n)) + tuple(f"constraint {r} at the base point" for r in rows.kept),
         canonical=not book.size,
     )
@@ -144,7 +146,7 @@ def resolved_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) -> St
 
     def at_point(t, q, v, params):
         """(p, ṗ, λ) at a point of M_f."""
-        rate, p = _rates(system, t, q, v, params)
+        rate, p = rates(system, t, q, v, params)
         w = rows.matrix(t, q, params)
         coupling = _along(system, lambda t, q: system.legendre(q, v, params, t), t, q, v)
         turning = _along(system, lambda t, q: rows.velocity_defect(t, q, v, params), t, q, v)
@@ -223,7 +225,7 @@ def _resolved(system: Any, shape: Shape, unknowns: int, residual, advance, unpac
         unpack=unpack,
         state_size=2 * n + book.size,
         unknowns=unknowns,
-        fields=_fields(system, n, shape.m + shape.c),
+        fields=lagrangian_fields(system, n, shape.m + shape.c),
         labels=tuple(f"equation {i} of Method 2" for i in range(unknowns)),
         canonical=not book.size,
     )

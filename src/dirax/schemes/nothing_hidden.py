@@ -12,6 +12,7 @@ from dirax.schemes.step import StepEquation
 from dirax.systems.constraint_algorithm import rank_of
 from dirax.systems.forms import RelationForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 from dirax.systems.system import AbstractSystem
 
 
@@ -29,9 +30,15 @@ def nothing_hidden_in_relation(system: AbstractSystem, form: RelationForm, equat
     return _refusing(system, "x", at, equation)
 
 
-def nothing_hidden_in_lagrangian(system: LagrangeDirac, equation: StepEquation) -> StepEquation:
+def nothing_hidden_in_lagrangian(system: LagrangeDirac | ManifoldLagrangian, equation: StepEquation) -> StepEquation:
     """The equation, which refuses initial data at which the Hessian ∂²L/∂v² is singular."""
-    hessian = lambda t, q, v, params: jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(v)
+
+    def hessian(t, q, v, params):
+        whole = jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(v)
+        if not isinstance(system, ManifoldLagrangian):
+            return whole
+        frame = system.manifold.frame(q)
+        return frame.T @ whole @ frame
 
     def at(data, h, params):
         if "p" in data:

@@ -1,4 +1,4 @@
-"""Lagrangians on a manifold, in ambient coordinates: no angles, no poles."""
+"""Lagrangians on a manifold, in ambient coordinates, with constraints and forces: no angles, no poles."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,10 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.geometry.manifolds import AbstractManifold
+from dirax.program.linear_solves import solve
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import gradient
+from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import UserFunction
-from dirax.systems.constraints import no_constraint
+from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem, refuse_start
 
 
@@ -20,17 +21,52 @@ class ManifoldLagrangian(AbstractSystem):
 
     `lagrangian(q, v[, params])` returns a scalar and is used for points and tangent vectors only; `manifold` is a dirax
     manifold such as `dx.Product(dx.Sphere(3), dx.Sphere(3))`. Momenta are covectors, given as the tangent vectors that
-    represent them in R^N. It must be regular on Q. Stepped by `dx.InCharts`.
+    represent them in R^N. It must be regular on Q. `one_forms(q[, params])` (m, N) are the rows of constraints W(q) v = 0 on
+    tangent vectors, with `affine(q[, params])` (m,) W(q) v + b(q) = 0; `forces(t, q, v[, params])` (N,) is the covector of
+    other forces. Of one-forms and forces only what acts on tangent vectors matters; one-forms and b may take `t` first.
+
+    Stepped by `dx.DiscreteDirac` with a discretization map on Q, and without constraints and forces by `dx.InCharts`.
+
+        ball = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - q[2], dx.Sphere(3), one_forms=lambda q: a(q)[None])
+        dx.simulate(ball, dx.DiscreteDirac(dx.SphereProjection()), q=q, v=v, step=0.01, steps=1000)
+
+    Raises `TypeError` for something that is no manifold, `ValueError` for `affine` without `one_forms`.
     """
 
     lagrangian: UserFunction
     manifold: AbstractManifold
+    one_forms: UserFunction | None
+    forces: UserFunction | None
+    affine: UserFunction | None
+    _tangential: UserFunction | None
 
-    def __init__(self, lagrangian: Callable, manifold: AbstractManifold):
+    def __init__(
+        self,
+        lagrangian: Callable,
+        manifold: AbstractManifold,
+        one_forms: Callable | None = None,
+        *,
+        forces: Callable | None = None,
+        affine: Callable | None = None,
+    ):
         if not isinstance(manifold, AbstractManifold):
             raise TypeError(f"manifold must be a dirax manifold such as dx.Sphere(3), but {manifold!r} was given.")
         self.lagrangian = UserFunction(lagrangian, "lagrangian", ("q", "v"))
         self.manifold = manifold
+        given = Constraints.of(one_forms, affine, None)
+        self.one_forms, self.affine = given.one_forms, given.affine
+        self.forces = None if forces is None else UserFunction(forces, "forces", ("t", "q", "v"))
+        self._tangential = None if given.one_forms is None else _tangential(given.one_forms, manifold)
+
+    @property
+    def constraints(self) -> Constraints:
+        """The constraints, with the rows of W projected to the tangent space."""
+        return Constraints(self._tangential, self.affine, None)
+
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether a constraint takes the time."""
+        return any(f is not None and f.takes_time for f in (self.one_forms, self.affine))
 
     def manifold_form(self) -> "ManifoldLagrangian":
         """The system itself."""
@@ -38,6 +74,8 @@ class ManifoldLagrangian(AbstractSystem):
 
     def lagrangian_value(self, t: Any, q: Float[Array, " N"], v: Float[Array, " N"], params: Any) -> Float[Array, ""]:
         return self.lagrangian(q, v, params)
+
+    # ------------------------------------------------------------------ geometry of L, one point at a time
 
     def legendre(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
         """The covector ∂L/∂v restricted to the tangent space at q."""
@@ -57,7 +95,22 @@ class ManifoldLagrangian(AbstractSystem):
         value, derivative = jax.value_and_grad(lambda v: self.lagrangian(q, v, params))(v)
         return derivative @ v - value
 
+    def project_position(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None, t: Any = 0.0) -> Array:
+        """The point of the manifold near q."""
+        return self.manifold.nearest(q)
+
+    def project_velocity(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None, t: Any = 0.0) -> Array:
+        """The tangent vector at q with W v + b = 0 nearest to v, in the metric ∂²L/∂v² of the tangent space."""
+        v, frame = self.manifold.projection(q, v), self.manifold.frame(q)
+        hessian = jacobian(gradient(lambda v: self.lagrangian(q, v, params)))(v)
+        rows = self.constraints.matrix(t, q, params)
+        lifted = frame @ solve(frame.T @ hessian @ frame, (rows @ frame).T)
+        return self.constraints.nearest_velocity(t, q, v, lifted, params)
+
+    # ------------------------------------------------------------------ AbstractSystem
+
     def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+        """(N, m)."""
         if set(data) - {"t"} == {"q"}:
             refuse_start(self, data, "q, v", "q, p")
         if "q" not in data:
@@ -66,25 +119,42 @@ class ManifoldLagrangian(AbstractSystem):
         vectors = [name for name in ("v", "p") if name in data]
         for name in vectors:
             self.manifold.check_tangent(q, data[name], name, point="q")
-        if not vectors:
-            self.manifold.check_point(q, "q")
         if self.lagrangian.shape(q, q, params).shape != ():
             raise ValueError(f"lagrangian must return a scalar, not shape {self.lagrangian.shape(q, q, params).shape}.")
-        return q.shape[0], 0
+        if self.forces is not None:
+            out = self.forces.shape(jnp.zeros(()), q, q, params)
+            if out.shape != q.shape:
+                raise ValueError(f"forces(t, q, v) must return shape {q.shape} like q, but it returned shape {out.shape}.")
+        return q.shape[0], Constraints(self.one_forms, self.affine, None).sizes(q, params)[0]
 
     def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
-        q = data["q"]
-        if "p" in data:
-            return {"q": q, "p": data["p"], "v": self.inverse_legendre(q, data["p"], params)}
-        return {"q": q, "v": data["v"], "p": self.legendre(q, data["v"], params)}
+        q, t = data["q"], data.get("t", 0.0)
+        v = data["v"] if "v" in data else self.inverse_legendre(q, data["p"], params)
+        if project and self.constraints.any:
+            v = self.project_velocity(q, v, params, t)
+        keep = "p" in data and not (project and self.constraints.any)
+        return {"q": q, "v": v, "p": data["p"] if keep else self.legendre(q, v, params)}
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, "0"]:
-        return no_constraint()
+    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
+        """W v + b."""
+        return self.constraints.nonholonomic_defect(data.get("t", 0.0), data["q"], data["v"], params)
 
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """The energy at the saved point and momentum."""
         return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params), params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
-        """How far the point is from the manifold."""
-        return self.manifold.defect(row["q"])[None]
+    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " 1+m"]:
+        """How far the point is from the manifold, and W v + b with the velocity that belongs to the saved momentum."""
+        q, off = row["q"], self.manifold.defect(row["q"])[None]
+        if not self.constraints.any:
+            return off
+        v = self.inverse_legendre(q, row["p"], params)
+        return jnp.concatenate([off, self.constraints.nonholonomic_defect(row.get("t", 0.0), q, v, params)])
+
+
+def _tangential(one_forms: UserFunction, manifold: AbstractManifold) -> UserFunction:
+    """The one-forms as the tangent vectors that represent them on the manifold."""
+    rows = lambda q, rows: jax.vmap(lambda row: manifold.projection(q, row))(rows)
+    if one_forms.takes_time:
+        return UserFunction(lambda t, q, params: rows(q, one_forms(t, q, params)), "one_forms", ("q",), timed=True)
+    return UserFunction(lambda q, params: rows(q, one_forms(q, params)), "one_forms", ("q",), timed=True)
