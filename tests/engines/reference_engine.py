@@ -51,13 +51,17 @@ class Reference(dx.AbstractEngine):
         return finished(problem, self._lanes(problem, jnp, None))
 
     def _lanes(self, p: Problem, xp, progress) -> Outcome:
-        pick = lambda a, lane: a if p.batch is None else a[lane]
-        params = lambda lane: jax.tree.map(lambda a: a[lane], p.params) if p.batch_params else p.params
-        runs = [
-            self._one(p, pick(p.state, lane), [pick(g, lane) for g in p.guess], params(lane), xp is jnp, progress)
-            for lane in range(p.batch or 1)
-        ]
-        fields, closing, numbers, states, unknowns = (jax.tree.map(lambda *a: xp.stack(a), *part) for part in zip(*runs, strict=True))
+        one = lambda state, guess, params: self._one(p, state, guess, params, xp is jnp, progress)
+        if p.batch is None:
+            runs = jax.tree.map(lambda a: a[None], one(p.state, list(p.guess), p.params))
+        elif xp is jnp:
+            runs = jax.vmap(one, (0, 0, 0 if p.batch_params else None))(p.state, list(p.guess), p.params)
+        else:
+            pick = lambda tree, lane: jax.tree.map(lambda a: a[lane], tree)
+            params = lambda lane: pick(p.params, lane) if p.batch_params else p.params
+            lanes = [one(p.state[lane], pick(list(p.guess), lane), params(lane)) for lane in range(p.batch)]
+            runs = jax.tree.map(lambda *a: np.stack(a), *lanes)
+        fields, closing, numbers, states, unknowns = runs
         completed, status, iterations = (numbers[:, i].astype(int) for i in range(3))
         interrupted = xp is np and bool(np.any((completed < p.steps) & (status == OK)))
         return Outcome(
@@ -87,9 +91,9 @@ class Reference(dx.AbstractEngine):
             state = jnp.where(good, at, state)
             guesses = [jnp.where(good, r[0], g) for r, g in zip(results, guesses, strict=True)]
             worst = jnp.maximum(numbers[3], jnp.max(jnp.stack([r[2] for r in results])))
-            updates = jnp.where(before, sum(r[3] for r in results), 0)
-            status = jnp.where(before, outcome, numbers[1])
-            numbers = jnp.stack([numbers[0] + good, status, numbers[2] + updates, jnp.where(good, worst, numbers[3])])
+            updates = jnp.where(before, sum(r[3] for r in results).astype(float), 0.0)
+            status = jnp.where(before, outcome.astype(float), numbers[1])
+            numbers = jnp.stack([numbers[0] + good.astype(float), status, numbers[2] + updates, jnp.where(good, worst, numbers[3])])
             try:
                 if progress:
                     progress(k + 1, p.steps)

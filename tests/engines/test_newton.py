@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import dirax as dx
 from dirax.engines.stopping import EPSILON
+from dirax.engines.xla import Xla
 from dirax.engines.xla.dense import Dense
 from dirax.engines.xla.newton import as_function, solve
 
@@ -105,3 +107,51 @@ def test_linear_solves_with_zero_pivots(k, seed):
     x = np.asarray(SOLVED(a, b))
     exact = np.linalg.solve(a, b)
     assert np.max(np.abs(x - exact)) <= 100 * EPSILON * condition * max(np.max(np.abs(exact)), EPSILON)
+
+
+class QR(dx.AbstractLinearSolver):
+    """By orthogonal factors."""
+
+    def factorise(self, matrix):
+        return jnp.linalg.qr(matrix)
+
+    def solve(self, factors, right):
+        q, r = factors
+        return jax.scipy.linalg.solve_triangular(r, q.T @ right)
+
+
+class Richardson(dx.AbstractLinearSolver):
+    """Iterations x ← x + D⁻¹(b − A x), for matrices with a large diagonal; a loop, which JAX does not transpose."""
+
+    most: int = 200
+
+    def factorise(self, matrix):
+        return matrix
+
+    def solve(self, factors, right):
+        diagonal = jnp.diagonal(factors)
+        going = lambda carry: (carry[1] < self.most) & (jnp.max(jnp.abs(factors @ carry[0] - right)) > 0)
+        more = lambda carry: (carry[0] + (right - factors @ carry[0]) / diagonal, carry[1] + 1)
+        return jax.lax.while_loop(going, more, (right / diagonal, 0))[0]
+
+    def solve_transposed(self, factors, right):
+        return self.solve(factors.T, right)
+
+
+@pytest.mark.parametrize("solver", [QR(), Richardson()])
+def test_a_linear_solver_is_one_class(solver):
+    """Values and derivatives of a run of five coupled pendulums, against the solver that the engine comes with."""
+    system = dx.LagrangeDirac(lambda q, v, k: v @ v / 2 + jnp.sum(jnp.cos(q)) - k * jnp.sum(jnp.diff(q) ** 2) / 2)
+    run = {"q": np.linspace(0.1, 1.0, 5), "step": 0.1, "steps": 8}
+
+    def end(engine, v, k):
+        sol = dx.simulate(system, dx.LagrangeDAlembert(), v=v, params=k, engine=engine, **run)
+        return jnp.sum(jnp.sin(sol.q[-1] + sol.p[-1])), sol
+
+    v, ours, theirs = np.linspace(0.0, 1.0, 5), Xla(linear_solver=solver), Xla()
+    np.testing.assert_allclose(end(ours, v, 0.3)[1].q, end(theirs, v, 0.3)[1].q, rtol=1e-12, atol=1e-13)
+    slopes = [jax.jit(jax.grad(lambda v, k, e=e: end(e, v, k)[0], argnums=(0, 1)))(v, 0.3) for e in (ours, theirs)]
+    for mine, other in zip(*slopes, strict=True):
+        np.testing.assert_allclose(mine, other, rtol=1e-11, atol=1e-13)
+    forward = [jax.jvp(lambda k, e=e: end(e, v, k)[0], (0.3,), (1.0,))[1] for e in (ours, theirs)]
+    assert forward[0] == pytest.approx(forward[1], rel=1e-11) and forward[0] == pytest.approx(float(slopes[0][1]), rel=1e-11)

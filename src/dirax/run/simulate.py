@@ -104,7 +104,7 @@ def simulate(
         compensated=bool(compensated),
     )
     # engine
-    with reporting(progress and not traced, steps) as report:
+    with reporting(False if traced else progress, steps) as report:
         outcome = on.run_traced(problem) if traced else on.run(problem, report)
     if redundant:
         outcome.notes["redundant_constraints"] = list(redundant)
