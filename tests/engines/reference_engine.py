@@ -12,7 +12,7 @@ TINY = 1e-13
 
 
 def one_stage(stage, state, guess, t, h, params, most, follow):
-    """(unknowns, next state, largest residual, updates, outcome) of a stage, by Newton's method with a new Jacobian every time."""
+    """(unknowns, next state, largest residual, updates, outcome) of a stage, by Newton's method with a new Jacobian each time."""
     stop = jax.lax.stop_gradient
     args = jax.tree.map(stop, (state, t, h, params))
     residual = lambda u: stage.residual(u, *args)
@@ -93,7 +93,9 @@ class Reference(dx.AbstractEngine):
             worst = jnp.maximum(numbers[3], jnp.max(jnp.stack([r[2] for r in results])))
             updates = jnp.where(before, sum(r[3] for r in results).astype(float), 0.0)
             status = jnp.where(before, outcome.astype(float), numbers[1])
-            numbers = jnp.stack([numbers[0] + good.astype(float), status, numbers[2] + updates, jnp.where(good, worst, numbers[3])])
+            numbers = jnp.stack(
+                [numbers[0] + good.astype(float), status, numbers[2] + updates, jnp.where(good, worst, numbers[3])]
+            )
             try:
                 if progress:
                     progress(k + 1, p.steps)

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from engines.reference_engine import Reference
 
 import dirax as dx
 from dirax.engines.auto import Auto
@@ -15,6 +14,7 @@ from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem, cut, 
 from dirax.engines.native import Native
 from dirax.engines.xla import Xla
 from dirax.schemes.step import Field, StepEquation
+from engines.reference_engine import Reference
 
 ENGINES: dict[str, dx.AbstractEngine] = {
     "native": Native(),

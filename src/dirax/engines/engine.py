@@ -15,7 +15,7 @@ class AbstractEngine(eqx.Module):
     trajectories that fail is said in `dirax/engines/contract.py`, and asked by `tests/engines/test_contract.py`.
     """
 
-    name: eqx.AbstractClassVar[str]
+    name: ClassVar[str]
     """What `stats["engine"]` says."""
 
     compiles_start: ClassVar[bool] = False

@@ -31,7 +31,8 @@ A chain of 32 pendulums, each coupled to all: 44 220 operations a step, compiled
 which pays after 35 000 steps. At 40 there are more than 60 000 operations, which is where tracing ends."""
 
 LARGEST_NATIVE = 96
-"""The same for steps that are sparse enough: 40 pendulums with forces between neighbours have 2 372 operations, compiled in .5 s."""
+"""The same for steps that are sparse enough: 40 pendulums with forces between neighbours have 2 372
+operations, compiled in .5 s."""
 
 MOST_OPERATIONS = 10_000
 """Scalar operations of a step that is sparse enough: a second of compiling, which 20 000 steps get back."""
@@ -47,8 +48,8 @@ loops that XLA makes one kernel: the rolling disk as arrays and as scalars 4.2 a
 spherical pendulum 5.5 and 4.3 in a batch of 512, vortices of 8 unknowns 8.4 and 8.3."""
 
 SCALAR_BATCH = 64
-"""Trajectories from which on a batch is large: on a CPU an array program calls LAPACK once for each small matrix of a batch. For
-one trajectory, as JAX comes, scalars may be slower: the double spherical pendulum takes 6.9 µs a step as arrays and 11 as scalars."""
+"""Trajectories from which on a batch is large: on a CPU an array program calls LAPACK once for each small matrix of a batch. For one
+trajectory, as JAX comes, scalars may be slower: the double spherical pendulum takes 6.9 µs a step in arrays, 11 in scalars."""
 
 LARGEST_NESTED = 96
 """The same as LARGEST_SCALAR for a step that is nested, whatever its batch and device: the array program of a pendulum with its

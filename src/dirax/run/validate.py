@@ -20,7 +20,7 @@ KINDS = ({"q", "v"}, {"q", "p"}, {"q0", "q1"}, {"x"}, {"q"})
 @dataclass(frozen=True)
 class Case:
     """What a run begins with: initial data (n,) or (B, n) by name, parameters (with a leading axis B if `batch_params`), the
-    step h and the time t0 of the first row. Arrays are NumPy's where no value is traced; `batch` is B, None for one trajectory."""
+    step h and the time t0 of the first row. Arrays are NumPy's where no value is traced; `batch` is B, or None."""
 
     data: Mapping[str, Any]
     params: Any

@@ -27,7 +27,7 @@ KEPT = 128
 """Programs kept in memory."""
 
 SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 5)
-LINEARIZED_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3)
+LINEAR_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3)
 
 
 NESTED = 4
@@ -85,7 +85,7 @@ class Program:
         if (reverse, width) not in self.linearizations:
             text = lambda: self._linearized(reverse).module(width, llvm.has_fma())
             library, _ = self._library("linearized", width, text, "backward" if reverse else "forward")
-            self.linearizations[reverse, width] = library, LINEARIZED_SIGNATURE(library["linearized"])
+            self.linearizations[reverse, width] = library, LINEAR_SIGNATURE(library["linearized"])
         return self.linearizations[reverse, width][1]
 
     def check(self) -> None:

@@ -37,7 +37,8 @@ class Xla(AbstractEngine):
     def __check_init__(self):
         if not isinstance(self.linear_solver, AbstractLinearSolver | None):
             raise TypeError(
-                f"linear_solver must be a dx.AbstractLinearSolver such as one of your own, but {self.linear_solver!r:.80} was given."
+                f"linear_solver must be a dx.AbstractLinearSolver, such as one of your own, but "
+                f"{self.linear_solver!r:.80} was given."
             )
         if self.scalars not in ("policy", "never"):
             raise ValueError(f"scalars must be 'policy' or 'never', but {self.scalars!r} was given.")
@@ -83,7 +84,9 @@ class Xla(AbstractEngine):
         except KeyboardInterrupt:
             interrupted = True
         _, rows = call(lanes, 0, 1, closing=True)
-        outcome = _outcome(p, jax.tree.map(np.asarray, lanes), fields, {name: values[:, 0] for name, values in rows.items()}, notes)
+        outcome = _outcome(
+            p, jax.tree.map(np.asarray, lanes), fields, {name: values[:, 0] for name, values in rows.items()}, notes
+        )
         outcome.interrupted, outcome.compile_seconds = interrupted, compile_seconds
         outcome.run_seconds = time.perf_counter() - started
         return finished(p, outcome)

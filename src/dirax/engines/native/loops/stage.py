@@ -33,7 +33,7 @@ class Block:
 def emit_stage(
     block: Block, stage: int | str, index: int, around: Region, time: str, running: str, number: str, saves: str | None
 ) -> None:
-    """Stage number `stage`, which solves equation `index` at `time` in the lanes `running`; a row `number` where `saves` holds."""
+    """Stage number `stage`, which solves equation `index` at `time` in the lanes `running`; row `number` where `saves` holds."""
     plan, frame, e = block.plan, block.frame, block.emitter
     b, equation, correction = e.body, plan.equations[index], plan.corrections[index]
     k, offset = len(equation.unknowns), 0
