@@ -57,7 +57,9 @@ class Reference(dx.AbstractEngine):
             self._one(p, pick(p.state, lane), [pick(g, lane) for g in p.guess], params(lane), xp is jnp, progress)
             for lane in range(p.batch or 1)
         ]
-        fields, closing, numbers, states, unknowns = (jax.tree.map(lambda *a: xp.stack(a), *part) for part in zip(*runs, strict=True))
+        fields, closing, numbers, states, unknowns = (
+            jax.tree.map(lambda *a: xp.stack(a), *part) for part in zip(*runs, strict=True)
+        )
         completed, status, iterations = (numbers[:, i].astype(int) for i in range(3))
         interrupted = xp is np and bool(np.any((completed < p.steps) & (status == OK)))
         return Outcome(

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from dirax.engines.native.program import program
-from dirax.program.evaluation.host_function import Values, in_parts
+from dirax.program.evaluation.in_numpy import Values, in_parts
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 

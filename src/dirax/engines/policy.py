@@ -13,7 +13,6 @@ import jax
 from dirax.engines.configure import fast_loops_asked_for
 from dirax.engines.contract import Problem
 from dirax.engines.engine import AbstractEngine
-from dirax.program.user_functions import evaluate_on
 
 ENGINES = {
     "auto": "dirax.engines.auto:Auto",
@@ -92,12 +91,3 @@ def _other_device() -> str | None:
 @cache
 def _plugins() -> bool:
     return any(map(find_spec, PLUGINS))
-
-
-def _native_host() -> Any:
-    from dirax.program.evaluation import concrete  # imported when it is used
-
-    return concrete
-
-
-evaluate_on(_native_host)

@@ -12,7 +12,6 @@ from jax.extend.core import jaxprs_in_params
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.program.graph import Graph, GraphTooLarge
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
-from dirax.program.tracing import in_scalars
 
 
 @dataclass(frozen=True)
@@ -114,8 +113,7 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
             [jnp.asarray(row[name]) for name in sorted(row)],
         )
 
-    with in_scalars():
-        closed = jax.make_jaxpr(everything)(vector(k), vector(s), vector(k), scalar, scalar, leaf_shapes)
+    closed = jax.make_jaxpr(everything)(vector(k), vector(s), vector(k), scalar, scalar, leaf_shapes)
     names = sorted(equation.fields)
     state = [g.input(f"state{i}") for i in range(s)]
     unknowns = [g.input(f"u{i}") for i in range(k)]
@@ -144,13 +142,16 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
     )  # fmt: skip
 
 
+DERIVATIVES = ("dirax_derivative", "dirax_directional")
+
+
 def nesting(jaxpr: Any) -> int:
     """How deep derivatives that tracing left to the graph lie in one another."""
     known: dict[int, int] = {}
 
     def depth(jaxpr: Any) -> int:
         if id(jaxpr) not in known:
-            inner = [(e.primitive.name == "dirax_derivative", j) for e in jaxpr.eqns for j in jaxprs_in_params(e.params)]
+            inner = [(e.primitive.name in DERIVATIVES, j) for e in jaxpr.eqns for j in jaxprs_in_params(e.params)]
             known[id(jaxpr)] = max((derives + depth(getattr(j, "jaxpr", j)) for derives, j in inner), default=0)
         return known[id(jaxpr)]
 

@@ -11,7 +11,9 @@ OFF_CONSTRAINT = 1e-9
 """Largest admissible |W v|, relative to |v| where that is above 1, for initial data that are to satisfy the constraint."""
 
 
-def refuse_bad_start(system: AbstractSystem, initial: Initial, start: Start, labels: tuple[str, ...], check_constraint: bool) -> None:
+def refuse_bad_start(
+    system: AbstractSystem, initial: Initial, start: Start, labels: tuple[str, ...], check_constraint: bool
+) -> None:
     """Raise `ValueError` for functions that are not finite at the data, data off the constraints (with the residual), and a
     first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
     the equations of the first step."""

@@ -27,7 +27,9 @@ KEPT = 128
 """Programs kept in memory."""
 
 SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 5)
-LINEARIZED_SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3)
+LINEARIZED_SIGNATURE = ctypes.CFUNCTYPE(
+    None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3
+)
 
 
 NESTED = 4

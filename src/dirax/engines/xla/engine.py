@@ -83,7 +83,9 @@ class Xla(AbstractEngine):
         except KeyboardInterrupt:
             interrupted = True
         _, rows = call(lanes, 0, 1, closing=True)
-        outcome = _outcome(p, jax.tree.map(np.asarray, lanes), fields, {name: values[:, 0] for name, values in rows.items()}, notes)
+        outcome = _outcome(
+            p, jax.tree.map(np.asarray, lanes), fields, {name: values[:, 0] for name, values in rows.items()}, notes
+        )
         outcome.interrupted, outcome.compile_seconds = interrupted, compile_seconds
         outcome.run_seconds = time.perf_counter() - started
         return finished(p, outcome)

@@ -11,6 +11,7 @@ from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, STALLED
 from dirax.engines.xla.dense import Dense
 
+
 class Search(NamedTuple):
     """Where the iteration stands: the unknowns, and (the size of the last update relative to |u_i| + 1, its ratio to the
     update before, the number of updates) as one array, which costs XLA one kernel and not three."""

@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from dirax.engines.native.gradients.recording import Recorded
-
 from dirax.engines.native.lanes import Lanes, width_for
 from dirax.engines.native.program import program
 
