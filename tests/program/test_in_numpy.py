@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.engines import linearization
-from dirax.engines.linearization import linearized
+from dirax.engines import step_program
+from dirax.engines.step_program import linearized
 from dirax.program.evaluation import in_numpy as module
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.linear_solves import scaled_pseudo_inverse, solve
@@ -61,7 +61,7 @@ def test_what_has_no_rule_is_left_to_the_compiler():
 
 @pytest.mark.parametrize("limit", [0, 10**9], ids=["on the graph", "in numbers"])
 def test_the_first_step_is_linearized_as_jax_does_it(limit, monkeypatch):
-    monkeypatch.setattr(linearization, "IN_NUMBERS", limit)
+    monkeypatch.setattr(step_program, "IN_NUMBERS", limit)
     system = dx.LagrangeDirac(
         lambda q, v, g: v @ v / 2 * (1 + q[0] ** 2) + g * jnp.where(q[1] > 0, jnp.cos(q[1]), 1 - q[1] ** 2 / 2),
         lambda q: jnp.stack([jnp.sin(q)]),

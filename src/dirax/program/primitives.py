@@ -43,8 +43,8 @@ def plain_primitive(name: str, by_jax: Callable[..., Sequence], shapes: Callable
             given = iter(moving)
             return list(by_jax(*(next(given) if m else x for x, m in zip(primals, moves, strict=True)), **p))
 
-        moving = [(x, a) for x, a, m in zip(primals, along, moves, strict=True) if m]
-        return jax.jvp(function, *map(tuple, zip(*moving, strict=True)))
+        chosen = lambda values: tuple(value for value, m in zip(values, moves, strict=True) if m)
+        return jax.jvp(function, chosen(primals), chosen(along))
 
     made.def_impl(lambda *operands, **p: list(by_jax(*operands, **p)))
     made.def_abstract_eval(lambda *operands, **p: list(shapes(*operands, **p)))
