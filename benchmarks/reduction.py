@@ -28,7 +28,7 @@ from benchmarks.harness import interleaved, store, summary, table
 from dirax.diagnostics.bench.engines import plain_run
 from dirax.engines.contract import Problem
 from dirax.engines.native import Native
-from dirax.engines.native.program import program
+from dirax.engines.native.kernels import kernels
 from dirax.engines.xla import Xla
 from dirax.gallery import double_spherical_pendulum, planar_n_body
 from dirax.gallery.rodriguez_leok import FASTER
@@ -78,7 +78,7 @@ def problem(subject: str, way: str, steps: int, batch: int | None) -> Problem:
 
 def operations(subject: str, way: str) -> dict[str, int]:
     """Scalar operations of the compiled step: residual, Jacobian, elimination and all together."""
-    made, _ = program(problem(subject, way, 1, None).equation, None, False)
+    made = kernels(problem(subject, way, 1, None).equation, None, False)
     plan = made._planned()
     g, equation, correction = plan.graph, plan.equations[0], plan.corrections[0]
     count = lambda nodes: sum(1 for node in g.reachable(nodes) if g.args[node])

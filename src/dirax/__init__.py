@@ -39,6 +39,7 @@ from dirax.geometry.tulczyjew import (
     minus_legendre,
     plus_legendre,
 )
+from dirax.program.memo import clear_caches
 from dirax.reduction.actions import GroupAction, Translations
 from dirax.reduction.connection import DiscreteConnection, LinearConnection
 from dirax.reduction.coordinates import adapted_basis, in_coordinates
@@ -150,6 +151,7 @@ __all__ = [
     "check_chart",
     "check_discretization_map",
     "check_invariance",
+    "clear_caches",
     "compare",
     "configure",
     "constraint_algorithm",

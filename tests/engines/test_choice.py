@@ -8,7 +8,7 @@ import pytest
 
 import dirax as dx
 from dirax.engines import policy as choice
-from dirax.engines.native.program import program
+from dirax.engines.step_program import step_program
 
 N = 20
 RUN = {"q": np.sin(np.arange(float(N))), "v": np.zeros(N), "step": 0.01, "steps": 5}
@@ -48,5 +48,5 @@ def test_operations_do_not_matter_where_an_array_program_would_be_far_larger(nes
         assert chain.index == 4
         system, run = chain.resolved(), {"x": chain.point}
     sol = dx.simulate(system, dx.DiscreteDirac() if nested else dx.LagrangeDAlembert(), **run, step=0.01, steps=3)
-    assert program(sol.equation, sol.params, False)[0].nested == nested
+    assert step_program(sol.equation, sol.params, False).nested == nested
     assert sol.stats["engine"] == ("native" if nested else "xla")

@@ -15,8 +15,8 @@ from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem
 from dirax.engines.native import Native
 from dirax.engines.native import compile as llvm
 from dirax.engines.native import engine as driver
+from dirax.engines.native.kernels import kernels
 from dirax.engines.native.loops.step_loop import kernel_module
-from dirax.engines.native.program import program
 from dirax.engines.xla import Xla
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.schemes.step import Field, Shape, StepEquation, StepSequence, make_step_equation
@@ -296,11 +296,9 @@ def test_an_interruption_keeps_what_was_computed(monkeypatch):
 
 
 def test_kernels_are_cached_on_disk_and_damaged_entries_are_made_again(tmp_path, monkeypatch):
-    from dirax.engines.native import program as programs
-
     monkeypatch.setenv("DIRAX_CACHE", str(tmp_path))
     p = problem("Hénon–Heiles", steps=30)
-    forget = lambda: programs._programs.clear()
+    forget = dx.clear_caches
     forget()
     first = native.run(p)
     assert not first.notes["kernel_cached"] and native.run(p).notes["kernel_cached"]
@@ -339,7 +337,7 @@ def test_what_cannot_be_compiled_is_named_with_its_line():
 
 def test_the_kernel_compiles_for_aarch64():
     p = problem("rolling disk, plus")
-    plan = program(p.equation, None, False)[0]._planned()
+    plan = kernels(p.equation, None, False)._planned()
     for width in (1, 2):
         text = llvm.object_code(kernel_module(plan, width, fma=True), ("aarch64-unknown-linux-gnu", "generic", ""), assembly=True)
         assert "fmadd" in text if width == 1 else "fmla" in text or "fmls" in text

@@ -1,4 +1,6 @@
-"""Derivatives left to the scalar graph are JAX's; functions of the user are traced once; outside a graph nothing changes."""
+"""Derivatives on the scalar graph are JAX's; functions of the user are traced once; outside of tracing nothing changes."""
+
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -7,9 +9,9 @@ import pytest
 
 import dirax as dx
 from dirax.geometry.numerics import arc_over_sine, norm, radial
-from dirax.program.evaluation.on_host import on_host
+from dirax.program.evaluation.functions import in_numpy
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import along, call, gradient, in_scalars, jacobian, once
+from dirax.program.tracing import along, gradient, jacobian, once
 
 POINT = np.array([0.3, 0.9, -0.4])
 SCALARS = {
@@ -41,7 +43,7 @@ def by_jax(function, *point):
 
 def on_graph(function, *point):
     """The value of a function that is traced in scalars, at one point."""
-    found = on_host(function, [np.asarray(x, float)[None] for x in point], (function,))
+    found = in_numpy(function, [np.asarray(x, float)[None] for x in point], function)
     assert found is not None
     return jax.tree.map(lambda leaf: leaf[0], found)
 
@@ -83,11 +85,11 @@ def test_an_operand_that_is_itself_an_expression_is_not_looked_into():
     assert on_graph(f, 2.0, 3.0) == -3.0
 
 
-def test_the_primitive_is_differentiated_and_vectorized_by_jax():
-    """A function that was traced in scalars may come under any transformation."""
-    f = SCALARS["functions"]
-    with in_scalars():
-        jaxpr = jax.make_jaxpr(gradient(f))(POINT)
+@pytest.mark.parametrize("name", ["functions", "a rule of its own", "branches"])
+def test_the_primitive_is_differentiated_and_vectorized_by_jax(name):
+    """What JAX traces has one equation a derivative, which is jax.grad to every transformation."""
+    f = SCALARS[name]
+    jaxpr = jax.make_jaxpr(gradient(f))(POINT)
     assert "dirax_derivative" in str(jaxpr)
     evaluated = lambda q: jax.extend.core.jaxpr_as_fun(jaxpr)(q)[0]
     rows = jnp.stack([POINT, POINT + 0.1])
@@ -98,9 +100,26 @@ def test_the_primitive_is_differentiated_and_vectorized_by_jax():
     assert by_jax(jax.jacrev(evaluated)) == pytest.approx(by_jax(jax.hessian(f)), rel=1e-12)
 
 
-def test_outside_a_graph_jax_differentiates():
-    assert "dirax_derivative" not in str(jax.make_jaxpr(gradient(SCALARS["polynomial"]))(POINT))
-    with pytest.raises(TypeError, match="scalar"), in_scalars():
+@pytest.mark.parametrize("name", VECTORS)
+def test_a_direction_is_differentiated_and_vectorized_by_jax(name):
+    f, v = VECTORS[name], np.array([1.0, -2.0, 0.5])
+    ours = lambda q, v: along(f, (q,), (v,))
+    theirs = lambda q, v: jax.jvp(f, (q,), (v,))[1]
+    assert "dirax_directional" in str(jax.make_jaxpr(ours)(POINT, v))
+    rows = np.stack([POINT, POINT + 0.1])
+    over_rows = lambda f: jax.vmap(f, (0, None))
+    cases = [(jax.jit, POINT), (jax.jacfwd, POINT), (jax.jacrev, POINT), (lambda f: jax.jacfwd(f, 1), POINT), (over_rows, rows)]
+    for transform, q in cases:
+        expected = by_jax(transform(theirs), q, v)
+        assert by_jax(transform(ours), q, v) == pytest.approx(expected, rel=1e-12, abs=1e-14)
+        assert transform(ours)(q, v) == pytest.approx(expected, rel=1e-12, abs=1e-14)
+
+
+def test_outside_a_trace_jax_differentiates():
+    seen = []
+    slope = gradient(lambda q: seen.append(q) or q @ q)(POINT)
+    assert slope == pytest.approx(2 * POINT) and len(seen) == 1
+    with pytest.raises(TypeError, match="scalar"):
         jax.make_jaxpr(gradient(lambda q: q))(POINT)
 
 
@@ -123,13 +142,24 @@ def test_a_function_is_traced_once_within_a_run_and_again_in_the_next():
     assert len(traced) == 2 * count
 
 
-def test_calls_outside_a_run_are_plain():
+def test_functions_and_methods_are_traced_once_and_called_plainly():
     seen = []
-    function = lambda x: seen.append(x) or x
-    assert call(function, 1.0) == 1.0
-    with once():
-        call(function, 1.0), call(function, 1.0)
-    assert len(seen) == 2
+
+    @dataclass(frozen=True)
+    class Scaled:
+        by: float
+
+        @once
+        def times(self, x):
+            """x times the factor."""
+            seen.append(x)
+            return self.by * x
+
+    assert Scaled(2.0).times(1.0) == 2.0 and seen == [1.0]
+    assert Scaled.times.__doc__ == "x times the factor."
+    twice = lambda x: Scaled(2.0).times(Scaled(2.0).times(x)) + Scaled(3.0).times(x)
+    assert jax.jit(twice)(1.0) == 7.0
+    assert len(seen) == 3  # once for each factor
 
 
 def test_derivatives_of_a_root_of_first_and_second_order():

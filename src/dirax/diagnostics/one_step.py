@@ -19,6 +19,7 @@ from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annih
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.structures import canonical_two_form
 from dirax.geometry.tulczyjew import FiniteDifferenceTriple, slot_derivatives
+from dirax.program.compiled import compiled
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
@@ -358,7 +359,7 @@ def over_rows(function: Callable, sol: Solution, items: tuple) -> np.ndarray:
     return np.concatenate(found, axis=1)
 
 
-@eqx.filter_jit
+@compiled
 def _piece(function, items, params, axis):
     lane = jax.vmap(lambda item, params: function(*item, params), in_axes=(0, None))
     return jax.vmap(lane, in_axes=(0, axis))(items, params)

@@ -13,7 +13,6 @@ import jax
 from dirax.engines.configure import fast_loops_asked_for
 from dirax.engines.contract import Problem
 from dirax.engines.engine import AbstractEngine
-from dirax.program.user_functions import evaluate_on
 
 ENGINES = {
     "auto": "dirax.engines.auto:Auto",
@@ -48,8 +47,8 @@ loops that XLA makes one kernel: the rolling disk as arrays and as scalars 4.2 a
 spherical pendulum 5.5 and 4.3 in a batch of 512, vortices of 8 unknowns 8.4 and 8.3."""
 
 SCALAR_BATCH = 64
-"""Trajectories from which on a batch is large: on a CPU an array program calls LAPACK once for each small matrix of a batch. For one
-trajectory, as JAX comes, scalars may be slower: the double spherical pendulum takes 6.9 µs a step in arrays, 11 in scalars."""
+"""Trajectories from which on a batch is large: on a CPU an array program calls LAPACK once for each small matrix of a batch. For
+one trajectory, as JAX comes, scalars may be slower: the double spherical pendulum takes 6.9 µs a step in arrays, 11 in scalars."""
 
 LARGEST_NESTED = 96
 """The same as LARGEST_SCALAR for a step that is nested, whatever its batch and device: the array program of a pendulum with its
@@ -93,12 +92,3 @@ def _other_device() -> str | None:
 @cache
 def _plugins() -> bool:
     return any(map(find_spec, PLUGINS))
-
-
-def _native_host() -> Any:
-    from dirax.program.evaluation import concrete  # imported when it is used
-
-    return concrete
-
-
-evaluate_on(_native_host)

@@ -1,72 +1,34 @@
-"""From a StepEquation to the scalar graph: its functions traced at the flat sizes, interpreted, with the Jacobian."""
+"""StepProgram: a step as one scalar program, of its functions traced at the flat sizes; what every engine asks of it."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.extend.core import jaxprs_in_params
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
-from dirax.program.graph import Graph, GraphTooLarge
-from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
-from dirax.program.tracing import in_scalars
+from dirax.engines.parameters import Parameters, parameters
+from dirax.program.derivatives import jacobian
+from dirax.program.evaluation.by_jax import by_jax
+from dirax.program.evaluation.in_numpy import Values, in_parts
+from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.interpreter import Nodes, UnsupportedPrimitive
+from dirax.program.memo import Memo, Same
+from dirax.program.scalar_program import ScalarProgram
 
+KEPT = 128
+"""Programs kept in memory."""
 
-@dataclass(frozen=True)
-class Parameters:
-    """How a params pytree becomes scalar inputs: floating leaves in order; other leaves are part of the program, or, where
-    they have a batch axis, inputs too, of their own dtype to the user's functions."""
+NESTED = 4
+"""Derivatives of derivatives from which on a step is `nested`: each more takes the array program times 2.6, and the graph
+hardly any."""
 
-    shapes: tuple[tuple[int, ...], ...]
-    dtypes: tuple[np.dtype, ...]
-    fixed: tuple[Any, ...]
-    treedef: Any
-    dynamic: tuple[bool, ...]
-
-    @property
-    def size(self) -> int:
-        return sum(int(np.prod(s)) for s in self.shapes)
-
-    @property
-    def key(self) -> tuple:
-        """Equal for parameters that give the same program; other leaves than arrays count by identity."""
-        fixed = ((a.dtype.str, a.shape, a.tobytes()) if isinstance(a, np.ndarray) else id(a) for a in self.fixed)
-        return self.treedef, self.shapes, self.dtypes, tuple(fixed)
-
-    def rebuild(self, leaves) -> Any:
-        """The pytree of its float64 inputs."""
-        own = lambda x, dtype: x if np.issubdtype(dtype, np.floating) else jnp.asarray(x).astype(dtype)
-        leaves, fixed = iter([own(*given) for given in zip(leaves, self.dtypes, strict=True)]), iter(self.fixed)
-        return jax.tree.unflatten(self.treedef, [next(leaves) if d else next(fixed) for d in self.dynamic])
-
-    def flatten(self, params: Any, batch: int | None) -> np.ndarray:
-        """The floating leaves as (size,), or (B, size) with their batch axis."""
-        leaves = [leaf for leaf, d in zip(jax.tree.leaves(params), self.dynamic, strict=True) if d]
-        lead = () if batch is None else (batch,)
-        columns = [np.asarray(leaf, dtype=np.float64).reshape(*lead, -1) for leaf in leaves]
-        return np.concatenate(columns, axis=-1) if columns else np.zeros((*lead, 0))
-
-
-def parameters(params: Any, batched: bool) -> Parameters:
-    """Which leaves of `params` are inputs of the kernel."""
-    leaves, treedef = jax.tree.flatten(params)
-    dynamic, shapes, dtypes, fixed = [], [], [], []
-    for leaf in leaves:
-        number = isinstance(leaf, int | float | np.ndarray | np.generic | jax.Array) and not isinstance(leaf, bool)
-        dtype = leaf.dtype if isinstance(leaf, Tracer) else np.asarray(leaf).dtype
-        moves = number and (batched or np.issubdtype(dtype, np.floating))
-        dynamic.append(bool(moves))
-        if moves:
-            shapes.append(np.shape(leaf)[1:] if batched else np.shape(leaf))
-            dtypes.append(np.dtype(dtype))
-        else:
-            if isinstance(leaf, Tracer):
-                raise UnsupportedPrimitive("params", f"has a leaf of dtype {dtype} that JAX traces", "see docs/native-engine.md")
-            fixed.append(np.asarray(leaf) if number else leaf)
-    return Parameters(tuple(shapes), tuple(dtypes), tuple(fixed), treedef, tuple(dynamic))
+IN_NUMBERS = 2**22
+"""Derivatives of nodes up to which a Jacobian is found in numbers, which is quicker once than to write it as nodes."""
 
 
 @dataclass
@@ -114,8 +76,7 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
             [jnp.asarray(row[name]) for name in sorted(row)],
         )
 
-    with in_scalars():
-        closed = jax.make_jaxpr(everything)(vector(k), vector(s), vector(k), scalar, scalar, leaf_shapes)
+    closed = jax.make_jaxpr(everything)(vector(k), vector(s), vector(k), scalar, scalar, leaf_shapes)
     names = sorted(equation.fields)
     state = [g.input(f"state{i}") for i in range(s)]
     unknowns = [g.input(f"u{i}") for i in range(k)]
@@ -126,16 +87,13 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
         count = int(np.prod(shape))
         leaves.append(ids(shared.params[at : at + count], shape))
         at += count
+    arguments = [ids(unknowns), ids(state), ids(previous), ids(shared.t, ()), ids(shared.h, ()), *leaves]
+    program = ScalarProgram(g, arguments)
     try:
-        outputs = Interpreter(g).run(
-            closed, ids(unknowns), ids(state), ids(previous), ids(shared.t, ()), ids(shared.h, ()), *leaves
-        )
+        program.run(closed)
     except GraphTooLarge as error:
         raise UnsupportedPrimitive("the step as a whole", f"has {error}", "see docs/native-engine.md") from None
-    for output in outputs:
-        if isinstance(output, Unavailable):
-            raise output.error
-    guess, residual, advance, *rows = outputs
+    guess, residual, advance, *rows = program.results
     if len(rows) != len(names):
         raise UnsupportedPrimitive("unpack", f"returns {len(rows)} arrays for {len(names)} fields", "the scheme")
     return TracedEquation(
@@ -144,14 +102,121 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
     )  # fmt: skip
 
 
+DERIVATIVES = ("dirax_derivative", "dirax_directional")
+
+
 def nesting(jaxpr: Any) -> int:
     """How deep derivatives that tracing left to the graph lie in one another."""
     known: dict[int, int] = {}
 
     def depth(jaxpr: Any) -> int:
         if id(jaxpr) not in known:
-            inner = [(e.primitive.name == "dirax_derivative", j) for e in jaxpr.eqns for j in jaxprs_in_params(e.params)]
+            inner = [(e.primitive.name in DERIVATIVES, j) for e in jaxpr.eqns for j in jaxprs_in_params(e.params)]
             known[id(jaxpr)] = max((derives + depth(getattr(j, "jaxpr", j)) for derives, j in inner), default=0)
         return known[id(jaxpr)]
 
     return depth(jaxpr)
+
+
+@dataclass(eq=False)
+class StepProgram:
+    """A step as nodes of one graph: its distinct equations, and for each stage which of them it solves and its fraction of h.
+
+    The graph gains Jacobians alone, which are always the same nodes; what else is to be added goes to a copy.
+    """
+
+    graph: Graph
+    shared: Inputs
+    equations: list[TracedEquation]
+    stages: list[tuple[int, float]]
+    parameters: Parameters
+    size: int = field(init=False)
+    """Nodes of the step without its Jacobians."""
+
+    def __post_init__(self):
+        self.size = len(self.graph)
+
+    @classmethod
+    def of(cls, equation: Any, p: Parameters) -> "StepProgram":
+        """The program of a StepEquation or a StepSequence. Raises `UnsupportedPrimitive`."""
+        graph = Graph(NODE_LIMIT)
+        shared = inputs(graph, p.size)
+        distinct: list[Any] = []
+        stages = []
+        for stage, fraction in equation.stages:
+            index = next((i for i, other in enumerate(distinct) if other is stage), len(distinct))
+            distinct += [stage] if index == len(distinct) else []
+            stages.append((index, float(fraction)))
+        return cls(graph, shared, [trace(graph, shared, stage, p) for stage in distinct], stages, p)
+
+    @property
+    def nested(self) -> bool:
+        """Whether derivatives lie in one another so deep that an array program is far larger than the graph."""
+        return any(e.nesting >= NESTED for e in self.equations)
+
+    @cached_property
+    def jacobians(self) -> list[list[dict[int, int]]]:
+        """The rows {column: node} of the Jacobian of every equation's residual. Raises `GraphTooLarge`."""
+        return [jacobian(self.graph, e.residual, e.unknowns) for e in self.equations]
+
+    def in_jax(self, index: int, outputs: list[int], graph: Graph | None = None) -> Callable:
+        """(u, state, t, h, params) ↦ nodes of an equation as one array, of this graph or a copy of it with more nodes."""
+        equation, g, shared = self.equations[index], graph or self.graph, self.shared
+
+        def function(u, state, t, h, params):
+            leaves = [leaf for leaf, moves in zip(jax.tree.leaves(params), self.parameters.dynamic, strict=True) if moves]
+            numbers = [x for leaf in leaves for x in jnp.ravel(jnp.asarray(leaf, float))]
+            values: dict[int, Any] = {shared.t: jnp.asarray(t, float), shared.h: jnp.asarray(h, float)}
+            values.update(zip(shared.params, numbers, strict=True))
+            values.update(zip([*equation.unknowns, *equation.state], [*u, *state], strict=True))
+            return by_jax(g, outputs, values)
+
+        return jax.jit(function)  # so that JAX traces it once for all the places that a loop has it in
+
+    def linearized(self, params: Any, batch_params: bool, u, state, t, h) -> tuple[np.ndarray, np.ndarray]:
+        """(residual, Jacobian) of the first stage in numbers, (entries, k) and (entries, k, k); arguments have an axis of
+        entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
+        first, shared, graph = self.equations[self.stages[0][0]], self.shared, self.graph
+        k, few = len(first.unknowns), len(u) * len(first.unknowns) * len(graph) <= IN_NUMBERS
+        rows = [] if few else self.jacobians[self.stages[0][0]]
+        entries = [row.get(j, graph.zero) for row in rows for j in range(k)]
+        graph = graph.copy() if few else graph
+        node = lambda nodes: np.asarray(nodes, dtype=np.int64)
+        leaves = self.parameters.flatten(params, len(u) if batch_params else None)
+
+        def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
+            known = Values(graph, len(arguments[0]))
+            for nodes, array in zip((first.unknowns, first.state, shared.t, shared.h, shared.params), arguments, strict=True):
+                known.bind(node(nodes), array)
+            slopes = known.slopes(first.residual, first.unknowns) if few else known.read(node(entries).reshape(k, k))
+            return [known.read(node(first.residual)), slopes]
+
+        residual, slopes = in_parts(part, [u, state, t, h, np.broadcast_to(leaves, (len(u), self.parameters.size))])
+        return residual, slopes
+
+
+_programs: Memo[StepProgram | UnsupportedPrimitive] = Memo(KEPT)
+
+
+def step_program(equation: Any, params: Any, batch_params: bool) -> StepProgram:
+    """The program of a step, the same object for the same equation and parameters of one kind. Raises `UnsupportedPrimitive`."""
+    p = parameters(params, batch_params)
+
+    def made() -> StepProgram | UnsupportedPrimitive:
+        try:
+            return StepProgram.of(equation, p)
+        except UnsupportedPrimitive as error:
+            return error.with_traceback(None)
+
+    found = _programs.get((Same(equation), p.key), made)
+    if isinstance(found, UnsupportedPrimitive):
+        raise UnsupportedPrimitive(found.primitive, found.reason, found.line)
+    return found
+
+
+def linearized(equation: Any, params: Any, batch_params: bool, u, state, t, h) -> tuple[np.ndarray, np.ndarray] | None:
+    """`StepProgram.linearized`; None for a step that is no scalar program."""
+    try:
+        return step_program(equation, params, batch_params).linearized(params, batch_params, u, state, t, h)
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return None

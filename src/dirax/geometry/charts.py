@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import Scalar
-from dirax.program.tracing import call, gradient, value_along
+from dirax.program.tracing import gradient, once, value_along
 
 Local = Float[Array, " d"]
 
@@ -33,11 +33,11 @@ class RetractionChart(eqx.Module):
 
     def to_manifold(self, r: Local) -> Vector:
         """The point φ⁻¹(r) (N,)."""
-        return call(_to_manifold, self, r)
+        return once(_to_manifold)(self, r)
 
     def to_local(self, x: Vector) -> Local:
         """The coordinates r = φ(x) (d,) of a point of the domain."""
-        return call(_to_local, self, x)
+        return once(_to_local)(self, x)
 
     def components(self, v: Vector) -> Local:
         """The components (d,) in `frame` of a tangent vector v (N,) at m."""

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from dirax.program.formula import Formula, apply
-from dirax.program.tracing import call
+from dirax.program.formula import Formula
+from dirax.program.tracing import once
 
 Scalar: TypeAlias = Float[Array, ""]
 
@@ -30,7 +30,7 @@ def radial(order: int, s: Scalar) -> Scalar:
 
     f_n(x²) = j_{n−1}(x)/x^{n−1} with the spherical Bessel functions j, so f_{n+1} = ((2n − 1) f_n − f_{n−1})/s.
     """
-    return apply(Radial(order), s)
+    return Radial(order)(s)
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def arc_over_sine(order: int, near: Scalar, far: Scalar) -> Scalar:
     For points of a unit sphere near and far are |y − x|²/4 and |y + x|²/4, each accurate at its own end of the arc.
     F is the hypergeometric function F(1, 1; 3/2; near). Right up to φ = π − 10⁻¹⁵, and some finite number beyond.
     """
-    return apply(ArcOverSine(order), near, far)
+    return ArcOverSine(order)(near, far)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def _piecewise(xp: Any, s: Any, below: float, coefficients: Sequence[float], oth
 
 def norm(v: Float[Array, " n"]) -> Scalar:
     """Euclidean norm with derivative 0, instead of NaN, at v = 0."""
-    return call(_norm, v)
+    return once(_norm)(v)
 
 
 def _norm(v: Float[Array, " n"]) -> Scalar:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import TINY, arc_over_sine, norm, radial
-from dirax.program.tracing import Method, call
+from dirax.program.tracing import once
 
 
 class AbstractFlat(AbstractGeodesicManifold):
@@ -131,14 +131,14 @@ class Sphere(AbstractGeodesicManifold):
 
     def local_parametrization(self, x):
         # The frame is only a choice of coordinates, so it is held fixed under differentiation in x.
-        frame = jax.lax.stop_gradient(call(orthonormal_complement, x))
+        frame = jax.lax.stop_gradient(once(orthonormal_complement)(x))
         return lambda r: self.nearest(x + frame @ r)
 
     def frame(self, x):
-        return call(orthonormal_complement, x)
+        return once(orthonormal_complement)(x)
 
     def coordinates(self, x, v):
-        return call(orthonormal_complement, x).T @ v
+        return once(orthonormal_complement)(x).T @ v
 
     def exp(self, x, v):
         s = jnp.dot(v, v)
@@ -202,7 +202,7 @@ class Product(AbstractGeodesicManifold):
     def _blocks(self, method: str, *arguments):
         """The method of every factor on its blocks; factors that are equal are traced once where that can be."""
         rows = zip(self.factors, *(self.split(argument) for argument in arguments), strict=True)
-        return [call(Method(getattr(type(factor), method), factor), *blocks) for factor, *blocks in rows]
+        return [once(getattr(type(factor), method), factor)(*blocks) for factor, *blocks in rows]
 
     def defect(self, x):
         return jnp.max(jnp.stack(self._blocks("defect", x)))
@@ -232,7 +232,7 @@ class Product(AbstractGeodesicManifold):
 
     def geodesic(self, x, v, t):
         rows = zip(self.factors, self.split(x), self.split(v), strict=True)
-        points, velocities = zip(*(call(Method(type(f).geodesic, f), *blocks, t) for f, *blocks in rows), strict=True)
+        points, velocities = zip(*(once(type(f).geodesic, f)(*blocks, t) for f, *blocks in rows), strict=True)
         return jnp.concatenate(points), jnp.concatenate(velocities)
 
     def log(self, x, y):

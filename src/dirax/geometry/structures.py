@@ -16,6 +16,7 @@ from dirax.geometry.linear import LinearDirac
 from dirax.geometry.representations import KERNEL_PAIRS, KernelPair
 from dirax.geometry.scattering import block_diagonal, scattering_matrix
 from dirax.geometry.subspaces import AnyArray, known
+from dirax.program.compiled import compiled
 from dirax.program.user_functions import UserFunction
 
 Matrices = tuple[Float[AnyArray, "rows columns"], ...]
@@ -193,7 +194,7 @@ def induced_dirac(one_forms: Callable | None, n: int) -> DiracStructure:
     return DiracStructure(_Induced(function, n), "two_form" if function is None else "annihilator", 2 * n)
 
 
-@eqx.filter_jit
+@compiled
 def _courant_tensor(structure: DiracStructure, x: Float[Array, " n"], params: Any) -> Float[Array, "n n n"]:
     def scattering(x):
         return scattering_matrix(structure.kernel(x, params))

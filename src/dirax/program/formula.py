@@ -10,8 +10,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad
 from jaxtyping import Array, Float
 
-from dirax.program.primitives import deferred
-from dirax.program.tracing import becomes_scalars, call
+from dirax.program.primitives import binds, plain_primitive
 
 Slope: TypeAlias = "tuple[float, Formula] | None"
 
@@ -28,14 +27,10 @@ class Formula(ABC):
         """The derivative by each argument as (factor, function of the same arguments), None for zero."""
 
     def __call__(self, *x: Float[Array, ""]) -> Float[Array, ""]:
+        """The formula at x, differentiable any number of times."""
+        if binds(*x) and not any(map(jnp.ndim, x)):
+            return formula_p.bind(*map(jnp.asarray, x), formula=self)[0]
         return _by_jax(self, *x)
-
-
-def apply(formula: Formula, *x: Float[Array, ""]) -> Float[Array, ""]:
-    """The formula at x, differentiable any number of times."""
-    if becomes_scalars(*x) and not any(map(jnp.ndim, x)):
-        return formula_p.bind(*map(jnp.asarray, x), formula=formula)[0]
-    return call(formula, *x)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -46,8 +41,8 @@ def _by_jax(formula: Formula, *x):
 @_by_jax.defjvp
 def _value_and_tangent(formula, primals, tangents):
     slopes = zip(formula.slopes(), tangents, strict=True)
-    parts = [slope[0] * apply(slope[1], *primals) * along for slope, along in slopes if slope is not None]
-    return apply(formula, *primals), sum(parts[1:], parts[0])
+    parts = [slope[0] * slope[1](*primals) * along for slope, along in slopes if slope is not None]
+    return formula(*primals), sum(parts[1:], parts[0])
 
 
 def _formula_p_tangents(primals, tangents, *, formula: Formula):
@@ -55,7 +50,7 @@ def _formula_p_tangents(primals, tangents, *, formula: Formula):
     return [value], [along]
 
 
-formula_p = deferred(
+formula_p = plain_primitive(
     "dirax_formula", lambda *x, formula: [_by_jax(formula, *x)], lambda x, *_, formula: [ShapedArray((), x.dtype)]
 )
 ad.primitive_jvps[formula_p] = _formula_p_tangents

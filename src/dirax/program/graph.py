@@ -46,9 +46,9 @@ class Graph:
     def __len__(self) -> int:
         return len(self.op)
 
-    def copy(self) -> "Graph":
+    def copy(self, limit: int = 1_000_000) -> "Graph":
         """A graph of the same nodes, to which others can be added."""
-        other = Graph()
+        other = Graph(limit)
         other.op, other.args, other.value = self.op.copy(), self.args.copy(), self.value.copy()
         other.slopes, other._known = self.slopes.copy(), self._known.copy()
         return other

@@ -9,8 +9,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, batching
 from jaxtyping import Array, Float
 
-from dirax.program.primitives import deferred, each
-from dirax.program.tracing import becomes_scalars
+from dirax.program.primitives import binds, each, plain_primitive
 
 RANK_TOLERANCE = 1e-12
 """Singular values below this, relative to the largest of the equilibrated matrix, count as zero."""
@@ -22,21 +21,21 @@ def solve(matrix: Float[Array, "n n"], right: Array, apart: bool = False) -> Arr
     `apart`: the graph may differentiate the elimination itself, which it does quickly however deep derivatives lie in one
     another; else a derivative is another solve.
     """
-    if not becomes_scalars(matrix, right):
+    if not binds(matrix, right):
         return jnp.linalg.solve(matrix, right)
     return solve_p.bind(matrix, right, apart=apart)[0]
 
 
 def pseudo_inverse(matrix: Float[Array, "k l"], tolerance: float) -> Float[Array, "l k"]:
     """`jnp.linalg.pinv`; singular values below `tolerance`, relative to the largest, count as zero."""
-    if not becomes_scalars(matrix):
+    if not binds(matrix):
         return jnp.linalg.pinv(matrix, tolerance)
     return pseudo_inverse_p.bind(matrix, tolerance=tolerance)[0]
 
 
 def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> tuple[Float[Array, "l k"], Float[Array, " l"]]:
     """The pseudo-inverse of a matrix with rows and columns scaled to unit size, and the units that this gives the columns."""
-    inverse, units = scaled_inverse_p.bind(matrix) if becomes_scalars(matrix) else equilibrated_inverse(jnp, matrix)
+    inverse, units = scaled_inverse_p.bind(matrix) if binds(matrix) else equilibrated_inverse(jnp, matrix)
     return inverse, units
 
 
@@ -84,13 +83,13 @@ def _solve_by_jax(matrix, right, **_):
     return [jnp.linalg.solve(matrix, right)]
 
 
-solve_p = deferred("dirax_solve", _solve_by_jax, lambda a, b, **_: [ShapedArray(b.shape, b.dtype)])
+solve_p = plain_primitive("dirax_solve", _solve_by_jax, lambda a, b, **_: [ShapedArray(b.shape, b.dtype)])
 ad.primitive_jvps[solve_p] = _solve_tangents
 ad.primitive_transposes[solve_p] = _solve_transposed
 batching.primitive_batchers[solve_p] = _solve_batched
-pseudo_inverse_p = deferred(
+pseudo_inverse_p = plain_primitive(
     "dirax_pseudo_inverse",
     lambda matrix, tolerance: [jnp.linalg.pinv(matrix, tolerance)],
     lambda matrix, **_: _turned(matrix)[:1],
 )
-scaled_inverse_p = deferred("dirax_scaled_inverse", lambda matrix: equilibrated_inverse(jnp, matrix), _turned)
+scaled_inverse_p = plain_primitive("dirax_scaled_inverse", lambda matrix: equilibrated_inverse(jnp, matrix), _turned)

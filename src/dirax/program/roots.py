@@ -11,8 +11,8 @@ from jax.interpreters import ad
 from jaxtyping import Array, Float
 
 from dirax.program.linear_solves import scaled_pseudo_inverse
-from dirax.program.primitives import deferred
-from dirax.program.tracing import becomes_scalars, closed_over, jacobian
+from dirax.program.primitives import binds, plain_primitive
+from dirax.program.tracing import closed_over, jacobian
 
 EPSILON = 2.220446049250313e-16
 SHORTEST = 2.0**-30
@@ -27,7 +27,7 @@ def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int =
     back, so check the residual if that can happen. Differentiable any number of times, by the implicit function theorem.
     """
     guess = jnp.asarray(guess)
-    if becomes_scalars(guess):
+    if binds(guess):
         closed, captured, result = closed_over(residual, [guess])
         if all(jnp.result_type(x) == jnp.float64 for x in (result, *captured)):
             return root_p.bind(*captured, guess, residual=closed, max_steps=max_steps)[0]
@@ -93,6 +93,6 @@ def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, max_steps: int
     return [u], [_tangent(_unknowns_first(residual), u, primals[:-1], tuple(along))]
 
 
-root_p = deferred("dirax_root", _by_jax, lambda *operands, **_: [operands[-1]])
+root_p = plain_primitive("dirax_root", _by_jax, lambda *operands, **_: [operands[-1]])
 """The root of a jaxpr of (*captured, unknowns) from the last operand on, the others being what it captured."""
 ad.primitive_jvps[root_p] = _root_p_tangents

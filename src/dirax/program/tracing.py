@@ -1,27 +1,19 @@
-"""Tracing of functions whose step becomes a scalar graph: the user's functions once, first derivatives left to the graph.
-
-JAX takes a few milliseconds to differentiate what it traces, and the graph some microseconds. Everywhere else `gradient` and
-`jacobian` are `jax.grad` and `jax.jacfwd`.
-"""
+"""Tracing of functions that may become scalar programs: each once, and derivatives as equations of the jaxpr."""
 
 import functools
-import gc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, jaxprs_in_params
 
-from dirax.program.primitives import deferred
+from dirax.program.memo import Memo
+from dirax.program.primitives import binds, is_tracing, plain_primitive
 
-_traced: ContextVar[dict | None] = ContextVar("functions of the user that were traced", default=None)
-_in_scalars: ContextVar[bool] = ContextVar("whether what is traced becomes a scalar graph", default=False)
+KEPT = 512
+"""Traced functions kept in memory."""
 
 PLAIN = frozenset(
     (
@@ -30,7 +22,8 @@ PLAIN = frozenset(
         *("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite", "convert_element_type", "copy", "reshape"),
         *("squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "concatenate", "stack", "unstack", "tile", "split"),
         *("slice", "pad", "iota", "gather", "dynamic_slice", "dynamic_update_slice", "scatter", "scatter-add", "reduce_sum"),
-        *("dot_general", "add_any", "jit", "pjit", "closed_call", "dirax_derivative", "dirax_formula"),
+        *("dot_general", "add_any", "jit", "pjit", "closed_call"),
+        *("dirax_derivative", "dirax_directional", "dirax_formula", "dirax_program"),
     )
 )
 """Primitives whose derivative is the same for JAX and for the graph, and as accurate: no corners (of an absolute value, a
@@ -40,134 +33,103 @@ graph loses digits or meets ∞·0 (an arcsine, a logistic function)."""
 RULE = "custom_jvp_call"
 """A function with a rule of its own for its derivative, which the graph knows how to take where it is one of numbers."""
 
-PATIENCE = 200_000
-"""New objects after which Python looks for garbage while something is traced; it takes a tenth of the time as it comes."""
+_jitted: Memo[Callable] = Memo(KEPT)
 
 
-@contextmanager
-def once() -> Iterator[None]:
-    """Within, every function of the user is traced once for arguments of one kind, and garbage is looked for less often."""
-    if _traced.get() is not None:
-        yield
-        return
-    token, before = _traced.set({}), gc.get_threshold()
-    gc.set_threshold(max(before[0], PATIENCE) if before[0] else 0, *before[1:])
+class once:
+    """`function(*first, ·)`, traced once for values of one kind wherever JAX traces it; plain calls elsewhere.
+
+    Equal functions with equal `first` count as one: of an object's methods, `first` is the object. Also a decorator of
+    functions and of methods.
+    """
+
+    def __init__(self, function: Callable, *first: Any):
+        self.function, self.first, self.__doc__ = function, first, function.__doc__
+
+    def __call__(self, *values: Any) -> Any:
+        plain = functools.partial(self.function, *self.first) if self.first else self.function
+        return _jitted.get(self, lambda: jax.jit(plain))(*values) if is_tracing() and _has_hash(self) else plain(*values)
+
+    def __get__(self, owner: Any, kind: type | None = None) -> "once":
+        return self if owner is None else once(self.function, owner)
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, once) and self.function == other.function and self.first == other.first
+
+    def __hash__(self) -> int:
+        return hash((self.function, self.first))
+
+
+def _has_hash(value: Any) -> bool:
     try:
-        yield
-    finally:
-        _traced.reset(token)
-        gc.set_threshold(*before)
-
-
-@contextmanager
-def in_scalars() -> Iterator[None]:
-    """Within, what is traced becomes a scalar graph."""
-    with once():
-        token = _in_scalars.set(True)
-        try:
-            yield
-        finally:
-            _in_scalars.reset(token)
-
-
-def becomes_scalars(*values: Any) -> bool:
-    """Whether what is traced becomes a scalar graph, and the values are arrays of floats."""
-    return _in_scalars.get() and all(jnp.result_type(x) == jnp.float64 for x in values)
-
-
-def call(function: Callable, *values: Any) -> Any:
-    """`function(*values)`, which within `once` is traced once for values of one kind; equal functions count as one."""
-    known = _traced.get()
-    if known is None or not _hashable(function):
-        return function(*values)
-    if function not in known:
-        known[function] = jax.jit(function)
-    return known[function](*values)
-
-
-def shared(function: Callable) -> Callable:
-    """A function that is traced once wherever it is used, with derivatives by the graph and by JAX apart."""
-    by_jax, by_graph = jax.jit(function), jax.jit(lambda *values: function(*values))
-    return lambda *values: (by_graph if _in_scalars.get() else by_jax)(*values)
-
-
-@dataclass(frozen=True)
-class Method:
-    """A method of an object, equal for equal objects; quicker to make and to compare than those of equinox."""
-
-    method: Callable
-    owner: Any
-
-    def __call__(self, *values):
-        return self.method(self.owner, *values)
-
-
-def traced_once(method: Callable) -> Callable:
-    """A method that within `once` is traced once for values of one kind and equal objects."""
-
-    @functools.wraps(method)
-    def bound(self, *values, **named):
-        return method(self, *values, **named) if named else call(Method(method, self), *values)
-
-    return bound
-
-
-def _hashable(function: Callable) -> bool:
-    try:
-        hash(function)
+        hash(value)
     except TypeError:  # the method of an object that holds arrays
         return False
     return True
 
 
 def gradient(function: Callable, argnums: int | tuple[int, ...] = 0) -> Callable:
-    """`jax.grad(function, argnums)`, by the graph where that is built and has the same derivative."""
+    """`jax.grad(function, argnums)`."""
     return _derivative(function, argnums, jax.grad)
 
 
 def jacobian(function: Callable, argnums: int | tuple[int, ...] = 0, reverse: bool = False) -> Callable:
-    """`jax.jacfwd(function, argnums)`, or `jax.jacrev`, of a function with one array, by the graph as above."""
+    """`jax.jacfwd(function, argnums)`, or `jax.jacrev`, of a function with one array."""
     return _derivative(function, argnums, jax.jacrev if reverse else jax.jacfwd)
 
 
 def along(function: Callable, point: tuple, direction: tuple) -> Any:
-    """The derivative of a function with one array at `point` along `direction`, `jax.jvp(…)[1]`, by the graph as above."""
-    if not _in_scalars.get():
-        return jax.jvp(function, point, direction)[1]
-    shifted = lambda s: function(*(x + s * v for x, v in zip(point, direction, strict=True)))
-    by_jax = lambda function, _: lambda s: jax.jvp(function, (s,), (jnp.ones(()),))[1]
-    return _derivative(shifted, 0, by_jax)(np.zeros(()))
+    """The derivative of a function with one array at `point` along `direction`: `jax.jvp(function, point, direction)[1]`."""
+    if is_tracing():
+        traced = _Traced(function, point)
+        if traced.is_plain and binds(*direction) and len(jax.tree.leaves(direction)) == len(traced.leaves):
+            operands = (*traced.captured, *traced.leaves, *map(operand, direction))
+            return directional_p.bind(*operands, jaxpr=traced.jaxpr, count=len(direction))[0]
+    return jax.jvp(function, point, direction)[1]
 
 
 def value_along(function: Callable, point: tuple, direction: tuple) -> tuple[Any, Any]:
-    """`jax.jvp(function, point, direction)` of a function with one array, its derivative by the graph as above."""
-    if not _in_scalars.get():
-        return jax.jvp(function, point, direction)
-    return function(*point), along(function, point, direction)
+    """`jax.jvp(function, point, direction)` of a function with one array."""
+    return (function(*point), along(function, point, direction)) if is_tracing() else jax.jvp(function, point, direction)
 
 
 def _derivative(function: Callable, argnums: int | tuple[int, ...], by_jax: Callable) -> Callable:
     def derivative(*values):
-        if not _in_scalars.get():
+        if not is_tracing():
+            return by_jax(function, argnums)(*values)
+        traced = _Traced(function, values)
+        if not traced.is_plain or (by_jax is jax.grad and traced.result.shape):
             return by_jax(function, argnums)(*values)
         chosen = (argnums,) if isinstance(argnums, int) else tuple(argnums)
-        leaves, structure = jax.tree.flatten(values)
-        places, at = [], 0
-        for value in values:
-            places.append(at)
-            at += len(jax.tree.leaves(value))
-        flat = lambda *leaves: function(*jax.tree.unflatten(structure, leaves))
-        jaxpr, captured, result = closed_over(flat, leaves)
-        operands = [x if isinstance(x, Tracer) else np.asarray(x) for x in (*captured, *leaves)]
-        one = isinstance(result, jax.ShapeDtypeStruct) and not (by_jax is jax.grad and result.shape)
-        floats = one and all(x.dtype == np.float64 for x in (result, *operands))
-        if not floats or not _plain(jaxpr.jaxpr):
-            return by_jax(function, argnums)(*values)
-        wanted = [len(captured) + places[k] for k in chosen]
-        found = derivative_p.bind(*operands, jaxpr=jaxpr, wanted=tuple(wanted))
+        starts = np.cumsum([0, *(len(jax.tree.leaves(value)) for value in values)])
+        wanted = tuple(len(traced.captured) + int(starts[k]) for k in chosen)
+        reverse = by_jax is not jax.jacfwd
+        found = derivative_p.bind(*traced.captured, *traced.leaves, jaxpr=traced.jaxpr, wanted=wanted, reverse=reverse)
         return found[0] if isinstance(argnums, int) else tuple(found)
 
     return derivative
+
+
+def operand(value: Any) -> Any:
+    """A value as an operand of a primitive."""
+    return value if isinstance(value, Tracer) else np.asarray(value)
+
+
+class _Traced:
+    """A function at values, for a primitive of its derivative: `jaxpr` of the captured values and then the leaves."""
+
+    def __init__(self, function: Callable, values: tuple):
+        leaves, structure = jax.tree.flatten(values)
+        self.jaxpr, captured, self.result = closed_over(lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), leaves)
+        self.captured, self.leaves = [*map(operand, captured)], [*map(operand, leaves)]
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it is one array of floats and the graph has the same derivative as JAX."""
+        one = isinstance(self.result, jax.ShapeDtypeStruct)
+        return (
+            one and all(x.dtype == np.float64 for x in (self.result, *self.captured, *self.leaves)) and _plain(self.jaxpr.jaxpr)
+        )
 
 
 def closed_over(function: Callable, values: list) -> tuple[ClosedJaxpr, list, Any]:
@@ -198,16 +160,31 @@ def _numbers(equation: Any) -> bool:
     return len(equation.outvars) == 1 and all(v.aval.shape == () and v.aval.dtype == np.float64 for v in variables)
 
 
-def _by_jax(*operands, jaxpr: ClosedJaxpr, wanted: tuple[int, ...]):
+def of_one_result(jaxpr: ClosedJaxpr) -> Callable:
+    """A jaxpr with one result as a function."""
+    return lambda *values: jaxpr_as_fun(jaxpr)(*values)[0]
+
+
+def _derivatives_by_jax(*operands, jaxpr: ClosedJaxpr, wanted: tuple[int, ...], reverse: bool):
     (result,) = jaxpr.out_avals
-    function = lambda *values: jaxpr_as_fun(jaxpr)(*values)[0]
-    return (jax.jacfwd if result.shape else jax.grad)(function, wanted)(*operands)
+    by_jax = jax.grad if not result.shape else jax.jacrev if reverse else jax.jacfwd
+    return by_jax(of_one_result(jaxpr), wanted)(*operands)
 
 
-def _shapes(*operands, jaxpr: ClosedJaxpr, wanted: tuple[int, ...]):
+def _derivative_shapes(*operands, jaxpr: ClosedJaxpr, wanted: tuple[int, ...], reverse: bool):
     (result,) = jaxpr.out_avals
     return [ShapedArray((*result.shape, *operands[k].shape), result.dtype) for k in wanted]
 
 
-derivative_p = deferred("dirax_derivative", _by_jax, _shapes)
+derivative_p = plain_primitive("dirax_derivative", _derivatives_by_jax, _derivative_shapes)
 """The derivatives of a jaxpr of floats with one result by the operands numbered `wanted`, one result each."""
+
+
+def _directional_by_jax(*operands, jaxpr: ClosedJaxpr, count: int):
+    """Its operands are captured values, the point and the direction (`count` arrays each)."""
+    captured, point, direction = operands[: -2 * count], operands[-2 * count : -count], operands[-count:]
+    return [jax.jvp(lambda *point: of_one_result(jaxpr)(*captured, *point), tuple(point), tuple(direction))[1]]
+
+
+directional_p = plain_primitive("dirax_directional", _directional_by_jax, lambda *_, jaxpr, count: jaxpr.out_avals)
+"""The derivative of a jaxpr of floats with one result along a direction."""

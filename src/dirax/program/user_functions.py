@@ -13,7 +13,8 @@ from jax.core import Tracer
 from jax.experimental import checkify
 from jax.extend.core import jaxprs_in_params
 
-from dirax.program.tracing import becomes_scalars, call
+from dirax.program.compiled import compiled
+from dirax.program.tracing import once
 from dirax.text.representation import value_text
 
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
@@ -51,7 +52,7 @@ class UserFunction(eqx.Module):
 
     def __call__(self, *values: Any):
         *args, params = values
-        return call(self.function, *args, *((params,) if self.takes_params else ()))
+        return once(self.function)(*args, *((params,) if self.takes_params else ()))
 
     def at(self, t: Any, *values: Any):
         """The function of `(*arguments, params)` at time t, which is passed on where the function takes it."""
@@ -86,7 +87,7 @@ class UserFunction(eqx.Module):
             what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
             raise TypeError(f"{call} must return one array of real numbers (float64), but it returned {what}.")
         if _indexes(jaxpr.jaxpr) and not is_traced(values, jaxpr.consts) and not _reads_inside(jaxpr, values):
-            outside = _compiled(_Indexing(self), *values)[0].get()
+            outside = compiled(_Indexing(self))(*values)[0].get()
             if outside:
                 raise ValueError(
                     f"{call} reads an entry that its arguments, of shapes {shapes}, do not have "
@@ -128,45 +129,28 @@ def _takes_time(function: Callable, count: int) -> bool:
 
 
 def evaluated(function: Callable, *values: Any) -> Any:
-    """`function(*values)` for checks of concrete values: without a compiler where that can be, else by one compiled program
-    instead of one an operation; either is kept for later calls with equal functions."""
-    host = _host()
-    found = None if host is None or is_traced(values) else host.evaluated(function, values)
-    return _compiled(function, *values) if found is None else found[0]
+    """`function(*values)` for checks of concrete values: in NumPy where that can be, else by one compiled program instead of
+    one an operation; either is kept for later calls with equal functions."""
+    from dirax.program.evaluation.functions import at_values  # imported when it is used, here and below
+
+    found = None if is_traced(values) else at_values(function, values)
+    return compiled(function)(*values) if found is None else found[0]
 
 
 def scalar_program(function: Callable, *values: Any) -> Any:
-    """`function(*values)` for traced values by the operations of its scalar graph where it has one: far fewer than those of
-    an array program where derivatives lie in one another."""
-    host = _host()
-    found = None if host is None or becomes_scalars() else host.scalar_program(function, values)
+    """`function(*values)` for traced values by the operations of its scalar program where it has one: far fewer than those of
+    derivatives in one another."""
+    from dirax.program.evaluation.functions import in_scalars
+
+    found = in_scalars(function, values)
     return function(*values) if found is None else found[0]
 
 
 def constant_entries(function: Callable, *values: Any) -> np.ndarray | None:
     """The array `function(*values)` with NaN for the entries that depend on the values; None where that is not found."""
-    host = _host()
-    return None if host is None else host.constant_entries(function, values)
+    from dirax.program.evaluation.functions import constants
 
-
-@eqx.filter_jit
-def _compiled(function: Callable, *values: Any) -> Any:
-    return function(*values)
-
-
-def _no_host() -> Any:
-    return None
-
-
-_host = _no_host
-
-
-def evaluate_on(host: Callable[[], Any]) -> None:
-    """Have concrete values found without a compiler by what `host` returns: a module with `evaluated(function, values)`, a
-    tuple of one result, `scalar_program(function, values)`, the same of traced values, `constant_entries(function, values)`,
-    an array, and `reads_inside(jaxpr, values)`, whether every index is inside its array; None and False where it cannot say."""
-    global _host
-    _host = host
+    return constants(function, values)
 
 
 class _Indexing(eqx.Module):
@@ -216,8 +200,9 @@ def _indexes(jaxpr) -> bool:
 
 
 def _reads_inside(jaxpr, values) -> bool:
-    host = _host()
-    return host is not None and host.reads_inside(jaxpr, values)
+    from dirax.program.evaluation.indices import reads_inside
+
+    return reads_inside(jaxpr, values)
 
 
 def _first_line(message: Any) -> str:

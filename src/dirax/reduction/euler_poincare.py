@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import gradient, jacobian, traced_once
+from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.lie_poisson import LiePoisson, checked_point
 from dirax.systems.constraints import no_constraint
@@ -67,7 +67,7 @@ class EulerPoincare(AbstractSystem):
         """l(ξ, a)."""
         return self.lagrangian(*self._given(xi, a), params)
 
-    @traced_once
+    @once
     def slopes(self, xi: Algebra, a: Advected, params: Any = None) -> tuple[Algebra, Advected]:
         """(∂l/∂ξ, ∂l/∂a)."""
         return gradient(lambda xi, a: self.value(xi, a, params), (0, 1))(xi, a)

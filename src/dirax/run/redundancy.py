@@ -2,11 +2,11 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.program.compiled import compiled
 from dirax.run.start import numerical_rank
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
@@ -77,7 +77,7 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
         )
 
 
-@eqx.filter_jit
+@compiled
 def _nearby(system, q, params, t):
     """[W; G] at an admissible point near q, and the residuals of g and of the velocities' constraints that no point and no
     velocity nearest to q makes zero."""

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 
 from dirax.engines.contract import Problem
 from dirax.engines.engine import AbstractEngine
-from dirax.program.tracing import once
 from dirax.program.user_functions import is_traced
 from dirax.run.premises import refuse_bad_start
 from dirax.run.progress import reporting
@@ -75,19 +74,18 @@ def simulate(
     case = validated_case({"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, params, batch_params, step, t0)
     system = system if inputs is None else system.with_inputs(inputs)
     data, own = case.first
-    with once():
-        # discretize: constraints that follow from others at the completed data are left out of the equation
-        shape, redundant = Shape(*system.sizes(data, own)), ()
-        initial = completed(system, case, project, on.compiles_start)
-        if not (traced := case.traced or is_traced(initial)):
-            redundant = redundant_constraints(system, initial.constraints, data, own, case.t0)
-        equation = make_step_equation(scheme, system, Shape(shape.n, shape.m, shape.c, redundant=redundant))
-        # start
-        start = begun(equation, case, initial, on.compiles_start)
-        # user functions that close over a traced value make the start traced although nothing that was passed is
-        if not (traced := traced or is_traced(start)):
-            equation.stages[0][0].check(data, case.h, own)
-            refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial)
+    # discretize: constraints that follow from others at the completed data are left out of the equation
+    shape, redundant = Shape(*system.sizes(data, own)), ()
+    initial = completed(system, case, project, on.compiles_start)
+    if not (traced := case.traced or is_traced(initial)):
+        redundant = redundant_constraints(system, initial.constraints, data, own, case.t0)
+    equation = make_step_equation(scheme, system, Shape(shape.n, shape.m, shape.c, redundant=redundant))
+    # start
+    start = begun(equation, case, initial, on.compiles_start)
+    # user functions that close over a traced value make the start traced although nothing that was passed is
+    if not (traced := traced or is_traced(start)):
+        equation.stages[0][0].check(data, case.h, own)
+        refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial)
     problem = Problem(
         equation=equation,
         state=start.state,

@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.linearization import linearized
-from dirax.program.evaluation.on_host import on_host
+from dirax.engines.step_program import linearized
+from dirax.program.compiled import compiled
+from dirax.program.evaluation.functions import in_numpy
+from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
 from dirax.run.validate import Case, spread
 
@@ -127,7 +129,7 @@ def _of_every(one: Any, kept: tuple, case: Case, given: Any, by_jax: bool) -> An
     return _compiled(one, (given, case.params, jnp.asarray(case.h, float), jnp.asarray(case.t0, float)), axes)
 
 
-@eqx.filter_jit
+@compiled
 def _compiled(one: Any, arguments: tuple, axes: tuple | None) -> Any:
     """One compiled function for all of it, reused by later runs of equal systems and schemes."""
     return (one if axes is None else jax.vmap(one, in_axes=axes))(*arguments)
@@ -140,7 +142,7 @@ def _in_numpy(one: Any, kept: tuple, case: Case, given: Any) -> Any:
     params = jax.tree.map(lead if case.batch_params else repeated, case.params)
     leaves, structure = jax.tree.flatten((jax.tree.map(lead, given), params, repeated(case.h), repeated(case.t0)))
     options = type(one), case.two_points, getattr(one, "project", None), structure
-    found = on_host(lambda *leaves: one(*jax.tree.unflatten(structure, leaves)), leaves, kept, options)
+    found = in_numpy(lambda *leaves: one(*jax.tree.unflatten(structure, leaves)), leaves, (*map(Same, kept), options))
     return found if case.batch is not None or found is None else jax.tree.map(lambda leaf: leaf[0], found)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.program.tracing import call
+from dirax.program.tracing import once
 from dirax.schemes.constraint_rows import independent_constraints
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.systems.dirac_system import DiracSystem
@@ -75,7 +75,7 @@ def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, poi
         return first, (supplied - dissipated) + (lost_supplied - lost_dissipated)
 
     def discrete_gradient(u, state, h, params):
-        return call(whole_gradient, u, state, h, params)
+        return once(whole_gradient)(u, state, h, params)
 
     def whole_gradient(u, state, h, params):
         """∇̄H, with ⟨∇̄H, Δx⟩ = H(x + Δx) − account, and x̄."""
@@ -89,7 +89,7 @@ def _with_exact_balance(system: PortHamiltonian | DiracSystem, shape: Shape, poi
         return gradient + (stored - gradient @ change) / length * change, x + change / 2
 
     def ports(u, state, t, h, params):
-        return call(all_ports, u, state, t, h, params)
+        return once(all_ports)(u, state, t, h, params)
 
     def all_ports(u, state, t, h, params):
         """(ū, ȳ, dissipated power) of the step."""

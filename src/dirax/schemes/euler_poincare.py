@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.geometry.group_retractions import RETRACTIONS, coadjoint, pulled_back, retraction
-from dirax.program.tracing import call
+from dirax.program.tracing import once
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.lie_poisson import LiePoisson
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
@@ -92,7 +92,7 @@ def discrete_euler_poincare(system: Any, shape: Shape, name: str) -> StepEquatio
         return v[:m], v[m : m + d], v[m + d :]
 
     def step(u, state, h, params):
-        return call(whole_step, u, state, h, params)
+        return once(whole_step)(u, state, h, params)
 
     def whole_step(u, state, h, params):
         """ξ, m, ν, the next μ and a, f, and the residual of ξ = ∂h/∂μ."""

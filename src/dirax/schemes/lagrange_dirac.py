@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import call
+from dirax.program.tracing import once
 from dirax.program.user_functions import UserFunction
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.constraint_rows import ConstraintRows, step_constraints
@@ -141,7 +141,7 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
     share = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}[momentum] if m else 0.0
 
     def slots(t, q, v, h, params):
-        return call(both_slots, t, q, v, h, params)
+        return once(both_slots)(t, q, v, h, params)
 
     def both_slots(t, q, v, h, params):
         """(D1 L_d + f_d^−, D2 L_d + f_d^+): a step leaves its first point with minus the one, and arrives with the other."""

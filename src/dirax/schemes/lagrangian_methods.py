@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from dirax.program.linear_solves import solve
-from dirax.program.tracing import along, call, gradient, jacobian
+from dirax.program.tracing import along, gradient, jacobian, once
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.step import Field, Shape, StepEquation
 from dirax.schemes.work import WorkBook, work_field
@@ -91,7 +91,7 @@ def resolved_nonholonomic(system: NonholonomicMechanics, shape: Shape, theta: fl
     one_forms = lambda q, params: system.constraints.one_forms_at(0.0, q, params)
 
     def base(u, state, h, params):
-        return call(at_base, u, state, h, params)
+        return once(at_base)(u, state, h, params)
 
     def at_base(u, state, h, params):
         """(q, p, ṗ, λ) at the base point. With v at hand the metric is inverted once, and its inverse never differentiated."""
@@ -142,7 +142,7 @@ def resolved_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) -> St
         return jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(v)
 
     def flow(t, q, v, params):
-        return call(at_point, t, q, v, params)
+        return once(at_point)(t, q, v, params)
 
     def at_point(t, q, v, params):
         """(p, ṗ, λ) at a point of M_f."""

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.program.linear_solves import solve
-from dirax.program.tracing import along, call, gradient, jacobian
+from dirax.program.tracing import along, gradient, jacobian, once
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.lagrangian_methods import lagrangian_fields, rates
 from dirax.schemes.step import Shape, StepEquation
@@ -185,7 +185,7 @@ def projected_lagrangian(system: LagrangeDirac | ManifoldLagrangian, shape: Shap
         return jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(v)
 
     def flow(q0, t, q, v, params):
-        return call(at_point, q0, t, q, v, params)
+        return once(at_point)(q0, t, q, v, params)
 
     def at_point(q0, t, q, v, params):
         """(p, ṗ, λ) at a point of M_f: M v̇ and [W; G] v̇ with v̇ = F a + its normal part, F tangent vectors at q."""

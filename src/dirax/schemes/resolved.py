@@ -1,11 +1,10 @@
 """Method 2 of [BLM] on a final constraint manifold in coordinates x: the projected θ map."""
 
-from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
 
-from dirax.program.tracing import call, gradient
+from dirax.program.tracing import gradient, once
 from dirax.schemes.step import Field, StepEquation
 from dirax.systems.forms import FinalManifold
 
@@ -21,7 +20,7 @@ def projected_field(manifold: FinalManifold, n: int, theta: float) -> StepEquati
     """
     k = n + manifold.size
     constraints, field_at, multipliers, normal = (  # each is used several times in a step
-        partial(call, f) for f in (manifold.constraints, manifold.field, manifold.multipliers, manifold.normal)
+        once(f) for f in (manifold.constraints, manifold.field, manifold.multipliers, manifold.normal)
     )
 
     def parts(u, state, h):

@@ -2,13 +2,13 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.program.memo import Memo
 from dirax.systems.shape import Shape
 from dirax.text.representation import counted, html_table, module_html, module_text
 
@@ -150,16 +150,9 @@ def explicit_step(u, state, t, h, params) -> Float[Array, "0"]:
     return jnp.zeros((0,))
 
 
-@lru_cache(maxsize=256)
-def _cached(scheme, system, shape):
-    return scheme.step_equation(system, shape)
+_equations: Memo[StepEquation | StepSequence] = Memo(256)
 
 
 def make_step_equation(scheme: AbstractScheme, system: Any, shape: Shape) -> StepEquation | StepSequence:
     """`scheme.step_equation(system, shape)`, the same object for equal arguments, so that compiled code is reused."""
-    try:
-        return _cached(scheme, system, shape)
-    except TypeError as error:
-        if "unhashable" not in str(error):
-            raise
-        return scheme.step_equation(system, shape)
+    return _equations.get((scheme, system, shape), lambda: scheme.step_equation(system, shape))

@@ -5,11 +5,11 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.program.compiled import compiled
 from dirax.program.user_functions import is_traced
 from dirax.schemes.step import Field
 from dirax.text.representation import counted, html_table
@@ -239,7 +239,7 @@ class Solution:
         return html_table("Solution", self._summary())
 
 
-@eqx.filter_jit
+@compiled
 def _along(function, nodes, params, axes):
     """`function` of every row, compiled once per function and shape: a system's bound method is compared by its system."""
     along = jax.vmap(function, in_axes=(0, None))

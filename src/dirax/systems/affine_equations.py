@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.program.linear_solves import solve
-from dirax.program.tracing import shared
+from dirax.program.tracing import once
 
 THRESHOLD = 0.1
 """A pivot is at least this fraction of the largest entry left, in units of the rows and columns; among these, a sparse one."""
@@ -45,14 +45,14 @@ def explicit(equations: Callable, entries: np.ndarray, size: int) -> Explicit:
     others, free = (np.setdiff1d(np.arange(n), taken) for n, taken in zip(entries.shape, (rows, columns), strict=True))
     inverse = np.linalg.inv(entries[np.ix_(rows, columns)])
 
-    @shared
+    @once
     def family(x, params):
         matrix, right = equations(x, params)
         top = inverse @ jnp.concatenate([right[rows, None], -matrix[rows][:, free]], axis=1)
         whole = _whole(top, columns, free)
         return whole[:, 0], whole[:, 1:]
 
-    @shared
+    @once
     def rest(x, params):
         (matrix, right), (w, basis) = equations(x, params), family(x, params)
         return matrix[others] @ basis, right[others] - matrix[others] @ w
@@ -109,7 +109,7 @@ def solved(equations: Callable, matrix: np.ndarray, rank: int, entries: np.ndarr
     others, free = np.setdiff1d(np.arange(r), rows), np.setdiff1d(np.arange(f), columns)
     zero = np.all(entries[others] == 0.0, axis=1)
 
-    @shared
+    @once
     def whole(x, params):
         """(solution and kernel (f, 1 + f − rank), conditions)."""
         matrix, right = equations(x, params)

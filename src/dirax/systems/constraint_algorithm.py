@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.program.linear_solves import solve
-from dirax.program.tracing import along, jacobian, shared
+from dirax.program.tracing import along, jacobian, once
 from dirax.program.user_functions import check_finite, constant_entries, evaluated, is_traced
 from dirax.systems.affine_equations import Solved, explicit, solved
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
@@ -72,7 +72,7 @@ class _Search:
         self.parts: list[Callable] = []
         self.levels: list[ConstraintLevel] = []
         self.phi_and_slope: Callable = lambda x: (np.zeros(0), np.zeros((0, self.size)))
-        equations = shared(form.equations)
+        equations = once(form.equations)
         self.given = self.at_points(equations)
         self.explicit = explicit(equations, self.constant_entries(equations), self.size)
         self.rows = [self.explicit.rest]
@@ -94,7 +94,7 @@ class _Search:
         parts = tuple(self.parts)
         if not parts:
             return lambda x, params: jnp.zeros(0)
-        return shared(lambda x, params: jnp.concatenate([part(x, params) for part in parts]))
+        return once(lambda x, params: jnp.concatenate([part(x, params) for part in parts]))
 
     def equations(self) -> Callable:
         """(x, params) ↦ the equations (A, b) of c that are still asked, one below the other."""
@@ -105,7 +105,7 @@ class _Search:
         """Dφ ẋ = 0 as equations of c."""
         family, size = self.explicit.family, self.size
 
-        @shared
+        @once
         def rows(x, params):
             w, basis = family(x, params)
             rate = lambda y: along(lambda x: part(x, params), (x,), (y[:size],))
@@ -123,7 +123,7 @@ class _Search:
     def with_conditions(self, conditions: Callable) -> Callable:
         """x ↦ (φ, Dφ) of the constraints so far and the conditions after them, as numpy arrays."""
         phi = self.constraints()
-        both = shared(lambda x, params: jnp.concatenate([phi(x, params), conditions(x, params)]))
+        both = once(lambda x, params: jnp.concatenate([phi(x, params), conditions(x, params)]))
         return self.at_points(lambda x, params: (both(x, params), jacobian(lambda x: both(x, params))(x)))
 
     # ------------------------------------------------------------------ points
@@ -231,7 +231,7 @@ class _Search:
                 "regular zero set. State such a constraint by a function whose derivative does not vanish.",
             )
         select = _independent(slope[old:], slope[:old], reference[old:], new)
-        part = shared(lambda x, params: select @ conditions(x, params))
+        part = once(lambda x, params: select @ conditions(x, params))
 
         def constraints_of_level(x):
             value, slope = function(x)
@@ -272,12 +272,12 @@ class _Search:
             words.append(f"{redundant} multiplier{'s' * (redundant > 1)} undetermined: constraints are redundant, consistently")
         family = self.explicit.family
 
-        @shared
+        @once
         def kernel(x, params):
             free = family(x, params)[1] @ found.kernel(x, params)
             return free @ solve(null.T @ free, jnp.eye(null.shape[1]), apart=True)
 
-        @shared
+        @once
         def solution(x, params):
             w, basis = family(x, params)
             rates = w + basis @ found.solution(x, params)

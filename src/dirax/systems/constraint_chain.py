@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import Method, gradient, jacobian
+from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import evaluated, is_traced, scalar_program
 from dirax.systems.forms import FinalManifold
 from dirax.systems.shape import Shape
@@ -124,7 +124,7 @@ class ConstraintChain:
         """The first level that x is off, the values of its constraints and the nearest point of M_f, in words; "" on M_f."""
         params = self._with(params)
         for level in self.levels:
-            value, slope = map(np.asarray, self._at(Method(_with_slope, level.constraints), x, params))
+            value, slope = map(np.asarray, self._at(once(_with_slope, level.constraints), x, params))
             slope = np.abs(slope).max(initial=0.0)
             if np.abs(value).max(initial=0.0) > OFF * slope * (1.0 + np.abs(np.asarray(x)).max()):
                 where = np.asarray(self.project(x, params))

@@ -1,7 +1,6 @@
 """Dirac systems: a Dirac structure and a Hamiltonian, ẋ ⊕ dH(x) ∈ D_x."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -12,7 +11,7 @@ from jaxtyping import Array, Float
 from dirax.geometry.structures import DiracStructure
 from dirax.program.linear_solves import pseudo_inverse, solve
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import call, gradient, jacobian, traced_once
+from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import UserFunction, evaluated
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import FinalManifold, ImplicitForm, RelationForm
@@ -67,7 +66,7 @@ class DiracSystem(AbstractSystem):
         """The constraints g(x) = 0, as functions of (t, x, params)."""
         return Constraints(None, None, self.holonomic)
 
-    @traced_once
+    @once
     def holonomic_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "c N"]:
         """G(x) = ∂g/∂x; (0, N) without constraints."""
         return self.constraints.holonomic_matrix(0.0, x, params)
@@ -141,7 +140,7 @@ class DiracSystem(AbstractSystem):
         v = jnp.asarray(-E @ covector)
         return v if self.structure.representation == "bivector" else solve(jnp.asarray(F), v)
 
-    @traced_once
+    @once
     def hidden_defect(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " c"]:
         """{g, H} = G ẋ for the ẋ of dH, the rate of change of g."""
         velocity = self.hamiltonian_vector(x, self.differential(x, params), params)
@@ -151,7 +150,7 @@ class DiracSystem(AbstractSystem):
         """{g_i, g_j}: zero for functions of q on T*Q, and wherever N is coisotropic."""
         return self.holonomic_matrix(x, params) @ self.forces(x, params)
 
-    @traced_once
+    @once
     def forces(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N c"]:
         """The velocities of the rows of G, by columns: λ changes ẋ by −forces λ."""
         rows = self.holonomic_matrix(x, params)
@@ -191,7 +190,7 @@ class DiracSystem(AbstractSystem):
                     "dx.constraint_algorithm(system, near=x).resolved() instead of the system."
                 )
 
-        both = partial(call, lambda x, params: system.constrained_field(x, params))
+        both = once(lambda x, params: system.constrained_field(x, params))
         field = lambda x, params: both(x, params)[0]
         multipliers = lambda x, params: shape.spread(both(x, params)[1])
         size = 2 * len(shape.kept)

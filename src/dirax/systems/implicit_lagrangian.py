@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from dirax.geometry.structures import canonical_two_form
 from dirax.program.linear_solves import solve
-from dirax.program.tracing import gradient, jacobian, shared
+from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import constant_entries
 from dirax.systems.forms import ImplicitForm
 from dirax.systems.implicit_form import in_time, names, uses_time, without_time
@@ -89,7 +89,7 @@ def _on_cotangent_bundle(system: Any, x: np.ndarray, hessian: np.ndarray, params
     constant = constant_entries(bordered, t, x[:n], params)
     inverse = None if constant is None or np.any(np.isnan(constant)) else np.linalg.inv(constant)
 
-    @shared
+    @once
     def legendre_inverse(t, x, params):
         """(v, φ) with ∂L/∂v (q, v) = p − Zφ and Zᵀv = 0, Z a basis of the Hessian's kernel at the point of the chain."""
         q, p = x[:n], x[n:]

@@ -18,7 +18,8 @@ import numpy as np
 from dirax.diagnostics.bench.subject import Program, Skipped, Subject, library
 from dirax.diagnostics.bench.timing import compiler
 from dirax.engines.contract import Problem
-from dirax.engines.step_program import inputs, parameters, trace
+from dirax.engines.parameters import parameters
+from dirax.engines.step_program import inputs, trace
 from dirax.program.graph import Graph
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.operations import EXACT, OPERATIONS

@@ -6,8 +6,8 @@ import numpy as np
 
 from dirax.engines.contract import Outcome, Problem, Progress, finished
 from dirax.engines.engine import AbstractEngine
+from dirax.engines.native.kernels import kernels
 from dirax.engines.native.lanes import Lanes, width_for
-from dirax.engines.native.program import program
 from dirax.program.interpreter import UnsupportedPrimitive
 
 CHUNK_SECONDS = 0.1
@@ -31,8 +31,8 @@ class Native(AbstractEngine):
         """None if the step is a scalar program, of so many operations; else the primitive and the line of the user's source, or
         how many operations there are."""
         try:
-            made, _ = program(problem.equation, problem.params, problem.batch_params, problem.compensated)
-            if self.most_operations is not None and not made.nested:
+            made = kernels(problem.equation, problem.params, problem.batch_params, problem.compensated)
+            if self.most_operations is not None and not made.step.nested:
                 made.check()
                 if made.operations > self.most_operations:
                     return f"{made.operations} scalar operations a step, more than {self.most_operations}"
@@ -58,7 +58,7 @@ class Native(AbstractEngine):
 def run(p: Problem, progress: Progress | None = None) -> Outcome:
     """The run of a problem, as `Native.run` has it."""
     started = time.perf_counter()
-    made, _ = program(p.equation, p.params, p.batch_params, p.compensated)
+    made = kernels(p.equation, p.params, p.batch_params, p.compensated)
     lanes = Lanes(p, made, width_for(p.batch or 1))
     kernel, cached = made.kernel(lanes.width)
     compile_seconds, started = time.perf_counter() - started, time.perf_counter()
@@ -97,7 +97,7 @@ def run(p: Problem, progress: Progress | None = None) -> Outcome:
         run_seconds=time.perf_counter() - started,
         engine="native",
         notes={
-            "unknowns": sum(len(made.equations[i].unknowns) for i, _ in made.stages),
+            "unknowns": sum(len(made.step.equations[i].unknowns) for i, _ in made.step.stages),
             "operations": made.operations,
             "lanes": lanes.width,
             "threads": lanes.threads,

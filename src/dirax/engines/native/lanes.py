@@ -9,7 +9,7 @@ import numpy as np
 
 from dirax.engines.contract import OK, Problem
 from dirax.engines.native import compile as llvm
-from dirax.engines.native.program import Program
+from dirax.engines.native.kernels import Kernels
 
 SHARES = 4
 """Parts of a batch per thread, so that a thread that is held up holds up little."""
@@ -38,7 +38,7 @@ class Lanes:
     The last block is filled up with copies of its first lane, which write where that one writes.
     """
 
-    def __init__(self, problem: Problem, made: Program, width: int):
+    def __init__(self, problem: Problem, made: Kernels, width: int):
         p = self.problem = problem
         self.width = width
         self.lanes = p.batch or 1
@@ -53,9 +53,9 @@ class Lanes:
             values = np.asarray(guess).reshape(self.lanes, -1)
             table[:, self.record.unknowns(stage, values.shape[1])] = values
         self.records = self._blocked(table)
-        leaves = made.parameters.flatten(p.params, p.batch if p.batch_params else None)
+        leaves = made.step.parameters.flatten(p.params, p.batch if p.batch_params else None)
         self.params = self._blocked(np.broadcast_to(leaves, (self.lanes, leaves.shape[-1])))
-        rows = made.equations[made.stages[0][0]].rows
+        rows = made.step.equations[made.step.stages[0][0]].rows
         self.shapes = {name: rows[name].shape for name in sorted(rows)}
         self.ends_before = [not p.is_node(name) for name in self.shapes]
         self.sizes = [math.prod(shape) for shape in self.shapes.values()]

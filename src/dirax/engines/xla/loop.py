@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from dirax.engines.contract import OK, Problem
 from dirax.engines.xla.lane import Lane, Numerics, packed_row, take_step, time_of, unpacked_row
+from dirax.program.compiled import compiled
 
 CHUNK_BYTES = 2**20
 """Largest buffer of saved rows on the device. Runs of more go through it several times; runs of less pay for all of it."""
@@ -63,12 +64,12 @@ def unpack_rows(equation, axes, packed, params, clock: Clock) -> dict:
 def compiled_chunk(platform: str) -> Any:
     """`_chunk` compiled for a platform, with the options that this version of XLA knows."""
     if platform != "cpu":
-        return eqx.filter_jit(_chunk)
+        return compiled(_chunk)
     try:
         jax.jit(lambda: 0.0, compiler_options=QUICK_TO_COMPILE).lower().compile()
     except jax.errors.JaxRuntimeError:
-        return eqx.filter_jit(_chunk)
-    return eqx.filter_jit(_chunk, compiler_options=QUICK_TO_COMPILE)  # pyright: ignore[reportCallIssue]
+        return compiled(_chunk)
+    return compiled(_chunk, compiler_options=QUICK_TO_COMPILE)  # pyright: ignore[reportCallIssue]
 
 
 def _chunk(

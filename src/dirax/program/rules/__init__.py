@@ -1,6 +1,7 @@
 """What the primitives of JAX, and dirax's own, are on the scalar graph: importing this room registers the rules."""
 
 from dirax.program.rules import (
+    by_numpy,
     control,
     derivatives,
     elementwise,
@@ -9,4 +10,4 @@ from dirax.program.rules import (
     reductions,
 )
 
-__all__ = ["control", "derivatives", "elementwise", "linear_algebra", "movement", "reductions"]
+__all__ = ["by_numpy", "control", "derivatives", "elementwise", "linear_algebra", "movement", "reductions"]

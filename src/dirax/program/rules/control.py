@@ -19,7 +19,7 @@ def closed(jaxpr: Any) -> ClosedJaxpr:
     return jaxpr if hasattr(jaxpr, "consts") else ClosedJaxpr(jaxpr, ())
 
 
-@rule("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "remat2", "composite", lazy=True)
+@rule("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint", "remat2", "composite", "dirax_program", lazy=True)
 def call(interpreter: Interpreter, equation: Any, *operands):
     """The jaxpr of a function that is called again is the same object; with the same operands it has the same results."""
     p = equation.params

@@ -1,56 +1,56 @@
-"""The rule of a derivative that tracing left to the graph."""
+"""The rules of derivatives, which are taken on a graph of their own."""
 
-import functools
 import math
-from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr
 
 from dirax.program.derivatives import gradient, jacobian
 from dirax.program.graph import Graph
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, Unsupported, elementwise, rule
+from dirax.program.memo import Memo, Same
 from dirax.program.rules import formulas
+from dirax.program.tracing import of_one_result
 
 KEPT = 256
 """Derivatives kept in memory."""
 
 
+_derived: Memo["Derived"] = Memo(KEPT)
+_pushed: Memo[ClosedJaxpr] = Memo(KEPT)
+
+
 @rule("dirax_derivative")
 def derivative(interpreter: Interpreter, equation: Any, *operands: Nodes):
     """Derived on a graph of its own, whose inputs stand for the operands, so that nothing is simplified across them."""
-    own = derived(equation.params["jaxpr"], equation.params["wanted"], interpreter.graph.limit)
-    nodes = [node for operand in operands for node in operand.ravel().tolist()]
-    outputs = [node for result in own.results for node in result.ravel().tolist()]
-    made = own.made_in(interpreter.graph, outputs, dict(zip(own.inputs, nodes, strict=True)))
-    parts = np.split(np.array(made, np.int64), np.cumsum([result.size for result in own.results])[:-1])
-    return [part.reshape(result.shape) for part, result in zip(parts, own.results, strict=True)]
+    jaxpr, wanted, limit = equation.params["jaxpr"], equation.params["wanted"], interpreter.graph.limit
+    own = _derived.get((Same(jaxpr), wanted, limit), lambda: Derived.by_operands(jaxpr, wanted, limit))
+    return own.results_in(interpreter.graph, operands)
 
 
-@functools.lru_cache(KEPT)
-def derived(jaxpr: Any, wanted: tuple[int, ...], limit: int) -> "Derived":
-    """The derivatives of a jaxpr on a graph of their own, the same object for the same jaxpr. Raises `Unsupported`."""
-    return Derived(jaxpr, wanted, limit)
-
-
-_pushed: OrderedDict[tuple, tuple[Any, ClosedJaxpr]] = OrderedDict()
+@rule("dirax_directional")
+def directional(interpreter: Interpreter, equation: Any, *operands: Nodes):
+    """The same by a number s at 0, by which the point is moved along the direction."""
+    jaxpr, count, limit = equation.params["jaxpr"], equation.params["count"], interpreter.graph.limit
+    own = _derived.get((Same(jaxpr), count, limit), lambda: Derived.along(jaxpr, count, limit))
+    return own.results_in(interpreter.graph, [*operands, np.array(interpreter.graph.zero)])
 
 
 def pushed_forward(equation: Any, k: int) -> ClosedJaxpr:
     """The derivative of a function with a rule of its own by its operand number k, the same for the same jaxpr."""
     inner = equation.params["call_jaxpr"].jaxpr
-    key = id(inner), k
-    if key not in _pushed:
+
+    def traced() -> ClosedJaxpr:
         alone = equation.replace(invars=inner.invars)
         whole = ClosedJaxpr(inner.replace(constvars=(), outvars=equation.outvars, eqns=[alone]), ())
         along = tuple(float(i == k) for i in range(len(inner.invars)))
-        tangent = lambda *x: jax.jvp(lambda *x: jaxpr_as_fun(whole)(*x)[0], x, along)[1]
-        _pushed[key] = inner, jax.make_jaxpr(tangent)(*[jax.ShapeDtypeStruct((), np.float64)] * len(along))
-        if len(_pushed) > KEPT:
-            _pushed.popitem(last=False)
-    return _pushed[key][1]
+        tangent = lambda *x: jax.jvp(of_one_result(whole), x, along)[1]
+        return jax.make_jaxpr(tangent)(*[jax.ShapeDtypeStruct((), np.float64)] * len(along))
+
+    return _pushed.get((Same(inner), k), traced)
 
 
 class Derived:
@@ -59,29 +59,60 @@ class Derived:
     `written[node]` is the value of such a function in other nodes.
     """
 
-    def __init__(self, jaxpr: Any, wanted: tuple[int, ...], limit: int):
+    def __init__(self, limit: int):
         self.graph = Graph(limit)
         self.written: dict[int, int] = {}
+        self.inputs: list[int] = []
+        self.results: list[Nodes] = []
+
+    @classmethod
+    def by_operands(cls, jaxpr: ClosedJaxpr, wanted: tuple[int, ...], limit: int) -> "Derived":
+        """The derivatives of a jaxpr with one result by its operands of these numbers. Raises `Unsupported`."""
+        made = cls(limit)
+        inputs = [made._fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
+        made._differentiate(jaxpr, inputs, [inputs[k] for k in wanted])
+        return made
+
+    @classmethod
+    def along(cls, jaxpr: ClosedJaxpr, count: int, limit: int) -> "Derived":
+        """The one along a direction of the last `count` operands; the inputs are operands, direction and s."""
+        made, shapes = cls(limit), [v.aval.shape for v in jaxpr.jaxpr.invars]
+        inputs = [made._fresh(shape) for shape in shapes]
+        direction = [made._fresh(shape) for shape in shapes[-count:]]
+        s, g = made._fresh(()), made.graph
+        steps = [elementwise(g.mul, s, v) for v in direction]
+        moved = [elementwise(g.add, x, step) for x, step in zip(inputs[-count:], steps, strict=True)]
+        made._differentiate(jaxpr, [*inputs[:-count], *moved], [s])
+        return made
+
+    def _differentiate(self, jaxpr: ClosedJaxpr, operands: list[Nodes], by: list[Nodes]) -> None:
         rules = {"integer_pow": _power, "pow": _power, "custom_jvp_call": self._custom, "dirax_formula": self._formula}
-        inputs = [self._fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
-        self.inputs = [node for nodes in inputs for node in nodes.ravel().tolist()]
-        (value,) = Interpreter(self.graph, rules).run(jaxpr, *inputs)
+        (value,) = Interpreter(self.graph, rules).run(jaxpr, *operands)
         if isinstance(value, Unavailable):
             raise Unsupported(f"of a function with {value.error}")
-        columns = [node for k in wanted for node in inputs[k].ravel().tolist()]
+        columns = [node for nodes in by for node in nodes.ravel().tolist()]
         outputs, zero = value.ravel().tolist(), self.graph.zero
         if len(outputs) == 1:  # backward from a single number, else forward
             rows = [gradient(self.graph, {outputs[0]: self.graph.one}, columns)]
         else:
             rows = [[row.get(j, zero) for j in range(len(columns))] for row in jacobian(self.graph, outputs, columns)]
         table = np.array(rows, np.int64).reshape(value.size, len(columns))
-        parts = np.split(table, np.cumsum([inputs[k].size for k in wanted])[:-1], axis=1)
-        shapes = [(*value.shape, *inputs[k].shape) for k in wanted]
-        self.results: list[Nodes] = [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+        parts = np.split(table, np.cumsum([nodes.size for nodes in by])[:-1], axis=1)
+        self.results = [part.reshape((*value.shape, *nodes.shape)) for part, nodes in zip(parts, by, strict=True)]
+
+    def results_in(self, target: Graph, operands: Sequence[Nodes]) -> list[Nodes]:
+        """The results in another graph, with these nodes of it for the inputs."""
+        nodes = [node for operand in operands for node in operand.ravel().tolist()]
+        outputs = [node for result in self.results for node in result.ravel().tolist()]
+        made = self.made_in(target, outputs, dict(zip(self.inputs, nodes, strict=True)))
+        parts = np.split(np.array(made, np.int64), np.cumsum([result.size for result in self.results])[:-1])
+        return [part.reshape(result.shape) for part, result in zip(parts, self.results, strict=True)]
 
     def _fresh(self, shape: tuple[int, ...]) -> Nodes:
         first, count = len(self.graph), math.prod(shape)
-        return np.array([self.graph.input(f"x{first + i}") for i in range(count)], np.int64).reshape(shape)
+        nodes = [self.graph.input(f"x{first + i}") for i in range(count)]
+        self.inputs += nodes
+        return np.array(nodes, np.int64).reshape(shape)
 
     def _custom(self, interpreter: Interpreter, equation: Any, *operands: Nodes):
         """A function of numbers with a rule for its derivative, which is interpreted along each operand."""

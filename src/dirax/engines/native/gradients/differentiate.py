@@ -19,8 +19,8 @@ from dirax.engines.contract import Outcome, Problem, finished, saved_steps
 from dirax.engines.native.engine import run
 from dirax.engines.native.gradients.host import jvp, vjp
 from dirax.engines.native.gradients.recording import INPUTS, Recorded
-from dirax.engines.native.program import program
-from dirax.engines.step_program import parameters
+from dirax.engines.native.kernels import kernels
+from dirax.engines.parameters import parameters
 from dirax.engines.xla import Xla
 from dirax.engines.xla.loop import unpacked_rows
 
@@ -147,7 +147,7 @@ def run_traced(problem: Problem) -> Outcome:
     per_lane = lambda a: a if p.batch_params else jnp.broadcast_to(a, (batch, *jnp.shape(a)))
     columns = [per_lane(jnp.asarray(leaf, float)).reshape(batch, -1) for leaf in moving]
     c = jnp.concatenate(columns, axis=1) if columns else jnp.zeros((batch, 1))
-    made, _ = program(task.equation, np.zeros((1, c.shape[1])), True, p.compensated)
+    made = kernels(task.equation, np.zeros((1, c.shape[1])), True, p.compensated)
     made.check()
     guesses = [jnp.asarray(g).reshape(batch, -1) for g in p.guess]
     guess = jnp.stack([jnp.pad(g, ((0, 0), (0, task.unknowns - g.shape[1]))) for g in guesses], axis=1)

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from dirax.engines.native.gradients.recording import Recorded
+from dirax.engines.native.kernels import kernels
 from dirax.engines.native.lanes import Lanes, width_for
-from dirax.engines.native.program import program
 
 SEGMENT_BYTES = 2**26
 """Memory for the steps that are gone over at a time."""
@@ -20,7 +20,7 @@ class Segments:
         self.task, self.problem = task, task.problem(*inputs)
         p = self.problem
         self.stages = len(p.equation.stages)
-        made, _ = program(p.equation, p.params, True, p.compensated, self.stages > 1)
+        made = kernels(p.equation, p.params, True, p.compensated, self.stages > 1)
         self.lanes = Lanes(p, made, width_for(p.batch or 1))
         self.kernel, _ = made.kernel(self.lanes.width)
         self.linearized = made.linearized(reverse, self.lanes.width)

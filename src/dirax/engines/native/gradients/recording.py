@@ -1,13 +1,13 @@
 """A run as a function of arrays: what its derivatives are derivatives of, and the equation that saves what they need."""
 
-from collections import OrderedDict
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Problem
-from dirax.engines.step_program import Parameters
+from dirax.engines.parameters import Parameters
+from dirax.program.memo import Memo, Same
 from dirax.schemes.step import Field, StepEquation, StepSequence
 
 KEPT = 128
@@ -40,19 +40,13 @@ class Recorded:
         return Problem(self.equation, state, guesses, h, t0, params=c, batch=batch, batch_params=True, **self.numbers)
 
 
-_recordings: OrderedDict[tuple, tuple[Any, tuple[Any, int]]] = OrderedDict()
+_recordings: Memo[tuple[Any, int]] = Memo(KEPT)
 
 
 def recording(equation: Any, leaves: Parameters) -> tuple[Any, int]:
     """The equation with parameters as one array (m,), whose rows are the state and the unknowns, and their number, 1 at
     least; the same object for the same arguments."""
-    key = (id(equation), leaves.key)
-    if key not in _recordings:
-        _recordings[key] = (equation, leaves), _recording(equation, leaves)
-        if len(_recordings) > KEPT:
-            _recordings.popitem(last=False)
-    _recordings.move_to_end(key)
-    return _recordings[key][1]
+    return _recordings.get((Same(equation), leaves.key), lambda: _recording(equation, leaves))
 
 
 def _recording(equation: Any, leaves: Parameters) -> tuple[Any, int]:

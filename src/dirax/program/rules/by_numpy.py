@@ -7,21 +7,21 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr
 
-from dirax.program.evaluation.host_function import HostFunction, host_rule, interpreted
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported
 from dirax.program.linear_solves import equilibrated_inverse
 from dirax.program.roots import EPSILON, SHORTEST
 from dirax.program.rules.reductions import factors_of_product
-from dirax.program.tracing import in_scalars, jacobian
+from dirax.program.scalar_program import ScalarProgram, numpy_rule
+from dirax.program.tracing import jacobian, of_one_result
 
 LARGE_PRODUCT = 256
 """Multiplications of a product of arrays from which on it is no graph of them."""
 
 
-@host_rule("dot_general")
-def dot_general(made: HostFunction, interpreter: Interpreter, equation: Any, a: Nodes, b: Nodes) -> list[Nodes]:
+@numpy_rule("dot_general")
+def dot_general(made: ScalarProgram, interpreter: Interpreter, equation: Any, a: Nodes, b: Nodes) -> list[Nodes]:
     """Large products stay products of arrays; summed in one order, so that an entry's bits do not depend on the others."""
     shape, (rows, columns) = equation.outvars[0].aval.shape, factors_of_product(equation, a, b)
     length = rows.shape[-1]
@@ -40,8 +40,8 @@ def dot_general(made: HostFunction, interpreter: Interpreter, equation: Any, a: 
     return made.between([left, right], [shape], product)
 
 
-@host_rule("svd")
-def svd(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
+@numpy_rule("svd")
+def svd(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
     p = equation.params
 
     def decompose(a: np.ndarray) -> list[np.ndarray]:
@@ -51,8 +51,8 @@ def svd(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nod
     return _decomposed(made, equation, matrix, decompose, "singular values")
 
 
-@host_rule("eigh")
-def eigh(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
+@numpy_rule("eigh")
+def eigh(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
     def decompose(a: np.ndarray) -> list[np.ndarray]:
         values, vectors = np.linalg.eigh(a, UPLO="L" if equation.params["lower"] else "U")
         return [vectors, values]
@@ -60,15 +60,15 @@ def eigh(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: No
     return _decomposed(made, equation, matrix, decompose, "eigenvalues")
 
 
-def _decomposed(made: HostFunction, equation: Any, matrix: Nodes, decompose: Callable, what: str) -> list[Nodes]:
+def _decomposed(made: ScalarProgram, equation: Any, matrix: Nodes, decompose: Callable, what: str) -> list[Nodes]:
     if equation.params.get("subset_by_index") is not None:
         raise Unsupported(f"finds some {what} only")
     shapes = [v.aval.shape for v in equation.outvars]
     return made.between([matrix], shapes, lambda operands: _of_finite(decompose, *operands))
 
 
-@host_rule("while")
-def while_(made: HostFunction, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
+@numpy_rule("while")
+def while_(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
     try:
         return list(RULES["while"](interpreter, equation, *operands))
     except Unsupported:
@@ -76,7 +76,7 @@ def while_(made: HostFunction, interpreter: Interpreter, equation: Any, *operand
     if lost := next((o for o in operands if isinstance(o, Unavailable)), None):
         return [lost] * len(equation.outvars)
     p = equation.params
-    condition, body = interpreted(p["cond_jaxpr"]), interpreted(p["body_jaxpr"])
+    condition, body = (ScalarProgram.of(p[name], by_numpy=True).in_numpy for name in ("cond_jaxpr", "body_jaxpr"))
     a, b = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
 
     def loop(arrays: list[np.ndarray]) -> list[np.ndarray]:
@@ -91,8 +91,8 @@ def while_(made: HostFunction, interpreter: Interpreter, equation: Any, *operand
     return made.between(list(operands), [v.aval.shape for v in equation.outvars], loop)
 
 
-@host_rule("dirax_solve")
-def solve(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes, right: Nodes) -> list[Nodes]:
+@numpy_rule("dirax_solve")
+def solve(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes, right: Nodes) -> list[Nodes]:
     return made.between([matrix, right], [right.shape], lambda operands: [_solved(*operands)])
 
 
@@ -108,16 +108,16 @@ def _solved(matrices: np.ndarray, sides: np.ndarray) -> np.ndarray:
     return found.reshape(sides.shape)
 
 
-@host_rule("dirax_pseudo_inverse")
-def pseudo_inverse(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
+@numpy_rule("dirax_pseudo_inverse")
+def pseudo_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
     inverse = functools.partial(np.linalg.pinv, rcond=equation.params["tolerance"])
     return made.between(
         [matrix], [equation.outvars[0].aval.shape], lambda operands: _of_finite(lambda a: [inverse(a)], *operands)
     )
 
 
-@host_rule("dirax_scaled_inverse")
-def scaled_inverse(made: HostFunction, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
+@numpy_rule("dirax_scaled_inverse")
+def scaled_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
     return made.between([matrix], [v.aval.shape for v in equation.outvars], lambda operands: _inverted(*operands))
 
 
@@ -133,14 +133,13 @@ def _of_finite(function: Callable, matrices: np.ndarray) -> list[np.ndarray]:
     return [np.where(spread(a), a, np.nan) for a in function(np.where(spread(matrices), matrices, 0.0))]
 
 
-@host_rule("dirax_root")
-def root(made: HostFunction, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
+@numpy_rule("dirax_root")
+def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
     """The method of `dirax.program.roots`, for all entries side by side."""
     closed: ClosedJaxpr = equation.params["residual"]
-    function = lambda *values: jaxpr_as_fun(closed)(*values)[0]
-    with in_scalars():
-        slope = jax.make_jaxpr(jacobian(function, len(operands) - 1))(*(v.aval for v in closed.jaxpr.invars))
-    residual, linear, most = interpreted(closed), interpreted(slope), equation.params["max_steps"]
+    slope = jax.make_jaxpr(jacobian(of_one_result(closed), len(operands) - 1))(*closed.in_avals)
+    residual, linear = (ScalarProgram.of(jaxpr, by_numpy=True).in_numpy for jaxpr in (closed, slope))
+    most = equation.params["max_steps"]
 
     def find(arrays: list[np.ndarray]) -> list[np.ndarray]:
         *captured, found = arrays

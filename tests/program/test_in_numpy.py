@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.engines import linearization
-from dirax.engines.linearization import linearized
-from dirax.program.evaluation import host_function as module
-from dirax.program.evaluation.on_host import on_host
+from dirax.engines import step_program
+from dirax.engines.step_program import linearized
+from dirax.program.evaluation import in_numpy as module
+from dirax.program.evaluation.functions import in_numpy
 from dirax.program.linear_solves import scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.schemes.step import Shape, make_step_equation
@@ -48,20 +48,20 @@ def test_entries_of_a_batch_are_what_jax_computes(name, monkeypatch):
     monkeypatch.setattr(module, "LANES", 4)
     rng = np.random.default_rng(3)
     a, x = rng.normal(size=(7, 3, 3)), rng.normal(size=(7, 3))
-    found, expected = on_host(CASES[name], [a, x], (), name), jax.jit(jax.vmap(CASES[name]))(a, x)
+    found, expected = in_numpy(CASES[name], [a, x], name), jax.jit(jax.vmap(CASES[name]))(a, x)
     for mine, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-11, atol=1e-12)
 
 
 def test_what_has_no_rule_is_left_to_the_compiler():
     x = np.ones((2, 3))
-    assert on_host(jnp.sort, [x], ()) is None
-    assert jax.jit(lambda y: jnp.zeros(()) if on_host(lambda x: x * y, [x], ()) is None else y)(2.0) == 0.0
+    assert in_numpy(jnp.sort, [x], "sort") is None
+    assert jax.jit(lambda y: jnp.zeros(()) if in_numpy(lambda x: x * y, [x], "captured") is None else y)(2.0) == 0.0
 
 
 @pytest.mark.parametrize("limit", [0, 10**9], ids=["on the graph", "in numbers"])
 def test_the_first_step_is_linearized_as_jax_does_it(limit, monkeypatch):
-    monkeypatch.setattr(linearization, "IN_NUMBERS", limit)
+    monkeypatch.setattr(step_program, "IN_NUMBERS", limit)
     system = dx.LagrangeDirac(
         lambda q, v, g: v @ v / 2 * (1 + q[0] ** 2) + g * jnp.where(q[1] > 0, jnp.cos(q[1]), 1 - q[1] ** 2 / 2),
         lambda q: jnp.stack([jnp.sin(q)]),

@@ -1,0 +1,153 @@
+"""A step compiled: its kernels by width, in memory and on disk."""
+
+import ctypes
+import functools
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from dirax.engines.compensation import increments
+from dirax.engines.native import compile as llvm
+from dirax.engines.native.gradients.linearized_loop import LinearizedLoop, backward, forward
+from dirax.engines.native.loops.newton_step import newton_correction
+from dirax.engines.native.loops.plan import Plan
+from dirax.engines.native.loops.step_loop import kernel_module
+from dirax.engines.step_program import KEPT, StepProgram, step_program
+from dirax.program import graph as graph_module
+from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.interpreter import UnsupportedPrimitive
+from dirax.program.memo import Memo, Same
+
+SIGNATURE = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 5)
+LINEARIZED_SIGNATURE = ctypes.CFUNCTYPE(
+    None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3
+)
+
+
+class Kernels:
+    """The machine code of a step: kernels by width, made when they are asked for."""
+
+    def __init__(self, step: StepProgram, compensated: bool, every_stage: bool):
+        self.step, self.compensated, self.every_stage = step, compensated, every_stage
+        self.plan: Plan | None = None
+        self.operations = 0
+        self.digest = _digest(self)
+        self._runs: dict[int, tuple[Any, Any]] = {}
+        self._linearizations: dict[tuple[bool, int], tuple[Any, Any]] = {}
+
+    @property
+    def bare(self) -> Plan:
+        """The plan without corrections: sizes and names only."""
+        return self.plan or self._plan(self.step.graph)
+
+    def kernel(self, width: int) -> tuple[Any, bool]:
+        """The compiled `run` for a width, and whether it came from a cache."""
+        if width in self._runs:
+            return self._runs[width][1], True
+        library, cached = self._library("run", width, lambda: kernel_module(self._planned(), width, llvm.has_fma()))
+        self._runs[width] = library, SIGNATURE(library["run"])
+        return self._runs[width][1], cached
+
+    def linearized(self, reverse: bool, width: int) -> Any:
+        """The compiled `linearized` for a width: tangents forward or cotangents backward. Raises `UnsupportedPrimitive`."""
+        if (reverse, width) not in self._linearizations:
+            text = lambda: self._linearized(reverse).module(width, llvm.has_fma())
+            library, _ = self._library("linearized", width, text, "backward" if reverse else "forward")
+            self._linearizations[reverse, width] = library, LINEARIZED_SIGNATURE(library["linearized"])
+        return self._linearizations[reverse, width][1]
+
+    def check(self) -> None:
+        """Raise `UnsupportedPrimitive` for a step with too many operations."""
+        self._planned()
+
+    def _library(self, name: str, width: int, text: Callable[[], str], *more: str) -> tuple[Any, bool]:
+        """The linked code that exports `name`, and whether it came from the disk."""
+        key = llvm.kernel_key(self.digest, width, *more)
+        stored = llvm.read_cached(key)
+        if stored is not None:
+            size = int.from_bytes(stored[:4], "little")
+            self.operations, code = json.loads(stored[4 : 4 + size])["operations"], stored[4 + size :]
+        else:
+            code = llvm.object_code(text())
+            header = json.dumps({"operations": self.operations}).encode()
+            llvm.write_cached(key, len(header).to_bytes(4, "little") + header + code)
+        return llvm.load(code, (name,)), stored is not None
+
+    def _linearized(self, reverse: bool) -> LinearizedLoop:
+        step, one = self.step, backward if reverse else forward
+        try:
+            g = self._graph()
+            linear = [one(g, e, step.shared, rows) for e, rows in zip(step.equations, step.jacobians, strict=True)]
+        except GraphTooLarge as error:
+            raise too_large(error) from None
+        return LinearizedLoop(g, step.shared, step.equations, linear, step.stages, reverse)
+
+    def _planned(self) -> Plan:
+        if self.plan is None:
+            step = self.step
+            try:
+                g = self._graph()
+                plan = self._plan(g)
+                plan.corrections = [newton_correction(g, e, rows) for e, rows in zip(step.equations, step.jacobians, strict=True)]
+                if self.compensated:
+                    plan.increments = [increments(g, e) for e in step.equations]
+            except GraphTooLarge as error:
+                raise too_large(error) from None
+            self.plan, self.operations = plan, count_operations(plan)
+        return self.plan
+
+    def _plan(self, graph: Graph) -> Plan:
+        step = self.step
+        return Plan(graph, step.shared, step.equations, [], step.stages, self.compensated, self.every_stage)
+
+    def _graph(self) -> Graph:
+        """A graph of the step with its Jacobians, to which more can be added. Raises `GraphTooLarge`."""
+        _ = self.step.jacobians
+        return self.step.graph.copy(NODE_LIMIT)
+
+
+def too_large(error: GraphTooLarge) -> UnsupportedPrimitive:
+    return UnsupportedPrimitive("the step as a whole", f"has {error}", "a larger system than the native engine is for")
+
+
+def count_operations(plan: Plan) -> int:
+    """Scalar operations of a step with two Newton updates a stage, one of either kind."""
+    total = 0
+    for index, _ in plan.stages:
+        e, c = plan.equations[index], plan.corrections[index]
+        needed = plan.graph.reachable([*e.guess, *e.residual, *e.advance, *c.change, *c.again, c.stable])
+        total += sum(1 for node in needed if plan.graph.args[node])
+    return total
+
+
+@functools.cache
+def source_digest() -> str:
+    """A digest of the engine's own source: kernels made by another version of it are not reused."""
+    digest = hashlib.sha256()
+    rooms = Path(__file__).parents[1], Path(graph_module.__file__).parent
+    for path in sorted(path for room in rooms for path in room.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+_kernels: Memo[Kernels] = Memo(KEPT)
+
+
+def kernels(equation: Any, params: Any, batch_params: bool, compensated: bool = False, every_stage: bool = False) -> Kernels:
+    """The kernels of a step; with `every_stage` each stage has a row in the saved arrays. Raises `UnsupportedPrimitive`."""
+    step = step_program(equation, params, batch_params)
+    return _kernels.get((Same(step), compensated, every_stage), lambda: Kernels(step, compensated, every_stage))
+
+
+def _digest(made: Kernels) -> str:
+    step, g = made.step, made.step.graph
+    rows = lambda e: [(name, nodes.shape, nodes.ravel().tolist()) for name, nodes in sorted(e.rows.items())]
+    outputs = [(e.state, e.unknowns, e.previous, e.guess, e.residual, e.advance, e.scale, rows(e)) for e in step.equations]
+    constants = sorted((node, value) for node, value in g.value.items() if node < step.size)
+    nodes = g.op[: step.size], g.args[: step.size], constants
+    digest = hashlib.sha256(source_digest().encode())
+    for part in (*nodes, outputs, step.stages, step.shared, made.compensated, made.every_stage):
+        digest.update(repr(part).encode() + b"\0")
+    return digest.hexdigest()

@@ -1,0 +1,81 @@
+"""What dirax keeps of what it has made: traced functions, programs, kernels, step equations. All of it can be let go.
+
+A key is made of values where equal values mean the same (functions, frozen systems, shapes), and of `Same(object)` where
+only the object itself does.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from threading import Lock
+from typing import Any, Generic, TypeVar
+
+Made = TypeVar("Made")
+
+_clear: list[Callable[[], Any]] = []
+
+
+class Same:
+    """An object as part of a key: equal to itself alone, and kept alive by the key so that it stays so."""
+
+    __slots__ = ("object",)
+
+    def __init__(self, object: Any):
+        self.object = object
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, Same) and self.object is other.object
+
+    def __hash__(self) -> int:
+        return id(self.object)
+
+
+class Memo(Generic[Made]):
+    """The `size` things that were used last, by their keys."""
+
+    def __init__(self, size: int):
+        self.size = size
+        self._made: OrderedDict[Hashable, Made] = OrderedDict()
+        self._lock = Lock()
+        when_cleared(self.clear)
+
+    def get(self, key: Hashable, make: Callable[[], Made]) -> Made:
+        """What was made for an equal key, else what `make` makes now; always the latter for a key that has no hash."""
+        try:
+            hash(key)
+        except TypeError:  # an object that holds arrays
+            return make()
+        with self._lock:
+            if key in self._made:
+                self._made.move_to_end(key)
+                return self._made[key]
+        made = make()
+        with self._lock:
+            made = self._made.setdefault(key, made)  # another thread may have been quicker
+            if len(self._made) > self.size:
+                self._made.popitem(last=False)
+        return made
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._made
+
+    def __len__(self) -> int:
+        return len(self._made)
+
+    def clear(self) -> None:
+        """Let go of everything."""
+        with self._lock:
+            self._made.clear()
+
+
+def when_cleared(clear: Callable[[], Any]) -> None:
+    """Have `clear_caches` call `clear` too, which lets go of what is kept elsewhere: in a jitted function of a module."""
+    _clear.append(clear)
+
+
+def clear_caches() -> None:
+    """Let go of every system, traced function and compiled kernel that dirax keeps in memory for later calls.
+
+    Runs after it work as before; the first is as slow as a first one. Kernels on the disk stay.
+    """
+    for clear in _clear:
+        clear()

@@ -1,0 +1,128 @@
+"""ScalarProgram: a function of a few numbers, traced once into scalar expressions; values of it in NumPy and in JAX."""
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+
+from dirax.program.evaluation.by_jax import by_jax
+from dirax.program.evaluation.in_numpy import Values, in_parts
+from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
+from dirax.program.memo import Memo, Same
+from dirax.program.primitives import plain_primitive
+
+NUMPY_RULES: dict[str, Callable] = {}
+"""Primitive name → rule(made, interpreter, equation, *operands), which may add computations in NumPy to the program `made`."""
+
+
+def numpy_rule(name: str) -> Callable[[Callable], Callable]:
+    """Register a rule that is used before that of the graph, in programs that are evaluated in NumPy alone."""
+    return lambda function: NUMPY_RULES.setdefault(name, function)
+
+
+@dataclass
+class Opaque:
+    """A computation between nodes that is no node: arrays (entries, …) of the operands to those of the results."""
+
+    operands: list[Nodes]
+    results: list[Nodes]
+    function: Callable[[list[np.ndarray]], list[np.ndarray]]
+
+
+@dataclass(eq=False)
+class ScalarProgram:
+    """A jaxpr as a graph: arrays of input nodes, the nodes of its results, and what is computed between nodes by NumPy."""
+
+    graph: Graph
+    inputs: list[Nodes]
+    results: list[Nodes] = field(default_factory=list)
+    opaque: list[Opaque] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, jaxpr: ClosedJaxpr, by_numpy: bool = False) -> "ScalarProgram":
+        """The program of a jaxpr, `by_numpy` with decompositions, roots and loops that are no expressions.
+
+        Raises `UnsupportedPrimitive` and `GraphTooLarge`."""
+        made = cls(Graph(NODE_LIMIT), [])
+        made.inputs = [made.fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
+        made.run(jaxpr, {name: functools.partial(rule, made) for name, rule in NUMPY_RULES.items()} if by_numpy else {})
+        return made
+
+    def run(self, jaxpr: ClosedJaxpr, rules: dict[str, Callable] | None = None) -> None:
+        """Find the results, the nodes of `jaxpr` of the inputs. Raises as `of`."""
+        self.results = Interpreter(self.graph, rules).run(jaxpr, *self.inputs)
+        for result in self.results:
+            if isinstance(result, Unavailable):
+                raise result.error
+
+    def fresh(self, shape: tuple[int, ...]) -> Nodes:
+        """New input nodes."""
+        first = len(self.graph)
+        return np.array([self.graph.input(f"x{first + i}") for i in range(math.prod(shape))], np.int64).reshape(shape)
+
+    def between(self, operands: list[Nodes], shapes: list[tuple[int, ...]], function: Callable) -> list[Nodes]:
+        """The nodes of the results of an opaque computation."""
+        self.opaque.append(Opaque(operands, [self.fresh(shape) for shape in shapes], function))
+        return self.opaque[-1].results
+
+    def in_numpy(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
+        """The results for arguments (entries, …), with that leading axis."""
+        return in_parts(self._part, leaves)
+
+    def _part(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
+        known = Values(self.graph, len(leaves[0]))
+        for nodes, leaf in zip(self.inputs, leaves, strict=True):
+            known.bind(nodes, leaf)
+        for step in self.opaque:
+            for nodes, array in zip(step.results, step.function([known.read(o) for o in step.operands]), strict=True):
+                known.bind(nodes, array)
+        return [known.read(nodes) for nodes in self.results]
+
+    @functools.cached_property
+    def in_jax(self) -> Callable[..., list[Any]]:
+        """The program, without opaque computations, as a function of its arguments in JAX, operation by operation."""
+        outputs = [node for nodes in self.results for node in nodes.ravel().tolist()]
+        ends = np.cumsum([nodes.size for nodes in self.results])[:-1].tolist()
+
+        @jax.jit
+        def program(*leaves):
+            values: dict[int, Any] = {}
+            for nodes, leaf in zip(self.inputs, leaves, strict=True):
+                values.update(zip(nodes.ravel().tolist(), jnp.ravel(leaf), strict=True))
+            parts = jnp.split(by_jax(self.graph, outputs, values), ends) if outputs else [jnp.zeros(0)] * len(self.results)
+            return [part.reshape(nodes.shape) for part, nodes in zip(parts, self.results, strict=True)]
+
+        return program
+
+    def constants(self, nodes: Nodes) -> np.ndarray:
+        """What nodes (…) are whatever the arguments; NaN where that is not constant."""
+        graph = self.graph
+        entries = [graph.value[node] if graph.is_constant(node) else np.nan for node in nodes.ravel().tolist()]
+        return np.array(entries, dtype=float).reshape(nodes.shape)
+
+
+_written: Memo[Callable] = Memo(128)
+
+
+def _by_jax(*operands, jaxpr: ClosedJaxpr):
+    """By the operations of the scalar program, or as it was traced where it has none."""
+
+    def written() -> Callable:
+        try:
+            made = ScalarProgram.of(jaxpr)
+        except (UnsupportedPrimitive, GraphTooLarge):
+            return jaxpr_as_fun(jaxpr)
+        return made.in_jax if made.results else jaxpr_as_fun(jaxpr)
+
+    return _written.get(Same(jaxpr), written)(*operands)
+
+
+program_p = plain_primitive("dirax_program", _by_jax, lambda *_, jaxpr: jaxpr.out_avals)
+"""A jaxpr of floats, for JAX by the operations of its scalar program: far fewer than those of derivatives in one another."""
