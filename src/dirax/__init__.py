@@ -25,7 +25,15 @@ from dirax.geometry.discrete import (
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.map_report import check_discretization_map
-from dirax.geometry.maps import LieGroupExp, Midpoint, ProductMap, RiemannianExp, SphereProjection, Theta
+from dirax.geometry.maps import (
+    AbstractDiscretizationMap,
+    LieGroupExp,
+    Midpoint,
+    ProductMap,
+    RiemannianExp,
+    SphereProjection,
+    Theta,
+)
 from dirax.geometry.projected_map import ProjectedMap, Submanifold
 from dirax.geometry.semidirect import SemidirectProduct
 from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
@@ -65,6 +73,7 @@ from dirax.solution.storage import load
 from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.forms import FinalManifold, Observed, RelationForm
 from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.interconnection import interconnect
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -72,6 +81,7 @@ from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 from dirax.systems.nonholonomic import NonholonomicMechanics
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 from dirax.systems.port_hamiltonian import PortHamiltonian
+from dirax.systems.system import AbstractSystem
 
 __version__ = "0.1.0"
 
@@ -80,9 +90,11 @@ __all__ = [
     "SE3",
     "SO2",
     "SO3",
+    "AbstractDiscretizationMap",
     "AbstractEngine",
     "AbstractLinearSolver",
     "AbstractScheme",
+    "AbstractSystem",
     "Adjoint",
     "Atlas",
     "Circle",
@@ -102,6 +114,7 @@ __all__ = [
     "Euclidean",
     "EulerPoincare",
     "Field",
+    "FinalManifold",
     "FiniteDifferenceDirac",
     "FiniteDifferenceTriple",
     "GeneratingFunctionDirac",
@@ -121,6 +134,7 @@ __all__ = [
     "Midpoint",
     "MinusLagrangeDirac",
     "NonholonomicMechanics",
+    "Observed",
     "PhaseSpaceLagrangian",
     "PlusLagrangeDirac",
     "PortHamiltonian",
@@ -128,6 +142,7 @@ __all__ = [
     "ProductMap",
     "ProjectedMap",
     "ReducedLagrangeDirac",
+    "RelationForm",
     "Report",
     "RetractionChart",
     "RiemannianExp",

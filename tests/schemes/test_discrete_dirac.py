@@ -239,3 +239,49 @@ def test_method_2_of_regular_systems_is_method_1():
     run = {"q": [0.3], "v": [0.1], "step": 0.1, "steps": 5}
     one, two = (dx.simulate(oscillator, dx.DiscreteDirac(constraints=kind), **run) for kind in ("discretize", "resolve"))
     np.testing.assert_array_equal(one.q, two.q)
+
+
+# ---------------------------------------------------------------------- where the base point lies in time
+
+CLOCK = dx.PortHamiltonian(lambda x: x @ x / 2, np.zeros((1, 1)), B=np.ones((1, 1)))
+
+
+@pytest.mark.parametrize("theta", [0.0, 0.3, 0.5, 1.0])
+def test_ports_are_driven_at_the_time_of_the_base_point(theta):
+    """ẋ = t: the θ map takes t at t_k + θh, so that one step from 0 with h = 1 ends at θ."""
+    for map in (Theta(theta), dx.ProductMap((Theta(theta), 1)), RiemannianExp(dx.Circle(), theta)):
+        sol = dx.simulate(CLOCK, dx.DiscreteDirac(map), x=[0.0], step=1.0, steps=1, inputs=lambda t, x: jnp.stack([t]))
+        assert sol.x[1] == pytest.approx([theta], abs=1e-15)
+        assert sol.power[0, 1] == pytest.approx(theta * theta * theta, abs=1e-15)  # ⟨y, u⟩ at x = θ·θ, t = θ
+
+
+def test_base_fractions_of_maps():
+    third = Theta(1 / 3)
+    assert dx.cotangent_lift(third).base_fraction == dx.ProjectedMap(third, lambda x: x).base_fraction == 1 / 3
+    assert dx.LieGroupExp(dx.SO3(), 0.2).base_fraction == 0.2 and SphereProjection().base_fraction == 0.5
+    assert dx.ProductMap((third, 1), (Theta(0.0), 2)).base_fraction == 0.5
+
+
+def test_inputs_at_the_start_are_those_of_the_first_time():
+    driven = CLOCK.with_inputs(lambda t, x: jnp.stack([t**2]))
+    assert driven.complete({"x": jnp.zeros(1), "t": 3.0}, None, False)["velocity"] == pytest.approx([9.0])
+
+
+def test_a_phase_space_lagrangian_starts_from_its_point_alone():
+    """Its velocity and momentum are determined, by whatever name the point is given."""
+    for constraints in ("discretize", "resolve"):
+        scheme, run = dx.DiscreteDirac(constraints=constraints), {"step": 0.1, "steps": 5}
+        one, other, full = (
+            dx.simulate(vortices, scheme, **start, **run)
+            for start in ({"q": FOUR_VORTICES}, {"x": FOUR_VORTICES}, {"q": FOUR_VORTICES, "v": np.zeros(8)})
+        )
+        assert np.array_equal(one.q, full.q) and np.array_equal(other.q, full.q) and np.array_equal(one.p, full.p)
+    with pytest.raises(ValueError, match="q= alone was given: a LagrangeDirac system starts from q=, v="):
+        dx.simulate(vortices.lagrange_dirac(), dx.DiscreteDirac(), q=FOUR_VORTICES, **run)
+
+
+def test_a_lie_poisson_system_by_its_relation_form():
+    body = dx.LiePoisson(dx.SO3(), lambda mu: mu @ (mu / jnp.array([1.0, 2.0, 3.0])) / 2)
+    run = {"x": [0.3, 1.0, 0.2], "step": 0.1, "steps": 20}
+    one, other = (dx.simulate(s, dx.DiscreteDirac(), **run) for s in (body, body.dirac_system()))
+    assert np.array_equal(one.x, other.x)

@@ -50,7 +50,7 @@ def in_time(timed: bool, t: float, equations: Callable, x: np.ndarray, coordinat
 
     def extended(x, params):
         matrix, right = equations(x[n], x[:n], params)
-        matrix = jnp.insert(matrix, n, 0.0, axis=1)
+        matrix = jnp.concatenate([matrix[:, :n], jnp.zeros((matrix.shape[0], 1)), matrix[:, n:]], axis=1)
         clock = jnp.zeros((1, matrix.shape[1])).at[0, n].set(1.0)
         return jnp.concatenate([matrix, clock]), jnp.concatenate([right, jnp.ones(1)])
 
