@@ -48,7 +48,8 @@ spherical pendulum 5.5 and 4.3 in a batch of 512, vortices of 8 unknowns 8.4 and
 
 SCALAR_BATCH = 64
 """Trajectories from which on a batch is large: on a CPU an array program calls LAPACK once for each small matrix of a batch. For
-one trajectory, as JAX comes, scalars may be slower: the double spherical pendulum takes 6.9 µs a step in arrays, 11 in scalars."""
+one trajectory, as JAX comes, scalars may be slower: the double spherical pendulum takes 6.9 µs a step in arrays, 11 in
+scalars."""
 
 LARGEST_NESTED = 96
 """The same as LARGEST_SCALAR for a step that is nested, whatever its batch and device: the array program of a pendulum with its
