@@ -20,12 +20,14 @@ class Auto(AbstractEngine):
         """By the native engine or by the xla engine."""
         reason = policy.kept_from_native(problem)
         if reason is None:
-            from dirax.engines.native import Native  # the compiler is imported when it is used
-
-            native = Native(most_operations=policy.most_operations(problem))
-            reason = native.supports(problem)
-            if reason is None:
-                return native.run(problem, progress)
+            try:
+                native = policy.engine_of("native", most_operations=policy.most_operations(problem))
+                reason = native.supports(problem)
+            except ImportError as error:
+                reason = str(error)
+            else:
+                if reason is None:
+                    return native.run(problem, progress)
         outcome = Xla().run(problem, progress)
         outcome.notes["not_native"] = reason
         return outcome
@@ -34,11 +36,9 @@ class Auto(AbstractEngine):
         """The same, for smaller systems: their derivatives are compiled, too."""
         reason = policy.kept_from_native(problem, traced=True)
         if reason is None:
-            from dirax.engines.native import Native
-
             try:
-                return Native().run_traced(problem)
-            except UnsupportedPrimitive as error:
+                return policy.engine_of("native").run_traced(problem)
+            except (ImportError, UnsupportedPrimitive) as error:
                 reason = str(error)
         outcome = Xla().run_traced(problem)
         outcome.notes["not_native"] = reason

@@ -56,10 +56,10 @@ LARGEST_NESTED = 96
 tension as a coordinate has 500 000 operations and took XLA 160 s to compile, its graph has 1 263."""
 
 
-def engine_of(name: str) -> AbstractEngine:
-    """The engine of that name, with its options as they come. Raises `KeyError`."""
+def engine_of(name: str, **options: Any) -> AbstractEngine:
+    """The engine of that name. Raises `KeyError` for another, `ImportError` without the libraries that it needs."""
     module, _, kind = ENGINES[name].partition(":")
-    return getattr(import_module(module), kind)()
+    return getattr(import_module(module), kind)(**options)
 
 
 def kept_from_native(problem: Problem, traced: bool = False) -> str | None:
