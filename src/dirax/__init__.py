@@ -65,6 +65,7 @@ from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.discrete_gradient import DiscreteGradient
 from dirax.schemes.euler_poincare import DiscreteEulerPoincare
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
+from dirax.schemes.layout import Layout
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
 from dirax.solution.reconstruction import reconstruct
@@ -125,6 +126,7 @@ __all__ = [
     "InducedFiniteDifferenceDirac",
     "LagrangeDAlembert",
     "LagrangeDirac",
+    "Layout",
     "LeftTranslation",
     "LieGroupExp",
     "LiePoisson",

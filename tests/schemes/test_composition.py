@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dirax as dx
-from dirax.schemes.composition import COEFFICIENTS, adjoint_scheme
+from dirax.schemes.composition_coefficients import COEFFICIENTS
 
 MOST_STAGES = 125
 
@@ -176,10 +176,10 @@ def newton_step(equation, state, u, h):
 
 
 def test_adjoints_of_the_lagrange_dalembert_family():
-    plus, minus = adjoint_scheme(dx.PlusLagrangeDirac("left")), adjoint_scheme(dx.MinusLagrangeDirac("right"))
+    plus, minus = dx.PlusLagrangeDirac("left").adjoint(disk), dx.MinusLagrangeDirac("right").adjoint(disk)
     assert (plus.discrete_lagrangian, plus.constraint) == ("right", "left")
     assert (minus.discrete_lagrangian, minus.constraint) == ("left", "right")
-    own = adjoint_scheme(dx.LagrangeDAlembert(lambda q0, q1, h: (q1 @ q1 - q0 @ q0) / h, lambda q0, q1, h: q0 * h))
+    own = dx.LagrangeDAlembert(lambda q0, q1, h: (q1 @ q1 - q0 @ q0) / h, lambda q0, q1, h: q0 * h).adjoint(disk)
     q0, q1 = jnp.array([1.0, 2.0]), jnp.array([0.5, 1.0])
     assert own.discrete_lagrangian(q0, q1, 0.1, None) == pytest.approx((q0 @ q0 - q1 @ q1) / 0.1 * -1 / -1)
     assert np.asarray(own.constraint(q0, q1, 0.1, None)) == pytest.approx(-0.1 * np.asarray(q1))

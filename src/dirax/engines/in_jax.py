@@ -1,5 +1,6 @@
 """Steps in scalars for JAX: an equation with the functions of its scalar program, and what the graph derives from them."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -98,17 +99,9 @@ def _unpacked(made: StepProgram, index: int) -> Callable:
 
 def _replaced(stage: StepEquation, made: StepProgram, index: int) -> StepEquation:
     traced = made.equations[index]
-    return StepEquation(
-        start=stage.start,
+    return dataclasses.replace(
+        stage,
         residual=made.in_jax(index, traced.residual) if stage.unknowns else stage.residual,
         advance=made.in_jax(index, traced.advance),
         unpack=_unpacked(made, index),
-        state_size=stage.state_size,
-        unknowns=stage.unknowns,
-        fields=stage.fields,
-        guess=stage.guess,
-        scale=stage.scale,
-        labels=stage.labels,
-        needs_leaving_step=stage.needs_leaving_step,
-        canonical=stage.canonical,
     )

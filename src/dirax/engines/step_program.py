@@ -42,7 +42,6 @@ class TracedEquation:
     residual: list[int]
     advance: list[int]
     rows: dict[str, Nodes]
-    scale: tuple[float, ...]
     nesting: int
     """How deep derivatives of derivatives go in its functions."""
 
@@ -98,7 +97,7 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
         raise UnsupportedPrimitive("unpack", f"returns {len(rows)} arrays for {len(names)} fields", "the scheme")
     return TracedEquation(
         state, unknowns, previous, guess.tolist(), residual.tolist(), advance.tolist(),
-        dict(zip(names, rows, strict=True)), tuple(equation.scale), nesting(closed.jaxpr),
+        dict(zip(names, rows, strict=True)), nesting(closed.jaxpr),
     )  # fmt: skip
 
 

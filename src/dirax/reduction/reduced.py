@@ -29,6 +29,9 @@ class ReducedLagrangeDirac(AbstractSystem):
     system: LagrangeDirac
     connection: AbstractConnection
 
+    def quotient_form(self) -> "ReducedLagrangeDirac":
+        return self
+
     def unreduced(self) -> LagrangeDirac:
         """The system on Q that this one is the quotient of."""
         return self.system

@@ -1,5 +1,7 @@
 """Discrete Lagrangian mechanics on a manifold, computed in retraction-compatible charts that change on the way ([RL] §6)."""
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -8,8 +10,10 @@ from dirax.geometry.charts import Atlas, RetractionChart
 from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.program.user_functions import UserFunction
+from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.discrete_lagrangian import LD_ARGUMENTS
-from dirax.schemes.lagrange_dirac import discrete_lagrange_dalembert
+from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
+from dirax.schemes.layout import Layout
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
@@ -28,62 +32,84 @@ class InCharts(AbstractScheme):
     atlas: Atlas | None = None
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        if not isinstance(system, ManifoldLagrangian):
+        on_manifold = system.manifold_form()
+        if on_manifold is None:
             raise TypeError(f"dx.InCharts steps a dx.ManifoldLagrangian, but a {type(system).__name__} was given.")
-        if system.constraints.any or system.forces is not None:
+        if on_manifold.constraints.any or on_manifold.forces is not None:
             raise ValueError("dx.InCharts steps a Lagrangian without one_forms and forces: use dx.DiscreteDirac(map).")
-        manifold = system.manifold
+        manifold = on_manifold.manifold
         if not isinstance(manifold, AbstractGeodesicManifold):
             raise TypeError(f"dx.InCharts needs a manifold with a retraction, and {manifold!r} has none.")
-        return _charted(system, manifold, self.map, self.atlas or Atlas(manifold), shape.n)
+        return StepInCharts(on_manifold, manifold, self.map, self.atlas or Atlas(manifold), shape.n).equation()
 
 
-def _charted(system, manifold, map, atlas: Atlas, size: int) -> StepEquation:
-    d = manifold.dimension
+@dataclass(frozen=True, eq=False)
+class StepInCharts(AbstractStep):
+    """The discrete Euler–Lagrange equations in the chart at a point m: state (m, r, p), unknown the velocity of r.
 
-    def chart(m) -> RetractionChart:
-        return RetractionChart(manifold, m, manifold.frame(m), atlas.exponential)
+    The inner step is that of the (+) scheme in R^d, with the coordinates r and (params, m) as its parameters.
+    """
 
-    def discrete_lagrangian(r0, r1, h, where):
+    system: ManifoldLagrangian
+    manifold: AbstractGeodesicManifold
+    map: AbstractDiscretizationMap
+    atlas: Atlas
+    size: int
+
+    @cached_property
+    def inner(self) -> LagrangeDAlembertStep:
+        """The step in coordinates."""
+        only_its_rule_is_used = LagrangeDirac(lambda r, v: jnp.zeros(()))
+        rule = UserFunction(self.discrete_lagrangian, "discrete_lagrangian", LD_ARGUMENTS)
+        return LagrangeDAlembertStep(only_its_rule_is_used, Shape(self.manifold.dimension), rule, "right", "incoming")
+
+    @property
+    def state(self) -> Layout:
+        return Layout(chart=self.size, r=self.manifold.dimension, p=self.manifold.dimension)
+
+    @property
+    def unknowns(self) -> Layout:
+        return Layout(v=self.manifold.dimension)
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        return {
+            "q": Field((self.size,)),
+            "p": Field((self.size,)),
+            "chart": Field((self.size,), description="the point at which the chart in use is centred"),
+        }
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(f"discrete Euler–Lagrange equation {i} in the chart" for i in range(self.manifold.dimension))
+
+    def chart(self, m) -> RetractionChart:
+        """The chart centred at m."""
+        return RetractionChart(self.manifold, m, self.manifold.frame(m), self.atlas.exponential)
+
+    def discrete_lagrangian(self, r0, r1, h, where):
+        """L_d of two points given by their coordinates, in the chart that `where` names."""
         params, m = where
-        here = chart(m)
-        x, w = map.backward(here.to_manifold(r0), here.to_manifold(r1))
-        return h * system.lagrangian(x, w / h, params)
+        here = self.chart(m)
+        x, w = self.map.backward(here.to_manifold(r0), here.to_manifold(r1))
+        return h * self.system.lagrangian(x, w / h, params)
 
-    local = LagrangeDirac(lambda r, v: jnp.zeros(()))  # only its discrete Lagrangian is used
-    rule = UserFunction(discrete_lagrangian, "discrete_lagrangian", LD_ARGUMENTS)
-    inner = discrete_lagrange_dalembert(local, Shape(d), rule, "right", "incoming")
+    def residual(self, u, state, t, h, params):
+        m, r, p = self.state.split(state)
+        return self.inner.residual(u, self.inner.state.join(q=r, p=p), t, h, (params, m))
 
-    def residual(u, state, t, h, params):
-        return inner.residual(u, state[size:], t, h, (params, state[:size]))
+    def advance(self, u, state, t, h, params):
+        m, r, p = self.state.split(state)
+        after = self.inner.state.split(self.inner.advance(u, self.inner.state.join(q=r, p=p), t, h, (params, m)))
+        there, r, p = self.atlas.follow(self.chart(m), after.q, after.p)
+        return self.state.join(chart=there.base, r=r, p=p)
 
-    def advance(u, state, t, h, params):
-        m = state[:size]
-        r, p = jnp.split(inner.advance(u, state[size:], t, h, (params, m)), 2)
-        there, r, p = atlas.follow(chart(m), r, p)
-        return jnp.concatenate([there.base, r, p])
+    def unpack(self, state, u, t, h, params):
+        m, r, p = self.state.split(state)
+        q, momentum = self.chart(m).momentum_to_manifold(r, p)
+        return {"q": q, "p": momentum, "chart": m}
 
-    def unpack(state, u, t, h, params):
-        r, p = jnp.split(state[size:], 2)
-        q, momentum = chart(state[:size]).momentum_to_manifold(r, p)
-        return {"q": q, "p": momentum, "chart": state[:size]}
-
-    def start(data, h, params):
-        here, r, p = atlas.enter(data["q"], data["p"])
-        return jnp.concatenate([here.base, r, p]), here.components(data["v"])  # a first guess of the velocity
-
-    fields = {
-        "q": Field((size,)),
-        "p": Field((size,)),
-        "chart": Field((size,), description="the point at which the chart in use is centred"),
-    }
-    return StepEquation(
-        start=start,
-        residual=residual,
-        advance=advance,
-        unpack=unpack,
-        state_size=size + 2 * d,
-        unknowns=d,
-        fields=fields,
-        labels=tuple(f"discrete Euler–Lagrange equation {i} in the chart" for i in range(d)),
-    )
+    def start(self, data, h, params):
+        here, r, p = self.atlas.enter(data["q"], data["p"])
+        # the unknowns are a first guess of the velocity
+        return self.state.join(chart=here.base, r=r, p=p), here.components(data["v"])

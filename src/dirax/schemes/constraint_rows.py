@@ -68,14 +68,6 @@ class ConstraintRows:
         return tuple(of(i) for i in self.kept)
 
 
-def independent_constraints(system: Any, shape: Shape) -> tuple[Any, int, Callable]:
-    """(system, k, all) of a system in coordinates x: the same with the k multipliers of independent constraints only, and the
-    function that puts them among all of them."""
-    if not shape.redundant:
-        return system, shape.m + shape.c, lambda multipliers: multipliers
-    return system.independent(shape), len(shape.kept), shape.spread
-
-
 def step_constraints(rows: ConstraintRows, wd: Callable) -> Callable:
     """(w_d(q0, q1), g(q1)/unit) as a function (t0, q0, v, h, params, unit=1) with q1 = q0 + h v, all m + c of them."""
 

@@ -19,6 +19,10 @@ CONSTRAINTS = ("left", "right", "midpoint")
 BASE = {"left": 0.0, "right": 1.0, "midpoint": 0.5}
 """Where the point of a one-point rule lies in the step."""
 
+MIRRORED = {"left": "right", "right": "left", "midpoint": "midpoint", "trapezoidal": "trapezoidal"}
+
+"""The rule that is the same when time runs backwards, by the name of a rule."""
+
 
 def checked_rule(rule, names: tuple[str, ...], argument: str):
     """A rule name, or the user's function wrapped; raises `ValueError` with the choices otherwise."""
@@ -97,3 +101,13 @@ def slot_derivatives(ld: Callable, t, q, v, h, params) -> tuple[Float[Array, " n
     """(D1 L_d, D2 L_d) at (q, q + h v), from the derivatives with respect to (q, v)."""
     dq, dv = gradient(ld, (1, 2))(t, q, v, h, params)
     return dq - dv / h, dv / h
+
+
+def mirrored(rule: str | UserFunction, sign: float) -> str | Callable:
+    """sign·f(q1, q0, −h) of a function f(q0, q1, h), or the rule of that name's mirror image."""
+    if isinstance(rule, str):
+        return MIRRORED[rule]
+    name = f"adjoint of {rule.name}"
+    if rule.takes_time:
+        return UserFunction(lambda t, q0, q1, h, params: sign * rule(t + h, q1, q0, -h, params), name, LD_ARGUMENTS, timed=True)
+    return UserFunction(lambda q0, q1, h, params: sign * rule(q1, q0, -h, params), name, LD_ARGUMENTS)

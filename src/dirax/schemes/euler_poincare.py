@@ -3,14 +3,12 @@
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
 
-from dirax.geometry.group_retractions import RETRACTIONS, coadjoint, pulled_back, retraction
-from dirax.program.tracing import once
+from dirax.geometry.group_retractions import RETRACTIONS
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.lie_poisson import LiePoisson
-from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
+from dirax.schemes.euler_poincare_step import EulerPoincareStep
+from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 
 
 class DiscreteEulerPoincare(AbstractScheme):
@@ -55,111 +53,4 @@ class DiscreteEulerPoincare(AbstractScheme):
                 "dx.DiscreteEulerPoincare steps dx.EulerPoincare and dx.LiePoisson systems, but a "
                 f"{type(system).__name__} was given."
             )
-        return discrete_euler_poincare(system, shape, self.map)
-
-
-def discrete_euler_poincare(system: Any, shape: Shape, name: str) -> StepEquation:
-    """The StepEquation: state (μ, a, g) and the impulse (h/2)λ' of the step before; unknowns ξ, of a Lie–Poisson system
-    also ν, with constraints (λ, ξ', λ') too, ξ' the velocity at the end of the step."""
-    space, m = system.space, shape.m
-    group, d, n = space.group, space.dimension, space.size
-    tau = retraction(group, name)
-    hamiltonian = isinstance(system, LiePoisson)
-    motion_size = 2 * d if hamiltonian else d
-    whole = n + group.ambient_dimension
-
-    def split(state):
-        return state[:d], state[d:n], state[n:whole]
-
-    def motion(u, a, h, params):
-        """ξ, ν, f, the next a, J at both ends and what is left of ξ = ∂h/∂μ."""
-        xi = u[:d]
-        f = tau(h * xi)
-        after = space.carried(f, a)
-        at = u[d : 2 * d] if hamiltonian else xi
-        (first, slope), (second, next_slope) = system.slopes(at, a, params), system.slopes(at, after, params)
-        mean = (first + second) / 2.0 if space.advected else first
-        if hamiltonian:
-            return xi, at, f, after, -space.diamond(slope, a), -space.diamond(next_slope, after), xi - mean
-        return xi, mean, f, after, space.diamond(slope, a), space.diamond(next_slope, after), jnp.zeros(0)
-
-    def reaction(a, multipliers, params):
-        return system.constraint_forms(a, params).T @ multipliers if m else jnp.zeros(d)
-
-    def parts(u):
-        """(λ, ξ', λ')."""
-        v = u[motion_size:]
-        return v[:m], v[m : m + d], v[m + d :]
-
-    def step(u, state, h, params):
-        return once(whole_step)(u, state, h, params)
-
-    def whole_step(u, state, h, params):
-        """ξ, m, ν, the next μ and a, f, and the residual of ξ = ∂h/∂μ."""
-        momentum, a, _ = split(state)
-        xi, nu, f, after, torque, next_torque, defect = motion(u, a, h, params)
-        first, _, last = parts(u)
-        leaving = momentum + h / 2.0 * (reaction(a, first, params) - torque)
-        arriving = coadjoint(group, f, leaving) + h / 2.0 * (reaction(after, last, params) - next_torque)
-        return xi, leaving, nu, arriving, after, f, defect
-
-    def discrete_constraint(xi, a, after, params):
-        forms = system.constraint_forms(a, params)
-        return (forms + system.constraint_forms(after, params)) @ xi / 2.0 if space.advected else forms @ xi
-
-    def residual(u, state, t, h, params):
-        xi, leaving, nu, arriving, after, _, defect = step(u, state, h, params)
-        angle = h * xi[group.translations :]
-        small = jnp.sum(angle * angle) < np.pi**2
-        rows = [jnp.where(small, pulled_back(group, tau, h * xi, leaving) - nu, jnp.nan), defect]
-        if m:
-            _, end, _ = parts(u)
-            rows.append(discrete_constraint(xi, split(state)[1], after, params))
-            rows.append(system.legendre(end, after, params) - arriving)
-            rows.append(system.constraint_forms(after, params) @ end)
-        return jnp.concatenate(rows)
-
-    def advance(u, state, t, h, params):
-        _, _, _, arriving, after, f, _ = step(u, state, h, params)
-        return jnp.concatenate([arriving, after, group.nearest(group.multiply(split(state)[2], f)), h / 2.0 * parts(u)[2]])
-
-    def unpack(state, u, t, h, params):
-        saved = {"x": state[:n], "g": state[n:whole], "xi": u[:d]}
-        if m:
-            a = split(state)[1]
-            saved["multipliers"] = state[whole:] + h / 2.0 * parts(u)[0]
-            saved["constraint"] = discrete_constraint(u[:d], a, space.carried(tau(h * u[:d]), a), params)
-        return saved
-
-    def start(data, h, params):
-        x, xi = data["x"], data["v"]
-        zero = jnp.zeros(m)
-        motion = [xi, x[:d]] if hamiltonian else [xi]
-        u = jnp.concatenate([*motion, *([zero, xi, zero] if m else [])])
-        return jnp.concatenate([x, data.get("g", group.identity()), zero]), u
-
-    fields = {
-        "x": Field((n,), dims=("component",), description="body momentum μ and advected quantities a"),
-        "g": Field(
-            (group.ambient_dimension,), dims=("group",), description="group element g_k, from the identity on unless q= was given"
-        ),
-        "xi": Field((d,), "step", ("algebra",), "velocity ξ_k of the step, g_k⁻¹g_{k+1} = τ(hξ_k)"),
-    }
-    labels = [f"discrete Euler–Poincaré equation {i}, of a step that turns by less than π" for i in range(d)]
-    labels += [f"velocity ∂h/∂μ, component {i}" for i in range(motion_size - d)]
-    if m:
-        fields["multipliers"] = Field((m,), "step", ("constraint",), "impulse of the constraints at the node")
-        fields["constraint"] = Field((m,), "step", ("constraint",), "discrete constraint A ξ_k")
-        labels += [f"discrete constraint {r}" for r in range(m)]
-        labels += [f"Legendre transform {i} at the end of the step" for i in range(d)]
-        labels += [f"constraint {r} at the end of the step" for r in range(m)]
-    return StepEquation(
-        start=start,
-        residual=residual,
-        advance=advance,
-        unpack=unpack,
-        state_size=whole + m,
-        unknowns=motion_size + (2 * m + d if m else 0),
-        fields=fields,
-        labels=tuple(labels),
-    )
+        return EulerPoincareStep(system, shape.m, self.map).equation()

@@ -3,29 +3,12 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
-
-from dirax.program.roots import nearest_root
-from dirax.program.tracing import once
 from dirax.program.user_functions import UserFunction
-from dirax.reduction.reduced import ReducedLagrangeDirac
-from dirax.schemes.constraint_rows import ConstraintRows, step_constraints
-from dirax.schemes.discrete_lagrangian import (
-    CONSTRAINTS,
-    RULES,
-    checked_rule,
-    discrete_constraint,
-    discrete_forces,
-    discrete_lagrangian,
-    slot_derivatives,
-)
-from dirax.schemes.reduced import lagrange_poincare_dirac
-from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
-from dirax.schemes.work import WorkBook, work_field
-from dirax.systems.lagrange_dirac import LagrangeDirac
-from dirax.systems.nonholonomic import as_lagrange_dirac
-
-MOMENTA = ("incoming", "mean", "outgoing")
+from dirax.schemes.discrete_lagrangian import CONSTRAINTS, RULES, checked_rule, mirrored
+from dirax.schemes.lagrange_dalembert_step import MOMENTA, LagrangeDAlembertStep
+from dirax.schemes.lagrange_poincare_dirac import LagrangePoincareDiracStep
+from dirax.schemes.step import AbstractScheme, Shape, StepEquation
+from dirax.systems.system import AbstractSystem
 
 
 class LagrangeDAlembert(AbstractScheme):
@@ -71,7 +54,22 @@ class LagrangeDAlembert(AbstractScheme):
             raise ValueError(f"momentum must be one of {', '.join(map(repr, MOMENTA))}, but {momentum!r} was given.")
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        return _on_q_or_quotient(system, shape, self.discrete_lagrangian, self.constraint, self.momentum)
+        return _equation(self, system, shape)
+
+    def step_on_q(self, system: AbstractSystem, shape: Shape) -> LagrangeDAlembertStep:
+        """The step of a system on Q; raises `TypeError` for one that has no Lagrangian form, or whose motion is known to lie
+        on a smaller manifold than T*Q: two-point methods have modes off it, that grow."""
+        lagrangian = system.lagrangian_form()
+        if lagrangian is None or system.final_relation(shape) is not None:
+            raise TypeError(
+                "this scheme discretizes a dx.LagrangeDirac or dx.NonholonomicMechanics system (a Lagrangian with constraints), "
+                f"but a {type(system).__name__} was given: use dx.DiscreteDirac for the others."
+            )
+        return LagrangeDAlembertStep(lagrangian, shape, self.discrete_lagrangian, self.constraint, self.momentum)
+
+    def adjoint(self, system: Any) -> "LagrangeDAlembert":
+        """That of L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h)."""
+        return LagrangeDAlembert(mirrored(self.discrete_lagrangian, -1.0), mirrored(self.constraint, 1.0), "incoming")
 
 
 class PlusLagrangeDirac(AbstractScheme):
@@ -88,8 +86,17 @@ class PlusLagrangeDirac(AbstractScheme):
     def __init__(self, discrete_lagrangian: str | Callable = "left"):
         self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
 
+    @property
+    def lagrange_dalembert(self) -> LagrangeDAlembert:
+        """The general scheme of which this is a case."""
+        return LagrangeDAlembert(self.discrete_lagrangian, "right", "incoming")
+
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        return _on_q_or_quotient(system, shape, self.discrete_lagrangian, "right", "incoming")
+        return _equation(self.lagrange_dalembert, system, shape)
+
+    def adjoint(self, system: Any) -> LagrangeDAlembert:
+        """That of the general scheme."""
+        return self.lagrange_dalembert.adjoint(system)
 
 
 class MinusLagrangeDirac(AbstractScheme):
@@ -107,146 +114,22 @@ class MinusLagrangeDirac(AbstractScheme):
     def __init__(self, discrete_lagrangian: str | Callable = "left"):
         self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
 
+    @property
+    def lagrange_dalembert(self) -> LagrangeDAlembert:
+        """The general scheme of which this is a case."""
+        return LagrangeDAlembert(self.discrete_lagrangian, "left", "incoming")
+
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        return _on_q_or_quotient(system, shape, self.discrete_lagrangian, "left", "incoming", -1)
+        return _equation(self.lagrange_dalembert, system, shape, -1)
+
+    def adjoint(self, system: Any) -> LagrangeDAlembert:
+        """That of the general scheme."""
+        return self.lagrange_dalembert.adjoint(system)
 
 
-def _on_q_or_quotient(system: Any, shape: Shape, rule, constraint, momentum: str, sign: int = +1) -> StepEquation:
+def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, sign: int = +1) -> StepEquation:
     """The discrete Lagrange–d'Alembert equations of a system on Q, or on the quotient by its symmetry."""
-    if not isinstance(system, ReducedLagrangeDirac):
-        return discrete_lagrange_dalembert(as_lagrange_dirac(system), shape, rule, constraint, momentum)
-    unreduced = discrete_lagrange_dalembert(system.system, shape, rule, constraint, momentum)
-    return lagrange_poincare_dirac(system, shape, unreduced, rule, constraint, sign)
-
-
-def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, momentum: str) -> StepEquation:
-    """The StepEquation of the discrete Lagrange–d'Alembert equations: state (q, p), with forces (q, p, work); unknowns
-    (v, μ, λ) with q_{k+1} = q_k + h v, and with holonomic constraints (v̂, σ) of the projection of the saved momentum."""
-    if not isinstance(system, LagrangeDirac):
-        raise TypeError(
-            "this scheme discretizes a dx.LagrangeDirac or dx.NonholonomicMechanics system (a Lagrangian with constraints), but "
-            f"a {type(system).__name__} was given: use dx.DiscreteDirac for the others."
-        )
-    n, m, rows = shape.n, shape.m, ConstraintRows(system, shape)
-    k, holonomic, book = rows.count, rows.holonomic, WorkBook(system, n)
-    if isinstance(constraint, UserFunction) and not m:
-        raise ValueError(
-            "constraint is a function w_d(q0, q1, h), but the system has no one_forms, whose forces would impose it: "
-            "give the system one_forms=, or leave constraint out."
-        )
-    ld = discrete_lagrangian(system.lagrangian, rule)
-    wd = discrete_constraint(system.constraints, constraint, m)
-    step_constraint = step_constraints(rows, wd)
-    impulses = None if system.forces is None else discrete_forces(system.forces, rule)
-    share = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}[momentum] if m else 0.0
-
-    def slots(t, q, v, h, params):
-        return once(both_slots)(t, q, v, h, params)
-
-    def both_slots(t, q, v, h, params):
-        """(D1 L_d + f_d^−, D2 L_d + f_d^+): a step leaves its first point with minus the one, and arrives with the other."""
-        d1, d2 = slot_derivatives(ld, t, q, v, h, params)
-        if impulses is None:
-            return d1, d2
-        first, last = impulses(t, q, v, h, params)
-        return d1 + first, d2 + last
-
-    def equations(u, q, p, t, h, params):
-        balance = p + slots(t, q, u[:n], h, params)[0]
-        if not k:
-            return balance
-        imposed = rows.pick(step_constraint(t, q, u[:n], h, params, unit=h))  # all in the unit of W v
-        return jnp.concatenate([balance - rows.matrix(t, q, params).T @ u[n : n + k], imposed])
-
-    def saved_momentum(u, q, p, t, params):
-        """p_k − share·Wᵀμ − Gᵀσ."""
-        if share:
-            p = p - share * (rows.matrix(t, q, params)[: rows.nonholonomic].T @ u[n : n + rows.nonholonomic])
-        return p - rows.holonomic_matrix(t, q, params).T @ u[n + k + n :] if holonomic else p
-
-    def projection(u, q, p, t, params):
-        """∂L/∂v(q, v̂) is the saved momentum, and G v̂ + ∂g/∂t = 0."""
-        v = u[n + k : n + k + n]
-        missed = system.legendre(q, v, params, t) - saved_momentum(u, q, p, t, params)
-        return jnp.concatenate([missed, rows.hidden(t, q, v, params)])
-
-    def residual(u, state, t, h, params):
-        q, p = state[:n], state[n : 2 * n]
-        if not holonomic:
-            return equations(u, q, p, t, h, params)
-        return jnp.concatenate([equations(u, q, p, t, h, params), projection(u, q, p, t, params)])
-
-    def advance(u, state, t, h, params):
-        q, v = state[:n], u[:n]
-        _, p1 = slots(t, q, v, h, params)
-        # outside the domain of L its derivatives can still be numbers: those of log q are, for q < 0
-        inside = jnp.isfinite(system.lagrangian.at(t + h, q + h * v, v, params))
-        end = [q + h * v, jnp.where(inside, p1, jnp.nan)]
-        return jnp.concatenate(end) if impulses is None else book.add(state, end, sum(impulses(t, q, v, h, params)) @ v)
-
-    def unpack(state, u, t, h, params):
-        q, p = state[:n], state[n : 2 * n]
-        row = {"q": q, "p": saved_momentum(u, q, p, t, params)}
-        if m + rows.c:
-            row |= {"multipliers": rows.all(u[n : n + k]), "constraint": step_constraint(t, q, u[:n], h, params)}
-        return row | book.row(state)
-
-    def start(data, h, params):
-        t = data.get("t", 0.0)
-        if "q0" in data:
-            q, v = data["q0"], (data["q1"] - data["q0"]) / h
-            p, u = -slots(t, q, v, h, params)[0], jnp.concatenate([v, jnp.zeros(k)])
-            if holonomic:
-                end = jnp.concatenate([v, jnp.zeros(holonomic)])
-                end = nearest_root(lambda end: projection(jnp.concatenate([u, end]), q, p, t, params), end)
-                u = jnp.concatenate([u, end])
-            return book.start(q, p), u
-        q, p, v = data["q"], data["p"], data["v"]
-        u = jnp.concatenate([v, jnp.zeros(k)])
-        if share or holonomic:
-            p, u = incoming_momentum(q, p, u, t, h, params)
-        return book.start(q, p), u
-
-    def incoming_momentum(q, p, guess, t, h, params):
-        """The incoming momentum whose saved momentum is p, with the unknowns of the step that leaves it.
-
-        λ is that of the leaving step and of one that would arrive at (q, p): the whole impulse, of second order here too.
-        """
-        nonholonomic = slice(n, n + rows.nonholonomic)
-
-        def both(u):
-            leaving = equations(u[: n + k], q, p, t, h, params)
-            return jnp.concatenate([leaving, arriving(u[n + k :], q, p, t, h, params)]) if holonomic else leaving
-
-        found = nearest_root(both, jnp.tile(guess, 1 + bool(holonomic)))
-        found = jnp.where(jnp.all(jnp.isfinite(found)), found, jnp.tile(guess, 1 + bool(holonomic)))
-        first, before = found[: n + k], found[n + k :]
-        # with incoming p + s/(1−s) Wᵀμ the multiplier is μ/(1−s), and its share is taken off again; at s = 1 nothing is added
-        jump = share / (1.0 - share) * first[nonholonomic] if share < 1.0 else 0.0 * first[nonholonomic]
-        if not holonomic:
-            return p + rows.matrix(t, q, params).T @ jump, first.at[nonholonomic].add(jump)
-        sigma = before[n + rows.nonholonomic :]
-        jump = jnp.concatenate([jump, sigma])
-        return p + rows.matrix(t, q, params).T @ jump, jnp.concatenate([first.at[n:].add(jump), guess[:n], sigma])
-
-    def arriving(u, q, p, t, h, params):
-        """The equations of (v, μ, σ) for a step from q − h v on the constraints to (q, p)."""
-        before, v = q - h * u[:n], u[:n]
-        missed = p - slots(t - h, before, v, h, params)[1] + rows.matrix(t, q, params).T @ u[n:]
-        g = rows.constraints.position_defect(t - h, before, params) / h
-        return jnp.concatenate([missed, rows.pick(jnp.concatenate([wd(t - h, before, v, h, params), g]))])
-
-    return StepEquation(
-        start=start,
-        residual=residual,
-        advance=advance,
-        unpack=unpack,
-        state_size=2 * n + book.size,
-        unknowns=n + k + (n + holonomic) * bool(holonomic),
-        fields={"q": Field((n,)), "p": Field((n,)), **rows.fields(), **work_field(system)},
-        labels=tuple(f"discrete Lagrange–d'Alembert equation {i}" for i in range(n))
-        + rows.labels()
-        + tuple(f"projection of the momentum {i}" for i in range((n + holonomic) * bool(holonomic))),
-        needs_leaving_step=bool(share or holonomic),
-        canonical=not book.size,
-    )
+    quotient = system.quotient_form()
+    if quotient is None:
+        return scheme.step_on_q(system, shape).equation()
+    return LagrangePoincareDiracStep(quotient, scheme.step_on_q(quotient.unreduced(), shape), sign).equation()

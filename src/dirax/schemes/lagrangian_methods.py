@@ -8,7 +8,7 @@ from dirax.program.linear_solves import solve
 from dirax.program.tracing import along, gradient, jacobian, once
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.step import Field, Shape, StepEquation
-from dirax.schemes.work import WorkBook, work_field
+from dirax.schemes.work_of_forces import WorkOfForces
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 from dirax.systems.nonholonomic import NonholonomicMechanics
@@ -25,7 +25,7 @@ def lagrangian_fields(system: Any, n: int, k: int) -> dict[str, Field]:
     fields = {"q": Field((n,)), "p": Field((n,))}
     if k:
         fields["multipliers"] = Field((k,), "step", ("constraint",), "Lagrange multipliers of the constraints")
-    return fields | work_field(system)
+    return fields | WorkOfForces(system, n).fields
 
 
 def discretized_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) -> StepEquation:
@@ -36,7 +36,7 @@ def discretized_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) ->
     constraints the Dirac structure has their distribution, G q̇ + ∂g/∂t = 0 at the base point: θ = ½ keeps quadratic g.
     """
     n, rows = shape.n, ConstraintRows(system, shape)
-    k, book = rows.count, WorkBook(system, n)
+    k, book = rows.count, WorkOfForces(system, n)
 
     def base(u, state, t, h, params):
         q, v = state[:n] + theta * h * u[:n], u[:n]
@@ -135,7 +135,7 @@ def resolved_lagrangian(system: LagrangeDirac, shape: Shape, theta: float) -> St
     moves q and M(w − v) = Gᵀs. Constraints at the times t_k, t_k + θh and t_k + h hold to roundoff at all three points.
     """
     n, rows = shape.n, ConstraintRows(system, shape)
-    k, c, book = n + rows.count, rows.holonomic, WorkBook(system, shape.n)
+    k, c, book = n + rows.count, rows.holonomic, WorkOfForces(system, shape.n)
     first, second = k + c, (k + n + c) if c else k
 
     def mass(t, q, v, params):
@@ -211,7 +211,7 @@ def _along(system: LagrangeDirac, function, t, q, v):
 
 def _resolved(system: Any, shape: Shape, unknowns: int, residual, advance, unpack, first_guess) -> StepEquation:
     """The StepEquation on M_f with state (q, p): common to the two forms of Method 2."""
-    n, book = shape.n, WorkBook(system, shape.n)
+    n, book = shape.n, WorkOfForces(system, shape.n)
 
     def start(data: dict[str, Any], h, params):
         if "q0" in data:

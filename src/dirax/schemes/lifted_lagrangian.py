@@ -17,7 +17,7 @@ from dirax.program.tracing import along, gradient, jacobian, once
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.lagrangian_methods import lagrangian_fields, rates
 from dirax.schemes.step import Shape, StepEquation
-from dirax.schemes.work import WorkBook
+from dirax.schemes.work_of_forces import WorkOfForces
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 
@@ -113,7 +113,7 @@ def lifted_lagrangian(system: LagrangeDirac | ManifoldLagrangian, shape: Shape, 
     Euler–Lagrange equations of L_d = h L(B(q0, q1)/h), also for degenerate L.
     """
     n, d, rows = shape.n, lift.manifold.dimension, ConstraintRows(system, shape)
-    k, book = rows.count, WorkBook(system, shape.n)
+    k, book = rows.count, WorkOfForces(system, shape.n)
 
     def ends(u, state, t, h, params):
         """The base point, and (−p0, p1)."""
@@ -170,7 +170,7 @@ def projected_lagrangian(system: LagrangeDirac | ManifoldLagrangian, shape: Shap
     σ and s of the first half, and v', σ of the second, with the velocity from q_k to q_{k+1} and s for holonomic constraints.
     """
     n, d, rows = shape.n, lift.manifold.dimension, ConstraintRows(system, shape)
-    r, c, book = rows.count, rows.holonomic, WorkBook(system, shape.n)
+    r, c, book = rows.count, rows.holonomic, WorkOfForces(system, shape.n)
     # (u, σ, s) of the first half, (v', σ) of the second, and (u', s) of its end where there are holonomic constraints
     cuts = [d, d + r, d + r + c, 2 * d + r + c, 2 * (d + r) + c, 3 * d + 2 * r + c]
     unknowns = 3 * d + 2 * r + 2 * c if c else 2 * (d + r)

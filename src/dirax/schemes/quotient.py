@@ -4,11 +4,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.reduction.connection import AbstractConnection, LinearConnection
+from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 
 
 class Quotient:
-    """The layout (x, w, μ, g, …) of a state on Σ × G × g*: shape, its trivialized momentum, momentum map, group coordinate.
+    """The state (x, w, μ, g) on Σ × G × g*: shape, its trivialized momentum, momentum map, group coordinate.
 
     `k` group coordinates and `s` = n − k of the shape; a step has the velocity ẋ and the vertical part ω_d = hγ.
     """
@@ -17,10 +18,10 @@ class Quotient:
         self.connection, self.k = connection, len(connection.fibre)
         self.s = n - self.k
 
-    def split(self, state: Float[Array, " state"]) -> tuple[Array, Array, Array, Array]:
-        """x, w, μ, g."""
-        s, k = self.s, self.k
-        return state[:s], state[s : 2 * s], state[2 * s : 2 * s + k], state[2 * s + k : 2 * s + 2 * k]
+    @property
+    def state(self) -> Layout:
+        """The parts of the state."""
+        return Layout(x=self.s, w=self.s, mu=self.k, g=self.k)
 
     def group_rate(self, x, rate, vertical, h) -> Float[Array, " k"]:
         """ġ = (g1 − g0)/h = γ + h⁰_d(x, x + hẋ)/h."""

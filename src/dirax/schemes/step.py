@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.program.memo import Memo
+from dirax.schemes.layout import Layout
 from dirax.systems.shape import Shape
 from dirax.text.representation import counted, html_table, module_html, module_text
 
@@ -30,17 +31,22 @@ class StepEquation(eqx.Module):
 
     - `start(data, h, params) -> (state, u)`: initial state (s,) and first guess (k,) from the initial data, a dict that
       holds one of the pairs `q, v` · `q, p` · `q0, q1` or a single `x`, and the time `t`;
-    - `guess(state, previous, h, params) -> u`: where Newton starts; `previous` (k,) are the unknowns extrapolated from
-      the steps before;
     - `residual(u, state, t, h, params) -> r`: (k,), zero at the step;
     - `advance(u, state, t, h, params) -> state`: the next state (s,);
     - `unpack(state, u, t, h, params) -> dict`: the named arrays to be saved for the row that `state` is at; `u` is the
       step leaving it.
 
-    An explicit method has `unknowns = 0`. `scale` (k,) is the unit of each unknown, for the stopping test of Newton's
-    method only. `labels` names each row of the residual for messages. With `needs_leaving_step` the node fields depend on
-    `u`, and an engine solves one more step to fill the last row. `check(data, h, params)` raises `ValueError` for initial
-    data, concrete ones, at which a premise of the method does not hold.
+    `state_size` is s and `unknowns` is k, 0 for an explicit method; `state_layout` and `unknown_layout` name their parts, and
+    may be given instead. `fields` says what is saved, `labels` names each row of the residual for messages, and `canonical`
+    that the state is (q, p) of T*Q, so that its symplecticity can be measured. Optional are
+
+    - `check(data, h, params)`, which raises `ValueError` for initial data, concrete ones, at which a premise of the method
+      does not hold;
+    - `guess(state, previous, h, params) -> u`: where Newton's method starts, if that is not `previous` (k,), the unknowns
+      extrapolated from the steps before.
+
+    Equations are compared by the identity of their functions. One with other functions is made by `dataclasses.replace`.
+    Raises `ValueError` where sizes, layouts and labels do not fit.
     """
 
     start: Callable = eqx.field(static=True)
@@ -50,12 +56,12 @@ class StepEquation(eqx.Module):
     state_size: int = eqx.field(static=True)
     unknowns: int = eqx.field(static=True)
     fields: dict[str, Field]
-    guess: Callable = eqx.field(static=True)
-    scale: tuple[float, ...] = eqx.field(static=True)
     labels: tuple[str, ...] = eqx.field(static=True)
-    needs_leaving_step: bool = eqx.field(static=True)
     canonical: bool = eqx.field(static=True)
     check: Callable = eqx.field(static=True)
+    guess: Callable = eqx.field(static=True)
+    state_layout: Layout = eqx.field(static=True)
+    unknown_layout: Layout = eqx.field(static=True)
 
     def __init__(
         self,
@@ -64,29 +70,25 @@ class StepEquation(eqx.Module):
         residual: Callable,
         advance: Callable,
         unpack: Callable,
-        state_size: int,
-        unknowns: int,
         fields: dict[str, Field],
-        guess: Callable | None = None,
-        scale: tuple[float, ...] | None = None,
+        state_size: int | None = None,
+        unknowns: int | None = None,
+        state_layout: Layout | None = None,
+        unknown_layout: Layout | None = None,
         labels: tuple[str, ...] | None = None,
-        needs_leaving_step: bool = False,
         canonical: bool = False,
         check: Callable | None = None,
+        guess: Callable | None = None,
     ):
-        """`canonical` says that the state is (q, p) of T*Q, so that its symplecticity can be measured."""
         self.start, self.residual, self.advance, self.unpack = start, residual, advance, unpack
-        self.state_size, self.unknowns, self.fields = state_size, unknowns, dict(fields)
-        self.guess = guess or previous_unknowns
-        self.scale = (1.0,) * unknowns if scale is None else tuple(float(s) for s in scale)
-        self.labels = labels or tuple(f"equation {i}" for i in range(unknowns))
-        self.needs_leaving_step, self.canonical = needs_leaving_step, canonical
+        self.fields, self.canonical = dict(fields), canonical
+        self.state_layout, self.state_size = _layout("state", state_layout, "state_size", state_size)
+        self.unknown_layout, self.unknowns = _layout("u", unknown_layout, "unknowns", unknowns)
+        self.labels = labels or tuple(f"equation {i}" for i in range(self.unknowns))
         self.check = check or nothing_to_check
-        if not len(self.scale) == len(self.labels) == unknowns:
-            raise ValueError(
-                f"scale and labels need one entry per unknown ({unknowns}), but {len(self.scale)} and {len(self.labels)} "
-                "were given."
-            )
+        self.guess = guess or previous_unknowns
+        if len(self.labels) != self.unknowns:
+            raise ValueError(f"labels need one entry per unknown ({self.unknowns}), but {len(self.labels)} were given.")
 
     @property
     def stages(self) -> tuple[tuple["StepEquation", float], ...]:
@@ -105,7 +107,8 @@ class StepEquation(eqx.Module):
         return f"StepEquation({'; '.join(f'{name} {text}' for name, text in self._summary().items())})"
 
     def _repr_html_(self) -> str:
-        return html_table("StepEquation", self._summary() | {"equations": ", ".join(self.labels)})
+        parts = {"state is": repr(self.state_layout), "unknowns are": repr(self.unknown_layout)}
+        return html_table("StepEquation", self._summary() | parts | {"equations": ", ".join(self.labels)})
 
 
 class StepSequence(eqx.Module):
@@ -134,6 +137,22 @@ class AbstractScheme(eqx.Module):
     @abstractmethod
     def step_equation(self, system: Any, shape: Shape) -> StepEquation | StepSequence:
         """The equation of one step; raises `TypeError` for a system that the scheme does not discretize."""
+
+    def adjoint(self, system: Any) -> "AbstractScheme | None":
+        """The adjoint Φ*_h = (Φ_{−h})⁻¹ on this system as a scheme of its own; None where it is the inverse map as such,
+        whose equation `dx.Adjoint` makes of the scheme's. A scheme that is self-adjoint returns itself."""
+        return None
+
+
+def _layout(part: str, layout: Layout | None, name: str, size: int | None) -> tuple[Layout, int]:
+    """The layout and the size of the state or of the unknowns, of which one at least is given."""
+    if layout is None:
+        if size is None:
+            raise ValueError(f"a StepEquation needs {name}=, or a layout instead.")
+        layout = Layout(**{part: size})
+    if size not in (None, layout.size):
+        raise ValueError(f"{name} = {size} does not fit {layout!r}, which has {layout.size} numbers.")
+    return layout, layout.size
 
 
 def previous_unknowns(state, previous, h, params):

@@ -14,7 +14,7 @@ from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import UserFunction, evaluated
 from dirax.systems.constraints import Constraints
-from dirax.systems.forms import FinalManifold, ImplicitForm, RelationForm
+from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
 from dirax.systems.implicit_form import energy_of_x, names, point_of
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
@@ -93,6 +93,9 @@ class DiracSystem(AbstractSystem):
         saved = shape.m + shape.c
         relation = self.independent(shape).relation
         return RelationForm(relation, len(shape.kept), labels, saved, shape.spread, canonical=self.canonical)
+
+    def energy_form(self, shape: Shape) -> EnergyForm:
+        return EnergyForm(self.hamiltonian, self.differential, self.independent(shape).relation)
 
     def independent(self, shape: Shape) -> "DiracSystem":
         """The same system with the holonomic constraints that are not redundant."""

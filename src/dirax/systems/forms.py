@@ -53,6 +53,20 @@ class RelationForm(NamedTuple):
     node: Callable = lambda x, params: {"x": x}
 
 
+class EnergyForm(NamedTuple):
+    """What a scheme with an exact energy balance needs of a system with a relation form, beside that form.
+
+    `hamiltonian(x, params)` is a number and `differential(x, params)` its dH (N,); `residual(x, ẋ, u, t, params, gradient)`
+    is that of the relation form with another covector in place of dH(x). `ports(t, x, gradient, params)` gives the inputs
+    and outputs of open ports, the product of which is the power supplied, and the power dissipated; None without ports.
+    """
+
+    hamiltonian: Callable
+    differential: Callable
+    residual: Callable
+    ports: Callable | None = None
+
+
 class FinalManifold(NamedTuple):
     """M_f = {φ = 0} with what a step needs, functions of (x, params): constraints φ, `size` of them; the `field` ẋ = X(x); the
     `multipliers`, as many as `forces`; and `normal(x, α, params)`, the vector by which a combination α of the dφ moves a

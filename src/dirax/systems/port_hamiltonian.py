@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.systems.constraints import no_constraint
-from dirax.systems.forms import ImplicitForm, Observed, RelationForm
+from dirax.systems.forms import EnergyForm, ImplicitForm, Observed, RelationForm
 from dirax.systems.implicit_form import in_time, names, point_of, uses_time, without_time
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
@@ -127,6 +127,18 @@ class PortHamiltonian(AbstractSystem):
         about = "power stored ⟨dH, ẋ⟩, supplied and dissipated at the base point"
         observed = (Observed("power", self.power, (3,), ("power",), about),)
         return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port", observed=observed)
+
+    def ports(
+        self, t: Any, x: Float[Array, " N"], gradient: Float[Array, " N"], params: Any = None
+    ) -> tuple[Array, Array, Array]:
+        """(u, y, ⟨α, Rα⟩) with the inputs of the open ports, their outputs y = Bᵀα and the power dissipated, for a covector α
+        in place of dH."""
+        driven = self.input(t, x, params)
+        outputs = self.open_matrix(x, params).T @ gradient
+        return driven, outputs, jnp.zeros(()) if self.R is None else gradient @ self.R(x, params) @ gradient
+
+    def energy_form(self, shape: Shape) -> EnergyForm:
+        return EnergyForm(self.hamiltonian, self.differential, self.relation, self.ports)
 
     def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
         near, t = without_time(near)

@@ -8,7 +8,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from dirax.systems.constraints import Constraints
-from dirax.systems.forms import FinalManifold, ImplicitForm, RelationForm
+from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
 from dirax.systems.implicit_form import of_relation
 from dirax.systems.shape import Shape
 from dirax.text.representation import module_html, module_text
@@ -75,12 +75,20 @@ class AbstractSystem(eqx.Module):
         """The relation between x and ẋ that a discretization map discretizes; None for a system without one."""
         return None
 
+    def energy_form(self, shape: Shape) -> EnergyForm | None:
+        """The Hamiltonian whose balance `dx.DiscreteGradient` keeps, of a system with a relation form; None where none is."""
+        return None
+
     def lagrangian_form(self) -> Any:
         """The same system as a Lagrangian with constraints in coordinates, a `dx.LagrangeDirac`; None where there is none."""
         return None
 
     def manifold_form(self) -> Any:
         """The same system as a Lagrangian on a manifold in R^N, a `dx.ManifoldLagrangian`; None where there is none."""
+        return None
+
+    def quotient_form(self) -> Any:
+        """The same system as one on the quotient by its symmetry, a `dx.ReducedLagrangeDirac`; None where it is none."""
         return None
 
     def metric_form(self) -> Any:

@@ -144,7 +144,7 @@ def kernels(equation: Any, params: Any, batch_params: bool, compensated: bool = 
 def _digest(made: Kernels) -> str:
     step, g = made.step, made.step.graph
     rows = lambda e: [(name, nodes.shape, nodes.ravel().tolist()) for name, nodes in sorted(e.rows.items())]
-    outputs = [(e.state, e.unknowns, e.previous, e.guess, e.residual, e.advance, e.scale, rows(e)) for e in step.equations]
+    outputs = [(e.state, e.unknowns, e.previous, e.guess, e.residual, e.advance, rows(e)) for e in step.equations]
     constants = sorted((node, value) for node, value in g.value.items() if node < step.size)
     nodes = g.op[: step.size], g.args[: step.size], constants
     digest = hashlib.sha256(source_digest().encode())

@@ -1,5 +1,6 @@
 """A run as a function of arrays: what its derivatives are derivatives of, and the equation that saves what they need."""
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -64,16 +65,13 @@ def _recording(equation: Any, leaves: Parameters) -> tuple[Any, int]:
         def unpack(state, u, t, h, c):
             return {"state": state, "unknowns": jnp.concatenate([u, jnp.zeros(size - stage.unknowns)])}
 
-        return StepEquation(
-            start=stage.start,
+        return dataclasses.replace(
+            stage,
             guess=lambda state, previous, h, c: stage.guess(state, previous, h, split(c)),
             residual=lambda u, state, t, h, c: stage.residual(u, state, t, h, split(c)),
             advance=lambda u, state, t, h, c: stage.advance(u, state, t, h, split(c)),
             unpack=unpack,
-            state_size=stage.state_size,
-            unknowns=stage.unknowns,
             fields={"state": Field((stage.state_size,)), "unknowns": Field((size,))},
-            labels=stage.labels,
         )
 
     made = {id(stage): one(stage) for stage, _ in equation.stages}

@@ -1,0 +1,125 @@
+"""One step with an exact energy balance: the discrete gradient, and the balance that is carried along."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+
+from dirax.program.tracing import once
+from dirax.schemes.abstract_step import AbstractStep
+from dirax.schemes.layout import Layout
+from dirax.schemes.step import Field
+from dirax.systems.forms import EnergyForm, RelationForm
+
+EPSILON = 2.220446049250313e-16
+NOISE = 1e-11
+"""How much of dH the correction may be, relative, where it is roundoff of H only. It fades out for steps so short that it
+would be more: dividing roundoff by such a step would push a system that comes to rest."""
+TINY = 1e-300
+
+
+@dataclass(frozen=True, eq=False)
+class DiscreteGradientStep(AbstractStep):
+    """ẋ_d = (J − R)(x̄) ∇̄H + B(x̄) ū: state (x, supplied, dissipated, their lost digits, H(x_0)), unknowns ẋ_d and the inputs
+    of closed ports, or the multipliers of constraints.
+
+    ∇̄H is the mean of dH at the `points` of the step (0 to 1) with these `weights`, corrected along the step.
+    """
+
+    relation: RelationForm
+    energy: EnergyForm
+    n: int
+    points: tuple[float, ...]
+    weights: tuple[float, ...]
+
+    @property
+    def state(self) -> Layout:
+        return Layout(x=self.n, supplied=(), dissipated=(), lost_supplied=(), lost_dissipated=(), first=())
+
+    @property
+    def unknowns(self) -> Layout:
+        return Layout(velocity=self.n, multipliers=self.relation.multipliers)
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        fields = {
+            "x": Field((self.n,)),
+            "work": Field((2,), "node", ("work",), "energy supplied and energy dissipated since the start"),
+            "power": Field((3,), "step", ("power",), "power stored, supplied and dissipated"),
+        }
+        if self.relation.saved:
+            closed = self.relation.axis == "closed_port"
+            about = "inputs that keep the closed ports closed" if closed else "multipliers of the constraints"
+            fields["multipliers"] = Field((self.relation.saved,), "step", (self.relation.axis,), about)
+        return fields
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(f"component {i} of the discrete balance" for i in range(self.n)) + self.relation.labels
+
+    # ------------------------------------------------------------------------------------------------------ the gradient
+
+    @once
+    def discrete_gradient(self, u, state, h, params):
+        """∇̄H, with ⟨∇̄H, Δx⟩ = H(x + Δx) − H(x), and x̄.
+
+        H(x) is what it has to be by the balance: H(x_0) + supplied − dissipated.
+        """
+        state, change = self.state.split(state), h * self.unknowns.split(u).velocity
+        at = lambda s: self.energy.differential(state.x + s * change, params)
+        gradient = jnp.stack([w * at(s) for s, w in zip(self.points, self.weights, strict=True)]).sum(axis=0)
+        gained = (state.supplied - state.dissipated) + (state.lost_supplied - state.lost_dissipated)
+        stored = (self.energy.hamiltonian(state.x + change, params) - state.first) - gained
+        blurred = EPSILON * (jnp.abs(state.first) + jnp.abs(gained)) / NOISE
+        length = jnp.sqrt((change @ change) ** 2 + (blurred**2 / (gradient @ gradient + TINY)) ** 2 + TINY)
+        return gradient + (stored - gradient @ change) / length * change, state.x + change / 2
+
+    @once
+    def ports(self, u, state, t, h, params):
+        """(ū, ȳ, dissipated power) of the step."""
+        gradient, middle = self.discrete_gradient(u, state, h, params)
+        if self.energy.ports is None:
+            return jnp.zeros(0), jnp.zeros(0), jnp.zeros(())
+        return self.energy.ports(t + h / 2, middle, gradient, params)
+
+    # ------------------------------------------------------------------------------------------------------ the step
+
+    def residual(self, u, state, t, h, params):
+        gradient, middle = self.discrete_gradient(u, state, h, params)
+        velocity, multipliers = self.unknowns.split(u)
+        return self.energy.residual(middle, velocity, multipliers, t + h / 2, params, gradient)
+
+    def advance(self, u, state, t, h, params):
+        driven, outputs, loss = self.ports(u, state, t, h, params)
+        now = self.state.split(state)
+        supplied, lost_supplied = _add(now.supplied, now.lost_supplied, h * (driven @ outputs))
+        dissipated, lost_dissipated = _add(now.dissipated, now.lost_dissipated, h * loss)
+        return self.state.join(
+            x=now.x + h * self.unknowns.split(u).velocity,
+            supplied=supplied,
+            dissipated=dissipated,
+            lost_supplied=lost_supplied,
+            lost_dissipated=lost_dissipated,
+            first=now.first,
+        )
+
+    def unpack(self, state, u, t, h, params):
+        gradient, _ = self.discrete_gradient(u, state, h, params)
+        driven, outputs, loss = self.ports(u, state, t, h, params)
+        now, (velocity, multipliers) = self.state.split(state), self.unknowns.split(u)
+        power = jnp.stack([gradient @ velocity, driven @ outputs, loss])
+        work = jnp.stack([now.supplied + now.lost_supplied, now.dissipated + now.lost_dissipated])
+        row = {"x": now.x, "work": work, "power": power}
+        return row | {"multipliers": self.relation.spread(multipliers)} if self.relation.saved else row
+
+    def start(self, data, h, params):
+        if "x" not in data:
+            raise ValueError("this scheme starts from x=.")
+        state = self.state.join(x=data["x"], first=self.energy.hamiltonian(data["x"], params))
+        return state, self.unknowns.join(velocity=data["velocity"])
+
+
+def _add(total, lost, term):
+    """A running sum and its lost digits after one more term (Neumaier's compensated summation)."""
+    new = total + term
+    small = jnp.where(jnp.abs(total) >= jnp.abs(term), (total - new) + term, (term - new) + total)
+    return new, lost + small

@@ -1,0 +1,229 @@
+"""One step of the discrete Lagrange–d'Alembert equations on Q: the step of the (+), (−), midpoint and trapezoidal schemes."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dirax.program.roots import nearest_root
+from dirax.program.tracing import once
+from dirax.program.user_functions import UserFunction
+from dirax.schemes.abstract_step import AbstractStep
+from dirax.schemes.constraint_rows import ConstraintRows, step_constraints
+from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian, slot_derivatives
+from dirax.schemes.layout import Layout
+from dirax.schemes.step import Field, Shape
+from dirax.schemes.work_of_forces import WorkOfForces
+from dirax.systems.lagrange_dirac import LagrangeDirac
+
+MOMENTA = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}
+"""The share of the constraint force at a node that is taken off its incoming momentum p_k before p is saved, by the name of
+the momentum."""
+
+
+@dataclass(frozen=True, eq=False)
+class LagrangeDAlembertStep(AbstractStep):
+    """p_k + D1 L_d = Wᵀμ + Gᵀλ, w_d(q_k, q_{k+1}) = 0, g(q_{k+1}) = 0, p_{k+1} = D2 L_d, where D1 L_d and D2 L_d include the
+    impulses of forces.
+
+    The state is (q, p, work); the unknowns are v with q_{k+1} = q_k + h v, the multipliers (μ, λ), and with holonomic
+    constraints those of the projection of the saved momentum: the velocity v̂ that belongs to it, and σ.
+    Raises `ValueError` for a w_d without one-forms.
+    """
+
+    system: LagrangeDirac
+    shape: Shape
+    rule: str | UserFunction
+    constraint: str | UserFunction
+    momentum: str
+
+    def __post_init__(self):
+        if isinstance(self.constraint, UserFunction) and not self.shape.m:
+            raise ValueError(
+                "constraint is a function w_d(q0, q1, h), but the system has no one_forms, whose forces would impose it: "
+                "give the system one_forms=, or leave constraint out."
+            )
+
+    # ------------------------------------------------------------------------------------------- what it is made of
+
+    @cached_property
+    def rows(self) -> ConstraintRows:
+        """The constraints that enter the equations."""
+        return ConstraintRows(self.system, self.shape)
+
+    @cached_property
+    def work(self) -> WorkOfForces:
+        """The state with the work of the forces."""
+        return WorkOfForces(self.system, self.shape.n)
+
+    @cached_property
+    def discrete_lagrangian(self):
+        """L_d as a function (t0, q0, v, h, params)."""
+        return discrete_lagrangian(self.system.lagrangian, self.rule)
+
+    @cached_property
+    def discrete_constraint(self):
+        """w_d as a function (t0, q0, v, h, params)."""
+        return discrete_constraint(self.system.constraints, self.constraint, self.shape.m)
+
+    @cached_property
+    def impulses(self):
+        """(f_d^−, f_d^+) as a function (t0, q0, v, h, params), None without forces."""
+        return None if self.system.forces is None else discrete_forces(self.system.forces, self.rule)
+
+    @property
+    def projects(self) -> bool:
+        """Whether the saved momentum is projected, for holonomic constraints."""
+        return self.rows.holonomic > 0
+
+    @property
+    def share(self) -> float:
+        """The share of Wᵀμ that is taken off p_k before it is saved."""
+        return MOMENTA[self.momentum] if self.shape.m else 0.0
+
+    @property
+    def state(self) -> Layout:
+        return self.work.layout
+
+    @property
+    def unknowns(self) -> Layout:
+        n, rows = self.shape.n, self.rows
+        return Layout(v=n, multipliers=rows.count, saved_v=n if self.projects else 0, sigma=rows.holonomic)
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        n = self.shape.n
+        return {"q": Field((n,)), "p": Field((n,)), **self.rows.fields(), **self.work.fields}
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        balance = tuple(f"discrete Lagrange–d'Alembert equation {i}" for i in range(self.shape.n))
+        projected = self.shape.n + self.rows.holonomic if self.projects else 0
+        return balance + self.rows.labels() + tuple(f"projection of the momentum {i}" for i in range(projected))
+
+    @property
+    def canonical(self) -> bool:
+        return not self.work.size
+
+    # -------------------------------------------------------------------------------------------------- the equations
+
+    @once
+    def slots(self, t, q, v, h, params):
+        """(D1 L_d + f_d^−, D2 L_d + f_d^+): a step leaves its first point with minus the one, and arrives with the other."""
+        d1, d2 = slot_derivatives(self.discrete_lagrangian, t, q, v, h, params)
+        if self.impulses is None:
+            return d1, d2
+        first, last = self.impulses(t, q, v, h, params)
+        return d1 + first, d2 + last
+
+    def step_constraint(self, t, q, v, h, params, unit=1.0):
+        """(w_d(q0, q1), g(q1)/unit), of all constraints."""
+        return step_constraints(self.rows, self.discrete_constraint)(t, q, v, h, params, unit)
+
+    def equations(self, v, multipliers, q, p, t, h, params):
+        """The balance of momentum and the constraints, all in the unit of W v."""
+        balance = p + self.slots(t, q, v, h, params)[0]
+        if not self.rows.count:
+            return balance
+        imposed = self.rows.pick(self.step_constraint(t, q, v, h, params, unit=h))
+        return jnp.concatenate([balance - self.rows.matrix(t, q, params).T @ multipliers, imposed])
+
+    def saved_momentum(self, multipliers, sigma, q, p, t, params):
+        """p_k − share·Wᵀμ − Gᵀσ."""
+        if self.share:
+            count = self.rows.nonholonomic
+            p = p - self.share * (self.rows.matrix(t, q, params)[:count].T @ multipliers[:count])
+        return p - self.rows.holonomic_matrix(t, q, params).T @ sigma if self.projects else p
+
+    def projection(self, saved_v, sigma, multipliers, q, p, t, params):
+        """∂L/∂v(q, v̂) is the saved momentum, and G v̂ + ∂g/∂t = 0."""
+        missed = self.system.legendre(q, saved_v, params, t) - self.saved_momentum(multipliers, sigma, q, p, t, params)
+        return jnp.concatenate([missed, self.rows.hidden(t, q, saved_v, params)])
+
+    def residual(self, u, state, t, h, params):
+        u, (q, p, _) = self.unknowns.split(u), self.state.split(state)
+        missed = self.equations(u.v, u.multipliers, q, p, t, h, params)
+        if not self.projects:
+            return missed
+        return jnp.concatenate([missed, self.projection(u.saved_v, u.sigma, u.multipliers, q, p, t, params)])
+
+    def advance(self, u, state, t, h, params):
+        q, v = self.state.split(state).q, self.unknowns.split(u).v
+        _, p1 = self.slots(t, q, v, h, params)
+        # outside the domain of L its derivatives can still be numbers: those of log q are, for q < 0
+        inside = jnp.isfinite(self.system.lagrangian.at(t + h, q + h * v, v, params))
+        end = [q + h * v, jnp.where(inside, p1, jnp.nan)]
+        return self.work.add(state, end, None if self.impulses is None else sum(self.impulses(t, q, v, h, params)) @ v)
+
+    def unpack(self, state, u, t, h, params):
+        u, (q, p, _) = self.unknowns.split(u), self.state.split(state)
+        row = {"q": q, "p": self.saved_momentum(u.multipliers, u.sigma, q, p, t, params)}
+        if self.shape.m + self.shape.c:
+            constraint = self.step_constraint(t, q, u.v, h, params)
+            row |= {"multipliers": self.rows.all(u.multipliers), "constraint": constraint}
+        return row | self.work.row(state)
+
+    # ------------------------------------------------------------------------------------------------------ the start
+
+    def start(self, data, h, params):
+        t = data.get("t", 0.0)
+        if "q0" in data:
+            return self._start_from_two_points(data["q0"], (data["q1"] - data["q0"]) / h, t, h, params)
+        q, p, v = data["q"], data["p"], data["v"]
+        if self.share or self.projects:
+            p, u = self._incoming_momentum(q, p, v, t, h, params)
+            return self.work.start(q, p), u
+        return self.work.start(q, p), self.unknowns.join(v=v)
+
+    def _start_from_two_points(self, q, v, t, h, params):
+        p = -self.slots(t, q, v, h, params)[0]
+        if not self.projects:
+            return self.work.start(q, p), self.unknowns.join(v=v)
+        end, none = Layout(saved_v=self.shape.n, sigma=self.rows.holonomic), jnp.zeros(self.rows.count)
+
+        def projection(found):
+            saved_v, sigma = end.split(found)
+            return self.projection(saved_v, sigma, none, q, p, t, params)
+
+        saved_v, sigma = end.split(nearest_root(projection, end.join(saved_v=v)))
+        return self.work.start(q, p), self.unknowns.join(v=v, saved_v=saved_v, sigma=sigma)
+
+    def _incoming_momentum(self, q, p, v, t, h, params) -> tuple[Float[Array, " n"], Float[Array, " k"]]:
+        """The incoming momentum whose saved momentum is p, with the unknowns of the step that leaves it.
+
+        λ is that of the leaving step and of one that would arrive at (q, p): the whole impulse, of second order here too.
+        """
+        step = Layout(v=self.shape.n, multipliers=self.rows.count)
+        both = Layout(leaving=step.size, arriving=step.size * self.projects)
+        guess = both.join(leaving=step.join(v=v), **({"arriving": step.join(v=v)} if self.projects else {}))
+
+        def equations(u):
+            leaving, arriving = both.split(u)
+            leaving = step.split(leaving)
+            missed = self.equations(leaving.v, leaving.multipliers, q, p, t, h, params)
+            if not self.projects:
+                return missed
+            arriving = step.split(arriving)
+            return jnp.concatenate([missed, self._arriving(arriving.v, arriving.multipliers, q, p, t, h, params)])
+
+        found = nearest_root(equations, guess)
+        found = both.split(jnp.where(jnp.all(jnp.isfinite(found)), found, guess))
+        rows, share, leaving = self.rows, self.share, step.split(found.leaving)
+        # with incoming p + s/(1−s) Wᵀμ the multiplier is μ/(1−s), and its share is taken off again; at s = 1 nothing is added
+        mu = leaving.multipliers[: rows.nonholonomic]
+        jump = share / (1.0 - share) * mu if share < 1.0 else 0.0 * mu
+        if not self.projects:
+            return p + rows.matrix(t, q, params).T @ jump, self.unknowns.join(v=leaving.v, multipliers=mu + jump)
+        sigma = step.split(found.arriving).multipliers[rows.nonholonomic :]
+        jump = jnp.concatenate([jump, sigma])
+        u = self.unknowns.join(v=leaving.v, multipliers=leaving.multipliers + jump, saved_v=v, sigma=sigma)
+        return p + rows.matrix(t, q, params).T @ jump, u
+
+    def _arriving(self, v, multipliers, q, p, t, h, params):
+        """The equations of (v, μ, σ) for a step from q − h v on the constraints to (q, p)."""
+        rows, before = self.rows, q - h * v
+        missed = p - self.slots(t - h, before, v, h, params)[1] + rows.matrix(t, q, params).T @ multipliers
+        g = rows.constraints.position_defect(t - h, before, params) / h
+        imposed = rows.pick(jnp.concatenate([self.discrete_constraint(t - h, before, v, h, params), g]))
+        return jnp.concatenate([missed, imposed])

@@ -1,0 +1,42 @@
+"""The state (q, p) with the work of the forces carried beside it, for systems with forces."""
+
+from typing import Any
+
+from jaxtyping import Array, Float
+
+from dirax.schemes.layout import Layout
+from dirax.schemes.step import Field
+
+
+class WorkOfForces:
+    """The state (q, p, work) of a Lagrangian system with n coordinates; without forces `work` is empty.
+
+    The work is that since the start, so that E_N − E_0 − work is what the method itself changes.
+    """
+
+    def __init__(self, system: Any, n: int):
+        self.forces = getattr(system, "forces", None)
+        self.size = int(self.forces is not None)
+        self.layout = Layout(q=n, p=n, work=self.size)
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        """What is saved of it."""
+        return {"work": Field((), "node", (), "work of the forces since the start")} if self.size else {}
+
+    def start(self, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " s"]:
+        """The first state."""
+        return self.layout.join(q=q, p=p)
+
+    def after(self, state: Array, end: list[Array], t: Any, q: Array, v: Array, h: Any, params: Any) -> Float[Array, " s"]:
+        """The state (q1, p1) = `end` with the work h⟨f(t, q, v), v⟩ added."""
+        return self.add(state, end, None if self.forces is None else h * self.forces(t, q, v, params) @ v)
+
+    def add(self, state: Array, end: list[Array], work: Array | None) -> Float[Array, " s"]:
+        """The state (q1, p1) = `end` with this work added, None without forces."""
+        before = self.layout.split(state).work
+        return self.layout.join(q=end[0], p=end[1], work=before if work is None else before + work)
+
+    def row(self, state: Array) -> dict[str, Array]:
+        """What is saved of a state."""
+        return {"work": self.layout.split(state).work[0]} if self.size else {}
