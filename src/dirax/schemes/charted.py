@@ -11,6 +11,7 @@ from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import LD_ARGUMENTS
 from dirax.schemes.lagrange_dirac import discrete_lagrange_dalembert
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
+from dirax.schemes.step_forms import ChartedForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 
@@ -27,6 +28,9 @@ class InCharts(AbstractScheme):
     map: AbstractDiscretizationMap
     atlas: Atlas | None = None
 
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
+        return "no structure on a Q × Q that is not flat is stated; whether a step is symplectic is measured instead"
+
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         if not isinstance(system, ManifoldLagrangian):
             raise TypeError(f"dx.InCharts steps a dx.ManifoldLagrangian, but a {type(system).__name__} was given.")
@@ -36,6 +40,9 @@ class InCharts(AbstractScheme):
         if not isinstance(manifold, AbstractGeodesicManifold):
             raise TypeError(f"dx.InCharts needs a manifold with a retraction, and {manifold!r} has none.")
         return _charted(system, manifold, self.map, self.atlas or Atlas(manifold), shape.n)
+
+    def step_form(self, system: Any, shape: Shape, step: Any) -> ChartedForm:
+        return ChartedForm(system, step)
 
 
 def _charted(system, manifold, map, atlas: Atlas, size: int) -> StepEquation:

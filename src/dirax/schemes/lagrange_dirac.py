@@ -19,13 +19,15 @@ from dirax.schemes.discrete_lagrangian import (
     discrete_lagrangian,
     slot_derivatives,
 )
+from dirax.schemes.discrete_structure_pairs import LagrangianPairs, structure_on_pairs
 from dirax.schemes.reduced import lagrange_poincare_dirac
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.schemes.work import WorkBook, work_field
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import as_lagrange_dirac
 
-MOMENTA = ("incoming", "mean", "outgoing")
+MOMENTA = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}
+"""The part of the constraint force at a node that is taken off the incoming momentum before it is saved."""
 
 
 class LagrangeDAlembert(AbstractScheme):
@@ -73,6 +75,10 @@ class LagrangeDAlembert(AbstractScheme):
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         return _on_q_or_quotient(system, shape, self.discrete_lagrangian, self.constraint, self.momentum)
 
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
+        share = MOMENTA[self.momentum]
+        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, self.constraint, share=share)
+
 
 class PlusLagrangeDirac(AbstractScheme):
     """The (+)-discrete Lagrange–Dirac scheme ([PY] Def 6.7, (53), (58)): the constraint holds at the new point q_{k+1}.
@@ -90,6 +96,9 @@ class PlusLagrangeDirac(AbstractScheme):
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         return _on_q_or_quotient(system, shape, self.discrete_lagrangian, "right", "incoming")
+
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
+        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "right", sign="+")
 
 
 class MinusLagrangeDirac(AbstractScheme):
@@ -109,6 +118,9 @@ class MinusLagrangeDirac(AbstractScheme):
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         return _on_q_or_quotient(system, shape, self.discrete_lagrangian, "left", "incoming", -1)
+
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
+        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "left", sign="-")
 
 
 def _on_q_or_quotient(system: Any, shape: Shape, rule, constraint, momentum: str, sign: int = +1) -> StepEquation:
@@ -138,7 +150,7 @@ def discrete_lagrange_dalembert(system: Any, shape: Shape, rule, constraint, mom
     wd = discrete_constraint(system.constraints, constraint, m)
     step_constraint = step_constraints(rows, wd)
     impulses = None if system.forces is None else discrete_forces(system.forces, rule)
-    share = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}[momentum] if m else 0.0
+    share = MOMENTA[momentum] if m else 0.0
 
     def slots(t, q, v, h, params):
         return once(both_slots)(t, q, v, h, params)

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.program.memo import Memo
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
+from dirax.schemes.step_forms import form_of_steps
 from dirax.systems.shape import Shape
 from dirax.text.representation import counted, html_table, module_html, module_text
 
@@ -134,6 +136,20 @@ class AbstractScheme(eqx.Module):
     @abstractmethod
     def step_equation(self, system: Any, shape: Shape) -> StepEquation | StepSequence:
         """The equation of one step; raises `TypeError` for a system that the scheme does not discretize."""
+
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
+        """The discrete Dirac structure that consecutive rows belong to, for steps of size `step`; or why there is none."""
+        return f"{type(self).__name__} states no discrete Dirac structure"
+
+    def step_form(self, system: Any, shape: Shape, step: Any) -> AbstractStepForm | str:
+        """The form on its states whose change in one step is known; or why none is."""
+        equation = make_step_equation(self, system, shape)
+        return form_of_steps(system, step, equation, self.discrete_structure(system, shape, step))
+
+    @property
+    def constraints_at_rows(self) -> bool:
+        """Whether the constraints hold at the saved rows to roundoff, and not inside the steps alone."""
+        return True
 
 
 def previous_unknowns(state, previous, h, params):
