@@ -13,7 +13,7 @@ from hypothesis import given, settings
 import dirax as dx
 from dirax.diagnostics.drift import SMALLEST_SERIES, judge, oscillations
 from dirax.diagnostics.judging import EPSILON, ROUNDINGS
-from dirax.diagnostics.one_step import discrete_system, membership_defect, structural_defect
+from dirax.diagnostics.one_step import differentiated_step
 from dirax.diagnostics.report import Line, Report
 from dirax.diagnostics.verify import verify
 from dirax.schemes.step import explicit_step
@@ -31,6 +31,7 @@ def disk_forms(q):
 
 
 DISK = dx.LagrangeDirac(disk_lagrangian, disk_forms)
+DISK_SHAPE = dx.Shape(4, 2)
 KEPLER = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 1 / jnp.sqrt(q @ q))
 KEPLER_START = {"q": [0.4, 0.0], "v": [0.0, 2.0]}
 ROTATION = {"rotation": lambda q: jnp.array([-q[1], q[0]])}
@@ -169,10 +170,11 @@ def test_membership_is_that_of_the_printed_formulas(plus_disk):
     matrix = np.asarray(disk_forms(q[1]))
     residual = force - matrix.T @ np.linalg.lstsq(matrix.T, force, rcond=None)[0]
     assert np.max(np.abs(residual)) < 1e-11 < 1e-3 < np.max(np.abs(force))
-    measure, given = eqx.filter_jit(membership_defect), (plus_disk.p[201], plus_disk.multipliers[201])
-    assert np.max(measure(discrete_system(DISK, dx.PlusLagrangeDirac(), h), 0.0, *q, *given, None)) < EPSILON
+    rows = {"q": q, "p": plus_disk.p[200:203], "multipliers": plus_disk.multipliers[200:202], "t": h * np.arange(3)}
+    measure = eqx.filter_jit(lambda structure: structure.membership_defect(jax.tree.map(jnp.asarray, rows), None))
+    assert np.max(measure(dx.PlusLagrangeDirac().discrete_structure(DISK, DISK_SHAPE, h))) < EPSILON
     # the constraint of the other sign is missed by h|dW||v|, here in units of |W||q|/h
-    assert measure(discrete_system(DISK, dx.MinusLagrangeDirac(), h), 0.0, *q, *given, None)[0] > 1e-6
+    assert measure(dx.MinusLagrangeDirac().discrete_structure(DISK, DISK_SHAPE, h))[0] > 1e-6
 
 
 # -------------------------------------------------------------------------------------- the structural relation φ*Ω = Ω + dβ
@@ -189,6 +191,14 @@ def disk_map(z, h):
     system = np.block([[mass, w.T], [w, np.zeros((2, 2))]])
     solved = np.linalg.solve(system, np.concatenate([p - h * gradient, np.zeros(2)]))
     return np.concatenate([q1, q1 + h * solved[:4]]), w.T @ solved[4:]
+
+
+def structural_defect(structure, equation, q0, q1):
+    """The numbers of the relation φ*Ω = Ω + dβ at a pair, q1 at time 0."""
+    h = structure.step
+    step = lambda state, guess, t, params: differentiated_step(equation, h, state, guess, t, params)
+    rows = {"q": jnp.stack([q0, q1]), "t": jnp.array([-h, 0.0])}
+    return eqx.filter_jit(lambda rows: structure.step_form.defect(step, equation, rows, None))(rows)
 
 
 def complex_step(function, z):
@@ -213,8 +223,8 @@ def test_the_structural_relation_agrees_with_an_independent_computation(minus_di
     # printed with β over the first point of the pair, the relation is wrong (by h|v| of the force's part, for small h)
     assert restrict(change - (over_first.T - over_first)) > 1e-2 * restrict(change) > 1e-5 * np.max(form)
 
-    discrete = discrete_system(DISK, dx.MinusLagrangeDirac(), h)
-    measured = eqx.filter_jit(structural_defect)(discrete, minus_disk.equation, q0, q1, 0.0, None)
+    discrete = dx.MinusLagrangeDirac().discrete_structure(DISK, DISK_SHAPE, h)
+    measured = structural_defect(discrete, minus_disk.equation, q0, q1)
     size = np.max(np.abs(jacobian).T @ np.abs(form) @ np.abs(jacobian)) + np.max(np.abs(derivative))
     assert measured[0] < 1e-14
     assert measured[1] == pytest.approx(restrict(change) / size, rel=1e-9)
@@ -228,8 +238,8 @@ def test_a_force_outside_the_annihilator_breaks_the_structural_relation():
     equation = dx.make_step_equation(scheme, heisenberg, dx.Shape(3, 1))
     q0, q1 = np.array([1.0, 0.2, 0.1]), np.array([1.05, 0.3, 0.01])
     other = dx.LagrangeDirac(free, lambda q: jnp.array([[-q[1], q[0], 1.1]]))
-    discrete = discrete_system(other, scheme, 0.01)
-    assert eqx.filter_jit(structural_defect)(discrete, equation, q0, q1, 0.0, None)[0] > 1e-5
+    discrete = scheme.discrete_structure(other, dx.Shape(3, 1), 0.01)
+    assert structural_defect(discrete, equation, q0, q1)[0] > 1e-5
 
 
 # ---------------------------------------------------------------------------------------------------- symplecticity, momenta

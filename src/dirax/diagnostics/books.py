@@ -2,14 +2,13 @@
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
+import equinox as eqx
 import numpy as np
 
 from dirax.diagnostics.judging import roundoff_limit
 from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line
+from dirax.diagnostics.rows import energy_of, over_rows
 from dirax.solution.solution import Solution
-from dirax.systems.port_hamiltonian import PortHamiltonian
 
 PORTS = 2
 """Entries of `work` where it keeps books: energy supplied, energy dissipated."""
@@ -20,6 +19,11 @@ def keeps_books(sol: Solution) -> bool:
     return "work" in sol.fields and sol.field_info["work"].shape == (PORTS,)
 
 
+def has_power(sol: Solution) -> bool:
+    """Whether the run saves the power stored, supplied and dissipated in every step."""
+    return "power" in sol.fields and sol.field_info["power"].dims == ("power",)
+
+
 def balances(sol: Solution, energy_scale: float, tolerance: float | None) -> list[Line]:
     """The power balance of every step, and the books over the whole run, where the solution has them.
 
@@ -27,7 +31,7 @@ def balances(sol: Solution, energy_scale: float, tolerance: float | None) -> lis
     """
     limit = roundoff_limit(tolerance, 1)
     lines = []
-    if "power" in sol.fields:
+    if has_power(sol):
         lines.append(_step_balance(sol, energy_scale, limit))
     if keeps_books(sol):
         lines.append(_whole_balance(sol, energy_scale, limit))
@@ -47,30 +51,24 @@ def _step_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
     if keeps_books(sol):
         text = "power stored less supplied plus dissipated"
         if sol.save_every == 1 and np.all(sol.ok):
-            change = np.diff(np.asarray(sol.energy(), dtype=float), axis=-1) / h
+            change = np.diff(energy_of(sol), axis=-1) / h
             worst = max(worst, np.nanmax(np.abs(change - stored) / sizes))
             text += "; stored is the change of H"
     return _line(name, float(worst), limit, text)
 
 
 def _flow(sol: Solution) -> float:
-    """The largest sum of the sizes of the terms of ⟨dH, ẋ⟩, which may cancel, at the saved rows: |dH|ᵀ (|J − R| |dH| + 1),
-    where 1 is the unit in which ẋ is solved."""
-    system: Any = sol.system
-    if not isinstance(system, PortHamiltonian):
-        return 0.0
-    x, params = jnp.asarray(sol.fields["x"]), sol.params_of_one
+    """The largest sum of the sizes of the terms of ⟨dH, ẋ⟩, which may cancel, at the saved rows."""
+    return float(np.nanmax(over_rows(eqx.Partial(_flow_size, sol.system), sol, (np.asarray(sol.fields["x"]),))))
 
-    def terms(x):
-        dh = jnp.abs(system.differential(x, params))
-        return dh @ (jnp.abs(system.flow_matrix(x, params)) @ dh + 1.0)
 
-    return float(np.nanmax(np.asarray(jax.jit(jax.vmap(terms))(x.reshape(-1, x.shape[-1])))))
+def _flow_size(system: Any, x, params: Any):
+    return system.flow_size(x, params)
 
 
 def _whole_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
     """H − H(0) − supplied + dissipated at every saved row."""
-    energy, work = np.asarray(sol.energy()), np.asarray(sol.fields["work"])
+    energy, work = energy_of(sol), np.asarray(sol.fields["work"])
     supplied, dissipated = work[..., 0], work[..., 1]
     missing = np.abs(energy - energy[..., :1] - supplied + dissipated)
     sizes = energy_scale + np.abs(supplied) + np.abs(dissipated)

@@ -6,31 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.books import balances, keeps_books
+from dirax.diagnostics.books import balances, has_power, keeps_books
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.judging import EPSILON, ROUNDINGS, of_lane, sampled_terms, steps_of
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, Line
+from dirax.diagnostics.rows import energy_of
 from dirax.solution.solution import Solution
-from dirax.systems.dirac_system import DiracSystem
-from dirax.systems.lagrange_dirac import LagrangeDirac
-from dirax.systems.nonholonomic import as_lagrange_dirac
-from dirax.systems.port_hamiltonian import PortHamiltonian
 
 
 def energy_less_work(sol: Solution) -> tuple[np.ndarray, bool, str]:
     """The energy less the work of the forces, (…, rows), whether there are forces, and why the system changes it all the
     same ("" if it does not)."""
-    energy, system = np.asarray(sol.energy()), as_lagrange_dirac(sol.system)
+    energy = energy_of(sol)
     forced = "work" in sol.fields and not keeps_books(sol)
     if forced:
         energy = energy - np.asarray(sol.fields["work"])
-    if isinstance(system, PortHamiltonian) and (system.R is not None or system.inputs is not None):
-        return energy, forced, "does not conserve it"
-    if isinstance(system, LagrangeDirac) and system.depends_on_time:
-        return energy, forced, "depends on time and does not conserve it"
-    if isinstance(system, LagrangeDirac) and system.affine is not None:
-        return energy, forced, "has constraints that do work (affine) and does not conserve it"
-    return energy, forced, ""
+    return energy, forced, "" if sol.system is None else sol.system.energy_changes
 
 
 def energy_line(sol: Solution) -> Line:
@@ -40,6 +31,8 @@ def energy_line(sol: Solution) -> Line:
     except ValueError as error:
         return Line(name, None, None, NOT_CHECKED, str(error))
     energy = energy.reshape(-1, energy.shape[-1])
+    if not np.any(np.isfinite(energy)):
+        return Line(name, None, None, NOT_CHECKED, "the system states no energy")
     roundoff = ROUNDINGS * EPSILON * steps_of(sol) * energy_scale(sol, energy)
     if changes:
         change = float(np.nanmax(np.abs(energy - energy[:, :1])))
@@ -63,10 +56,9 @@ def energy_line(sol: Solution) -> Line:
 
 def port_lines(sol: Solution, tolerance: float | None) -> list[Line]:
     """The balances of a system with ports."""
-    balanced = "power" in sol.fields or keeps_books(sol)
-    if not balanced or not isinstance(sol.system, PortHamiltonian | DiracSystem):
+    if sol.system is None or not (has_power(sol) or keeps_books(sol)):
         return []
-    energy = np.asarray(sol.energy())
+    energy = energy_of(sol)
     return balances(sol, energy_scale(sol, energy), tolerance)
 
 

@@ -3,11 +3,10 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.one_step import over_rows
 from dirax.diagnostics.report import OK, VIOLATED, Line
+from dirax.diagnostics.rows import over_rows, times_at
 from dirax.solution.solution import Solution
 
 EPSILON = 2.0**-52
@@ -18,10 +17,11 @@ SAMPLED_ROWS = 64
 """Rows at which natural scales are taken."""
 
 
-def where_reached(values: np.ndarray, items: tuple, sol: Solution) -> np.ndarray:
-    """The values, 0 at rows that were not reached, and infinite where finite rows give no finite value."""
-    finite = [np.all(np.isfinite(item), axis=-1) for item in items]
-    reached = np.logical_and.reduce(finite).reshape(values.shape[:2])[..., None]
+def where_reached(values: np.ndarray, items: dict[str, np.ndarray]) -> np.ndarray:
+    """The values (B, rows, …), 0 at rows whose items (…, rows, …) were not reached, and infinite where finite ones give no
+    finite value."""
+    finite = [np.all(np.isfinite(a).reshape(*values.shape[:2], -1), axis=-1) for a in items.values()]
+    reached = np.logical_and.reduce(finite)[..., None]
     return np.where(reached, np.where(np.isfinite(values), values, np.inf), 0.0)
 
 
@@ -60,11 +60,6 @@ def of_lane(sol: Solution, lane: int) -> str:
 
 def steps_of(sol: Solution) -> int:
     return max(1, round(float(sol.t[-1] - sol.t[0]) / float(sol.step)))
-
-
-def times_at(sol: Solution, rows: np.ndarray):
-    t = jnp.asarray(sol.t)[rows]
-    return t if sol.batch is None else jnp.broadcast_to(t, (sol.batch, len(rows)))
 
 
 def sampled_terms(sol: Solution, terms: Callable) -> np.ndarray:

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.judging import judged, of_lane, relative_changes, roundoff_limit, steps_of
-from dirax.diagnostics.one_step import over_rows
 from dirax.diagnostics.report import NOT_CHECKED, Line
-from dirax.reduction.reduced import ReducedLagrangeDirac
+from dirax.diagnostics.rows import initial_of_one, over_rows
 from dirax.solution.solution import Solution
 
 Symmetries = Mapping[str, Callable] | Sequence[int] | None
@@ -65,7 +64,7 @@ def momentum(sol: Solution, name: str, generator: Callable, tolerance: float | N
     title = f"momentum map {name}"
     if "p" not in sol.fields or "q" not in sol.fields:
         return Line(title, None, None, NOT_CHECKED, "the solution has no q and p")
-    values = over_rows(eqx.Partial(_momentum_terms, generator), sol, (jnp.asarray(sol.q), jnp.asarray(sol.p)))
+    values = over_rows(eqx.Partial(_momentum_terms, generator), sol, (np.asarray(sol.q), np.asarray(sol.p)))
     change, relative = relative_changes(values[..., :1], np.nanmax(values[..., 1], axis=1))
     lane = int(np.argmax(relative))
     text = f"⟨p, ξ⟩ = {values[lane, 0, 0]:.6g} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
@@ -74,7 +73,7 @@ def momentum(sol: Solution, name: str, generator: Callable, tolerance: float | N
 
 def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
     """μ of a run on the quotient by an abelian symmetry, relative to the largest momentum, w and μ."""
-    if not isinstance(sol.system, ReducedLagrangeDirac):
+    if sol.system is None or sol.system.unreduced() is None:
         return []
     title, mu = "momentum map μ", np.asarray(sol.fields["mu"]).reshape(-1, *np.shape(sol.fields["mu"])[-2:])
     w = np.asarray(sol.fields["w"]).reshape(*mu.shape[:2], -1)
@@ -82,15 +81,9 @@ def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
     change, relative = relative_changes(mu, scale)
     lane = int(np.argmax(change))
     text = f"{np.array2string(mu[lane, 0], precision=6)} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
-    if _moved(sol):
+    if sol.system.moves_momentum(initial_of_one(sol), sol.params_of_one):
         return [Line(title, float(change[lane]), None, NOT_CHECKED, f"forces with a part along the group move it; {text}")]
     return [judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)]
-
-
-def _moved(sol: Solution) -> bool:
-    """Whether something of the system has a part along the group."""
-    one = {name: jnp.asarray(a)[0] if np.ndim(a) == 2 else jnp.asarray(a) for name, a in sol.initial.items()}
-    return bool(sol.system.moves_momentum(one, sol.params_of_one))
 
 
 def _momentum_terms(generator: Callable, q, p, params: Any):

@@ -8,8 +8,7 @@ from dirax.diagnostics.energy_lines import energy_line, port_lines
 from dirax.diagnostics.judging import steps_of
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.report import OK, VIOLATED, Line, Report
-from dirax.diagnostics.structure_lines import membership, symplecticity
-from dirax.reduction.reduced import ReducedLagrangeDirac
+from dirax.diagnostics.structure_lines import membership, structure_of, symplecticity
 from dirax.solution.reconstruction import reconstruct
 from dirax.solution.solution import Solution
 
@@ -48,11 +47,12 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     if not isinstance(sol, Solution):
         raise TypeError(f"sol must be a dirax Solution (from dx.simulate or dx.load), but a {type(sol).__name__} was given.")
     generators = generators_of(sol, symmetries)
-    whole = reconstruct(sol) if isinstance(sol.system, ReducedLagrangeDirac) else sol
+    whole = reconstruct(sol) if sol.system is not None and sol.system.unreduced() is not None else sol
+    structure = structure_of(whole)
     lines = [
         _completion(sol),
-        *membership(whole, tolerance),
-        constraint(whole, tolerance),
+        *membership(whole, structure, tolerance),
+        constraint(whole, structure, tolerance),
         hidden_constraint(whole, tolerance),
         energy_line(sol),
         *port_lines(sol, tolerance),

@@ -203,6 +203,10 @@ class EulerPoincare(AbstractSystem):
         momentum, a = self.space.split(row["x"])
         return self.constraint_forms(a, params) @ self.inverse_legendre(momentum, a, params)
 
+    @property
+    def dual(self) -> SemidirectProduct:
+        return self.space
+
 
 def _constant(matrix: Any) -> Callable:
     values = np.asarray(matrix, dtype=float)

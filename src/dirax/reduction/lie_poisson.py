@@ -80,6 +80,10 @@ class LiePoisson(AbstractSystem):
     def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, "0"]:
         return no_constraint()
 
+    @property
+    def dual(self) -> SemidirectProduct:
+        return self.space
+
 
 def checked_point(space: SemidirectProduct, data: dict[str, Array], kind: str, way: str) -> tuple[Algebra, Advected]:
     """(μ, a) of the initial data; raises `ValueError` for data that are no point x of shape (d + r,)."""

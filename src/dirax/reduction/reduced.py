@@ -142,6 +142,10 @@ class ReducedLagrangeDirac(AbstractSystem):
     def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
         return self.system.constraint_at(self.unreduced_row(row), params)
 
+    @property
+    def energy_changes(self) -> str:
+        return self.system.energy_changes
+
 
 def sampled(data: dict[str, Array]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times, points and velocities, (1 + SAMPLES, …) each: the initial data, at t = 0, and random ones near them."""

@@ -15,6 +15,7 @@ from dirax.schemes.discrete_lagrangian import LD_ARGUMENTS
 from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
+from dirax.schemes.step_forms import ChartedForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 
@@ -31,6 +32,9 @@ class InCharts(AbstractScheme):
     map: AbstractDiscretizationMap
     atlas: Atlas | None = None
 
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
+        return "no structure on a Q × Q that is not flat is stated; whether a step is symplectic is measured instead"
+
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         on_manifold = system.manifold_form()
         if on_manifold is None:
@@ -41,6 +45,9 @@ class InCharts(AbstractScheme):
         if not isinstance(manifold, AbstractGeodesicManifold):
             raise TypeError(f"dx.InCharts needs a manifold with a retraction, and {manifold!r} has none.")
         return StepInCharts(on_manifold, manifold, self.map, self.atlas or Atlas(manifold), shape.n).equation()
+
+    def step_form(self, system: Any, shape: Shape, step: Any) -> ChartedForm:
+        return ChartedForm(system, step)
 
 
 @dataclass(frozen=True, eq=False)

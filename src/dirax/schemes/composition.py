@@ -40,6 +40,13 @@ class Composition(AbstractScheme):
         inner = make_step_equation(self.scheme, system, shape)
         return StepSequence(tuple((eq, a * c) for c in self.coefficients for eq, a in inner.stages))
 
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
+        return between_the_parts(self)
+
+    @property
+    def constraints_at_rows(self) -> bool:
+        return self.scheme.constraints_at_rows
+
 
 class Adjoint(AbstractScheme):
     """The adjoint Φ*_h = (Φ_{−h})⁻¹ of a scheme: x1 = Φ*_h(x0) iff x0 = Φ_{−h}(x1).
@@ -55,6 +62,10 @@ class Adjoint(AbstractScheme):
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         return _adjoint_of(self.scheme, system, shape, "Adjoint takes a one-stage scheme: compose the parts' adjoints instead.")
 
+    @property
+    def constraints_at_rows(self) -> bool:
+        return self.scheme.constraints_at_rows
+
 
 class SymmetricComposition(AbstractScheme):
     """Φ_{h/2} ∘ Φ*_{h/2}: a self-adjoint scheme, of order 2 at least, from any scheme."""
@@ -65,6 +76,18 @@ class SymmetricComposition(AbstractScheme):
         refusal = "SymmetricComposition takes a one-stage scheme."
         adjoint = _adjoint_of(self.scheme, system, shape, refusal)
         return StepSequence(((adjoint, 0.5), (_one_stage(self.scheme, system, shape, refusal), 0.5)))
+
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
+        return between_the_parts(self)
+
+    @property
+    def constraints_at_rows(self) -> bool:
+        return self.scheme.constraints_at_rows
+
+
+def between_the_parts(scheme: AbstractScheme) -> str:
+    """Why the rows of a composed step belong to no structure."""
+    return f"the points between the parts of a step of {type(scheme).__name__}, which the structure joins, are not saved"
 
 
 def _adjoint_of(scheme: AbstractScheme, system: Any, shape: Shape, refusal: str) -> StepEquation:

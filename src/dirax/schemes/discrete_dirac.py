@@ -1,7 +1,11 @@
 """Discrete Dirac systems by discretization maps ([BLM] §5): one scheme for Hamiltonian, Lagrangian and port systems."""
 
+from typing import Any
+
 from dirax.geometry.cotangent_lift import CotangentLift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure
+from dirax.schemes.discrete_structure_maps import PROJECTED, RelationPairs, structure_on_cotangent_bundle
 from dirax.schemes.discretized import discretized_relation
 from dirax.schemes.lagrangian_methods import discretized_lagrangian, resolved_lagrangian, resolved_nonholonomic
 from dirax.schemes.lifted_lagrangian import lift_of, lifted_lagrangian, projected_lagrangian
@@ -102,6 +106,24 @@ class DiscreteDirac(AbstractScheme):
         if theta is not None and system.manifold_form() is None:
             return resolved_lagrangian(lagrangian, shape, theta)
         return projected_lagrangian(lagrangian, shape, lift_of(_map_on_q(self.map), lagrangian, shape.n))
+
+    def discrete_structure(self, system: AbstractSystem, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
+        if self.constraints == "discretize":
+            relation = system.relation_form(shape)
+        elif system.final_manifold(shape) is None:
+            relation = system.final_relation(shape) or system.relation_form(shape)
+        else:
+            return PROJECTED
+        if relation is not None:
+            return RelationPairs(relation, self.map, step)
+        lagrangian = system.manifold_form() or system.lagrangian_form()
+        if lagrangian is None or (self.constraints == "resolve" and shape.m + shape.c):
+            return PROJECTED
+        return structure_on_cotangent_bundle(lagrangian, shape, self.map, step)
+
+    @property
+    def constraints_at_rows(self) -> bool:
+        return self.constraints == "resolve"
 
 
 def _map_on_q(map: AbstractDiscretizationMap) -> AbstractDiscretizationMap:

@@ -37,6 +37,9 @@ class DiscreteGradient(AbstractScheme):
             raise ValueError(f"nodes must be at least 1, but {nodes} was given.")
         self.kind, self.nodes = kind, int(nodes)
 
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
+        return "the discrete gradient that (x₁ − x₀)/h is paired with in D is not saved; its balance is measured instead"
+
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         relation, energy = system.relation_form(shape), system.energy_form(shape)
         if relation is None or energy is None:

@@ -47,6 +47,9 @@ class DiscreteEulerPoincare(AbstractScheme):
             raise ValueError(f"map must be {' or '.join(RETRACTIONS)}, but {map!r} was given.")
         self.map = map
 
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
+        return "D is the graph of a Lie–Poisson bivector: whether a step is a Poisson map is measured instead"
+
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         if not isinstance(system, EulerPoincare | LiePoisson):
             raise TypeError(

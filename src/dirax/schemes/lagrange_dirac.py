@@ -5,6 +5,7 @@ from typing import Any
 
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import CONSTRAINTS, RULES, checked_rule, mirrored
+from dirax.schemes.discrete_structure_pairs import LagrangianPairs, structure_on_pairs
 from dirax.schemes.lagrange_dalembert_step import MOMENTA, LagrangeDAlembertStep
 from dirax.schemes.lagrange_poincare_dirac import LagrangePoincareDiracStep
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
@@ -71,6 +72,10 @@ class LagrangeDAlembert(AbstractScheme):
         """That of L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h)."""
         return LagrangeDAlembert(mirrored(self.discrete_lagrangian, -1.0), mirrored(self.constraint, 1.0), "incoming")
 
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
+        share = MOMENTA[self.momentum]
+        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, self.constraint, share=share)
+
 
 class PlusLagrangeDirac(AbstractScheme):
     """The (+)-discrete Lagrange–Dirac scheme ([PY] Def 6.7, (53), (58)): the constraint holds at the new point q_{k+1}.
@@ -97,6 +102,9 @@ class PlusLagrangeDirac(AbstractScheme):
     def adjoint(self, system: Any) -> LagrangeDAlembert:
         """That of the general scheme."""
         return self.lagrange_dalembert.adjoint(system)
+
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
+        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "right", sign="+")
 
 
 class MinusLagrangeDirac(AbstractScheme):
@@ -125,6 +133,9 @@ class MinusLagrangeDirac(AbstractScheme):
     def adjoint(self, system: Any) -> LagrangeDAlembert:
         """That of the general scheme."""
         return self.lagrange_dalembert.adjoint(system)
+
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
+        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "left", sign="-")
 
 
 def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, sign: int = +1) -> StepEquation:

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.program.memo import Memo
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
 from dirax.schemes.layout import Layout
+from dirax.schemes.step_forms import form_of_steps
 from dirax.systems.shape import Shape
 from dirax.text.representation import counted, html_table, module_html, module_text
 
@@ -142,6 +144,20 @@ class AbstractScheme(eqx.Module):
         """The adjoint Φ*_h = (Φ_{−h})⁻¹ on this system as a scheme of its own; None where it is the inverse map as such,
         whose equation `dx.Adjoint` makes of the scheme's. A scheme that is self-adjoint returns itself."""
         return None
+
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
+        """The discrete Dirac structure that consecutive rows belong to, for steps of size `step`; or why there is none."""
+        return f"{type(self).__name__} states no discrete Dirac structure"
+
+    def step_form(self, system: Any, shape: Shape, step: Any) -> AbstractStepForm | str:
+        """The form on its states whose change in one step is known; or why none is."""
+        equation = make_step_equation(self, system, shape)
+        return form_of_steps(system, step, equation, self.discrete_structure(system, shape, step))
+
+    @property
+    def constraints_at_rows(self) -> bool:
+        """Whether the constraints hold at the saved rows to roundoff, and not inside the steps alone."""
+        return True
 
 
 def _layout(part: str, layout: Layout | None, name: str, size: int | None) -> tuple[Layout, int]:

@@ -92,7 +92,7 @@ class DiracSystem(AbstractSystem):
         labels = tuple(f"rate of constraint {a}" for a in range(len(shape.kept)))
         saved = shape.m + shape.c
         relation = self.independent(shape).relation
-        return RelationForm(relation, len(shape.kept), labels, saved, shape.spread, canonical=self.canonical)
+        return RelationForm(relation, len(shape.kept), labels, saved, shape.spread, canonical=self.canonical, dirac="(ẋ, dH) ∈ D")
 
     def energy_form(self, shape: Shape) -> EnergyForm:
         return EnergyForm(self.hamiltonian, self.differential, self.independent(shape).relation)
@@ -262,3 +262,7 @@ class DiracSystem(AbstractSystem):
     def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
         """The defect of x, as in `initial_defect`."""
         return self.initial_defect(self.complete({"x": row["x"]}, params, False), params)
+
+    @property
+    def constrains_differential(self) -> bool:
+        return self.holonomic is None

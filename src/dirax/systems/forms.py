@@ -38,7 +38,8 @@ class RelationForm(NamedTuple):
     `residual(x, ẋ, u, t, params)` is zero where (x, ẋ) satisfies the system with multipliers u (k,): N numbers, which are
     paired with the tangent space where M is a submanifold of R^N, and k more, named by `labels`. `spread(u)` puts the
     multipliers among all `saved` ones, whose axis is called `axis`. `observed` is what else is saved.
-    `canonical`: x is (q, p) on T*Q. A node is saved as `node(x, params)`, a dict with the keys `names`, arrays (N,) each.
+    `canonical`: x is (q, p) on T*Q. `dirac` tells the relation where it is one of a Dirac structure. A node is saved as
+    `node(x, params)`, a dict with the keys `names`, arrays (N,) each.
     """
 
     residual: Callable
@@ -49,6 +50,7 @@ class RelationForm(NamedTuple):
     axis: str = "constraint"
     observed: tuple[Observed, ...] = ()
     canonical: bool = False
+    dirac: str = ""
     names: tuple[str, ...] = ("x",)
     node: Callable = lambda x, params: {"x": x}
 

@@ -201,3 +201,9 @@ class LagrangeDirac(AbstractSystem):
         if not self.constraints.any:
             return no_constraint()
         return self.constraints.defect(row.get("t", 0.0), row["q"], self._velocity(row, params), params)
+
+    @property
+    def energy_changes(self) -> str:
+        if self.depends_on_time:
+            return "depends on time and does not conserve it"
+        return "" if self.affine is None else "has constraints that do work (affine) and does not conserve it"

@@ -151,6 +151,12 @@ class ManifoldLagrangian(AbstractSystem):
         v = self.inverse_legendre(q, row["p"], params)
         return jnp.concatenate([off, self.constraints.nonholonomic_defect(row.get("t", 0.0), q, v, params)])
 
+    @property
+    def energy_changes(self) -> str:
+        if self.depends_on_time:
+            return "depends on time and does not conserve it"
+        return "" if self.affine is None else "has constraints that do work (affine) and does not conserve it"
+
 
 def _tangential(one_forms: UserFunction, manifold: AbstractManifold) -> UserFunction:
     """The one-forms as the tangent vectors that represent them on the manifold."""

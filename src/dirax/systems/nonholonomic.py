@@ -174,6 +174,10 @@ class NonholonomicMechanics(AbstractSystem):
         q, t = row["q"], row.get("t", 0.0)
         return self.constraints.defect(t, q, self.velocity(q, row["p"], params, t), params)
 
+    @property
+    def energy_changes(self) -> str:
+        return self.lagrange_dirac().energy_changes
+
 
 def as_lagrange_dirac(system: Any) -> Any:
     """The `LagrangeDirac` system that a `NonholonomicMechanics` is; any other system as it stands."""

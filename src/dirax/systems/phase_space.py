@@ -46,7 +46,7 @@ class PhaseSpaceLagrangian(AbstractSystem):
         """The Dirac system (dα, H) on M_f = graph α ≅ Q ([BLM] (14)); p = α(q) is saved beside q."""
         form = self.dirac_system().relation_form(Shape(shape.n))
         node = lambda q, params: {"q": q, "p": self.one_form(q, params)}
-        return form._replace(names=("q", "p"), node=node)
+        return form._replace(names=("q", "p"), node=node, dirac="(ẋ, dH) ∈ graph dα")
 
     def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
         return implicit_lagrangian(self.lagrange_dirac(), self, near, params)

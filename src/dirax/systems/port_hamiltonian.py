@@ -126,7 +126,8 @@ class PortHamiltonian(AbstractSystem):
         labels = tuple(f"output y[{a}]" for a in range(shape.m))
         about = "power stored ⟨dH, ẋ⟩, supplied and dissipated at the base point"
         observed = (Observed("power", self.power, (3,), ("power",), about),)
-        return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port", observed=observed)
+        dirac = "ẋ = (J − R) dH + B u" + ", Bᵀ dH = 0 at the closed ports" * bool(shape.m)
+        return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port", observed=observed, dirac=dirac)
 
     def ports(
         self, t: Any, x: Float[Array, " N"], gradient: Float[Array, " N"], params: Any = None
@@ -226,6 +227,15 @@ class PortHamiltonian(AbstractSystem):
 
     def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
         return self.initial_defect({"x": row["x"]}, params)
+
+    @property
+    def energy_changes(self) -> str:
+        return "does not conserve it" if self.R is not None or self.inputs is not None else ""
+
+    def flow_size(self, x: Float[Array, " N"], params: Any) -> Float[Array, ""]:
+        """|dH|ᵀ (|J − R| |dH| + 1), where 1 is the unit in which ẋ is solved."""
+        dh = jnp.abs(self.differential(x, params))
+        return dh @ (jnp.abs(self.flow_matrix(x, params)) @ dh + 1.0)
 
 
 def _matrix_function(value: Any, name: str) -> UserFunction:

@@ -5,8 +5,10 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.geometry.semidirect import SemidirectProduct
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
 from dirax.systems.implicit_form import of_relation
@@ -152,6 +154,35 @@ class AbstractSystem(eqx.Module):
 
     def explain(self, x: Array) -> str:
         """Which constraint the point x is off, and the way back, in words for a message; "" where there is no more to say."""
+        return ""
+
+    # ------------------------------------------------------------------ what `verify` asks
+
+    @property
+    def energy_changes(self) -> str:
+        """Why the system changes its energy, forces apart, in words that follow "the system"; "" where it does not."""
+        return ""
+
+    @property
+    def constrains_differential(self) -> bool:
+        """Whether the constraint is that dE lie in a subspace, so that it has the size of dE."""
+        return False
+
+    def flow_size(self, x: Float[Array, " N"], params: Any) -> Float[Array, ""]:
+        """The sum of the sizes of the terms of ⟨dH, ẋ⟩, which may cancel; 0 where it is not balanced against ports."""
+        return jnp.zeros(())
+
+    @property
+    def dual(self) -> SemidirectProduct | None:
+        """The dual of a Lie algebra or of a semidirect product that the points x are of; None for other systems."""
+        return None
+
+    def unreduced(self) -> "AbstractSystem | None":
+        """The system on T*Q whose quotient by a symmetry this is; None for other systems."""
+        return None
+
+    def moves_momentum(self, data: dict[str, Array], params: Any) -> str:
+        """What moves the momentum map of the symmetry of a quotient, at initial data, in words; "" where nothing does."""
         return ""
 
 

@@ -35,7 +35,8 @@ def along_axes(x: np.ndarray, axes, function: Callable[[list[int]], int]) -> np.
     """`function` of the entries along `axes`, for every position of the other axes."""
     kept = [a for a in range(x.ndim) if a not in axes]
     shape = tuple(x.shape[a] for a in kept)
-    rows = np.transpose(x, (*kept, *axes)).reshape(int(np.prod(shape)), -1).tolist()
+    count = int(np.prod([x.shape[a] for a in axes]))
+    rows = np.transpose(x, (*kept, *axes)).reshape(int(np.prod(shape)), count).tolist()
     return np.array([function(row) for row in rows], dtype=np.int64).reshape(shape)
 
 

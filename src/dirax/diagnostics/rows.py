@@ -1,0 +1,130 @@
+"""Functions of the saved rows of a solution, evaluated at many of them: by their scalar graph in NumPy, else compiled."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.program.compiled import compiled
+from dirax.program.evaluation.functions import in_numpy
+from dirax.schemes.step import Shape
+from dirax.solution.solution import Solution
+from dirax.systems.system import AbstractSystem
+
+CHUNK = 4096
+"""Rows that go through a compiled function at once."""
+
+
+def over_rows(function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray:
+    """function(*item, params) for every row of `items`, whose leaves have the shape (rows, …) or (B, rows, …).
+
+    The result is (B, rows, …), with B = 1 for one trajectory. Nothing is compiled where the scalar graph can say the function;
+    else rows go through in pieces, so that memory stays bounded. A function of a module, with what it is of, is traced once.
+    """
+    if sol.batch is None:
+        items = jax.tree.map(lambda a: np.asarray(a)[None], items)
+    found = _by_graph(function, sol, items)
+    return _compiled(function, sol, items) if found is None else found
+
+
+def _by_graph(function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray | None:
+    """The values by the scalar graph, without a compiler; None where it cannot say them."""
+    leaves, structure = jax.tree.flatten(items)
+    lanes, rows = np.shape(leaves[0])[:2]
+    of_params, params_structure = jax.tree.flatten(sol.params)
+    if not all(isinstance(leaf, bool | int | float | np.ndarray | np.generic | jax.Array) for leaf in of_params):
+        return None
+
+    def entries(leaf: Any, batched: bool) -> np.ndarray:
+        leaf = np.asarray(leaf)
+        spread = leaf[:, None] if batched else leaf[None, None]
+        return np.broadcast_to(spread, (lanes, rows, *spread.shape[2:])).reshape(lanes * rows, *spread.shape[2:])
+
+    arrays = [np.asarray(leaf).reshape(lanes * rows, *np.shape(leaf)[2:]) for leaf in leaves]
+    arrays += [entries(leaf, sol.batch_params) for leaf in of_params]
+
+    def flat(*values):
+        item = jax.tree.unflatten(structure, values[: len(leaves)])
+        return function(*item, jax.tree.unflatten(params_structure, values[len(leaves) :]))
+
+    found = in_numpy(flat, arrays, (function.func, function.args, structure, params_structure))
+    return None if found is None else found.reshape(lanes, rows, *found.shape[1:])
+
+
+def _compiled(function: Callable, sol: Solution, items: tuple) -> np.ndarray:
+    rows = jax.tree.leaves(items)[0].shape[1]
+    size = max(1, CHUNK // (sol.batch or 1)) if rows * (sol.batch or 1) > CHUNK else rows
+    axis = 0 if sol.batch_params and sol.params is not None else None
+    found = []
+    for start in range(0, rows, size):
+        numbers = np.minimum(np.arange(start, start + size), rows - 1)  # the last piece repeats its last row
+        piece = jax.tree.map(lambda a, numbers=numbers: jnp.asarray(a[:, numbers]), items)
+        found.append(np.asarray(_piece(function, piece, sol.params, axis))[:, : rows - start])
+    return np.concatenate(found, axis=1)
+
+
+@compiled
+def _piece(function, items, params, axis):
+    lane = jax.vmap(lambda item, params: function(*item, params), in_axes=(0, None))
+    return jax.vmap(lane, in_axes=(0, axis))(items, params)
+
+
+def energy_of(sol: Solution) -> np.ndarray:
+    """`sol.energy()`, found here where it was not before. Raises as it does."""
+    return _of_nodes(sol, "energy", _energy) if sol.system is not None else np.asarray(sol.energy())
+
+
+def constraint_of(sol: Solution) -> np.ndarray:
+    """`sol.constraint_residual()`, found here where it was not before. Raises as it does."""
+    if sol.system is None or "constraint" in sol.fields:
+        return np.asarray(sol.constraint_residual())
+    return _of_nodes(sol, "constraint_residual", _constraint)
+
+
+def _of_nodes(sol: Solution, name: str, function: Callable) -> np.ndarray:
+    if name in sol.derived:
+        return np.asarray(sol.derived[name])
+    nodes = {key: np.asarray(a) for key, a in sol.fields.items() if sol.field_info[key].place == "node"}
+    nodes["t"] = times_at(sol, np.arange(sol.rows))
+    found = over_rows(eqx.Partial(function, sol.system), sol, (nodes,))
+    return found if sol.batch is not None else found[0]
+
+
+def _energy(system: AbstractSystem, row: dict, params: Any):
+    return system.energy_at(row, params)
+
+
+def _constraint(system: AbstractSystem, row: dict, params: Any):
+    return system.constraint_at(row, params)
+
+
+def times_at(sol: Solution, rows: np.ndarray) -> np.ndarray:
+    """The times of rows, (…, rows)."""
+    t = np.asarray(sol.t)[rows]
+    return t if sol.batch is None else np.broadcast_to(t, (sol.batch, len(rows)))
+
+
+def consecutive(sol: Solution, names: tuple[str, ...], points: int, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """The saved arrays of these names at `points` rows from each of `rows` on, those of steps at the steps between, and the
+    times "t": (…, rows, points, …)."""
+    found = {"t": np.stack([times_at(sol, rows + i) for i in range(points)], axis=-1)}
+    axis = int(sol.batch is not None)
+    for name in names:
+        values = np.asarray(sol.fields[name])
+        count = points if sol.field_info[name].place == "node" else points - 1
+        found[name] = np.stack([np.take(values, rows + i, axis=axis) for i in range(count)], axis=axis + 1)
+    return found
+
+
+def initial_of_one(sol: Solution) -> dict[str, Any]:
+    """The initial data of a run, of the first trajectory of a batch."""
+    return {name: np.asarray(a)[0] if np.ndim(a) == 2 else np.asarray(a) for name, a in sol.initial.items()}
+
+
+def shape_of(sol: Solution) -> Shape:
+    """The sizes of the system of a run."""
+    redundant = tuple(sol.stats.get("redundant_constraints", ()))
+    return Shape(*sol.system.sizes(initial_of_one(sol), sol.params_of_one), redundant=redundant)

@@ -1,0 +1,122 @@
+"""What the steps of a scheme satisfy, however they were solved, as objects that measure saved rows.
+
+A scheme gives two of them: its discrete Dirac structure, which rows that follow each other belong to, and the form on its
+states whose change in one step is known.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Claim(NamedTuple):
+    """One thing that a structure says of every step: the `quantity` by its name, the names of its `parts`, the numbers by
+    which it is missed, and what it says in words."""
+
+    quantity: str
+    parts: tuple[str, ...]
+    statement: str
+
+
+class AbstractDiscreteStructure(eqx.Module):
+    """A relation between consecutive rows of a trajectory that every step of a scheme satisfies.
+
+    It reads nothing but saved arrays and the system's functions, never how a step was solved.
+    """
+
+    @property
+    @abstractmethod
+    def points(self) -> int:
+        """How many consecutive rows it joins."""
+
+    @property
+    @abstractmethod
+    def reads(self) -> tuple[str, ...]:
+        """The names of the saved arrays that it reads."""
+
+    @property
+    @abstractmethod
+    def claims(self) -> tuple[Claim, ...]:
+        """What it says; the first claim has the structure's name."""
+
+    @abstractmethod
+    def membership_defect(self, rows: dict[str, Array], params: Any) -> Float[Array, " parts"]:
+        """By how much rows miss it, one number for each part of the claims, in roundings: relative to the size of what
+        cancels, and to what it changes when every coordinate is changed by itself.
+
+        `rows`: the arrays that it reads, those of nodes (points, …) and those of the steps between (points − 1, …), and the
+        times "t" (points,).
+        """
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """The parts that at the first row judge a pair of points from which a run starts: given, not computed."""
+        return ()
+
+    @property
+    def step_form(self) -> "AbstractStepForm | str":
+        """The form whose change the forces of the constraints are, or why none is known."""
+        return f"no relation between the two-forms before and after a step is known for the {self.claims[0].quantity}"
+
+    @property
+    def own_constraints(self) -> bool:
+        """Whether a step imposes constraints between its points, whose terms have the sizes `constraint_size`."""
+        return False
+
+    def constraint_size(self, row: dict[str, Array], speed: Array, params: Any) -> Float[Array, " k"]:
+        """The sizes of the terms of the constraints that a step imposes between its points, at a saved row with its time "t".
+        `speed`: the largest |Δq|/h."""
+        raise NotImplementedError
+
+
+class DifferentiatedStep(NamedTuple):
+    """A step with its derivative ∂(new state)/∂(state), and how well its equations are conditioned (≥ 1)."""
+
+    state: Float[Array, " s"]
+    jacobian: Float[Array, "s s"]
+    condition: Float[Array, ""]
+
+
+class AbstractStepForm(eqx.Module):
+    """A form on the states of a scheme, and how one step changes it."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What holds, by its name."""
+
+    @property
+    @abstractmethod
+    def points(self) -> int:
+        """How many consecutive rows it reads."""
+
+    @property
+    @abstractmethod
+    def reads(self) -> tuple[str, ...]:
+        """The names of the saved arrays that it reads, those of nodes."""
+
+    @abstractmethod
+    def defect(self, step: Callable, equation: Any, rows: dict[str, Array], params: Any) -> Float[Array, " numbers"]:
+        """(by how much the change differs from what it is to be, …, the condition of the step), the first relative to the
+        size of the form after the step; numbers in between are for `told`.
+
+        `step(state, guess, t, params)` gives a DifferentiatedStep of `equation`; `rows`: the arrays that it reads (points, …)
+        and the times "t" (points,).
+        """
+
+    def refusal(self, equation: Any, row: dict[str, Array], params: Any) -> str:
+        """Why the step does not start from a saved row; empty if it does."""
+        return ""
+
+    @abstractmethod
+    def told(self, numbers: Any, place: str) -> str:
+        """The numbers at the worst place, in words."""
+
+
+def nonzero(values: Array) -> Array:
+    """The values, with 1 in the place of 0, to divide by."""
+    return jnp.where(values > 0, values, 1.0)

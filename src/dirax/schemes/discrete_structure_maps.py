@@ -1,0 +1,166 @@
+"""The discrete Dirac structures of discretization maps ([BLM] Definition 5.1), on points x and on T*Q of a Lagrangian."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dirax.geometry.cotangent_lift import CotangentLift, cotangent_lift
+from dirax.geometry.finite_difference import annihilator_projector
+from dirax.geometry.maps import AbstractDiscretizationMap
+from dirax.program.tracing import gradient
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Claim, nonzero
+from dirax.systems.forms import RelationForm
+from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.manifold_lagrangian import ManifoldLagrangian
+from dirax.systems.shape import Shape
+
+NAME = "discretization-map Dirac structure"
+PROJECTED = "Method 2 projects the step of D onto the final manifold"
+
+
+def moved(first: Array, last: Array, h: Any) -> Array:
+    """What both points change when every coordinate is changed by itself: |x| + |Δx| + h."""
+    return jnp.abs(jnp.concatenate([first, last])) + jnp.tile(jnp.abs(last - first) + h, 2)
+
+
+class RelationPairs(AbstractDiscreteStructure):
+    """A relation between points x and velocities, discretized by a map R_d: R_d⁻¹(x0, x1)/h satisfies it at its base point,
+    with the saved multipliers.
+
+    Of a Dirac system the relation is (ẋ, dH) ∈ D: that is [BLM] Definition 5.1.
+    """
+
+    relation: RelationForm = eqx.field(static=True)
+    map: AbstractDiscretizationMap
+    step: Any
+
+    @property
+    def points(self) -> int:
+        return 2
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (self._name, "multipliers") if self.relation.saved else (self._name,)
+
+    @property
+    def _name(self) -> str:
+        """That of the field of points."""
+        return self.relation.names[0]
+
+    @property
+    def claims(self) -> tuple[Claim, ...]:
+        x, says = self._name, self.relation.dirac or "(x, ẋ) ∈ S₀"
+        statement = says.replace("ẋ", f"R_d⁻¹({x}₀, {x}₁)/h")
+        quantity = NAME if self.relation.dirac else "discretized implicit system"
+        return (Claim(quantity, ("relation",), f"{statement} at every step, from {x} alone"),)
+
+    def membership_defect(self, rows: dict[str, Array], params: Any) -> Float[Array, "1"]:
+        """Relative to the terms of the relation that are linear in v and in the multipliers, and the rest."""
+        (x0, x1), at = rows[self._name], rows["t"][0] + self.map.base_fraction * self.step
+        multipliers = jnp.zeros(self.relation.multipliers)
+        if self.relation.saved:
+            multipliers = jax.vmap(self.relation.spread)(jnp.eye(self.relation.multipliers)) @ rows["multipliers"][0]
+        n = x0.shape[0]
+        manifold = self.map.manifold(n)
+
+        def velocity(a, b):
+            x, v = self.map.inverse(a, b)
+            return x, v / self.step
+
+        def defect(z):
+            x, v = velocity(*jnp.split(z, 2))
+            missed = jnp.asarray(self.relation.residual(x, v, multipliers, at, params))
+            return jnp.concatenate([manifold.projection(x, missed[:n]), missed[n:]])
+
+        x, v = velocity(x0, x1)
+        relation = lambda v, multipliers: jnp.asarray(self.relation.residual(x, v, multipliers, at, params))
+        of_velocity, of_multipliers = jax.jacfwd(relation, argnums=(0, 1))(v, multipliers)
+        rest = relation(jnp.zeros_like(v), jnp.zeros_like(multipliers))
+        terms = jnp.abs(of_velocity) @ jnp.abs(v) + jnp.abs(of_multipliers) @ jnp.abs(multipliers) + jnp.abs(rest)
+        z = jnp.concatenate([x0, x1])
+        scale = jnp.max(terms) + jnp.max(jnp.abs(jax.jacfwd(defect)(z)) @ moved(x0, x1, self.step))
+        return jnp.max(jnp.abs(defect(z)))[None] / nonzero(scale)
+
+
+class LiftedPairs(AbstractDiscreteStructure):
+    """[BLM] Definition 5.1 on T*Q for a Lagrangian and the Dirac structure of Δ = ker [W; ∂g/∂q], by a lifted map.
+
+    With ((q, p), (q̇, ṗ)) = R_d⁻¹((q0, p0), (q1, p1))/h: p = ∂L/∂q̇, q̇ ∈ Δ (with affine parts and explicit time
+    W q̇ + b = 0, ∂g/∂q q̇ + ∂g/∂t = 0) and ṗ − ∂L/∂q − f ∈ Δ°, which is [W; ∂g/∂q]ᵀλ with the saved multipliers λ. On a
+    manifold in R^N, L is extended to all vectors by their tangent parts, and covectors are judged by theirs.
+    """
+
+    system: LagrangeDirac | ManifoldLagrangian
+    map: CotangentLift
+    step: Any
+    constrained: bool = eqx.field(static=True)
+
+    @property
+    def points(self) -> int:
+        return 2
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return ("q", "p", "multipliers") if self.constrained else ("q", "p")
+
+    @property
+    def claims(self) -> tuple[Claim, ...]:
+        parts = "p = ∂L/∂q̇, q̇ ∈ Δ, ṗ − ∂L/∂q ∈ Δ°" if self.constrained else "p = ∂L/∂q̇, ṗ = ∂L/∂q"
+        names = ("momentum", "force", "constraint") if self.constrained else ("momentum", "force")
+        own = Claim(NAME, names, f"{parts} at the base point of R_d⁻¹ at every step, from q and p alone")
+        if not self.constrained:
+            return (own,)
+        return own, Claim("saved multipliers", ("multipliers",), "against the forces at the base points")
+
+    def membership_defect(self, rows: dict[str, Array], params: Any) -> Float[Array, " parts"]:
+        (q0, q1), (p0, p1), h = rows["q"], rows["p"], self.step
+        n, t = q0.shape[0], rows["t"][0] + self.map.base_fraction * h
+        multipliers = rows["multipliers"][0] if self.constrained else jnp.zeros(0)
+        constraints, manifold = self.system.constraints, self.map.map.manifold(n)
+
+        def base(z):
+            x0, x1 = jnp.split(z, 2)
+            (q, p), (q_dot, p_dot) = (jnp.split(part, 2) for part in self.map.inverse(x0, x1))
+            return q, p, q_dot / h, p_dot / h
+
+        def slopes(q, v):
+            return gradient(lambda q, v: self.system.lagrangian.at(t, q, manifold.projection(q, v), params), (0, 1))(q, v)
+
+        def terms_of(z):
+            """The terms of p − ∂L/∂q̇, and of the balance of forces: ṗ, ∂L/∂q, f, Wᵀλ."""
+            q, p, v, rate = base(z)
+            along, momentum = slopes(q, v)
+            force = jnp.zeros(n) if self.system.forces is None else self.system.forces(t, q, v, params)
+            reaction = constraints.matrix(t, q, params).T @ multipliers
+            tangential = jax.vmap(lambda vector: manifold.projection(q, vector))
+            return tangential(jnp.stack([p, -momentum])), tangential(jnp.stack([rate, -along, -force, -reaction]))
+
+        def missed(z):
+            legendre, balance = terms_of(z)
+            q, _, v, _ = base(z)
+            return jnp.sum(legendre, axis=0), jnp.sum(balance, axis=0), constraints.velocity_defect(t, q, v, params)
+
+        z = jnp.concatenate([q0, p0, q1, p1])
+        size = moved(jnp.concatenate([q0, p0]), jnp.concatenate([q1, p1]), h)
+        (momentum, force, constraint), slope = missed(z), jax.jacfwd(missed)(z)
+        legendre, balance = terms_of(z)
+        scales = [jnp.abs(part) @ size for part in slope]
+        of_momentum = nonzero(jnp.max(jnp.sum(jnp.abs(legendre), axis=0) + scales[0]))
+        of_force = nonzero(jnp.max(jnp.sum(jnp.abs(balance), axis=0) + scales[1]))
+        first = jnp.max(jnp.abs(momentum)) / of_momentum
+        if not self.constrained:
+            return jnp.stack([first, jnp.max(jnp.abs(force)) / of_force])
+        outside = force - annihilator_projector(constraints.matrix(t, base(z)[0], params)) @ force
+        of_constraint = jnp.max(jnp.abs(constraint) / nonzero(scales[2]), initial=0.0)
+        return jnp.stack([first, jnp.max(jnp.abs(outside)) / of_force, of_constraint, jnp.max(jnp.abs(force)) / of_force])
+
+
+def structure_on_cotangent_bundle(
+    system: LagrangeDirac | ManifoldLagrangian, shape: Shape, map: AbstractDiscretizationMap, step: Any
+) -> LiftedPairs:
+    """The structure of a Lagrangian by a map on Q, or by its lift."""
+    lift = map if isinstance(map, CotangentLift) else cotangent_lift(map)
+    return LiftedPairs(system, lift, step, shape.m + shape.c > 0)

@@ -1,0 +1,84 @@
+"""The two-form of a discrete Lagrangian on Q × Q, and what constraint forces change in it in one step ([PY] §3.2)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dirax.schemes.discrete_structure import AbstractStepForm, nonzero
+
+
+class FormOnPairs(AbstractStepForm):
+    """φ*Ω = Ω + dβ at a pair (q0, q1) with w_d(q0, q1) = 0, under constraints.
+
+    φ(q0, q1) = (q1, q2) is the discrete Lagrange–d'Alembert map, Ω = −d(−D1 L_d dq0) = F⁻L_d*(dq ∧ dp), and
+    β = ⟨F, dq1⟩ with F the part in Δ°(q1) of D2 L_d(q0, q1) + D1 L_d(q1, q2) ([PY] §3.2). There β_d is printed as a
+    pull-back from the first point of the pair; the variation (11) puts the force at q1, the first point of φ(q0, q1), and
+    only this makes the relation true. Both sides are restricted to the vectors tangent to {w_d = 0}, or {w_d = 0, g(q0) = 0,
+    g(q1) = 0}, where dβ has no part from holonomic constraints: without others φ is symplectic.
+    """
+
+    pairs: Any
+    """The `LagrangianPairs` whose L_d and constraints these are."""
+
+    @property
+    def name(self) -> str:
+        return "structural relation φ*Ω = Ω + dβ"
+
+    @property
+    def points(self) -> int:
+        return 2
+
+    def told(self, numbers: Any, place: str) -> str:
+        return f"on the pairs with w_d = 0, {place}; without dβ it would be off by {numbers[1]:.2g}"
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return ("q",)
+
+    def defect(self, step: Callable, equation: Any, rows: dict[str, Array], params: Any) -> Float[Array, "3"]:
+        """(defect of φ*Ω = Ω + dβ, ‖φ*Ω − Ω‖, both relative; condition number)."""
+        pairs, (q0, q1), (before, t) = self.pairs, rows["q"], rows["t"]
+        n, h = q0.shape[0], pairs.step
+        d1 = lambda t, a, b: pairs.slots(t, a, b, params)[0]
+        d2 = lambda t, a, b: pairs.slots(t, a, b, params)[1]
+        m = equation.stages[0][0].unknowns - n
+        guess = jnp.concatenate([(q1 - q0) / h, jnp.zeros(m)])
+
+        def state_of(z):
+            return jnp.concatenate([z[n:], d2(before, z[:n], z[n:])])
+
+        def force(z, c):
+            return pairs.annihilator(t, z[n:], params) @ (d2(before, z[:n], z[n:]) + d1(t, z[n:], c))
+
+        def lagrangian_two_form(t, z):
+            """−dΘ of Θ = −D1 L_d dq0: dq0 ∧ dq1 with the coefficients −D1 D2 L_d, and nothing else (D1 D1 L_d is symmetric)."""
+            mixed = -jax.jacfwd(lambda b: d1(t, z[:n], b))(z[n:])  # ∂p0_i/∂q1_j
+            zero = jnp.zeros((n, n))
+            return jnp.block([[zero, mixed], [-mixed.T, zero]])
+
+        z = jnp.concatenate([q0, q1])
+        state, of_pair = state_of(z), jax.jacfwd(state_of)(z)
+        after, of_state, condition = step(state, guess, t, params)
+        q2, q2_of_pair = after[:n], of_state[:n] @ of_pair
+        jacobian = jnp.concatenate([jnp.eye(2 * n)[n:], q2_of_pair])  # of φ
+        force_z, force_q2 = jax.jacfwd(force, argnums=(0, 1))(z, q2)
+        beta = jnp.concatenate([jnp.zeros((n, 2 * n)), force_z + force_q2 @ q2_of_pair])  # ∂_j β_i
+        two_form, two_form_after = lagrangian_two_form(before, z), lagrangian_two_form(t, jnp.concatenate([q1, q2]))
+        change = jacobian.T @ two_form_after @ jacobian - two_form
+        dbeta = beta.T - beta  # (dβ)_ij = ∂_i β_j − ∂_j β_i
+
+        def constraints_of_pair(z):
+            first = pairs.system.constraints.position_defect(before, z[:n], params)
+            return jnp.concatenate([pairs.constraint(before, z[:n], z[n:], params), first])
+
+        constraint_matrix = jax.jacfwd(constraints_of_pair)(z)
+        constraint_matrix = constraint_matrix / nonzero(jnp.max(jnp.abs(constraint_matrix), axis=1, keepdims=True))
+        _, values, right = jnp.linalg.svd(constraint_matrix, full_matrices=True)
+        kept = jnp.concatenate([values > 1e-10 * values[0], jnp.zeros(right.shape[0] - values.shape[0], bool)])
+        tangent = jnp.where(kept, 0.0, right.T)  # without the normal vectors, as many as there are independent constraints
+        restricted = lambda form: jnp.max(jnp.abs(tangent.T @ form @ tangent))
+        size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(two_form_after) @ jnp.abs(jacobian)) + jnp.max(jnp.abs(beta))
+        return jnp.stack([restricted(change - dbeta) / size, restricted(change) / size, condition])

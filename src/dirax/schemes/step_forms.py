@@ -1,0 +1,147 @@
+"""The forms on the states of schemes: the canonical two-form of T*Q, in charts too, and Lie–Poisson bivectors."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dirax.geometry.structures import canonical_two_form
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm, nonzero
+
+
+def started(system: Any, step: Any, equation: Any, rows: dict[str, Array], params: Any) -> tuple[Array, Array]:
+    """(state, first guess) of the first part of a step that starts from a saved row, the only one of `rows`."""
+    row = {name: values[0] for name, values in rows.items()}
+    stage, fraction = equation.stages[0]
+    return stage.start({**system.complete(row, params, False), "t": row["t"]}, fraction * step, params)
+
+
+class RowForm(AbstractStepForm):
+    """A form at the state that a step starts from at a saved row. A base class."""
+
+    system: Any
+    step: Any
+
+    @property
+    def name(self) -> str:
+        return "symplecticity of one step"
+
+    @property
+    def points(self) -> int:
+        return 1
+
+    def refusal(self, equation: Any, row: dict[str, Array], params: Any) -> str:
+        try:
+            jax.eval_shape(lambda row: started(self.system, self.step, equation, row, params), row)
+        except (KeyError, TypeError, ValueError) as error:
+            return f"the scheme does not start from a saved row: {error}"
+        return ""
+
+
+class CanonicalForm(RowForm):
+    """JᵀΩJ = Ω for J = ∂(q', p')/∂(q, p): the step is symplectic.
+
+    Relative to ‖|J|ᵀ|Ω||J|‖; entries are the largest ones after q and p were brought to balanced units, q → q√s, p → p/√s.
+    """
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return ("q", "p")
+
+    def told(self, numbers: Any, place: str) -> str:
+        return f"‖JᵀΩJ − Ω‖/‖JᵀΩJ‖, {place}"
+
+    def defect(self, step: Callable, equation: Any, rows: dict[str, Array], params: Any) -> Float[Array, "2"]:
+        """(‖JᵀΩJ − Ω‖/‖JᵀΩJ‖, condition number)."""
+        state, guess = started(self.system, self.step, equation, rows, params)
+        _, jacobian, condition = step(state, guess, rows["t"][0], params)
+        n = state.shape[0] // 2
+        form = canonical_two_form(n)
+        by_momentum, by_position = jnp.max(jnp.abs(jacobian[:n, n:])), jnp.max(jnp.abs(jacobian[n:, :n]))
+        both = (by_momentum > 0) & (by_position > 0)
+        unit = jnp.where(both, (nonzero(by_position) / nonzero(by_momentum)) ** 0.25, 1.0)
+        units = jnp.concatenate([jnp.full(n, unit), jnp.full(n, 1 / unit)])
+        jacobian = jacobian * units[:, None] / units[None, :]
+        defect = jnp.max(jnp.abs(jacobian.T @ form @ jacobian - form))
+        size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(form) @ jnp.abs(jacobian))
+        return jnp.stack([defect / size, condition])
+
+
+class CanonicalPoints(CanonicalForm):
+    """The same where a state is one point x = (q, p)."""
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return ("x",)
+
+
+class LiePoissonForm(RowForm):
+    """JΛJᵀ = Λ∘Φ for the bivector Λ of a dual: the step Φ is a Poisson map. The state begins with the point x.
+
+    Relative to ‖|J||Λ||J|ᵀ‖.
+    """
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return ("x",)
+
+    def told(self, numbers: Any, place: str) -> str:
+        return f"‖JΛJᵀ − Λ‖/‖JΛJᵀ‖ of the Lie–Poisson bivector, {place}"
+
+    def defect(self, step: Callable, equation: Any, rows: dict[str, Array], params: Any) -> Float[Array, "2"]:
+        """(‖JΛJᵀ − Λ∘Φ‖/‖JΛJᵀ‖, condition number)."""
+        state, guess = started(self.system, self.step, equation, rows, params)
+        after, jacobian, condition = step(state, guess, rows["t"][0], params)
+        bivector = self.system.dual.bivector
+        n = self.system.dual.size
+        jacobian, before = jacobian[:n, :n], bivector(state[:n])
+        defect = jnp.max(jnp.abs(jacobian @ before @ jacobian.T - bivector(after[:n])))
+        size = jnp.max(jnp.abs(jacobian) @ jnp.abs(before) @ jnp.abs(jacobian).T)
+        return jnp.stack([defect / nonzero(size), condition])
+
+
+class ChartedForm(RowForm):
+    """The canonical two-form of T*Q of a manifold Q in R^N, of which a state (m, r, p) has coordinates in a chart at m.
+
+    The saved (q, p) pull dq ∧ dp back to the coordinates (r, p), from both ends of the step: K'ᵀΩK' = KᵀΩK with
+    K = ∂(q, p)/∂(r, p) and K' = ∂(q', p')/∂(r, p), at a fixed centre m. Relative to ‖|K'|ᵀ|Ω||K'|‖.
+    """
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return ("q", "p")
+
+    def told(self, numbers: Any, place: str) -> str:
+        return f"‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖ of (q, p) by the coordinates of a chart, {place}"
+
+    def defect(self, step: Callable, equation: Any, rows: dict[str, Array], params: Any) -> Float[Array, "2"]:
+        """(‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖, condition number)."""
+        state, guess = started(self.system, self.step, equation, rows, params)
+        t, size = rows["t"][0], rows["q"].shape[1]
+        after, jacobian, condition = step(state, guess, t, params)
+        stage, fraction = equation.stages[0]
+
+        def saved(state):
+            row = stage.unpack(state, guess, t, fraction * self.step, params)
+            return jnp.concatenate([row["q"], row["p"]])
+
+        first = jax.jacfwd(saved)(state)[:, size:]
+        last = (jax.jacfwd(saved)(after) @ jacobian)[:, size:]
+        form = canonical_two_form(size)
+        change = last.T @ form @ last - first.T @ form @ first
+        return jnp.stack([jnp.max(jnp.abs(change)) / jnp.max(jnp.abs(last).T @ jnp.abs(form) @ jnp.abs(last)), condition])
+
+
+def form_of_steps(system: Any, step: Any, equation: Any, structure: AbstractDiscreteStructure | str) -> AbstractStepForm | str:
+    """The form of the steps of an equation by what the system and the equation say of themselves, or why none is known."""
+    fields = equation.stages[0][0].fields
+    constrained = "multipliers" in fields
+    if system.dual is not None and not constrained:
+        return LiePoissonForm(system, step)
+    if not all(stage.canonical for stage, _ in equation.stages):
+        return "the state of this scheme is not (q, p) on T*Q"
+    if constrained:
+        return structure if isinstance(structure, str) else structure.step_form
+    return (CanonicalPoints if "x" in fields else CanonicalForm)(system, step)
