@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from dirax.program.memo import Memo
 from dirax.systems.shape import Shape
-from dirax.text.representation import counted, html_table, module_html, module_text
+from dirax.text.representation import counted, fields_html, module_html, module_text
 
 
 class Field(eqx.Module):
@@ -105,7 +105,7 @@ class StepEquation(eqx.Module):
         return f"StepEquation({'; '.join(f'{name} {text}' for name, text in self._summary().items())})"
 
     def _repr_html_(self) -> str:
-        return html_table("StepEquation", self._summary() | {"equations": ", ".join(self.labels)})
+        return fields_html("StepEquation", self._summary() | {"equations": ", ".join(self.labels)})
 
 
 class StepSequence(eqx.Module):

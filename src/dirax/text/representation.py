@@ -1,10 +1,11 @@
 """How systems, schemes and equations show themselves: one readable line in a terminal, a small table in a notebook."""
 
 import dataclasses
-import html
 from typing import Any
 
 import numpy as np
+
+from dirax.text.tables import html_table
 
 LINE = 100
 """Longest representation that stays on one line."""
@@ -29,7 +30,7 @@ def module_text(module: Any) -> str:
 
 def module_html(module: Any) -> str:
     """The fields of a record as a table."""
-    return html_table(type(module).__name__, {k: value_text(v) for k, v in module_fields(module).items()})
+    return fields_html(type(module).__name__, {k: value_text(v) for k, v in module_fields(module).items()})
 
 
 def value_text(value: Any) -> str:
@@ -44,13 +45,9 @@ def value_text(value: Any) -> str:
     return repr(value)
 
 
-def html_table(title: str, rows: dict[str, str]) -> str:
-    """A captioned table of two columns, everything escaped."""
-    body = "".join(
-        f"<tr><th style='text-align:left'>{html.escape(name)}</th><td style='text-align:left'>{html.escape(text)}</td></tr>"
-        for name, text in rows.items()
-    )
-    return f"<table><caption><b>{html.escape(title)}</b></caption><tbody>{body}</tbody></table>"
+def fields_html(title: str, rows: dict[str, str]) -> str:
+    """Names and texts as a table of two columns."""
+    return html_table((), list(rows.items()), title)
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:
