@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 import dirax as dx
 from dirax import gallery
-from dirax.cli import app
+from dirax.cli.commands import app
 from dirax.cli.schemes import scheme_from_text
 from dirax.cli.subject import changed
 from dirax.gallery import peng_yoshimura, reproduction

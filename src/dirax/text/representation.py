@@ -53,3 +53,9 @@ def fields_html(title: str, rows: dict[str, str]) -> str:
 def counted(number: int, noun: str, plural: str | None = None) -> str:
     """`1 step`, `50 000 steps`: a number with its noun, thousands set apart."""
     return f"{number:,}".replace(",", " ") + " " + (noun if number == 1 else plural or f"{noun}s")
+
+
+def shortened(value: Any, most: int = 60) -> str:
+    """The representation of a value that a user gave, cut after `most` characters."""
+    text = repr(value)
+    return text if len(text) <= most else f"{text[: most - 1]}…"
