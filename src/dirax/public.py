@@ -55,9 +55,9 @@ from dirax.schemes.euler_poincare import DiscreteEulerPoincare
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
+from dirax.solution.loading import load
 from dirax.solution.reconstruction import reconstruct
 from dirax.solution.solution import Solution
-from dirax.solution.loading import load
 from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.dirac_system import DiracSystem

@@ -322,19 +322,10 @@ def test_long_names(ending, tmp_path, two_points):
 
 KILLED = """
 import os, signal, sys
-import numpy as np
-import dirax as dx
-from dirax.solution import saving
-path = sys.argv[1]
-ending = os.path.splitext(path)[1]
-write, is_one = saving.FORMATS[ending]
-def killed(beside, *rest):
-    write(beside, *rest)
+from dirax.solution.placing import placed
+with placed(sys.argv[1], False) as beside:
+    beside.write_text("half a file")
     os.kill(os.getpid(), signal.SIGKILL)
-saving.FORMATS[ending] = killed, is_one
-info = {"q": dx.Field((1,))}
-sol = dx.Solution(t=np.arange(3.0), fields={"q": np.zeros((3, 1))}, field_info=info, step=1.0, save_every=1, stats={})
-sol.save(path)
 """
 
 

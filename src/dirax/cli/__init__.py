@@ -3,13 +3,11 @@
 
 def main() -> None:
     """The entry point of the program `dirax`."""
-    from dirax.cli.terminal import flushed, interruptible, prepared
+    from dirax.cli.terminal import interruptible, prepared, written
 
     with interruptible():
         prepared()
         from dirax.cli.commands import app
 
-        try:
+        with written():
             app(prog_name="dirax")
-        finally:
-            flushed()

@@ -188,4 +188,3 @@ def bench(
     if untimed:
         typer.echo(f"dirax: {', '.join(untimed)} could not be timed.", err=True)
         raise typer.Exit(1)
-

@@ -9,8 +9,8 @@ from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
 from dirax.gallery.example import Example
 from dirax.schemes.step import AbstractScheme
-from dirax.solution.solution import Solution
 from dirax.solution.saving import FORMATS
+from dirax.solution.solution import Solution
 from dirax.text.tables import plain
 
 

@@ -71,7 +71,8 @@ def _value(node: ast.expr, text: str) -> Any:
         return ast.literal_eval(node)
     except ValueError:
         raise ValueError(
-            f"cannot read {shortened(ast.unparse(node))} in a scheme: arguments are numbers, strings, lists, or schemes and maps of dirax."
+            f"cannot read {shortened(ast.unparse(node))} in a scheme: arguments are numbers, strings, lists, or schemes and "
+            "maps of dirax."
         ) from None
 
 

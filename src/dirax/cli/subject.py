@@ -115,7 +115,9 @@ def _literal(key: str, text: str) -> Any:
     except (ValueError, SyntaxError, RecursionError, MemoryError):
         if text.strip().isidentifier():
             return {"true": True, "false": False}.get(text.strip().lower(), text.strip())
-        raise ValueError(f"cannot read the value {shortened(text)} of {key:.60}: give a number, a list such as [0, 1.5], or a word.") from None
+        raise ValueError(
+            f"cannot read the value {shortened(text)} of {key:.60}: give a number, a list such as [0, 1.5], or a word."
+        ) from None
 
 
 def _whole(value: Any) -> Any:

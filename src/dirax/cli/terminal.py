@@ -2,6 +2,7 @@
 lacks, Ctrl-C."""
 
 import codecs
+import io
 import os
 import signal
 import sys
@@ -11,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 SIMPLER = {"─": "-", "–": "-", "—": "-", "−": "-", "…": "...", "’": "'", "≤": "<=", "≥": ">=", "·": "."}
-"""What takes the place of signs that an encoding lacks; Greek letters are written out."""
+"""What takes the place of signs that an encoding lacks; Greek letters are written out, others lose their accents."""
 
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -54,16 +55,20 @@ def prepared() -> None:
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     codecs.register_error("dirax.simpler", _simpler)
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="dirax.simpler")
     if sys.stdout is None:
         raise SystemExit("dirax: standard output is closed, so that no result could be shown: redirect it, to /dev/null say.")
 
 
-def flushed() -> None:
-    """Write out what standard output holds back; one sentence and status 1 where that fails, as on a full disk."""
+@contextmanager
+def written() -> Iterator[None]:
+    """What the block prints is written out at its end; one sentence and status 1 where that fails, as on a full disk."""
     try:
-        sys.stdout.flush()
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
         raise SystemExit(f"dirax: the results could not be written: {error.strerror}.") from None
@@ -76,7 +81,9 @@ def _simpler(error: UnicodeError) -> tuple[str, int]:
 
 
 def _simple(sign: str) -> str:
+    if sign in SIMPLER:
+        return SIMPLER[sign]
     name = unicodedata.name(sign, "")
-    if sign in SIMPLER or not name.startswith("GREEK"):
-        return SIMPLER.get(sign, "?")
-    return name.rpartition("LETTER ")[2].partition(" ")[0].lower() or "?"
+    if name.startswith("GREEK"):
+        return name.rpartition("LETTER ")[2].partition(" ")[0].lower()
+    return unicodedata.normalize("NFKD", sign).encode("ascii", "ignore").decode() or "?"

@@ -48,9 +48,7 @@ class Description:
     attributes: dict[str, Any]
 
 
-def describe(
-    sol: Trajectory, units: Mapping[str, Any] | None = None, coordinates: Sequence[str] | None = None
-) -> Description:
+def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinates: Sequence[str] | None = None) -> Description:
     """The solution in full.
 
     Dimensions: `trajectory` (in a batch), `time` (saved rows), `interval` (the step leaving a row), `coordinate`,
@@ -108,19 +106,19 @@ def describe(
 def _layout(sol: Trajectory) -> list[dict[str, Any]]:
     """Name, name in the description, shape, place, dimensions and description of every field."""
     layout = []
-    for name, field in sol.field_info.items():
+    for name, info in sol.field_info.items():
         variable = RENAMED.get(name, f"{name}_field" if name in TAKEN else name)
-        layout.append({"name": name, "variable": variable, **vars_of(field)})
+        layout.append({"name": name, "variable": variable, **vars_of(info)})
     return layout
 
 
-def vars_of(field: Field) -> dict[str, Any]:
+def vars_of(info: Field) -> dict[str, Any]:
     """A Field as plain data."""
     return {
-        "shape": list(field.shape),
-        "place": field.place,
-        "dims": list(field.dims),
-        "description": field.description,
+        "shape": list(info.shape),
+        "place": info.place,
+        "dims": list(info.dims),
+        "description": info.description,
     }
 
 
@@ -204,7 +202,9 @@ def _attributes(sol: Trajectory, layout, derived: list[str], metadata: dict[str,
         "fields": json.dumps(layout),
         "initial": json.dumps(list(sol.initial)),
         "derived": json.dumps(derived),
-        "metadata": json.dumps(plain({k: v for k, v in metadata.items() if k not in ("system", "scheme", "dirax_version")}, nonfinite=True)),
+        "metadata": json.dumps(
+            plain({k: v for k, v in metadata.items() if k not in ("system", "scheme", "dirax_version")}, nonfinite=True)
+        ),
     }
     try:
         attributes["params"] = json.dumps(encode_params(sol.params))

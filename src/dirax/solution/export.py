@@ -20,9 +20,7 @@ BLOCK = 2**14
 """Rows of a CSV file that are written at a time."""
 
 
-def to_xarray(
-    sol: Trajectory, units: Mapping[str, Any] | None = None, coordinates: Sequence[str] | None = None
-) -> "Dataset":
+def to_xarray(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinates: Sequence[str] | None = None) -> "Dataset":
     """The solution as an `xarray.Dataset` with named dimensions, units, derived quantities and what was run.
 
     Dimensions: `trajectory` (in a batch), `time` (saved rows), `interval` (the step leaving a row), `coordinate`,
@@ -56,9 +54,7 @@ def to_dataframe(sol: Trajectory, coordinates: Sequence[str] | None = None) -> "
     return DataFrame(_columns(sol, coordinates))
 
 
-def to_csv(
-    sol: Trajectory, path: str | os.PathLike, overwrite: bool = False, coordinates: Sequence[str] | None = None
-) -> Path:
+def to_csv(sol: Trajectory, path: str | os.PathLike, overwrite: bool = False, coordinates: Sequence[str] | None = None) -> Path:
     """Write the table of `to_dataframe` to `path`, with a line of names and empty cells for NaN, and return the path.
 
     Numbers are written with all digits that they need to be read back exactly. The file appears complete or not at all.
@@ -99,7 +95,13 @@ def _columns(sol: Trajectory, coordinates: Sequence[str] | None) -> dict[str, np
         named = names if inner == ("coordinate",) else None
         labels = [*np.ndindex(*variable.values.shape[lead:])]
         for k, index in enumerate(labels):
-            name = f"{field}{'_'.join(map(str, index))}" if named is None else named[k] if field == position else f"{field}_{named[k]}"
+            name = (
+                f"{field}{'_'.join(map(str, index))}"
+                if named is None
+                else named[k]
+                if field == position
+                else f"{field}_{named[k]}"
+            )
             if name in columns:
                 raise ValueError(
                     f"two columns would be called {name!r}: pass coordinates= with names that are no names of other columns."

@@ -21,7 +21,9 @@ def checked_place(path: Path, overwrite: bool, replaceable: Callable[[Path], boo
     """Raise where nothing could be written to `path`: `ValueError` for a name that is too long, `FileNotFoundError` without
     its folder, `FileExistsError` unless `overwrite`, and for what is not `replaceable`."""
     if len(os.fsencode(path.name)) > LONGEST_NAME:
-        raise ValueError(f"the name {path.name[:20]}… has {len(os.fsencode(path.name))} bytes: choose one of at most {LONGEST_NAME}.")
+        raise ValueError(
+            f"the name {path.name[:20]}… has {len(os.fsencode(path.name))} bytes: choose one of at most {LONGEST_NAME}."
+        )
     if not path.parent.is_dir():
         raise FileNotFoundError(f"the folder {path.parent} does not exist: create it before saving {path.name}.")
     if os.path.lexists(path):
@@ -32,9 +34,7 @@ def checked_place(path: Path, overwrite: bool, replaceable: Callable[[Path], boo
 
 
 @contextmanager
-def placed(
-    path: str | os.PathLike, overwrite: bool, replaceable: Callable[[Path], bool] = Path.is_file
-) -> Iterator[Path]:
+def placed(path: str | os.PathLike, overwrite: bool, replaceable: Callable[[Path], bool] = Path.is_file) -> Iterator[Path]:
     """A path to write a file or a folder to, which is moved to `path` at the end of the block if nothing was raised.
 
     An older file stays as it was until then. What killed processes have left beside it is removed. Raises as
@@ -94,4 +94,3 @@ def _sweep(path: Path) -> None:
                 os.rename(old, path)
             shutil.rmtree(left, ignore_errors=True)
             os.close(lock)
-

@@ -8,6 +8,7 @@ import numpy as np
 
 from dirax.program.user_functions import is_traced
 from dirax.solution.trajectory import Trajectory
+from dirax.text.representation import shortened
 
 SLACK = 1e-6
 """Part of a step by which a saved time may lie outside of a stretch of time and still belong to it."""
@@ -41,8 +42,8 @@ def select(sol: Some, which: Any) -> Some:
             return _rows(sol, range(*which.indices(sol.rows)))
     if sol.batch is None:
         raise TypeError(
-            f"this solution is one trajectory: sol[t0:t1] is a stretch of time, sol[i:j] are rows, sol.{next(iter(sol.fields))}[i] "
-            f"is a row, but sol[{which!r}] was asked for."
+            f"this solution is one trajectory, but sol[{shortened(which)}] was asked for: sol[t0:t1] with floats is a stretch of "
+            f"time, sol[i:j] are rows, and sol.{next(iter(sol.fields))}[i] is a row."
         )
     index = np.arange(sol.batch)[which if isinstance(which, slice) else np.asarray(which)]
     return _trajectory(sol, int(index)) if np.ndim(index) == 0 else _trajectories(sol, index)
@@ -56,7 +57,9 @@ def count(sol: Trajectory) -> int:
 def each(sol: Some) -> Iterator[Some]:
     """The trajectories of a batch, one after the other; `TypeError` for one trajectory."""
     if sol.batch is None:
-        raise TypeError("this solution is one trajectory, not a batch to go through: its rows are those of sol.t, sol.q and so on.")
+        raise TypeError(
+            "this solution is one trajectory, not a batch to go through: its rows are those of sol.t, sol.q and so on."
+        )
     return (_trajectory(sol, lane) for lane in range(sol.batch))
 
 

@@ -6,6 +6,7 @@ library does, and so that the sizes of arrays are known, and nothing but numbers
 
 import json
 from collections.abc import Mapping
+from importlib import import_module
 from itertools import product
 from math import ceil, prod
 from pathlib import Path
@@ -94,9 +95,7 @@ def _chunk_file(folder: Path, index: tuple[int, ...]) -> Path:
 
 
 def _compress(data: bytes) -> bytes:
-    from numcodecs import zstd
-
-    return bytes(zstd.compress(data, 0))
+    return bytes(import_module("numcodecs.zstd").compress(data, 0))
 
 
 # ---------------------------------------------------------------------------------------------------------------- reading
@@ -178,11 +177,9 @@ def _read_array(folder: Path, node: dict[str, Any]) -> np.ndarray:
 
 def _decompress(data: bytes, size: int) -> bytes:
     """A zstd frame of `size` bytes, which its header must declare: no other is unpacked."""
-    from numcodecs import zstd
-
     if _declared(data) != size:
         raise Unreadable("a part of it is not compressed as dirax does")
-    return bytes(zstd.decompress(data))
+    return bytes(import_module("numcodecs.zstd").decompress(data))
 
 
 def _declared(data: bytes) -> int | None:
