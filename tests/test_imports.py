@@ -30,10 +30,7 @@ ROOMS = (
 RANK = {room: rank for rank, room in enumerate(ROOMS)}
 LOADED_ON_DEMAND = ("matplotlib", "xarray", "zarr", "h5netcdf", "h5py", "pandas", "typer", "rich")
 
-CIRCLES: tuple[set[str], ...] = (
-    {"program.graph", "program.operations"},
-    {"engines.native.gradients.differentiate", "engines.native.gradients.runs"},
-)
+CIRCLES: tuple[set[str], ...] = ({"engines.native.engine", "engines.native.gradients.differentiate"},)
 """Circles of modules that are still to be opened; there are to be none."""
 
 

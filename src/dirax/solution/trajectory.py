@@ -18,7 +18,6 @@ from dirax.text.representation import counted, fields_html
 BLOCK = 2**16
 """Rows that a quantity is computed for at a time, which bounds the memory that it takes."""
 
-
 GIVEN = (
     *("t", "fields", "field_info", "step", "save_every", "stats", "ok", "message", "system", "scheme", "equation"),
     *("batch_params", "initial", "derived", "metadata"),
