@@ -410,6 +410,7 @@ def edited(path, change):
     """The zarr store with its attributes changed."""
     file = path / "zarr.json"
     node = json.loads(file.read_text())
+    node["attributes"].pop(saving.SEAL, None)  # as in the first files, so that what is said is looked at
     change(node["attributes"])
     file.write_text(json.dumps(node))
 
@@ -604,6 +605,19 @@ def test_a_flipped_bit_anywhere_is_a_sentence_or_changes_nothing(ending, tmp_pat
         files[number].write_bytes(content)
     assert refused > 50
     assert_same(dx.load(path), two_points)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_an_edited_description_is_noticed(ending, tmp_path, batch):
+    path = batch.save(tmp_path / f"run{ending}")
+    if ending == ".zarr":
+        file = path / "zarr.json"
+        file.write_text(file.read_text().replace('"step": 0.01', '"step": 0.02'))
+    else:
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "r+") as store:
+            store.attrs["step"] = 0.02
+    assert "its description is not what was saved" in one_sentence(path)
 
 
 def test_a_later_format_is_refused(tmp_path, batch):

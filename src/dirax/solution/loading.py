@@ -13,7 +13,7 @@ from dirax.schemes.step import Field, Shape, make_step_equation
 from dirax.solution.file_record import FileRecord, file_record
 from dirax.solution.netcdf import open_netcdf
 from dirax.solution.records import decode_params, decode_scheme
-from dirax.solution.saving import MOVED, checked_ending, checksum
+from dirax.solution.saving import MOVED, SEAL, checked_ending, checksum, seal
 from dirax.solution.solution import Solution
 from dirax.solution.stored import Stored, Unreadable, reading
 from dirax.solution.zarr_store import open_store
@@ -82,6 +82,8 @@ def _opened(path: Path, ending: str) -> Iterator[Stored]:
 
 def _read(path: Path, ending: str, params: Any) -> Solution:
     with _opened(path, ending) as stored:
+        if SEAL in stored.attributes and stored.attributes[SEAL] != reading(NOT_OURS, seal, stored.attributes):
+            raise Unreadable("its description is not what was saved: the file is damaged or was edited")
         said = reading(NOT_OURS, file_record, {**stored.attributes, **_moved(stored)}, stored.kinds)
         sums = said.checksums
         for name in sums.keys() - stored.kinds.keys():

@@ -50,7 +50,7 @@ def _stored(file: Any) -> Stored:
             raise Unreadable(f"its entry {name} is not an array inside the file")
         if bytes(entry.attrs.get("NAME", b"")).startswith(DIMENSION):
             continue
-        if entry.dtype.name not in TYPES:
+        if entry.dtype.name not in TYPES or entry.dtype != np.dtype(entry.dtype.name).newbyteorder("<"):
             raise Unreadable(f"its variable {name} has the type {entry.dtype}, which dirax does not write")
         if entry.id.get_create_plist().get_nfilters() or entry.id.get_storage_size() != entry.nbytes:
             raise Unreadable(f"its variable {name} is compressed or has no numbers, which dirax does not write")

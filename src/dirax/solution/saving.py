@@ -23,6 +23,9 @@ LONGEST_ATTRIBUTE = 16_000
 
 MOVED = "attribute_"
 
+SEAL = "attributes_checksum"
+"""The attribute that holds the checksum of all others; files of the first versions have none."""
+
 
 def save(
     sol: Trajectory,
@@ -60,6 +63,12 @@ def checksum(values: np.ndarray) -> int:
     return zlib.crc32(np.ascontiguousarray(values).tobytes())
 
 
+def seal(attributes: Mapping[str, Any]) -> int:
+    """The CRC-32 of the attributes of a file, but for `SEAL` itself and those that netCDF adds."""
+    ours = {name: value for name, value in attributes.items() if name != SEAL and not name.startswith("_")}
+    return zlib.crc32(json.dumps(ours, sort_keys=True).encode())
+
+
 def _file_form(said: Description) -> tuple[dict[str, Variable], dict[str, Any]]:
     """Numbers only: names of coordinates stay in the attributes, long attributes become bytes; with checksums."""
     variables = {**said.variables, **{name: axis for name, axis in said.axes.items() if name != "coordinate"}}
@@ -70,6 +79,7 @@ def _file_form(said: Description) -> tuple[dict[str, Variable], dict[str, Any]]:
             data = np.frombuffer(attributes.pop(name).encode(), dtype=np.uint8)
             variables[MOVED + name] = Variable((f"{MOVED}{name}_byte",), data)
     attributes["checksums"] = json.dumps({name: checksum(variable.values) for name, variable in variables.items()})
+    attributes[SEAL] = seal(attributes)
     return variables, attributes
 
 
