@@ -403,6 +403,8 @@ def test_one_flipped_bit_is_noticed(tmp_path, two_points):
     assert at > 0
     content[at + 20] ^= 1
     path.write_bytes(content)
+    assert "it is not what was saved" in one_sentence(path)
+    path.write_bytes(content[:-16])  # without the checksum of the whole, as the first files are
     assert "variable q is not what was saved" in one_sentence(path)
 
 
