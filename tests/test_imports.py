@@ -11,6 +11,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "dirax"
 
 # A module may import from its own room and from those before it. "__init__" is the package itself: its public names.
 ROOMS = (
+    "float64",
     "text",
     "program",
     "geometry",
@@ -22,11 +23,15 @@ ROOMS = (
     "run",
     "diagnostics",
     "gallery",
+    "public",
     "__init__",
     "cli",
 )
 RANK = {room: rank for rank, room in enumerate(ROOMS)}
-LOADED_ON_DEMAND = ("matplotlib", "xarray", "zarr", "h5netcdf", "pandas", "typer", "rich")
+LOADED_ON_DEMAND = ("matplotlib", "xarray", "zarr", "h5netcdf", "h5py", "pandas", "typer", "rich")
+
+CIRCLES: tuple[set[str], ...] = ({"engines.native.engine", "engines.native.gradients.differentiate"},)
+"""Circles of modules that are still to be opened; there are to be none."""
 
 
 def room_of(path: Path) -> str:
@@ -105,8 +110,114 @@ def test_an_import_along_the_order_is_not(source):
     assert against_the_order(SOURCE / "systems" / "some_system.py", source) == []
 
 
-def test_importing_dirax_loads_no_plotting_storage_or_command_line_library():
-    program = f"import sys, dirax; print(*(name for name in {LOADED_ON_DEMAND} if name in sys.modules))"
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__") or "__init__"
+
+
+def imported_modules(path: Path, source: str, modules: set[str]) -> set[str]:
+    """The modules that a file imports, anywhere in it: also inside functions and for type checkers only."""
+    found = set()
+    package = ("dirax", *path.relative_to(SOURCE).parts[:-1])
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            targets = [(alias.name, None) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            targets = [(".".join((*above, *filter(None, [node.module]))), alias.name) for alias in node.names]
+        else:
+            continue
+        for target, name in targets:
+            root, _, module = target.partition(".")
+            if root == "dirax":
+                inner = f"{module}.{name}".removeprefix(".")
+                found.add(inner if name and inner in modules else module or "__init__")
+    return found & modules
+
+
+def circles(imports: dict[str, set[str]]) -> list[set[str]]:
+    """The strongly connected components of more than one module (Tarjan)."""
+    number, low, stack, found = {}, {}, [], []
+
+    def visit(module: str) -> None:
+        number[module] = low[module] = len(number)
+        stack.append(module)
+        for other in imports[module]:
+            if other not in number:
+                visit(other)
+            if other in stack:
+                low[module] = min(low[module], low[other])
+        if low[module] == number[module]:
+            component = set(stack[stack.index(module) :])
+            del stack[stack.index(module) :]
+            if len(component) > 1:
+                found.append(component)
+
+    for module in imports:
+        if module not in number:
+            visit(module)
+    return found
+
+
+def test_no_circle_of_modules():
+    paths = {module_of(path): path for path in SOURCE.rglob("*.py")}
+    imports = {name: imported_modules(path, path.read_text("utf-8"), paths.keys()) - {name} for name, path in paths.items()}
+    found = [circle for circle in circles(imports) if not any(circle <= known for known in CIRCLES)]
+    assert not found, "\n".join(", ".join(sorted(circle)) for circle in found)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from dirax.run.start import begin",
+        "def late():\n    import dirax.run.start",
+        "from dirax.run import start",
+        "from . import start",
+        "from .start import begin",
+    ],
+)
+def test_a_circle_is_found(source):
+    path = SOURCE / "run" / "simulate.py"
+    modules = {"run.simulate", "run.start", "run", "__init__"}
+    imports = {"run.simulate": imported_modules(path, source, modules), "run.start": {"run.simulate"}}
+    assert circles({"run": set(), "__init__": set(), **imports}) == [{"run.simulate", "run.start"}]
+
+
+def answer(program: str) -> str:
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-    assert run.stdout.split() == []
+    return run.stdout.strip()
+
+
+def test_importing_dirax_loads_no_plotting_storage_or_command_line_library():
+    public = f"import sys, dirax; dirax.simulate; print(*(name for name in {LOADED_ON_DEMAND} if name in sys.modules))"
+    assert answer(public) == ""
+
+
+def test_importing_dirax_loads_nothing_until_a_name_is_used():
+    program = "import sys, dirax; print('jax' in sys.modules, 'numpy' in sys.modules); dirax.Theta; print('jax' in sys.modules)"
+    assert answer(program).split() == ["False", "False", "True"]
+
+
+@pytest.mark.parametrize("order", ["import jax, dirax", "import dirax, jax"])
+def test_importing_dirax_turns_on_64_bits_in_whatever_order(order):
+    program = f"{order}; import jax.numpy as jnp; print(jnp.zeros(1).dtype, jax.__spec__.loader is jax.__loader__)"
+    assert answer(program).split() == ["float64", "True"]
+
+
+def test_public_names():
+    import dirax
+    from dirax import public
+
+    assert len(set(public.__all__)) == len(public.__all__) >= 93
+    assert all(getattr(dirax, name) is getattr(public, name) for name in public.__all__)
+    assert set(public.__all__) <= set(dir(dirax)) and dirax.__all__ is public.__all__
+    imported = {
+        alias.name
+        for node in ast.parse(Path(public.__file__).read_text("utf-8")).body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert imported == set(public.__all__)
+    assert dirax.gallery.names() and dirax.geometry.maps.Theta is dirax.Theta
+    with pytest.raises(AttributeError, match="module 'dirax' has no attribute 'Nonsense'"):
+        _ = dirax.Nonsense

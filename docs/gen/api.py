@@ -1,6 +1,6 @@
 """MkDocs hook: a line `::: room systems` on a page becomes the documentation of every public name of that room.
 
-The public names are those that `dirax/__init__.py` imports; each must find its place on one page.
+The public names are those that `dirax/public.py` imports; each must find its place on one page.
 """
 
 import ast
@@ -32,7 +32,7 @@ def public_names(init: Path) -> dict[str, str]:
 
 def on_config(config: Any) -> None:
     undocumented.clear()
-    undocumented.update(public_names(Path(config.config_file_path).parent / "src" / "dirax" / "__init__.py"))
+    undocumented.update(public_names(Path(config.config_file_path).parent / "src" / "dirax" / "public.py"))
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

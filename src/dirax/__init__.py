@@ -1,192 +1,35 @@
 """Geometric integrators from discrete Dirac mechanics: state a system, get the integrator, have it measured.
 
 Importing dirax turns on 64-bit floats in JAX (`jax_enable_x64`): structure is preserved to roundoff, and roundoff is float64's.
+The public names are those of `dirax.public`. They, and JAX with them, are imported where the first of them is used.
 """
 
-import jax
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
-jax.config.update("jax_enable_x64", True)
+from dirax.float64 import turn_on_in_jax
 
-from dirax.diagnostics.compare import compare
-from dirax.diagnostics.convergence import convergence
-from dirax.diagnostics.report import Report
-from dirax.diagnostics.verify import verify
-from dirax.engines.configure import configure
-from dirax.engines.engine import AbstractEngine
-from dirax.engines.linear_solver import AbstractLinearSolver
-from dirax.geometry.charts import Atlas, RetractionChart, chart_at, check_chart
-from dirax.geometry.cotangent_lift import CotangentBundle, cotangent_lift, symplecticity_defect
-from dirax.geometry.discrete import (
-    DiscretizationMapDirac,
-    FiniteDifferenceDirac,
-    GeneratingFunctionDirac,
-    InducedFiniteDifferenceDirac,
-)
-from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
-from dirax.geometry.linear import LinearDirac
-from dirax.geometry.map_report import check_discretization_map
-from dirax.geometry.maps import (
-    AbstractDiscretizationMap,
-    LieGroupExp,
-    Midpoint,
-    ProductMap,
-    RiemannianExp,
-    SphereProjection,
-    Theta,
-)
-from dirax.geometry.projected_map import ProjectedMap, Submanifold
-from dirax.geometry.semidirect import SemidirectProduct
-from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
-from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
-from dirax.geometry.subspaces import UndecidableRank
-from dirax.geometry.tulczyjew import (
-    DiscreteEvolution,
-    FiniteDifferenceTriple,
-    GeneratingFunctionTriple,
-    TulczyjewTriple,
-    minus_legendre,
-    plus_legendre,
-)
-from dirax.program.memo import clear_caches
-from dirax.reduction.actions import GroupAction, Translations
-from dirax.reduction.connection import DiscreteConnection, LinearConnection
-from dirax.reduction.coordinates import adapted_basis, in_coordinates
-from dirax.reduction.euler_poincare import EulerPoincare
-from dirax.reduction.left_translation import LeftTranslation
-from dirax.reduction.lie_poisson import LiePoisson
-from dirax.reduction.reduce import reduce
-from dirax.reduction.reduced import ReducedLagrangeDirac
-from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
-from dirax.run.simulate import simulate
-from dirax.schemes.charted import InCharts
-from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
-from dirax.schemes.discrete_constraints import DiscreteConstraintChain, discrete_constraint_algorithm
-from dirax.schemes.discrete_dirac import DiscreteDirac
-from dirax.schemes.discrete_gradient import DiscreteGradient
-from dirax.schemes.euler_poincare import DiscreteEulerPoincare
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
-from dirax.schemes.layout import Layout
-from dirax.schemes.routh import DiscreteRouth
-from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
-from dirax.solution.reconstruction import reconstruct
-from dirax.solution.solution import Solution
-from dirax.solution.storage import load
-from dirax.systems.constraint_algorithm import constraint_algorithm
-from dirax.systems.constraint_chain import ConstraintChain
-from dirax.systems.dirac_system import DiracSystem
-from dirax.systems.forms import FinalManifold, Observed, RelationForm
-from dirax.systems.implicit_system import ImplicitSystem
-from dirax.systems.interconnection import interconnect
-from dirax.systems.lagrange_dirac import LagrangeDirac
-from dirax.systems.manifold_lagrangian import ManifoldLagrangian
-from dirax.systems.nonholonomic import NonholonomicMechanics
-from dirax.systems.phase_space import PhaseSpaceLagrangian
-from dirax.systems.port_hamiltonian import PortHamiltonian
-from dirax.systems.system import AbstractSystem
+if TYPE_CHECKING:
+    from dirax.public import *  # noqa: F403
+    from dirax.public import __all__ as __all__
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "SE2",
-    "SE3",
-    "SO2",
-    "SO3",
-    "AbstractDiscretizationMap",
-    "AbstractEngine",
-    "AbstractLinearSolver",
-    "AbstractScheme",
-    "AbstractSystem",
-    "Adjoint",
-    "Atlas",
-    "Circle",
-    "Composition",
-    "ConstraintChain",
-    "CotangentBundle",
-    "DiracStructure",
-    "DiracSystem",
-    "DiscreteConnection",
-    "DiscreteConstraintChain",
-    "DiscreteDirac",
-    "DiscreteEulerPoincare",
-    "DiscreteEvolution",
-    "DiscreteGradient",
-    "DiscreteRouth",
-    "DiscretizationMapDirac",
-    "Euclidean",
-    "EulerPoincare",
-    "Field",
-    "FinalManifold",
-    "FiniteDifferenceDirac",
-    "FiniteDifferenceTriple",
-    "GeneratingFunctionDirac",
-    "GeneratingFunctionTriple",
-    "GroupAction",
-    "ImplicitSystem",
-    "InCharts",
-    "InducedFiniteDifferenceDirac",
-    "LagrangeDAlembert",
-    "LagrangeDirac",
-    "Layout",
-    "LeftTranslation",
-    "LieGroupExp",
-    "LiePoisson",
-    "LinearConnection",
-    "LinearDirac",
-    "ManifoldLagrangian",
-    "Midpoint",
-    "MinusLagrangeDirac",
-    "NonholonomicMechanics",
-    "Observed",
-    "PhaseSpaceLagrangian",
-    "PlusLagrangeDirac",
-    "PortHamiltonian",
-    "Product",
-    "ProductMap",
-    "ProjectedMap",
-    "ReducedLagrangeDirac",
-    "RelationForm",
-    "Report",
-    "RetractionChart",
-    "RiemannianExp",
-    "SemidirectProduct",
-    "Shape",
-    "Solution",
-    "Sphere",
-    "SphereProjection",
-    "StepEquation",
-    "StepSequence",
-    "Submanifold",
-    "SymmetricComposition",
-    "Theta",
-    "Torus",
-    "Translations",
-    "TulczyjewTriple",
-    "UndecidableRank",
-    "adapted_basis",
-    "canonical_two_form",
-    "chart_at",
-    "check_chart",
-    "check_discretization_map",
-    "check_invariance",
-    "clear_caches",
-    "compare",
-    "configure",
-    "constraint_algorithm",
-    "convergence",
-    "cotangent_lift",
-    "cyclic_coordinates",
-    "discrete_constraint_algorithm",
-    "in_coordinates",
-    "induced_dirac",
-    "interconnect",
-    "load",
-    "make_step_equation",
-    "minus_legendre",
-    "plus_legendre",
-    "reconstruct",
-    "reduce",
-    "simulate",
-    "symplecticity_defect",
-    "translation_symmetries",
-    "verify",
-]
+turn_on_in_jax()
+
+
+def __getattr__(name: str) -> Any:
+    """A room of the package, a public name, or the list of these."""
+    if not name.startswith("_") and find_spec(f"dirax.{name}"):
+        return import_module(f"dirax.{name}")
+    if not name.startswith("_") or name == "__all__":
+        public = import_module("dirax.public")
+        if name == "__all__" or name in public.__all__:
+            globals()[name] = getattr(public, name)
+            return globals()[name]
+    raise AttributeError(f"module 'dirax' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *import_module("dirax.public").__all__})

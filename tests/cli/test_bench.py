@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 import dirax as dx
 from dirax import gallery
-from dirax.cli import app
 from dirax.cli.bench import subject
+from dirax.cli.commands import app
 from dirax.diagnostics.bench import casadi_c, measure, ode_solvers
 from dirax.diagnostics.bench.engines import plain_run
 from dirax.diagnostics.bench.measure import PROGRAMS, SAME_STEPS, Bench, Row, bench

@@ -1,6 +1,10 @@
 """The command line, as a user types it."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -8,10 +12,12 @@ from typer.testing import CliRunner
 
 import dirax as dx
 from dirax import gallery
-from dirax.cli import app
+from dirax.cli import terminal
+from dirax.cli.commands import app
 from dirax.cli.schemes import scheme_from_text
 from dirax.cli.subject import changed
 from dirax.gallery import peng_yoshimura, reproduction
+from dirax.gallery.listing import listing
 from dirax.solution.plotting import new_figure
 
 SPRING = """
@@ -222,3 +228,109 @@ def test_reproduce_writes_and_prints_and_fails_where_a_number_differs(tmp_path, 
     monkeypatch.setattr(peng_yoshimura, "reproduction", lambda progress: paper(reproduction.DIFFERS))
     bad = call("reproduce", "PY", "--out", tmp_path, "--json")
     assert bad.exit_code == 1 and json.loads(bad.stdout)[0]["ok"] is False and "DIFFERS" in bad.stderr
+
+
+# ------------------------------------------------------------------------------------------------------ the program as it is
+
+
+def program(*arguments, before="", redirected="", **options):
+    """`dirax` as a process of its own, its streams redirected as a shell does."""
+    code = f"import sys; sys.argv[0] = 'dirax'\n{before}\nfrom dirax.cli import main\nmain()"
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+    shell = ["sh", "-c", f'exec "$@" {redirected}', "sh"] if redirected else []
+    return subprocess.Popen([*shell, sys.executable, "-c", code, *map(str, arguments)], **options)
+
+
+def ended(process):
+    out, err = process.communicate(timeout=120)
+    text = (err or b"").decode()
+    assert "Traceback" not in text
+    return process.returncode, (out or b"").decode("latin-1"), text
+
+
+def test_list_and_help_do_not_import_jax():
+    after = "import atexit; atexit.register(lambda: print('jax' in sys.modules, 'numpy' in sys.modules, file=sys.stderr))"
+    for command in ("list", "--help"):
+        status, out, err = ended(program(command, before=after))
+        assert (status, err.split()) == (0, ["False", "False"]) and "reproduce" in out
+
+
+def test_the_listing_says_what_the_examples_say():
+    examples = [gallery.get(name) for name in gallery.names()]
+    assert listing() == [(e.name, e.title, e.source) for e in examples]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_a_reader_that_stops_ends_the_program():
+    reader, writer = os.pipe()
+    process = program("list", stdout=writer)
+    os.close(writer)
+    os.close(reader)
+    assert ended(process) == (-signal.SIGPIPE, "", "")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+@pytest.mark.parametrize("command", ["list", "--help"])
+def test_a_full_disk(command):
+    with open("/dev/full", "w") as full:
+        status, _, err = ended(program(command, stdout=full))
+    assert status == 1 and "No space left" in err and len(err.splitlines()) == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file descriptors of POSIX")
+def test_closed_streams():
+    status, _, err = ended(program("list", redirected=">&-"))
+    assert status == 1 and err.startswith("dirax: standard output is closed") and len(err.splitlines()) == 1
+    status, out, _ = ended(program("list", redirected="2>&-"))
+    assert status == 0 and "kepler" in out
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
+def test_encodings_that_lack_signs(encoding):
+    environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"}
+    status, out, _ = ended(program("list", env=environment))
+    assert status == 0 and ("Barbero Liñán" in out or encoding == "ascii")  # click writes UTF-8 where ASCII is said
+    assert terminal._simpler(UnicodeEncodeError("ascii", "θ₁ ─ −φ ☃", 0, 9, "")) == ("theta1 - -phi ?", 9)
+
+
+@pytest.mark.parametrize("columns", [1, 20])
+def test_narrow_terminals(columns):
+    environment = {**os.environ, "COLUMNS": str(columns), "FORCE_COLOR": "1", "TERM": "xterm"}
+    for arguments in (("list",), ("--help",), ("run", "--help"), ("run",)):
+        status, out, err = ended(program(*arguments, env=environment))
+        assert status == (2 if arguments == ("run",) else 0) and out + err
+
+
+@pytest.mark.parametrize(
+    "setting",
+    ["q=" + "[" * 50_000, "q=" + "9" * 50_000, "a" * 50_000 + "=1", "=" * 50_000, "a" * 50_000, "q[" + "1" * 50_000 + "]=1"],
+)
+def test_settings_of_any_length(setting):
+    result = call("run", "kepler", "--set", setting)
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
+    assert len(result.stderr) < 400 and len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("text", ["(" * 50_000, "plus" * 20_000, "LagrangeDAlembert(" * 5_000 + ")" * 5_000, "-" * 50_000 + "1"])
+def test_schemes_of_any_length(text):
+    result = call("run", "kepler", "--scheme", text)
+    assert result.exit_code == 1 and isinstance(result.exception, SystemExit)
+    assert len(result.stderr) < 400 and len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("moment", ["import dirax.cli.commands", "import dirax.gallery", "import jax"])
+def test_an_interruption_at_any_moment(moment):
+    """Ctrl-C in the middle of an import: of the commands, of a command's own modules, of JAX."""
+    name = moment.removeprefix("import ")
+    before = f"""
+import os, signal
+class Interrupts:
+    def find_spec(self, name, path=None, target=None):
+        if name == {name!r}:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupts())
+"""
+    status, out, err = ended(program("run", "kepler", before=before))
+    assert (status, out, err.strip()) == (130, "", "dirax: interrupted.")

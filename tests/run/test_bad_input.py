@@ -410,7 +410,7 @@ def test_unknown_gallery_names():
 
 
 def test_unreadable_files(tmp_path):
-    """More in test_storage.py."""
+    """More in test_files.py."""
     (tmp_path / "notes.nc").write_text("not a trajectory")
     complaint_of(lambda: dx.load(tmp_path / "notes.nc"), ValueError, "notes.nc cannot be loaded")
     complaint_of(lambda: dx.load(tmp_path / "nothing.nc"), FileNotFoundError, "there is no file", "check the path")

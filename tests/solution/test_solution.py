@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.solution import solution
+from dirax.solution import trajectory
 
 SPRING = dx.LagrangeDirac(lambda q, v, params: (params["m"] * (v @ v) - params["k"] * (q @ q)) / 2)
 SKATE = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]]))
@@ -46,7 +46,7 @@ def test_momentum_map(spring):
 @pytest.mark.parametrize("rows", [1, 2, 5, 13, 26, 1000])
 def test_rows_in_blocks(rows, spring, monkeypatch):
     """Long trajectories are worked through in blocks; the last one may be shorter."""
-    monkeypatch.setattr(solution, "BLOCK", rows)
+    monkeypatch.setattr(trajectory, "BLOCK", rows)
     values = spring.map_rows(lambda row, params: {"e": params["k"] * (row["q"] @ row["q"]), "q": row["q"]})
     np.testing.assert_allclose(values["e"], np.array([[3.0], [1.0]]) * np.sum(spring.q**2, -1), rtol=1e-14)
     np.testing.assert_array_equal(values["q"], spring.q)

@@ -1,6 +1,7 @@
 """What the commands show: progress, tables, errors. Results go to standard output, everything else to standard error."""
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import wraps
@@ -81,5 +82,6 @@ def show_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]],
 
 
 def show_json(value: Any) -> None:
-    """JSON on standard output."""
-    typer.echo(json.dumps(value, indent=2, ensure_ascii=False))
+    """JSON on standard output, in ASCII where that cannot show everything."""
+    everything = "utf" in (getattr(sys.stdout, "encoding", None) or "").lower()
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=not everything))

@@ -9,8 +9,8 @@ from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
 from dirax.gallery.example import Example
 from dirax.schemes.step import AbstractScheme
+from dirax.solution.saving import FORMATS
 from dirax.solution.solution import Solution
-from dirax.solution.storage import ENDINGS
 from dirax.text.tables import plain
 
 
@@ -34,8 +34,8 @@ def run_and_verify(
 
 def refuse_target(path: Path, overwrite: bool) -> None:
     """Raise before a run whose trajectory could not be saved in `path`."""
-    if path.suffix not in ENDINGS:
-        raise ValueError(f"--out must end in {' or '.join(ENDINGS)}, but {str(path)!r} was given.")
+    if path.suffix not in FORMATS:
+        raise ValueError(f"--out must end in {' or '.join(FORMATS)}, but {str(path)!r} was given.")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"the folder {path.parent} does not exist: create it, or choose another for --out.")
     if path.exists() and not overwrite:

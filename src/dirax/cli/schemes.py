@@ -9,6 +9,7 @@ from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.discrete_gradient import DiscreteGradient
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.step import AbstractScheme
+from dirax.text.representation import shortened
 
 SHORT_NAMES: dict[str, AbstractScheme] = {
     "plus": PlusLagrangeDirac(),
@@ -47,11 +48,11 @@ def scheme_from_text(text: str) -> AbstractScheme:
         return SHORT_NAMES[text]
     try:
         tree = ast.parse(text.strip(), mode="eval").body
-    except (SyntaxError, ValueError):
-        raise ValueError(f"cannot read the scheme {text!r}: {_choices()}") from None
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise ValueError(f"cannot read the scheme {shortened(text)}: {_choices()}") from None
     scheme = _value(tree, text)
     if not isinstance(scheme, AbstractScheme):
-        raise ValueError(f"{text!r} is not a scheme: {_choices()}")
+        raise ValueError(f"{shortened(text)} is not a scheme: {_choices()}")
     return scheme
 
 
@@ -62,7 +63,7 @@ def _value(node: ast.expr, text: str) -> Any:
         return _maker(node.id)()
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         if any(keyword.arg is None for keyword in node.keywords):
-            raise ValueError(f"cannot read {text!r}: write every argument out, without **.")
+            raise ValueError(f"cannot read {shortened(text)}: write every argument out, without **.")
         maker = _maker(node.func.id)
         named = {str(keyword.arg): _value(keyword.value, text) for keyword in node.keywords}
         return maker(*(_value(argument, text) for argument in node.args), **named)
@@ -70,7 +71,8 @@ def _value(node: ast.expr, text: str) -> Any:
         return ast.literal_eval(node)
     except ValueError:
         raise ValueError(
-            f"cannot read {ast.unparse(node)!r} in a scheme: arguments are numbers, strings, lists, or schemes and maps of dirax."
+            f"cannot read {shortened(ast.unparse(node))} in a scheme: arguments are numbers, strings, lists, or schemes and "
+            "maps of dirax."
         ) from None
 
 
@@ -78,7 +80,7 @@ def _maker(name: str) -> Any:
     if name in MAKERS:
         return MAKERS[name]
     near = difflib.get_close_matches(name, [*SHORT_NAMES, *MAKERS], n=1)
-    raise ValueError(f"no scheme {name!r}: {f'did you mean {near[0]!r}?' if near else _choices()}")
+    raise ValueError(f"no scheme {shortened(name)}: {f'did you mean {near[0]!r}?' if near else _choices()}")
 
 
 def _choices() -> str:

@@ -17,6 +17,7 @@ from dirax.gallery.example import Example
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
+from dirax.text.representation import shortened
 
 INITIAL = ("q", "v", "p", "q0", "q1", "x")
 RUN_OPTIONS = ("save_every", "t0", "max_iterations", "engine", "project", "check_initial")
@@ -88,7 +89,7 @@ def changed(example: Example, settings: Sequence[str]) -> tuple[Example, dict[st
         key, equals, text = setting.partition("=")
         key = key.strip()
         if not equals:
-            raise ValueError(f"--set takes key=value, but {setting!r} was given.")
+            raise ValueError(f"--set takes key=value, but {shortened(setting)} was given.")
         value = _literal(key, text)
         entry = re.fullmatch(r"(\w+)\[(.+)\]", key)
         if key in ("step", "steps"):
@@ -111,10 +112,12 @@ def changed(example: Example, settings: Sequence[str]) -> tuple[Example, dict[st
 def _literal(key: str, text: str) -> Any:
     try:
         return ast.literal_eval(text.strip())
-    except (ValueError, SyntaxError):
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
         if text.strip().isidentifier():
             return {"true": True, "false": False}.get(text.strip().lower(), text.strip())
-        raise ValueError(f"cannot read the value {text!r} of {key}: give a number, a list such as [0, 1.5], or a word.") from None
+        raise ValueError(
+            f"cannot read the value {shortened(text)} of {key:.60}: give a number, a list such as [0, 1.5], or a word."
+        ) from None
 
 
 def _whole(value: Any) -> Any:
@@ -125,12 +128,12 @@ def _array(key: str, value: Any) -> np.ndarray:
     try:
         return np.array(value, dtype=float)
     except (TypeError, ValueError):
-        raise ValueError(f"{key} must be a list of numbers, but {value!r} was given.") from None
+        raise ValueError(f"{key} must be a list of numbers, but {shortened(value)} was given.") from None
 
 
 def _number(key: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{key} must be a number, but {value!r} was given.")
+        raise ValueError(f"{key} must be a number, but {shortened(value)} was given.")
     return float(value)
 
 
@@ -142,10 +145,10 @@ def _position(example: Example, name: str, index: str, initial: dict[str, np.nda
     if re.fullmatch(r"-?\d+", index) and -size <= int(index) < size:
         return ..., int(index)
     names = f", or one of {', '.join(labels)}" if labels else ""
-    raise ValueError(f"{name} has no entry {index!r}: give a number from 0 to {size - 1}{names}.")
+    raise ValueError(f"{name} has no entry {shortened(index)}: give a number from 0 to {size - 1}{names}.")
 
 
 def _unknown(key: str, initial: dict[str, Any], params: Any) -> str:
     known = ["step", "steps", *RUN_OPTIONS, *initial, *(params if isinstance(params, Mapping) else ())]
     near = difflib.get_close_matches(key, known, n=1)
-    return f"cannot set {key!r}: {f'did you mean {near[0]}?' if near else 'there are ' + ', '.join(known) + '.'}"
+    return f"cannot set {shortened(key)}: {f'did you mean {near[0]}?' if near else 'there are ' + ', '.join(known) + '.'}"

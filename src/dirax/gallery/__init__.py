@@ -2,8 +2,10 @@
 
 import difflib
 from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from dirax.gallery.example import Coordinate, Example
+if TYPE_CHECKING:
+    from dirax.gallery.example import Coordinate, Example
 
 __all__ = ["Coordinate", "Example", "get", "names"]
 
@@ -51,7 +53,12 @@ def names() -> tuple[str, ...]:
     return tuple(_MODULES)
 
 
-def get(name: str) -> Example:
+def modules() -> dict[str, str]:
+    """The module here of each system."""
+    return dict(_MODULES)
+
+
+def get(name: str) -> "Example":
     """The example of that name; capitals, spaces and underscores do not matter.
 
     Raises `ValueError`, with the nearest name, for a name that is not in the gallery.
@@ -60,5 +67,11 @@ def get(name: str) -> Example:
     if wanted not in _MODULES:
         near = difflib.get_close_matches(wanted, _MODULES, n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(_MODULES)}."
-        raise ValueError(f"no system {name!r} in the gallery: {hint}")
+        raise ValueError(f"no system {name!r:.60} in the gallery: {hint}")
     return import_module(f"dirax.gallery.{_MODULES[wanted]}").EXAMPLE
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("Coordinate", "Example"):
+        return getattr(import_module("dirax.gallery.example"), name)
+    raise AttributeError(f"module 'dirax.gallery' has no attribute {name!r}")

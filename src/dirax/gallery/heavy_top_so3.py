@@ -21,7 +21,7 @@ def hamiltonian(mu, gamma, params):
 EXAMPLE = Example(
     name="heavy-top-so3",
     title="Heavy top on SO(3)",
-    source=heavy_top.EXAMPLE.source,
+    source="Marsden & Ratiu, Introduction to Mechanics and Symmetry, §1.4",
     system=LiePoisson(SO3(), hamiltonian, advected=3),
     params=heavy_top.PARAMS,
     initial=heavy_top.EXAMPLE.initial,

@@ -7,30 +7,25 @@ eliminated, iterated as they are printed, without any of dirax.
 import math
 from typing import Any
 
-import jax
 import numpy as np
 
 from dirax.diagnostics.verify import verify
 from dirax.gallery import heisenberg, rolling_disk
+from dirax.gallery.peng_yoshimura_figures import disk_figures, heisenberg_figures
+from dirax.gallery.peng_yoshimura_quantities import AXIS_END, SIGN, TEXT_END, generalized_energy, path_energy
 from dirax.gallery.reproduction import AGREES, DIFFERS, NEW, WRONG, Progress, Reproduction, Row, compared
-from dirax.schemes.discrete_lagrangian import discrete_lagrangian, slot_derivatives
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.solution.solution import Solution
 
 TITLE = "Peng, Yoshimura: discrete Lagrange–Dirac dynamical systems, §8"
 SCHEMES = {"+": PlusLagrangeDirac(), "-": MinusLagrangeDirac()}
-SIGN = {"+": "(+)", "-": "(−)"}
 DISK, HEISENBERG = rolling_disk.EXAMPLE, heisenberg.EXAMPLE
-TEXT_END, AXIS_END = 50, 100
-"""Where the disk's runs end: [0, 50] in the text, 100 on the axes of Figures 10–12, 15 and 16."""
 
 BY_ITS_EQUATIONS = "The paper prints no numbers: its column is its equations for (x, y, θ, φ), iterated as printed."
 
 
 def reproduction(progress: Progress = lambda fraction, text: None) -> Reproduction:
     """Run §8 of the paper: table and Figures 9–20."""
-    from dirax.gallery.peng_yoshimura_figures import disk_figures, heisenberg_figures
-
     disks, lines = {}, {}
     for number, sign in enumerate(SCHEMES):
         progress(0.04 * number, f"rolling disk, {SIGN[sign]}, h = .001 to t = {AXIS_END}")
@@ -74,29 +69,6 @@ def iterate_printed(sign: str, q0, q1, step: float, steps: int) -> np.ndarray:
         change = known / (0.25 + c * cb + s * sb)
         x0, x, y0, y, a0, a, f0, f = x, x + cb * change, y, y + sb * change, a, a + change, f, f2
     return np.array([x, y, a, f])
-
-
-def path_energy(sol: Solution) -> np.ndarray:
-    """E(q_k, (q_{k+1} − q_k)/h) of the trajectory's steps, (rows − 1,)."""
-    q = np.asarray(sol.q)
-    along = jax.jit(jax.vmap(lambda q, v: sol.system.energy(q, v, sol.params)))
-    return np.asarray(along(q[:-1], np.diff(q, axis=0) / sol.step))
-
-
-def generalized_energy(sol: Solution, sign: str) -> np.ndarray:
-    """The discrete generalized energy of [PY] Def 7.1 at each step, (rows − 1,); it is about h times the energy.
-
-    E⁺ = ⟨p_{k+1}, q_{k+1} − q_k⟩ − L_d with p_{k+1} = D2 L_d, and E⁻ = ⟨p_k, q_{k+1} − q_k⟩ − L_d with p_k = −D1 L_d.
-    """
-    ld = discrete_lagrangian(sol.system.lagrangian, "left")
-    h = sol.step
-
-    def of_step(q, v):
-        d1, d2 = slot_derivatives(ld, 0.0, q, v, h, sol.params)
-        return h * ((d2 if sign == "+" else -d1) @ v) - ld(0.0, q, v, h, sol.params)
-
-    q = np.asarray(sol.q)
-    return np.asarray(jax.jit(jax.vmap(of_step))(q[:-1], np.diff(q, axis=0) / h))
 
 
 def disk_rows(sign: str, sol: Solution) -> list[Row]:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.gallery.peng_yoshimura import AXIS_END, SIGN, generalized_energy, path_energy
+from dirax.gallery.peng_yoshimura_quantities import AXIS_END, SIGN, generalized_energy, path_energy
 from dirax.solution.plotting import (
     BLUE,
     ENERGY_ERROR,

@@ -161,6 +161,11 @@ def _arrays(params):
                 f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {leaf!r:.60}: "
                 "use such a value in the system's functions directly."
             )
+        if isinstance(leaf, int) and not -(2**63) <= leaf < 2**63:
+            raise ValueError(
+                f"params{jax.tree_util.keystr(path)} is a whole number of {leaf.bit_length()} bits, and arrays hold 64: write "
+                "it as a float."
+            )
     return jax.tree.map(lambda leaf: jnp.asarray(leaf) if is_traced(leaf) else np.array(leaf), params)
 
 

@@ -13,7 +13,7 @@ from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Abstract
 from dirax.schemes.layout import Layout
 from dirax.schemes.step_forms import form_of_steps
 from dirax.systems.shape import Shape
-from dirax.text.representation import counted, html_table, module_html, module_text
+from dirax.text.representation import counted, fields_html, module_html, module_text
 
 
 class Field(eqx.Module):
@@ -110,7 +110,7 @@ class StepEquation(eqx.Module):
 
     def _repr_html_(self) -> str:
         parts = {"state is": repr(self.state_layout), "unknowns are": repr(self.unknown_layout)}
-        return html_table("StepEquation", self._summary() | parts | {"equations": ", ".join(self.labels)})
+        return fields_html("StepEquation", self._summary() | parts | {"equations": ", ".join(self.labels)})
 
 
 class StepSequence(eqx.Module):

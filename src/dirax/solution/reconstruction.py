@@ -16,7 +16,7 @@ from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import Field
-from dirax.solution.dataset import with_code
+from dirax.solution.loading import with_code
 from dirax.solution.solution import Solution
 
 

@@ -116,14 +116,3 @@ def _classes(bases: tuple[type, ...]) -> dict[tuple[str, str], type]:
             if cls.__module__.startswith("dirax."):
                 found[cls.__module__, cls.__name__] = cls
     return found
-
-
-def plain(value: Any) -> Any:
-    """Dicts, lists and numbers as JSON can hold them, everything else as text; for information only."""
-    if isinstance(value, np.generic | np.ndarray | jax.Array):
-        return plain(np.asarray(value).tolist())
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    return value if type(value) in PLAIN else str(value)

@@ -1,10 +1,11 @@
 """How systems, schemes and equations show themselves: one readable line in a terminal, a small table in a notebook."""
 
 import dataclasses
-import html
 from typing import Any
 
 import numpy as np
+
+from dirax.text.tables import html_table
 
 LINE = 100
 """Longest representation that stays on one line."""
@@ -29,7 +30,7 @@ def module_text(module: Any) -> str:
 
 def module_html(module: Any) -> str:
     """The fields of a record as a table."""
-    return html_table(type(module).__name__, {k: value_text(v) for k, v in module_fields(module).items()})
+    return fields_html(type(module).__name__, {k: value_text(v) for k, v in module_fields(module).items()})
 
 
 def value_text(value: Any) -> str:
@@ -44,15 +45,17 @@ def value_text(value: Any) -> str:
     return repr(value)
 
 
-def html_table(title: str, rows: dict[str, str]) -> str:
-    """A captioned table of two columns, everything escaped."""
-    body = "".join(
-        f"<tr><th style='text-align:left'>{html.escape(name)}</th><td style='text-align:left'>{html.escape(text)}</td></tr>"
-        for name, text in rows.items()
-    )
-    return f"<table><caption><b>{html.escape(title)}</b></caption><tbody>{body}</tbody></table>"
+def fields_html(title: str, rows: dict[str, str]) -> str:
+    """Names and texts as a table of two columns."""
+    return html_table((), list(rows.items()), title)
 
 
 def counted(number: int, noun: str, plural: str | None = None) -> str:
     """`1 step`, `50 000 steps`: a number with its noun, thousands set apart."""
     return f"{number:,}".replace(",", " ") + " " + (noun if number == 1 else plural or f"{noun}s")
+
+
+def shortened(value: Any, most: int = 60) -> str:
+    """The representation of a value that a user gave, cut after `most` characters."""
+    text = repr(value)
+    return text if len(text) <= most else f"{text[: most - 1]}…"

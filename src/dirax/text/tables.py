@@ -15,12 +15,13 @@ def text_table(header: tuple[str, ...], rows: list[tuple[str, ...]], title: str 
 
 
 def html_table(header: tuple[str, ...], rows: list[tuple[str, ...]], title: str = "", bold: tuple[str, ...] = ()) -> str:
-    """The same as an HTML table; cells whose text is in `bold` stand out."""
+    """The same as an HTML table; cells whose text is in `bold` stand out. An empty header leaves its row out."""
     show = lambda cell: f"<b>{html.escape(cell)}</b>" if cell in bold else html.escape(cell)
     cells = lambda tag, line: "".join(f"<{tag} style='text-align:left'>{show(cell)}</{tag}>" for cell in line)
     body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    top = f"<p>{html.escape(title)}</p>" if title else ""
-    return f"{top}<table><thead><tr>{cells('th', header)}</tr></thead><tbody>{body}</tbody></table>"
+    top = f"<caption style='text-align:left'>{html.escape(title)}</caption>" if title else ""
+    head = f"<thead><tr>{cells('th', header)}</tr></thead>" if header else ""
+    return f"<table>{top}{head}<tbody>{body}</tbody></table>"
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -28,14 +29,15 @@ def number(value: float | None, digits: int = 3) -> str:
     return "" if value is None else "–" if math.isnan(value) else f"{value:.{digits}g}"
 
 
-def plain(value: Any) -> Any:
-    """Nested dicts and lists of plain Python values, fit for JSON: arrays as lists, NaN and infinity as None."""
+def plain(value: Any, nonfinite: bool = False) -> Any:
+    """Nested dicts and lists of plain Python values, fit for JSON: arrays as lists, what is no plain value as text, NaN and
+    infinity as None unless `nonfinite`."""
     if isinstance(value, dict):
-        return {str(name): plain(entry) for name, entry in value.items()}
+        return {str(name): plain(entry, nonfinite) for name, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
+        return [plain(entry, nonfinite) for entry in value]
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
+        return plain(value.tolist(), nonfinite)
+    if isinstance(value, float) and not (nonfinite or math.isfinite(value)):
         return None
-    return value
+    return value if value is None or isinstance(value, (str, bool, int, float)) else str(value)

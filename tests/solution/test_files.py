@@ -3,19 +3,27 @@
 import json
 import pickle
 import shutil
+import signal
+import subprocess
+import sys
+import tracemalloc
 import zipfile
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from numcodecs import zstd
 
 import dirax as dx
-from dirax.solution import storage
+from dirax.solution import placing, saving, zarr_store
+from dirax.solution.description import Description, Variable, describe
 from dirax.solution.records import decode_scheme, encode_scheme
 
 ENDINGS = (".zarr", ".nc")
+FILES = Path(__file__).parent / "files"
 
 
 def skate_lagrangian(q, v, params):
@@ -240,6 +248,8 @@ def test_names_are_checked(batch):
         batch.to_xarray(units={"energie": "J"})
     with pytest.raises(TypeError, match=r"units\['q'\] must be a string, or a list of strings, but 3 was given"):
         batch.to_xarray(units={"q": 3})
+    with pytest.raises(ValueError, match=r"coordinates names 'x' twice"):
+        batch.to_xarray(coordinates=["x", "y", "x"])
     with pytest.raises(ValueError, match=r"one name for each of 3 coordinates, but it holds 2"):
         batch.to_xarray(coordinates=["x", "y"])
 
@@ -268,23 +278,22 @@ def test_a_folder_of_something_else_is_never_replaced(tmp_path, batch):
 def test_an_interrupted_save_leaves_the_old_file(moment, ending, tmp_path, batch, two_points, monkeypatch):
     path = two_points.save(tmp_path / f"run{ending}")
     if moment == "writing":
-        name = "to_zarr" if ending == ".zarr" else "to_netcdf"
-        write = getattr(xr.Dataset, name)
+        write, is_one = saving.FORMATS[ending]
 
-        def interrupted(self, *args, **kwargs):
-            write(self, *args, **kwargs)
+        def interrupted(*args):
+            write(*args)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(xr.Dataset, name, interrupted)
+        monkeypatch.setitem(saving.FORMATS, ending, (interrupted, is_one))
     else:
-        replace = storage.os.rename if ending == ".zarr" else storage.os.replace
+        replace = placing.os.rename if ending == ".zarr" else placing.os.replace
 
         def stopped(source, target):
-            if str(target) == str(path) and "-old" not in str(source):
+            if str(target) == str(path) and "old" not in str(source):
                 raise KeyboardInterrupt
             replace(source, target)
 
-        monkeypatch.setattr(storage.os, "rename" if ending == ".zarr" else "replace", stopped)
+        monkeypatch.setattr(placing.os, "rename" if ending == ".zarr" else "replace", stopped)
     with pytest.raises(KeyboardInterrupt):
         batch.save(path, overwrite=True)
     monkeypatch.undo()
@@ -299,6 +308,45 @@ def test_paths(tmp_path, batch):
         batch.save(tmp_path / "nowhere" / "run.nc")
     with pytest.raises(FileNotFoundError, match=r"there is no file .*run\.nc: check the path"):
         dx.load(tmp_path / "run.nc")
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_long_names(ending, tmp_path, two_points):
+    with pytest.raises(ValueError, match=r"the name .* has 30\d bytes: choose one of at most 255"):
+        two_points.save(tmp_path / ("r" * 300 + ending))
+    path = two_points.save(tmp_path / ("ü" * 120 + ending))
+    assert_same(dx.load(path), two_points)
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        dx.load(tmp_path / ("r" * 300 + ending))
+
+
+KILLED = """
+import os, signal, sys
+from dirax.solution.placing import placed
+with placed(sys.argv[1], False) as beside:
+    beside.write_text("half a file")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_what_a_killed_save_left_is_swept_by_the_next(ending, tmp_path, two_points):
+    path = tmp_path / f"run{ending}"
+    killed = subprocess.run([sys.executable, "-c", KILLED, path], capture_output=True, text=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".run-")
+    with placing.placed(path, False) as beside:  # one that is still at work is left alone
+        assert not left.exists() and beside.parent.exists()
+        two_points.save(path)
+        assert beside.parent.exists()
+        if ending == ".zarr":
+            shutil.copytree(path, beside)
+            shutil.rmtree(path)
+        else:
+            shutil.copy(path, beside)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert_same(dx.load(path), two_points)
 
 
 def one_sentence(path, **arguments) -> str:
@@ -355,6 +403,8 @@ def test_one_flipped_bit_is_noticed(tmp_path, two_points):
     assert at > 0
     content[at + 20] ^= 1
     path.write_bytes(content)
+    assert "it is not what was saved" in one_sentence(path)
+    path.write_bytes(content[:-16])  # without the checksum of the whole, as the first files are
     assert "variable q is not what was saved" in one_sentence(path)
 
 
@@ -362,6 +412,7 @@ def edited(path, change):
     """The zarr store with its attributes changed."""
     file = path / "zarr.json"
     node = json.loads(file.read_text())
+    node["attributes"].pop(saving.SEAL, None)  # as in the first files, so that what is said is looked at
     change(node["attributes"])
     file.write_text(json.dumps(node))
 
@@ -380,6 +431,26 @@ def edited(path, change):
         ("initial", '["nothing"]'),
         ("checksums", "{}"),
         ("dirax_format", "one"),
+        ("dirax_format", 0),
+        ("dirax_format", 1.5),
+        ("dirax_format", True),
+        ("step", -1.0),
+        ("step", 0.0),
+        ("step", float("nan")),
+        ("step", float("inf")),
+        ("save_every", -5),
+        ("save_every", 0),
+        ("save_every", 2.0),
+        ("ok", '"maybe"'),
+        ("message", '{"0": 3}'),
+        ("batch_params", "no"),
+        ("checksums", "[]"),
+        ("stats", "[]"),
+        ("derived", '["fields"]'),
+        ("initial", '["q", "q"]'),
+        ("fields", "[" * 100_000),
+        ("metadata", '{"coordinates": [1, 2, 3]}'),
+        ("metadata", '{"units": {"q": 3}}'),
         ("scheme_settings", '{"class": "PlusLagrangeDirac", "module": "dirax.schemes.lagrange_dirac", "settings": {"x": 1}}'),
     ],
 )
@@ -387,6 +458,168 @@ def test_crafted_attributes(name, value, tmp_path, batch):
     path = batch.save(tmp_path / "run.zarr")
     edited(path, lambda attributes: attributes.update({name: value}))
     assert one_sentence(path)
+
+
+@pytest.mark.parametrize("change", ["shape", "place", "more", "variable"])
+def test_fields_that_are_not_as_described(change, tmp_path, batch):
+    path = batch.save(tmp_path / "run.zarr")
+
+    def changed(attributes):
+        fields = json.loads(attributes["fields"])
+        if change == "more":
+            fields.append({**fields[0], "name": "r", "variable": "r"})
+        else:
+            fields[0][change] = {"shape": [2], "place": "step", "variable": "p"}[change]
+        attributes["fields"] = json.dumps(fields)
+
+    edited(path, changed)
+    assert one_sentence(path)
+
+
+def rewritten(path, sol, **arrays):
+    """A file as `save` writes it, with other arrays and the checksums that belong to them."""
+    said = describe(sol)
+    variables = {**said.variables, **said.axes}
+    for name, values in arrays.items():
+        variables[name] = Variable(variables[name].dims, values)
+    variables, attributes = saving._file_form(Description(variables, {}, said.attributes))
+    saving.FORMATS[path.suffix][0](path, variables, attributes)
+    return path
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_times_that_do_not_increase(ending, tmp_path, two_points):
+    assert_same(dx.load(rewritten(tmp_path / f"good{ending}", two_points)), two_points)
+    down, nan = two_points.t.copy(), two_points.t.copy()
+    down[2], nan[3] = -1.0, np.nan
+    for number, t in enumerate((down, nan)):
+        path = rewritten(tmp_path / f"run{number}{ending}", two_points, time=t, interval=t[:-1])
+        assert "times do not increase" in one_sentence(path)
+    path = rewritten(tmp_path / f"steps{ending}", two_points, interval=two_points.t[1:])
+    assert "steps do not begin" in one_sentence(path)
+
+
+def test_stores_with_links_and_codecs_of_another_kind(tmp_path, batch):
+    good = batch.save(tmp_path / "good.zarr")
+    linked = tmp_path / "linked.zarr"
+    shutil.copytree(good, linked)
+    shutil.rmtree(linked / "q")
+    (linked / "q").symlink_to(good / "q")
+    assert "q is a link" in one_sentence(linked)
+    node = json.loads((good / "q" / "zarr.json").read_text())
+    first = node["codecs"][0]
+    for codecs in (None, [], "zstd", [3], [{"name": "zstd"}], [first, first], [{"name": "bytes", "configuration": 3}]):
+        (good / "q" / "zarr.json").write_text(json.dumps(node | {"codecs": codecs}))
+        assert one_sentence(good)
+    for change in ({"shape": [-1]}, {"shape": 3}, {"chunk_grid": None}, {"attributes": []}, {"data_type": ["float64"]}):
+        (good / "q" / "zarr.json").write_text(json.dumps(node | change))
+        assert one_sentence(good)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_folder_or_a_file_in_the_place_of_the_other(ending, tmp_path):
+    (tmp_path / "folder.nc").mkdir()
+    (tmp_path / "file.zarr").write_text("")
+    assert one_sentence(tmp_path / "folder.nc") and one_sentence(tmp_path / "file.zarr")
+
+
+def test_sizes_are_read_before_numbers(tmp_path, batch):
+    """Arrays of 4e8 zeros in a few kilobytes are refused without being unpacked."""
+    h5py = pytest.importorskip("h5py")
+    extra = batch.save(tmp_path / "extra.nc")
+    with h5py.File(extra, "r+") as store:
+        store.create_dataset("zeros", (400_000_000,), "f8", chunks=(1_000_000,), compression="gzip")
+    within = batch.save(tmp_path / "within.nc")
+    with h5py.File(within, "r+") as store:
+        del store["p"]
+        store.create_dataset("p", (400_000_000,), "f8")
+    packed = batch.save(tmp_path / "packed.zarr")
+    node = json.loads((packed / "p" / "zarr.json").read_text())
+    node["codecs"].append({"name": "zstd", "configuration": {"level": 0, "checksum": False}})
+    (packed / "p" / "zarr.json").write_text(json.dumps(node))
+    (packed / "p" / "c" / "0" / "0" / "0").write_bytes(zstd.compress(bytes(2**27), 1))
+    tracemalloc.start()
+    try:
+        for path in (extra, within, packed):
+            assert one_sentence(path)
+        assert tracemalloc.get_traced_memory()[1] < 2**24
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_files_of_the_first_version(ending, tmp_path):
+    """A batch of two skates, saved by dirax 0.1.0 through xarray."""
+    path = FILES / "first.nc"
+    if ending == ".zarr":
+        shutil.unpack_archive(FILES / "first.zarr.zip", tmp_path / "first.zarr")
+        path = tmp_path / "first.zarr"
+    loaded = dx.load(path, system=SKATE)
+    assert loaded.scheme == dx.PlusLagrangeDirac() and loaded.metadata["note"] == "ü" * 3000
+    assert loaded.metadata["coordinates"] == ["x", "y", "φ"] and loaded.ok.tolist() == [True, True]
+    again = dx.simulate(SKATE, loaded.scheme, **loaded.initial, params=loaded.params, step=loaded.step, steps=5, save_every=2)
+    np.testing.assert_allclose(again.q, loaded.q, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(again.energy(), loaded.derived["energy"], rtol=1e-12)
+    assert_same(dx.load(loaded.save(tmp_path / f"again{ending}")), loaded)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_long_arrays_go_through_chunks_and_compression(ending, tmp_path, monkeypatch):
+    monkeypatch.setattr(zarr_store, "CHUNK", 4000)
+    monkeypatch.setattr(zarr_store, "SMALL", 2000)
+    random = np.random.default_rng(0)
+    info = {"q": dx.Field((3,)), "flag": dx.Field((2, 2), "step", ("a", "b"))}
+    fields = {"q": random.normal(size=(2, 301, 3)), "flag": random.integers(0, 9, (2, 300, 2, 2))}
+    sol = dx.Solution(t=np.arange(301.0), fields=fields, field_info=info, step=1.0, save_every=1, stats={}, ok=np.ones(2, bool))
+    path = sol.save(tmp_path / f"run{ending}")
+    loaded = dx.load(path)
+    for name in fields:
+        assert bits(loaded.fields[name]) == bits(fields[name])
+    if ending == ".zarr":
+        assert len([p for p in (path / "q" / "c").rglob("*") if p.is_file()]) == 4
+        with xr.open_zarr(path, consolidated=False) as data:
+            np.testing.assert_array_equal(data.q, fields["q"])
+
+
+# ------------------------------------------------------------------------------------------------------------------- fuzz
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_flipped_bit_anywhere_is_a_sentence_or_changes_nothing(ending, tmp_path, two_points):
+    path = two_points.save(tmp_path / f"run{ending}")
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    random = np.random.default_rng(5)
+    sizes = np.cumsum([file.stat().st_size for file in files])
+    refused = 0
+    for bit in random.integers(0, 8 * sizes[-1], 200).tolist():
+        number = int(np.searchsorted(sizes, bit // 8, side="right"))
+        content = files[number].read_bytes()
+        damaged = bytearray(content)
+        damaged[bit // 8 - (sizes[number - 1] if number else 0)] ^= 1 << bit % 8
+        files[number].write_bytes(damaged)
+        try:
+            loaded = dx.load(path)
+            for name in two_points.fields:
+                assert bits(loaded.fields[name]) == bits(two_points.fields[name])
+        except ValueError as error:
+            assert str(error).startswith(f"{path} cannot be loaded: ") and "\n" not in str(error)
+            refused += 1
+        files[number].write_bytes(content)
+    assert refused > 50
+    assert_same(dx.load(path), two_points)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_an_edited_description_is_noticed(ending, tmp_path, batch):
+    path = batch.save(tmp_path / f"run{ending}")
+    if ending == ".zarr":
+        file = path / "zarr.json"
+        file.write_text(file.read_text().replace('"step": 0.01', '"step": 0.02'))
+    else:
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "r+") as store:
+            store.attrs["step"] = 0.02
+    assert "its description is not what was saved" in one_sentence(path)
 
 
 def test_a_later_format_is_refused(tmp_path, batch):

@@ -1,0 +1,190 @@
+"""The commands of the program `dirax`: list the gallery, run a system, compare schemes, reproduce the papers, measure speed."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dirax.cli.output import progress_bar, show_json, show_table, with_messages
+
+app = typer.Typer(
+    name="dirax",
+    help="Geometric integrators from discrete Dirac mechanics: run a system, verify its structure, reproduce the papers.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+System = Annotated[str, typer.Argument(help="a name that `dirax list` shows, or a Python file", show_default=False)]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="change step, steps, save_every, engine, initial data (q=[0,1], v[0]=2) or a parameter; may be repeated",
+        show_default=False,
+    ),
+]
+Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
+SCHEME_HELP = (
+    "plus, minus, midpoint, trapezoidal, method1, method2, gradient, or a class: \"Composition(LagrangeDAlembert(), 'suzuki4')\""
+)
+
+
+@app.command("list")
+@with_messages
+def list_systems(as_json: Json = False) -> None:
+    """List the systems of the gallery, and the papers that can be reproduced."""
+    from dirax import gallery
+    from dirax.gallery.listing import listing
+    from dirax.gallery.reproduction import papers
+
+    if as_json:
+        keys = ("name", "title", "source", "step", "steps")
+        examples = [gallery.get(name) for name in gallery.names()]
+        described = [{key: getattr(e, key) for key in keys} | {"scheme": repr(e.scheme)} for e in examples]
+        show_json({"systems": described, "papers": list(papers())})
+        return
+    rows = listing()
+    widths = [max(len(row[i]) for row in rows) for i in (0, 1)]
+    text = "\n".join(f"{name:{widths[0]}}  {title:{widths[1]}}  {source}" for name, title, source in rows)
+    show_table("", ("name", "system", "source"), rows, text)
+    typer.echo(f"\ndirax run NAME runs one of them; dirax reproduce takes {', '.join(papers())} or all.")
+
+
+@app.command()
+@with_messages
+def run(
+    system: System,
+    settings: Settings = None,
+    scheme: Annotated[str | None, typer.Option(help=SCHEME_HELP, show_default=False)] = None,
+    out: Annotated[Path | None, typer.Option(help="save the trajectory: PATH.zarr or PATH.nc", show_default=False)] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file that --out names")] = False,
+    as_json: Json = False,
+) -> None:
+    """Run a system of the gallery, or of your own file, and verify the structure of the trajectory.
+
+    A file defines `system` and `initial`, a dict of initial data (q= and v=, or another pair that dirax.simulate takes), and, if
+    it likes, `scheme`, `step`, `steps` and `params`. The exit status is 1 when the trajectory failed or a structure is violated;
+    a drifting energy is a finding, not a failure.
+    """
+    from dirax.cli.running import description, message, run_and_verify, summary
+    from dirax.cli.schemes import scheme_from_text
+    from dirax.cli.subject import changed, subject
+    from dirax.diagnostics.report import HEADER, VIOLATED
+
+    example, options = changed(subject(system), settings or ())
+    chosen = scheme_from_text(scheme) if scheme else example.scheme
+    with progress_bar(f"{example.title}: compiling") as tell:
+        sol, report = run_and_verify(example, chosen, options, out, overwrite, tell)
+    if as_json:
+        show_json(description(example, sol, report, out))
+    else:
+        typer.echo(f"{summary(example, sol)}\n")
+        show_table(report.title, HEADER, [line.cells() for line in report.lines], str(report))
+        if out is not None:
+            typer.echo(f"saved in {out}")
+    if message(sol):
+        typer.echo(f"dirax: {message(sol)}", err=True)
+    if any(line.verdict == VIOLATED for line in report.lines):
+        raise typer.Exit(1)
+
+
+@app.command()
+@with_messages
+def compare(
+    system: System,
+    settings: Settings = None,
+    scheme: Annotated[
+        list[str] | None, typer.Option(help=f"a scheme to compare, may be repeated: {SCHEME_HELP}", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare schemes on a system: order, error, energy drift, constraint, time of a step."""
+    from dirax.cli.comparison import compare_schemes
+    from dirax.cli.subject import changed, subject
+    from dirax.diagnostics.compare import HEADER
+
+    example, options = changed(subject(system), settings or ())
+    with progress_bar(f"{example.title}: comparing schemes"):
+        found = compare_schemes(example, scheme or (), options)
+    notes = [f"{entry.scheme}: {entry.note}" for entry in found.entries if entry.note]
+    if as_json:
+        show_json(found.to_dict())
+    else:
+        cells = [entry.cells() for entry in found.entries]
+        show_table(f"{example.title}, {found.title}", HEADER, cells, str(found), notes)
+    failed = [entry for entry in found.entries if entry.ended != "ok"]
+    for entry in failed:
+        typer.echo(f"dirax: {entry.scheme}: {entry.ended}.", err=True)
+    if failed:
+        raise typer.Exit(1)
+
+
+@app.command()
+@with_messages
+def reproduce(
+    paper: Annotated[str, typer.Argument(help="the short name of a paper that `dirax list` shows, or all")] = "all",
+    out: Annotated[Path, typer.Option(help="the folder for the figures and the tables")] = Path("out"),
+    as_json: Json = False,
+) -> None:
+    """Reproduce a paper: print a table of its quantities, theirs against computed, and draw its figures again.
+
+    The exit status is 1 when a quantity differs from what it should be.
+    """
+    import json
+
+    from dirax.gallery.reproduction import HEADER, tables_as_json
+    from dirax.gallery.reproduction import reproduce as reproductions
+
+    with progress_bar("starting") as tell:
+        results = reproductions(paper, out, tell)
+    if as_json:
+        show_json(json.loads(tables_as_json(results)))
+    else:
+        for result in results:
+            marks, notes = result.notes()
+            cells = [(r.quantity, r.paper, r.computed, r.verdict, mark) for r, mark in zip(result.rows, marks, strict=True)]
+            show_table(f"[{result.paper}] {result.title}", (*HEADER, "note"), cells, f"{result}\n", notes)
+        typer.echo(f"figures and tables are in {out}")
+    if not all(result.ok for result in results):
+        typer.echo("dirax: a quantity differs from what it should be, see DIFFERS in the table.", err=True)
+        raise typer.Exit(1)
+
+
+@app.command()
+@with_messages
+def bench(
+    names: Annotated[
+        list[str] | None, typer.Argument(help="systems that `dirax list` shows; all of them without a name", show_default=False)
+    ] = None,
+    repeats: Annotated[int | None, typer.Option(min=1, help="interleaved repeats [default: 7]", show_default=False)] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="most steps of a timed trajectory [default: 2000]", show_default=False)
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="three systems, 100 steps, 2 repeats, unless given")] = False,
+    table: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="store everything measured in FILE", show_default=False)
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--plot", metavar="FILE", help="draw it: FILE.png, .svg or .pdf", show_default=False)
+    ] = None,
+) -> None:
+    """Time the engines beside other programs: plain JAX, C generated by CasADi, heyoka, SciPy's DOP853 and diffrax.
+
+    Each is a column if it is installed, as a ratio to one lane of the native engine. The libraries for ordinary
+    differential equations run at the end error of the scheme. What cannot run is left out, and the reason said. The whole
+    gallery takes about a quarter of an hour. The exit status is 1 when a system could not be timed.
+    """
+    from dirax.cli.bench import check_targets, run_bench, store
+
+    check_targets(table, picture)
+    with progress_bar("starting") as tell:
+        found = run_bench(names or (), repeats, quick, tell, steps)
+    show_table(found.title, found.header, found.cells(), str(found), found.notes())
+    store(found, table, picture)
+    untimed = [row.name for row in found.rows if not row.seconds]
+    if untimed:
+        typer.echo(f"dirax: {', '.join(untimed)} could not be timed.", err=True)
+        raise typer.Exit(1)

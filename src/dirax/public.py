@@ -1,0 +1,202 @@
+"""Every public name of dirax, each from the module that defines it; `dirax.NAME` is what is listed here.
+
+A name is added by its import and its line in the list of its room.
+"""
+
+from dirax.diagnostics.compare import compare
+from dirax.diagnostics.convergence import convergence
+from dirax.diagnostics.report import Report
+from dirax.diagnostics.verify import verify
+from dirax.engines.configure import configure
+from dirax.engines.engine import AbstractEngine
+from dirax.engines.linear_solver import AbstractLinearSolver
+from dirax.geometry.charts import Atlas, RetractionChart, chart_at, check_chart
+from dirax.geometry.cotangent_lift import CotangentBundle, cotangent_lift, symplecticity_defect
+from dirax.geometry.discrete import (
+    DiscretizationMapDirac,
+    FiniteDifferenceDirac,
+    GeneratingFunctionDirac,
+    InducedFiniteDifferenceDirac,
+)
+from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
+from dirax.geometry.linear import LinearDirac
+from dirax.geometry.map_report import check_discretization_map
+from dirax.geometry.maps import (
+    AbstractDiscretizationMap,
+    LieGroupExp,
+    Midpoint,
+    ProductMap,
+    RiemannianExp,
+    SphereProjection,
+    Theta,
+)
+from dirax.geometry.projected_map import ProjectedMap, Submanifold
+from dirax.geometry.semidirect import SemidirectProduct
+from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
+from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
+from dirax.geometry.subspaces import UndecidableRank
+from dirax.geometry.tulczyjew import (
+    DiscreteEvolution,
+    FiniteDifferenceTriple,
+    GeneratingFunctionTriple,
+    TulczyjewTriple,
+    minus_legendre,
+    plus_legendre,
+)
+from dirax.program.memo import clear_caches
+from dirax.reduction.actions import GroupAction, Translations
+from dirax.reduction.connection import DiscreteConnection, LinearConnection
+from dirax.reduction.coordinates import adapted_basis, in_coordinates
+from dirax.reduction.euler_poincare import EulerPoincare
+from dirax.reduction.left_translation import LeftTranslation
+from dirax.reduction.lie_poisson import LiePoisson
+from dirax.reduction.reduce import reduce
+from dirax.reduction.reduced import ReducedLagrangeDirac
+from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
+from dirax.run.simulate import simulate
+from dirax.schemes.charted import InCharts
+from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
+from dirax.schemes.discrete_constraints import DiscreteConstraintChain, discrete_constraint_algorithm
+from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.schemes.discrete_gradient import DiscreteGradient
+from dirax.schemes.euler_poincare import DiscreteEulerPoincare
+from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
+from dirax.schemes.layout import Layout
+from dirax.schemes.routh import DiscreteRouth
+from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
+from dirax.solution.loading import load
+from dirax.solution.reconstruction import reconstruct
+from dirax.solution.solution import Solution
+from dirax.systems.constraint_algorithm import constraint_algorithm
+from dirax.systems.constraint_chain import ConstraintChain
+from dirax.systems.dirac_system import DiracSystem
+from dirax.systems.forms import FinalManifold, Observed, RelationForm
+from dirax.systems.implicit_system import ImplicitSystem
+from dirax.systems.interconnection import interconnect
+from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.manifold_lagrangian import ManifoldLagrangian
+from dirax.systems.nonholonomic import NonholonomicMechanics
+from dirax.systems.phase_space import PhaseSpaceLagrangian
+from dirax.systems.port_hamiltonian import PortHamiltonian
+from dirax.systems.system import AbstractSystem
+
+# What a user states
+__all__ = [
+    "AbstractSystem",
+    "ConstraintChain",
+    "DiracSystem",
+    "FinalManifold",
+    "ImplicitSystem",
+    "LagrangeDirac",
+    "ManifoldLagrangian",
+    "NonholonomicMechanics",
+    "Observed",
+    "PhaseSpaceLagrangian",
+    "PortHamiltonian",
+    "RelationForm",
+    "constraint_algorithm",
+    "interconnect",
+]
+# Symmetries, and systems reduced by them
+__all__ += [
+    "DiscreteConnection",
+    "EulerPoincare",
+    "GroupAction",
+    "LeftTranslation",
+    "LiePoisson",
+    "LinearConnection",
+    "ReducedLagrangeDirac",
+    "Translations",
+    "adapted_basis",
+    "check_invariance",
+    "cyclic_coordinates",
+    "in_coordinates",
+    "reduce",
+    "translation_symmetries",
+]
+# Dirac structures, manifolds, groups, maps
+__all__ += [
+    "SE2",
+    "SE3",
+    "SO2",
+    "SO3",
+    "AbstractDiscretizationMap",
+    "Atlas",
+    "Circle",
+    "CotangentBundle",
+    "DiracStructure",
+    "DiscreteEvolution",
+    "DiscretizationMapDirac",
+    "Euclidean",
+    "FiniteDifferenceDirac",
+    "FiniteDifferenceTriple",
+    "GeneratingFunctionDirac",
+    "GeneratingFunctionTriple",
+    "InducedFiniteDifferenceDirac",
+    "LieGroupExp",
+    "LinearDirac",
+    "Midpoint",
+    "Product",
+    "ProductMap",
+    "ProjectedMap",
+    "RetractionChart",
+    "RiemannianExp",
+    "SemidirectProduct",
+    "Sphere",
+    "SphereProjection",
+    "Submanifold",
+    "Theta",
+    "Torus",
+    "TulczyjewTriple",
+    "UndecidableRank",
+    "canonical_two_form",
+    "chart_at",
+    "check_chart",
+    "check_discretization_map",
+    "cotangent_lift",
+    "induced_dirac",
+    "minus_legendre",
+    "plus_legendre",
+    "symplecticity_defect",
+]
+# How time is cut
+__all__ += [
+    "AbstractScheme",
+    "Adjoint",
+    "Composition",
+    "DiscreteConstraintChain",
+    "DiscreteDirac",
+    "DiscreteEulerPoincare",
+    "DiscreteGradient",
+    "DiscreteRouth",
+    "Field",
+    "InCharts",
+    "LagrangeDAlembert",
+    "Layout",
+    "MinusLagrangeDirac",
+    "PlusLagrangeDirac",
+    "Shape",
+    "StepEquation",
+    "StepSequence",
+    "SymmetricComposition",
+    "discrete_constraint_algorithm",
+    "make_step_equation",
+]
+# Running, and what comes out
+__all__ += [
+    "AbstractEngine",
+    "AbstractLinearSolver",
+    "Solution",
+    "clear_caches",
+    "configure",
+    "load",
+    "reconstruct",
+    "simulate",
+]
+# Measuring
+__all__ += [
+    "Report",
+    "compare",
+    "convergence",
+    "verify",
+]

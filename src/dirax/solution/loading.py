@@ -1,0 +1,142 @@
+"""Solutions from files: everything is checked before it is believed, and nothing is executed."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dirax.schemes.step import Field, Shape, make_step_equation
+from dirax.solution.file_record import FileRecord, file_record
+from dirax.solution.netcdf import open_netcdf
+from dirax.solution.records import decode_params, decode_scheme
+from dirax.solution.saving import MOVED, SEAL, checked_ending, checksum, seal
+from dirax.solution.solution import Solution
+from dirax.solution.stored import Stored, Unreadable, reading
+from dirax.solution.zarr_store import open_store
+
+MOST_ATTRIBUTE = 2**28
+"""Bytes of a single attribute."""
+
+NOT_OURS = "its description is not one that dirax wrote"
+
+
+def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params: Any = None) -> Solution:
+    """The solution in a file that `Solution.save` wrote, bit for bit.
+
+    Code is not stored: `system` (and `scheme`, if it is not one of dirax with plain settings) supply it where it is needed,
+    as for `dx.verify`; energies and constraint residuals are in the file. `params` replaces the stored parameters.
+    Loading never executes anything from the file, and takes no more memory than its numbers need.
+
+    Raises `FileNotFoundError`, or `ValueError` for a file that dirax did not write, cannot read, or that is damaged.
+    """
+    path = Path(path)
+    ending = checked_ending(path)
+    if not _exists(path):
+        raise FileNotFoundError(f"there is no file {path}: check the path.")
+    try:
+        sol = reading("it cannot be read, being damaged or incomplete", _read, path, ending, params)
+    except Unreadable as error:
+        raise ValueError(f"{path} cannot be loaded: {str(error).rstrip('.')}.") from error
+    return with_code(sol, system, scheme)
+
+
+def _exists(path: Path) -> bool:
+    """Whether there is something at a path; False for a path that no file can have."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def with_code(sol: Solution, system: Any, scheme: Any) -> Solution:
+    """The solution with its system, scheme and equation; `ValueError` where they have other fields than were saved."""
+    sol.system, sol.scheme = system, sol.scheme if scheme is None else scheme
+    if sol.system is None or sol.scheme is None or not sol.initial:
+        return sol
+    one = {name: a[0] if a.ndim == 2 else a for name, a in sol.initial.items()}
+    redundant = tuple(sol.stats.get("redundant_constraints", ()))
+    sol.equation = make_step_equation(
+        sol.scheme, sol.system, Shape(*sol.system.sizes(one, sol.params_of_one), redundant=redundant)
+    )
+    made = {name: tuple(field.shape) for name, field in sol.equation.stages[0][0].fields.items()}
+    saved = {name: tuple(field.shape) for name, field in sol.field_info.items()}
+    if made != saved:
+        raise ValueError(f"the file holds the fields {saved}, but the system and scheme that were given have {made}.")
+    return sol
+
+
+@contextmanager
+def _opened(path: Path, ending: str) -> Iterator[Stored]:
+    if ending == ".zarr":
+        yield open_store(path)
+    elif not path.is_file():
+        raise Unreadable("it is a folder, not a netCDF file")
+    else:
+        with open_netcdf(path) as stored:
+            yield stored
+
+
+def _read(path: Path, ending: str, params: Any) -> Solution:
+    with _opened(path, ending) as stored:
+        if SEAL in stored.attributes and stored.attributes[SEAL] != reading(NOT_OURS, seal, stored.attributes):
+            raise Unreadable("its description is not what was saved: the file is damaged or was edited")
+        said = reading(NOT_OURS, file_record, {**stored.attributes, **_moved(stored)}, stored.kinds)
+        sums = said.checksums
+        for name in sums.keys() - stored.kinds.keys():
+            raise Unreadable(f"its variable {name} is missing: the file is incomplete")
+        arrays = {}
+        for name in sorted(stored.kinds, key=lambda name: name != "time"):
+            values = stored.read(name)
+            if sums.get(name) != checksum(values):
+                raise Unreadable(f"its variable {name} is not what was saved: the file is damaged, incomplete or was edited")
+            arrays[name] = values
+    _check_times(arrays)
+    return reading(NOT_OURS, _solution, said, arrays, params)
+
+
+def _moved(stored: Stored) -> dict[str, str]:
+    """The long attributes, which are stored as arrays of bytes."""
+    found = {}
+    for name, (shape, dtype) in stored.kinds.items():
+        if name.startswith(MOVED):
+            if dtype != np.uint8 or len(shape) != 1 or shape[0] > MOST_ATTRIBUTE:
+                raise Unreadable(f"its variable {name} is not an attribute as dirax writes it")
+            found[name.removeprefix(MOVED)] = stored.read(name).tobytes().decode()
+    return found
+
+
+def _check_times(arrays: dict[str, np.ndarray]) -> None:
+    t = arrays["time"]
+    if not np.all(np.isfinite(t)) or np.any(np.diff(t) < 0):
+        raise Unreadable("its times do not increase")
+    if "interval" in arrays and not np.array_equal(arrays["interval"], t[:-1]):
+        raise Unreadable("its steps do not begin at its times")
+
+
+def _solution(said: FileRecord, arrays: dict[str, np.ndarray], params: Any) -> Solution:
+    ok, message = said.ok, said.message
+    if said.batched:
+        ok = arrays["ok"].astype(bool)
+        message = [said.message.get(str(lane), "") for lane in range(len(ok))]
+    if params is None and said.params is not None:
+        params = decode_params(json.loads(said.params))
+    return Solution(
+        t=arrays["time"],
+        fields={e["name"]: arrays[e["variable"]] for e in said.fields},
+        field_info={e["name"]: Field(tuple(e["shape"]), e["place"], tuple(e["dims"]), e["description"]) for e in said.fields},
+        step=said.step,
+        save_every=said.save_every,
+        stats=said.stats,
+        ok=ok,
+        message=message,
+        scheme=decode_scheme(said.scheme),
+        params=params,
+        batch_params=said.batch_params,
+        initial={name: arrays[f"initial_{name}"] for name in said.initial},
+        derived={name: arrays[name] for name in said.derived},
+        metadata=said.metadata,
+    )

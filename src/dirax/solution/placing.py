@@ -1,0 +1,96 @@
+"""Files that appear complete or not at all: written beside their place, then moved there."""
+
+import os
+import shutil
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from glob import escape
+from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows: leftovers of killed processes stay there
+    fcntl = None
+
+LONGEST_NAME = 255
+"""Bytes of a file's name."""
+
+
+def checked_place(path: Path, overwrite: bool, replaceable: Callable[[Path], bool] = Path.is_file) -> None:
+    """Raise where nothing could be written to `path`: `ValueError` for a name that is too long, `FileNotFoundError` without
+    its folder, `FileExistsError` unless `overwrite`, and for what is not `replaceable`."""
+    if len(os.fsencode(path.name)) > LONGEST_NAME:
+        raise ValueError(
+            f"the name {path.name[:20]}… has {len(os.fsencode(path.name))} bytes: choose one of at most {LONGEST_NAME}."
+        )
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"the folder {path.parent} does not exist: create it before saving {path.name}.")
+    if os.path.lexists(path):
+        if not overwrite:
+            raise FileExistsError(f"{path} exists: pass overwrite=True to replace it, or choose another path.")
+        if not replaceable(path):
+            raise FileExistsError(f"{path} exists and is no {path.suffix} file, so it is not replaced: choose another path.")
+
+
+@contextmanager
+def placed(path: str | os.PathLike, overwrite: bool, replaceable: Callable[[Path], bool] = Path.is_file) -> Iterator[Path]:
+    """A path to write a file or a folder to, which is moved to `path` at the end of the block if nothing was raised.
+
+    An older file stays as it was until then. What killed processes have left beside it is removed. Raises as
+    `checked_place` does.
+    """
+    path = Path(path)
+    checked_place(path, overwrite, replaceable)
+    workshop = path.parent / f".{path.stem[:40]}-{uuid.uuid4().hex}"
+    _sweep(path)
+    workshop.mkdir()
+    lock = _locked(workshop)
+    try:
+        new = workshop / f"new{path.suffix}"
+        yield new
+        _move_into_place(new, path, workshop / f"old{path.suffix}")
+    finally:
+        shutil.rmtree(workshop, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+
+
+def _move_into_place(new: Path, path: Path, old: Path) -> None:
+    """Files are replaced in one action; a folder is first moved aside, and back if its successor cannot be moved in."""
+    if not path.is_dir():
+        os.replace(new, path)
+        return
+    os.rename(path, old)
+    try:
+        os.rename(new, path)
+    except BaseException:
+        os.rename(old, path)
+        raise
+
+
+def _locked(folder: Path) -> int | None:
+    """The descriptor of a folder that is locked until it is closed or its process ends; None if another holds it."""
+    if fcntl is None:
+        return None
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _sweep(path: Path) -> None:
+    """Remove what processes that were killed have left beside `path`; an older folder that was moved aside is put back."""
+    for left in path.parent.glob(f".{escape(path.stem[:40])}-{'[0-9a-f]' * 32}"):
+        with suppress(OSError):
+            lock = _locked(left) if left.is_dir() and not left.is_symlink() else None
+            if lock is None:
+                continue
+            old = left / f"old{path.suffix}"
+            if old.exists() and not os.path.lexists(path):
+                os.rename(old, path)
+            shutil.rmtree(left, ignore_errors=True)
+            os.close(lock)

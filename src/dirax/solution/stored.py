@@ -1,0 +1,35 @@
+"""What a file of dirax holds, before its arrays are read: attributes, sizes, and a way to each array."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+TYPES = ("float64", "float32", "int64", "int32", "int8", "uint8", "bool")
+"""Types of the arrays that dirax writes."""
+
+
+class Unreadable(ValueError):
+    """What is wrong with a file, without its path."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """`attributes`: plain values by name; `kinds`: shape and type of every array; `read(name)`: the array itself."""
+
+    attributes: dict[str, Any]
+    kinds: dict[str, tuple[tuple[int, ...], np.dtype]]
+    read: Callable[[str], np.ndarray]
+
+
+def reading(problem: str, read: Callable, *arguments: Any) -> Any:
+    """`read(*arguments)`, where anything unexpected means that the file has this problem."""
+    try:
+        return read(*arguments)
+    except Unreadable:
+        raise
+    except Exception as error:
+        reason = (str(error).splitlines() or ["no reason given"])[0].rstrip(".")
+        reason = reason if len(reason) <= 100 else f"{reason[:99]}…"
+        raise Unreadable(f"{problem} ({type(error).__name__}: {reason})") from error

@@ -1,0 +1,213 @@
+"""Trajectory: the numbers of a run or of a batch of runs, and the quantities that its system derives from them."""
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.program.compiled import compiled
+from dirax.program.evaluation.functions import in_numpy
+from dirax.program.memo import Same
+from dirax.program.user_functions import is_traced
+from dirax.schemes.step import Field
+from dirax.text.representation import counted, fields_html
+
+BLOCK = 2**16
+"""Rows that a quantity is computed for at a time, which bounds the memory that it takes."""
+
+GIVEN = (
+    *("t", "fields", "field_info", "step", "save_every", "stats", "ok", "message", "system", "scheme", "equation"),
+    *("batch_params", "initial", "derived", "metadata"),
+)
+"""What a Trajectory is made of, besides the params."""
+
+
+class Trajectory:
+    """The arrays of a run and what was run: `Solution` says what each is."""
+
+    def __init__(
+        self,
+        *,
+        t: Any,
+        fields: dict[str, Any],
+        field_info: dict[str, Field],
+        step: float,
+        save_every: int,
+        stats: dict[str, Any],
+        ok: Any = True,
+        message: Any = "",
+        system: Any = None,
+        scheme: Any = None,
+        equation: Any = None,
+        params: Any = None,
+        batch_params: bool = False,
+        initial: dict[str, Any] | None = None,
+        derived: dict[str, Any] | None = None,
+        metadata: dict[str, Any] | None = None,
+    ):
+        self.t, self.fields, self.field_info = t, fields, field_info
+        self.step, self.save_every, self.stats = step, save_every, stats
+        self.ok, self.message = ok, message
+        self.system, self.scheme, self.equation = system, scheme, equation
+        self._params, self.batch_params = params, batch_params
+        self.initial = initial or {}
+        self.metadata = metadata or {}
+        self.derived = dict(derived or {})
+
+    def __getattr__(self, name: str):
+        fields = self.__dict__.get("fields", {})
+        if name in fields:
+            return fields[name]
+        if name in ("q", "p", "x", "multipliers"):
+            raise AttributeError(f"this solution has no {name!r}; it holds {', '.join(fields)}.")
+        raise AttributeError(f"'Solution' object has no attribute {name!r}")
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with other values for some of the constructor's arguments."""
+        given = {name: getattr(self, name) for name in GIVEN} | {"params": self._params}
+        return type(self)(**(given | changes))
+
+    @property
+    def batch(self) -> int | None:
+        """Number of trajectories, None for a single one without a batch axis."""
+        name, values = next(iter(self.fields.items()))
+        return values.shape[0] if np.ndim(values) == len(self.field_info[name].shape) + 2 else None
+
+    @cached_property
+    def params(self) -> Any:
+        """The params of a run, as JAX's arrays."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, self._params)
+
+    @property
+    def params_of_one(self) -> Any:
+        """The params of a run, of the first trajectory where they have a batch axis."""
+        return jax.tree.map(lambda leaf: leaf[0], self.params) if self.batch_params else self.params
+
+    @property
+    def rows(self) -> int:
+        """Number of saved rows."""
+        return len(self.t)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the saved arrays, `t` included."""
+        return int(self.t.nbytes + sum(np.asarray(a).nbytes for a in self.fields.values()))
+
+    def energy(self):
+        """The energy at every saved row, (…, rows): E = ⟨p, v⟩ − L for Lagrangian systems, H for Hamiltonian ones.
+
+        It is computed from the saved momentum where there is one, with the velocity that belongs to it. Raises
+        `ValueError` for a loaded solution saved without it (`dx.load(path, system=…)` supplies the system).
+        """
+        return self._per_row("energy", "energy_at")
+
+    def constraint_residual(self):
+        """The constraint along the trajectory: the discrete one of each step, (…, rows − 1, m), where the method imposes
+        it between two points; else the system's own at each row, (…, rows, m). Raises as `energy` does."""
+        if "constraint" in self.fields:
+            return self.fields["constraint"]
+        return self._per_row("constraint_residual", "constraint_at")
+
+    def momentum_map(self, generator: Callable):
+        """⟨p, ξ_Q(q)⟩ along the trajectory, (…, rows), for the infinitesimal generator `generator(q) -> (n,)`."""
+        return self.map_rows(lambda row, params: jnp.vdot(row["p"], generator(row["q"])))
+
+    def map_rows(self, function: Callable):
+        """`function(row, params)` for every saved row, stacked; `row` is the dict of node fields of one trajectory and of
+        the time `t`."""
+        nodes = {k: jnp.asarray(a) for k, a in self.fields.items() if self.field_info[k].place == "node"}
+        batched = self.batch is not None
+        nodes["t"] = jnp.broadcast_to(jnp.asarray(self.t), (self.batch, self.rows) if batched else (self.rows,))
+        axes = (0, 0 if self.batch_params and self.params is not None else None) if batched else None
+        if is_traced(nodes, self.params) or self.rows * (self.batch or 1) <= BLOCK:
+            return _along(function, nodes, self.params, axes)
+        size = max(1, BLOCK // (self.batch or 1))
+        blocks = []
+        for first in range(0, self.rows, size):
+            at = np.minimum(np.arange(first, first + size), self.rows - 1)  # full blocks only: one compilation
+            block = {k: jnp.take(a, at, axis=int(batched)) for k, a in nodes.items()}
+            blocks.append(jax.tree.map(np.asarray, _along(function, block, self.params, axes)))
+        rows = (slice(None),) * batched + (slice(self.rows),)
+        return jax.tree.map(lambda *parts: np.concatenate(parts, axis=int(batched))[rows], *blocks)
+
+    def _per_row(self, name: str, method: str):
+        if name not in self.derived:
+            if self.system is None:
+                raise ValueError(
+                    f"this solution was loaded without its system, and its file holds no {name}: "
+                    "use dx.load(path, system=system)."
+                )
+            values = self._without_compiling(method)
+            values = self.map_rows(getattr(self.system, method)) if values is None else values
+            self.derived[name] = values if is_traced(values) else np.asarray(values)
+        return self.derived[name]
+
+    def _without_compiling(self, method: str) -> np.ndarray | None:
+        """A quantity of the system at every row by its scalar program, which is ready sooner than XLA's; None for long
+        trajectories, where XLA is faster, and where there is no such program."""
+        nodes = {k: a for k, a in self.fields.items() if self.field_info[k].place == "node"}
+        leaves, structure = jax.tree.flatten(self._params)
+        count = self.batch or 1
+        if is_traced(self.t, nodes, leaves) or self.rows * count > BLOCK or not all(map(_is_numeric, leaves)):
+            return None
+        lead = (self.rows,) if self.batch is None else (self.batch, self.rows)
+        rows = {k: np.asarray(a).reshape(self.rows * count, *np.shape(a)[len(lead) :]) for k, a in nodes.items()}
+        rows["t"] = np.tile(np.asarray(self.t), count)
+        repeated = lambda leaf: np.repeat(leaf, self.rows, axis=0)
+        constant = lambda leaf: np.broadcast_to(leaf, (self.rows * count, *np.shape(leaf)))
+        along = [(repeated if self.batch_params else constant)(np.asarray(leaf)) for leaf in leaves]
+        function = getattr(self.system, method)
+        program = lambda *values: function(
+            dict(zip(rows, values, strict=False)), jax.tree.unflatten(structure, values[len(rows) :])
+        )
+        values = in_numpy(program, [*rows.values(), *along], (Same(self.system), method, tuple(rows), structure))
+        return None if values is None else values.reshape(*lead, *values.shape[1:])
+
+    # ------------------------------------------------------------------ how it shows itself
+
+    def _summary(self) -> dict[str, str]:
+        text = lambda value, name: repr(value) if value is not None else str(self.metadata.get(name, "unknown"))
+        shapes = ", ".join(f"{name}{list(np.shape(values))}" for name, values in self.fields.items())
+        about = {"system": text(self.system, "system"), "scheme": text(self.scheme, "scheme")}
+        if is_traced(self.t, self.fields, self.step):
+            return {**about, "holds": f"{shapes}, traced"}
+        every = "every step" if self.save_every == 1 else f"every {counted(self.save_every, 'step')}"
+        about["time"] = f"{self.t[0]:.6g} to {self.t[-1]:.6g}, step {float(self.step):.6g}, {every} saved"
+        about["holds"] = shapes
+        if redundant := self.stats.get("redundant_constraints"):
+            about["redundant"] = f"constraints {', '.join(map(str, redundant))}, left out because they follow from the others"
+        about["ended"] = self._ending()
+        if "energy" in self.derived:
+            energy = np.asarray(self.derived["energy"])
+            change = np.nanmax(np.abs(energy - energy[..., :1]))
+            about["energy"] = f"{energy.flat[0]:.9g} at the start, changes by at most {change:.3g}"
+        return about
+
+    def _ending(self) -> str:
+        if self.batch is None:
+            return "ok" if self.ok else str(self.message)
+        failed = np.flatnonzero(~np.asarray(self.ok))
+        if not len(failed):
+            return f"all {counted(self.batch, 'trajectory', 'trajectories')} ok"
+        return f"{len(failed)} of {self.batch} trajectories failed, the first: {self.message[failed[0]]}"
+
+    def __repr__(self) -> str:
+        lines = (f"  {name}: {text}".replace("\n", "\n    ") for name, text in self._summary().items())
+        return "\n".join(("Solution", *lines))
+
+    def _repr_html_(self) -> str:
+        return fields_html("Solution", self._summary())
+
+
+def _is_numeric(leaf: Any) -> bool:
+    return isinstance(leaf, bool | int | float | np.ndarray | np.generic | jax.Array) and np.asarray(leaf).dtype.kind in "fiub"
+
+
+@compiled
+def _along(function, nodes, params, axes):
+    """`function` of every row, compiled once per function and shape: a system's bound method is compared by its system."""
+    along = jax.vmap(function, in_axes=(0, None))
+    return (along if axes is None else jax.vmap(along, in_axes=axes))(nodes, params)
