@@ -1,9 +1,9 @@
 """A step compiled: traced once per equation, kernels by width, in memory and on disk."""
 
+import contextlib
 import ctypes
 import functools
 import hashlib
-import json
 import time
 from collections import OrderedDict
 from collections.abc import Callable
@@ -13,6 +13,7 @@ from typing import Any
 
 from dirax.engines.compensation import increments
 from dirax.engines.native import compile as llvm
+from dirax.engines.native import kernel_cache
 from dirax.engines.native.gradients.linearized_loop import Sweep, backward, forward
 from dirax.engines.native.loops.newton_step import newton_correction
 from dirax.engines.native.loops.step_loop import Plan, kernel_module
@@ -93,16 +94,16 @@ class Program:
 
     def _library(self, name: str, width: int, text: Callable[[], str], *more: str) -> tuple[Any, bool]:
         """The linked code that exports `name`, and whether it came from the disk."""
-        key = llvm.kernel_key(self.digest, width, *more)
-        stored = llvm.read_cached(key)
+        entry = kernel_cache.name_of(self.digest, width, *more, *llvm.version())
+        stored = kernel_cache.read(entry)
         if stored is not None:
-            size = int.from_bytes(stored[:4], "little")
-            self.operations, code = json.loads(stored[4 : 4 + size])["operations"], stored[4 + size :]
-        else:
-            code = llvm.object_code(text())
-            header = json.dumps({"operations": self.operations}).encode()
-            llvm.write_cached(key, len(header).to_bytes(4, "little") + header + code)
-        return llvm.load(code, (name,)), stored is not None
+            with contextlib.suppress(RuntimeError):  # the linker does not take it: it is compiled anew
+                library = llvm.load(stored.code, (name,))
+                self.operations = stored.operations
+                return library, True
+        code = llvm.object_code(text())
+        kernel_cache.write(entry, kernel_cache.Kernel(self.operations, code))
+        return llvm.load(code, (name,)), False
 
     def _linearized(self, reverse: bool) -> Sweep:
         g, stage = self.graph, backward if reverse else forward
