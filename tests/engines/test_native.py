@@ -302,7 +302,7 @@ def test_kernels_are_cached_on_disk_and_damaged_entries_are_made_again(tmp_path,
     forget()
     first = native.run(p)
     assert not first.notes["kernel_cached"] and native.run(p).notes["kernel_cached"]
-    (entry,) = (tmp_path / "kernels").iterdir()
+    (entry,) = (path for path in (tmp_path / "kernels").iterdir() if path.name != ".key")
     forget()
     again = native.run(p)
     assert again.notes["kernel_cached"] and again.notes["operations"] == first.notes["operations"]
@@ -317,9 +317,6 @@ def test_kernels_are_cached_on_disk_and_damaged_entries_are_made_again(tmp_path,
     monkeypatch.setenv("DIRAX_CACHE", "off")
     forget()
     assert not native.run(p).notes["kernel_cached"]
-    monkeypatch.delenv("DIRAX_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert llvm.cache_folder() == llvm.Path("/somewhere/dirax/kernels")
 
 
 def test_what_cannot_be_compiled_is_named_with_its_line():

@@ -1,12 +1,8 @@
-"""LLVM in this process: from IR text to object code, and from object code to addresses; and a cache of it on disk."""
+"""LLVM in this process: from IR text to object code, and from object code to addresses."""
 
 import functools
-import hashlib
 import itertools
-import os
 import platform
-import tempfile
-from pathlib import Path
 from typing import Any
 
 import llvmlite
@@ -32,6 +28,11 @@ def host() -> tuple[str, str, str]:
 @functools.cache
 def features() -> dict[str, bool]:
     return dict(llvm.get_host_cpu_features())
+
+
+def version() -> tuple[object, ...]:
+    """What determines the code beside the IR text: this machine, and the version of LLVM."""
+    return *host(), llvmlite.__version__, llvm.llvm_version_info
 
 
 def has_fma() -> bool:
@@ -83,51 +84,3 @@ def load(code: bytes, names: tuple[str, ...]):
     for name in names:
         builder.export_symbol(name)
     return builder.link(_jit(), f"dirax_kernel_{next(_numbers)}")
-
-
-# ---------------------------------------------------------------------- cache on disk
-
-
-def cache_folder() -> Path | None:
-    """Where compiled kernels are kept: DIRAX_CACHE, else the user's cache folder; None when DIRAX_CACHE is "off"."""
-    chosen = os.environ.get("DIRAX_CACHE")
-    if chosen is not None:
-        return None if chosen.lower() in ("off", "0", "") else Path(chosen) / "kernels"
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "dirax" / "kernels"
-
-
-def kernel_key(*parts: object) -> str:
-    """A digest of what determines the code: the given parts, this processor, the version of LLVM."""
-    digest = hashlib.sha256()
-    for part in (*parts, *host(), llvmlite.__version__, llvm.llvm_version_info):
-        digest.update(repr(part).encode() + b"\0")
-    return digest.hexdigest()
-
-
-def read_cached(key: str) -> bytes | None:
-    """The object code kept under a key; None if there is none or it was damaged."""
-    folder = cache_folder()
-    if folder is None:
-        return None
-    try:
-        stored = (folder / key).read_bytes()
-    except OSError:
-        return None
-    check, code = stored[:32], stored[32:]
-    return code if hashlib.sha256(code).digest() == check else None
-
-
-def write_cached(key: str, code: bytes) -> None:
-    """Keep object code; a folder that cannot be written is no error."""
-    folder = cache_folder()
-    if folder is None:
-        return
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=folder)
-        with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(code).digest() + code)
-        os.replace(name, folder / key)
-    except OSError:
-        return

@@ -1,15 +1,16 @@
 """A step compiled: its kernels by width, in memory and on disk."""
 
+import contextlib
 import ctypes
 import functools
 import hashlib
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from dirax.engines.compensation import increments
 from dirax.engines.native import compile as llvm
+from dirax.engines.native import kernel_cache
 from dirax.engines.native.gradients.linearized_loop import LinearizedLoop, backward, forward
 from dirax.engines.native.loops.newton_step import newton_correction
 from dirax.engines.native.loops.plan import Plan
@@ -64,16 +65,16 @@ class Kernels:
 
     def _library(self, name: str, width: int, text: Callable[[], str], *more: str) -> tuple[Any, bool]:
         """The linked code that exports `name`, and whether it came from the disk."""
-        key = llvm.kernel_key(self.digest, width, *more)
-        stored = llvm.read_cached(key)
+        entry = kernel_cache.name_of(self.digest, width, *more, *llvm.version())
+        stored = kernel_cache.read(entry)
         if stored is not None:
-            size = int.from_bytes(stored[:4], "little")
-            self.operations, code = json.loads(stored[4 : 4 + size])["operations"], stored[4 + size :]
-        else:
-            code = llvm.object_code(text())
-            header = json.dumps({"operations": self.operations}).encode()
-            llvm.write_cached(key, len(header).to_bytes(4, "little") + header + code)
-        return llvm.load(code, (name,)), stored is not None
+            with contextlib.suppress(RuntimeError):  # the linker does not take it: it is compiled anew
+                library = llvm.load(stored.code, (name,))
+                self.operations = stored.operations
+                return library, True
+        code = llvm.object_code(text())
+        kernel_cache.write(entry, kernel_cache.Kernel(self.operations, code))
+        return llvm.load(code, (name,)), False
 
     def _linearized(self, reverse: bool) -> LinearizedLoop:
         step, one = self.step, backward if reverse else forward
