@@ -188,3 +188,19 @@ def bench(
     if untimed:
         typer.echo(f"dirax: {', '.join(untimed)} could not be timed.", err=True)
         raise typer.Exit(1)
+
+
+@app.command()
+@with_messages
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="remove all kernels")] = False,
+    as_json: Json = False,
+) -> None:
+    """Show the compiled kernels that are kept on the disk: where, how many, how large; or remove them."""
+    from dirax.cli.cache import cleared, described, sentence
+
+    found = cleared() if clear else described()
+    if as_json:
+        show_json(found)
+    else:
+        typer.echo(sentence(found))
