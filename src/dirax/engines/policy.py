@@ -56,6 +56,7 @@ LARGEST_NESTED = 96
 tension as a coordinate has 500 000 operations and took XLA 160 s to compile, its graph has 1 263."""
 
 
+@cache
 def engine_of(name: str, **options: Any) -> AbstractEngine:
     """The engine of that name. Raises `KeyError` for another, `ImportError` without the libraries that it needs."""
     module, _, kind = ENGINES[name].partition(":")

@@ -79,7 +79,8 @@ def simulate(
     initial = completed(system, case, project, on.compiles_start)
     if not (traced := case.traced or is_traced(initial)):
         redundant = redundant_constraints(system, initial.constraints, data, own, case.t0)
-    equation = make_step_equation(scheme, system, Shape(shape.n, shape.m, shape.c, redundant=redundant))
+    shape = Shape(shape.n, shape.m, shape.c, redundant=redundant) if redundant else shape
+    equation = make_step_equation(scheme, system, shape)
     # start
     start = begun(equation, case, initial, on.compiles_start)
     # user functions that close over a traced value make the start traced although nothing that was passed is
