@@ -73,7 +73,8 @@ def momentum(sol: Solution, name: str, generator: Callable, tolerance: float | N
 
 def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
     """μ of a run on the quotient by an abelian symmetry, relative to the largest momentum, w and μ."""
-    if sol.system is None or sol.system.unreduced() is None:
+    quotient = None if sol.system is None else sol.system.quotient_form()
+    if quotient is None:
         return []
     title, mu = "momentum map μ", np.asarray(sol.fields["mu"]).reshape(-1, *np.shape(sol.fields["mu"])[-2:])
     w = np.asarray(sol.fields["w"]).reshape(*mu.shape[:2], -1)
@@ -81,7 +82,7 @@ def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
     change, relative = relative_changes(mu, scale)
     lane = int(np.argmax(change))
     text = f"{np.array2string(mu[lane, 0], precision=6)} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
-    if sol.system.moves_momentum(initial_of_one(sol), sol.params_of_one):
+    if quotient.moves_momentum(initial_of_one(sol), sol.params_of_one):
         return [Line(title, float(change[lane]), None, NOT_CHECKED, f"forces with a part along the group move it; {text}")]
     return [judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)]
 

@@ -47,7 +47,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     if not isinstance(sol, Solution):
         raise TypeError(f"sol must be a dirax Solution (from dx.simulate or dx.load), but a {type(sol).__name__} was given.")
     generators = generators_of(sol, symmetries)
-    whole = reconstruct(sol) if sol.system is not None and sol.system.unreduced() is not None else sol
+    whole = reconstruct(sol) if sol.system is not None and sol.system.quotient_form() is not None else sol
     structure = structure_of(whole)
     lines = [
         _completion(sol),

@@ -177,14 +177,6 @@ class AbstractSystem(eqx.Module):
         """The dual of a Lie algebra or of a semidirect product that the points x are of; None for other systems."""
         return None
 
-    def unreduced(self) -> "AbstractSystem | None":
-        """The system on T*Q whose quotient by a symmetry this is; None for other systems."""
-        return None
-
-    def moves_momentum(self, data: dict[str, Array], params: Any) -> str:
-        """What moves the momentum map of the symmetry of a quotient, at initial data, in words; "" where nothing does."""
-        return ""
-
 
 def refuse_start(system: AbstractSystem, data: dict[str, Array], *kinds: str) -> None:
     """Raise `ValueError` for initial data that are none of `kinds`, such as "q, v"."""
