@@ -131,7 +131,7 @@ UNSUPPORTED = {
 
 @pytest.mark.parametrize("name", UNSUPPORTED)
 def test_unsupported_primitives_are_named_with_the_users_line(name):
-    from dirax.engines.native import UnsupportedPrimitive
+    from dirax.program.interpreter import UnsupportedPrimitive
 
     with pytest.raises(UnsupportedPrimitive, match=r"test_primitives\.py:\d+") as caught:
         traced(UNSUPPORTED[name], V)

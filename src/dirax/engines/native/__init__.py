@@ -1,6 +1,6 @@
 """The native engine: a step traced to scalars, compiled by LLVM, run on vectors of trajectories and several threads.
 
-kernels.py            the kernels compiled from a scalar program, by width
+kernels.py            a step's scalar program (engines/step_program.py) → the kernels compiled from it, by width
 loops/                scalar program → the loop over rows, steps, stages and Newton's iterations as LLVM IR
 ir/                   the writer of LLVM IR, and nodes written with it
 functions/            the elementary functions in LLVM IR
