@@ -3,7 +3,7 @@
 from typer.testing import CliRunner
 
 from dirax import gallery
-from dirax.cli import app
+from dirax.cli.commands import app
 
 
 def run(*arguments):
