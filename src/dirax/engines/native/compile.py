@@ -8,6 +8,9 @@ from typing import Any
 import llvmlite
 import llvmlite.binding as llvm
 
+LINKED_TOGETHER = 64
+"""Libraries after which a new linker begins: one keeps 9 kB of every library that it linked, until all of them are gone."""
+
 _numbers = itertools.count()
 
 
@@ -46,20 +49,17 @@ def vector_width() -> int:
     return 8 if have.get("avx512f") else 4 if have.get("avx") else 2
 
 
-def object_code(text: str, target: tuple[str, str, str] | None = None, assembly: bool = False) -> Any:
-    """Object code of a module (or its assembly text), for this machine or a (triple, processor, features).
+@functools.cache
+def _compiler(triple: str, cpu: str, flags: str) -> tuple[Any, Any, Any]:
+    """(machine, passes, pass builder) for a target, made once: LLVM keeps some memory of each that was ever used.
 
     Few passes are run: the graph has simplified what there was to simplify. LLVM's own choice of passes takes several times
     as long and makes no faster code.
     """
     _initialized()
-    if target is None:
-        target = host()
-    else:
+    if (triple, cpu, flags) != host():
         llvm.initialize_all_targets()
         llvm.initialize_all_asmprinters()
-    triple, cpu, flags = target
-    module = llvm.parse_assembly(f'target triple = "{triple}"\n' + text)
     machine = llvm.Target.from_triple(triple).create_target_machine(
         cpu=cpu, features=flags, opt=2, reloc="pic", codemodel="small"
     )
@@ -67,12 +67,21 @@ def object_code(text: str, target: tuple[str, str, str] | None = None, assembly:
     passes.add_sroa_pass()
     passes.add_instruction_combine_pass()
     passes.add_simplify_cfg_pass()
-    passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=1)))
+    return machine, passes, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=1))
+
+
+def object_code(text: str, target: tuple[str, str, str] | None = None, assembly: bool = False) -> Any:
+    """Object code of a module (or its assembly text), for this machine or a (triple, processor, features)."""
+    target = target or host()
+    machine, passes, builder = _compiler(*target)
+    module = llvm.parse_assembly(f'target triple = "{target[0]}"\n' + text, llvm.create_context())
+    passes.run(module, builder)
     return machine.emit_assembly(module) if assembly else machine.emit_object(module)
 
 
-@functools.cache
-def _jit():
+@functools.lru_cache(maxsize=1)
+def _jit(block: int):
+    """The linker of this block of libraries; it lives as long as one of them."""
     _initialized()
     # JITLink keeps the sections of an object together: its code reaches its constants wherever the memory is
     return llvm.create_lljit_compiler(use_jit_link=True)
@@ -83,4 +92,5 @@ def load(code: bytes, names: tuple[str, ...]):
     builder = llvm.JITLibraryBuilder().add_object_img(code).add_current_process()
     for name in names:
         builder.export_symbol(name)
-    return builder.link(_jit(), f"dirax_kernel_{next(_numbers)}")
+    number = next(_numbers)
+    return builder.link(_jit(number // LINKED_TOGETHER), f"dirax_kernel_{number}")
