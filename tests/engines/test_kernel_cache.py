@@ -252,8 +252,6 @@ def test_several_processes_share_it(folder, monkeypatch):
 
 
 def test_a_run_goes_on_whatever_is_in_the_cache(folder):
-    from dirax.engines.native import program as programs
-
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.cos(q[0]))
     run = lambda: dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.0], step=0.01, steps=20, engine="native")
     first = run()
@@ -261,7 +259,7 @@ def test_a_run_goes_on_whatever_is_in_the_cache(folder):
     key = (folder / ".key").read_bytes()
 
     def again(cached: bool) -> None:
-        programs._programs.clear()
+        dx.clear_caches()
         sol = run()
         assert sol.stats["kernel_cached"] is cached and sol.q.tobytes() == first.q.tobytes()
         assert sol.stats["operations"] == first.stats["operations"]
@@ -280,7 +278,7 @@ def test_a_run_goes_on_whatever_is_in_the_cache(folder):
 def test_the_command_line_shows_and_clears_it(folder, monkeypatch):
     from typer.testing import CliRunner
 
-    from dirax.cli import app
+    from dirax.cli.commands import app
 
     call = lambda *options: CliRunner().invoke(app, ["cache", *options])
     kernel_cache.write(name(), Kernel(1, bytes(400_000)))
