@@ -51,3 +51,18 @@ def test_a_system_that_was_run_is_let_go(engine):
     gc.collect()
     assert kept() is None
     assert run()[1] == before
+
+
+def test_garbage_is_looked_for_less_often_while_something_is_made():
+    usual, seen = gc.get_threshold(), []
+    inner = lambda: seen.append(gc.get_threshold()[0]) or 1
+    memo = Memo(4)
+
+    def fails():
+        seen.append(gc.get_threshold()[0])
+        raise ValueError
+
+    assert memo.get("outer", lambda: memo.get("inner", inner)) == 1
+    with pytest.raises(ValueError):
+        memo.get("fails", fails)
+    assert min(seen) > usual[0] and gc.get_threshold() == usual
