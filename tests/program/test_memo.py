@@ -55,10 +55,13 @@ def test_a_system_that_was_run_is_let_go(engine):
 
 def test_garbage_is_looked_for_less_often_while_something_is_made():
     usual, seen = gc.get_threshold(), []
-    inner = lambda: seen.append(gc.get_threshold()[0]) or 1
-    memo = Memo(4)
+    memo: Memo[int] = Memo(4)
 
-    def fails():
+    def inner() -> int:
+        seen.append(gc.get_threshold()[0])
+        return 1
+
+    def fails() -> int:
         seen.append(gc.get_threshold()[0])
         raise ValueError
 
