@@ -51,3 +51,21 @@ def test_a_system_that_was_run_is_let_go(engine):
     gc.collect()
     assert kept() is None
     assert run()[1] == before
+
+
+def test_garbage_is_looked_for_less_often_while_something_is_made():
+    usual, seen = gc.get_threshold(), []
+    memo: Memo[int] = Memo(4)
+
+    def inner() -> int:
+        seen.append(gc.get_threshold()[0])
+        return 1
+
+    def fails() -> int:
+        seen.append(gc.get_threshold()[0])
+        raise ValueError
+
+    assert memo.get("outer", lambda: memo.get("inner", inner)) == 1
+    with pytest.raises(ValueError):
+        memo.get("fails", fails)
+    assert min(seen) > usual[0] and gc.get_threshold() == usual

@@ -7,9 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.step_program import linearized
 from dirax.program.compiled import compiled
-from dirax.program.evaluation.functions import in_numpy
 from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
 from dirax.run.validate import Case, spread
@@ -137,6 +135,8 @@ def _compiled(one: Any, arguments: tuple, axes: tuple | None) -> Any:
 
 def _in_numpy(one: Any, kept: tuple, case: Case, given: Any) -> Any:
     """The same from the scalar program of `one`; None where it has none."""
+    from dirax.program.evaluation.functions import in_numpy  # imported when it is used
+
     lead = lambda leaf: np.asarray(leaf) if case.batch is not None else np.asarray(leaf)[None]
     repeated = lambda leaf: np.broadcast_to(np.asarray(leaf), (case.batch or 1, *np.shape(leaf)))
     params = jax.tree.map(lead if case.batch_params else repeated, case.params)
@@ -148,6 +148,8 @@ def _in_numpy(one: Any, kept: tuple, case: Case, given: Any) -> Any:
 
 def _first_step_in_numbers(equation: Any, case: Case, start: Start) -> tuple[np.ndarray, np.ndarray] | None:
     """The residual and the Jacobian of the first step from the scalar program of the step; None where it has none."""
+    from dirax.engines.step_program import linearized  # imported when it is used
+
     lead = lambda leaf: leaf if case.batch is not None else leaf[None]
     each = lambda number: np.broadcast_to(np.asarray(number), (case.batch or 1,))
     fraction = equation.stages[0][1]
