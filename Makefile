@@ -11,13 +11,14 @@ RUN := $(BIN)/python -m
 INSTALL := $(RUN) pip install -qq --disable-pip-version-check --no-deps
 LOCKED := $(VENV)/.locked
 READY := $(VENV)/.ready
+REPORT := src/dirax/show/assets
 
 # Compiled JAX functions, shared by the test workers and kept between runs.
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo test lint types format docs soak bench lock clean
+.PHONY: help install demo test lint types format docs soak bench vendor lock clean
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1 \t\2/p' $(MAKEFILE_LIST)
@@ -49,6 +50,9 @@ soak: $(READY)  ## The long tests that `make test` leaves out
 
 bench: $(READY)  ## Measure speed
 	$(RUN) benchmarks
+
+vendor:  ## Bundle the script of reports anew, with three.js and uPlot at the versions of its package.json (needs node and npm)
+	cd $(REPORT) && npm ci --no-audit --no-fund --ignore-scripts && node build.mjs && rm -rf node_modules
 
 lock:  ## Write requirements.lock anew from pyproject.toml (UPGRADE=--upgrade takes the newest versions)
 	$(PYTHON) -m venv --clear $(VENV)-lock

@@ -22,6 +22,7 @@ ROOMS = (
     "solution",
     "run",
     "diagnostics",
+    "show",
     "gallery",
     "public",
     "__init__",

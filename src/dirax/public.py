@@ -65,6 +65,8 @@ from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, 
 from dirax.schemes.layout import Layout
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
+from dirax.show import scene
+from dirax.show.report import report
 from dirax.solution.loading import load
 from dirax.solution.reconstruction import reconstruct
 from dirax.solution.solution import Solution
@@ -201,4 +203,9 @@ __all__ += [
     "compare",
     "convergence",
     "verify",
+]
+# Looked at
+__all__ += [
+    "report",
+    "scene",
 ]

@@ -93,6 +93,31 @@ def run(
 
 @app.command()
 @with_messages
+def report(
+    system: Annotated[
+        str, typer.Argument(help="a name that `dirax list` shows, a Python file, or a saved solution", show_default=False)
+    ],
+    settings: Settings = None,
+    scheme: Annotated[
+        list[str] | None, typer.Option(help=f"a scheme, may be repeated: {SCHEME_HELP}", show_default=False)
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="the page [default: NAME.html]", show_default=False)] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file that exists")] = False,
+    opened: Annotated[bool, typer.Option("--open", help="open the page in the browser")] = False,
+) -> None:
+    """Write one HTML file about a run: the motion in three dimensions, plots, verdicts, the system. Several schemes are
+    shown side by side."""
+    from dirax.cli.report import write_report
+
+    with progress_bar("starting") as tell:
+        path = write_report(system, settings or (), scheme or (), out, overwrite, tell)
+    typer.echo(f"the report is in {path}")
+    if opened:
+        typer.launch(path.resolve().as_uri())
+
+
+@app.command()
+@with_messages
 def compare(
     system: System,
     settings: Settings = None,

@@ -31,7 +31,8 @@ def subject(name: str) -> Example:
 
 
 def from_file(path: Path) -> Example:
-    """Run a user's file and take `system` and `initial` from it, and `scheme`, `step`, `steps` and `params` if they are there.
+    """Run a user's file and take `system` and `initial` from it, and `scheme`, `step`, `steps`, `params` and `scene` if they
+    are there.
 
     Raises `ValueError` where the file fails (with the line) or does not define them, `FileNotFoundError` without a file.
     """
@@ -66,6 +67,7 @@ def from_file(path: Path) -> Example:
         steps=found.get("steps", 1000),
         params=found.get("params"),
         coordinates=(),
+        scene=found.get("scene"),
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from dirax.gallery import double_pendulum
 from dirax.gallery.example import Coordinate, Example
+from dirax.show.scene import Scene, point, rod
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 PARAMS = double_pendulum.PARAMS
@@ -39,6 +40,14 @@ def from_angles(angles, rates, params=PARAMS) -> dict[str, np.ndarray]:
     return {"q": np.cumsum(arms, axis=0).ravel(), "v": np.cumsum(speeds, axis=0).ravel()}
 
 
+def scene() -> Scene:
+    """Two rods and two bobs: y upwards."""
+    upright = lambda x, y: jnp.stack([x, jnp.zeros(()), y])
+    first, second, pivot = (lambda q: upright(q[0], q[1])), (lambda q: upright(q[2], q[3])), [0.0, 0.0, 0.0]
+    bobs = (point(pivot, radius=0.03, colour="ink"), point(first, radius=0.07), point(second, radius=0.07, trail=True, colour=1))
+    return Scene((rod(pivot, first), rod(first, second), *bobs), view="front")
+
+
 EXAMPLE = Example(
     name="cartesian-double-pendulum",
     title="Double pendulum in Cartesian coordinates",
@@ -52,4 +61,5 @@ EXAMPLE = Example(
     plane=(2, 3),
     time_unit="s",
     energy_unit="J",
+    scene=scene(),
 )

@@ -10,6 +10,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.gallery.vortices import point_vortices
+from dirax.gallery.vortices import scene as vortex_scene
 from dirax.schemes.discrete_dirac import DiscreteDirac
 
 CIRCULATIONS = (1.0, 1.0, 1.0, 1.0)
@@ -26,4 +27,5 @@ EXAMPLE = Example(
     steps=4000,
     coordinates=tuple(Coordinate(f"{letter}{j}") for letter in "xy" for j in range(1, 5)),
     plane=(0, 4),
+    scene=vortex_scene(),
 )

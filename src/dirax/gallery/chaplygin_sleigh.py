@@ -13,6 +13,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, blade, plane, point, rod, turn
 from dirax.systems.nonholonomic import NonholonomicMechanics
 
 PARAMS = {"m": 1.0, "I": 0.5, "a": 0.4}
@@ -65,6 +66,15 @@ def exact(t, q, v, params=None) -> np.ndarray:
     return np.stack([x0 + x, y0 + y, angle(t)], axis=1)
 
 
+def scene() -> Scene:
+    """The edge, and the centre of mass ahead of it."""
+    edge = lambda q: q[:2]
+    lifted = lambda q: jnp.stack([q[0], q[1], jnp.asarray(0.15)])
+    ahead = lambda q, params: lifted(q) + params["a"] * jnp.stack([jnp.cos(q[2]), jnp.sin(q[2]), jnp.zeros(())])
+    blades = (blade(edge, lambda q: turn([0, 0, 1], q[2]), length=0.5, trail=True), rod(lifted, ahead))
+    return Scene((plane(), *blades, point(ahead, radius=0.09, colour=1)))
+
+
 EXAMPLE = Example(
     name="chaplygin-sleigh",
     title="Chaplygin sleigh",
@@ -77,4 +87,5 @@ EXAMPLE = Example(
     steps=1000,
     coordinates=(Coordinate("x"), Coordinate("y"), Coordinate("φ", "rad")),
     exact=exact,
+    scene=scene(),
 )

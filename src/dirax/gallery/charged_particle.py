@@ -12,6 +12,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.lagrange_dirac import PlusLagrangeDirac
+from dirax.show.scene import Scene, arrow, path, plane, point
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 PARAMS = {"m": 1.0, "B0": 1.0}
@@ -52,6 +53,12 @@ def turn_of_the_circle(q):
     return jnp.array([0.0, 0.0, 0.0, 1.0])
 
 
+def scene() -> Scene:
+    """The particle on its helix about the field."""
+    place = lambda q: q[:3]
+    return Scene((plane(), path(place), point(place, trail=True), arrow([0.0, 0.0, 0.0], [0.0, 0.0, 5.0], colour="ink")))
+
+
 EXAMPLE = Example(
     name="charged-particle",
     title="Charged particle in a magnetic field",
@@ -65,4 +72,5 @@ EXAMPLE = Example(
     coordinates=(Coordinate("x"), Coordinate("y"), Coordinate("z"), Coordinate("θ", "rad")),
     exact=exact,
     symmetries={"charge": turn_of_the_circle},
+    scene=scene(),
 )

@@ -14,6 +14,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.lagrange_dirac import PlusLagrangeDirac
+from dirax.show.scene import Scene, point, rod
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 PARAMS = {"m1": 20.0, "m2": 35.0, "l1": 500.0, "l2": 800.0, "g": 9.8}
@@ -38,6 +39,23 @@ def turn(q):
     return jnp.array([1.0, 0.0, 0.0, 0.0])
 
 
+def bobs(q, params):
+    """The two masses, (2, 3), z up."""
+    azimuths, angles = jnp.stack([q[0] - q[2], q[0] + q[2]]), jnp.stack([q[1], q[3]])
+    lengths = jnp.stack([jnp.asarray(params["l1"], float), jnp.asarray(params["l2"], float)])
+    level = jnp.sin(angles)
+    arms = jnp.stack([level * jnp.cos(azimuths), level * jnp.sin(azimuths), jnp.cos(angles)], axis=1)
+    return jnp.cumsum(lengths[:, None] * arms, axis=0)
+
+
+def scene() -> Scene:
+    """Two rods and two bobs."""
+    first, second = (lambda q, params: bobs(q, params)[0]), (lambda q, params: bobs(q, params)[1])
+    pivot = [0.0, 0.0, 0.0]
+    parts = (point(pivot, colour="ink"), point(first), point(second, trail=True, colour=1))
+    return Scene((rod(pivot, first), rod(first, second), *parts))
+
+
 EXAMPLE = Example(
     name="double-spherical-pendulum",
     title="Double spherical pendulum in angles",
@@ -53,4 +71,5 @@ EXAMPLE = Example(
     time_unit="s",
     energy_unit="J",
     symmetries={"angular momentum about the vertical": turn},
+    scene=scene(),
 )

@@ -9,6 +9,7 @@ import numpy as np
 from dirax.run.simulate import simulate
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.step import AbstractScheme
+from dirax.show.scene import Scene
 from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
 
@@ -32,6 +33,7 @@ class Example:
     - `coordinates`: one `Coordinate` per entry of q or x; `plane`: the two that make a good picture.
     - `exact(t, params=…, **initial) -> (rows, n)`: the solution at times `t` (rows,) from a closed form or a quadrature.
     - `symmetries`: infinitesimal generators `ξ(q) -> (n,)` by name, whose momentum ⟨p, ξ(q)⟩ is conserved.
+    - `scene`: what a report draws of it, a `dx.scene.Scene`.
 
         sol = dirax.gallery.get("kepler").simulate(step=0.05)
     """
@@ -51,12 +53,14 @@ class Example:
     plane: tuple[int, int] = (0, 1)
     exact: Callable[..., np.ndarray] | None = None
     symmetries: Mapping[str, Callable] = field(default_factory=dict)
+    scene: Scene | None = None
 
     @property
     def labels(self) -> dict[str, Any]:
         """Names and units, as a Solution carries them in its `metadata` for plots and files."""
         return {
             "title": self.title,
+            "example": self.name,
             "coordinates": [c.name for c in self.coordinates],
             "units": {"q": [c.unit for c in self.coordinates], "t": self.time_unit, "energy": self.energy_unit},
         }
@@ -75,4 +79,5 @@ class Example:
         settings["params"] = {**self.params, **params} if partly else self.params if params is None else params
         solution = simulate(self.system, scheme or self.scheme, **{**settings, **changes})
         solution.metadata.update(self.labels)
+        solution.example = self
         return solution

@@ -9,6 +9,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, path, plane, point
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 
 PARAMS = {"b": 0.3, "s": 2.0}
@@ -24,6 +25,11 @@ def potential(q, params):
     return (q[0] ** 2 + params["s"] * q[1] ** 2) / 2
 
 
+def scene() -> Scene:
+    """The drift in the plane."""
+    return Scene((plane(), path(lambda q: q), point(lambda q: q, trail=True)), view="tilted")
+
+
 EXAMPLE = Example(
     name="guiding-centre",
     title="Guiding centre in a varying magnetic field",
@@ -35,4 +41,5 @@ EXAMPLE = Example(
     step=0.1,
     steps=2000,
     coordinates=(Coordinate("x"), Coordinate("y")),
+    scene=scene(),
 )

@@ -30,4 +30,5 @@ EXAMPLE = Example(
     steps=heavy_top.EXAMPLE.steps,
     coordinates=heavy_top.EXAMPLE.coordinates,
     plane=heavy_top.EXAMPLE.plane,
+    scene=heavy_top.EXAMPLE.scene,
 )

@@ -9,6 +9,7 @@ the motion is bounded; the data have energy 1/8, where regular and chaotic orbit
 import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
+from dirax.show.scene import Scene, plane, point
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 ENERGY = 1 / 8
@@ -25,6 +26,11 @@ def _velocity(y: float) -> float:
     return np.sqrt(2 * ENERGY - y**2 + 2 * y**3 / 3)
 
 
+def scene() -> Scene:
+    """The star in its plane."""
+    return Scene((plane(), point(lambda q: q, trail=True)), view="tilted")
+
+
 EXAMPLE = Example(
     name="henon-heiles",
     title="Hénon–Heiles system",
@@ -34,4 +40,5 @@ EXAMPLE = Example(
     step=0.05,
     steps=10_000,
     coordinates=(Coordinate("x"), Coordinate("y")),
+    scene=scene(),
 )

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
+from dirax.show.scene import Scene, path, plane, point
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 ECCENTRICITY = 0.6
@@ -55,6 +56,11 @@ def rotation(q):
     return jnp.array([-q[1], q[0]])
 
 
+def scene() -> Scene:
+    """The centre and the body that goes round it."""
+    return Scene((plane(), point([0.0, 0.0], colour="ink"), path(lambda q: q), point(lambda q: q, trail=True)), view="tilted")
+
+
 EXAMPLE = Example(
     name="kepler",
     title="Kepler problem",
@@ -70,4 +76,5 @@ EXAMPLE = Example(
     coordinates=(Coordinate("x"), Coordinate("y")),
     exact=exact,
     symmetries={"angular momentum": rotation},
+    scene=scene(),
 )

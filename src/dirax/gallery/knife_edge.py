@@ -11,6 +11,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, blade, plane, turn
 from dirax.systems.nonholonomic import NonholonomicMechanics
 
 PARAMS = {"m": 1.0, "I": 1.0, "g": 1.0}
@@ -46,6 +47,11 @@ def exact(t, q, v, params=None) -> np.ndarray:
     return np.stack([x0 + x - first, y0 + y - second, phi], axis=1)
 
 
+def scene() -> Scene:
+    """The skate on its plane, x downhill."""
+    return Scene((plane(), blade(lambda q: q[:2], lambda q: turn([0, 0, 1], q[2]), trail=True)))
+
+
 EXAMPLE = Example(
     name="knife-edge",
     title="Knife edge on an inclined plane",
@@ -58,4 +64,5 @@ EXAMPLE = Example(
     steps=1000,
     coordinates=(Coordinate("x"), Coordinate("y"), Coordinate("φ", "rad")),
     exact=exact,
+    scene=scene(),
 )

@@ -11,6 +11,8 @@ import numpy as np
 from dirax.gallery.example import Coordinate, Example
 from dirax.geometry.structures import DiracStructure
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, arrow, point, sphere
+from dirax.show.scene import rod as straight
 from dirax.systems.dirac_system import DiracSystem
 
 PARAMS = {"b": np.array([0.3, -0.2, 0.8]), "g": 1.0, "l": 1.0}
@@ -34,6 +36,13 @@ def rod(x, params):
     return jnp.stack([x[:3] @ x[:3] - params["l"] ** 2])
 
 
+def scene() -> Scene:
+    """The bob on its sphere, and the field."""
+    bob, pivot = (lambda x: x[:3]), [0.0, 0.0, 0.0]
+    field = arrow(pivot, lambda params: params["b"], colour="accent")
+    return Scene((sphere(radius=PARAMS["l"]), straight(pivot, bob), point(bob, radius=0.06, trail=True), field))
+
+
 EXAMPLE = Example(
     name="magnetic-spherical-pendulum",
     title="Charged spherical pendulum in a magnetic field",
@@ -45,4 +54,5 @@ EXAMPLE = Example(
     step=0.02,
     steps=10_000,
     coordinates=tuple(Coordinate(name) for name in ("q1", "q2", "q3", "v1", "v2", "v3")),
+    scene=scene(),
 )

@@ -12,12 +12,20 @@ from dirax.geometry.cotangent_lift import cotangent_lift
 from dirax.geometry.maps import Midpoint
 from dirax.geometry.structures import induced_dirac
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, point, rod
 from dirax.systems.dirac_system import DiracSystem
 
 
 def hamiltonian(x):
     """H(q, p) = p²/2 − cos q, a scalar."""
     return x[1] ** 2 / 2 - jnp.cos(x[0])
+
+
+def scene() -> Scene:
+    """A rod and a bob."""
+    bob = lambda x: jnp.stack([jnp.sin(x[0]), jnp.zeros(()), -jnp.cos(x[0])])
+    pivot = [0.0, 0.0, 0.0]
+    return Scene((rod(pivot, bob), point(pivot, radius=0.03, colour="ink"), point(bob, radius=0.08, trail=True)), view="front")
 
 
 EXAMPLE = Example(
@@ -30,4 +38,5 @@ EXAMPLE = Example(
     step=0.1,
     steps=1000,
     coordinates=(Coordinate("q", "rad"), Coordinate("p")),
+    scene=scene(),
 )

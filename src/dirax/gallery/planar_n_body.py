@@ -18,6 +18,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.reduction.coordinates import in_coordinates
+from dirax.show.scene import Scene, plane, point
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 PERIOD = 6.32591398
@@ -99,6 +100,14 @@ SYMMETRIC = in_coordinates(SYSTEM, from_shape)
 """The system in the coordinates of `from_shape`; its `fibre` for N bodies is range(2N − 3, 2N)."""
 
 _POSITION, _SPEED = np.array([0.97000436, -0.24308753]), np.array([-0.93240737, -0.86473146])
+
+
+def scene() -> Scene:
+    """The bodies in their plane."""
+    places = [lambda q, k=k: q[2 * k : 2 * k + 2] for k in range(3)]
+    return Scene((plane(), *(point(place, radius=0.05, trail=True, colour=k) for k, place in enumerate(places))), view="tilted")
+
+
 EXAMPLE = Example(
     name="planar-n-body",
     title="Planar three-body problem: the figure eight",
@@ -113,4 +122,5 @@ EXAMPLE = Example(
     steps=2000,
     coordinates=tuple(Coordinate(f"{axis}{body}") for body in (1, 2, 3) for axis in "xy"),
     symmetries={"momentum along x": along(0), "momentum along y": along(1), "angular momentum": rotation},
+    scene=scene(),
 )

@@ -11,6 +11,7 @@ from dirax.gallery.example import Coordinate, Example
 from dirax.geometry.maps import SphereProjection
 from dirax.geometry.structures import DiracStructure
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, path, point, sphere
 from dirax.systems.dirac_system import DiracSystem
 
 PARAMS = {"I1": 1.0, "I2": 2.0, "I3": 3.0}
@@ -26,6 +27,11 @@ def hamiltonian(x, params):
     return (x[0] ** 2 / params["I1"] + x[1] ** 2 / params["I2"] + x[2] ** 2 / params["I3"]) / 2
 
 
+def scene() -> Scene:
+    """The momentum on its sphere."""
+    return Scene((sphere(), path(lambda x: x), point(lambda x: x, radius=0.04, trail=True)))
+
+
 EXAMPLE = Example(
     name="rigid-body",
     title="Free rigid body on the sphere",
@@ -37,4 +43,5 @@ EXAMPLE = Example(
     step=0.1,
     steps=1000,
     coordinates=(Coordinate("ξ1"), Coordinate("ξ2"), Coordinate("ξ3")),
+    scene=scene(),
 )

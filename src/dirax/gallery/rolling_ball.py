@@ -13,6 +13,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, after, ball, plane, turn
 from dirax.systems.nonholonomic import NonholonomicMechanics
 
 PARAMS = {"m": 1.0, "r": 1.0, "I": 0.4, "g": 0.1}
@@ -57,6 +58,17 @@ def exact(t, q, v, params=None) -> np.ndarray:
     return np.stack([q[0] + v[0] * t + fall * t**2 / 2, q[1] + v[1] * t], axis=1)
 
 
+def attitude(q):
+    """The ball's rotation as a quaternion, from Euler angles z–x–z."""
+    return after(turn([0, 0, 1], q[2]), turn([1, 0, 0], q[3]), turn([0, 0, 1], q[4]))
+
+
+def scene() -> Scene:
+    """The ball on the plane, x downhill."""
+    centre = lambda q, params: jnp.stack([q[0], q[1], jnp.asarray(params["r"])])
+    return Scene((plane(), ball(centre, attitude, radius=PARAMS["r"], trail=True)))
+
+
 EXAMPLE = Example(
     name="rolling-ball",
     title="Ball rolling on an inclined plane",
@@ -68,4 +80,5 @@ EXAMPLE = Example(
     step=0.01,
     steps=500,
     coordinates=tuple(Coordinate(name, unit) for name, unit in zip("xyψθφ", ("", "", "rad", "rad", "rad"), strict=True)),
+    scene=scene(),
 )

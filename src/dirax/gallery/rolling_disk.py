@@ -13,6 +13,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.lagrange_dirac import PlusLagrangeDirac
+from dirax.show.scene import Scene, after, disk, plane, turn
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 PARAMS = {"m": 1.0, "R": 1.0, "I": 0.25, "J": 0.5, "V": 10.0}
@@ -97,6 +98,13 @@ def heading(q):
     return jnp.array([0.0, 0.0, 0.0, 1.0])
 
 
+def scene() -> Scene:
+    """The disk on its plane: it leans nowhere, heads along φ and turns by θ."""
+    rolled = lambda q: after(turn([0, 0, 1], q[3]), turn([0, 1, 0], q[2]), turn([1, 0, 0], jnp.pi / 2))
+    centre = lambda q, params: jnp.stack([q[0], q[1], jnp.asarray(params["R"])])
+    return Scene((plane(), disk(centre, rolled, radius=PARAMS["R"], trail=True)))
+
+
 EXAMPLE = Example(
     name="rolling-disk",
     title="Vertical rolling disk",
@@ -113,4 +121,5 @@ EXAMPLE = Example(
     coordinates=(Coordinate("x"), Coordinate("y"), Coordinate("θ", "rad"), Coordinate("φ", "rad")),
     exact=exact,
     symmetries={"p_φ": heading},
+    scene=scene(),
 )

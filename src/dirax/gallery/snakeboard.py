@@ -13,6 +13,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, blade, box, plane, turn
 from dirax.systems.nonholonomic import NonholonomicMechanics
 
 PARAMS = {"m": 1.0, "r": 1.0, "J_r": 0.3, "J_w": 0.1}
@@ -37,6 +38,23 @@ def one_forms(q, params):
     return jnp.stack([row(q[2] + q[4], -lever), row(q[2] - q[4], lever)])
 
 
+def scene() -> Scene:
+    """The board, its two axles and its rotor."""
+    heading = lambda angle: turn([0, 0, 1], angle)
+    ahead = lambda q: jnp.stack([jnp.cos(q[2]), jnp.sin(q[2]), jnp.zeros(())])
+    at = lambda along, height: lambda q: jnp.stack([q[0], q[1], jnp.asarray(height)]) + along * ahead(q)
+    r = PARAMS["r"]
+    return Scene(
+        (
+            plane(),
+            box(at(0.0, 0.2), lambda q: heading(q[2]), size=(2 * r, 0.3, 0.06), trail=True),
+            blade(at(-r, 0.0), lambda q: heading(q[2] + q[4]), length=0.6, colour=1),
+            blade(at(r, 0.0), lambda q: heading(q[2] - q[4]), length=0.6, colour=1),
+            box(at(0.0, 0.3), lambda q: heading(q[2] + q[3]), size=(0.9, 0.12, 0.08), colour=2),
+        )
+    )
+
+
 EXAMPLE = Example(
     name="snakeboard",
     title="Snakeboard",
@@ -49,4 +67,5 @@ EXAMPLE = Example(
     steps=1000,
     coordinates=tuple(Coordinate(name, unit) for name, unit in zip("xyθψφ", ("", "", "rad", "rad", "rad"), strict=True)),
     symmetries={"p_ψ": lambda q: jnp.eye(5)[3], "p_φ": lambda q: jnp.eye(5)[4]},
+    scene=scene(),
 )

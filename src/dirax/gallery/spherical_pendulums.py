@@ -12,6 +12,7 @@ from dirax.gallery.example import Coordinate, Example
 from dirax.geometry.maps import RiemannianExp
 from dirax.geometry.spaces import Product, Sphere
 from dirax.schemes.charted import InCharts
+from dirax.show.scene import Scene, point, rod, sphere
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 
 PARAMS = {"m1": 1.0, "m2": 1.5, "l1": 1.0, "l2": 0.8, "g": 9.8}
@@ -29,6 +30,15 @@ def lagrangian(q, v, params):
 def turn(q):
     """The generator of turns of both arms about the vertical."""
     return jnp.array([-q[1], q[0], 0.0, -q[4], q[3], 0.0])
+
+
+def scene() -> Scene:
+    """Two rods and two bobs, and the sphere of the first."""
+    first = lambda q, params: params["l1"] * q[:3]
+    second = lambda q, params: params["l1"] * q[:3] + params["l2"] * q[3:]
+    pivot = [0.0, 0.0, 0.0]
+    bobs = (point(pivot, radius=0.03, colour="ink"), point(first, radius=0.07), point(second, radius=0.08, trail=True, colour=1))
+    return Scene((sphere(radius=PARAMS["l1"]), rod(pivot, first), rod(first, second), *bobs))
 
 
 EXAMPLE = Example(
@@ -49,4 +59,5 @@ EXAMPLE = Example(
     time_unit="s",
     energy_unit="J",
     symmetries={"angular momentum about the vertical": turn},
+    scene=scene(),
 )

@@ -9,9 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
+from dirax.gallery.heavy_top import along
 from dirax.geometry.lie_groups import SO3
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.schemes.euler_poincare import DiscreteEulerPoincare
+from dirax.show.scene import Scene, arrow, attitudes, axes, box, point
 
 PARAMS = {"I1": 1.0, "I2": 1.5, "I3": 2.0, "I13": 0.3, "I23": 0.2}
 
@@ -45,6 +47,23 @@ def exact(t, x, params=None) -> np.ndarray:
     return omega @ matrix[:, :2].T
 
 
+def motion(rows, params):
+    """The attitude by integration of ω = I⁻¹μ from the identity."""
+    omega = np.linalg.solve(np.asarray(inertia(params), float), rows["x"].T).T
+    return {"attitude": attitudes(rows["t"], omega), "omega": omega}
+
+
+def scene() -> Scene:
+    """The body, its forbidden axis with its trail, and the angular velocity."""
+    tip = lambda attitude: along(attitude, jnp.array([0.0, 0.0, 0.9]))
+    speed = lambda attitude, omega: along(attitude, omega)
+    bodies = (
+        box([0.0, 0.0, 0.0], lambda attitude: attitude, size=(1.2, 1.0, 0.5)),
+        point(tip, radius=0.05, trail=True, colour=1),
+    )
+    return Scene((axes(length=1.0), *bodies, arrow([0.0, 0.0, 0.0], speed)), fields=motion)
+
+
 EXAMPLE = Example(
     name="suslov",
     title="Suslov's problem",
@@ -57,4 +76,5 @@ EXAMPLE = Example(
     steps=1000,
     coordinates=(Coordinate("μ1"), Coordinate("μ2"), Coordinate("μ3")),
     exact=exact,
+    scene=scene(),
 )

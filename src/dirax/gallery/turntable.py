@@ -15,6 +15,7 @@ import numpy as np
 
 from dirax.gallery import rolling_ball
 from dirax.gallery.example import Coordinate, Example
+from dirax.show.scene import Scene, ball, disk, plane, turn
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 PARAMS = {"m": 1.0, "r": 1.0, "I": 0.4, "turn": 1.0}
@@ -49,6 +50,15 @@ def rolling(q, centre, params=PARAMS) -> np.ndarray:
 
 START = np.array([1.0, 0.0, 0.2, 1.2, 0.0])
 
+
+def scene() -> Scene:
+    """The ball on the table, which turns."""
+    centre = lambda q, params: jnp.stack([q[0], q[1], jnp.asarray(params["r"])])
+    turned = lambda t, params: turn([0, 0, 1], params["turn"] * t)
+    parts = (plane(turn=turned), disk([0.0, 0.0, 0.0], turned, radius=0.3, thickness=0.02, colour="ink"))
+    return Scene((*parts, ball(centre, rolling_ball.attitude, radius=PARAMS["r"], trail=True)))
+
+
 EXAMPLE = Example(
     name="turntable",
     title="Ball on a turntable",
@@ -59,4 +69,5 @@ EXAMPLE = Example(
     step=0.01,
     steps=2200,
     coordinates=tuple(Coordinate(name, unit) for name, unit in zip("xyψθφ", ("", "", "rad", "rad", "rad"), strict=True)),
+    scene=scene(),
 )

@@ -15,6 +15,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, plane, point
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 
 CIRCULATIONS = (1.0, 1.0, -1.0, -1.0)
@@ -56,6 +57,12 @@ def runge_kutta_step(q, h: float, circulations: Sequence[float] = CIRCULATIONS):
     return q + h * velocity(q + h / 2 * velocity(q, circulations), circulations)
 
 
+def scene() -> Scene:
+    """Four vortices in their plane."""
+    places = [lambda q, k=k: jnp.stack([q[k], q[k + 4]]) for k in range(4)]
+    return Scene((plane(), *(point(place, trail=True, colour=k) for k, place in enumerate(places))), view="tilted")
+
+
 EXAMPLE = Example(
     name="vortices",
     title="Four point vortices",
@@ -67,4 +74,5 @@ EXAMPLE = Example(
     steps=300,
     coordinates=tuple(Coordinate(f"{letter}{j}") for letter in "xy" for j in range(1, 5)),
     plane=(0, 4),
+    scene=scene(),
 )

@@ -1,5 +1,8 @@
 """Solution: what `simulate` returns, a trajectory with everything that can be done with it as methods."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 from dirax.solution import export, plotting, saving, selection
 from dirax.solution.trajectory import Trajectory
 
@@ -19,6 +22,9 @@ class Solution(Trajectory):
       trajectories of a batch or rows of one trajectory (`dirax.solution.selection.select`). `len(sol)` is the number of
       trajectories of a batch, of rows of one trajectory; `for one in sol` goes through a batch.
     """
+
+    report: Callable[..., Path]
+    """`sol.report(path)`: a page for a browser; `dirax.show`, which stands above this room, puts the method here."""
 
     __getitem__ = selection.select
     __len__ = selection.count

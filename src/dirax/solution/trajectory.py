@@ -28,6 +28,9 @@ GIVEN = (
 class Trajectory:
     """The arrays of a run and what was run: `Solution` says what each is."""
 
+    example: Any = None
+    """The example of the gallery that was run, which knows a scene and an exact solution; None for other systems."""
+
     def __init__(
         self,
         *,
@@ -68,7 +71,9 @@ class Trajectory:
     def replace(self, **changes: Any) -> Self:
         """A copy with other values for some of the constructor's arguments."""
         given = {name: getattr(self, name) for name in GIVEN} | {"params": self._params}
-        return type(self)(**(given | changes))
+        copy = type(self)(**(given | changes))
+        copy.example = self.example
+        return copy
 
     @property
     def batch(self) -> int | None:

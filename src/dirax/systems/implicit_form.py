@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from dirax.program.tracing import jacobian
 from dirax.systems.forms import ImplicitForm
@@ -71,9 +72,8 @@ def uses_time(function: Callable | None, *values) -> bool:
     if function is None:
         return False
     jaxpr = jax.make_jaxpr(lambda t: function(t, *values))(jnp.zeros(())).jaxpr
-    (t,) = jaxpr.invars
-    used = [v for equation in jaxpr.eqns for v in equation.invars]
-    return any(v is t for v in (*used, *jaxpr.outvars))
+    _, (used,) = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    return bool(used)
 
 
 def point_of(near, keys: tuple[str, ...], system) -> np.ndarray:

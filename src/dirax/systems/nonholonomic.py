@@ -179,11 +179,6 @@ class NonholonomicMechanics(AbstractSystem):
         return self.lagrange_dirac().energy_changes
 
 
-def as_lagrange_dirac(system: Any) -> Any:
-    """The `LagrangeDirac` system that a `NonholonomicMechanics` is; any other system as it stands."""
-    return system.lagrange_dirac() if isinstance(system, NonholonomicMechanics) else system
-
-
 def _check_metric(metric: np.ndarray) -> None:
     """Raise `ValueError` for a metric that is not symmetric and positive definite; not finite ones are refused later."""
     scale = np.abs(metric).max()
