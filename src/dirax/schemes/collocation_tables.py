@@ -25,7 +25,9 @@ class Tableau:
 
     `conjugate` is Â with b_i Â_ij + b_j A_ji = b_i b_j, which makes the pair (A, Â) symplectic: A itself for Gauss nodes, the
     matrix of Lobatto IIIB for those of Lobatto (IIIA). `extrapolation` (s, s) takes the values of a polynomial of degree
-    s − 1 at the nodes to those at 1 + c_i, the nodes of the next step. `second` is A·A, rounded once.
+    s − 1 at the nodes to those at 1 + c_i, the nodes of the next step. `second` is A·A, rounded once. `shares` are
+    μ_ij = A_ij/b_j, rounded so that μ_ij + μ_ji = 1 holds exactly for a symplectic A: a_i = a_0 + Σ_j μ_ij (h b_j ȧ_j) keeps
+    quadratic invariants then whatever b was rounded to (Antoñana, Makazaga, Murua 2017).
     """
 
     nodes: np.ndarray
@@ -34,6 +36,7 @@ class Tableau:
     conjugate: np.ndarray
     extrapolation: np.ndarray
     second: np.ndarray
+    shares: np.ndarray
 
     @property
     def stages(self) -> int:
@@ -69,10 +72,15 @@ def _tableau(nodes: list[Decimal]) -> Tableau:
     second = [[sum((matrix[i][k] * matrix[k][j] for k in range(s)), Decimal(0)) for j in range(s)] for i in range(s)]
     rounded = lambda values: np.array([[float(x) for x in row] for row in values])
     vector = lambda values: np.array([float(x) for x in values])
-    found = (vector(nodes), vector(weights), *map(rounded, (matrix, conjugate, extrapolation, second)))
-    for array in found:
+    shares = rounded([[matrix[i][j] / weights[j] for j in range(s)] for i in range(s)])
+    symplectic = max(abs(conjugate[i][j] - matrix[i][j]) for i in range(s) for j in range(s)) < Decimal(10) ** (30 - DIGITS)
+    for i, j in zip(*np.nonzero(shares >= 0.5), strict=True) if symplectic else ():
+        shares[j, i] = 1.0 - shares[i, j]  # exact from ½ to 2
+    matrices = map(rounded, (matrix, conjugate, extrapolation, second))
+    made = Tableau(vector(nodes), vector(weights), *matrices, shares)  # pyright: ignore[reportCallIssue]
+    for array in vars(made).values():
         array.flags.writeable = False
-    return Tableau(*found)
+    return made
 
 
 def _legendre(degree: int) -> Polynomial:
