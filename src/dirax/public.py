@@ -55,6 +55,7 @@ from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.run.simulate import simulate
 from dirax.schemes.charted import InCharts
+from dirax.schemes.collocation import Collocation
 from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
 from dirax.schemes.discrete_constraints import DiscreteConstraintChain, discrete_constraint_algorithm
 from dirax.schemes.discrete_dirac import DiscreteDirac
@@ -165,6 +166,7 @@ __all__ += [
 __all__ += [
     "AbstractScheme",
     "Adjoint",
+    "Collocation",
     "Composition",
     "DiscreteConstraintChain",
     "DiscreteDirac",

@@ -4,8 +4,9 @@ import time
 
 import numpy as np
 
-from dirax.engines.contract import Outcome, Problem, Progress, finished
+from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem, Progress, finished
 from dirax.engines.engine import AbstractEngine
+from dirax.engines.native.collocation_kernels import collocation_kernels
 from dirax.engines.native.kernels import kernels
 from dirax.engines.native.lanes import Lanes, width_for
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -31,6 +32,8 @@ class Native(AbstractEngine):
         """None if the step is a scalar program, of so many operations; else the primitive and the line of the user's source, or
         how many operations there are."""
         try:
+            if collocation_kernels(problem.equation, problem.params, problem.batch_params) is not None:
+                return None
             made = kernels(problem.equation, problem.params, problem.batch_params, problem.compensated)
             if self.most_operations is not None and not made.step.nested:
                 made.check()
@@ -58,8 +61,9 @@ class Native(AbstractEngine):
 def run(p: Problem, progress: Progress | None = None) -> Outcome:
     """The run of a problem, as `Native.run` has it."""
     started = time.perf_counter()
-    made = kernels(p.equation, p.params, p.batch_params, p.compensated)
-    lanes = Lanes(p, made, width_for(p.batch or 1))
+    nodes = collocation_kernels(p.equation, p.params, p.batch_params)
+    made = nodes or kernels(p.equation, p.params, p.batch_params, p.compensated)
+    lanes = Lanes(p, made, width_for(p.batch or 1) if nodes is None else 1)
     kernel, cached = made.kernel(lanes.width)
     compile_seconds, started = time.perf_counter() - started, time.perf_counter()
 
@@ -79,6 +83,8 @@ def run(p: Problem, progress: Progress | None = None) -> Outcome:
                 progress(done, p.steps)
     except KeyboardInterrupt:
         interrupted = True
+    if nodes is not None and not interrupted:
+        _by_newton(lanes, outs)
     closing, outs = lanes.arrays(2)
     lanes.call(kernel, lanes.records.copy(), outs, 0, 1, 1, threads)
     table, record = lanes.table(), lanes.record
@@ -102,6 +108,21 @@ def run(p: Problem, progress: Progress | None = None) -> Outcome:
             "lanes": lanes.width,
             "threads": lanes.threads,
             "kernel_cached": cached,
+            **({} if nodes is None else nodes.notes),
         },
     )
     return finished(p, outcome)
+
+
+def _by_newton(lanes: Lanes, outs: np.ndarray) -> None:
+    """Go on with trajectories whose fixed-point iteration has not converged, by Newton's method for all nodes together."""
+    p, record = lanes.problem, lanes.record
+    left = np.flatnonzero(lanes.records[:, record.status, 0] == NOT_CONVERGED).tolist()
+    if not left:
+        return
+    newton, _ = kernels(p.equation, p.params, p.batch_params, True).kernel(1)
+    for lane in left:
+        one = lanes.records[lane : lane + 1]
+        one[:, record.status] = OK
+        one[:, record.differences] = 0.0
+        lanes.call(newton, one, outs[lane : lane + 1], int(one[0, record.completed, 0]), p.steps, p.save_every, 1, lane)

@@ -14,6 +14,7 @@ from dirax.engines.native import kernel_cache
 from dirax.engines.native.gradients.linearized_loop import LinearizedLoop, backward, forward
 from dirax.engines.native.loops.newton_step import newton_correction
 from dirax.engines.native.loops.plan import Plan
+from dirax.engines.native.loops.record import Record
 from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program import graph as graph_module
@@ -43,6 +44,11 @@ class Kernels:
         """The plan without corrections: sizes and names only."""
         return self.plan or self._plan(self.step.graph)
 
+    @property
+    def record(self) -> Record:
+        """What is kept of a lane."""
+        return self.bare.record
+
     def kernel(self, width: int) -> tuple[Any, bool]:
         """The compiled `run` for a width, and whether it came from a cache."""
         if width in self._runs:
@@ -65,16 +71,8 @@ class Kernels:
 
     def _library(self, name: str, width: int, text: Callable[[], str], *more: str) -> tuple[Any, bool]:
         """The linked code that exports `name`, and whether it came from the disk."""
-        entry = kernel_cache.name_of(self.digest, width, *more, *llvm.version())
-        stored = kernel_cache.read(entry)
-        if stored is not None:
-            with contextlib.suppress(RuntimeError):  # the linker does not take it: it is compiled anew
-                library = llvm.load(stored.code, (name,))
-                self.operations = stored.operations
-                return library, True
-        code = llvm.object_code(text())
-        kernel_cache.write(entry, kernel_cache.Kernel(self.operations, code))
-        return llvm.load(code, (name,)), False
+        library, self.operations, cached = linked(name, (self.digest, width, *more), text, lambda: self.operations)
+        return library, cached
 
     def _linearized(self, reverse: bool) -> LinearizedLoop:
         step, one = self.step, backward if reverse else forward
@@ -107,6 +105,18 @@ class Kernels:
         """A graph of the step with its Jacobians, to which more can be added. Raises `GraphTooLarge`."""
         _ = self.step.jacobians
         return self.step.graph.copy(NODE_LIMIT)
+
+
+def linked(name: str, key: tuple, text: Callable[[], str], operations: Callable[[], int]) -> tuple[Any, int, bool]:
+    """The linked code of the IR `text()` that exports `name`, the operations of a step, and whether it came from the disk."""
+    entry = kernel_cache.name_of(*key, *llvm.version())
+    stored = kernel_cache.read(entry)
+    if stored is not None:
+        with contextlib.suppress(RuntimeError):  # the linker does not take it: it is compiled anew
+            return llvm.load(stored.code, (name,)), stored.operations, True
+    code = llvm.object_code(text())
+    kernel_cache.write(entry, kernel_cache.Kernel(operations(), code))
+    return llvm.load(code, (name,)), operations(), False
 
 
 def too_large(error: GraphTooLarge) -> UnsupportedPrimitive:

@@ -9,6 +9,7 @@ import numpy as np
 
 from dirax.engines.contract import OK, Problem
 from dirax.engines.native import compile as llvm
+from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 
 SHARES = 4
@@ -38,7 +39,7 @@ class Lanes:
     The last block is filled up with copies of its first lane, which write where that one writes.
     """
 
-    def __init__(self, problem: Problem, made: Kernels, width: int):
+    def __init__(self, problem: Problem, made: Kernels | CollocationKernels, width: int):
         p = self.problem = problem
         self.width = width
         self.lanes = p.batch or 1
@@ -46,7 +47,7 @@ class Lanes:
         self.threads = min(thread_count(), self.blocks) if self.blocks > 1 else 1
         self.source = np.arange(self.blocks * width)
         self.source[self.lanes :] = (self.blocks - 1) * width
-        self.record = made.bare.record
+        self.record = made.record
         table = np.zeros((self.lanes, self.record.size))
         table[:, self.record.state] = np.asarray(p.state).reshape(self.lanes, -1)
         for stage, guess in enumerate(p.guess):
@@ -95,17 +96,21 @@ class Lanes:
         table = np.array(begins)[:, None] + steps * self.source
         return made, np.ascontiguousarray(table.reshape(-1, self.blocks, self.width).swapaxes(0, 1))
 
-    def call(self, kernel, records: np.ndarray, outs: np.ndarray, first: int, stop: int, every: int, threads: int) -> None:
-        """Steps `first` to `stop` − 1 of every trajectory, blocks shared among threads; Ctrl-C waits for their end."""
+    def call(
+        self, kernel, records: np.ndarray, outs: np.ndarray, first: int, stop: int, every: int, threads: int, block: int = 0
+    ) -> None:
+        """Steps `first` to `stop` − 1 of the trajectories of these records, whose first block has number `block`; blocks shared
+        among threads. Ctrl-C waits for their end."""
         p = self.problem
         numbers = (p.t0, p.h, p.first_step, first, stop, every, p.max_iterations)
-        places = (records.ctypes.data, records.strides[0]), self._at, (outs.ctypes.data, outs.strides[0])
+        params, stride = self._at
+        places = (records.ctypes.data, records.strides[0]), (params + block * stride, stride), (outs.ctypes.data, outs.strides[0])
 
         def part(low: int, high: int) -> None:
             kernel(*[place + low * stride for place, stride in places], high - low, *numbers)
 
         if threads == 1:
-            part(0, self.blocks)
+            part(0, len(records))
             return
         bounds = np.linspace(0, self.blocks, min(self.blocks, SHARES * threads) + 1).astype(int).tolist()
         with ThreadPoolExecutor(threads) as pool:

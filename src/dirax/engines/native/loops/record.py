@@ -44,6 +44,11 @@ class Record:
         return slice(first, first + count)
 
     @property
+    def differences(self) -> slice:
+        """First and second differences of the unknowns of all stages."""
+        return slice(self.state_size + self.kept, self.state_size + 3 * self.kept)
+
+    @property
     def completed(self) -> int:
         return self.size - 4
 

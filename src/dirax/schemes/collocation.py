@@ -1,0 +1,62 @@
+"""Collocation: steps of high order whose unknowns are the rates at s nodes, coupled by constant matrices."""
+
+from dirax.schemes.collocation_step import LagrangianCollocation, RelationCollocation
+from dirax.schemes.collocation_tables import MOST_STAGES, gauss
+from dirax.schemes.step import AbstractScheme, Shape, StepEquation
+from dirax.systems.system import AbstractSystem
+
+NODES = ("gauss", "lobatto")
+
+
+class Collocation(AbstractScheme):
+    """Collocation with s stages: the polynomials through the state that satisfy the equations at the nodes c_1, …, c_s.
+
+        X_i = x_k + h Σ_j a_ij Ẋ_j,   x_{k+1} = x_k + h Σ_i b_i Ẋ_i,   (X_i, Ẋ_i) satisfying the system at t_k + c_i h.
+
+    `nodes="gauss"`: order 2s, symplectic, self-adjoint (Hairer, Lubich, Wanner, Geometric Numerical Integration, II.1.3). On a
+    regular Lagrangian, with x = (q, p), these are the discrete Euler–Lagrange equations of the Galerkin discrete Lagrangian
+    L_d(q_0, q_1) = ext h Σ b_i L(Q_i, Q̇_i) over polynomials of degree s (VI.6.3); forces and explicit time enter at the
+    nodes. Quadratic invariants are kept: Casimirs of linear Poisson structures that are quadratic, angular momenta.
+
+    Takes systems without constraints: regular `dx.LagrangeDirac`, `dx.DiracSystem` with a Hamiltonian vector field,
+    `dx.PortHamiltonian` without closed ports, `dx.LiePoisson`, and `dx.PhaseSpaceLagrangian` on its final manifold.
+    Raises `ValueError` for stages that are not 1 to 16 and nodes that do not exist, and `TypeError` for other systems.
+
+        sol = dx.simulate(system, dx.Collocation(stages=4), q=…, v=…, step=0.1, steps=1000)
+    """
+
+    stages: int
+    nodes: str
+
+    def __init__(self, stages: int = 3, nodes: str = "gauss"):
+        if nodes not in NODES:
+            raise ValueError(f"nodes must be {' or '.join(map(repr, NODES))}, but {nodes!r} was given.")
+        fewest = 1 if nodes == "gauss" else 2
+        if isinstance(stages, bool) or not isinstance(stages, int) or not fewest <= stages <= MOST_STAGES:
+            raise ValueError(
+                f"stages must be a whole number from {fewest} to {MOST_STAGES} for {nodes} nodes, but {stages!r} was given."
+            )
+        self.stages, self.nodes = stages, nodes
+
+    @property
+    def order(self) -> int:
+        """The order of convergence on smooth systems: 2s, or 2s − 2 with Lobatto nodes."""
+        return 2 * self.stages - 2 * (self.nodes == "lobatto")
+
+    def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
+        if shape.m + shape.c:
+            raise TypeError(
+                "collocation at Gauss nodes does not keep constraints, of which the system has "
+                f'{shape.m + shape.c}: use dx.Collocation(stages={max(self.stages, 2)}, nodes="lobatto") or '
+                "dx.EnergyCollocation()."
+            )
+        relation = system.relation_form(shape) or system.final_relation(shape)
+        if relation is not None and not relation.multipliers:
+            return RelationCollocation(gauss(self.stages), shape.n, relation).equation()
+        lagrangian = system.lagrangian_form()
+        if lagrangian is not None:
+            return LagrangianCollocation(gauss(self.stages), shape.n, lagrangian).equation()
+        raise TypeError(
+            "dx.Collocation steps systems with a relation between x and ẋ or with a Lagrangian in coordinates, but a "
+            f"{type(system).__name__} was given."
+        )
