@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxpr_as_fun
 
 import dirax as dx
 from dirax.geometry.numerics import arc_over_sine, norm, radial
@@ -91,7 +92,7 @@ def test_the_primitive_is_differentiated_and_vectorized_by_jax(name):
     f = SCALARS[name]
     jaxpr = jax.make_jaxpr(gradient(f))(POINT)
     assert "dirax_derivative" in str(jaxpr)
-    evaluated = lambda q: jax.extend.core.jaxpr_as_fun(jaxpr)(q)[0]
+    evaluated = lambda q: jaxpr_as_fun(jaxpr)(q)[0]
     rows = jnp.stack([POINT, POINT + 0.1])
     assert jax.jit(evaluated)(POINT) == pytest.approx(by_jax(jax.grad(f)), rel=1e-14)
     assert evaluated(POINT) == pytest.approx(by_jax(jax.grad(f)), rel=1e-14)
