@@ -65,9 +65,9 @@ def run(p: Problem, progress: Progress | None = None) -> Outcome:
     made = nodes or kernels(p.equation, p.params, p.batch_params, p.compensated)
     lanes = Lanes(p, made, width_for(p.batch or 1) if nodes is None else 1)
     kernel, cached = made.kernel(lanes.width)
+    fields, outs = lanes.arrays(p.rows)
     compile_seconds, started = time.perf_counter() - started, time.perf_counter()
 
-    fields, outs = lanes.arrays(p.rows)
     done, interrupted, threads = 0, False, 1
     count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
     try:
@@ -85,6 +85,7 @@ def run(p: Problem, progress: Progress | None = None) -> Outcome:
         interrupted = True
     if nodes is not None and not interrupted:
         _by_newton(lanes, outs)
+    run_seconds = time.perf_counter() - started
     closing, outs = lanes.arrays(2)
     lanes.call(kernel, lanes.records.copy(), outs, 0, 1, 1, threads)
     table, record = lanes.table(), lanes.record
@@ -100,7 +101,7 @@ def run(p: Problem, progress: Progress | None = None) -> Outcome:
         last_unknowns=table[:, record.unknowns(0, p.equation.stages[0][0].unknowns)].copy(),
         interrupted=interrupted,
         compile_seconds=compile_seconds,
-        run_seconds=time.perf_counter() - started,
+        run_seconds=run_seconds,
         engine="native",
         notes={
             "unknowns": sum(len(made.step.equations[i].unknowns) for i, _ in made.step.stages),
