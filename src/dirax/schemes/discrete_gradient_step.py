@@ -14,7 +14,10 @@ EPSILON = 2.220446049250313e-16
 NOISE = 1e-11
 """How much of dH the correction may be, relative, where it is roundoff of H only. It fades out for steps so short that it
 would be more: dividing roundoff by such a step would push a system that comes to rest."""
-TINY = 1e-300
+FADED = 1e-6
+"""Of a step for which |dH||Δx| is less than this of what roundoff blurs, the correction is below one rounding of dH."""
+TINY = 1e-290
+"""Squares below this leave the range of double precision where they are divided by."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +73,7 @@ class DiscreteGradientStep(AbstractStep):
         gained = (state.supplied - state.dissipated) + (state.lost_supplied - state.lost_dissipated)
         stored = (self.energy.hamiltonian(state.x + change, params) - state.first) - gained
         blurred = EPSILON * (jnp.abs(state.first) + jnp.abs(gained)) / NOISE
-        length = jnp.sqrt((change @ change) ** 2 + (blurred**2 / (gradient @ gradient + TINY)) ** 2 + TINY)
-        return gradient + (stored - gradient @ change) / length * change, state.x + change / 2
+        return gradient + _along(change, gradient, stored - gradient @ change, blurred), state.x + change / 2
 
     @once
     def ports(self, u, state, t, h, params):
@@ -116,6 +118,20 @@ class DiscreteGradientStep(AbstractStep):
             raise ValueError("this scheme starts from x=.")
         state = self.state.join(x=data["x"], first=self.energy.hamiltonian(data["x"], params))
         return state, self.unknowns.join(velocity=data["velocity"])
+
+
+def _along(change, gradient, missing, blurred):
+    """The multiple a Δx of the step with ⟨a Δx, Δx⟩ = `missing`, faded out where |∇̄H||Δx| is lost in what is `blurred`.
+
+    Its limit for Δx → 0 is zero, for `missing` is of higher order than |Δx|: a system at rest has the discrete gradient dH.
+    """
+    squared, steep = change @ change, gradient @ gradient
+    on = (squared > TINY) & (steep > TINY)
+    length, slope = jnp.sqrt(jnp.where(on, squared, 1.0)), jnp.sqrt(jnp.where(on, steep, 1.0))
+    on = on & (length * slope > FADED * blurred)
+    hidden = jnp.where(on, blurred / length / slope, 0.0)
+    factor = jnp.where(on, missing / length, 0.0) / jnp.sqrt(1.0 + (hidden * hidden) ** 2)
+    return factor * (change / length)
 
 
 def _add(total, lost, term):
