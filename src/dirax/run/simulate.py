@@ -85,7 +85,8 @@ def simulate(
     start = begun(equation, case, initial, on.compiles_start)
     # user functions that close over a traced value make the start traced although nothing that was passed is
     if not (traced := traced or is_traced(start)):
-        equation.stages[0][0].check(data, case.h, own)
+        for stage in dict.fromkeys(stage.check for stage, _ in equation.stages):
+            stage(data, case.h, own)
         refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial)
     problem = Problem(
         equation=equation,

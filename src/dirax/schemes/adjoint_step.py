@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.layout import Layout
+from dirax.schemes.nothing_grows import NothingGrows
 from dirax.schemes.step import Field, StepEquation
 
 
@@ -59,3 +60,5 @@ class AdjointStep(AbstractStep):
 
     def check(self, data, h, params):
         self.inner.check(data, -h, params)
+        if isinstance(self.inner.check, NothingGrows):
+            self.inner.check.of_adjoint(data, -h, params)

@@ -4,11 +4,13 @@ from typing import Any
 
 from dirax.geometry.cotangent_lift import CotangentLift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
+from dirax.geometry.spaces import Euclidean
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.schemes.discrete_structure_maps import PROJECTED, RelationPairs, structure_on_cotangent_bundle
 from dirax.schemes.discretized import discretized_relation
 from dirax.schemes.lagrangian_methods import discretized_lagrangian, resolved_lagrangian, resolved_nonholonomic
 from dirax.schemes.lifted_lagrangian import lift_of, lifted_lagrangian, projected_lagrangian
+from dirax.schemes.nothing_grows import nothing_grows
 from dirax.schemes.nothing_hidden import nothing_hidden_in_lagrangian, nothing_hidden_in_relation
 from dirax.schemes.resolved import projected_field
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
@@ -30,7 +32,8 @@ class DiscreteDirac(AbstractScheme):
     constraints g = 0, Method 1 imposes the distribution G q̇ + ∂g/∂t = 0 at the base point, which keeps quadratic g for the
     midpoint map and others to O(h²); Method 2 keeps g and G q̇ + ∂g/∂t at the nodes, to roundoff. With either kind of
     constraint the multipliers of Method 1 alternate around those of the system by O(h), and means of neighbours are of the
-    order of q. Method 2 of a DiracSystem with `holonomic` is stated here for graphs of two-forms and bivectors with
+    order of q; with a base point off the middle, and with it the adjoint, what is off a constraint is multiplied by
+    −θ/(1 − θ) or −(1 − θ)/θ in a step, and a scheme in which that grows is refused. Method 2 of a DiracSystem with `holonomic` is stated here for graphs of two-forms and bivectors with
     {g_i, g_j} = 0, and by its resolved chain for others. Multipliers are forces at the base point, ṗ = … + Wᵀλ; those of
     `dx.LagrangeDAlembert` are impulses of the opposite sign.
 
@@ -55,6 +58,9 @@ class DiscreteDirac(AbstractScheme):
     def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         resolve = self.constraints == "resolve"
         equation = self._resolved(system, shape) if resolve else self._discretized(system, shape)
+        flat = isinstance(_map_on_q(self.map).manifold(shape.n), Euclidean)
+        if equation is not None and not resolve and flat and self.map.base_fraction != 0.5:
+            equation = nothing_grows(system, equation)
         if equation is None and not resolve:
             equation = self._resolved(system, shape)  # all that is known of the system is its final manifold
         if equation is None:
