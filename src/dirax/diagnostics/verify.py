@@ -5,6 +5,7 @@ import numpy as np
 from dirax.diagnostics.casimir_lines import casimir_lines
 from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
+from dirax.diagnostics.final_manifold_lines import final_manifold
 from dirax.diagnostics.judging import steps_of
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.report import OK, VIOLATED, Line, Report
@@ -25,6 +26,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
 
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
+    - final manifold of a singular Lagrangian: 32 ε where a scheme keeps it, and violated where the run starts off it, or jumps
+      across it from one solution of the discrete equations to the other;
     - momentum maps, and of Euler–Poincaré and Lie–Poisson systems the Casimirs and the spatial momentum (where quantities
       are advected, its part that leaves them alone): 32 ε · steps, the most that 32 roundings a step add up to (a random
       walk gives √steps of that);
@@ -54,6 +57,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         *membership(whole, structure, tolerance),
         constraint(whole, structure, tolerance),
         hidden_constraint(whole, tolerance),
+        final_manifold(whole, tolerance),
         energy_line(sol),
         *port_lines(sol, tolerance),
         *(momentum(sol, name, generator, tolerance) for name, generator in generators.items()),

@@ -8,6 +8,12 @@ import jax.numpy as jnp
 from dirax.engines.contract import Problem
 from dirax.engines.engine import AbstractEngine
 from dirax.program.user_functions import is_traced
+from dirax.run.final_manifold import (
+    is_singular,
+    projected_onto_manifold,
+    refuse_leaving_final_manifold,
+    refuse_off_final_manifold,
+)
 from dirax.run.premises import refuse_bad_start
 from dirax.run.progress import reporting
 from dirax.run.redundancy import redundant_constraints
@@ -62,7 +68,8 @@ def simulate(
 
     Raises `ValueError` or `TypeError`, naming the argument, for wrong shapes, dtypes and arities, values that are not
     finite, `step` ≤ 0, `steps` < 1, data off the constraints, constraints that contradict each other, that are dependent at
-    the initial point alone, and a Lagrangian singular together with its constraints ([PY] (21)).
+    the initial point alone, a Lagrangian singular together with its constraints ([PY] (21)), data off the final manifold of a
+    singular Lagrangian, and compositions of steps that leave it.
     A run that fails midway, or is stopped by Ctrl-C, raises nothing: what was computed is
     kept, and `Solution.ok` and `.message` say what happened.
     """
@@ -75,10 +82,12 @@ def simulate(
     system = system if inputs is None else system.with_inputs(inputs)
     data, own = case.first
     # discretize: constraints that follow from others at the completed data are left out of the equation
-    shape, redundant = Shape(*system.sizes(data, own)), ()
+    shape, redundant, singular = Shape(*system.sizes(data, own)), (), False
     initial = completed(system, case, project, on.compiles_start)
     if not (traced := case.traced or is_traced(initial)):
         redundant = redundant_constraints(system, initial.constraints, data, own, case.t0)
+        if (singular := is_singular(initial)) and project and (moved := projected_onto_manifold(system, case, initial)):
+            case, initial = moved, completed(system, moved, False, on.compiles_start)
     shape = Shape(shape.n, shape.m, shape.c, redundant=redundant) if redundant else shape
     equation = make_step_equation(scheme, system, shape)
     # start
@@ -88,6 +97,10 @@ def simulate(
         for stage in dict.fromkeys(stage.check for stage, _ in equation.stages):
             stage(data, case.h, own)
         refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial)
+        if check_initial and singular:
+            refuse_off_final_manifold(system, case, initial)
+        if check_initial:
+            refuse_leaving_final_manifold(system, equation, shape, case, initial, start, singular)
     problem = Problem(
         equation=equation,
         state=start.state,

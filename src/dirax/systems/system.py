@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.geometry.semidirect import SemidirectProduct
+from dirax.program.tracing import gradient, jacobian
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
 from dirax.systems.implicit_form import of_relation
@@ -145,6 +146,12 @@ class AbstractSystem(eqx.Module):
         """L(t, q, v), by which data outside its domain are found; None for a system without a Lagrangian."""
         form = self.lagrangian_form()
         return None if form is None else form.lagrangian.at(t, q, v, params)
+
+    def velocity_hessian(self, t: Any, q: Array, v: Array, params: Any) -> Float[Array, "n n"] | None:
+        """∂²L/∂v², by which a singular Lagrangian is told; None where there is no Lagrangian on T*Q, where it is known to be
+        regular, and where the system says its final manifold itself."""
+        form = None if self.metric_form() is not None else self.lagrangian_form()
+        return None if form is None else jacobian(gradient(lambda v: form.lagrangian.at(t, q, v, params)))(v)
 
     def with_inputs(self, inputs: Callable) -> "AbstractSystem":
         """The same system driven by u = inputs(t, x[, params]) through its open ports; raises `TypeError` without ports."""

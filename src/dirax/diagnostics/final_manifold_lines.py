@@ -1,0 +1,83 @@
+"""Lines of `dx.verify` on the final manifold of a singular Lagrangian, and on solutions that jump to and fro across it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.diagnostics.judging import judged, of_lane, roundoff_limit, worst_place
+from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
+from dirax.diagnostics.rows import initial_of_one, over_rows, times_at
+from dirax.program.tracing import jacobian
+from dirax.program.user_functions import evaluated
+from dirax.run.final_manifold import KEPT, chain_at
+from dirax.solution.solution import Solution
+from dirax.systems.constraint_algorithm import rank_of
+from dirax.systems.constraint_chain import ConstraintChain
+
+NOTICED = 1e-6
+"""Jumps below this, relative to the positions, are not called so."""
+
+
+def final_manifold(sol: Solution, tolerance: float | None) -> Line | None:
+    """The constraints of M_f at every row of a run with a singular Lagrangian; None for others."""
+    if sol.system is None or not {"q", "p"} <= sol.fields.keys():
+        return None
+    chain = _chain_of(sol)
+    if chain is None or chain.empty or len(chain.coordinates) - chain.clock != 2 * sol.q.shape[-1]:
+        return None
+    name, rows = "final manifold", np.arange(sol.rows)
+    items = (times_at(sol, rows), np.asarray(sol.q), np.asarray(sol.p))
+    found = over_rows(eqx.Partial(_defect, chain), sol, items)
+    size = float(np.nanmax(found[..., 1])) or 1.0
+    values = np.where(np.isnan(found[..., 0]), 0.0, found[..., 0]) / size
+    lane, row = worst_place(values)
+    text = f"the constraints of M_f at each row, worst at t = {float(sol.t[row]):.6g}{of_lane(sol, lane)}"
+    line = judged(sol, name, np.max(values, axis=1), roundoff_limit(tolerance, 1), text)
+    if line.verdict != VIOLATED:
+        return line
+    if _jumps(sol):
+        text = f"the trajectory jumps from one solution of the discrete equations to the other, across M_f; {text}"
+        return Line(name, line.value, line.tolerance, VIOLATED, text)
+    if "q0" not in sol.initial and np.max(values[:, 0]) > KEPT:
+        return Line(name, line.value, line.tolerance, VIOLATED, f"the run starts off it by {np.max(values[:, 0]):.2g}; {text}")
+    text = f"the scheme imposes it inside each step, and not at the rows, which are off by {line.value:.2g}"
+    return Line(name, line.value, None, NOT_CHECKED, text)
+
+
+def _chain_of(sol: Solution) -> ConstraintChain | None:
+    """The chain around the first row, None for a Lagrangian that is regular there."""
+    assert sol.system is not None
+    first = lambda name: np.asarray(sol.fields[name]).reshape(-1, *np.shape(sol.fields[name])[-2:])[0, 0]
+    q, t, params = first("q"), float(sol.t[0]), sol.params_of_one
+    v = initial_of_one(sol).get("v", np.zeros_like(q))
+    # numbers of the point, for a system of one's own may have no Lagrangian at all
+    if sol.system.lagrangian_form() is None or sol.system.quotient_form() is not None:
+        return None
+    hessian = evaluated(eqx.Partial(_hessian, sol.system), np.asarray(t), q, v, params)
+    if hessian is None or rank_of(np.asarray(hessian)) == len(q):
+        return None
+    return chain_at(sol.system, q, v, t, params)
+
+
+def _hessian(system: Any, t, q, v, params: Any):
+    return system.velocity_hessian(t, q, v, params)
+
+
+def _defect(chain: ConstraintChain, t, q, p, params: Any):
+    """The largest |φ| at a row, and of |∂φ| times the largest entry of the row."""
+    x = jnp.concatenate([q, p, jnp.reshape(t, (1,))] if chain.clock else [q, p])
+    slope = jacobian(lambda x: chain.constraints(x, params))(x)
+    size = jnp.max(jnp.abs(slope)) * jnp.max(jnp.abs(jnp.concatenate([q, p])))
+    return jnp.stack([jnp.max(jnp.abs(chain.constraints(x, params))), size])
+
+
+def _jumps(sol: Solution) -> bool:
+    """Whether a position goes to and fro from row to row by more than it moves in a step."""
+    q = np.asarray(sol.q).reshape(-1, *np.shape(sol.q)[-2:])
+    if sol.save_every != 1 or q.shape[1] < 4:
+        return False
+    turns, moves = np.abs(q[:, 2:] - 2 * q[:, 1:-1] + q[:, :-2]) / 4, np.abs(q[:, 2:] - q[:, :-2]) / 2
+    turns, moves = np.nanmax(turns, axis=1), np.nanmax(moves, axis=1)
+    return bool(np.any((turns > moves) & (turns > NOTICED * np.nanmax(np.abs(q)))))

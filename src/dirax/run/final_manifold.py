@@ -1,0 +1,181 @@
+"""The final constraint manifold of a singular Lagrangian, as a premise: initial data on it, and steps that stay on it."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.engines.step_program import linearized
+from dirax.program.memo import Memo, Same
+from dirax.program.tracing import jacobian
+from dirax.program.user_functions import evaluated
+from dirax.run.start import Initial, Start
+from dirax.run.validate import Case
+from dirax.systems.constraint_algorithm import constraint_algorithm, rank_of
+from dirax.systems.constraint_chain import EMPTY, IRREGULAR, ConstraintChain
+from dirax.systems.shape import Shape
+from dirax.systems.system import AbstractSystem
+
+KEPT = 1e-9
+"""How far off the manifold a step may take a point on it, relative to the state, where it keeps it."""
+
+UPDATES = 30
+"""Updates of Newton's method in the step that is tried."""
+
+_chains: Memo[ConstraintChain | None] = Memo(64)
+
+
+def is_singular(initial: Initial) -> bool:
+    """Whether ∂²L/∂v² is singular at the data of any trajectory."""
+    if initial.hessian is None:
+        return False
+    hessian = np.asarray(initial.hessian)
+    whole = hessian.reshape(-1, *hessian.shape[-2:])
+    scale = np.max(np.abs(whole), axis=(1, 2))
+    sizes = np.abs(np.linalg.det(whole / np.where(scale > 0, scale, 1.0)[:, None, None]))
+    # a determinant above this belongs to no matrix that a rank could find singular; the others are asked
+    doubtful = np.isfinite(whole).all(axis=(1, 2)) & ~(sizes > 1e-6)
+    return any(rank_of(matrix) < len(matrix) for matrix in whole[doubtful])
+
+
+def chain_at(system: AbstractSystem, q: Any, v: Any, t: float, params: Any) -> ConstraintChain | None:
+    """The constraint chain around (q, v); None where the algorithm does not take the system, or ends irregular."""
+    given = tuple(np.asarray(leaf).tobytes() for leaf in (q, v, t, *jax.tree.leaves(params)))
+
+    def found() -> ConstraintChain | None:
+        try:
+            chain = constraint_algorithm(system, {"q": np.asarray(q), "v": np.asarray(v), "t": float(t)}, params)
+        except (TypeError, ValueError):
+            return None
+        return None if chain.verdict == IRREGULAR else chain
+
+    return _chains.get((Same(system), given, jax.tree.structure(params)), found)
+
+
+def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any) -> np.ndarray:
+    """The point x of the chain with these q and p; where v is among its coordinates, the nearest one that the chain admits."""
+    q, p, v = map(np.asarray, (q, p, v))
+    time = [float(t)] if chain.clock else []
+    if len(chain.coordinates) - chain.clock == 2 * len(q):
+        return np.concatenate([q, p, time])
+    n, x = len(q), np.concatenate([q, v, p, time])
+    for _ in range(UPDATES):
+        value = np.asarray(chain.constraints(x, params))
+        slope = np.asarray(evaluated(_slope_of(chain), x, params))[:, n : 2 * n]
+        change = np.linalg.lstsq(slope, value, rcond=1e-10)[0]
+        x[n : 2 * n] -= change
+        if np.max(np.abs(change), initial=0.0) <= 1e-15 * (1 + np.max(np.abs(x))):
+            break
+    return x
+
+
+_slopes: Memo[Callable] = Memo(64)
+
+
+def _slope_of(chain: ConstraintChain) -> Callable:
+    """The derivative of the constraints of a chain as a function of (x, params)."""
+    return _slopes.get(Same(chain), lambda: lambda x, params: jacobian(lambda x: chain.constraints(x, params))(x))
+
+
+def projected_onto_manifold(system: AbstractSystem, case: Case, initial: Initial) -> Case | None:
+    """The case with q, p and v on the final manifold, those nearest to the data; None where no chain says what it is."""
+    if case.two_points:
+        return None
+    found = []
+    for q, p, v, params in _lanes_of(case, initial):
+        chain = chain_at(system, q, v, case.t0, params)
+        if chain is None or chain.empty:
+            return None
+        x, n = np.asarray(chain.project(on_chain(chain, q, p, v, case.t0, params), params)), len(q)
+        found.append((x[:n], x[len(x) - chain.clock - n : len(x) - chain.clock]))
+    points = [np.stack(a) if case.batch is not None else a[0] for a in zip(*found, strict=True)]
+    return Case({"q": points[0], "p": points[1]}, case.params, case.h, case.t0, case.batch, case.batch_params)
+
+
+def refuse_off_final_manifold(system: AbstractSystem, case: Case, initial: Initial) -> None:
+    """Raise `ValueError` for data of a singular Lagrangian that are off its final manifold, which the scheme would not find:
+    its steps would jump between solutions of the discrete equations that belong to no motion."""
+    if case.two_points:
+        return
+    for lane, (q, p, v, params) in enumerate(_lanes_of(case, initial)):
+        chain = chain_at(system, q, v, case.t0, params)
+        if chain is None:
+            continue
+        which = f" of trajectory {lane}" if case.batch is not None else ""
+        singular = f"the Lagrangian is singular at the initial data{which} (∂²L/∂v²), and"
+        if chain.verdict == EMPTY:
+            raise ValueError(f"{singular} no motion passes through them: {chain.explanation[:-1].split(': ')[0]}.")
+        if off := chain.off(on_chain(chain, q, p, v, case.t0, params), params):
+            raise ValueError(
+                f"{singular} they are off its final constraint manifold: {off.split('. ')[0]}; pass project=True to project "
+                "them, or check_initial=False to take them as they are."
+            )
+
+
+def refuse_leaving_final_manifold(
+    system: AbstractSystem, equation: Any, shape: Shape, case: Case, initial: Initial, start: Start, singular: bool
+) -> None:
+    """Raise `ValueError` for a composition of steps that leave the final manifold of a singular Lagrangian: the order of a
+    composition is that of maps of the manifold to itself. Without constraints, whose forces are in the saved p."""
+    stages = equation.stages
+    if len(stages) < 2 or case.two_points or system.constraints.any or "p" not in stages[0][0].fields:
+        return
+    if not singular and system.final_relation(shape) is None:
+        return
+    q, p, v, params = next(_lanes_of(case, initial))
+    stage, fraction = stages[0]
+    first = lambda a: np.asarray(a)[0] if case.batch is not None else np.asarray(a)
+    row = _after(stage, first(start.state), first(start.guess[0]), case.t0, fraction * case.h, params)
+    if row is None:
+        return
+    missed = _off(system, row, q, v, case.t0, case.t0 + fraction * case.h, params, singular)
+    if missed > KEPT:
+        raise ValueError(
+            f"a composition raises the order of maps of the final manifold to itself, and a step of this scheme leaves that of "
+            f"this {type(system).__name__}, by {missed:.2g} relative to the state (p = α(q) is kept for one-forms α "
+            'that are linear): take constraints="resolve", or check_initial=False to run it at the order of its parts.'
+        )
+
+
+def _off(system: AbstractSystem, row: dict, q, v, t0: float, t: float, params: Any, singular: bool) -> float:
+    """How far a row is off the final manifold, relative to the row."""
+    if not singular:
+        value = np.asarray(evaluated(system.initial_defect, {**row, "t": np.asarray(t)}, params))
+        return float(np.max(np.abs(value), initial=0.0) / (np.max(np.abs(row["p"])) or 1.0))
+    chain = chain_at(system, q, v, t0, params)
+    if chain is None or chain.empty:
+        return 0.0
+    x = on_chain(chain, row["q"], row["p"], v, t, params)
+    value, slope = np.abs(np.asarray(chain.constraints(x, params))), np.asarray(evaluated(_slope_of(chain), x, params))
+    scale = np.max(np.abs(slope), axis=1) * np.max(np.abs(x))
+    return float(np.max(value / np.where(scale > 0, scale, 1.0), initial=0.0))
+
+
+def _after(stage: Any, state: np.ndarray, u: np.ndarray, t: float, h: float, params: Any) -> dict[str, np.ndarray] | None:
+    """The row after one step of a stage, by Newton's method in numbers; None where it has none."""
+    one = lambda a: np.asarray(a, float)[None]
+    for _ in range(UPDATES):
+        found = linearized(stage, params, False, one(u), one(state), one(t), one(h))
+        if found is None or not all(np.all(np.isfinite(a)) for a in found):
+            return None
+        try:
+            change = np.linalg.solve(found[1][0], found[0][0])
+        except np.linalg.LinAlgError:
+            return None
+        u = u - change
+        if np.max(np.abs(change), initial=0.0) <= 1e-14 * (1 + np.max(np.abs(u), initial=0.0)):
+            break
+    end = stage.advance(jnp.asarray(u), jnp.asarray(state), t, h, params)
+    row = stage.unpack(end, jnp.asarray(u), t + h, h, params)
+    return {name: np.asarray(row[name]) for name in ("q", "p")}
+
+
+def _lanes_of(case: Case, initial: Initial) -> Iterator[tuple[Any, Any, Any, Any]]:
+    """(q, p, v, params) of every trajectory."""
+    data = initial.data
+    arrays = [np.asarray(data[name]) for name in ("q", "p", "v")]
+    for lane in range(case.batch or 1):
+        params = jax.tree.map(lambda leaf, lane=lane: leaf[lane], case.params) if case.batch_params else case.params
+        yield (*((a[lane] if case.batch is not None else a) for a in arrays), params)

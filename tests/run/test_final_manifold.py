@@ -1,0 +1,68 @@
+"""Singular Lagrangians: data off the final manifold are refused or projected, and compositions of steps that leave it too."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax import gallery
+
+FLAT = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - q @ q / 2)  # q1 has no inertia, and is zero
+OFF = {"q": [1.0, 0.7], "v": [0.0, 0.0], "step": 0.1, "steps": 50}
+SCHEMES = [dx.LagrangeDAlembert(), dx.DiscreteDirac()]
+
+
+@pytest.mark.parametrize("scheme", SCHEMES, ids=["lagrange-dalembert", "method 1"])
+def test_data_off_the_final_manifold(scheme):
+    with pytest.raises(ValueError, match=r"singular at the initial data.*off its final constraint manifold.*0\.7.*project=True"):
+        dx.simulate(FLAT, scheme, **OFF)
+    sol = dx.simulate(FLAT, scheme, **OFF, project=True)
+    assert sol.ok and np.abs(sol.q[:, 1]).max() < 1e-15 and abs(sol.q[0, 0] - 1) < 1e-15
+    assert dx.verify(sol)["final manifold"].verdict == "ok"
+    on = dx.simulate(FLAT, scheme, **(OFF | {"q": [1.0, 0.0]}))
+    np.testing.assert_allclose(on.q, sol.q, atol=1e-14)
+    as_they_are = dx.simulate(FLAT, scheme, **OFF, check_initial=False)
+    np.testing.assert_allclose(as_they_are.q[:, 1], 0.7 * (-1.0) ** np.arange(51), atol=1e-12)
+    line = dx.verify(as_they_are)["final manifold"]
+    assert line.verdict == "VIOLATED" and "jumps from one solution of the discrete equations to the other" in line.explanation
+
+
+def test_each_trajectory_of_a_batch():
+    q = np.array([[1.0, 0.0], [1.0, 0.2]])
+    run = {"q": q, "v": np.zeros((2, 2)), "step": 0.1, "steps": 3}
+    with pytest.raises(ValueError, match="of trajectory 1.*final constraint manifold"):
+        dx.simulate(FLAT, dx.DiscreteDirac(), **run)
+    sol = dx.simulate(FLAT, dx.DiscreteDirac(), **run, project=True)
+    np.testing.assert_allclose(sol.q[0], sol.q[1], atol=1e-14)
+
+
+def test_an_inconsistent_system():
+    empty = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 + q[1] ** 3 + q[1])
+    with pytest.raises(ValueError, match="no motion passes through"):
+        dx.simulate(empty, dx.DiscreteDirac(), q=[1.0, 0.7], v=[0.0, 0.0], step=0.1, steps=3)
+
+
+def test_a_velocity_that_the_system_determines_is_a_guess():
+    """L = v0²/2 − q²/2 with friction on q1 alone: q1 has no inertia and v1 = −q1, whatever was given."""
+    system = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - q @ q / 2, forces=lambda t, q, v: jnp.stack([0.0 * v[0], -v[1]]))
+    sol = dx.simulate(system, dx.DiscreteDirac(), q=[1.0, 0.7], v=[0.0, 5.0], step=0.01, steps=100)
+    assert np.abs(sol.q[-1] - [np.cos(1.0), 0.7 * np.exp(-1.0)]).max() < 1e-4
+
+
+@pytest.mark.parametrize("coefficients", ["suzuki4", "kahan-li8"])
+def test_compositions_of_steps_that_leave_the_final_manifold(coefficients):
+    curved = dx.LagrangeDirac(lambda q, v: q[1] * (1 + q[0] ** 2) * v[0] - q @ q / 2)
+    lotka = gallery.get("lotka-volterra")
+    for system, start in ((curved, {"q": [0.5, 1.2], "v": [0.0, 0.0]}), (lotka.system, {"q": [0.5, 1.2], "params": lotka.params})):
+        with pytest.raises(ValueError, match=r"leaves that of this \w+, by .*constraints=\"resolve\""):
+            dx.simulate(system, dx.Composition(dx.DiscreteDirac(), coefficients), **start, step=0.05, steps=5)
+    resolved = dx.Composition(dx.DiscreteDirac(constraints="resolve"), coefficients)
+    assert dx.simulate(lotka.system, resolved, q=[0.5, 1.2], params=lotka.params, step=0.05, steps=5).ok
+
+
+def test_a_linear_one_form_keeps_the_order_of_a_composition():
+    linear = dx.LagrangeDirac(lambda q, v: q[1] * v[0] - q @ q / 2 - q[0] ** 4 / 4)
+    found = dx.convergence(
+        linear, dx.Composition(dx.DiscreteDirac(), "suzuki4"), q=[0.5, 1.2], v=[0.0, 0.0], time=1.6, step_sizes=[0.4, 0.2, 0.1]
+    )
+    assert abs(found.orders["q"] - 4) < 0.3 if hasattr(found, "orders") else found.slopes["q"].order > 3.7
