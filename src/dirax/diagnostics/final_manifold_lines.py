@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.diagnostics.judging import judged, of_lane, roundoff_limit, worst_place
 from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
-from dirax.diagnostics.rows import initial_of_one, over_rows, times_at
+from dirax.diagnostics.rows import initial_of_one, over_rows, shape_of, times_at
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.final_manifold import KEPT, chain_at
@@ -52,17 +52,12 @@ def _chain_of(sol: Solution) -> ConstraintChain | None:
     first = lambda name: np.asarray(sol.fields[name]).reshape(-1, *np.shape(sol.fields[name])[-2:])[0, 0]
     q, t, params = first("q"), float(sol.t[0]), sol.params_of_one
     v = initial_of_one(sol).get("v", np.zeros_like(q))
-    # numbers of the point, for a system of one's own may have no Lagrangian at all
-    if sol.system.lagrangian_form() is None or sol.system.quotient_form() is not None:
+    system = sol.system
+    if system.lagrangian_form() is None or system.metric_form() is not None or system.final_relation(shape_of(sol)) is not None:
         return None
-    hessian = evaluated(eqx.Partial(_hessian, sol.system), np.asarray(t), q, v, params)
-    if hessian is None or rank_of(np.asarray(hessian)) == len(q):
+    if rank_of(np.asarray(evaluated(system.velocity_hessian, np.asarray(t), q, v, params))) == len(q):
         return None
     return chain_at(sol.system, q, v, t, params)
-
-
-def _hessian(system: Any, t, q, v, params: Any):
-    return system.velocity_hessian(t, q, v, params)
 
 
 def _defect(chain: ConstraintChain, t, q, p, params: Any):

@@ -11,8 +11,9 @@ from dirax.engines.step_program import linearized
 from dirax.program.memo import Memo, Same
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
-from dirax.run.start import Initial, Start
+from dirax.run.start import Initial, Start, completed
 from dirax.run.validate import Case
+from dirax.systems.affine_equations import equilibrated
 from dirax.systems.constraint_algorithm import constraint_algorithm, rank_of
 from dirax.systems.constraint_chain import EMPTY, IRREGULAR, ConstraintChain
 from dirax.systems.shape import Shape
@@ -24,20 +25,50 @@ KEPT = 1e-9
 UPDATES = 30
 """Updates of Newton's method in the step that is tried."""
 
+MOVED = 2.0**-10
+"""By how much of itself a velocity is changed to see whether its momentum follows."""
+
+MOST = 200
+"""Coordinates up to which it is asked: the matrix of all of them is not for a chain of thousands."""
+
+DOUBTFUL = 1e-6
+"""Smallest singular value of that change, rows and columns scaled to 1, that leaves no doubt of a regular Lagrangian."""
+
 _chains: Memo[ConstraintChain | None] = Memo(64)
 
 
-def is_singular(initial: Initial) -> bool:
-    """Whether ∂²L/∂v² is singular at the data of any trajectory."""
-    if initial.hessian is None:
+def is_singular(system: AbstractSystem, shape: Shape, case: Case, initial: Initial) -> bool:
+    """Whether ∂²L/∂v² is singular at the data of the first trajectory, of a system that does not say its final manifold itself.
+
+    Asked first is how p follows v, or v follows p, in numbers of the program that completes the data; the Hessian where that
+    leaves a doubt. What is regular once is not asked again.
+    """
+    if case.two_points or "q" not in case.data or len(case.data) < 2:
         return False
-    hessian = np.asarray(initial.hessian)
-    whole = hessian.reshape(-1, *hessian.shape[-2:])
-    scale = np.max(np.abs(whole), axis=(1, 2))
-    sizes = np.abs(np.linalg.det(whole / np.where(scale > 0, scale, 1.0)[:, None, None]))
-    # a determinant above this belongs to no matrix that a rank could find singular; the others are asked
-    doubtful = np.isfinite(whole).all(axis=(1, 2)) & ~(sizes > 1e-6)
-    return any(rank_of(matrix) < len(matrix) for matrix in whole[doubtful])
+    data, params = case.first
+    given = tuple(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params))
+    return _singular.get((Same(system), given, *data), lambda: _is_singular(system, shape, case, data, params, initial))
+
+
+_singular: Memo[bool] = Memo(256)
+
+
+def _is_singular(system: AbstractSystem, shape: Shape, case: Case, data: dict, params: Any, initial: Initial) -> bool:
+    if system.metric_form() is not None or system.lagrangian_form() is None or system.final_relation(shape) is not None:
+        return False
+    if len(data["q"]) > MOST:
+        return False
+    moved, answers = ("v", "p") if "v" in data else ("p", "v")
+    n, at = len(data["q"]), np.asarray(data[moved], float)
+    near = np.tile(at, (n + 1, 1)) + MOVED * (np.max(np.abs(at)) or 1.0) * np.eye(n + 1, n, -1)
+    varied = Case({"q": np.tile(data["q"], (n + 1, 1)), moved: near}, params, case.h, case.t0, n + 1)
+    answer = np.asarray(completed(system, varied, False).data[answers])
+    response = equilibrated(answer[1:] - answer[:1])
+    if np.all(np.isfinite(response)) and np.linalg.svd(response, compute_uv=False)[-1] > DOUBTFUL:
+        return False
+    first = lambda name: np.asarray(initial.data[name])[0] if case.batch is not None else np.asarray(initial.data[name])
+    hessian = np.asarray(evaluated(system.velocity_hessian, np.asarray(case.t0), first("q"), first("v"), params))
+    return bool(np.all(np.isfinite(hessian))) and rank_of(hessian) < n
 
 
 def chain_at(system: AbstractSystem, q: Any, v: Any, t: float, params: Any) -> ConstraintChain | None:

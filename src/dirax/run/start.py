@@ -17,14 +17,13 @@ class Initial(NamedTuple):
     """Initial data as the system completes them, each entry with a leading batch axis in a batch.
 
     All that a scheme may start from, by name; how far the data are off the constraints, and the size of the velocity; the
-    Lagrangian, its ∂²L/∂v² and the matrix [W; ∂g/∂q] of the constraints at the data, if the system has them.
+    Lagrangian and the matrix [W; ∂g/∂q] of the constraints at the data, if the system has them.
     """
 
     data: dict[str, Any]
     defect: Any
     size: Any
     lagrangian: Any
-    hessian: Any
     constraints: Any
 
 
@@ -85,9 +84,8 @@ class _Completion(eqx.Module):
             size = jnp.max(jnp.abs(complete["v"]))
         q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if self.two_points else (complete.get("q"), complete.get("v"))
         lagrangian = None if q is None or v is None else system.lagrangian_value(t0, q, v, params)
-        hessian = None if q is None or v is None or self.two_points else system.velocity_hessian(t0, q, v, params)
         constraints = system.constraints.matrix(t0, system.point(complete), params) if system.constraints.any else None
-        return Initial(complete, defect, size, lagrangian, hessian, constraints)
+        return Initial(complete, defect, size, lagrangian, constraints)
 
 
 class _Beginning(eqx.Module):

@@ -87,10 +87,6 @@ class PhaseSpaceLagrangian(AbstractSystem):
             return no_constraint()
         return data["p"] - self.one_form(data["q"], params)
 
-    def velocity_hessian(self, t: Any, q: Array, v: Array, params: Any) -> None:
-        """None: it is zero, and M_f is p = α(q), which `initial_defect` tells."""
-        return None
-
     def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
         """H(q)."""
         return self.hamiltonian(row["q"], params)

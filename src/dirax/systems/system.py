@@ -148,9 +148,8 @@ class AbstractSystem(eqx.Module):
         return None if form is None else form.lagrangian.at(t, q, v, params)
 
     def velocity_hessian(self, t: Any, q: Array, v: Array, params: Any) -> Float[Array, "n n"] | None:
-        """∂²L/∂v², by which a singular Lagrangian is told; None where there is no Lagrangian on T*Q, where it is known to be
-        regular, and where the system says its final manifold itself."""
-        form = None if self.metric_form() is not None else self.lagrangian_form()
+        """∂²L/∂v², by which a singular Lagrangian is told; None for a system without a Lagrangian on TQ."""
+        form = self.lagrangian_form()
         return None if form is None else jacobian(gradient(lambda v: form.lagrangian.at(t, q, v, params)))(v)
 
     def with_inputs(self, inputs: Callable) -> "AbstractSystem":
