@@ -497,3 +497,13 @@ def test_a_report_escapes_html_and_knows_its_lines():
     assert report.to_dict()["lines"][0]["value"] is None
     with pytest.raises(KeyError, match="x & y"):
         report["energy"]
+
+
+def test_steps_across_a_jump_of_the_lagrangian_are_told():
+    run = {"q": [1.2, 0.0], "v": [0.0, 1.0], "step": 0.01, "steps": 500}
+    for wall in (lambda q: jnp.floor(2 * q), lambda q: jnp.where(q > 0.3, 1e-3, 0.0)):
+        system = dx.LagrangeDirac(lambda q, v, wall=wall: v @ v / 2 - q @ q / 2 - wall(q[0]))
+        line = dx.verify(dx.simulate(system, dx.LagrangeDAlembert(), **run))["energy"]
+        assert line.verdict == "VIOLATED" and "the Lagrangian has a jump there" in line.explanation
+    smooth = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2 - q[0] ** 4)
+    assert dx.verify(dx.simulate(smooth, dx.LagrangeDAlembert(), **run))["energy"].verdict != "VIOLATED"

@@ -414,3 +414,27 @@ def test_unreadable_files(tmp_path):
     (tmp_path / "notes.nc").write_text("not a trajectory")
     complaint_of(lambda: dx.load(tmp_path / "notes.nc"), ValueError, "notes.nc cannot be loaded")
     complaint_of(lambda: dx.load(tmp_path / "nothing.nc"), FileNotFoundError, "there is no file", "check the path")
+
+
+def test_more_rows_than_memory():
+    complaint(ValueError, "rows of this run would take", "GiB", "save_every=", steps=10**13)
+    run = GOOD | {"steps": 10**6, "save_every": 10**5}
+    assert dx.simulate(OSCILLATOR, PLUS, **run).rows == 11
+
+
+def test_a_wrong_key_of_params():
+    system = dx.LagrangeDirac(lambda q, v, params: params["m"] * v @ v / 2 - params["k"] * q @ q)
+    complaint(TypeError, "KeyError: 'k'", "params has the keys 'K', 'm'", system=system, params={"m": 1.0, "K": 2.0})
+
+
+def test_method_2_of_a_singular_lagrangian_needs_its_final_manifold():
+    """A coil and three capacitors, with Kirchhoff's laws of two nodes as one-forms ([PY] §7)."""
+    circuit = dx.LagrangeDirac(
+        lambda q, v: v[0] ** 2 / 2 - (q[1] ** 2 + q[2] ** 2 / 2 + 2 * q[3] ** 2) / 2,
+        lambda q: jnp.array([[-1.0, 0.0, 1.0, 1.0], [0.0, 1.0, -1.0, 0.0]]),
+    )
+    data = {"q": [1.0, 0.2, 0.3, 0.1], "v": np.zeros(4)}
+    complaint(
+        ValueError, "the Lagrangian is singular", "needs its final manifold", "constraint_algorithm", ".resolved()",
+        system=circuit, scheme=dx.DiscreteDirac(constraints="resolve"), **data,
+    )  # fmt: skip

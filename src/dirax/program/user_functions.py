@@ -81,7 +81,7 @@ class UserFunction(eqx.Module):
         except Exception as error:
             raise TypeError(
                 f"{call} could not be traced by JAX on float64 arrays of shapes {shapes}{self._without_params(values)}: "
-                f"{type(error).__name__}: {_first_line(error)}{_way_out(error)}"
+                f"{type(error).__name__}: {_first_line(error)}{_way_out(error, values[-1])}"
             ) from error
         if not isinstance(out, jax.ShapeDtypeStruct) or out.dtype != jnp.float64:
             what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
@@ -209,7 +209,9 @@ def _first_line(message: Any) -> str:
     return (str(message).splitlines() or ["no message"])[0].split(" (`")[0].rstrip(". ")
 
 
-def _way_out(error: Exception) -> str:
+def _way_out(error: Exception, params: Any) -> str:
+    if isinstance(error, KeyError) and isinstance(params, dict):
+        return f"; params has the keys {', '.join(map(repr, params))}." if params else "; params has no keys."
     if isinstance(error, jax.errors.TracerArrayConversionError):
         return "; write it with jax.numpy instead of numpy."
     if isinstance(error, jax.errors.ConcretizationTypeError):

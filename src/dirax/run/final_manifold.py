@@ -131,6 +131,8 @@ def refuse_off_final_manifold(system: AbstractSystem, case: Case, initial: Initi
     if case.two_points:
         return
     for lane, (q, p, v, params) in enumerate(_lanes_of(case, initial)):
+        if _on_known_manifold(system, q, p, v, case.t0, params):
+            continue
         chain = chain_at(system, q, v, case.t0, params)
         if chain is None:
             continue
@@ -143,6 +145,16 @@ def refuse_off_final_manifold(system: AbstractSystem, case: Case, initial: Initi
                 f"{singular} they are off its final constraint manifold: {off.split('. ')[0]}; pass project=True to project "
                 "them, or check_initial=False to take them as they are."
             )
+
+
+def _on_known_manifold(system: AbstractSystem, q: Any, p: Any, v: Any, t: float, params: Any) -> bool:
+    """Whether a point is on the final manifold by the chain that was first found for the system, elsewhere."""
+    key = Same(system), jax.tree.structure(params), *(np.shape(leaf) for leaf in jax.tree.leaves(params))
+    chain = _chains.get(key, lambda: chain_at(system, q, v, t, params))
+    if chain is None or chain.empty:
+        return False
+    x = on_chain(chain, q, p, v, t, params)
+    return bool(np.all(np.isfinite(np.asarray(chain.constraints(x, params))))) and not chain.off(x, params)
 
 
 def refuse_leaving_final_manifold(

@@ -12,11 +12,11 @@ OFF_CONSTRAINT = 1e-9
 
 
 def refuse_bad_start(
-    system: AbstractSystem, initial: Initial, start: Start, labels: tuple[str, ...], check_constraint: bool
+    system: AbstractSystem, initial: Initial, start: Start, labels: tuple[str, ...], check_constraint: bool, singular: bool
 ) -> None:
     """Raise `ValueError` for functions that are not finite at the data, data off the constraints (with the residual), and a
     first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
-    the equations of the first step."""
+    the equations of the first step; `singular` says that the Lagrangian is."""
     if start.row0 is not None and "constraint" in start.row0:
         both = _lanes(initial.defect, 1), _lanes(start.row0["constraint"], 1)
         initial = initial._replace(defect=np.concatenate(both, axis=-1))
@@ -25,7 +25,7 @@ def refuse_bad_start(
     if check_constraint:
         _refuse_off_constraint(system, initial, start)
     if start.jacobian is not None:
-        _refuse_singular_step(start, labels)
+        _refuse_singular_step(start, labels, singular)
 
 
 def _refuse_outside_the_domain(initial: Initial) -> None:
@@ -75,11 +75,17 @@ def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Star
         )
 
 
-def _refuse_singular_step(start: Start, labels: tuple[str, ...]) -> None:
+def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool) -> None:
     residual, jacobian = _lanes(start.residual, 1), _lanes(start.jacobian, 2)
     rows = np.isfinite(residual) & np.all(np.isfinite(jacobian), axis=2)
     finite = np.all(rows, axis=1)
     if not np.all(finite):
+        if singular:
+            raise ValueError(
+                f"the first step is not finite at the initial data{_which(~finite)}, since the Lagrangian is singular (∂²L/∂v²), "
+                'and this scheme needs its final manifold: simulate dx.constraint_algorithm(system, near={"q": …, "v": …})'
+                ".resolved() instead of the system, from x=chain.point."
+            )
         row = int(np.argmin(rows[np.argmin(finite)]))
         raise ValueError(
             f"the first step is not finite at the initial data{_which(~finite)} (in {labels[row]}): the data lie outside the "

@@ -19,7 +19,7 @@ from dirax.run.progress import reporting
 from dirax.run.redundancy import redundant_constraints
 from dirax.run.result import solution_of
 from dirax.run.start import begun, completed
-from dirax.run.validate import check_kinds, count, engine_from, validated_case
+from dirax.run.validate import check_kinds, count, engine_from, refuse_more_than_memory, validated_case
 from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
 from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
@@ -96,7 +96,7 @@ def simulate(
     if not (traced := traced or is_traced(start)):
         for stage in dict.fromkeys(stage.check for stage, _ in equation.stages):
             stage(data, case.h, own)
-        refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial)
+        refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial, singular)
         if check_initial and singular:
             refuse_off_final_manifold(system, case, initial)
         if check_initial:
@@ -116,6 +116,7 @@ def simulate(
         max_iterations=max_iterations,
         compensated=bool(compensated),
     )
+    refuse_more_than_memory(problem)
     # engine
     with reporting(False if traced else progress, steps) as report:
         outcome = on.run_traced(problem) if traced else on.run(problem, report)

@@ -1,5 +1,7 @@
 """The arguments of a run, checked: each mistake is one error that names the argument, what came and what was expected."""
 
+import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +15,9 @@ from dirax.engines.policy import ENGINES, engine_of
 from dirax.program.user_functions import check_finite, is_traced
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
+
+ROOM = 4
+"""How many times the rows of a run should fit into memory."""
 
 KINDS = ({"q", "v"}, {"q", "p"}, {"q0", "q1"}, {"x"}, {"q"})
 
@@ -121,6 +126,26 @@ def _real_array(name: str, value: Any) -> Any:
         raise ValueError(f"{name} must have shape (n,), or (B, n) for a batch of B trajectories, but its shape is {array.shape}.")
     check_finite(name, array)
     return array.astype(np.float64)
+
+
+def refuse_more_than_memory(problem: Any) -> None:
+    """Raise `ValueError` for a run whose saved rows are more than this machine can hold."""
+    numbers = 1 + (problem.batch or 1) * sum(math.prod(field.shape) for field in problem.fields.values())
+    there, row = _memory(), 8 * numbers
+    if there and problem.rows * row > there:
+        every = -(-problem.steps * row * ROOM // there)
+        raise ValueError(
+            f"the {problem.rows} rows of this run would take {problem.rows * row / 2**30:.3g} GiB, and this machine has "
+            f"{there / 2**30:.3g} GiB: save fewer of them, with save_every={max(every, 2)} for instance."
+        )
+
+
+def _memory() -> int:
+    """The bytes of memory of this machine; 0 where they are not known."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return 0
 
 
 def finite(value, name: str):
