@@ -507,3 +507,13 @@ def test_steps_across_a_jump_of_the_lagrangian_are_told():
         assert line.verdict == "VIOLATED" and "the Lagrangian has a jump there" in line.explanation
     smooth = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2 - q[0] ** 4)
     assert dx.verify(dx.simulate(smooth, dx.LagrangeDAlembert(), **run))["energy"].verdict != "VIOLATED"
+
+
+def test_a_residual_is_judged_against_the_size_of_its_terms():
+    for unit in (1.0, 1e30, 1e-30):
+        system = dx.LagrangeDirac(lambda q, v, unit=unit: unit * (v @ v / 2 - jnp.sum(jnp.cos(q))))
+        sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[0.3], v=[0.1], step=0.1, steps=20)
+        line = dx.verify(sol)["steps solved"]
+        assert line.verdict == "ok" and 0 <= line.value < 1e-13
+        sol.stats["max_residual"] = 1e-3 * unit
+        assert dx.verify(sol)["steps solved"].verdict == "VIOLATED"

@@ -30,7 +30,7 @@ def test_data_off_the_final_manifold(scheme):
 def test_each_trajectory_of_a_batch():
     q = np.array([[1.0, 0.0], [1.0, 0.2]])
     run = {"q": q, "v": np.zeros((2, 2)), "step": 0.1, "steps": 3}
-    with pytest.raises(ValueError, match="of trajectory 1.*final constraint manifold"):
+    with pytest.raises(ValueError, match=r"of trajectory 1.*final constraint manifold"):
         dx.simulate(FLAT, dx.DiscreteDirac(), **run)
     sol = dx.simulate(FLAT, dx.DiscreteDirac(), **run, project=True)
     np.testing.assert_allclose(sol.q[0], sol.q[1], atol=1e-14)
@@ -53,7 +53,10 @@ def test_a_velocity_that_the_system_determines_is_a_guess():
 def test_compositions_of_steps_that_leave_the_final_manifold(coefficients):
     curved = dx.LagrangeDirac(lambda q, v: q[1] * (1 + q[0] ** 2) * v[0] - q @ q / 2)
     lotka = gallery.get("lotka-volterra")
-    for system, start in ((curved, {"q": [0.5, 1.2], "v": [0.0, 0.0]}), (lotka.system, {"q": [0.5, 1.2], "params": lotka.params})):
+    for system, start in (
+        (curved, {"q": [0.5, 1.2], "v": [0.0, 0.0]}),
+        (lotka.system, {"q": [0.5, 1.2], "params": lotka.params}),
+    ):
         with pytest.raises(ValueError, match=r"leaves that of this \w+, by .*constraints=\"resolve\""):
             dx.simulate(system, dx.Composition(dx.DiscreteDirac(), coefficients), **start, step=0.05, steps=5)
     resolved = dx.Composition(dx.DiscreteDirac(constraints="resolve"), coefficients)
@@ -65,4 +68,4 @@ def test_a_linear_one_form_keeps_the_order_of_a_composition():
     found = dx.convergence(
         linear, dx.Composition(dx.DiscreteDirac(), "suzuki4"), q=[0.5, 1.2], v=[0.0, 0.0], time=1.6, step_sizes=[0.4, 0.2, 0.1]
     )
-    assert abs(found.orders["q"] - 4) < 0.3 if hasattr(found, "orders") else found.slopes["q"].order > 3.7
+    assert abs(found.order - 4) < 0.3

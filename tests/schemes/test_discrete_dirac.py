@@ -203,7 +203,7 @@ FORMS = lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
 HIDDEN = {
     "a Lagrangian": (
         dx.LagrangeDirac(lambda q, v: v[:2] @ v[:2] / 2 - q[1] + q[2] * (q[:2] @ q[:2] - 1.0)),
-        {"q": [0.6, -0.8, 0.1], "v": [0.4, 0.3, 0.0]},
+        {"q": [0.6, -0.8, -0.525], "v": [0.4, 0.3, 0.0]},
         "∂²L/∂v² has rank 2 of 3",
     ),
     "its two points": (

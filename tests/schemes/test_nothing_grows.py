@@ -8,9 +8,7 @@ import dirax as dx
 
 PENDULUM = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([q @ q - 1.0]))
 SKATE = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]]))
-CLOSED = dx.PortHamiltonian(
-    lambda x: x @ x / 2, J=[[0, 1.0, 0], [-1, 0, 0], [0, 0, 0]], B=[[1.0], [0.0], [1.0]], closed=True
-)
+CLOSED = dx.PortHamiltonian(lambda x: x @ x / 2, J=[[0, 1.0, 0], [-1, 0, 0], [0, 0, 0]], B=[[1.0], [0.0], [1.0]], closed=True)
 CASES = [
     (PENDULUM, {"q": [1.0, 0.0], "v": [0.0, 0.3]}, 0.7, 0.3),
     (SKATE, {"q": [0.0, 0.0, 0.0], "v": [1.0, 0.0, 0.5]}, 0.7, 0.3),

@@ -13,7 +13,6 @@ from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Lin
 from dirax.diagnostics.rows import energy_of
 from dirax.solution.solution import Solution
 
-
 JUMP = 1000.0
 """A change in one step that is so many times those of two steps before and after it is a jump."""
 

@@ -9,7 +9,9 @@ from dirax.diagnostics.final_manifold_lines import final_manifold
 from dirax.diagnostics.judging import steps_of
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.report import OK, VIOLATED, Line, Report
+from dirax.diagnostics.residuals import residual_size
 from dirax.diagnostics.structure_lines import membership, structure_of, symplecticity
+from dirax.engines.stopping import STALLED
 from dirax.solution.reconstruction import reconstruct
 from dirax.solution.solution import Solution
 
@@ -26,6 +28,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
 
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
+    - steps solved: the largest residual of a run, relative to the terms of its equations, which Newton's method brings to
+      their roundoff;
     - final manifold of a singular Lagrangian: 32 ε where a scheme keeps it, and violated where the run starts off it, or jumps
       across it from one solution of the discrete equations to the other;
     - momentum maps, and of Euler–Poincaré and Lie–Poisson systems the Casimirs and the spatial momentum (where quantities
@@ -72,7 +76,11 @@ def _completion(sol: Solution) -> Line:
     ok, messages = np.atleast_1d(sol.ok), np.atleast_1d(sol.message)
     residual = float(np.max(sol.stats["max_residual"])) if "max_residual" in sol.stats else None
     if np.all(ok):
-        return Line("steps solved", residual, None, OK, f"every step was solved, up to t = {float(sol.t[-1]):.6g}")
+        text = f"every step was solved, up to t = {float(sol.t[-1]):.6g}"
+        if residual is None or (size := residual_size(sol)) is None:
+            return Line("steps solved", residual, None, OK, text)
+        text = f"{text}; the largest residual, {residual:.2g}, relative to its terms"
+        return Line("steps solved", residual / size, STALLED, OK if residual <= STALLED * size else VIOLATED, text)
     failed = np.flatnonzero(~ok)
     which = f"trajectory {failed[0]}: " if sol.batch is not None else ""
     more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""

@@ -85,7 +85,7 @@ def chain_at(system: AbstractSystem, q: Any, v: Any, t: float, params: Any) -> C
     return _chains.get((Same(system), given, jax.tree.structure(params)), found)
 
 
-def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any) -> np.ndarray:
+def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any) -> Any:
     """The point x of the chain with these q and p; where v is among its coordinates, the nearest one that the chain admits."""
     q, p, v = map(np.asarray, (q, p, v))
     time = [float(t)] if chain.clock else []
@@ -93,7 +93,7 @@ def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any
         return np.concatenate([q, p, time])
     n, x = len(q), np.concatenate([q, v, p, time])
     for _ in range(UPDATES):
-        value = np.asarray(chain.constraints(x, params))
+        value = np.asarray(chain.constraints(jnp.asarray(x), params))
         slope = np.asarray(evaluated(_slope_of(chain), x, params))[:, n : 2 * n]
         change = np.linalg.lstsq(slope, value, rcond=1e-10)[0]
         x[n : 2 * n] -= change
@@ -167,7 +167,7 @@ def refuse_leaving_final_manifold(
         return
     if not singular and system.final_relation(shape) is None:
         return
-    q, p, v, params = next(_lanes_of(case, initial))
+    q, _, v, params = next(_lanes_of(case, initial))
     stage, fraction = stages[0]
     first = lambda a: np.asarray(a)[0] if case.batch is not None else np.asarray(a)
     row = _after(stage, first(start.state), first(start.guess[0]), case.t0, fraction * case.h, params)
@@ -221,4 +221,5 @@ def _lanes_of(case: Case, initial: Initial) -> Iterator[tuple[Any, Any, Any, Any
     arrays = [np.asarray(data[name]) for name in ("q", "p", "v")]
     for lane in range(case.batch or 1):
         params = jax.tree.map(lambda leaf, lane=lane: leaf[lane], case.params) if case.batch_params else case.params
-        yield (*((a[lane] if case.batch is not None else a) for a in arrays), params)
+        q, p, v = (a[lane] if case.batch is not None else a for a in arrays)
+        yield q, p, v, params

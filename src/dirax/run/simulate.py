@@ -86,7 +86,11 @@ def simulate(
     initial = completed(system, case, project, on.compiles_start)
     if not (traced := case.traced or is_traced(initial)):
         redundant = redundant_constraints(system, initial.constraints, data, own, case.t0)
-        if (singular := is_singular(system, shape, case, initial)) and project and (moved := projected_onto_manifold(system, case, initial)):
+        if (
+            (singular := is_singular(system, shape, case, initial))
+            and project
+            and (moved := projected_onto_manifold(system, case, initial))
+        ):
             case, initial = moved, completed(system, moved, False, on.compiles_start)
     shape = Shape(shape.n, shape.m, shape.c, redundant=redundant) if redundant else shape
     equation = make_step_equation(scheme, system, shape)

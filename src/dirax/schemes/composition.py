@@ -15,6 +15,10 @@ class Composition(AbstractScheme):
     that sum to 1. The named ones need a self-adjoint scheme of order 2 (midpoint or trapezoidal ones, Methods 1 and 2
     with the midpoint map); for any other compose it with its `Adjoint` first: `SymmetricComposition(scheme)`.
 
+    Of a singular Lagrangian a composition has the order that is named where the scheme maps the final manifold to itself: the
+    p = α(q) of L = ⟨α(q), q̇⟩ − H is kept by Method 1 for linear α alone, and by Method 2 for any. `dx.simulate` refuses others,
+    which with check_initial=False stay at the order of the scheme.
+
     Raises `ValueError` for unknown names and for numbers that do not sum to 1.
     """
 

@@ -32,9 +32,10 @@ class DiscreteDirac(AbstractScheme):
     constraints g = 0, Method 1 imposes the distribution G q̇ + ∂g/∂t = 0 at the base point, which keeps quadratic g for the
     midpoint map and others to O(h²); Method 2 keeps g and G q̇ + ∂g/∂t at the nodes, to roundoff. With either kind of
     constraint the multipliers of Method 1 alternate around those of the system by O(h), and means of neighbours are of the
-    order of q; with a base point off the middle, and with it the adjoint, what is off a constraint is multiplied by
-    −θ/(1 − θ) or −(1 − θ)/θ in a step, and a scheme in which that grows is refused. Method 2 of a DiracSystem with `holonomic` is stated here for graphs of two-forms and bivectors with
-    {g_i, g_j} = 0, and by its resolved chain for others. Multipliers are forces at the base point, ṗ = … + Wᵀλ; those of
+    order of q. With a base point off the middle of the step (θ ≠ ½) what is off a constraint is multiplied by −θ/(1 − θ) or
+    −(1 − θ)/θ in a step, whatever its size, and in the adjoint by the inverse: where that grows the run is refused. Method 2 of
+    a DiracSystem with `holonomic` is stated here for graphs of two-forms and bivectors with {g_i, g_j} = 0, and by its resolved
+    chain for others. Multipliers are forces at the base point, ṗ = … + Wᵀλ; those of
     `dx.LagrangeDAlembert` are impulses of the opposite sign.
 
     Takes systems with a relation form or a Lagrangian form: DiracSystem, PortHamiltonian, ImplicitSystem, LiePoisson,

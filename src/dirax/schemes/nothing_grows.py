@@ -47,7 +47,7 @@ class NothingGrows:
             raise ValueError(
                 f"a step of this scheme multiplies what is off the constraints of this {type(self.system).__name__} by "
                 f"−{factor:.3g}, whatever its size: their forces are those of a base point that is not in the middle of the "
-                "step. Take dx.Midpoint(), a map with the base point on its other side, or constraints=\"resolve\"."
+                'step. Take dx.Midpoint(), a map with the base point on its other side, or constraints="resolve".'
             )
 
     def _largest(self, whole: np.ndarray) -> float:
