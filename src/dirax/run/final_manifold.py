@@ -178,7 +178,7 @@ def refuse_leaving_final_manifold(
         raise ValueError(
             f"a composition raises the order of maps of the final manifold to itself, and a step of this scheme leaves that of "
             f"this {type(system).__name__}, by {missed:.2g} relative to the state (p = α(q) is kept for one-forms α "
-            'that are linear): take constraints="resolve", or check_initial=False to run it at an order that dx.convergence measures.'
+            'that are linear): take constraints="resolve", or check_initial=False to run it at the order that it has.'
         )
 
 
