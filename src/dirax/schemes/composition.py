@@ -37,7 +37,7 @@ class Composition(AbstractScheme):
         self.scheme, self.coefficients = scheme, numbers
 
     def step_equation(self, system: Any, shape: Shape) -> StepSequence:
-        inner = make_step_equation(self.scheme, system, shape)
+        inner = make_step_equation(self.scheme.part(system, shape), system, shape)
         return StepSequence(tuple((eq, a * c) for c in self.coefficients for eq, a in inner.stages))
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
@@ -74,8 +74,8 @@ class SymmetricComposition(AbstractScheme):
 
     def step_equation(self, system: Any, shape: Shape) -> StepSequence:
         refusal = "SymmetricComposition takes a one-stage scheme."
-        adjoint = _adjoint_of(self.scheme, system, shape, refusal)
-        return StepSequence(((adjoint, 0.5), (_one_stage(self.scheme, system, shape, refusal), 0.5)))
+        adjoint = _adjoint_of(self.scheme, system, shape, refusal, part=True)
+        return StepSequence(((adjoint, 0.5), (_one_stage(self.scheme.part(system, shape), system, shape, refusal), 0.5)))
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
         return between_the_parts(self)
@@ -90,9 +90,10 @@ def between_the_parts(scheme: AbstractScheme) -> str:
     return f"the points between the parts of a step of {type(scheme).__name__}, which the structure joins, are not saved"
 
 
-def _adjoint_of(scheme: AbstractScheme, system: Any, shape: Shape, refusal: str) -> StepEquation:
+def _adjoint_of(scheme: AbstractScheme, system: Any, shape: Shape, refusal: str, part: bool = False) -> StepEquation:
     adjoint = scheme.adjoint(system)
     if adjoint is not None:
+        adjoint = adjoint.part(system, shape) if part else adjoint
         return _one_stage(adjoint, system, shape, refusal)
     return AdjointStep(_one_stage(scheme, system, shape, refusal)).equation()
 
