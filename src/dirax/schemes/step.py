@@ -16,7 +16,6 @@ from dirax.schemes.step_forms import form_of_steps
 from dirax.systems.shape import Shape
 from dirax.text.representation import counted, fields_html, module_html, module_text
 
-
 COMPOSED = ("first", "sum", "mean", "each")
 """How the row of a composed step is made of those of its parts."""
 

@@ -21,7 +21,8 @@ INPUTS = 5
 
 class Recorded:
     """A run as a function of arrays, the five inputs. Its results are (B, rows, parts·s) and (B, rows, parts·k): states and
-    unknowns of the first stage, or of every one where a row takes them; then good steps, status, Newton updates and largest residual (B, 4), and the last unknowns (B, k)."""
+    unknowns of the first stage, or of every one where a row takes them; then good steps, status, Newton updates and largest
+    residual (B, 4), and the last unknowns (B, k)."""
 
     def __init__(self, problem: Problem, leaves: Parameters):
         p = problem
@@ -37,7 +38,7 @@ class Recorded:
             "compensated": p.compensated,
         }
 
-    def problem(self, state, guess, c, t0, h, every_stage: bool = False) -> Problem:
+    def problem(self, state, guess, c, t0, h, *, every_stage: bool = False) -> Problem:
         """The run of equal t0 and h; with `every_stage` its rows have every stage."""
         equation = self.every_stage if every_stage else self.equation
         guesses = tuple(guess[:, i, : stage.unknowns] for i, (stage, _) in enumerate(self.equation.stages))

@@ -21,7 +21,9 @@ class Plan:
     equations: list[TracedEquation]
     corrections: list[Correction]
     stages: list[tuple[int, float]]
-    rules: dict[str, str] = field(default_factory=dict)  # how the row of a step is made of its stages', by field; "first" if not said
+    rules: dict[str, str] = field(
+        default_factory=dict
+    )  # how the row of a step is made of its stages', by field; "first" if not said
     compensated: bool = False
     increments: list[list[int | None]] = field(default_factory=list)
 

@@ -31,7 +31,14 @@ class Block:
 
 
 def emit_stage(
-    block: Block, stage: int | str, index: int, around: Region, time: str, running: str, number: str, saves: str,
+    block: Block,
+    stage: int | str,
+    index: int,
+    around: Region,
+    time: str,
+    running: str,
+    number: str,
+    saves: str,
     fraction: str = "",
 ) -> None:
     """Stage number `stage`, which solves equation `index` at `time` in the lanes `running`; its part of the row of step `number`
@@ -115,7 +122,7 @@ def _judge(block: Block, active: str, converged: str, residual: str, solution: l
 def _save(
     block: Block, stage: int | str, index: int, region: Region, solution: list[str], last: list[str], number: str, fraction: str
 ) -> None:
-    """Write a stage's part of the saved arrays of a row; unknowns that are not finite are replaced by those of the step before."""
+    """Write a stage's part of a row; unknowns that are not finite are replaced by those of the step before."""
     e, graph, plan = block.emitter, block.plan.graph, block.plan
     b, inside, saving = e.body, Region(e, graph, region), plan.saving(index)
     for node, new, old in zip(plan.equations[index].unknowns, solution, last, strict=True):
