@@ -57,7 +57,8 @@ class Lanes:
         leaves = made.step.parameters.flatten(p.params, p.batch if p.batch_params else None)
         self.params = self._blocked(np.broadcast_to(leaves, (self.lanes, leaves.shape[-1])))
         rows = made.step.equations[made.step.stages[0][0]].rows
-        front = lambda name: (len(made.step.stages),) if made.bare.every_stage and made.bare.rule(name) == "each" else ()
+        stages = len(p.equation.stages)
+        front = lambda name: (stages,) if stages > 1 and p.fields[name].rule == "each" else ()
         self.shapes = {name: (*front(name), *rows[name].shape) for name in sorted(rows)}
         self.ends_before = [not p.is_node(name) for name in self.shapes]
         self.sizes = [math.prod(shape) for shape in self.shapes.values()]
