@@ -15,6 +15,10 @@ class Composition(AbstractScheme):
     that sum to 1. The named ones need a self-adjoint scheme of order 2 (midpoint or trapezoidal ones, Methods 1 and 2
     with the midpoint map); for any other compose it with its `Adjoint` first: `SymmetricComposition(scheme)`.
 
+    A saved row is the whole step's: impulses of its parts are summed, rates are means. Parts of a discrete Lagrange–d'Alembert
+    scheme with constraints end at the momentum whose velocity satisfies them, so that p and the multipliers have the order of
+    q; a Lagrangian that is singular on the constraint distribution determines no such momentum, and is refused at the start.
+
     Raises `ValueError` for unknown names and for numbers that do not sum to 1.
     """
 
