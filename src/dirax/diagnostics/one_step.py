@@ -19,7 +19,7 @@ def differentiated_step(equation: Any, h: Any, state, guess, t, params) -> Diffe
     With r(u, x) = 0 and x' = a(u, x) of each stage, ∂x'/∂x = ∂_x a − ∂_u a (∂_u r)⁻¹ ∂_x r.
     """
     lane = first_lane(state, (guess,) * len(equation.stages))
-    after, unknowns = take_step(equation, lane, t, h, params, MAX_ITERATIONS, differentiable=False)
+    after, unknowns, _ = take_step(equation, lane, t, h, params, MAX_ITERATIONS, differentiable=False)
     jacobian, condition = jnp.eye(state.shape[0]), jnp.ones(())
     for (stage, fraction), u in zip(equation.stages, unknowns, strict=True):
 

@@ -46,7 +46,14 @@ class AdjointStep(AbstractStep):
         return state + h * self.unknowns.split(u).increment
 
     def unpack(self, state, u, t, h, params):
-        return self.inner.unpack(state, self.unknowns.split(u).inner, t, h, params)
+        """Arrays of nodes are those of the point that the step leaves, those of steps are of the step back to it: impulses of
+        that one have the opposite sign."""
+        increment, inner = self.unknowns.split(u)
+        here = self.inner.unpack(state, inner, t, h, params)
+        back = self.inner.unpack(state + h * increment, inner, t + h, -h, params)
+        sign = lambda field: -1.0 if field.rule == "sum" else 1.0
+        of_step = {name: sign(field) * back[name] for name, field in self.fields.items() if field.place == "step"}
+        return here | of_step
 
     def start(self, data, h, params):
         state, u = self.inner.start(data, -h, params)

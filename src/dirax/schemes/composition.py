@@ -19,6 +19,10 @@ class Composition(AbstractScheme):
     p = α(q) of L = ⟨α(q), q̇⟩ − H is kept by Method 1 for linear α alone, and by Method 2 for any. `dx.simulate` refuses others,
     which with check_initial=False stay at the order of the scheme.
 
+    A saved row is the whole step's: impulses of its parts are summed, rates are means. Parts of a discrete Lagrange–d'Alembert
+    scheme with constraints end at the momentum whose velocity satisfies them, so that p and the multipliers have the order of
+    q; a Lagrangian that is singular on the constraint distribution determines no such momentum, and is refused at the start.
+
     Raises `ValueError` for unknown names and for numbers that do not sum to 1.
     """
 
@@ -41,7 +45,7 @@ class Composition(AbstractScheme):
         self.scheme, self.coefficients = scheme, numbers
 
     def step_equation(self, system: Any, shape: Shape) -> StepSequence:
-        inner = make_step_equation(self.scheme, system, shape)
+        inner = make_step_equation(self.scheme.part(system, shape), system, shape)
         return StepSequence(tuple((eq, a * c) for c in self.coefficients for eq, a in inner.stages))
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
@@ -78,8 +82,8 @@ class SymmetricComposition(AbstractScheme):
 
     def step_equation(self, system: Any, shape: Shape) -> StepSequence:
         refusal = "SymmetricComposition takes a one-stage scheme."
-        adjoint = _adjoint_of(self.scheme, system, shape, refusal)
-        return StepSequence(((adjoint, 0.5), (_one_stage(self.scheme, system, shape, refusal), 0.5)))
+        adjoint = _adjoint_of(self.scheme, system, shape, refusal, part=True)
+        return StepSequence(((adjoint, 0.5), (_one_stage(self.scheme.part(system, shape), system, shape, refusal), 0.5)))
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
         return between_the_parts(self)
@@ -94,9 +98,10 @@ def between_the_parts(scheme: AbstractScheme) -> str:
     return f"the points between the parts of a step of {type(scheme).__name__}, which the structure joins, are not saved"
 
 
-def _adjoint_of(scheme: AbstractScheme, system: Any, shape: Shape, refusal: str) -> StepEquation:
+def _adjoint_of(scheme: AbstractScheme, system: Any, shape: Shape, refusal: str, part: bool = False) -> StepEquation:
     adjoint = scheme.adjoint(system)
     if adjoint is not None:
+        adjoint = adjoint.part(system, shape) if part else adjoint
         return _one_stage(adjoint, system, shape, refusal)
     return AdjointStep(_one_stage(scheme, system, shape, refusal)).equation()
 

@@ -58,7 +58,7 @@ class ConstraintRows:
             "discrete constraint w_d(q_k, q_{k+1})" if not self.c else "constraints of the step: w_d(q_k, q_{k+1}), g(q_{k+1})"
         )
         return {
-            "multipliers": Field(size, "step", ("constraint",), "Lagrange multipliers of the constraints"),
+            "multipliers": Field(size, "step", ("constraint",), "Lagrange multipliers of the constraints", "sum"),
             "constraint": Field(size, "step", ("constraint",), about),
         }
 

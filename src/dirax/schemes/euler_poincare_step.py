@@ -80,7 +80,7 @@ class EulerPoincareStep(AbstractStep):
             "xi": Field((space.dimension,), "step", ("algebra",), "velocity ξ_k of the step, g_k⁻¹g_{k+1} = τ(hξ_k)"),
         }
         if m:
-            fields["multipliers"] = Field((m,), "step", ("constraint",), "impulse of the constraints at the node")
+            fields["multipliers"] = Field((m,), "step", ("constraint",), "impulse of the constraints at the node", "sum")
             fields["constraint"] = Field((m,), "step", ("constraint",), "discrete constraint A ξ_k")
         return fields
 

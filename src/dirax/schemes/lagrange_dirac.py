@@ -6,6 +6,7 @@ from typing import Any
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import CONSTRAINTS, RULES, checked_rule, mirrored
 from dirax.schemes.discrete_structure_pairs import LagrangianPairs, structure_on_pairs
+from dirax.schemes.lagrange_dalembert_part import LagrangeDAlembertPart
 from dirax.schemes.lagrange_dalembert_step import MOMENTA, LagrangeDAlembertStep
 from dirax.schemes.lagrange_poincare_dirac import LagrangePoincareDiracStep
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
@@ -72,6 +73,9 @@ class LagrangeDAlembert(AbstractScheme):
         """That of L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h)."""
         return LagrangeDAlembert(mirrored(self.discrete_lagrangian, -1.0), mirrored(self.constraint, 1.0), "incoming")
 
+    def part(self, system: Any, shape: Shape) -> AbstractScheme:
+        return _part(self, self, system, shape)
+
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
         share = MOMENTA[self.momentum]
         return structure_on_pairs(system, shape, step, self.discrete_lagrangian, self.constraint, share=share)
@@ -102,6 +106,9 @@ class PlusLagrangeDirac(AbstractScheme):
     def adjoint(self, system: Any) -> LagrangeDAlembert:
         """That of the general scheme."""
         return self.lagrange_dalembert.adjoint(system)
+
+    def part(self, system: Any, shape: Shape) -> AbstractScheme:
+        return _part(self, self.lagrange_dalembert, system, shape)
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
         return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "right", sign="+")
@@ -134,8 +141,25 @@ class MinusLagrangeDirac(AbstractScheme):
         """That of the general scheme."""
         return self.lagrange_dalembert.adjoint(system)
 
+    def part(self, system: Any, shape: Shape) -> AbstractScheme:
+        return _part(self, self.lagrange_dalembert, system, shape)
+
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
         return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "left", sign="-")
+
+
+class _Part(AbstractScheme):
+    """A discrete Lagrange–d'Alembert scheme whose steps end at the projected momentum."""
+
+    scheme: LagrangeDAlembert
+
+    def step_equation(self, system: Any, shape: Shape) -> StepEquation:
+        return LagrangeDAlembertPart(self.scheme.step_on_q(system, shape)).equation()
+
+
+def _part(scheme: AbstractScheme, general: LagrangeDAlembert, system: AbstractSystem, shape: Shape) -> AbstractScheme:
+    """A scheme as a part of a composed step. Without constraints, and on a quotient by a symmetry, it is the scheme itself."""
+    return _Part(general) if shape.m + shape.c and system.quotient_form() is None else scheme
 
 
 def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, sign: int = +1) -> StepEquation:

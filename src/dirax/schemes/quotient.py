@@ -42,5 +42,5 @@ class Quotient:
             "w": Field((s,), dims=("shape",), description="momentum of the shape, w + h*_{d,Σ}(μ)"),
             "mu": Field((k,), dims=("group",), description="momentum map"),
             "g": Field((k,), dims=("group",), description="group coordinate, by reconstruction"),
-            "vertical": Field((k,), "step", ("group",), "discrete connection ω_d(q_k, q_{k+1})"),
+            "vertical": Field((k,), "step", ("group",), "discrete connection ω_d(q_k, q_{k+1})", "sum"),
         }

@@ -1,7 +1,7 @@
 """StepEquation: the hub. One step of size h as an equation between two states; schemes make it, engines solve it."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -16,17 +16,38 @@ from dirax.schemes.step_forms import form_of_steps
 from dirax.systems.shape import Shape
 from dirax.text.representation import counted, fields_html, module_html, module_text
 
+COMPOSED = ("first", "sum", "mean", "each")
+"""How the row of a composed step is made of those of its parts."""
+
 
 class Field(eqx.Module):
     """One named array of a trajectory: its shape in a row and whether it belongs to nodes or to steps.
 
     `place="node"` has steps + 1 rows (q, p, x), `place="step"` has steps rows (multipliers). `dims` names the axes.
+    `composed` says how the row of a composed step is made of those of its parts: "first" (the array of the first part, at
+    whose point the row is), "sum" (impulses), "mean" (rates, weighted by the parts' fractions of h) or "each" (all of them,
+    along a new axis in front). A field of nodes is "first" unless it says otherwise, one of steps "mean".
+    Raises `ValueError` for another `composed`.
     """
 
     shape: tuple[int, ...] = eqx.field(static=True)
     place: str = eqx.field(static=True, default="node")
     dims: tuple[str, ...] = eqx.field(static=True, default=("coordinate",))
     description: str = eqx.field(static=True, default="")
+    composed: str = eqx.field(static=True, default="")
+
+    def __check_init__(self):
+        if self.composed not in ("", *COMPOSED):
+            raise ValueError(f"composed must be one of {', '.join(map(repr, COMPOSED))}, but {self.composed!r} was given.")
+
+    @property
+    def rule(self) -> str:
+        """How the row of a composed step is made: `composed`, or what stands for it by the field's place."""
+        return self.composed or ("mean" if self.place == "step" else "first")
+
+    def weight(self, fraction: float) -> float:
+        """What a part that takes this fraction of the step is multiplied by in its row."""
+        return fraction if self.rule == "mean" else 1.0
 
 
 class StepEquation(eqx.Module):
@@ -127,9 +148,33 @@ class StepSequence(eqx.Module):
     def first(self) -> StepEquation:
         return self.stages[0][0]
 
+    @property
+    def fields(self) -> dict[str, Field]:
+        """The named arrays of a row: those of the first part, at which every row is."""
+        return self.first.fields
+
     def __repr__(self) -> str:
         fractions = ", ".join(f"{fraction:.6g}" for _, fraction in self.stages)
         return f"StepSequence({counted(len(self.stages), 'stage')} of h·({fractions}); first {self.first!r})"
+
+
+def needs_every_part(equation: "StepEquation | StepSequence") -> bool:
+    """Whether a row takes more than the first part of a step."""
+    return len(equation.stages) > 1 and any(field.rule != "first" for field in equation.fields.values())
+
+
+def composed_row(equation: "StepEquation | StepSequence", rows: Sequence[dict[str, Array]]) -> dict[str, Array]:
+    """The row of a whole step, of those of its parts in order; of the first one alone where that is all there is."""
+    if len(rows) == 1:
+        return rows[0]
+
+    def whole(name: str, field: Field):
+        if field.rule == "first":
+            return rows[0][name]
+        arrays = [field.weight(fraction) * row[name] for row, (_, fraction) in zip(rows, equation.stages, strict=True)]
+        return jnp.stack(arrays) if field.rule == "each" else sum(arrays[1:], arrays[0])
+
+    return {name: whole(name, field) for name, field in equation.fields.items()}
 
 
 class AbstractScheme(eqx.Module):
@@ -149,6 +194,10 @@ class AbstractScheme(eqx.Module):
         """The adjoint Φ*_h = (Φ_{−h})⁻¹ on this system as a scheme of its own; None where it is the inverse map as such,
         whose equation `dx.Adjoint` makes of the scheme's. A scheme that is self-adjoint returns itself."""
         return None
+
+    def part(self, system: Any, shape: Shape) -> "AbstractScheme":
+        """The scheme as a part of a composed step: itself, or one with the same q whose saved p has the order of q there."""
+        return self
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
         """The discrete Dirac structure that consecutive rows belong to, for steps of size `step`; or why there is none."""

@@ -31,8 +31,8 @@ LINEARIZED_SIGNATURE = ctypes.CFUNCTYPE(
 class Kernels:
     """The machine code of a step: kernels by width, made when they are asked for."""
 
-    def __init__(self, step: StepProgram, compensated: bool, every_stage: bool):
-        self.step, self.compensated, self.every_stage = step, compensated, every_stage
+    def __init__(self, step: StepProgram, compensated: bool, rules: dict[str, str]):
+        self.step, self.compensated, self.rules = step, compensated, rules
         self.plan: Plan | None = None
         self.operations = 0
         self.digest = _digest(self)
@@ -99,7 +99,7 @@ class Kernels:
 
     def _plan(self, graph: Graph) -> Plan:
         step = self.step
-        return Plan(graph, step.shared, step.equations, [], step.stages, self.compensated, self.every_stage)
+        return Plan(graph, step.shared, step.equations, [], step.stages, self.rules, self.compensated)
 
     def _graph(self) -> Graph:
         """A graph of the step with its Jacobians, to which more can be added. Raises `GraphTooLarge`."""
@@ -146,10 +146,11 @@ def source_digest() -> str:
 _kernels: Memo[Kernels] = Memo(KEPT)
 
 
-def kernels(equation: Any, params: Any, batch_params: bool, compensated: bool = False, every_stage: bool = False) -> Kernels:
-    """The kernels of a step; with `every_stage` each stage has a row in the saved arrays. Raises `UnsupportedPrimitive`."""
+def kernels(equation: Any, params: Any, batch_params: bool, compensated: bool = False) -> Kernels:
+    """The kernels of a step. Raises `UnsupportedPrimitive`."""
     step = step_program(equation, params, batch_params)
-    return _kernels.get((Same(step), compensated, every_stage), lambda: Kernels(step, compensated, every_stage))
+    rules = {name: field.rule for name, field in equation.stages[0][0].fields.items()} if len(equation.stages) > 1 else {}
+    return _kernels.get((Same(step), compensated, tuple(rules.items())), lambda: Kernels(step, compensated, rules))
 
 
 def _digest(made: Kernels) -> str:
@@ -159,6 +160,6 @@ def _digest(made: Kernels) -> str:
     constants = sorted((node, value) for node, value in g.value.items() if node < step.size)
     nodes = g.op[: step.size], g.args[: step.size], constants
     digest = hashlib.sha256(source_digest().encode())
-    for part in (*nodes, outputs, step.stages, step.shared, made.compensated, made.every_stage):
+    for part in (*nodes, outputs, step.stages, step.shared, made.compensated, sorted(made.rules.items())):
         digest.update(repr(part).encode() + b"\0")
     return digest.hexdigest()

@@ -57,7 +57,9 @@ class Lanes:
         leaves = made.step.parameters.flatten(p.params, p.batch if p.batch_params else None)
         self.params = self._blocked(np.broadcast_to(leaves, (self.lanes, leaves.shape[-1])))
         rows = made.step.equations[made.step.stages[0][0]].rows
-        self.shapes = {name: rows[name].shape for name in sorted(rows)}
+        stages = len(p.equation.stages)
+        front = lambda name: (stages,) if stages > 1 and p.fields[name].rule == "each" else ()
+        self.shapes = {name: (*front(name), *rows[name].shape) for name in sorted(rows)}
         self.ends_before = [not p.is_node(name) for name in self.shapes]
         self.sizes = [math.prod(shape) for shape in self.shapes.values()]
         self._at = self.params.ctypes.data, self.params.strides[0]

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
 from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.engines.xla.newton import as_function, solve
+from dirax.schemes.step import composed_row, needs_every_part
 
 
 class Numerics(NamedTuple):
@@ -70,8 +71,9 @@ def first_lane(state, guess: tuple, xp=jnp, compensated: bool = False) -> Lane:
 
 def take_step(
     equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True, numerics: Numerics | None = None
-) -> tuple[Lane, tuple]:
-    """One step of every stage; the lane after it (unchanged where it had failed or the step fails) and the unknowns.
+) -> tuple[Lane, tuple, tuple]:
+    """One step of every stage; the lane after it (unchanged where it had failed or the step fails), and of each stage the
+    unknowns and the state that it left.
 
     With `differentiable` it can be differentiated in reverse mode too, and no derivative passes through a step that failed."""
     linear_solver, *known = numerics or Numerics()
@@ -80,6 +82,7 @@ def take_step(
 
     def solved(carry, fraction, before, stage, increment, jacobian):
         state, lost, t, status, updates, worst = carry
+        left_state = state
         running = status == OK
         args = (state, t, fraction * h, params)
         fixed = passing(args, False) if differentiable else args
@@ -101,18 +104,19 @@ def take_step(
             new, left_out = compensated_sum(state, lost, increment(u, *args), new)
             lost = jnp.where(status == OK, left_out, lost)
         state = jnp.where(status == OK, new, state)
-        return (state, lost, t + fraction * h, status, updates, worst), (_remembered(u, before, lane.completed), u)
+        found = _remembered(u, before, lane.completed), u, left_state
+        return (state, lost, t + fraction * h, status, updates, worst), found
 
     carry = (lane.state, lane.lost, jnp.asarray(t, float), lane.status, jnp.zeros_like(lane.iterations), lane.max_residual)
     if len(stages) > 1 and len({(stage.residual, stage.advance, stage.guess) for stage in stages}) == 1:
         one = lambda carry, given: solved(carry, given[0], given[1], stages[0], increments[0], jacobians[0])
-        carry, (histories, solutions) = jax.lax.scan(one, carry, (jnp.array(fractions), jnp.stack(lane.history)))
-        history, unknowns = tuple(histories), tuple(solutions)
+        carry, (histories, solutions, left) = jax.lax.scan(one, carry, (jnp.array(fractions), jnp.stack(lane.history)))
+        history, unknowns, states = tuple(histories), tuple(solutions), tuple(left)
     else:
-        history, unknowns = (), ()
+        history, unknowns, states = (), (), ()
         for i, before in enumerate(lane.history):
-            carry, (remembered, u) = solved(carry, fractions[i], before, stages[i], increments[i], jacobians[i])
-            history, unknowns = (*history, remembered), (*unknowns, u)
+            carry, (remembered, u, left) = solved(carry, fractions[i], before, stages[i], increments[i], jacobians[i])
+            history, unknowns, states = (*history, remembered), (*unknowns, u), (*states, left)
     state, lost, _, status, updates, worst = carry
     good = status == OK
     after = Lane(
@@ -122,7 +126,7 @@ def take_step(
         worst,
         jnp.where(good, lost, lane.lost),
     )
-    return after, unknowns
+    return after, unknowns, states
 
 
 def passing(numbers: Any, pass_on: Any) -> Any:
@@ -155,14 +159,26 @@ def time_of(lane: Lane, t0, h, first_step):
     return t0 + (first_step + lane.completed.astype(jnp.float64)) * h
 
 
-def packed_row(lane: Lane, unknowns) -> Any:
-    """All that the row at `lane` depends on as one array (s + k + 1,), `unknowns` being those of the step leaving it."""
-    finite = jnp.where(jnp.isfinite(unknowns[0]), unknowns[0], lane.unknowns[0])
-    return jnp.concatenate([lane.state, finite, lane.counts[:1].astype(lane.state.dtype)])
+def packed_row(equation, lane: Lane, unknowns, states) -> Any:
+    """All that the row at `lane` depends on as one array, `unknowns` and `states` being those of the step leaving it: the state
+    and the unknowns of every part of it that a row takes, and the number of steps before."""
+    parts = []
+    for i in range(parts_of_row(equation)):
+        finite = jnp.where(jnp.isfinite(unknowns[i]), unknowns[i], lane.unknowns[i])
+        parts += [states[i] if i else lane.state, finite]
+    return jnp.concatenate([*parts, lane.counts[:1].astype(lane.state.dtype)])
+
+
+def parts_of_row(equation) -> int:
+    """How many parts of a step its row takes, from the first on: one, or all."""
+    return len(equation.stages) if needs_every_part(equation) else 1
 
 
 def unpacked_row(equation, packed, t0, h, first_step, params) -> dict:
     """The named arrays of the row."""
-    stage, fraction = equation.stages[0]
-    state, unknowns, completed = jnp.split(packed, [stage.state_size, stage.state_size + stage.unknowns])
-    return stage.unpack(state, unknowns, t0 + (first_step + completed[0]) * h, fraction * h, params)
+    t, at, rows = t0 + (first_step + packed[-1]) * h, 0, []
+    for stage, fraction in equation.stages[: parts_of_row(equation)]:
+        middle, end = at + stage.state_size, at + stage.state_size + stage.unknowns
+        rows.append(stage.unpack(packed[at:middle], packed[middle:end], t, fraction * h, params))
+        t, at = t + fraction * h, end
+    return composed_row(equation, rows)

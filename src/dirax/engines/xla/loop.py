@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from dirax.engines.contract import OK, Problem
-from dirax.engines.xla.lane import Lane, Numerics, packed_row, take_step, time_of, unpacked_row
+from dirax.engines.xla.lane import Lane, Numerics, packed_row, parts_of_row, take_step, time_of, unpacked_row
 from dirax.program.compiled import compiled
 
 CHUNK_BYTES = 2**20
@@ -47,8 +47,8 @@ def make_step(equation, axes, max_iterations: int, differentiable: bool, numeric
 
     def one(lane, params, clock):
         t = time_of(lane, clock.t0, clock.h, clock.first_step)
-        after, unknowns = take_step(equation, lane, t, clock.h, params, max_iterations, differentiable, numerics)
-        return after, packed_row(lane, unknowns)
+        after, unknowns, states = take_step(equation, lane, t, clock.h, params, max_iterations, differentiable, numerics)
+        return after, packed_row(equation, lane, unknowns, states)
 
     return one if axes is None else jax.vmap(one, in_axes=(*axes, None))
 
@@ -137,6 +137,6 @@ def axes_of(p: Problem) -> tuple | None:
 
 def row_capacity(p: Problem) -> int:
     """Rows of a chunk."""
-    stage = p.equation.stages[0][0]
-    row_bytes = 8 * (p.batch or 1) * (stage.state_size + stage.unknowns + 1)
+    parts = p.equation.stages[: parts_of_row(p.equation)]
+    row_bytes = 8 * (p.batch or 1) * (sum(stage.state_size + stage.unknowns for stage, _ in parts) + 1)
     return max(1, min(CHUNK_ROWS, CHUNK_BYTES // row_bytes))

@@ -33,13 +33,17 @@ def _run(task: Recorded, *arrays: np.ndarray) -> list[np.ndarray]:
     table = np.stack([out.completed, out.status, out.iterations, out.max_residual], axis=1)
     last = np.zeros((len(table), task.unknowns))
     last[:, : out.last_unknowns.shape[1]] = out.last_unknowns
-    return [out.fields["state"], out.fields["unknowns"], table, last]
+    return [*_of_rows(out.fields), table, last]
+
+
+def _of_rows(fields) -> list:
+    """States and unknowns of rows, those of all parts in one."""
+    return [fields[name].reshape(*fields[name].shape[:2], -1) for name in ("state", "unknowns")]
 
 
 def _reference(task: Recorded, *inputs):
     """States and unknowns by the xla engine, for derivatives of derivatives."""
-    fields = Xla().run_traced(task.problem(*inputs)).fields
-    return [fields["state"], fields["unknowns"]]
+    return _of_rows(Xla().run_traced(task.problem(*inputs)).fields)
 
 
 def _reference_jvp(task: Recorded, *arrays):
@@ -91,7 +95,7 @@ def _primitive(name: str, host: Callable, shapes: Callable) -> Primitive:
 
 
 def _rows(task: Recorded, state, *_) -> list[tuple[int, ...]]:
-    return [(state.shape[0], task.rows, task.state_size), (state.shape[0], task.rows, task.unknowns)]
+    return [(state.shape[0], task.rows, task.parts * size) for size in (task.state_size, task.unknowns)]
 
 
 run_p = _primitive(
@@ -157,7 +161,11 @@ def run_traced(problem: Problem) -> Outcome:
 
     stage = p.equation.stages[0][0]
     completed = jnp.minimum(saved_steps(p)[None, :, None], table[:, None, :1])
-    packed = jnp.concatenate([states, unknowns[..., : stage.unknowns], completed], axis=2)
+    pieces = []
+    for i, (part, _) in enumerate(p.equation.stages[: task.parts]):
+        at = i * task.unknowns
+        pieces += [states[..., i * task.state_size : (i + 1) * task.state_size], unknowns[..., at : at + part.unknowns]]
+    packed = jnp.concatenate([*pieces, completed], axis=2)
     rows = unpacked_rows(p, packed)
     outcome = Outcome(
         fields={name: a if p.is_node(name) else a[:, :-1] for name, a in rows.items()},
@@ -166,7 +174,7 @@ def run_traced(problem: Problem) -> Outcome:
         status=table[:, 1].astype(int),
         iterations=table[:, 2].astype(int),
         max_residual=table[:, 3],
-        last_state=states[:, -1],
+        last_state=states[:, -1, : task.state_size],
         last_unknowns=last[:, : stage.unknowns],
         engine="native",
     )

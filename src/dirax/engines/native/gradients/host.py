@@ -17,10 +17,10 @@ class Segments:
     """A recorded run whose stages are gone over in either direction, segment by segment."""
 
     def __init__(self, task: Recorded, inputs: tuple[np.ndarray, ...], reverse: bool):
-        self.task, self.problem = task, task.problem(*inputs)
+        self.task, self.problem = task, task.problem(*inputs, every_stage=True)
         p = self.problem
         self.stages = len(p.equation.stages)
-        made = kernels(p.equation, p.params, True, p.compensated, self.stages > 1)
+        made = kernels(p.equation, p.params, True, p.compensated)
         self.lanes = Lanes(p, made, width_for(p.batch or 1))
         self.kernel, _ = made.kernel(self.lanes.width)
         self.linearized = made.linearized(reverse, self.lanes.width)
@@ -38,9 +38,9 @@ class Segments:
         return found
 
     def _run(self, records: np.ndarray, count: int) -> dict[str, np.ndarray]:
-        arrays, outs = self.lanes.arrays(count * self.stages)
+        arrays, outs = self.lanes.arrays(count)
         self.lanes.call(self.kernel, records, outs, 0, count, 1, self.lanes.threads)
-        return arrays
+        return {name: a.reshape(len(a), count * self.stages, a.shape[-1]) for name, a in arrays.items()}
 
     def rows(self, count: int, records: np.ndarray) -> np.ndarray:
         """State and unknowns of every stage of a segment, (blocks, rows, quantities, width)."""
@@ -75,10 +75,10 @@ class Segments:
                 future.result()
 
     def saved(self, first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Which saved rows are in a segment, and at which of its rows."""
+        """Which saved rows are in a segment, and at which of its rows their parts are, (rows, parts)."""
         numbers = np.minimum(np.arange(self.problem.rows) * self.problem.save_every, self.problem.steps)
         chosen = np.flatnonzero((numbers >= first) & (numbers < first + count))
-        return chosen, (numbers[chosen] - first) * self.stages
+        return chosen, ((numbers[chosen] - first) * self.stages)[:, None] + np.arange(self.task.parts)
 
     def limits(self, completed: np.ndarray, closing: np.ndarray) -> np.ndarray:
         """The step before which each trajectory ended (B, 1): with the one that leaves the last row where that matters."""
@@ -93,7 +93,8 @@ def jvp(task: Recorded, *arrays: np.ndarray) -> list[np.ndarray]:
     parts = Segments(task, tuple(inputs), reverse=False)
     limits = parts.limits(completed, np.ones(batch, bool))
     carry = parts.blocked(np.concatenate([state, c, t0[:, None], h[:, None], limits], axis=1))
-    states, unknowns = np.zeros((batch, task.rows, s)), np.zeros((batch, task.rows, task.unknowns))
+    states = np.zeros((batch, task.rows, task.parts, s))
+    unknowns = np.zeros((batch, task.rows, task.parts, task.unknowns))
     for first, count, records in parts.segments():
         rows = parts.rows(count, records)
         flow = np.zeros_like(rows)
@@ -101,7 +102,7 @@ def jvp(task: Recorded, *arrays: np.ndarray) -> list[np.ndarray]:
         chosen, at = parts.saved(first, count)
         found = parts.unblocked(flow[:, at])
         states[:, chosen], unknowns[:, chosen] = found[..., :s], found[..., s:]
-    return [states, unknowns]
+    return [a.reshape(batch, task.rows, -1) for a in (states, unknowns)]
 
 
 def vjp(task: Recorded, *arrays: np.ndarray) -> list[np.ndarray]:
@@ -109,12 +110,13 @@ def vjp(task: Recorded, *arrays: np.ndarray) -> list[np.ndarray]:
     *inputs, completed, states, unknowns = arrays
     batch, s, m = len(states), task.state_size, inputs[2].shape[1]
     parts = Segments(task, tuple(inputs), reverse=True)
-    limits = parts.limits(completed, np.any(unknowns[:, -1] != 0, axis=1))
+    closing = np.concatenate([states[:, -1, s:], unknowns[:, -1]], axis=1)
+    limits = parts.limits(completed, np.any(closing != 0, axis=1))
     carry = parts.blocked(np.concatenate([np.zeros((batch, s + m + 2)), limits], axis=1))
-    given = np.concatenate([states, unknowns], axis=2)
+    given = np.concatenate([a.reshape(batch, task.rows, task.parts, -1) for a in (states, unknowns)], axis=3)
     for first, count, records in reversed(parts.segments()):
         rows = parts.rows(count, records)
-        flow = np.zeros((batch, count * parts.stages, given.shape[2]))
+        flow = np.zeros((batch, count * parts.stages, given.shape[3]))
         chosen, at = parts.saved(first, count)
         flow[:, at] = given[:, chosen]
         parts.call(carry, rows, parts.blocked(flow), first, count)

@@ -21,8 +21,10 @@ class Plan:
     equations: list[TracedEquation]
     corrections: list[Correction]
     stages: list[tuple[int, float]]
+    rules: dict[str, str] = field(
+        default_factory=dict
+    )  # how the row of a step is made of its stages', by field; "first" if not said
     compensated: bool = False
-    every_stage: bool = False  # a row for each stage of a step, of the equation that it solves; `every` is then 1
     increments: list[list[int | None]] = field(default_factory=list)
 
     @property
@@ -37,8 +39,23 @@ class Plan:
 
     @property
     def fields(self) -> list[tuple[str, list[int]]]:
-        """The saved arrays, each as the nodes of a row; they come from the first stage."""
+        """The saved arrays, each as the nodes of the first stage's row."""
         return fields_of(self.equations[self.stages[0][0]])
+
+    def rule(self, name: str) -> str:
+        """How a field's row is made of those of the stages."""
+        return self.rules.get(name, "first")
+
+    @property
+    def every_stage(self) -> bool:
+        """Whether stages after the first have a part in a row."""
+        return len(self.stages) > 1 and any(self.rule(name) != "first" for name, _ in self.fields)
+
+    def saving(self, index: int) -> list[tuple[int, str, list[int]]]:
+        """(number, rule, nodes) of the fields in whose row the equation has a part."""
+        equation, first = self.equations[index], index == self.stages[0][0]
+        found = [(f, self.rule(name), nodes) for f, (name, nodes) in enumerate(fields_of(equation))]
+        return [(f, rule, nodes) for f, rule, nodes in found if nodes and (first or (self.every_stage and rule != "first"))]
 
     @property
     def outputs(self) -> list[int]:
@@ -48,8 +65,7 @@ class Plan:
             out += [*equation.guess, *equation.residual, *equation.advance]
             out += [*correction.change, *correction.factors, correction.stable]
         out += [node for nodes in self.increments for node in nodes if node is not None]
-        saving = self.equations if self.every_stage else [self.equations[self.stages[0][0]]]
-        return out + [node for equation in saving for _, nodes in fields_of(equation) for node in nodes]
+        return out + [node for index in range(len(self.equations)) for *_, nodes in self.saving(index) for node in nodes]
 
     def levels(self) -> dict[int, int]:
         """Node → RUN, STEP or NEWTON (0 for constants)."""

@@ -6,7 +6,7 @@ from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
 from dirax.engines.native.ir.emitter import Emitter
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.newton_loop import NewtonLoop
-from dirax.engines.native.loops.plan import STEP, Plan, fields_of, frontier
+from dirax.engines.native.loops.plan import STEP, Plan, frontier
 from dirax.engines.native.loops.record import Frame
 
 
@@ -31,9 +31,18 @@ class Block:
 
 
 def emit_stage(
-    block: Block, stage: int | str, index: int, around: Region, time: str, running: str, number: str, saves: str | None
+    block: Block,
+    stage: int | str,
+    index: int,
+    around: Region,
+    time: str,
+    running: str,
+    number: str,
+    saves: str,
+    fraction: str = "",
 ) -> None:
-    """Stage number `stage`, which solves equation `index` at `time` in the lanes `running`; row `number` where `saves` holds."""
+    """Stage number `stage`, which solves equation `index` at `time` in the lanes `running`; its part of the row of step `number`
+    where `saves` holds. `fraction` is that of the step, of one of several stages."""
     plan, frame, e = block.plan, block.frame, block.emitter
     b, equation, correction = e.body, plan.equations[index], plan.corrections[index]
     k, offset = len(equation.unknowns), 0
@@ -61,9 +70,10 @@ def emit_stage(
     after = Region(e, plan.graph, region)
     for node, value in zip(equation.unknowns, solution, strict=True):
         after.bind(node, value)
-    if saves is not None:
+    saving = plan.saving(index)
+    if saving:
         with b.when(saves):
-            _save(block, index, region, solution, last, number)
+            _save(block, stage, index, region, solution, last, number, fraction)
     after.require([*equation.advance, *equation.residual])
     new = [after.value(n) for n in equation.advance]
     residual = e.const(0.0)
@@ -109,18 +119,41 @@ def _judge(block: Block, active: str, converged: str, residual: str, solution: l
     b.store(e.real, e.select(better, e.max(residual, worst), worst), frame.max_residual)
 
 
-def _save(block: Block, index: int, region: Region, solution: list[str], last: list[str], number: str) -> None:
-    """Write the saved arrays of a row; unknowns that are not finite are replaced by those of the step before."""
-    e, graph, equation = block.emitter, block.plan.graph, block.plan.equations[index]
-    b, inside = e.body, Region(e, graph, region)
-    for node, new, old in zip(equation.unknowns, solution, last, strict=True):
+def _save(
+    block: Block, stage: int | str, index: int, region: Region, solution: list[str], last: list[str], number: str, fraction: str
+) -> None:
+    """Write a stage's part of a row; unknowns that are not finite are replaced by those of the step before."""
+    e, graph, plan = block.emitter, block.plan.graph, block.plan
+    b, inside, saving = e.body, Region(e, graph, region), plan.saving(index)
+    for node, new, old in zip(plan.equations[index].unknowns, solution, last, strict=True):
         finite = e.compare("olt", e.abs(new), e.const(float("inf")))
         inside.bind(node, e.select(finite, new, old))
-    fields, row = fields_of(equation), b.put(f"sdiv i64 {number}, %every")
-    inside.require([node for _, nodes in fields for node in nodes])
-    for f, (_, nodes) in enumerate(fields):
-        if not nodes:
-            continue
+    row = b.put(f"sdiv i64 {number}, %every")
+    inside.require([node for *_, nodes in saving for node in nodes])
+    if stage == 0 or not plan.every_stage:
+        _write(block, inside, [(f, "first", nodes) for f, _, nodes in saving], row)
+        return
+    is_first = b.put(f"icmp eq i64 {stage}, 0")
+    here = [one for one in saving if one[1] == "first"]
+    if here:
+        with b.when(is_first):
+            _write(block, inside, here, row)
+    for f, rule, nodes in saving:
+        if rule == "each":
+            place = b.put(f"add i64 {b.put(f'mul i64 {row}, {len(plan.stages)}')}, {stage}")
+            _write(block, inside, [(f, rule, nodes)], place)
+        elif rule != "first":
+            _write(block, inside, [(f, rule, nodes)], row, is_first, fraction if rule == "mean" else "")
+
+
+def _write(
+    block: Block, inside: Region, saving: list[tuple[int, str, list[int]]], row: str, is_first: str = "", weight: str = ""
+) -> None:
+    """Write fields into a row, of the array of which this is the number. With `is_first` what stands there is added to where that
+    does not hold, after multiplying by the number `weight` if there is one."""
+    e, graph = block.emitter, block.plan.graph
+    b, scalar = e.body, Emitter(e.body, 1)
+    for f, _, nodes in saving:
         bytes_ = b.put(f"mul i64 {row}, {8 * len(nodes)}")
         for lane in range(e.width):
             address = b.load("ptr", b.at("ptr", "%outs", f * e.width + lane))
@@ -129,4 +162,9 @@ def _save(block: Block, index: int, region: Region, solution: list[str], last: l
                 value = inside.value(node)
                 if graph.is_boolean(node):
                     value = e.select(value, e.const(1.0), e.const(0.0))
-                b.store("double", e.extract(value, lane), b.at("double", target, j))
+                value, place = e.extract(value, lane), b.at("double", target, j)
+                if is_first:
+                    value = scalar.mul(weight, value) if weight else value
+                    before = b.load("double", place)
+                    value = b.put(f"select i1 {is_first}, double {value}, double {scalar.add(before, value)}")
+                b.store("double", value, place)

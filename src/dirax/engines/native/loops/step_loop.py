@@ -111,16 +111,13 @@ def _emit_one_of_stages(block: Block, stage: str, clock: str, running: str, numb
     time = b.load(e.real, clock)
     which = b.load("i64", b.at("i64", "@stage_equation", stage))
     is_first = b.put(f"icmp eq i64 {stage}, 0")
-    if plan.every_stage:
-        number = b.put(f"add i64 {b.put(f'mul i64 {number}, {len(plan.stages)}')}, {stage}")
-    else:
+    if not plan.every_stage:
         saves = b.put(f"and i1 {is_first}, {saves}")
     for i in range(len(plan.equations)):
         with b.when(b.put(f"icmp eq i64 {which}, {i}")):
             region = Region(e, plan.graph, block.known)
             region.bind(plan.shared.h, h)
-            first = i == plan.stages[0][0] or plan.every_stage
-            emit_stage(block, stage, i, region, time, running, number, saves if first else None)
+            emit_stage(block, stage, i, region, time, running, number, saves, fraction)
     b.store(e.real, e.add(time, h), clock)
 
 

@@ -1,0 +1,90 @@
+"""One step of the discrete Lagrange–d'Alembert equations as a part of a composed step: it ends at the projected momentum."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+
+from dirax.schemes.abstract_step import AbstractStep
+from dirax.schemes.constraint_rows import ConstraintRows
+from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
+from dirax.schemes.layout import Layout
+from dirax.schemes.step import Field
+
+
+@dataclass(frozen=True, eq=False)
+class LagrangeDAlembertPart(AbstractStep):
+    """The step of `inner` from a momentum on the constraints to one on them:
+
+        p_k + D1 L_d = [W; G](q_k)ᵀμ,   w_d = 0,   g(q_{k+1}) = 0,
+        p_{k+1} = D2 L_d − [W; G](q_{k+1})ᵀσ = ∂L/∂v(q_{k+1}, v̂),   W v̂ + b = 0,   G v̂ + ∂g/∂t = 0 at q_{k+1}.
+
+    The inner step takes p modulo the constraint forces, so that σ changes nothing in q. The impulse of the step, μ + σ, is
+    that of both its ends: with it (q, p, ∫λ dt) is a one-step map, self-adjoint where the inner step is, and a composition
+    has its order in all three. The state is (q, p, work), the unknowns are (v, μ, v̂, σ).
+    """
+
+    inner: LagrangeDAlembertStep
+
+    @property
+    def rows(self) -> ConstraintRows:
+        """The constraints that enter the equations."""
+        return self.inner.rows
+
+    @property
+    def state(self) -> Layout:
+        return self.inner.state
+
+    @property
+    def unknowns(self) -> Layout:
+        n, count = self.inner.shape.n, self.rows.count
+        return Layout(v=n, multipliers=count, end_v=n, sigma=count)
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        return self.inner.fields
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        n, count = self.inner.shape.n, self.rows.count
+        return self.inner.labels[: n + count] + tuple(f"projection of the momentum {i}" for i in range(n + count))
+
+    @property
+    def canonical(self) -> bool:
+        return self.inner.canonical
+
+    def end(self, u, state, t, h, params):
+        """(q_{k+1}, p_{k+1})."""
+        v, sigma = self.unknowns.split(u).v, self.unknowns.split(u).sigma
+        q = self.state.split(state).q
+        q1, p1 = q + h * v, self.inner.slots(t, q, v, h, params)[1]
+        return q1, p1 - self.rows.matrix(t + h, q1, params).T @ sigma
+
+    def residual(self, u, state, t, h, params):
+        v, multipliers, end_v, _ = self.unknowns.split(u)
+        q, p, _ = self.state.split(state)
+        q1, p1 = self.end(u, state, t, h, params)
+        missed = self.inner.system.legendre(q1, end_v, params, t + h) - p1
+        left = self.rows.velocity_defect(t + h, q1, end_v, params)
+        return jnp.concatenate([self.inner.equations(v, multipliers, q, p, t, h, params), missed, left])
+
+    def advance(self, u, state, t, h, params):
+        work = self.inner.state.split(self.inner.advance(self.of_inner(u), state, t, h, params))
+        q1, p1 = self.end(u, state, t, h, params)
+        # the inner step marks the domain of L in its momentum
+        return self.state.join(q=q1, p=jnp.where(jnp.isfinite(work.p), p1, jnp.nan), work=work.work)
+
+    def of_inner(self, u):
+        """The unknowns of the inner step, without its projection."""
+        v, multipliers, *_ = self.unknowns.split(u)
+        return self.inner.unknowns.join(v=v, multipliers=multipliers)
+
+    def unpack(self, state, u, t, h, params):
+        v, multipliers, _, sigma = self.unknowns.split(u)
+        q, p, _ = self.state.split(state)
+        row = {"q": q, "p": p, "multipliers": self.rows.all(multipliers + sigma)}
+        return row | {"constraint": self.inner.step_constraint(t, q, v, h, params)} | self.inner.work.row(state)
+
+    def start(self, data, h, params):
+        if "q0" in data:
+            raise ValueError("a composition starts from q= with v= or p=, not from two points, which belong to one step.")
+        return self.inner.work.start(data["q"], data["p"]), self.unknowns.join(v=data["v"], end_v=data["v"])
