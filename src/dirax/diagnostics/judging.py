@@ -7,9 +7,9 @@ import numpy as np
 
 from dirax.diagnostics.report import OK, VIOLATED, Line
 from dirax.diagnostics.rows import over_rows, times_at
+from dirax.numerics.tolerances import EPSILON
 from dirax.solution.solution import Solution
 
-EPSILON = 2.0**-52
 ROUNDINGS = 32
 """Roundings, each of half a unit in the last place, that the equations of one step are allowed, and their safety factor."""
 

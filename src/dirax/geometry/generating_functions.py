@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from dirax.geometry.subspaces import STRUCTURE_TOLERANCE, AnyArray
+from dirax.geometry.subspaces import AnyArray
+from dirax.numerics.tolerances import STRUCTURE_DEFECT
 
 Vector = Float[Array, " n"]
 Covector = Float[Array, " n"]
@@ -65,7 +66,7 @@ class GeneratingFunctionDirac(eqx.Module):
         return jnp.concatenate([*base, *covector]) - jnp.concatenate([*expected_base, *expected])
 
     def contains(
-        self, z0: Point, z1: Point, base: Mixed, covector: Mixed, tolerance: float = STRUCTURE_TOLERANCE
+        self, z0: Point, z1: Point, base: Mixed, covector: Mixed, tolerance: float = STRUCTURE_DEFECT
     ) -> Bool[AnyArray, ""]:
         """Whether (z0, z1, α) ∈ D^{d±}, to `tolerance` relative to the length of (z0, z1)."""
         defect = jnp.linalg.norm(self.membership_defect(z0, z1, base, covector))

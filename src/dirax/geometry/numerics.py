@@ -1,4 +1,4 @@
-"""Numerical building blocks of geometry: functions of a squared angle that are smooth at 0, and a small Newton root.
+"""Numerical building blocks of geometry: functions of a squared angle that are smooth at 0.
 
 Lengths and angles enter geometry through their squares, which are smooth where the norm is not. Each function knows its
 own derivative, so that derivatives of any order are accurate and finite, and cost little to compile.
@@ -9,9 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from dirax.program.formula import Formula
@@ -115,34 +113,3 @@ def norm(v: Float[Array, " n"]) -> Scalar:
 def _norm(v: Float[Array, " n"]) -> Scalar:
     s = jnp.sum(v * v)
     return jnp.where(s == 0.0, 0.0, jnp.sqrt(jnp.where(s == 0.0, 1.0, s)))
-
-
-def newton_root(
-    residual: Callable, guess: Float[Array, " k"], tolerance: float = 1e-9, max_steps: int = 40
-) -> Float[Array, " k"]:
-    """A root of `residual` (k,) → (k,) by Newton's method to the roundoff floor; NaN where it does not converge.
-
-    Traceable, and differentiable any number of times, forwards and backwards, by the implicit function theorem.
-    `tolerance` is on the last residual, relative to 1 + ‖root‖.
-    """
-
-    def solve(residual, guess):
-        def step(carry):
-            z, size, _, count = carry
-            update = jnp.linalg.solve(jax.jacfwd(residual)(z), residual(z))
-            return z - update, jnp.max(jnp.abs(update)), size, count + 1
-
-        def unfinished(carry):
-            _, size, previous, count = carry
-            still_shrinking = (size < 0.5 * previous) | (size > 1e-6)
-            return (count < max_steps) & (size > 0.0) & still_shrinking
-
-        start = (guess, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0)
-        z, *_ = lax.while_loop(unfinished, step, start)
-        converged = jnp.max(jnp.abs(residual(z))) <= tolerance * (1.0 + jnp.max(jnp.abs(z)))
-        return jnp.where(converged, z, jnp.nan)
-
-    def tangent_solve(linear, right_side):
-        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(right_side)), right_side)
-
-    return lax.custom_root(residual, guess, solve, tangent_solve)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
-from dirax.geometry.numerics import newton_root, norm
+from dirax.geometry.numerics import norm
+from dirax.numerics.newton import regular_root
 from dirax.program.linear_solves import solve
 
 
@@ -102,7 +103,7 @@ class ProjectedMap(AbstractDiscretizationMap):
             y0, y1 = self.forward(x, v)
             return jnp.concatenate([y0 - x0 + z[:n] - x, y1 - x1 + z[n:] - v])
 
-        return tangent(newton_root(residual, jnp.concatenate(self.map.backward(x0, x1))))
+        return tangent(regular_root(residual, jnp.concatenate(self.map.backward(x0, x1))))
 
     def reach(self, x, v):
         return self.map.reach(x, v)

@@ -7,13 +7,12 @@ from jaxtyping import Array, Float
 from dirax.geometry.representations import KernelPair
 from dirax.geometry.subspaces import (
     AnyArray,
-    UndecidableRank,
-    decide_rank,
     matrix_transpose,
     namespace,
     pseudo_inverse,
     uniform_rank,
 )
+from dirax.numerics.ranks import UndecidableRank, decide_rank
 from dirax.program.user_functions import is_traced
 
 

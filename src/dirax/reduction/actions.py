@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.tolerances import ACTION_DEFECT
 from dirax.program.linear_solves import solve
 from dirax.program.user_functions import UserFunction
 from dirax.reduction.connection import check_fibre, fibre_indices
@@ -103,5 +104,7 @@ class GroupAction(AbstractAction):
             ("action(g + h, q) = action(g, action(h, q))", act(g + h, q), act(g, act(h, q))),
         ):
             defect = float(np.max(np.abs(np.asarray(found) - np.asarray(wanted))))
-            if not defect <= 1e-9 * (1 + float(np.max(np.abs(np.asarray(wanted))))):
-                raise ValueError(f"action is none of an abelian group: {law} fails by {defect:.3g} at q = {np.asarray(q)}.")
+            if not defect <= ACTION_DEFECT * (1 + float(np.max(np.abs(np.asarray(wanted))))):
+                raise ValueError(
+                    f"the function is no action of an abelian group: {law} fails by {defect:.3g} at q = {np.asarray(q)}."
+                )

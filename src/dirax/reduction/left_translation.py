@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.numerics.tolerances import GROUP_DEFECT
 from dirax.program.user_functions import is_traced
 from dirax.reduction.actions import AbstractAction
 
@@ -36,7 +37,7 @@ class LeftTranslation(AbstractAction):
         name, size = type(self.group).__name__, self.group.ambient_dimension
         if jnp.shape(q) != (size,):
             raise ValueError(f"an element of {name} has shape ({size},), but q has shape {jnp.shape(q)}.")
-        if not is_traced(q) and not float(self.group.defect(q)) < 1e-9:
+        if not is_traced(q) and not float(self.group.defect(q)) < GROUP_DEFECT:
             raise ValueError(f"q = {np.asarray(q)} is no element of {name}: it is off by {float(self.group.defect(q)):.3g}.")
 
     def __call__(self, g: Float[Array, " d"], q: Float[Array, " N"]) -> Float[Array, " N"]:
