@@ -32,6 +32,7 @@ def energy_less_work(sol: Solution) -> tuple[np.ndarray, bool, str]:
 
 
 def energy_line(sol: Solution) -> Line:
+    """The line of the energy, less the work of forces: bounded or drifting, or why it was not checked."""
     name = "energy"
     try:
         energy, forced, changes = energy_less_work(sol)

@@ -33,9 +33,12 @@ def radial(order: int, s: Scalar) -> Scalar:
 
 @dataclass(frozen=True)
 class Radial(Formula):
+    """f_n of `radial` as a formula with a derivative of its own, −f_{n+1}/2."""
+
     order: int
 
     def value(self, xp, x):
+        """f_n(s): its series near 0, the recurrence elsewhere."""
         (s,), order = x, self.order
         if order <= 1:
             # finite also for a derivative that is taken through the root, as that of a scalar graph is
@@ -57,6 +60,7 @@ class Radial(Formula):
         return _piecewise(xp, s, RADIAL_SERIES_BELOW, coefficients, by_recurrence)
 
     def slopes(self):
+        """−½ f_{n+1}."""
         return ((-0.5, Radial(self.order + 1)),)
 
 
@@ -71,9 +75,12 @@ def arc_over_sine(order: int, near: Scalar, far: Scalar) -> Scalar:
 
 @dataclass(frozen=True)
 class ArcOverSine(Formula):
+    """F^(n) of `arc_over_sine` as a formula with a derivative of its own."""
+
     order: int
 
     def value(self, xp, x):
+        """F^(n): its series near 0, the recurrence of the hypergeometric function elsewhere."""
         (near, far), order = x, self.order
         far = xp.where(far < TINY, 1.0, far)
 
@@ -94,6 +101,7 @@ class ArcOverSine(Formula):
         return _piecewise(xp, near, ARC_SERIES_BELOW, coefficients, by_recurrence)
 
     def slopes(self):
+        """F^(n+1), by the first argument alone."""
         return (1.0, ArcOverSine(self.order + 1)), None  # near + far = 1, so F is a function of near alone
 
 

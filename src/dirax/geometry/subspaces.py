@@ -17,8 +17,8 @@ from dirax.numerics.ranks import decide_rank
 from dirax.numerics.tolerances import STRUCTURE_DEFECT, STRUCTURE_RANK
 from dirax.program.user_functions import is_traced
 
-AnyArray = Array | np.ndarray
-"""Numbers that are known (numpy) or traced (JAX)."""
+AnyArray = Array | np.ndarray | np.generic
+"""Numbers that are known (numpy, also one that has lost its axes) or traced (JAX)."""
 
 
 def known(array: Any) -> Any:
