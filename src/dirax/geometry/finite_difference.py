@@ -20,7 +20,7 @@ from dirax.program.user_functions import UserFunction, is_traced
 
 Vector = Float[Array, " n"]
 Covector = Float[Array, " n"]
-PhasePoint = Float[Array, " 2*n"]
+PhasePoint = Float[Array, " two_n"]
 
 
 def annihilator_projector(one_forms: Float[Array, "m n"]) -> Float[Array, "n n"]:

@@ -60,7 +60,7 @@ class GeneratingFunctionDirac(eqx.Module):
         """
         return self.flat_inverse(base, jax.grad(function, argnums=(0, 1))(*base))
 
-    def membership_defect(self, z0: Point, z1: Point, base: Mixed, covector: Mixed) -> Float[Array, " 4*n"]:
+    def membership_defect(self, z0: Point, z1: Point, base: Mixed, covector: Mixed) -> Float[Array, " four_n"]:
         """(base, covector) − Ω♭_{d±}(z0, z1), side by side: zero iff (z0, z1, α) ∈ D^{d±}."""
         expected_base, expected = self.flat(z0, z1)
         return jnp.concatenate([*base, *covector]) - jnp.concatenate([*expected_base, *expected])

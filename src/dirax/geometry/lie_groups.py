@@ -21,6 +21,8 @@ from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import Scalar, arc_over_sine, norm, radial
 
 Algebra: TypeAlias = Float[Array, " d"]
+Rotation: TypeAlias = Float[Array, " r"]
+Translation: TypeAlias = Float[Array, " l"]
 
 
 @contextmanager
@@ -113,25 +115,25 @@ class AbstractLieGroup(AbstractGeodesicManifold):
     def _as_jaxlie(self, g: Vector) -> jaxlie.MatrixLieGroup:
         return self.jaxlie_group(g)
 
-    def _split(self, x: Vector) -> tuple[Vector, Vector]:
+    def _split(self, x: Vector) -> tuple[Rotation, Translation]:
         return x[: self.rotation_product.shape[0]], x[self.rotation_product.shape[0] :]
 
-    def _join(self, rotation: Vector, translation: Callable[[], Vector]) -> Vector:
+    def _join(self, rotation: Rotation, translation: Callable[[], Translation]) -> Vector:
         return jnp.concatenate([rotation, translation()]) if self.translations else rotation
 
-    def _product(self, rotation: Vector, other: Vector) -> Vector:
+    def _product(self, rotation: Rotation, other: Rotation) -> Rotation:
         return jnp.sum(self.rotation_product * (rotation[None, :, None] * other[None, None, :]), axis=(1, 2))
 
-    def _conjugate(self, rotation: Vector) -> Vector:
+    def _conjugate(self, rotation: Rotation) -> Rotation:
         return rotation * np.array([1.0] + [-1.0] * (rotation.shape[0] - 1))
 
-    def _rotate(self, rotation: Vector, v: Vector) -> Vector:
+    def _rotate(self, rotation: Rotation, v: Translation) -> Translation:
         if self.translations == 2:
             return self._product(rotation, v)
         spin = self._product(rotation, jnp.concatenate([jnp.zeros(1), v]))
         return self._product(spin, self._conjugate(rotation))[1:]
 
-    def _spin_lengths(self, spin: Vector) -> Vector:
+    def _spin_lengths(self, spin: Rotation) -> Float[Array, " s"]:
         return spin[1:] / self.rotation_basis[-1, -1]
 
     # ------------------------------------------------------------------ the manifold

@@ -16,7 +16,7 @@ from dirax.numerics.ranks import UndecidableRank, decide_rank
 from dirax.program.user_functions import is_traced
 
 
-def block_diagonal(first: Float[AnyArray, "*batch i j"], second: Float[AnyArray, "*batch k l"]) -> Float[AnyArray, "*batch m n"]:
+def block_diagonal(first: Float[AnyArray, "*#batch i j"], second: Float[AnyArray, "*#batch k l"]) -> Float[AnyArray, "*all m n"]:
     """[[first, 0], [0, second]] over broadcast leading axes."""
     upper = np.zeros((*first.shape[:-1], second.shape[-1]))
     lower = np.zeros((*second.shape[:-1], first.shape[-1]))
@@ -82,7 +82,7 @@ def _require_decided(matrix: np.ndarray, internal: np.ndarray, what: str, tolera
         )
 
 
-def rows(upper: Float[AnyArray, "*batch i k"], lower: Float[AnyArray, "*batch j k"]) -> Float[AnyArray, "*batch m k"]:
+def rows(upper: Float[AnyArray, "*#batch i k"], lower: Float[AnyArray, "*#batch j k"]) -> Float[AnyArray, "*all m k"]:
     """[upper; lower] over broadcast leading axes."""
     xp = namespace(upper, lower)
     batch = np.broadcast_shapes(upper.shape[:-2], lower.shape[:-2])

@@ -230,7 +230,7 @@ class Product(AbstractGeodesicManifold):
         self.dimension = sum(factor.dimension for factor in factors)
         self.ambient_dimension = sum(factor.ambient_dimension for factor in factors)
 
-    def split(self, x: Vector) -> list[Vector]:
+    def split(self, x: Vector) -> list[Array]:
         """The ambient blocks of x, one a factor."""
         return jnp.split(x, np.cumsum([factor.ambient_dimension for factor in self.factors])[:-1].tolist())
 

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from dirax.numerics.ranks import decide_rank
 from dirax.numerics.tolerances import STRUCTURE_DEFECT, STRUCTURE_RANK
@@ -120,7 +120,7 @@ class PontryaginSubspace(eqx.Module):
     The open port-Hamiltonian set of [BLM] (22) is one that is coisotropic without being Dirac.
     """
 
-    basis: Float[Array, "*batch 2*n k"] = eqx.field(converter=jnp.asarray)
+    basis: Float[Array, "*batch two_n k"] = eqx.field(converter=jnp.asarray)
 
     @classmethod
     def from_image(cls, A: ArrayLike, B: ArrayLike, tolerance: float = STRUCTURE_RANK) -> "PontryaginSubspace":
@@ -189,7 +189,7 @@ class PontryaginSubspace(eqx.Module):
         return self.is_isotropic(tolerance) & (self.dimension == self.n)
 
 
-def uniform_rank(ranks: np.ndarray, what: str) -> int:
+def uniform_rank(ranks: Int[AnyArray, "*batch"], what: str) -> int:
     """The one rank of a whole batch; raises where it differs between members."""
     distinct = np.unique(ranks)
     if distinct.size > 1:

@@ -9,6 +9,9 @@ from jaxtyping import ArrayLike
 from dirax.numerics.equilibration import equilibrated
 from dirax.numerics.tolerances import EQUATION_RANK, RANK_GAP, RANK_ROUNDOFF, STRUCTURE_RANK, TINY
 
+Ranks = np.ndarray | np.integer
+"""One whole number for each matrix of a batch, which NumPy gives without axes for a single one."""
+
 
 class UndecidableRank(ValueError):
     """The singular values of a matrix do not separate into zero and nonzero ones."""
@@ -20,7 +23,7 @@ def significant(values: Any, tolerance: float, least: float = TINY, xp: ModuleTy
     return values > tolerance * xp.maximum(values.max(axis=-1, keepdims=True, initial=0.0), least)
 
 
-def numerical_rank(values: np.ndarray, tolerance: float, least: float = TINY) -> np.ndarray:
+def numerical_rank(values: np.ndarray, tolerance: float, least: float = TINY) -> Ranks:
     """How many of the singular values (…, k) are `significant`: integers (…)."""
     return np.sum(significant(values, tolerance, least), axis=-1)
 
@@ -35,9 +38,7 @@ def rank_of_equations(matrices: np.ndarray, tolerance: float = EQUATION_RANK) ->
     return numerical_rank(values, tolerance), directions
 
 
-def decide_rank(
-    singular_values: ArrayLike, what: str, tolerance: float = STRUCTURE_RANK, scale: float | None = None
-) -> np.ndarray:
+def decide_rank(singular_values: ArrayLike, what: str, tolerance: float = STRUCTURE_RANK, scale: float | None = None) -> Ranks:
     """Number of singular values above `tolerance * scale`, along the last axis; `scale` is the largest one by default.
 
     Raises `UndecidableRank` where a singular value lies within a factor `RANK_GAP` of that threshold, unless it is below

@@ -11,7 +11,7 @@ from dirax.reduction.actions import AbstractAction
 
 
 class LeftTranslation(AbstractAction):
-    """Φ_ξ(q) = exp(ξ) q for algebra vectors ξ (d,) and elements q (N,) of `group`, not an abelian action.
+    """Φ_ξ(q) = exp(ξ) q for algebra vectors ξ (d,) and elements q (N,) of `group`.
 
     It is known by its generators ξ_Q(q) = ξ q: `dx.check_invariance` finds with them whether L(q, v) on TG is left-invariant,
     `momentum_map(q, p)` is the spatial momentum Ad*_{g⁻¹}μ, and `generator` serves `dx.verify`.
@@ -19,7 +19,7 @@ class LeftTranslation(AbstractAction):
         left = dx.LeftTranslation(dx.SO3())
         dx.verify(dx.reconstruct(sol), symmetries={"about z": lambda q: left.generator(jnp.array([0.0, 0.0, 1.0]), q)})
 
-    Raises `TypeError` for a group that is none, and `ValueError`, with the defect, for a q that is no element of it.
+    Raises `TypeError` for what is no Lie group of dirax, and `ValueError`, with the defect, for a q that is no element of it.
     """
 
     group: AbstractLieGroup
