@@ -110,7 +110,7 @@ def structures_and_systems() -> None:
     damped = dx.PortHamiltonian(lambda x: x @ x / 2, TURN, R=np.diag([0.0, 0.1]))
     assert dx.simulate(damped, dx.DiscreteGradient(), x=rng, step=0.01, steps=3).ok
     vortex = dx.PhaseSpaceLagrangian(lambda q: jnp.array([-q[1], q[0]]) / 2, lambda q: q @ q / 2)
-    assert dx.simulate(vortex, dx.PlusLagrangeDirac(), q=rng, step=0.01, steps=3).ok
+    assert dx.simulate(vortex, dx.DiscreteDirac(), q=rng, step=0.01, steps=3).ok
 
 
 if __name__ == "__main__":

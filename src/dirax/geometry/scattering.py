@@ -42,12 +42,12 @@ def nearest_orthogonal(matrix: Float[AnyArray, "*batch n n"]) -> Float[AnyArray,
 
 
 def eliminate(
-    F: Float[AnyArray, "*batch m n"],
-    E: Float[AnyArray, "*batch m n"],
-    internal: Float[AnyArray, "*batch m l"],
+    F: Float[AnyArray, "*#batch m n"],
+    E: Float[AnyArray, "*#batch m n"],
+    internal: Float[AnyArray, "*#batch m l"],
     what: str,
     tolerance: float,
-) -> Float[AnyArray, "*batch n n"]:
+) -> Float[AnyArray, "*all n n"]:
     """The scattering matrix of {(v, α) : F v + E α + G z = 0 for some z}, from m = n + l equations with G = `internal`.
 
     With v = (s + d)/2 and α = (s − d)/2 the unknowns are the wave s and z. The wave is unique for every d even where z
