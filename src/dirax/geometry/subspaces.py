@@ -5,7 +5,7 @@ Dirac according to how it lies in its orthogonal U^⊥; `LinearDirac` (linear.py
 """
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -17,8 +17,11 @@ from dirax.numerics.ranks import decide_rank
 from dirax.numerics.tolerances import STRUCTURE_DEFECT, STRUCTURE_RANK
 from dirax.program.user_functions import is_traced
 
-AnyArray = Array | np.ndarray | np.generic
-"""Numbers that are known (numpy, also one that has lost its axes) or traced (JAX)."""
+if TYPE_CHECKING:
+    AnyArray: TypeAlias = Array | np.ndarray
+else:
+    AnyArray = Array | np.ndarray | np.generic  # a number from which NumPy took the axes is an array without any
+"""Numbers that are known (numpy) or traced (JAX)."""
 
 
 def known(array: Any) -> Any:

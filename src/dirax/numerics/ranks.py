@@ -9,9 +9,6 @@ from jaxtyping import ArrayLike
 from dirax.numerics.equilibration import equilibrated
 from dirax.numerics.tolerances import EQUATION_RANK, RANK_GAP, RANK_ROUNDOFF, STRUCTURE_RANK, TINY
 
-Ranks = np.ndarray | np.integer
-"""One whole number for each matrix of a batch, which NumPy gives without axes for a single one."""
-
 
 class UndecidableRank(ValueError):
     """The singular values of a matrix do not separate into zero and nonzero ones."""
@@ -23,9 +20,9 @@ def significant(values: Any, tolerance: float, least: float = TINY, xp: ModuleTy
     return values > tolerance * xp.maximum(values.max(axis=-1, keepdims=True, initial=0.0), least)
 
 
-def numerical_rank(values: np.ndarray, tolerance: float, least: float = TINY) -> Ranks:
+def numerical_rank(values: np.ndarray, tolerance: float, least: float = TINY) -> np.ndarray:
     """How many of the singular values (…, k) are `significant`: integers (…)."""
-    return np.sum(significant(values, tolerance, least), axis=-1)
+    return np.asarray(np.sum(significant(values, tolerance, least), axis=-1))
 
 
 def rank_of_equations(matrices: np.ndarray, tolerance: float = EQUATION_RANK) -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +35,9 @@ def rank_of_equations(matrices: np.ndarray, tolerance: float = EQUATION_RANK) ->
     return numerical_rank(values, tolerance), directions
 
 
-def decide_rank(singular_values: ArrayLike, what: str, tolerance: float = STRUCTURE_RANK, scale: float | None = None) -> Ranks:
+def decide_rank(
+    singular_values: ArrayLike, what: str, tolerance: float = STRUCTURE_RANK, scale: float | None = None
+) -> np.ndarray:
     """Number of singular values above `tolerance * scale`, along the last axis; `scale` is the largest one by default.
 
     Raises `UndecidableRank` where a singular value lies within a factor `RANK_GAP` of that threshold, unless it is below
@@ -57,4 +56,4 @@ def decide_rank(singular_values: ArrayLike, what: str, tolerance: float = STRUCT
             f"The rank of {what} is undecidable: relative singular values {np.array2string(worst, precision=3)} have "
             f"no gap around the tolerance {tolerance:.0e}. Give a tolerance that is {RANK_GAP:.0f} times away from them."
         )
-    return np.sum(relative > tolerance, axis=-1)
+    return np.asarray(np.sum(relative > tolerance, axis=-1))
