@@ -13,6 +13,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "dirax"
 ROOMS = (
     "float64",
     "text",
+    "numerics",
     "program",
     "geometry",
     "systems",

@@ -34,7 +34,6 @@ from dirax.geometry.projected_map import ProjectedMap, Submanifold
 from dirax.geometry.semidirect import SemidirectProduct
 from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
-from dirax.geometry.subspaces import UndecidableRank
 from dirax.geometry.tulczyjew import (
     DiscreteEvolution,
     FiniteDifferenceTriple,
@@ -43,6 +42,7 @@ from dirax.geometry.tulczyjew import (
     minus_legendre,
     plus_legendre,
 )
+from dirax.numerics.ranks import UndecidableRank
 from dirax.program.memo import clear_caches
 from dirax.reduction.actions import GroupAction, Translations
 from dirax.reduction.connection import DiscreteConnection, LinearConnection

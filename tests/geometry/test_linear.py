@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dirax.geometry.linear import LinearDirac
-from dirax.geometry.subspaces import PontryaginSubspace, UndecidableRank, pseudo_inverse
+from dirax.geometry.subspaces import PontryaginSubspace, pseudo_inverse
+from dirax.numerics.ranks import UndecidableRank
 
 FAST = settings(max_examples=60, deadline=None)
 DIMENSIONS = st.sampled_from([2, 3, 5, 8, 12])  # a few, for the sake of compile time; all of 2, …, 12 below

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dirax as dx
+from dirax.numerics.ranks import rank_of_equations
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.roots import nearest_root
-from dirax.run.start import numerical_rank
 
 numbers = st.floats(-3, 3, allow_subnormal=False)
 vectors = st.tuples(*[numbers] * 3).map(np.array)
@@ -143,9 +143,9 @@ def test_pseudo_inverse_and_rank_of_badly_scaled_matrices(seed, k, l, rank):
     matrix = units[0] * plain * units[1]
     inverse = np.asarray(pseudo_inverse(jnp.array(matrix))[0])
     np.testing.assert_allclose(matrix @ inverse @ matrix / units[0] / units[1], plain, atol=1e-7)
-    assert numerical_rank(matrix[None])[0][0] == rank
+    assert rank_of_equations(matrix[None])[0][0] == rank
     if rank < l:
-        direction = numerical_rank(matrix[None])[1][0]
+        direction = rank_of_equations(matrix[None])[1][0]
         assert np.max(np.abs(plain @ (direction / np.max(np.abs(direction * units[1])) * units[1][0]))) < 1e-7
 
 

@@ -10,11 +10,10 @@ from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import over_rows
 from dirax.geometry.group_retractions import coadjoint
 from dirax.geometry.semidirect import SemidirectProduct
+from dirax.numerics.ranks import numerical_rank
+from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.reduction.casimirs import casimirs
 from dirax.solution.solution import Solution
-
-ISOTROPY = 1e-10
-"""A direction of the algebra that moves a by less than this, relative to |a|, leaves it alone."""
 
 
 def casimir_lines(sol: Solution, tolerance: float | None) -> list[Line]:
@@ -68,7 +67,7 @@ def _isotropy(moved: np.ndarray) -> np.ndarray:
     if not len(moved):
         return np.eye(moved.shape[1])
     _, sizes, directions = np.linalg.svd(moved)
-    rank = int(np.sum(sizes > ISOTROPY * max(1e-300, sizes[0])))
+    rank = int(numerical_rank(sizes, STRUCTURE_DEFECT))
     return directions[rank:]
 
 

@@ -17,6 +17,7 @@ from dirax.systems.lagrange_dirac import LagrangeDirac
 
 
 def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolerance: float | None) -> Line | None:
+    """The line of the constraints at the nodes, or of those that a step imposes; None for a system without any."""
     name = "constraint"
     try:
         residual = constraint_of(sol)

@@ -8,9 +8,10 @@ import numpy as np
 
 from dirax.diagnostics.books import balances, has_power, keeps_books
 from dirax.diagnostics.drift import judge
-from dirax.diagnostics.judging import EPSILON, ROUNDINGS, of_lane, sampled_terms, steps_of
+from dirax.diagnostics.judging import ROUNDINGS, of_lane, sampled_terms, steps_of
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Line
 from dirax.diagnostics.rows import energy_of
+from dirax.numerics.tolerances import EPSILON
 from dirax.solution.solution import Solution
 
 JUMP = 1000.0
@@ -31,6 +32,7 @@ def energy_less_work(sol: Solution) -> tuple[np.ndarray, bool, str]:
 
 
 def energy_line(sol: Solution) -> Line:
+    """The line of the energy, less the work of forces: bounded or drifting, or why it was not checked."""
     name = "energy"
     try:
         energy, forced, changes = energy_less_work(sol)

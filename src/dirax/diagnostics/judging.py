@@ -7,9 +7,9 @@ import numpy as np
 
 from dirax.diagnostics.report import OK, VIOLATED, Line
 from dirax.diagnostics.rows import over_rows, times_at
+from dirax.numerics.tolerances import EPSILON
 from dirax.solution.solution import Solution
 
-EPSILON = 2.0**-52
 ROUNDINGS = 32
 """Roundings, each of half a unit in the last place, that the equations of one step are allowed, and their safety factor."""
 
@@ -55,10 +55,12 @@ def spread(count: int, most: int) -> np.ndarray:
 
 
 def of_lane(sol: Solution, lane: int) -> str:
+    """Which trajectory, in words; empty for a single one."""
     return "" if sol.batch is None else f" (trajectory {lane})"
 
 
 def steps_of(sol: Solution) -> int:
+    """The number of steps of the run, at least 1."""
     return max(1, round(float(sol.t[-1] - sol.t[0]) / float(sol.step)))
 
 

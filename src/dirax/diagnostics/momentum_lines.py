@@ -18,6 +18,7 @@ Symmetries = Mapping[str, Callable] | Sequence[int] | None
 
 
 def generators_of(sol: Solution, symmetries: Symmetries) -> dict[str, Callable]:
+    """The generators q ↦ ξ_Q(q) by name, from what `verify` was given; raises `TypeError` for anything else."""
     if symmetries is None:
         return {}
     if isinstance(symmetries, Mapping):
@@ -61,6 +62,7 @@ def _check_generator(name: str, generator: Callable, n: int) -> None:
 
 
 def momentum(sol: Solution, name: str, generator: Callable, tolerance: float | None) -> Line:
+    """The line of the momentum map ⟨p, ξ_Q(q)⟩ of one generator."""
     title = f"momentum map {name}"
     if "p" not in sol.fields or "q" not in sol.fields:
         return Line(title, None, None, NOT_CHECKED, "the solution has no q and p")

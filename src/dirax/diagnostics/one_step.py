@@ -4,11 +4,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from dirax.engines.xla.lane import first_lane, take_step
+from dirax.numerics.equilibration import condition_number
 from dirax.program.linear_solves import solve
-from dirax.schemes.discrete_structure import DifferentiatedStep, nonzero
+from dirax.schemes.discrete_structure import DifferentiatedStep
 
 MAX_ITERATIONS = 50
 
@@ -29,18 +29,9 @@ def differentiated_step(equation: Any, h: Any, state, guess, t, params) -> Diffe
         (residual_u, residual_x), (advance_u, advance_x) = jax.jacfwd(both, argnums=(0, 1))(u, state)
         if stage.unknowns:
             advance_x = advance_x - advance_u @ solve(residual_u, residual_x)
-            condition = jnp.maximum(condition, equilibrated_condition(residual_u))
+            condition = jnp.maximum(condition, condition_number(residual_u, jnp))
         jacobian = advance_x @ jacobian
         state = stage.advance(u, state, t, fraction * h, params)
         t = t + fraction * h
     good = after.completed > 0
     return DifferentiatedStep(jnp.where(good, state, jnp.nan), jnp.where(good, jacobian, jnp.nan), condition)
-
-
-def equilibrated_condition(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
-    """The condition number of a matrix after scaling its rows and columns to unit size."""
-    for _ in range(3):
-        matrix = matrix / nonzero(jnp.max(jnp.abs(matrix), axis=1, keepdims=True))
-        matrix = matrix / nonzero(jnp.max(jnp.abs(matrix), axis=0, keepdims=True))
-    values = jnp.linalg.svd(matrix, compute_uv=False)
-    return values[0] / values[-1]

@@ -33,6 +33,7 @@ def terms(g: Graph, node: int) -> dict[int, float]:
 
 
 def total(g: Graph, parts: dict[int, float]) -> int:
+    """The node of Σ coefficient·node, in the order of the nodes."""
     out = g.zero
     for node, coefficient in sorted(parts.items()):
         out = g.add(out, g.mul(g.constant(coefficient), node))

@@ -25,6 +25,7 @@ class Parameters:
 
     @property
     def size(self) -> int:
+        """How many numbers they are."""
         return sum(int(np.prod(s)) for s in self.shapes)
 
     @property

@@ -56,6 +56,7 @@ class Inputs:
 
 
 def inputs(g: Graph, size: int) -> Inputs:
+    """The nodes of t, h and `size` parameters."""
     return Inputs(g.input("t"), g.input("h"), [g.input(f"param{i}") for i in range(size)])
 
 

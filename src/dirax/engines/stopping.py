@@ -9,8 +9,7 @@ first two updates: what an update leaves is at most 2·ratio·update. The iterat
 It is written out in array operations in `xla/newton.py` and in machine code in `native/loops/newton_loop.py`.
 """
 
-EPSILON = 2.220446049250313e-16
-"""The distance from 1 to the next number."""
+from dirax.numerics.tolerances import EPSILON
 
 FLOOR = 8 * EPSILON
 """A relative update of this size is roundoff: the unknowns cannot be known better."""

@@ -28,24 +28,29 @@ class CotangentBundle(AbstractManifold):
         self.dimension, self.ambient_dimension = 2 * base.dimension, 2 * base.ambient_dimension
 
     def defect(self, x):
+        """The larger of those of q and of p as a tangent vector at q."""
         q, p = jnp.split(x, 2)
         return jnp.maximum(self.base.defect(q), self.base.tangent_defect(q, p))
 
     def nearest(self, x):
+        """The nearest q, and p projected to the tangent space there."""
         q, p = jnp.split(x, 2)
         q = self.base.nearest(q)
         return jnp.concatenate([q, self.base.projection(q, p)])
 
     def projection(self, x, v):
+        """q̇ projected to the tangent space, and ṗ made the derivative of a p that stays tangent along it."""
         (q, p), (q_dot, p_dot) = jnp.split(x, 2), jnp.split(v, 2)
         q_dot = self.base.projection(q, q_dot)
         return jnp.concatenate([q_dot, self.base.projection(q, p_dot) + moving_with(self.base, q, p, q_dot)])
 
     def representative(self, x, near):
+        """The representative of q nearest to that of `near`, with p carried along."""
         (q, p), target = jnp.split(x, 2), jnp.split(near, 2)[0]
         return jnp.concatenate(jax.jvp(lambda q: self.base.representative(q, target), (q,), (p,)))
 
     def local_parametrization(self, x):
+        """(r, s) ↦ the point of r on Q, and p + Fs projected there, F the frame at q."""
         q, p = jnp.split(x, 2)
         point, frame = self.base.local_parametrization(q), self.base.frame(q)
 
@@ -56,12 +61,14 @@ class CotangentBundle(AbstractManifold):
         return parametrization
 
     def frame(self, x):
+        """The derivative of the parametrization at 0: of q with the p it moves, then of p alone."""
         q, p = jnp.split(x, 2)
         frame = self.base.frame(q)
         moving = jax.vmap(lambda direction: moving_with(self.base, q, p, direction), 1, 1)(frame)
         return jnp.block([[frame, jnp.zeros_like(frame)], [moving, frame]])
 
     def coordinates(self, x, v):
+        """The components of q̇ and of ṗ in the frame of Q."""
         (q, _), (q_dot, p_dot) = jnp.split(x, 2), jnp.split(v, 2)
         return jnp.concatenate([self.base.coordinates(q, q_dot), self.base.coordinates(q, p_dot)])
 
@@ -80,6 +87,7 @@ class CotangentLift(AbstractDiscretizationMap):
     map: AbstractDiscretizationMap
 
     def manifold(self, ambient_dimension):
+        """T*Q for the manifold Q of the map; `ValueError` for points of odd length, `TypeError` for a second lift off R^n."""
         if ambient_dimension % 2:
             raise ValueError(f"A point of T*Q is (q, p), of even length, but one of length {ambient_dimension} came.")
         base = self.map.manifold(ambient_dimension // 2)
@@ -89,9 +97,11 @@ class CotangentLift(AbstractDiscretizationMap):
 
     @property
     def base_fraction(self):
+        """That of the map."""
         return self.map.base_fraction
 
     def forward(self, x, v):
+        """((q0, p0), (q1, p1)) with (−p0, p1) = J^{−T}(ṗ, p)."""
         (q, p), (q_dot, p_dot) = jnp.split(x, 2), jnp.split(v, 2)
         base = self.map.manifold(q.shape[0])
         q0, q1 = self.map.forward(q, q_dot)
@@ -102,6 +112,7 @@ class CotangentLift(AbstractDiscretizationMap):
         )
 
     def backward(self, x0, x1):
+        """(q, q̇) = R_d⁻¹(q0, q1) and (ṗ, p) = Jᵀ(−p0, p1), as x = (q, p) and v = (q̇, ṗ)."""
         (q0, p0), (q1, p1) = jnp.split(x0, 2), jnp.split(x1, 2)
         base = self.map.manifold(q0.shape[0])
         q1, p1 = jax.jvp(lambda q: base.representative(q, q0), (q1,), (p1,))
@@ -115,6 +126,7 @@ class CotangentLift(AbstractDiscretizationMap):
         )
 
     def reach(self, x, v):
+        """That of the map at (q, q̇)."""
         return self.map.reach(jnp.split(x, 2)[0], jnp.split(v, 2)[0])
 
 

@@ -16,7 +16,8 @@ from dirax.geometry.generating_functions import GeneratingFunctionDirac
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.structures import DiracStructure
-from dirax.geometry.subspaces import STRUCTURE_TOLERANCE, AnyArray
+from dirax.geometry.subspaces import AnyArray
+from dirax.numerics.tolerances import STRUCTURE_DEFECT
 
 __all__ = [
     "DiscretizationMapDirac",
@@ -71,7 +72,7 @@ class DiscretizationMapDirac(eqx.Module):
         return F @ v + E @ covector
 
     def contains(
-        self, x0: Vector, x1: Vector, covector: Covector, params: Any = None, tolerance: float = STRUCTURE_TOLERANCE
+        self, x0: Vector, x1: Vector, covector: Covector, params: Any = None, tolerance: float = STRUCTURE_DEFECT
     ) -> Bool[AnyArray, ""]:
         """Whether ((x0, x1), α) ∈ D_d: the distance of (v, α) from D is at most `tolerance` of its length."""
         x, v = self.velocity(x0, x1)

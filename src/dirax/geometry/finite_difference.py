@@ -14,15 +14,13 @@ from jaxtyping import Array, Bool, Float
 
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.structures import canonical_two_form
-from dirax.geometry.subspaces import STRUCTURE_TOLERANCE, AnyArray
+from dirax.geometry.subspaces import AnyArray
+from dirax.numerics.tolerances import ONE_FORM_RANK, STRUCTURE_DEFECT
 from dirax.program.user_functions import UserFunction, is_traced
 
 Vector = Float[Array, " n"]
 Covector = Float[Array, " n"]
-PhasePoint = Float[Array, " 2*n"]
-
-DEPENDENT = 1e-12
-"""Singular values of W below this, relative to the largest, span no one-form."""
+PhasePoint = Float[Array, " two_n"]
 
 
 def annihilator_projector(one_forms: Float[Array, "m n"]) -> Float[Array, "n n"]:
@@ -33,7 +31,7 @@ def annihilator_projector(one_forms: Float[Array, "m n"]) -> Float[Array, "n n"]
     """
     if one_forms.shape[0] == 0:
         return jnp.zeros((one_forms.shape[1], one_forms.shape[1]))
-    return jnp.linalg.pinv(one_forms, rtol=DEPENDENT) @ one_forms
+    return jnp.linalg.pinv(one_forms, rtol=ONE_FORM_RANK) @ one_forms
 
 
 class FiniteDifferenceDirac(eqx.Module):
@@ -96,7 +94,7 @@ class FiniteDifferenceDirac(eqx.Module):
         return self.constraint(x0, x1, params), force - onto @ force
 
     def contains(
-        self, x0: Vector, x1: Vector, covector: Covector, params: Any = None, tolerance: float = STRUCTURE_TOLERANCE
+        self, x0: Vector, x1: Vector, covector: Covector, params: Any = None, tolerance: float = STRUCTURE_DEFECT
     ) -> Bool[AnyArray, ""]:
         """Whether ((x0, x1), α) ∈ D^{d±} ([PY] Theorem 5.7): its distance is at most `tolerance` of its length."""
         vector = self.velocity(x0, x1)
@@ -213,7 +211,7 @@ class InducedFiniteDifferenceDirac(eqx.Module):
         beta: Covector,
         gamma: Vector,
         params: Any = None,
-        tolerance: float = STRUCTURE_TOLERANCE,
+        tolerance: float = STRUCTURE_DEFECT,
     ) -> Bool[AnyArray, ""]:
         """Whether the element is in D^{d±} ([PY] Proposition 5.17): its distance is at most `tolerance` of its length."""
         base, _ = self.base_point(q0, q1, momenta)

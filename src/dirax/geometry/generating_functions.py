@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from dirax.geometry.subspaces import STRUCTURE_TOLERANCE, AnyArray
+from dirax.geometry.subspaces import AnyArray
+from dirax.numerics.tolerances import STRUCTURE_DEFECT
 
 Vector = Float[Array, " n"]
 Covector = Float[Array, " n"]
@@ -59,13 +60,13 @@ class GeneratingFunctionDirac(eqx.Module):
         """
         return self.flat_inverse(base, jax.grad(function, argnums=(0, 1))(*base))
 
-    def membership_defect(self, z0: Point, z1: Point, base: Mixed, covector: Mixed) -> Float[Array, " 4*n"]:
+    def membership_defect(self, z0: Point, z1: Point, base: Mixed, covector: Mixed) -> Float[Array, " four_n"]:
         """(base, covector) − Ω♭_{d±}(z0, z1), side by side: zero iff (z0, z1, α) ∈ D^{d±}."""
         expected_base, expected = self.flat(z0, z1)
         return jnp.concatenate([*base, *covector]) - jnp.concatenate([*expected_base, *expected])
 
     def contains(
-        self, z0: Point, z1: Point, base: Mixed, covector: Mixed, tolerance: float = STRUCTURE_TOLERANCE
+        self, z0: Point, z1: Point, base: Mixed, covector: Mixed, tolerance: float = STRUCTURE_DEFECT
     ) -> Bool[AnyArray, ""]:
         """Whether (z0, z1, α) ∈ D^{d±}, to `tolerance` relative to the length of (z0, z1)."""
         defect = jnp.linalg.norm(self.membership_defect(z0, z1, base, covector))

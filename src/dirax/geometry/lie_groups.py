@@ -21,6 +21,8 @@ from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
 from dirax.geometry.numerics import Scalar, arc_over_sine, norm, radial
 
 Algebra: TypeAlias = Float[Array, " d"]
+Rotation: TypeAlias = Float[Array, " r"]
+Translation: TypeAlias = Float[Array, " l"]
 
 
 @contextmanager
@@ -113,41 +115,45 @@ class AbstractLieGroup(AbstractGeodesicManifold):
     def _as_jaxlie(self, g: Vector) -> jaxlie.MatrixLieGroup:
         return self.jaxlie_group(g)
 
-    def _split(self, x: Vector) -> tuple[Vector, Vector]:
+    def _split(self, x: Vector) -> tuple[Rotation, Translation]:
         return x[: self.rotation_product.shape[0]], x[self.rotation_product.shape[0] :]
 
-    def _join(self, rotation: Vector, translation: Callable[[], Vector]) -> Vector:
+    def _join(self, rotation: Rotation, translation: Callable[[], Translation]) -> Vector:
         return jnp.concatenate([rotation, translation()]) if self.translations else rotation
 
-    def _product(self, rotation: Vector, other: Vector) -> Vector:
+    def _product(self, rotation: Rotation, other: Rotation) -> Rotation:
         return jnp.sum(self.rotation_product * (rotation[None, :, None] * other[None, None, :]), axis=(1, 2))
 
-    def _conjugate(self, rotation: Vector) -> Vector:
+    def _conjugate(self, rotation: Rotation) -> Rotation:
         return rotation * np.array([1.0] + [-1.0] * (rotation.shape[0] - 1))
 
-    def _rotate(self, rotation: Vector, v: Vector) -> Vector:
+    def _rotate(self, rotation: Rotation, v: Translation) -> Translation:
         if self.translations == 2:
             return self._product(rotation, v)
         spin = self._product(rotation, jnp.concatenate([jnp.zeros(1), v]))
         return self._product(spin, self._conjugate(rotation))[1:]
 
-    def _spin_lengths(self, spin: Vector) -> Vector:
+    def _spin_lengths(self, spin: Rotation) -> Float[Array, " s"]:
         return spin[1:] / self.rotation_basis[-1, -1]
 
     # ------------------------------------------------------------------ the manifold
 
     def defect(self, x):
+        """| ‖rotation‖ − 1 |; translations are anything."""
         return jnp.abs(norm(self._split(x)[0]) - 1.0)
 
     def nearest(self, x):
+        """The rotation divided by its length, the translation as it is."""
         rotation, translation = self._split(x)
         return self._join(rotation / norm(rotation), lambda: translation)
 
     def projection(self, x, v):
+        """v without the part of its rotation along the rotation of x."""
         (rotation, _), (spin, shift) = self._split(x), self._split(v)
         return self._join(spin - rotation * jnp.dot(rotation, spin), lambda: shift)
 
     def representative(self, x, near):
+        """Of a unit quaternion and its negative, the one nearer to that of `near`; else x."""
         if not self.double_cover:
             return x
         rotation, translation = self._split(x)
@@ -155,37 +161,48 @@ class AbstractLieGroup(AbstractGeodesicManifold):
         return self._join(sign * rotation, lambda: translation)
 
     def local_parametrization(self, x):
+        """r ↦ x exp(r), with the roundoff of products taken away."""
         return lambda r: self.nearest(self.multiply(x, self.group_exp(r)))
 
     def frame(self, x):
+        """The left-invariant frame: x e_i for the basis e_i of the algebra, as columns."""
         return jax.vmap(lambda xi: self.left_translate(x, xi), out_axes=1)(jnp.eye(self.dimension))
 
     def coordinates(self, x, v):
+        """The algebra vector x⁻¹v."""
         return self.to_algebra(x, v)
 
     def exp(self, x, v):
+        """x exp(x⁻¹v), along the one-parameter subgroups."""
         return self.multiply(x, self.group_exp(self.to_algebra(x, v)))
 
     def log(self, x, y):
+        """x log(x⁻¹y)."""
         return self.left_translate(x, self.group_log(self.multiply(self.inverse(x), y)))
 
     def distance(self, x, y):
+        """The angle of the rotation from x to y and the distance of the translations, as legs of a right triangle."""
         relative = self.group_log(self.multiply(self.inverse(x), y))
         return norm(jnp.append(self._split(x)[1] - self._split(y)[1], self._angle(relative)))
 
     def transport(self, x, v, y):
+        """y x⁻¹v: left translation."""
         return self.left_translate(y, self.to_algebra(x, v))
 
     def retraction(self, x, v):
+        """exp(x, v)."""
         return self.exp(x, v)
 
     def inverse_retraction(self, x, y):
+        """log(x, y)."""
         return self.log(x, y)
 
     def exp_reach(self, x, v):
+        """The angle of rotation over π."""
         return self._angle(self.to_algebra(x, v)) / jnp.pi
 
     def retraction_reach(self, x, v):
+        """That of `exp`."""
         return self.exp_reach(x, v)
 
     def _angle(self, xi: Algebra) -> Scalar:
@@ -217,9 +234,11 @@ class SO2(AbstractLieGroup):
     def __init__(self): ...
 
     def group_exp(self, xi):
+        """(cos ξ, sin ξ)."""
         return jnp.concatenate([jnp.cos(xi), jnp.sin(xi)])
 
     def group_log(self, g):
+        """The angle of (cos, sin), in (−π, π]."""
         return jnp.arctan2(g[1:2], g[0:1])
 
 
@@ -234,12 +253,14 @@ class SE2(AbstractLieGroup):
     def __init__(self): ...
 
     def group_exp(self, xi):
+        """The turn by the angle θ, and (sin θ/θ) u + ((1 − cos θ)/θ) u^⊥ for the velocity u."""
         velocity, angle = xi[:2], xi[2]
         along, across = radial(1, angle**2), angle / 2.0 * radial(1, angle**2 / 4.0) ** 2
         rotation = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         return jnp.concatenate([rotation, along * velocity + across * quarter_turn(velocity)])
 
     def group_log(self, g):
+        """The inverse of `group_exp` with an angle in (−π, π]."""
         angle, translation = jnp.arctan2(g[1], g[0]), g[2:]
         s = angle**2 / 4.0
         velocity = radial(0, s) / radial(1, s) * translation - angle / 2.0 * quarter_turn(translation)
@@ -260,9 +281,11 @@ class SO3(AbstractLieGroup):
     def __init__(self): ...
 
     def group_exp(self, xi):
+        """The unit quaternion (cos θ/2, sin(θ/2) ω/θ), θ = |ω|."""
         return _quaternion_exp(xi)
 
     def group_log(self, g):
+        """The inverse of `group_exp` with an angle of at most π."""
         return _quaternion_log(g)
 
 
@@ -277,6 +300,7 @@ class SE3(AbstractLieGroup):
     def __init__(self): ...
 
     def group_exp(self, xi):
+        """The rotation of ω, and u + ((1 − cos θ)/θ²) ω × u + ((θ − sin θ)/θ³) ω × (ω × u) for the velocity u."""
         velocity, omega = xi[:3], xi[3:]
         s = jnp.dot(omega, omega) / 4.0
         sinc = radial(1, s)
@@ -286,6 +310,7 @@ class SE3(AbstractLieGroup):
         return jnp.concatenate([_quaternion_exp(omega), velocity + second * once + third * cross(omega, once)])
 
     def group_log(self, g):
+        """The inverse of `group_exp` with an angle of at most π."""
         omega, translation = _quaternion_log(g[:4]), g[4:]
         s = jnp.dot(omega, omega) / 4.0
         once = cross(omega, translation)
@@ -306,8 +331,10 @@ def _quaternion_log(q: Float[Array, " 4"]) -> Float[Array, " 3"]:
 
 
 def quarter_turn(v: Float[Array, " 2"]) -> Float[Array, " 2"]:
+    """A vector of the plane turned by π/2 to the left."""
     return jnp.stack([-v[1], v[0]])
 
 
 def cross(a: Float[Array, " 3"], b: Float[Array, " 3"]) -> Float[Array, " 3"]:
+    """a × b as one product with the Levi-Civita symbol, which differentiates into products alone."""
     return jnp.sum(_LEVI_CIVITA * (a[None, :, None] * b[None, None, :]), axis=(1, 2))

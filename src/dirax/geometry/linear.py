@@ -27,8 +27,6 @@ from dirax.geometry.representations import (
 )
 from dirax.geometry.scattering import block_diagonal, eliminate, inverse_on_range, range_basis, rows, scattering_matrix
 from dirax.geometry.subspaces import (
-    RANK_TOLERANCE,
-    STRUCTURE_TOLERANCE,
     AnyArray,
     PontryaginSubspace,
     as_matrix,
@@ -37,12 +35,7 @@ from dirax.geometry.subspaces import (
     namespace,
     pairing_defect,
 )
-
-TRANSVERSALITY_TOLERANCE = 1e-12
-"""Relative singular value below which a pull-back, push-forward or composition counts as not transversal.
-
-Smaller than RANK_TOLERANCE, since such a singular value may be the square of the angle at which two subspaces meet.
-"""
+from dirax.numerics.tolerances import STRUCTURE_DEFECT, STRUCTURE_RANK, TRANSVERSALITY
 
 
 class LinearDirac(eqx.Module):
@@ -152,7 +145,7 @@ class LinearDirac(eqx.Module):
         """D as a subspace of V ⊕ V*."""
         return PontryaginSubspace(namespace(self.scattering).concatenate(_image(self), axis=-2))
 
-    def distribution(self, rank: int | None = None, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n k"]:
+    def distribution(self, rank: int | None = None, tolerance: float = STRUCTURE_RANK) -> Float[Array, "*batch n k"]:
         """Orthonormal basis, by columns, of F_D, the projection of D on V ([BLM] Proposition 2.3).
 
         Raises `UndecidableRank` where k is unclear, ValueError where it varies over the batch; with `rank` given it is
@@ -160,7 +153,7 @@ class LinearDirac(eqx.Module):
         """
         return range_basis(_image(self)[0], "the projection of D on V", rank, tolerance)
 
-    def two_form(self, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n n"]:
+    def two_form(self, tolerance: float = STRUCTURE_RANK) -> Float[Array, "*batch n n"]:
         """ω_D, the two-form on F_D given by ω_D(u, v) = α(v) for (u, α) ∈ D ([BLM] Proposition 2.3).
 
         Returned on all of V, extended by zero on the Euclidean complement of F_D; `distribution()` and it
@@ -170,14 +163,14 @@ class LinearDirac(eqx.Module):
         flat = B @ inverse_on_range(A, "the projection of D on V", tolerance)
         return jnp.asarray((matrix_transpose(flat) - flat) / 2)
 
-    def codistribution(self, rank: int | None = None, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n k"]:
+    def codistribution(self, rank: int | None = None, tolerance: float = STRUCTURE_RANK) -> Float[Array, "*batch n k"]:
         """Orthonormal basis, by columns, of F*_D, the projection of D on V* ([BLM] Theorem 2.5).
 
         Raises as `distribution` does.
         """
         return range_basis(_image(self)[1], "the projection of D on V*", rank, tolerance)
 
-    def bivector(self, tolerance: float = RANK_TOLERANCE) -> Float[Array, "*batch n n"]:
+    def bivector(self, tolerance: float = STRUCTURE_RANK) -> Float[Array, "*batch n n"]:
         """Λ_D on F*_D, given by Λ_D(β, α) = β(v) for (v, α) ∈ D ([BLM] Theorem 2.5).
 
         Returned on all of V*, extended by zero on the Euclidean complement; `codistribution()` and it determine D.
@@ -189,7 +182,7 @@ class LinearDirac(eqx.Module):
 
     # Tests
 
-    def contains(self, v: ArrayLike, covector: ArrayLike, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
+    def contains(self, v: ArrayLike, covector: ArrayLike, tolerance: float = STRUCTURE_DEFECT) -> Bool[AnyArray, "*batch"]:
         """Whether (v, α) ∈ D: its distance from D is at most `tolerance` times its length; v and α (..., n)."""
         vector, one_form = known(v).astype(float), known(covector).astype(float)
         if vector.shape[-1:] != (self.n,) or one_form.shape[-1:] != (self.n,):
@@ -209,15 +202,15 @@ class LinearDirac(eqx.Module):
         """Largest pairing between two members of the basis `image()`, max |AᵀB + BᵀA|."""
         return pairing_defect(*_image(self))
 
-    def is_isotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
+    def is_isotropic(self, tolerance: float = STRUCTURE_DEFECT) -> Bool[AnyArray, "*batch"]:
         """Whether D ⊆ D^⊥."""
         return self.isotropy_defect() <= tolerance
 
-    def is_coisotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
+    def is_coisotropic(self, tolerance: float = STRUCTURE_DEFECT) -> Bool[AnyArray, "*batch"]:
         """Whether D^⊥ ⊆ D."""
         return self.orthogonal().is_isotropic(tolerance)
 
-    def is_dirac(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
+    def is_dirac(self, tolerance: float = STRUCTURE_DEFECT) -> Bool[AnyArray, "*batch"]:
         """Whether D = D^⊥ ([BLM] Definition 2.1); False where unchecked input under tracing was not Dirac."""
         return self.is_isotropic(tolerance) & self.is_coisotropic(tolerance)
 
@@ -226,7 +219,7 @@ class LinearDirac(eqx.Module):
         difference = known(self.scattering) - known(other.scattering)
         return namespace(difference).linalg.norm(difference, ord=2, axis=(-2, -1)) / 2
 
-    def equals(self, other: "LinearDirac", tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
+    def equals(self, other: "LinearDirac", tolerance: float = STRUCTURE_DEFECT) -> Bool[AnyArray, "*batch"]:
         """Whether both are the same subspace, up to a distance of `tolerance`."""
         return self.distance(other) <= tolerance
 
@@ -236,7 +229,7 @@ class LinearDirac(eqx.Module):
         """D ⊕ D' on V ⊕ V', coordinates of V first."""
         return LinearDirac(block_diagonal(known(self.scattering), known(other.scattering)))
 
-    def pull_back(self, linear_map: ArrayLike, tolerance: float = TRANSVERSALITY_TOLERANCE) -> "LinearDirac":
+    def pull_back(self, linear_map: ArrayLike, tolerance: float = TRANSVERSALITY) -> "LinearDirac":
         """φ*D = {(w, φᵀβ) : (φ w, β) ∈ D} on W, for φ: W → V given as a matrix (..., n, dim W), of any rank.
 
         φ should be scaled to entries of order one. Raises `UndecidableRank` where the result hangs on roundoff.
@@ -249,7 +242,7 @@ class LinearDirac(eqx.Module):
         covectors = rows(np.zeros((self.n, width)), np.eye(width))
         return LinearDirac(eliminate(vectors, covectors, rows(E, -matrix_transpose(phi)), "the pull-back", tolerance))
 
-    def push_forward(self, linear_map: ArrayLike, tolerance: float = TRANSVERSALITY_TOLERANCE) -> "LinearDirac":
+    def push_forward(self, linear_map: ArrayLike, tolerance: float = TRANSVERSALITY) -> "LinearDirac":
         """φ_*D = {(φ v, β) : (v, φᵀβ) ∈ D} on W, for φ: V → W given as a matrix (..., dim W, n), of any rank.
 
         φ should be scaled to entries of order one. Raises `UndecidableRank` where the result hangs on roundoff.
@@ -268,7 +261,7 @@ class LinearDirac(eqx.Module):
         ports: Sequence[int],
         other_ports: Sequence[int] | None = None,
         common: Literal["covectors", "vectors"] = "covectors",
-        tolerance: float = TRANSVERSALITY_TOLERANCE,
+        tolerance: float = TRANSVERSALITY,
     ) -> "LinearDirac":
         """Interconnection of two Dirac structures over shared ports, again a Dirac structure, transversal or not.
 

@@ -94,19 +94,24 @@ class Theta(AbstractDiscretizationMap):
         _check_theta(self.theta)
 
     def manifold(self, ambient_dimension):
+        """R^N."""
         return Euclidean(ambient_dimension)
 
     @property
     def base_fraction(self):
+        """θ."""
         return self.theta
 
     def forward(self, x, v):
+        """(x − θv, x + (1 − θ)v)."""
         return x - self.theta * v, x + (1.0 - self.theta) * v
 
     def backward(self, x0, x1):
+        """((1 − θ)x0 + θx1, x1 − x0)."""
         return (1.0 - self.theta) * x0 + self.theta * x1, x1 - x0
 
     def reach(self, x, v):
+        """0: every pair of points is reached."""
         return jnp.zeros(())
 
 
@@ -136,19 +141,24 @@ class RiemannianExp(AbstractDiscretizationMap):
                 )
 
     def manifold(self, ambient_dimension):
+        """`space`; raises `ValueError` for points of another length."""
         return _same_size(self.space, ambient_dimension)
 
     @property
     def base_fraction(self):
+        """θ."""
         return self.theta
 
     def forward(self, x, v):
+        """(exp(x, −θv), exp(x, (1 − θ)v))."""
         return tuple(jax.vmap(lambda time: self.space.exp(x, time * v))(_times(self.theta)))
 
     def backward(self, x0, x1):
+        """The point at time θ of the shortest geodesic from x0 to x1, and the velocity there."""
         return self.space.geodesic(x0, self.space.log(x0, x1), jnp.asarray(self.theta))
 
     def reach(self, x, v):
+        """‖v‖ over the injectivity radius."""
         return self.space.exp_reach(x, v)
 
 
@@ -167,23 +177,28 @@ class LieGroupExp(AbstractDiscretizationMap):
             raise TypeError(f"LieGroupExp needs a group such as SO3(), but {self.group!r} came.")
 
     def manifold(self, ambient_dimension):
+        """`group`; raises `ValueError` for elements of another length."""
         return _same_size(self.group, ambient_dimension)
 
     @property
     def base_fraction(self):
+        """θ."""
         return self.theta
 
     def forward(self, x, v):
+        """(x exp(−θξ), x exp((1 − θ)ξ)) with ξ = x⁻¹v."""
         xi = self.group.to_algebra(x, v)
         move = lambda time: self.group.multiply(x, self.group.group_exp(time * xi))
         return tuple(jax.vmap(move)(_times(self.theta)))
 
     def backward(self, x0, x1):
+        """(x0 exp(θξ), its left translate of ξ) with ξ = log(x0⁻¹x1)."""
         xi = self.group.group_log(self.group.multiply(self.group.inverse(x0), x1))
         x = self.group.multiply(x0, self.group.group_exp(self.theta * xi))
         return x, self.group.left_translate(x, xi)
 
     def reach(self, x, v):
+        """The angle of rotation over π."""
         return self.group.exp_reach(x, v)
 
 
@@ -194,17 +209,21 @@ class SphereProjection(AbstractDiscretizationMap):
     """
 
     def manifold(self, ambient_dimension):
+        """The unit sphere of R^N."""
         return Sphere(ambient_dimension)
 
     def forward(self, x, v):
+        """((x − v/2)/‖x − v/2‖, (x + v/2)/‖x + v/2‖)."""
         back, ahead = x - v / 2.0, x + v / 2.0
         return back / norm(back), ahead / norm(ahead)
 
     def backward(self, x0, x1):
+        """((x0 + x1)/‖x0 + x1‖, 2(x1 − x0)/‖x0 + x1‖)."""
         length = norm(x0 + x1)
         return (x0 + x1) / length, 2.0 * (x1 - x0) / length
 
     def reach(self, x, v):
+        """The angle between x0 and x1 over π."""
         return jnp.arctan(norm(v) / 2.0) * (2.0 / jnp.pi)
 
 
@@ -224,6 +243,7 @@ class ProductMap(AbstractDiscretizationMap):
         self.sizes = tuple(int(size) for _, size in blocks)
 
     def manifold(self, ambient_dimension):
+        """The product of the manifolds of the maps; raises `ValueError` for points of another length."""
         factors = [map.manifold(size) for map, size in zip(self.maps, self.sizes, strict=True)]
         return _same_size(Product(*factors), ambient_dimension)  # pyright: ignore[reportArgumentType]
 
@@ -234,12 +254,15 @@ class ProductMap(AbstractDiscretizationMap):
         return fractions.pop() if len(fractions) == 1 else 0.5
 
     def forward(self, x, v):
+        """Each map on its block."""
         return self._joined("forward", x, v)
 
     def backward(self, x0, x1):
+        """The inverse of each map on its block."""
         return self._joined("backward", x0, x1)
 
     def reach(self, x, v):
+        """The largest of the maps."""
         return jnp.max(jnp.stack([map.reach(*block) for map, *block in self._blocks(x, v)]))
 
     def _blocks(self, a: Vector, b: Vector):

@@ -1,4 +1,4 @@
-"""Numerical building blocks of geometry: functions of a squared angle that are smooth at 0, and a small Newton root.
+"""Numerical building blocks of geometry: functions of a squared angle that are smooth at 0.
 
 Lengths and angles enter geometry through their squares, which are smooth where the norm is not. Each function knows its
 own derivative, so that derivatives of any order are accurate and finite, and cost little to compile.
@@ -9,9 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from dirax.program.formula import Formula
@@ -35,9 +33,12 @@ def radial(order: int, s: Scalar) -> Scalar:
 
 @dataclass(frozen=True)
 class Radial(Formula):
+    """f_n of `radial` as a formula with a derivative of its own, −f_{n+1}/2."""
+
     order: int
 
     def value(self, xp, x):
+        """f_n(s): its series near 0, the recurrence elsewhere."""
         (s,), order = x, self.order
         if order <= 1:
             # finite also for a derivative that is taken through the root, as that of a scalar graph is
@@ -59,6 +60,7 @@ class Radial(Formula):
         return _piecewise(xp, s, RADIAL_SERIES_BELOW, coefficients, by_recurrence)
 
     def slopes(self):
+        """−½ f_{n+1}."""
         return ((-0.5, Radial(self.order + 1)),)
 
 
@@ -73,9 +75,12 @@ def arc_over_sine(order: int, near: Scalar, far: Scalar) -> Scalar:
 
 @dataclass(frozen=True)
 class ArcOverSine(Formula):
+    """F^(n) of `arc_over_sine` as a formula with a derivative of its own."""
+
     order: int
 
     def value(self, xp, x):
+        """F^(n): its series near 0, the recurrence of the hypergeometric function elsewhere."""
         (near, far), order = x, self.order
         far = xp.where(far < TINY, 1.0, far)
 
@@ -96,6 +101,7 @@ class ArcOverSine(Formula):
         return _piecewise(xp, near, ARC_SERIES_BELOW, coefficients, by_recurrence)
 
     def slopes(self):
+        """F^(n+1), by the first argument alone."""
         return (1.0, ArcOverSine(self.order + 1)), None  # near + far = 1, so F is a function of near alone
 
 
@@ -115,34 +121,3 @@ def norm(v: Float[Array, " n"]) -> Scalar:
 def _norm(v: Float[Array, " n"]) -> Scalar:
     s = jnp.sum(v * v)
     return jnp.where(s == 0.0, 0.0, jnp.sqrt(jnp.where(s == 0.0, 1.0, s)))
-
-
-def newton_root(
-    residual: Callable, guess: Float[Array, " k"], tolerance: float = 1e-9, max_steps: int = 40
-) -> Float[Array, " k"]:
-    """A root of `residual` (k,) → (k,) by Newton's method to the roundoff floor; NaN where it does not converge.
-
-    Traceable, and differentiable any number of times, forwards and backwards, by the implicit function theorem.
-    `tolerance` is on the last residual, relative to 1 + ‖root‖.
-    """
-
-    def solve(residual, guess):
-        def step(carry):
-            z, size, _, count = carry
-            update = jnp.linalg.solve(jax.jacfwd(residual)(z), residual(z))
-            return z - update, jnp.max(jnp.abs(update)), size, count + 1
-
-        def unfinished(carry):
-            _, size, previous, count = carry
-            still_shrinking = (size < 0.5 * previous) | (size > 1e-6)
-            return (count < max_steps) & (size > 0.0) & still_shrinking
-
-        start = (guess, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0)
-        z, *_ = lax.while_loop(unfinished, step, start)
-        converged = jnp.max(jnp.abs(residual(z))) <= tolerance * (1.0 + jnp.max(jnp.abs(z)))
-        return jnp.where(converged, z, jnp.nan)
-
-    def tangent_solve(linear, right_side):
-        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(right_side)), right_side)
-
-    return lax.custom_root(residual, guess, solve, tangent_solve)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
-from dirax.geometry.numerics import newton_root, norm
+from dirax.geometry.numerics import norm
+from dirax.numerics.newton import regular_root
 from dirax.program.linear_solves import solve
 
 
@@ -39,29 +40,36 @@ class Submanifold(AbstractManifold):
         return round(trace)
 
     def defect(self, x):
+        """‖P(x) − x‖."""
         return norm(self.projector(x) - x)
 
     def nearest(self, x):
+        """P(x)."""
         return self.projector(x)
 
     def projection(self, x, v):
+        """The orthogonal projection to the image of DP(x)."""
         # A the projection DP(x), oblique: the orthogonal projection with the same image is A (A + Aᵀ − 1)⁻¹.
         oblique = jax.jacfwd(self.projector)(x)
         return oblique @ solve(oblique + oblique.T - jnp.eye(self.ambient_dimension), v)
 
     def representative(self, x, near):
+        """x."""
         return x
 
     def local_parametrization(self, x):
+        """r ↦ P(x + Fr) with the frame F."""
         basis = self.frame(x)
         return lambda r: self.projector(x + basis @ r)
 
     def frame(self, x):
+        """An orthonormal basis of the image of DP(x), by singular values."""
         # A choice of coordinates, held fixed under differentiation: singular vectors have no derivative here.
         oblique = jax.jacfwd(self.projector)(jax.lax.stop_gradient(x))
         return jax.lax.stop_gradient(jnp.linalg.svd(oblique)[0][:, : self.dimension])
 
     def coordinates(self, x, v):
+        """Fᵀv with the frame F."""
         return self.frame(x).T @ v
 
 
@@ -78,17 +86,21 @@ class ProjectedMap(AbstractDiscretizationMap):
     dimension: int | None = eqx.field(static=True, default=None)
 
     def manifold(self, ambient_dimension):
+        """The image of P."""
         return Submanifold(self.projector, ambient_dimension, self.dimension)
 
     @property
     def base_fraction(self):
+        """That of the map around it."""
         return self.map.base_fraction
 
     def forward(self, x, v):
+        """(P(x0), P(x1)) of the map around it."""
         x0, x1 = self.map.forward(x, v)
         return self.projector(x0), self.projector(x1)
 
     def backward(self, x0, x1):
+        """(x, v) with forward(x, v) = (x0, x1), by Newton from the inverse of the map around it."""
         n = x0.shape[0]
 
         def tangent(z):
@@ -102,7 +114,8 @@ class ProjectedMap(AbstractDiscretizationMap):
             y0, y1 = self.forward(x, v)
             return jnp.concatenate([y0 - x0 + z[:n] - x, y1 - x1 + z[n:] - v])
 
-        return tangent(newton_root(residual, jnp.concatenate(self.map.backward(x0, x1))))
+        return tangent(regular_root(residual, jnp.concatenate(self.map.backward(x0, x1))))
 
     def reach(self, x, v):
+        """That of the map around it."""
         return self.map.reach(x, v)

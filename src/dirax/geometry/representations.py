@@ -14,14 +14,14 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from dirax.geometry.subspaces import (
-    STRUCTURE_TOLERANCE,
     AnyArray,
     as_matrix,
-    decide_rank,
     matrix_transpose,
     namespace,
     require_full_rank,
 )
+from dirax.numerics.ranks import decide_rank
+from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.program.user_functions import is_traced
 
 ROUNDOFF = 1e-14  # a product of matrices of order one that should vanish has entries of this size
@@ -147,7 +147,7 @@ def _skew(name: str, value: ArrayLike) -> Float[AnyArray, "*batch n n"]:
     if not is_traced(matrix):
         defect = np.max(np.abs(matrix + matrix_transpose(matrix)), axis=(-1, -2), initial=0.0)
         size = np.max(np.abs(matrix), axis=(-1, -2), initial=0.0)
-        if np.any(defect > STRUCTURE_TOLERANCE * size + ROUNDOFF):
+        if np.any(defect > STRUCTURE_DEFECT * size + ROUNDOFF):
             raise ValueError(
                 f"{name} is not skew: max |M + Mᵀ| = {np.max(defect):.3e} for entries up to {np.max(size):.3e}. "
                 f"Use (M − Mᵀ)/2 if its skew part is meant."
@@ -182,7 +182,7 @@ def _require_isotropic(who: str, product: str, F: Float[AnyArray, "*batch n n"],
     pairing = basis[..., :n] @ np.swapaxes(basis[..., n:], -1, -2)
     defect = np.max(np.abs(pairing + np.swapaxes(pairing, -1, -2)), axis=(-1, -2))
     # The entries are only known to roundoff, which a nearly dependent basis magnifies.
-    allowed = STRUCTURE_TOLERANCE + 100 * np.finfo(float).eps / values[..., -1]
+    allowed = STRUCTURE_DEFECT + 100 * np.finfo(float).eps / values[..., -1]
     if np.any(defect > allowed):
         raise ValueError(
             f"{who} is not isotropic: {product} is not zero, max pairing {np.max(defect):.3e} on an orthonormal basis."

@@ -7,17 +7,16 @@ from jaxtyping import Array, Float
 from dirax.geometry.representations import KernelPair
 from dirax.geometry.subspaces import (
     AnyArray,
-    UndecidableRank,
-    decide_rank,
     matrix_transpose,
     namespace,
     pseudo_inverse,
     uniform_rank,
 )
+from dirax.numerics.ranks import UndecidableRank, decide_rank
 from dirax.program.user_functions import is_traced
 
 
-def block_diagonal(first: Float[AnyArray, "*batch i j"], second: Float[AnyArray, "*batch k l"]) -> Float[AnyArray, "*batch m n"]:
+def block_diagonal(first: Float[AnyArray, "*#batch i j"], second: Float[AnyArray, "*#batch k l"]) -> Float[AnyArray, "*all m n"]:
     """[[first, 0], [0, second]] over broadcast leading axes."""
     upper = np.zeros((*first.shape[:-1], second.shape[-1]))
     lower = np.zeros((*second.shape[:-1], first.shape[-1]))
@@ -34,6 +33,7 @@ def scattering_matrix(pair: KernelPair) -> Float[AnyArray, "*batch n n"]:
 
 
 def nearest_orthogonal(matrix: Float[AnyArray, "*batch n n"]) -> Float[AnyArray, "*batch n n"]:
+    """The orthogonal polar factor of a matrix that is orthogonal up to roundoff."""
     # Two Newton–Schulz steps for the polar factor: a defect of roundoff size, magnified by an ill-conditioned solve, is
     # removed (ε → ε⁴), and a matrix far from orthogonal stays so and can be told by is_dirac().
     for _ in range(2):
@@ -42,12 +42,12 @@ def nearest_orthogonal(matrix: Float[AnyArray, "*batch n n"]) -> Float[AnyArray,
 
 
 def eliminate(
-    F: Float[AnyArray, "*batch m n"],
-    E: Float[AnyArray, "*batch m n"],
-    internal: Float[AnyArray, "*batch m l"],
+    F: Float[AnyArray, "*#batch m n"],
+    E: Float[AnyArray, "*#batch m n"],
+    internal: Float[AnyArray, "*#batch m l"],
     what: str,
     tolerance: float,
-) -> Float[AnyArray, "*batch n n"]:
+) -> Float[AnyArray, "*all n n"]:
     """The scattering matrix of {(v, α) : F v + E α + G z = 0 for some z}, from m = n + l equations with G = `internal`.
 
     With v = (s + d)/2 and α = (s − d)/2 the unknowns are the wave s and z. The wave is unique for every d even where z
@@ -82,7 +82,8 @@ def _require_decided(matrix: np.ndarray, internal: np.ndarray, what: str, tolera
         )
 
 
-def rows(upper: Float[AnyArray, "*batch i k"], lower: Float[AnyArray, "*batch j k"]) -> Float[AnyArray, "*batch m k"]:
+def rows(upper: Float[AnyArray, "*#batch i k"], lower: Float[AnyArray, "*#batch j k"]) -> Float[AnyArray, "*all m k"]:
+    """[upper; lower] over broadcast leading axes."""
     xp = namespace(upper, lower)
     batch = np.broadcast_shapes(upper.shape[:-2], lower.shape[:-2])
     return xp.concatenate([xp.broadcast_to(part, (*batch, *part.shape[-2:])) for part in (upper, lower)], axis=-2)
@@ -91,6 +92,7 @@ def rows(upper: Float[AnyArray, "*batch i k"], lower: Float[AnyArray, "*batch j 
 def range_basis(
     matrix: Float[AnyArray, "*batch n n"], what: str, rank: int | None, tolerance: float
 ) -> Float[Array, "*batch n k"]:
+    """An orthonormal basis of the range, of the given rank or the one decided; `ValueError` if traced without a rank."""
     left, values, _ = namespace(matrix).linalg.svd(matrix)
     if rank is None:
         if is_traced(matrix):
@@ -100,6 +102,7 @@ def range_basis(
 
 
 def inverse_on_range(matrix: Float[AnyArray, "*batch n n"], what: str, tolerance: float) -> Float[AnyArray, "*batch n n"]:
+    """The pseudo-inverse, where the rank is decidable; raises `UndecidableRank` where it is not. `what` names the matrix."""
     if not is_traced(matrix):
         decide_rank(np.linalg.svd(matrix, compute_uv=False), what, tolerance, scale=1.0)
     return pseudo_inverse(matrix, tolerance, 1.0)

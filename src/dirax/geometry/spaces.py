@@ -17,42 +17,55 @@ class AbstractFlat(AbstractGeodesicManifold):
     """R^n, or R^n modulo a lattice: geodesics are the straight lines x + tv, and every vector is tangent everywhere."""
 
     def defect(self, x):
+        """0."""
         return jnp.zeros(())
 
     def nearest(self, x):
+        """x."""
         return x
 
     def projection(self, x, v):
+        """v."""
         return v
 
     def local_parametrization(self, x):
+        """r ↦ x + r."""
         return lambda r: x + r
 
     def frame(self, x):
+        """The unit matrix."""
         return jnp.eye(self.dimension)
 
     def coordinates(self, x, v):
+        """v."""
         return v
 
     def exp(self, x, v):
+        """x + v."""
         return x + v
 
     def geodesic(self, x, v, t):
+        """(x + tv, v)."""
         return x + t * v, v
 
     def distance(self, x, y):
+        """‖log(x, y)‖."""
         return norm(self.log(x, y))
 
     def transport(self, x, v, y):
+        """v."""
         return v
 
     def retraction(self, x, v):
+        """x + v."""
         return x + v
 
     def inverse_retraction(self, x, y):
+        """log(x, y)."""
         return self.log(x, y)
 
     def retraction_reach(self, x, v):
+        """That of `exp`."""
         return self.exp_reach(x, v)
 
 
@@ -66,12 +79,15 @@ class Euclidean(AbstractFlat):
         self.dimension = self.ambient_dimension = _whole("Euclidean(n), the vector space R^n", dimension, 0)
 
     def representative(self, x, near):
+        """x."""
         return x
 
     def log(self, x, y):
+        """y − x."""
         return y - x
 
     def exp_reach(self, x, v):
+        """0: all of R^n is reached."""
         return jnp.zeros(())
 
 
@@ -88,13 +104,16 @@ class Torus(AbstractFlat):
         self.dimension = self.ambient_dimension = _whole("Torus(n), the torus of n angles", dimension, 1)
 
     def representative(self, x, near):
+        """x with whole turns added so that every angle is within π of that of `near`."""
         return near + self.log(near, x)
 
     def log(self, x, y):
+        """y − x without whole turns, each angle in [−π, π]."""
         turns = jnp.round((y - x) / (2.0 * jnp.pi))
         return (y - x) - 2.0 * jnp.pi * turns
 
     def exp_reach(self, x, v):
+        """The largest angle over π."""
         return jnp.max(jnp.abs(v)) / jnp.pi
 
 
@@ -118,38 +137,48 @@ class Sphere(AbstractGeodesicManifold):
         self.dimension, self.ambient_dimension = n - 1, n
 
     def defect(self, x):
+        """| ‖x‖ − 1 |."""
         return jnp.abs(norm(x) - 1.0)
 
     def nearest(self, x):
+        """x/‖x‖."""
         return x / norm(x)
 
     def projection(self, x, v):
+        """v − ⟨x, v⟩x."""
         return v - x * jnp.dot(x, v)
 
     def representative(self, x, near):
+        """x."""
         return x
 
     def local_parametrization(self, x):
+        """r ↦ (x + Fr)/‖x + Fr‖ with the frame F."""
         # The frame is only a choice of coordinates, so it is held fixed under differentiation in x.
         frame = jax.lax.stop_gradient(once(orthonormal_complement)(x))
         return lambda r: self.nearest(x + frame @ r)
 
     def frame(self, x):
+        """An orthonormal basis of the hyperplane orthogonal to x."""
         return once(orthonormal_complement)(x)
 
     def coordinates(self, x, v):
+        """Fᵀv with the frame F."""
         return once(orthonormal_complement)(x).T @ v
 
     def exp(self, x, v):
+        """cos‖v‖ x + sin‖v‖ v/‖v‖."""
         s = jnp.dot(v, v)
         return radial(0, s) * x + radial(1, s) * v
 
     def geodesic(self, x, v, t):
+        """The great circle through x with velocity v: its point at time t and the velocity there."""
         s = jnp.dot(v, v)
         cosine, sine = radial(0, t * t * s), t * radial(1, t * t * s)
         return cosine * x + sine * v, cosine * v - (s * sine) * x
 
     def log(self, x, y):
+        """(φ/sin φ)(y − cos φ x), φ the angle between x and y; of all directions to the antipode, one."""
         difference, sum_ = y - x, y + x
         near, far = jnp.dot(difference, difference) / 4.0, jnp.dot(sum_, sum_) / 4.0
         # Both differences have the same tangential part; the short one has it without cancellation.
@@ -157,22 +186,28 @@ class Sphere(AbstractGeodesicManifold):
         return jnp.where(far < TINY, jnp.pi * orthonormal_complement(x)[:, 0], direction)
 
     def distance(self, x, y):
+        """The angle between x and y, accurate at both ends."""
         return 2.0 * jnp.arctan2(norm(y - x), norm(y + x))
 
     def transport(self, x, v, y):
+        """v − ⟨y, v⟩(x + y)/(1 + ⟨x, y⟩), along the great circle."""
         along = 1.0 + jnp.dot(x, y)
         return v - jnp.dot(y, v) / jnp.where(along < TINY, 1.0, along) * (x + y)
 
     def retraction(self, x, v):
+        """(x + v)/‖x + v‖."""
         return self.nearest(x + v)
 
     def inverse_retraction(self, x, y):
+        """y/⟨x, y⟩ − x."""
         return y / jnp.dot(x, y) - x
 
     def exp_reach(self, x, v):
+        """‖v‖/π."""
         return norm(v) / jnp.pi
 
     def retraction_reach(self, x, v):
+        """The angle arctan‖v‖ over π/2."""
         return jnp.arctan(norm(v)) * (2.0 / jnp.pi)
 
 
@@ -195,7 +230,7 @@ class Product(AbstractGeodesicManifold):
         self.dimension = sum(factor.dimension for factor in factors)
         self.ambient_dimension = sum(factor.ambient_dimension for factor in factors)
 
-    def split(self, x: Vector) -> list[Vector]:
+    def split(self, x: Vector) -> list[Array]:
         """The ambient blocks of x, one a factor."""
         return jnp.split(x, np.cumsum([factor.ambient_dimension for factor in self.factors])[:-1].tolist())
 
@@ -205,55 +240,71 @@ class Product(AbstractGeodesicManifold):
         return [once(getattr(type(factor), method), factor)(*blocks) for factor, *blocks in rows]
 
     def defect(self, x):
+        """The largest of the factors."""
         return jnp.max(jnp.stack(self._blocks("defect", x)))
 
     def nearest(self, x):
+        """That of each factor."""
         return jnp.concatenate(self._blocks("nearest", x))
 
     def projection(self, x, v):
+        """That of each factor."""
         return jnp.concatenate(self._blocks("projection", x, v))
 
     def representative(self, x, near):
+        """That of each factor."""
         return jnp.concatenate(self._blocks("representative", x, near))
 
     def local_parametrization(self, x):
+        """That of each factor, r in blocks of their dimensions."""
         maps = [factor.local_parametrization(block) for factor, block in zip(self.factors, self.split(x), strict=True)]
         ends = np.cumsum([factor.dimension for factor in self.factors])[:-1].tolist()
         return lambda r: jnp.concatenate([f(block) for f, block in zip(maps, jnp.split(r, ends), strict=True)])
 
     def frame(self, x):
+        """Those of the factors along the diagonal."""
         return jax.scipy.linalg.block_diag(*self._blocks("frame", x))
 
     def coordinates(self, x, v):
+        """Those of the factors, one after the other."""
         return jnp.concatenate(self._blocks("coordinates", x, v))
 
     def exp(self, x, v):
+        """That of each factor."""
         return jnp.concatenate(self._blocks("exp", x, v))
 
     def geodesic(self, x, v, t):
+        """That of each factor, all at time t."""
         rows = zip(self.factors, self.split(x), self.split(v), strict=True)
         points, velocities = zip(*(once(type(f).geodesic, f)(*blocks, t) for f, *blocks in rows), strict=True)
         return jnp.concatenate(points), jnp.concatenate(velocities)
 
     def log(self, x, y):
+        """That of each factor."""
         return jnp.concatenate(self._blocks("log", x, y))
 
     def distance(self, x, y):
+        """The root of the sum of the squares of the factors’ distances."""
         return norm(jnp.stack(self._blocks("distance", x, y)))
 
     def transport(self, x, v, y):
+        """That of each factor."""
         return jnp.concatenate(self._blocks("transport", x, v, y))
 
     def retraction(self, x, v):
+        """That of each factor."""
         return jnp.concatenate(self._blocks("retraction", x, v))
 
     def inverse_retraction(self, x, y):
+        """That of each factor."""
         return jnp.concatenate(self._blocks("inverse_retraction", x, y))
 
     def exp_reach(self, x, v):
+        """The largest of the factors."""
         return jnp.max(jnp.stack(self._blocks("exp_reach", x, v)))
 
     def retraction_reach(self, x, v):
+        """The largest of the factors."""
         return jnp.max(jnp.stack(self._blocks("retraction_reach", x, v)))
 
 

@@ -206,7 +206,7 @@ def _courant_tensor(structure: DiracStructure, x: Float[Array, " n"], params: An
     return lie + jnp.transpose(lie, (2, 0, 1)) + jnp.transpose(lie, (1, 2, 0))
 
 
-def canonical_two_form(n: int) -> Float[Array, "2*n 2*n"]:
+def canonical_two_form(n: int) -> Float[Array, "2*{n} 2*{n}"]:
     """ω = [[0, I], [−I, 0]] on R^{2n}: ω♭(q̇, ṗ) = (−ṗ, q̇)."""
     zero, identity = np.zeros((n, n)), np.eye(n)
     return jnp.asarray(np.block([[zero, identity], [-identity, zero]]))

@@ -5,31 +5,23 @@ Dirac according to how it lies in its orthogonal U^⊥; `LinearDirac` (linear.py
 """
 
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from dirax.numerics.ranks import decide_rank
+from dirax.numerics.tolerances import STRUCTURE_DEFECT, STRUCTURE_RANK
 from dirax.program.user_functions import is_traced
 
-AnyArray = Array | np.ndarray
+if TYPE_CHECKING:
+    AnyArray: TypeAlias = Array | np.ndarray
+else:
+    AnyArray = Array | np.ndarray | np.generic  # a number from which NumPy took the axes is an array without any
 """Numbers that are known (numpy) or traced (JAX)."""
-
-RANK_TOLERANCE = 1e-10
-"""Singular values below this fraction of the scale of a matrix count as zero."""
-RANK_GAP = 100.0
-"""A singular value within this factor of the tolerance, on either side, leaves the rank undecided."""
-ROUNDOFF = 2e-13
-"""Relative singular values below this are roundoff of a few products and factorizations in dimensions up to dozens."""
-STRUCTURE_TOLERANCE = 1e-10
-"""Largest relative defect (of skewness, of isotropy, of membership) that counts as roundoff."""
-
-
-class UndecidableRank(ValueError):
-    """The singular values of a matrix do not separate into zero and nonzero ones."""
 
 
 def known(array: Any) -> Any:
@@ -70,30 +62,6 @@ def pairing_defect(A: Float[AnyArray, "*batch n k"], B: Float[AnyArray, "*batch 
     return abs(product + matrix_transpose(product)).max(axis=(-1, -2), initial=0.0)
 
 
-def decide_rank(
-    singular_values: ArrayLike, what: str, tolerance: float = RANK_TOLERANCE, scale: float | None = None
-) -> np.ndarray:
-    """Number of singular values above `tolerance * scale`, along the last axis; `scale` is the largest one by default.
-
-    Raises `UndecidableRank` where a singular value lies within a factor `RANK_GAP` of that threshold, unless it is below
-    `ROUNDOFF` and the threshold above it.
-    """
-    values = np.asarray(singular_values)
-    if values.shape[-1] == 0:
-        return np.zeros(values.shape[:-1], dtype=int)
-    reference = values.max(axis=-1, keepdims=True) if scale is None else np.full_like(values[..., :1], scale)
-    relative = values / np.where(reference > 0, reference, 1.0)
-    surely_zero = max(tolerance / RANK_GAP, min(ROUNDOFF, tolerance))
-    undecided = np.any((relative > surely_zero) & (relative < tolerance * RANK_GAP), axis=-1)
-    if np.any(undecided):
-        worst = relative[undecided].reshape(-1, values.shape[-1])[0]
-        raise UndecidableRank(
-            f"The rank of {what} is undecidable: relative singular values {np.array2string(worst, precision=3)} have "
-            f"no gap around the tolerance {tolerance:.0e}. Give a tolerance that is {RANK_GAP:.0f} times away from them."
-        )
-    return np.sum(relative > tolerance, axis=-1)
-
-
 def require_full_rank(name: str, matrix: Float[AnyArray, "*batch rows columns"]) -> None:
     """Raise unless the columns, each divided by its length, are linearly independent; nothing under tracing."""
     if is_traced(matrix):
@@ -115,7 +83,7 @@ def require_full_rank(name: str, matrix: Float[AnyArray, "*batch rows columns"])
 
 
 def pseudo_inverse(
-    matrix: Float[AnyArray, "*batch i j"], tolerance: float = RANK_TOLERANCE, scale: float | None = None
+    matrix: Float[AnyArray, "*batch i j"], tolerance: float = STRUCTURE_RANK, scale: float | None = None
 ) -> Float[AnyArray, "*batch j i"]:
     """Moore–Penrose inverse with singular values up to `tolerance * scale` (largest one by default) taken as zero.
 
@@ -155,10 +123,10 @@ class PontryaginSubspace(eqx.Module):
     The open port-Hamiltonian set of [BLM] (22) is one that is coisotropic without being Dirac.
     """
 
-    basis: Float[Array, "*batch 2*n k"] = eqx.field(converter=jnp.asarray)
+    basis: Float[Array, "*batch two_n k"] = eqx.field(converter=jnp.asarray)
 
     @classmethod
-    def from_image(cls, A: ArrayLike, B: ArrayLike, tolerance: float = RANK_TOLERANCE) -> "PontryaginSubspace":
+    def from_image(cls, A: ArrayLike, B: ArrayLike, tolerance: float = STRUCTURE_RANK) -> "PontryaginSubspace":
         """U = {(A s, B s) : s ∈ R^k}; A and B (..., n, k). Dependent columns are dropped.
 
         Raises `UndecidableRank` where the rank of [A; B] is unclear at the relative SVD `tolerance`. Under tracing the
@@ -192,7 +160,7 @@ class PontryaginSubspace(eqx.Module):
         basis = known(self.basis)
         return basis[..., : self.n, :], basis[..., self.n :, :]
 
-    def contains(self, v: ArrayLike, covector: ArrayLike, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
+    def contains(self, v: ArrayLike, covector: ArrayLike, tolerance: float = STRUCTURE_DEFECT) -> Bool[AnyArray, "*batch"]:
         """Whether the distance of (v, α) from U is at most `tolerance` times its length."""
         vector, one_form, basis = known(v).astype(float), known(covector).astype(float), known(self.basis)
         element = namespace(vector, one_form).concatenate([vector, one_form], axis=-1)[..., None]
@@ -211,20 +179,20 @@ class PontryaginSubspace(eqx.Module):
         """Largest pairing between two members of the orthonormal basis, max |AᵀB + BᵀA|."""
         return pairing_defect(*self._halves())
 
-    def is_isotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
+    def is_isotropic(self, tolerance: float = STRUCTURE_DEFECT) -> Bool[AnyArray, "*batch"]:
         """Whether U ⊆ U^⊥ ([BLM] §2.1)."""
         return self.isotropy_defect() <= tolerance
 
-    def is_coisotropic(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
+    def is_coisotropic(self, tolerance: float = STRUCTURE_DEFECT) -> Bool[AnyArray, "*batch"]:
         """Whether U^⊥ ⊆ U ([BLM] §2.1), which is U^⊥ being isotropic, for U^⊥⊥ = U."""
         return self.orthogonal().is_isotropic(tolerance)
 
-    def is_dirac(self, tolerance: float = STRUCTURE_TOLERANCE) -> Bool[AnyArray, "*batch"]:
+    def is_dirac(self, tolerance: float = STRUCTURE_DEFECT) -> Bool[AnyArray, "*batch"]:
         """Whether U = U^⊥: isotropic and of dimension n ([BLM] Definition 2.1)."""
         return self.is_isotropic(tolerance) & (self.dimension == self.n)
 
 
-def uniform_rank(ranks: np.ndarray, what: str) -> int:
+def uniform_rank(ranks: Int[AnyArray, "*batch"], what: str) -> int:
     """The one rank of a whole batch; raises where it differs between members."""
     distinct = np.unique(ranks)
     if distinct.size > 1:

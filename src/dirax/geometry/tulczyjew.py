@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac
 from dirax.geometry.generating_functions import GeneratingFunctionDirac
-from dirax.geometry.numerics import newton_root
+from dirax.numerics.newton import regular_root
 
 Vector = Float[Array, " n"]
 Four = tuple[Vector, Vector, Vector, Vector]
@@ -235,7 +235,7 @@ class DiscreteEvolution(eqx.Module):
             other = q + h * u[:n]
             return jnp.concatenate([p - self._outgoing(q, other, direction) - w.T @ u[n:], self._matrix(other) @ u[:n]])
 
-        u = newton_root(residual, jnp.concatenate([_guess(velocity, q), jnp.zeros(w.shape[0])]))
+        u = regular_root(residual, jnp.concatenate([_guess(velocity, q), jnp.zeros(w.shape[0])]))
         return q + h * u[:n]
 
     def _far_step(self, q: Vector, p: Vector, velocity: Vector | None, direction: float) -> tuple[Vector, Vector]:
@@ -254,7 +254,7 @@ class DiscreteEvolution(eqx.Module):
             return jnp.concatenate([p - self._outgoing(q, r, direction), jump, w @ u[n : 2 * n]])
 
         start = _guess(velocity, q)
-        return parts(newton_root(residual, jnp.concatenate([start, start, jnp.zeros(self._matrix(q).shape[0])])))
+        return parts(regular_root(residual, jnp.concatenate([start, start, jnp.zeros(self._matrix(q).shape[0])])))
 
     def _matrix(self, q: Vector) -> Float[Array, "m n"]:
         forms = self.structure.one_forms

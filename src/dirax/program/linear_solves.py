@@ -9,10 +9,9 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, batching
 from jaxtyping import Array, Float
 
+from dirax.numerics.equilibration import balancing_scales
+from dirax.numerics.tolerances import EQUATION_RANK
 from dirax.program.primitives import binds, each, plain_primitive
-
-RANK_TOLERANCE = 1e-12
-"""Singular values below this, relative to the largest of the equilibrated matrix, count as zero."""
 
 
 def solve(matrix: Float[Array, "n n"], right: Array, apart: bool = False) -> Array:
@@ -41,15 +40,9 @@ def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> tuple[Float[Array, "l 
 
 def equilibrated_inverse(xp: ModuleType, matrix: Any) -> tuple[Any, Any]:
     """The same by JAX, or by NumPy with leading axes."""
-    lead = matrix.shape[:-2]
-    rows, columns = xp.ones((*lead, matrix.shape[-2], 1)), xp.ones((*lead, 1, matrix.shape[-1]))
-    fitting = lambda sizes: xp.sqrt(xp.where(sizes > 0.0, sizes, 1.0))
     sizes = xp.abs(lax.stop_gradient(matrix) if xp is jnp else matrix)  # units have no derivative, which would be ∞ at zero
-    for _ in range(3):
-        left = sizes / rows / columns
-        rows = rows * fitting(xp.max(left, axis=-1, keepdims=True))
-        columns = columns * fitting(xp.max(left, axis=-2, keepdims=True))
-    inverse = xp.linalg.pinv(matrix / rows / columns, RANK_TOLERANCE)
+    rows, columns = balancing_scales(sizes, xp)
+    inverse = xp.linalg.pinv(matrix / rows / columns, EQUATION_RANK)
     turned = lambda a: xp.swapaxes(a, -1, -2)
     return inverse / turned(columns) / turned(rows), 1.0 / columns[..., 0, :]
 

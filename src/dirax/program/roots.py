@@ -10,13 +10,10 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import ad
 from jaxtyping import Array, Float
 
+from dirax.numerics.newton import damped_step
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.primitives import binds, plain_primitive
 from dirax.program.tracing import closed_over, jacobian
-
-EPSILON = 2.220446049250313e-16
-SHORTEST = 2.0**-30
-"""Smallest fraction of a Newton step that is tried."""
 
 
 def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int = 100) -> Float[Array, " k"]:
@@ -43,26 +40,12 @@ def _root(residual: Callable, max_steps: int, guess, *captured):
 
     def step(carry):
         u, _, count = carry
-        inverse, unit = scaled_pseudo_inverse(jacobian(residual)(u))
-        change = inverse @ residual(u)
-        size = lambda v: jnp.max(jnp.abs(v) / unit)
-        here = size(change)
-        at_floor = here <= 4.0 * EPSILON * size(u)
+        inverse, units = scaled_pseudo_inverse(jacobian(residual)(u))
+        u, going = damped_step(lambda u: inverse @ residual(u), u, units, jnp)
+        return u, going, count + 1
 
-        def shorter(fraction):
-            following = inverse @ residual(u - fraction * change)
-            # not left to the comparison: XLA's vectorized maximum of NaNs can be −∞ on a CPU
-            return jnp.all(jnp.isfinite(following)) & (size(following) <= (1.0 - fraction / 4.0) * here)
-
-        def halve(carry):
-            fraction = carry[0] / 2.0
-            return fraction, shorter(fraction)
-
-        fraction, better = lax.while_loop(lambda c: ~c[1] & (c[0] > SHORTEST), halve, (jnp.ones(()), shorter(1.0) | at_floor))
-        return jnp.where(better, u - fraction * change, u), ~better | at_floor, count + 1
-
-    unfinished = lambda carry: ~carry[1] & (carry[2] < max_steps)
-    return lax.while_loop(unfinished, step, (guess, jnp.array(False), 0))[0]
+    unfinished = lambda carry: carry[1] & (carry[2] < max_steps)
+    return lax.while_loop(unfinished, step, (guess, jnp.array(True), 0))[0]
 
 
 @_root.defjvp

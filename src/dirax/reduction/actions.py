@@ -1,4 +1,4 @@
-"""Abelian group actions, their generators, lifts and momentum maps ([RL] §2)."""
+"""Group actions on configuration spaces, their generators, lifts and momentum maps ([RL] §2)."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -9,13 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.tolerances import ACTION_DEFECT
 from dirax.program.linear_solves import solve
 from dirax.program.user_functions import UserFunction
 from dirax.reduction.connection import check_fibre, fibre_indices
 
 
 class AbstractAction(eqx.Module):
-    """An abelian group R^k (or a torus, in angles) acting on Q ⊂ R^n: Φ_{g+h} = Φ_g ∘ Φ_h."""
+    """A Lie group acting on Q ⊂ R^n, in coordinates g (k,) of the group in which 0 is the identity: Φ_0 = id, and
+    t ↦ Φ_{tξ} is the flow of a generator ξ_Q for every ξ (k,).
+
+    In `Translations` and `GroupAction` the group is abelian, Φ_{g+h} = Φ_g ∘ Φ_h; in `LeftTranslation` g is an algebra vector
+    of any Lie group, and Φ_g the translation by exp(g).
+    """
 
     @abstractmethod
     def dimension(self) -> int:
@@ -38,7 +44,7 @@ class AbstractAction(eqx.Module):
         return jax.jvp(lambda q: self(g, q), (q,), (v,))
 
     def cotangent_lift(self, g: Float[Array, " k"], q: Float[Array, " n"], p: Float[Array, " n"]) -> tuple[Array, Array]:
-        """T*Φ_{−g}(q, p): the pairing with lifted velocities stays the same."""
+        """(Φ_g(q), (D Φ_g(q))^{−T} p): the pairing with lifted velocities stays the same."""
         derivative = jax.jacfwd(lambda q: self(g, q))(q)
         return self(g, q), solve(derivative.T, p)
 
@@ -48,7 +54,7 @@ class AbstractAction(eqx.Module):
 
 
 class Translations(AbstractAction):
-    """Addition to the coordinates `fibre` of q: a vector subgroup, or a torus where they are angles."""
+    """The abelian action by addition to the coordinates `fibre` of q: a vector subgroup, or a torus where they are angles."""
 
     fibre: tuple[int, ...] = eqx.field(static=True)
 
@@ -69,7 +75,7 @@ class Translations(AbstractAction):
 
 
 class GroupAction(AbstractAction):
-    """An action of R^k or a torus by a function `action(g, q) -> (n,)`, g of shape (k,).
+    """An abelian action, of R^k or a torus, by a function `action(g, q) -> (n,)`, g of shape (k,).
 
     That Φ_0 is the identity and Φ_{g+h} = Φ_g ∘ Φ_h is checked at random g as soon as a point is known; `ValueError`
     tells the defect.
@@ -103,5 +109,7 @@ class GroupAction(AbstractAction):
             ("action(g + h, q) = action(g, action(h, q))", act(g + h, q), act(g, act(h, q))),
         ):
             defect = float(np.max(np.abs(np.asarray(found) - np.asarray(wanted))))
-            if not defect <= 1e-9 * (1 + float(np.max(np.abs(np.asarray(wanted))))):
-                raise ValueError(f"action is none of an abelian group: {law} fails by {defect:.3g} at q = {np.asarray(q)}.")
+            if not defect <= ACTION_DEFECT * (1 + float(np.max(np.abs(np.asarray(wanted))))):
+                raise ValueError(
+                    f"the function is no action of an abelian group: {law} fails by {defect:.3g} at q = {np.asarray(q)}."
+                )

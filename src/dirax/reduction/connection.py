@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.program.user_functions import UserFunction
 
-AXIOM_TOLERANCE = 1e-10
 SAMPLES = 8
 
 
@@ -203,7 +203,7 @@ class DiscreteConnection(AbstractConnection):
                     defect = float(np.max(np.abs(np.asarray(found) - np.asarray(wanted))))
                     if not np.isfinite(defect):
                         raise ValueError(f"one_form is no discrete connection on all of Q: it is not finite at {where}.")
-                    if not defect <= AXIOM_TOLERANCE * (1 + float(np.max(np.abs(np.asarray(wanted))))):
+                    if not defect <= STRUCTURE_DEFECT * (1 + float(np.max(np.abs(np.asarray(wanted))))):
                         raise ValueError(f"one_form is no discrete connection: {axiom} fails by {defect:.3g} at {where}.")
 
     def lift_of_shapes(self, x0: Float[Array, " n-k"], x1: Float[Array, " n-k"]) -> Float[Array, " k"]:

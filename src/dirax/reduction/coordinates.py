@@ -6,6 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from dirax.numerics.ranks import numerical_rank
+from dirax.numerics.tolerances import ONE_FORM_RANK
 from dirax.program.user_functions import UserFunction
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
@@ -82,6 +84,6 @@ def adapted_basis(directions: Any) -> np.ndarray:
     rows = np.atleast_2d(np.asarray(directions, dtype=float))
     k, n = rows.shape
     _, values, basis = np.linalg.svd(rows, full_matrices=True)
-    if k > n or values[-1] <= 1e-12 * max(values[0], 1e-300):
+    if k > n or numerical_rank(values, ONE_FORM_RANK) < k:
         raise ValueError(f"directions must hold independent rows, but their singular values are {values}.")
     return np.concatenate([basis[k:], rows]).T

@@ -10,15 +10,13 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
+from dirax.numerics.tolerances import INERTIA_RANK
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.lie_poisson import LiePoisson, checked_point
 from dirax.systems.constraints import no_constraint
 from dirax.systems.system import AbstractSystem, refuse_start
-
-SINGULAR = 1e-13
-"""An inertia with singular values below this, relative to the largest, is singular."""
 
 
 class EulerPoincare(AbstractSystem):
@@ -146,7 +144,7 @@ class EulerPoincare(AbstractSystem):
         if np.linalg.matrix_rank(forms) < len(forms):
             raise ValueError(f"one_forms must be independent, but A = {forms.tolist()} has rank {np.linalg.matrix_rank(forms)}.")
         size = np.max(np.abs(inertia)) or 1.0
-        rank = int(np.linalg.matrix_rank(inertia / size, tol=SINGULAR, hermitian=True))
+        rank = int(np.linalg.matrix_rank(inertia / size, tol=INERTIA_RANK, hermitian=True))
         if rank < len(inertia):
             raise ValueError(
                 f"the inertia ∂²l/∂ξ² is singular at the initial data: it has rank {rank} of {len(inertia)}, so that μ does not "

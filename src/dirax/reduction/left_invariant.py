@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.numerics.tolerances import SYMMETRY_DEFECT
 from dirax.program.user_functions import UserFunction, evaluated
 from dirax.reduction.euler_poincare import EulerPoincare
-from dirax.reduction.symmetry import TOLERANCE, off_span
+from dirax.reduction.symmetry import off_span
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 
@@ -83,7 +84,7 @@ def _refuse_asymmetry(system: Any, group: AbstractLieGroup, params: Any) -> None
     names = ["lagrangian", *["one_forms"] * (one_forms is not None), *["holonomic"] * (holonomic is not None)]
     for column, of in enumerate(names, start=1):
         row = int(np.argmax(np.where(np.isfinite(values[:, column]), values[:, column], 0.0)))
-        if not values[row, column] > TOLERANCE:
+        if not values[row, column] > SYMMETRY_DEFECT:
             continue
         where = f"at g = {g[row]}"
         if of == "lagrangian":

@@ -5,12 +5,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.numerics.tolerances import GROUP_DEFECT
 from dirax.program.user_functions import is_traced
 from dirax.reduction.actions import AbstractAction
 
 
 class LeftTranslation(AbstractAction):
-    """Φ_ξ(q) = exp(ξ) q for algebra vectors ξ (d,) and elements q (N,) of `group`, not an abelian action.
+    """Φ_ξ(q) = exp(ξ) q for algebra vectors ξ (d,) and elements q (N,) of `group`.
 
     It is known by its generators ξ_Q(q) = ξ q: `dx.check_invariance` finds with them whether L(q, v) on TG is left-invariant,
     `momentum_map(q, p)` is the spatial momentum Ad*_{g⁻¹}μ, and `generator` serves `dx.verify`.
@@ -18,7 +19,7 @@ class LeftTranslation(AbstractAction):
         left = dx.LeftTranslation(dx.SO3())
         dx.verify(dx.reconstruct(sol), symmetries={"about z": lambda q: left.generator(jnp.array([0.0, 0.0, 1.0]), q)})
 
-    Raises `TypeError` for a group that is none, and `ValueError`, with the defect, for a q that is no element of it.
+    Raises `TypeError` for what is no Lie group of dirax, and `ValueError`, with the defect, for a q that is no element of it.
     """
 
     group: AbstractLieGroup
@@ -36,7 +37,7 @@ class LeftTranslation(AbstractAction):
         name, size = type(self.group).__name__, self.group.ambient_dimension
         if jnp.shape(q) != (size,):
             raise ValueError(f"an element of {name} has shape ({size},), but q has shape {jnp.shape(q)}.")
-        if not is_traced(q) and not float(self.group.defect(q)) < 1e-9:
+        if not is_traced(q) and not float(self.group.defect(q)) < GROUP_DEFECT:
             raise ValueError(f"q = {np.asarray(q)} is no element of {name}: it is off by {float(self.group.defect(q)):.3g}.")
 
     def __call__(self, g: Float[Array, " d"], q: Float[Array, " N"]) -> Float[Array, " N"]:

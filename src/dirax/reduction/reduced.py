@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.tolerances import INERTIA_RANK, SYMMETRY_DEFECT
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.actions import Translations
 from dirax.reduction.connection import AbstractConnection
-from dirax.reduction.symmetry import TOLERANCE, discrete_invariance, invariance, times
+from dirax.reduction.symmetry import discrete_invariance, invariance, times
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
@@ -75,7 +76,7 @@ class ReducedLagrangeDirac(AbstractSystem):
         largest = np.max(np.where(np.isfinite(sizes), sizes, 0.0), axis=0)
         defects = np.abs(parts) / np.where(largest > 0, largest, 1.0)[:, None]
         where, row, column = np.unravel_index(int(np.argmax(np.where(np.isfinite(defects), defects, 0.0))), defects.shape)
-        if not defects[where, row, column] > TOLERANCE:
+        if not defects[where, row, column] > SYMMETRY_DEFECT:
             return ""
         forces, coordinate = row == parts.shape[1] - 1, f"q[{self.connection.fibre[column]}]"
         what = "the forces f(t, q, v) move" if forces else "the forces of the constraints move"
@@ -165,5 +166,5 @@ def group_inertia_ranks(system: LagrangeDirac, connection: AbstractConnection, q
     if not (np.all(np.isfinite(here)) and np.all(np.isfinite(nearby))):
         return len(fibre), len(fibre)
     size = max(np.max(np.abs(nearby)), 1e-300)
-    ranks = [int(np.linalg.matrix_rank(block / size, tol=1e-13, hermitian=True)) for block in (here, nearby)]
+    ranks = [int(np.linalg.matrix_rank(block / size, tol=INERTIA_RANK, hermitian=True)) for block in (here, nearby)]
     return ranks[0], ranks[1]

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.ranks import numerical_rank
+from dirax.numerics.tolerances import SYMMETRY_DEFECT
 from dirax.program.user_functions import UserFunction
 from dirax.reduction.actions import AbstractAction
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
-
-TOLERANCE = 1e-9
-"""Largest defect, relative to the size of L and of its derivatives, of a symmetry."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class Invariance:
 
     def __str__(self) -> str:
         if self.ok:
-            return f"invariant: the largest relative defect is {self.relative:.1e} (tolerance {TOLERANCE:.0e})."
+            return f"invariant: the largest relative defect is {self.relative:.1e} (tolerance {SYMMETRY_DEFECT:.0e})."
         second = "q1" if self.of == "discrete_lagrangian" else "v"
         return (
             f"not invariant: the {self.of} changes along generator {self.generator} at the rate {self.defect:.3g} "
@@ -194,7 +193,7 @@ def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: An
         largest = float(relative[row, column])
         if worst is None or largest > worst.relative:
             place = np.asarray(q)[row], np.asarray(v)[row]
-            worst = Invariance(largest <= TOLERANCE, name, int(column), float(defect[row, column]), largest, *place)
+            worst = Invariance(largest <= SYMMETRY_DEFECT, name, int(column), float(defect[row, column]), largest, *place)
     assert worst is not None
     return worst
 
@@ -234,7 +233,7 @@ def translation_symmetries(
     if not len(slopes):
         raise ValueError("L is finite at none of the points around q: choose q inside its domain, or a smaller radius.")
     _, values, directions = np.linalg.svd(slopes, full_matrices=True)
-    rank = int(np.sum(values > TOLERANCE * max(unit, values[0])))
+    rank = int(numerical_rank(values, SYMMETRY_DEFECT, least=unit))
     return directions[rank:]
 
 

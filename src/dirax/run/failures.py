@@ -5,10 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import OK, Outcome, Problem
-from dirax.engines.stopping import EPSILON, STALLED
-
-SINGULAR = 1e15
-"""Condition number from which a Jacobian counts as singular."""
+from dirax.engines.stopping import STALLED
+from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
 
 SMALLER = "a smaller step may help"
 
@@ -61,7 +59,7 @@ def _replay_newton(stage, guess, args, max_iterations: int):
             label = stage.labels[int(np.argmax(broken))]
             return f"{label} is not finite (outside the domain of the system's functions) in Newton iteration {iteration + 1}", u
         worst, condition = int(np.argmax(np.abs(residual))), np.linalg.cond(jacobian)
-        if not condition < SINGULAR:
+        if not condition < LARGEST_CONDITION:
             return f"the Jacobian of the step is singular (condition number {condition:.2g})", u
         change = np.linalg.solve(jacobian, residual)
         u, size = u - change, np.max(np.abs(change) / (np.abs(u) + 1.0))
@@ -92,7 +90,7 @@ def _roundoff(stage, u, args) -> float:
     is a function of."""
     by_u, by_state = map(np.asarray, jax.jacfwd(stage.residual, argnums=(0, 1))(u, *args))
     left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
-    if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and np.linalg.cond(by_u) < SINGULAR):
+    if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and np.linalg.cond(by_u) < LARGEST_CONDITION):
         return np.inf
     change = EPSILON * np.abs(np.linalg.inv(by_u)) @ left
     return float(np.max(change / (np.abs(u) + 1.0)))

@@ -4,11 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from dirax.run.start import Initial, Start, numerical_rank
+from dirax.numerics.ranks import rank_of_equations
+from dirax.numerics.tolerances import CONSTRAINT_DEFECT
+from dirax.run.start import Initial, Start
 from dirax.systems.system import AbstractSystem
-
-OFF_CONSTRAINT = 1e-9
-"""Largest admissible |W v|, relative to |v| where that is above 1, for initial data that are to satisfy the constraint."""
 
 
 def refuse_bad_start(
@@ -60,7 +59,7 @@ def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Star
     if not defect.size:
         return
     worst = np.max(np.abs(defect), axis=-1)
-    bad = ~(worst <= OFF_CONSTRAINT * np.maximum(_lanes(initial.size, 0), 1.0))
+    bad = ~(worst <= CONSTRAINT_DEFECT * np.maximum(_lanes(initial.size, 0), 1.0))
     if np.any(bad):
         lane = int(np.argmax(bad))
         way = (
@@ -91,7 +90,7 @@ def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool)
             f"the first step is not finite at the initial data{_which(~finite)} (in {labels[row]}): the data lie outside the "
             "domain of the system's functions, or on its edge."
         )
-    ranks, directions = numerical_rank(jacobian)
+    ranks, directions = rank_of_equations(jacobian)
     unknowns = jacobian.shape[1]
     if np.any(ranks < unknowns):
         lane = int(np.argmax(ranks < unknowns))

@@ -6,13 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.ranks import rank_of_equations
+from dirax.numerics.tolerances import CONSTRAINT_DEFECT
 from dirax.program.compiled import compiled
-from dirax.run.start import numerical_rank
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
-
-CONSISTENT = 1e-9
-"""Largest residual of constraints, relative to 1 or to the velocity, that counts as satisfied."""
 
 AWAY = 1e-3
 """How far from the initial point, relative to it, the rank of the constraints is compared."""
@@ -31,7 +29,7 @@ def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, par
     matrices = matrices if matrices.ndim == 3 else matrices[None]
     if not np.all(np.isfinite(matrices)):
         return ()
-    ranks, _ = numerical_rank(matrices)
+    ranks, _ = rank_of_equations(matrices)
     total = matrices.shape[1]
     if np.all(ranks == total):
         return ()
@@ -39,9 +37,9 @@ def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, par
     _refuse_singular_point(system, matrices, ranks, where, data, params, t0)
     kept: list[int] = []
     for row in range(total):
-        if numerical_rank(matrices[:1, [*kept, row]])[0][0] > len(kept):
+        if rank_of_equations(matrices[:1, [*kept, row]])[0][0] > len(kept):
             kept.append(row)
-    if np.any(ranks != len(kept)) or np.any(numerical_rank(matrices[:, kept])[0] < len(kept)):
+    if np.any(ranks != len(kept)) or np.any(rank_of_equations(matrices[:, kept])[0] < len(kept)):
         raise ValueError(
             f"the constraints that follow from others are not the same in all trajectories of the batch (ranks from "
             f"{np.min(ranks)} to {np.max(ranks)} of {total}): run the trajectories in groups."
@@ -62,13 +60,13 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
     q = jnp.asarray(system.point(data))
     near, positions, velocities = map(np.asarray, _nearby(system, q, params, jnp.asarray(t0, float)))
     worst = max((positions, velocities), key=lambda residual: np.max(np.abs(residual), initial=0.0))
-    if np.max(np.abs(worst), initial=0.0) > CONSISTENT * (1 + np.max(np.abs(q))):
+    if np.max(np.abs(worst), initial=0.0) > CONSTRAINT_DEFECT * (1 + np.max(np.abs(q))):
         raise ValueError(
             f"the constraints ({constraints.names}) contradict each other at the initial data: their rank is {np.min(ranks)} "
             f"of {total}, and the nearest point and velocity leave the residual {np.array2string(worst, precision=4)}. Take "
             "out those that cannot hold."
         )
-    nearby = int(numerical_rank(near[None])[0][0])
+    nearby = int(rank_of_equations(near[None])[0][0])
     if nearby > np.min(ranks):
         raise ValueError(
             f"the constraints ({constraints.names}) are dependent at the initial data{where}, with rank {np.min(ranks)} of "

@@ -157,19 +157,3 @@ def _first_step_in_numbers(equation: Any, case: Case, start: Start) -> tuple[np.
     key = equation, case.params, case.batch_params
     found = linearized(*key, lead(start.guess[0]), lead(start.state), t, each(fraction * case.h))
     return found if case.batch is not None or found is None else (found[0][0], found[1][0])
-
-
-def numerical_rank(matrices: np.ndarray, relative: float = 1e-12) -> tuple[np.ndarray, np.ndarray]:
-    """The ranks of matrices (B, k, l) with rows and columns scaled to unit size, and directions nearest to their kernels."""
-    scaled = np.array(matrices, dtype=float)
-    columns = np.ones((len(scaled), 1, scaled.shape[2]))
-    for _ in range(3):
-        rows = np.max(np.abs(scaled), axis=2, keepdims=True)
-        scaled /= np.where(rows > 0, rows, 1.0)
-        sizes = np.max(np.abs(scaled), axis=1, keepdims=True)
-        sizes = np.where(sizes > 0, sizes, 1.0)
-        scaled, columns = scaled / sizes, columns / sizes
-    _, values, vt = np.linalg.svd(scaled)
-    directions = vt[:, -1] * columns[:, 0]
-    directions /= np.max(np.abs(directions), axis=1, keepdims=True)
-    return np.sum(values > relative * np.maximum(values[:, :1], 1e-300), axis=1), directions

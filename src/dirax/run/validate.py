@@ -149,6 +149,7 @@ def _memory() -> int:
 
 
 def finite(value, name: str):
+    """The number, or the traced value as it is; raises `ValueError` for anything that is not one finite number."""
     if is_traced(value):
         return value
     if not _is_number(value) or np.ndim(value) != 0 or not np.isfinite(value):
@@ -157,12 +158,14 @@ def finite(value, name: str):
 
 
 def positive(value, name: str):
+    """The same for a positive number."""
     if not is_traced(value) and (not _is_number(value) or np.ndim(value) != 0 or not 0 < value < np.inf):
         raise ValueError(f"{name} must be a positive finite number, but {value!r} was given.")
     return value if is_traced(value) else float(value)
 
 
 def count(value, name: str) -> int:
+    """The whole number; raises `ValueError` for anything else, and below 1."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise ValueError(f"{name} must be a whole number ≥ 1, but {value!r} was given.")
     return int(value)

@@ -13,23 +13,19 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
+from dirax.numerics.equilibration import equilibrated
+from dirax.numerics.newton import GaussNewton, regular_root
+from dirax.numerics.ranks import numerical_rank
+from dirax.numerics.tolerances import JACOBIAN_NOISE, STEP_RANK
 from dirax.schemes.step import StepEquation
-from dirax.systems.affine_equations import equilibrated
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintLevel
-
-RANK_TOLERANCE = 1e-11
-"""Singular values below this, of the equilibrated Jacobian, count as zero: those of a constraint of index ν are of size h^ν."""
-
-NOISE = 1e-13
-"""Entries of a Jacobian below this, relative to its largest, are roundoff."""
-
-ZERO = 1e-10
-"""Equations that keep a value of this, relative to their slope and to the point, have no solution there."""
 
 SAMPLES = 4
 """Points around the given one at which ranks are compared."""
+
+ONTO = GaussNewton(rank=JACOBIAN_NOISE, floor=1e-14, least_slope=1.0)
+"""The residual of a step is in the units of its scheme, and its Jacobian has entries of roundoff."""
 
 
 class DiscreteConstraintSearch:
@@ -61,20 +57,7 @@ class DiscreteConstraintSearch:
 
     def onto(self, relation: Callable, point: np.ndarray) -> tuple[np.ndarray | None, float]:
         """The point (x, u) of S_{d,k} near `point` by Gauss–Newton, None where there is none; the equations that are left."""
-        start, first = point, 0.0
-        for _ in range(60):
-            value, slope = (np.asarray(a) for a in relation(point))
-            if not (np.all(np.isfinite(value)) and np.all(np.isfinite(slope))):
-                return None, np.nan
-            first = max(first, np.abs(slope).max(initial=0.0))
-            change = np.linalg.lstsq(slope, value, rcond=1e-13)[0]
-            point = point - change
-            if np.linalg.norm(point - start) > 1e3 * (1.0 + np.linalg.norm(start)):
-                break
-            if np.abs(change).max(initial=0.0) <= 1e-14 * (1.0 + np.abs(point).max()):
-                break
-        left = float(np.abs(np.asarray(relation(point)[0])).max(initial=0.0))
-        return (point if left <= ZERO * max(first, 1.0) * (1.0 + np.abs(point).max()) else None), left
+        return ONTO.zero_near(relation, point)
 
     def around(self, relation: Callable) -> list[np.ndarray]:
         """The present point of S_{d,k} and samples around it."""
@@ -182,31 +165,15 @@ def _bordered(equations: Callable, by_u: np.ndarray, rank: int, base: np.ndarray
         def bordered(w):
             return jnp.concatenate([equations(w[:k], x, params) + left @ w[k:], right @ (w[:k] - base)])
 
-        return _smooth_root(bordered, start)
+        return regular_root(bordered, start, tolerance=np.inf, max_steps=30)
 
     return solve
-
-
-def _smooth_root(residual: Callable, guess: Float[Array, " k"]) -> Float[Array, " k"]:
-    """The root near a guess where the Jacobian is regular: Newton to the floor; differentiable."""
-
-    def solve(residual, guess):
-        def update(carry):
-            w, _, count = carry
-            change = jnp.linalg.solve(jax.jacfwd(residual)(w), residual(w))
-            return w - change, jnp.max(jnp.abs(change)) / (1.0 + jnp.max(jnp.abs(w))), count + 1
-
-        unfinished = lambda carry: (carry[1] > 1e-15) & (carry[2] < 30)
-        return jax.lax.while_loop(unfinished, update, (guess, jnp.array(1.0), 0))[0]
-
-    tangent = lambda linear, right: jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(right)), right)
-    return jax.lax.custom_root(residual, guess, solve, tangent)
 
 
 def _rank(matrix: np.ndarray) -> int:
     """The numerical rank, rows and columns scaled to unit size where they are more than roundoff."""
     if not matrix.size:
         return 0
-    matrix = np.where(np.abs(matrix) > NOISE * np.abs(matrix).max(), matrix, 0.0)
-    values = np.linalg.svd(equilibrated(matrix), compute_uv=False)
-    return int(np.sum(values > RANK_TOLERANCE * max(1.0, values[0])))
+    matrix = np.where(np.abs(matrix) > JACOBIAN_NOISE * np.abs(matrix).max(), matrix, 0.0)
+    values = np.linalg.svd(equilibrated(matrix, rounds=1)[0], compute_uv=False)
+    return int(numerical_rank(values, STEP_RANK, least=1.0))

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.tolerances import CONSTRAINT_DEFECT
 from dirax.program.user_functions import check_finite, is_traced
 from dirax.schemes.discrete_constraint_search import SAMPLES, DiscreteConstraintSearch
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation, make_step_equation
@@ -23,9 +24,6 @@ from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import EMPTY, IRREGULAR, ConstraintChain, ConstraintLevel
 from dirax.systems.system import AbstractSystem
 from dirax.text.tables import text_table
-
-SAME = 1e-9
-"""Constraints of the system up to this, relative to 1 + |x|, hold at a node."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +149,7 @@ def _compared(search: DiscreteConstraintSearch, verdict: str, chain: ConstraintC
     if len(nodes[0]) != len(chain.coordinates):
         return np.nan, False, f"The chain of the system is one of {', '.join(chain.coordinates)}: the two are not compared."
     distance = max(float(np.abs(np.asarray(chain.constraints(jnp.asarray(x)))).max(initial=0.0)) for x in nodes)
-    on = distance <= SAME * (1.0 + max(np.abs(x).max() for x in nodes))
+    on = distance <= CONSTRAINT_DEFECT * (1.0 + max(np.abs(x).max() for x in nodes))
     dimension = search.levels[-1].dimension
     if on and dimension == chain.dimension:
         return distance, True, f"M_d,f is M_f, of dimension {chain.dimension}: the nodes stay on it."

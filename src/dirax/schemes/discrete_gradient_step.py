@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 
+from dirax.numerics.tolerances import EPSILON
 from dirax.program.tracing import once
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 from dirax.systems.forms import EnergyForm, RelationForm
 
-EPSILON = 2.220446049250313e-16
 NOISE = 1e-11
 """How much of dH the correction may be, relative, where it is roundoff of H only. It fades out for steps so short that it
 would be more: dividing roundoff by such a step would push a system that comes to rest."""

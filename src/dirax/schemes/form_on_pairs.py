@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.numerics.ranks import significant
+from dirax.numerics.tolerances import PAIR_RANK
 from dirax.schemes.discrete_structure import AbstractStepForm, nonzero
 
 
@@ -77,7 +79,7 @@ class FormOnPairs(AbstractStepForm):
         constraint_matrix = jax.jacfwd(constraints_of_pair)(z)
         constraint_matrix = constraint_matrix / nonzero(jnp.max(jnp.abs(constraint_matrix), axis=1, keepdims=True))
         _, values, right = jnp.linalg.svd(constraint_matrix, full_matrices=True)
-        kept = jnp.concatenate([values > 1e-10 * values[0], jnp.zeros(right.shape[0] - values.shape[0], bool)])
+        kept = jnp.concatenate([significant(values, PAIR_RANK, xp=jnp), jnp.zeros(right.shape[0] - values.shape[0], bool)])
         tangent = jnp.where(kept, 0.0, right.T)  # without the normal vectors, as many as there are independent constraints
         restricted = lambda form: jnp.max(jnp.abs(tangent.T @ form @ tangent))
         size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(two_form_after) @ jnp.abs(jacobian)) + jnp.max(jnp.abs(beta))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.tolerances import INERTIA_RANK
 from dirax.program.user_functions import evaluated
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.abstract_step import AbstractStep
@@ -16,9 +17,6 @@ from dirax.schemes.quotient import Quotient
 from dirax.schemes.reduced_discrete_lagrangian import ReducedDiscreteLagrangian
 from dirax.schemes.step import Field
 from dirax.schemes.vertical_velocity import vertical_velocity
-
-SINGULAR = 1e-13
-"""A group inertia with singular values below this, when its rows and columns have unit size, is singular."""
 
 REGULAR = "which needs the group inertia ∂²l/∂γ² to be invertible: μ is not to be a singular value of the momentum map"
 
@@ -160,7 +158,7 @@ class RouthStep(AbstractStep):
         matrix, k = np.asarray(evaluated(self.group_inertia, data, h, params)), self.quotient.k
         units = np.sqrt(np.max(np.abs(matrix), axis=1))
         scaled = matrix / np.outer(units, units) if np.all(units > 0) else matrix
-        rank = int(np.linalg.matrix_rank(scaled, tol=SINGULAR)) if np.all(np.isfinite(scaled)) else k
+        rank = int(np.linalg.matrix_rank(scaled, tol=INERTIA_RANK)) if np.all(np.isfinite(scaled)) else k
         if rank < k:
             raise ValueError(
                 f"μ has a singular value at the initial data: the group inertia ∂²l_d/∂γ² = {matrix.tolist()} has rank {rank} of "

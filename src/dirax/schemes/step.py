@@ -146,6 +146,7 @@ class StepSequence(eqx.Module):
 
     @property
     def first(self) -> StepEquation:
+        """The equation of the first part."""
         return self.stages[0][0]
 
     @property

@@ -9,6 +9,7 @@ import numpy as np
 
 from dirax.geometry.group_retractions import coadjoint
 from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.numerics.tolerances import GROUP_DEFECT
 from dirax.program.user_functions import is_traced
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.lie_poisson import LiePoisson
@@ -123,7 +124,7 @@ def _element(group: AbstractLieGroup, g0: Any, batch: int | None) -> jax.Array:
             f"g0 must be an element of {type(group).__name__} of shape ({size},){many}, or a matrix {matrix}, but it has shape "
             f"{g.shape}."
         )
-    if not is_traced(g) and not float(defect) < 1e-9:
+    if not is_traced(g) and not float(defect) < GROUP_DEFECT:
         raise ValueError(f"g0 is no element of {type(group).__name__}: it is off by {float(defect):.3g}.")
     return element
 

@@ -15,14 +15,13 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.equilibration import equilibrated
+from dirax.numerics.tolerances import PIVOT
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import once
 
 THRESHOLD = 0.1
 """A pivot is at least this fraction of the largest entry left, in units of the rows and columns; among these, a sparse one."""
-
-NEGLIGIBLE = 1e-10
-"""Entries below this, in the same units, count as zero."""
 
 
 class Explicit(NamedTuple):
@@ -62,12 +61,12 @@ def explicit(equations: Callable, entries: np.ndarray, size: int) -> Explicit:
 
 def pivots(matrix: np.ndarray, rank: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns, as many as the rank of the matrix, whose square part is regular; sparse ones first (Markowitz)."""
-    left, rows, columns = equilibrated(matrix), [], []
+    left, rows, columns = equilibrated(matrix, rounds=1)[0], [], []
     while left.size and (rank is None or len(rows) < rank):
         sizes = np.abs(left)
-        if sizes.max() <= (NEGLIGIBLE if rank is None else 0.0):
+        if sizes.max() <= (PIVOT if rank is None else 0.0):
             break
-        there = sizes > NEGLIGIBLE
+        there = sizes > PIVOT
         fill = (there.sum(axis=1, keepdims=True) - 1) * (there.sum(axis=0, keepdims=True) - 1)
         i, j = np.unravel_index(np.argmin(np.where(sizes >= THRESHOLD * sizes.max(), fill, np.inf)), left.shape)
         rows.append(i)
@@ -80,14 +79,6 @@ def pivots(matrix: np.ndarray, rank: int | None = None) -> tuple[np.ndarray, np.
 def _whole(top, columns: np.ndarray, free: np.ndarray):
     """Solution and kernel of all unknowns, (n, 1 + f), where those of the solved `columns` are `top` and the others free."""
     return jnp.concatenate([top, np.eye(free.size, free.size + 1, 1)])[np.argsort(np.concatenate([columns, free]))]
-
-
-def equilibrated(matrix: np.ndarray) -> np.ndarray:
-    """The matrix with rows, then columns, of unit size where they are not zero."""
-    for axis in (1, 0):
-        sizes = np.abs(matrix).max(axis=axis, keepdims=True, initial=0.0)
-        matrix = matrix / np.where(sizes > 0, sizes, 1.0)
-    return matrix
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.newton import GaussNewton
+from dirax.numerics.ranks import numerical_rank
+from dirax.numerics.tolerances import EQUATION_RANK, MANIFOLD_RANK, ON_MANIFOLD, TINY
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import along, jacobian, once
 from dirax.program.user_functions import check_finite, constant_entries, evaluated, is_traced
@@ -20,10 +23,11 @@ from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, 
 from dirax.systems.forms import ImplicitForm
 from dirax.systems.system import AbstractSystem
 
-RANK_TOLERANCE = 1e-8
-ZERO = 1e-10
-"""A condition below this, relative to the right-hand side and the point, counts as satisfied."""
 SAMPLES = 6
+"""Points around the given one at which ranks are compared."""
+
+ONTO = GaussNewton(rank=EQUATION_RANK, floor=1e-15, least_slope=TINY)
+"""The conditions are in any units, and differentiated exactly."""
 
 
 def constraint_algorithm(system: AbstractSystem, near: Any, params: Any = None, radius: float = 0.02) -> ConstraintChain:
@@ -55,7 +59,7 @@ def rank_of(matrix: np.ndarray, reference: np.ndarray | None = None) -> int:
         return 0
     rows = np.abs(matrix).max(axis=1) if reference is None else reference
     values = np.linalg.svd(matrix / np.where(rows > 0, rows, 1.0)[:, None], compute_uv=False)
-    return int(np.sum(values > RANK_TOLERANCE * max(1.0, values[0])))
+    return int(numerical_rank(values, MANIFOLD_RANK, least=1.0))
 
 
 class _Search:
@@ -97,7 +101,7 @@ class _Search:
         return once(lambda x, params: jnp.concatenate([part(x, params) for part in parts]))
 
     def equations(self) -> Callable:
-        """(x, params) ↦ the equations (A, b) of c that are still asked, one below the other."""
+        """(x, params) ↦ the equations (A, b) of c that none of the ẋ and u so far satisfies by itself, one below the other."""
         rows = tuple(self.rows)
         return lambda x, params: tuple(jnp.concatenate(a) for a in zip(*(row(x, params) for row in rows), strict=True))
 
@@ -130,24 +134,9 @@ class _Search:
 
     def onto(self, function: Callable, x: np.ndarray) -> np.ndarray | None:
         """The zero of `function` (x ↦ value, slope) near x by Gauss–Newton, run to the floor; None where there is none."""
-        start, first, self.singular = x, 0.0, False
-        for _ in range(80):
-            value, slope = function(x)
-            if not value.size:
-                return x
-            if not (np.all(np.isfinite(value)) and np.all(np.isfinite(slope))):
-                self.singular = True
-                return None
-            first = max(first, np.abs(slope).max())
-            change = np.linalg.lstsq(slope * self.moved, value, rcond=1e-12)[0]
-            x = x - change
-            if np.linalg.norm(x - start) > 1e3 * (1.0 + np.linalg.norm(start)):
-                return None
-            if np.abs(change).max() <= 1e-15 * (1.0 + np.abs(x).max()):
-                break
-        value, _ = function(x)
-        self.singular = not np.all(np.isfinite(value))
-        return x if np.abs(value).max() <= ZERO * max(first, 1e-300) * (1.0 + np.abs(x).max()) else None
+        found, left = ONTO.zero_near(function, x, self.moved)
+        self.singular = bool(np.isnan(left))
+        return found
 
     def around(self, function: Callable | None = None) -> list[np.ndarray]:
         """The point and samples around it, put on the zeros of `function` if it is given."""
@@ -184,7 +173,7 @@ class _Search:
                 return self.finish(found, null, rank)
             missed = self.at_points(lambda x, params, found=found: (found.conditions(x, params),))
             size = 1.0 + np.abs(self.given(self.x)[1]).max(initial=0.0) + np.abs(self.x).max()
-            if all(np.all(np.abs(missed(x)[0]) <= ZERO * size) for x in points):
+            if all(np.all(np.abs(missed(x)[0]) <= ON_MANIFOLD * size) for x in points):
                 return self.finish(found, null, rank)
             function = self.with_conditions(found.conditions)
             outcome = self.add(found.conditions, function, points, rank, self._off_manifold(rank, place))

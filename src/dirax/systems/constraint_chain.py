@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.tolerances import OFF_MANIFOLD
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import evaluated, is_traced, scalar_program
@@ -17,8 +18,6 @@ from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
 DETERMINED, GAUGE, EMPTY, IRREGULAR = "determined", "gauge freedom", "empty", "irregular"
-OFF = 1e-8
-"""Largest value of a constraint, relative to the sizes of its derivative and of the point, at a point that counts as on M_k."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ class ConstraintChain:
         for level in self.levels:
             value, slope = map(np.asarray, self._at(once(_with_slope, level.constraints), x, params))
             slope = np.abs(slope).max(initial=0.0)
-            if np.abs(value).max(initial=0.0) > OFF * slope * (1.0 + np.abs(np.asarray(x)).max()):
+            if np.abs(value).max(initial=0.0) > OFF_MANIFOLD * slope * (1.0 + np.abs(np.asarray(x)).max()):
                 where = np.asarray(self.project(x, params))
                 return (
                     f"x is off M_{level.number}: its {level.count} new constraint{'s' * (level.count > 1)} there "

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.geometry.structures import DiracStructure
+from dirax.numerics.tolerances import BRACKET_DEFECT, RATE_RANK
 from dirax.program.linear_solves import pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
@@ -18,12 +19,6 @@ from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, Relatio
 from dirax.systems.implicit_form import energy_of_x, names, point_of
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
-
-RANK_TOLERANCE = 1e-10
-"""Singular values of the kernel matrix F below this, relative to the largest, count as zero in the initial check."""
-
-TINY_BRACKET = 1e-8
-"""Largest bracket of two constraints, relative to the size of their derivatives, that counts as zero."""
 
 
 class DiracSystem(AbstractSystem):
@@ -163,7 +158,7 @@ class DiracSystem(AbstractSystem):
         """The part of {g, H} that no λ takes away by its brackets {g_i, g_j} λ: all of it where they vanish."""
         hidden, brackets = self.hidden_defect(x, params), self.brackets(x, params)
         size = jnp.sum(self.holonomic_matrix(x, params) ** 2)
-        normal = brackets.T @ brackets + (TINY_BRACKET * size) ** 2 * jnp.eye(hidden.shape[0])
+        normal = brackets.T @ brackets + (BRACKET_DEFECT * size) ** 2 * jnp.eye(hidden.shape[0])
         return hidden - brackets @ solve(normal, brackets.T @ hidden)
 
     def constrained_field(self, x: Float[Array, " N"], params: Any = None) -> tuple[Float[Array, " N"], Float[Array, " c"]]:
@@ -186,7 +181,7 @@ class DiracSystem(AbstractSystem):
 
         def check(data, h, params):
             brackets, rows = map(np.asarray, evaluated(system._brackets_and_rows, np.asarray(system.point(data)), params))
-            if np.max(np.abs(brackets)) > TINY_BRACKET * np.sum(rows**2):
+            if np.max(np.abs(brackets)) > BRACKET_DEFECT * np.sum(rows**2):
                 raise ValueError(
                     f"Method 2 takes holonomic constraints whose brackets {{g_i, g_j}} vanish, as those of functions of q on "
                     f"T*Q do, but they are up to {np.max(np.abs(brackets)):.3g} here: simulate "
@@ -235,7 +230,7 @@ class DiracSystem(AbstractSystem):
         rows = self.holonomic_matrix(x, params)
         count = rows.shape[0]
         matrix = jnp.concatenate([matrix, jnp.concatenate([rows, jnp.zeros((count, count))], axis=1)])
-        rates = pseudo_inverse(matrix, RANK_TOLERANCE) @ jnp.concatenate([right, jnp.zeros(count)])
+        rates = pseudo_inverse(matrix, RATE_RANK) @ jnp.concatenate([right, jnp.zeros(count)])
         return {"x": x, "velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
 
     def project(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
@@ -243,7 +238,7 @@ class DiracSystem(AbstractSystem):
         x = self.project_position(x, x, params)
         along, rows = self.forces(x, params), self.holonomic_matrix(x, params)
         end = x + along @ nearest_root(lambda s: self.hidden_defect(x + along @ s, params), jnp.zeros(along.shape[1]))
-        return jnp.where(jnp.max(jnp.abs(rows @ along)) <= TINY_BRACKET * jnp.sum(rows**2), end, x)
+        return jnp.where(jnp.max(jnp.abs(rows @ along)) <= BRACKET_DEFECT * jnp.sum(rows**2), end, x)
 
     def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " k"]:
         """The part of F ẋ + E dH that no velocity makes zero: x is on M_0 where it vanishes. With holonomic constraints g and

@@ -77,6 +77,7 @@ def uses_time(function: Callable | None, *values) -> bool:
 
 
 def point_of(near, keys: tuple[str, ...], system) -> np.ndarray:
+    """`near` as a point x (N,): an array, {"x": …} or {"q": …, "p": …}; raises `ValueError` for anything else."""
     if isinstance(near, dict):
         if set(near) == {"q", "p"}:
             near = np.concatenate([np.asarray(near["q"]), np.asarray(near["p"])])
@@ -91,8 +92,10 @@ def point_of(near, keys: tuple[str, ...], system) -> np.ndarray:
 
 
 def names(letter: str, count: int) -> tuple[str, ...]:
+    """("x0", "x1", …) for the letter x."""
     return tuple(f"{letter}{i}" for i in range(count))
 
 
 def energy_of_x(system):
+    """The energy of the system as a function of (x, params)."""
     return lambda x, params: system.energy_at({"x": x}, params)

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Array
 
 from dirax.geometry.structures import canonical_two_form
+from dirax.numerics.ranks import significant
+from dirax.numerics.tolerances import HESSIAN_RANK
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import constant_entries
 from dirax.systems.forms import ImplicitForm
 from dirax.systems.implicit_form import in_time, names, uses_time, without_time
-
-RANK_TOLERANCE = 1e-9
 
 
 def implicit_lagrangian(system: Any, stated: Any, near: Any, params: Any) -> ImplicitForm:
@@ -71,7 +71,7 @@ def _momenta(system: Any, q, v, params, t) -> tuple[bool, np.ndarray]:
 def _kernel(hessian: np.ndarray) -> np.ndarray:
     """A basis (n, k) of the kernel of a symmetric matrix."""
     values, vectors = np.linalg.eigh(hessian)
-    return vectors[:, np.abs(values) <= RANK_TOLERANCE * max(np.abs(values).max(initial=0.0), 1e-300)]
+    return vectors[:, ~significant(np.abs(values), HESSIAN_RANK)]
 
 
 def _on_cotangent_bundle(system: Any, x: np.ndarray, hessian: np.ndarray, params, timed: bool, t: float) -> ImplicitForm:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.tolerances import METRIC_RANK
 from dirax.program.linear_solves import scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian
@@ -161,7 +162,7 @@ class LagrangeDirac(AbstractSystem):
         """metric⁻¹ rowsᵀ in the metric ∂²L/∂v² where it is positive definite and the Euclidean one elsewhere."""
         hessian = jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v)
         values = jnp.linalg.eigvalsh(hessian)
-        regular = values[0] > 1e-12 * jnp.abs(values[-1])
+        regular = values[0] > METRIC_RANK * jnp.abs(values[-1])
         return solve(jnp.where(regular, hessian, jnp.eye(q.shape[0])), rows.T)
 
     def project_velocity(

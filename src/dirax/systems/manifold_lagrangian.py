@@ -143,7 +143,7 @@ class ManifoldLagrangian(AbstractSystem):
         """The energy at the saved point and momentum."""
         return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params), params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " 1+m"]:
+    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
         """How far the point is from the manifold, and W v + b with the velocity that belongs to the saved momentum."""
         q, off = row["q"], self.manifold.defect(row["q"])[None]
         if not self.constraints.any:

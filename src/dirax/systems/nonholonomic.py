@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.program.linear_solves import solve
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.systems.constraints import Constraints
@@ -15,9 +16,6 @@ from dirax.systems.forms import ImplicitForm
 from dirax.systems.implicit_lagrangian import implicit_lagrangian
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem, refuse_start
-
-SYMMETRIC = 1e-10
-"""Smallest eigenvalue and largest asymmetry of a metric, relative to its largest entry."""
 
 
 class NonholonomicMechanics(AbstractSystem):
@@ -184,10 +182,10 @@ def _check_metric(metric: np.ndarray) -> None:
     scale = np.abs(metric).max()
     if not np.isfinite(scale):
         return
-    if (defect := np.abs(metric - metric.T).max()) > SYMMETRIC * scale:
+    if (defect := np.abs(metric - metric.T).max()) > STRUCTURE_DEFECT * scale:
         raise ValueError(f"metric is not symmetric at the initial point: max |g − gᵀ| = {defect:.3g}; return (g + gᵀ)/2.")
     lowest = float(np.linalg.eigvalsh(metric)[0])
-    if lowest <= SYMMETRIC * scale:
+    if lowest <= STRUCTURE_DEFECT * scale:
         raise ValueError(
             f"metric is not positive definite at the initial point: its lowest eigenvalue is {lowest:.3g}. A degenerate kinetic "
             "energy belongs in dx.LagrangeDirac, whose Lagrangian may be singular."

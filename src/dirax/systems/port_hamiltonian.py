@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.tolerances import STRUCTURE_DEFECT, TINY
 from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.systems.constraints import no_constraint
@@ -14,8 +15,6 @@ from dirax.systems.forms import EnergyForm, ImplicitForm, Observed, RelationForm
 from dirax.systems.implicit_form import in_time, names, point_of, uses_time, without_time
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
-
-SKEW_TOLERANCE = 1e-10
 
 
 class PortHamiltonian(AbstractSystem):
@@ -193,16 +192,16 @@ class PortHamiltonian(AbstractSystem):
     def _check_structure(self, x, params) -> None:
         J = np.asarray(evaluated(self.J, x, params))
         skewness = np.max(np.abs(J + J.T), initial=0.0)
-        if skewness > SKEW_TOLERANCE * max(np.max(np.abs(J), initial=0.0), 1e-300):
+        if skewness > STRUCTURE_DEFECT * max(np.max(np.abs(J), initial=0.0), TINY):
             raise ValueError(f"J is not skew at the initial point: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
         if self.R is None:
             return
         R = np.asarray(evaluated(self.R, x, params))
-        scale = max(np.max(np.abs(R), initial=0.0), 1e-300)
-        if np.max(np.abs(R - R.T)) > SKEW_TOLERANCE * scale:
+        scale = max(np.max(np.abs(R), initial=0.0), TINY)
+        if np.max(np.abs(R - R.T)) > STRUCTURE_DEFECT * scale:
             raise ValueError(f"R is not symmetric at the initial point: max |R − Rᵀ| = {np.max(np.abs(R - R.T)):.3g}.")
         lowest = np.linalg.eigvalsh(R)[0]
-        if lowest < -SKEW_TOLERANCE * scale:
+        if lowest < -STRUCTURE_DEFECT * scale:
             raise ValueError(
                 f"R is not positive semidefinite at the initial point: its lowest eigenvalue is {lowest:.3g}; dissipation "
                 "must not create energy."

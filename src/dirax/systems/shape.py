@@ -27,7 +27,7 @@ class Shape(eqx.Module):
         kept = [i - first for i in self.kept if i >= first]
         return values if len(kept) == values.shape[0] else jnp.stack([values[i] for i in kept])
 
-    def spread(self, multipliers: Float[Array, " k"]) -> Float[Array, " m+c"]:
+    def spread(self, multipliers: Float[Array, " k"]) -> Float[Array, " m_and_c"]:
         """The multipliers of all constraints: zero for the redundant ones."""
         if len(self.kept) == self.m + self.c:
             return multipliers

@@ -9,9 +9,9 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
+from dirax.numerics.newton import damped_step
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported
 from dirax.program.linear_solves import equilibrated_inverse
-from dirax.program.roots import EPSILON, SHORTEST
 from dirax.program.rules.reductions import factors_of_product
 from dirax.program.scalar_program import ScalarProgram, numpy_rule
 from dirax.program.tracing import jacobian, of_one_result
@@ -148,31 +148,10 @@ def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands
             if not len(going):
                 break
             known = [a[going] for a in captured]
-            found[going], more = _newton(
-                lambda u, k=known: residual([*k, u])[0], lambda u, k=known: linear([*k, u])[0], found[going]
-            )
+            inverse, units = _inverted(linear([*known, found[going]])[0])
+            update = lambda u, known=known, inverse=inverse: np.einsum("blk,bk->bl", inverse, residual([*known, u])[0])
+            found[going], more = damped_step(update, found[going], units)
             going = going[more]
         return [found]
 
     return made.between(list(operands), [equation.outvars[0].aval.shape], find)
-
-
-def _newton(residual: Callable, linear: Callable, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(u, whether to go on) after a step that is halved until the next one would be shorter."""
-    inverse, unit = _inverted(linear(u))
-    change = np.einsum("blk,bk->bl", inverse, residual(u))
-    size = lambda v: np.max(np.abs(v) / unit, axis=-1)
-    here = size(change)
-    at_floor = here <= 4.0 * EPSILON * size(u)
-
-    def shorter(fraction):
-        following = np.einsum("blk,bk->bl", inverse, residual(u - fraction[:, None] * change))
-        return np.all(np.isfinite(following), axis=-1) & (size(following) <= (1.0 - fraction / 4.0) * here)
-
-    fraction = np.ones(len(u))
-    with np.errstate(all="ignore"):
-        better = at_floor if np.all(at_floor) else at_floor | shorter(fraction)
-        while np.any(searching := ~better & (fraction > SHORTEST)):
-            fraction = np.where(searching, fraction / 2.0, fraction)
-            better = better | searching & shorter(fraction)
-        return np.where(better[:, None], u - fraction[:, None] * change, u), better & ~at_floor

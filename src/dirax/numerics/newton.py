@@ -1,0 +1,136 @@
+"""Newton's method for the small equations around a run: a step that is shortened, a search for the nearest zero, regular roots.
+
+The Newton iteration of a step is that of the engines (`dirax.engines.stopping` says when it stops).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from dirax.numerics.tolerances import EPSILON, ON_MANIFOLD
+
+SHORTEST = 2.0**-30
+"""Smallest fraction of a Newton step that is tried."""
+
+AT_FLOOR = 4.0 * EPSILON
+"""A step of this size relative to the point is roundoff."""
+
+FAR = 1e3
+"""A zero at this distance, relative to 1 + |start|, is none near the start."""
+
+
+def damped_step(update: Callable, u: Any, units: Any, xp: ModuleType = np) -> tuple[Any, Any]:
+    """(u, whether to go on) after a Newton step that is halved until the next one would be shorter: so neither the units of the
+    equations nor those of the unknowns matter, and the domain of the equations is not left.
+
+    `update(u)` (…, k) is A⁻¹ r(u), with one A for all u; `units` (…, k) those of the unknowns. With NumPy, leading axes hold
+    equations side by side; where no shorter step is an improvement, u stays.
+    """
+    size = lambda v: xp.max(xp.abs(v) / units, axis=-1)
+    change = update(u)
+    here = size(change)
+    at_floor = here <= AT_FLOOR * size(u)
+
+    def improves(fraction):
+        following = update(u - fraction[..., None] * change)
+        # not left to the comparison: XLA's vectorized maximum of NaNs can be −∞ on a CPU
+        return xp.all(xp.isfinite(following), axis=-1) & (size(following) <= (1.0 - fraction / 4.0) * here)
+
+    def halve(carry):
+        searching, (fraction, better) = unfinished(carry), carry
+        fraction = xp.where(searching, fraction / 2.0, fraction)
+        return fraction, better | searching & improves(fraction)
+
+    unfinished = lambda carry: ~carry[1] & (carry[0] > SHORTEST)
+    whole = xp.ones(here.shape)
+    with np.errstate(all="ignore"):
+        better = at_floor if xp is np and np.all(at_floor) else at_floor | improves(whole)
+        fraction, better = _repeated(xp, lambda carry: xp.any(unfinished(carry)), halve, (whole, better))
+        return xp.where(better[..., None], u - fraction[..., None] * change, u), better & ~at_floor
+
+
+def _repeated(xp: ModuleType, unfinished: Callable, step: Callable, carry: Any) -> Any:
+    if xp is jnp:
+        return lax.while_loop(unfinished, step, carry)
+    while unfinished(carry):
+        carry = step(carry)
+    return carry
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """The zero nearest to a point of equations that may be dependent or fewer than the unknowns: steps of least length, run to
+    the floor.
+
+    - `rank`: singular values of the derivative below this, relative to the largest, are left alone.
+    - `floor`: a step of this size, relative to 1 + |point|, is the last.
+    - `least_slope`: values are compared with the largest derivative met, or with this where that is more.
+    """
+
+    rank: float
+    floor: float
+    least_slope: float
+    max_steps: int = 80
+
+    def zero_near(self, function: Callable, start: np.ndarray, moved: Any = 1.0) -> tuple[np.ndarray | None, float]:
+        """(the zero, or None where there is none; the largest value left there, NaN where the function is not finite).
+
+        `function(x)` (n,) ↦ value (k,) and derivative (k, n), arrays; `moved` (n,): 0 for entries that stay as they are.
+        """
+        x, largest_slope = start, 0.0
+        for _ in range(self.max_steps):
+            value, slope = map(np.asarray, function(x))
+            if not value.size:
+                return x, 0.0
+            if not (np.all(np.isfinite(value)) and np.all(np.isfinite(slope))):
+                return None, np.nan
+            largest_slope = max(largest_slope, np.abs(slope).max(initial=0.0))
+            change = np.linalg.lstsq(slope * moved, value, rcond=self.rank)[0]
+            x = x - change
+            if np.linalg.norm(x - start) > FAR * (1.0 + np.linalg.norm(start)):
+                left = np.abs(np.asarray(function(x)[0])).max()
+                return None, float(left) if np.isfinite(left) else np.inf
+            if np.abs(change).max(initial=0.0) <= self.floor * (1.0 + np.abs(x).max()):
+                break
+        left = np.abs(np.asarray(function(x)[0])).max()
+        on = left <= ON_MANIFOLD * max(largest_slope, self.least_slope) * (1.0 + np.abs(x).max())
+        return (x if on else None), float(left) if np.isfinite(left) else np.nan
+
+
+def regular_root(
+    residual: Callable, guess: Float[Array, " k"], tolerance: float = 1e-9, max_steps: int = 40
+) -> Float[Array, " k"]:
+    """A root of `residual` (k,) → (k,) with a regular Jacobian, by Newton's method to the roundoff floor; NaN where it does not
+    converge.
+
+    Traceable, and differentiable any number of times, forwards and backwards, by the implicit function theorem.
+    `tolerance` is on the last residual, relative to 1 + ‖root‖.
+    """
+
+    def solve(residual, guess):
+        def step(carry):
+            z, size, _, count = carry
+            update = jnp.linalg.solve(jax.jacfwd(residual)(z), residual(z))
+            return z - update, jnp.max(jnp.abs(update)), size, count + 1
+
+        def unfinished(carry):
+            _, size, previous, count = carry
+            still_shrinking = (size < 0.5 * previous) | (size > 1e-6)
+            return (count < max_steps) & (size > 0.0) & still_shrinking
+
+        start = (guess, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0)
+        z, *_ = lax.while_loop(unfinished, step, start)
+        converged = jnp.max(jnp.abs(residual(z))) <= tolerance * (1.0 + jnp.max(jnp.abs(z)))
+        return jnp.where(converged, z, jnp.nan)
+
+    def tangent_solve(linear, right_side):
+        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(right_side)), right_side)
+
+    return lax.custom_root(residual, guess, solve, tangent_solve)
