@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.step_program import linearized
+from dirax.numerics.equilibration import equilibrated
 from dirax.program.memo import Memo, Same
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.start import Initial, Start, completed
 from dirax.run.validate import Case
-from dirax.systems.affine_equations import equilibrated
 from dirax.systems.constraint_algorithm import constraint_algorithm, rank_of
 from dirax.systems.constraint_chain import EMPTY, IRREGULAR, ConstraintChain
 from dirax.systems.shape import Shape
@@ -63,7 +63,7 @@ def _is_singular(system: AbstractSystem, shape: Shape, case: Case, data: dict, p
     near = np.tile(at, (n + 1, 1)) + MOVED * (np.max(np.abs(at)) or 1.0) * np.eye(n + 1, n, -1)
     varied = Case({"q": np.tile(data["q"], (n + 1, 1)), moved: near}, params, case.h, case.t0, n + 1)
     answer = np.asarray(completed(system, varied, False).data[answers])
-    response = equilibrated(answer[1:] - answer[:1])
+    response = equilibrated(answer[1:] - answer[:1], rounds=1)[0]
     if np.all(np.isfinite(response)) and np.linalg.svd(response, compute_uv=False)[-1] > DOUBTFUL:
         return False
     first = lambda name: np.asarray(initial.data[name])[0] if case.batch is not None else np.asarray(initial.data[name])
