@@ -113,12 +113,14 @@ def _layout(sol: Trajectory) -> list[dict[str, Any]]:
 
 
 def vars_of(info: Field) -> dict[str, Any]:
-    """A Field as plain data."""
+    """A Field as plain data; how it is composed only where it says so itself, which files of the first version never do."""
+    own = {"composed": info.composed} if info.composed else {}
     return {
         "shape": list(info.shape),
         "place": info.place,
         "dims": list(info.dims),
         "description": info.description,
+        **own,
     }
 
 

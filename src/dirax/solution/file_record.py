@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dirax.schemes.step import COMPOSED
 from dirax.solution.description import DERIVED, FORMAT
 from dirax.solution.saving import MOVED
 from dirax.solution.stored import Unreadable
@@ -101,7 +102,7 @@ def _check_numbers(record: FileRecord) -> None:
 
 
 def _check_entry(entry: Any) -> None:
-    """A field: its name, the name of its array, shape, place, names of axes, description."""
+    """A field: its name, the name of its array, shape, place, names of axes, description, how it is composed."""
     text = lambda key: type(entry[key]) is str
     sizes = lambda values: isinstance(values, list) and all(type(size) is int and size >= 0 for size in values)
     named = lambda values: isinstance(values, list) and all(type(name) is str for name in values)
@@ -111,6 +112,7 @@ def _check_entry(entry: Any) -> None:
         and sizes(entry["shape"])
         and entry["place"] in ("node", "step")
         and named(entry["dims"])
+        and entry.get("composed", "") in ("", *COMPOSED)
     ):
         raise Unreadable("it describes a field as dirax does not")
 

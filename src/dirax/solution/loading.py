@@ -127,7 +127,10 @@ def _solution(said: FileRecord, arrays: dict[str, np.ndarray], params: Any) -> S
     return Solution(
         t=arrays["time"],
         fields={e["name"]: arrays[e["variable"]] for e in said.fields},
-        field_info={e["name"]: Field(tuple(e["shape"]), e["place"], tuple(e["dims"]), e["description"]) for e in said.fields},
+        field_info={
+            e["name"]: Field(tuple(e["shape"]), e["place"], tuple(e["dims"]), e["description"], e.get("composed", ""))
+            for e in said.fields
+        },
         step=said.step,
         save_every=said.save_every,
         stats=said.stats,
