@@ -87,6 +87,32 @@ def test_order_in_positions_momenta_and_work(stages, steps, forces):
     assert np.all(np.abs(measured - 2 * stages) < 0.4) and np.all(np.abs(measured[:, -1] - 2 * stages) < 0.1), measured
 
 
+@pytest.mark.parametrize(("stages", "steps"), [(2, (200, 400, 800)), (3, (60, 90, 120)), (4, (40, 60, 90))])
+def test_lobatto_has_order_two_less_and_is_symplectic(stages, steps):
+    force = lambda t, q, v, params: jnp.array([0.4 * jnp.cos(t), 0.0]) - 0.2 * v
+    q, p, work = pendulum_reference(1.5, 0.2, 0.4)
+    errors, scheme = [], dx.Collocation(stages, nodes="lobatto")
+    for n in steps:
+        sol = dx.simulate(dx.LagrangeDirac(double_pendulum, forces=force), scheme, step=1.5 / n, steps=n, **PENDULUM)
+        errors.append([np.max(np.abs(sol.q[-1] - q)), np.max(np.abs(sol.p[-1] - p)), abs(sol.work[-1] - work)])
+    measured = orders(np.array(errors).T, 1.5 / np.array(steps))
+    assert np.all(np.abs(measured[:, -1] - (2 * stages - 2)) < 0.15), measured
+    sol = dx.simulate(dx.LagrangeDirac(double_pendulum), scheme, step=0.05, steps=20, **PENDULUM)
+    (line,) = [line for line in dx.verify(sol).lines if line.quantity == "symplecticity of one step"]
+    assert line.verdict == "ok", line
+
+
+def test_two_lobatto_nodes_are_stoermer_verlet():
+    sol = dx.simulate(
+        dx.LagrangeDirac(henon_heiles), dx.Collocation(2, "lobatto"), q=[0.3, 0.1], v=[0.2, 0.35], step=0.1, steps=9
+    )
+    verlet = dx.simulate(
+        dx.LagrangeDirac(henon_heiles), dx.LagrangeDAlembert("trapezoidal"), q=[0.3, 0.1], v=[0.2, 0.35], step=0.1, steps=9
+    )
+    np.testing.assert_allclose(sol.q, verlet.q, atol=1e-15)
+    np.testing.assert_allclose(sol.p, verlet.p, atol=1e-15)
+
+
 def test_explicit_time_enters_at_the_nodes():
     system = dx.LagrangeDirac(lambda t, q, v: v[0] ** 2 / 2 + q[0] * jnp.exp(t))  # q̈ = eᵗ
     sol = dx.simulate(system, dx.Collocation(5), q=[0.0], v=[0.0], step=0.5, steps=4)
@@ -227,6 +253,8 @@ def test_systems_that_it_does_not_step_are_refused():
     constrained = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[q[1], -1.0]]))
     with pytest.raises(TypeError, match="does not keep constraints"):
         dx.simulate(constrained, dx.Collocation(2), q=[0.0, 0.0], v=[1.0, 0.0], step=0.1, steps=1)
+    with pytest.raises(TypeError, match="Lobatto nodes are for Lagrangians"):
+        dx.simulate(SYSTEMS["rigid body"][0], dx.Collocation(2, "lobatto"), x=[1.0, 0.0, 0.0], step=0.1, steps=1)
     with pytest.raises(ValueError, match="one-step method"):
         dx.simulate(dx.LagrangeDirac(henon_heiles), dx.Collocation(2), q0=[0.0, 0.0], q1=[0.1, 0.0], step=0.1, steps=1)
     sphere = dx.ManifoldLagrangian(lambda q, v: v @ v / 2, dx.Sphere(3))

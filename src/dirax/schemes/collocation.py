@@ -1,7 +1,7 @@
 """Collocation: steps of high order whose unknowns are the rates at s nodes, coupled by constant matrices."""
 
 from dirax.schemes.collocation_step import LagrangianCollocation, RelationCollocation
-from dirax.schemes.collocation_tables import MOST_STAGES, gauss
+from dirax.schemes.collocation_tables import MOST_STAGES, gauss, lobatto
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.systems.system import AbstractSystem
 
@@ -17,6 +17,10 @@ class Collocation(AbstractScheme):
     regular Lagrangian, with x = (q, p), these are the discrete Euler–Lagrange equations of the Galerkin discrete Lagrangian
     L_d(q_0, q_1) = ext h Σ b_i L(Q_i, Q̇_i) over polynomials of degree s (VI.6.3); forces and explicit time enter at the
     nodes. Quadratic invariants are kept: Casimirs of linear Poisson structures that are quadratic, angular momenta.
+
+    `nodes="lobatto"`, for regular Lagrangians: order 2s − 2, with the first node at t_k and the last at t_{k+1}; positions by the
+    matrix of Lobatto IIIA, momenta by that of IIIB, P_i = p_k + h Σ_j â_ij Ṗ_j, a symplectic and self-adjoint pair (IV.2.2;
+    two stages are the Störmer–Verlet scheme where the mass matrix is constant).
 
     Takes systems without constraints: regular `dx.LagrangeDirac`, `dx.DiracSystem` with a Hamiltonian vector field,
     `dx.PortHamiltonian` without closed ports, `dx.LiePoisson`, and `dx.PhaseSpaceLagrangian` on its final manifold.
@@ -43,19 +47,28 @@ class Collocation(AbstractScheme):
         """The order of convergence on smooth systems: 2s, or 2s − 2 with Lobatto nodes."""
         return 2 * self.stages - 2 * (self.nodes == "lobatto")
 
+    def adjoint(self, system: AbstractSystem) -> "Collocation":
+        """The scheme itself, for nodes that lie symmetrically."""
+        return self
+
     def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         if shape.m + shape.c:
             raise TypeError(
-                "collocation at Gauss nodes does not keep constraints, of which the system has "
-                f'{shape.m + shape.c}: use dx.Collocation(stages={max(self.stages, 2)}, nodes="lobatto") or '
-                "dx.EnergyCollocation()."
+                f"dx.Collocation does not keep constraints, of which the system has {shape.m + shape.c}: use "
+                'dx.DiscreteDirac(constraints="resolve") or dx.LagrangeDAlembert(), and dx.Composition of it for higher order.'
             )
+        tableau = gauss(self.stages) if self.nodes == "gauss" else lobatto(self.stages)
         relation = system.relation_form(shape) or system.final_relation(shape)
         if relation is not None and not relation.multipliers:
-            return RelationCollocation(gauss(self.stages), shape.n, relation).equation()
+            if self.nodes == "lobatto":
+                raise TypeError(
+                    f"Lobatto nodes are for Lagrangians, whose positions and momenta they treat apart, but a "
+                    f'{type(system).__name__} was given: take nodes="gauss".'
+                )
+            return RelationCollocation(tableau, shape.n, relation).equation()
         lagrangian = system.lagrangian_form()
         if lagrangian is not None:
-            return LagrangianCollocation(gauss(self.stages), shape.n, lagrangian).equation()
+            return LagrangianCollocation(tableau, shape.n, lagrangian).equation()
         raise TypeError(
             "dx.Collocation steps systems with a relation between x and ẋ or with a Lagrangian in coordinates, but a "
             f"{type(system).__name__} was given."

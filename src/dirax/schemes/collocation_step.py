@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.program.tracing import gradient
@@ -50,7 +51,7 @@ class CollocationStep(AbstractStep):
     def residual(self, u, state, t, h, params):
         times, y, a, rates = self.nodes(u, state, t, h, params)
         rows = []
-        for i, row in enumerate(self.tableau.matrix.tolist()):
+        for i, row in enumerate(self.tableau.conjugate.tolist()):
             b = state[self.n :] + h * combined(row, rates)
             rows.append(self.relation(a[i], b, y[i], times[i], params))
         return jnp.concatenate(rows)
@@ -61,7 +62,9 @@ class CollocationStep(AbstractStep):
         return state + h * jnp.concatenate([combined(weights, y), combined(weights, rates)])
 
     def equation(self) -> StepEquation:
-        """The StepEquation, which says that it is made of stages."""
+        """The StepEquation, which says that it is made of stages where one matrix is that of all of the state."""
+        if not np.allclose(self.tableau.conjugate, self.tableau.matrix, rtol=0.0, atol=1e-12):
+            return super().equation()
         stage = StageRelation(self.n, self.state.size - self.n, self.rates, self.relation, self.tableau)
         return replace(super().equation(), collocation=stage)
 
