@@ -4,11 +4,12 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.judging import spread
+from dirax.diagnostics.rows import over_rows
 from dirax.engines.step_program import linearized
-from dirax.program.user_functions import evaluated
 from dirax.schemes.step_forms import started
 from dirax.solution.solution import Solution
 
@@ -22,25 +23,25 @@ def residual_size(sol: Solution) -> float | None:
     if sol.system is None or sol.equation is None or not sol.equation.stages[0][0].unknowns:
         return None
     stage, fraction = sol.equation.stages[0]
-    lane = lambda a: np.asarray(a) if sol.batch is None else np.asarray(a)[0]
-    nodes = {name: lane(a) for name, a in sol.fields.items() if sol.field_info[name].place == "node"}
-    begin, sizes = eqx.Partial(_started, sol.system, sol.step, sol.equation), []
-    for row in spread(sol.rows, ROWS):
-        at = {name: a[row : row + 1] for name, a in nodes.items()} | {"t": np.asarray(sol.t)[row : row + 1]}
-        if not all(np.all(np.isfinite(a)) for a in at.values()):
-            continue
-        try:
-            state, u = map(np.asarray, evaluated(begin, at, sol.params_of_one))
-        except (KeyError, TypeError, ValueError):  # the scheme does not start from a saved row
-            return None
-        entries = u[None], state[None], at["t"], np.full(1, fraction * sol.step)
-        found = linearized(stage, jax.tree.map(np.asarray, sol.params_of_one), False, *entries)
+    rows = spread(sol.rows, ROWS).astype(int)
+    nodes = {name: np.asarray(a) for name, a in sol.fields.items() if sol.field_info[name].place == "node"}
+    at = {name: np.take(a, rows, axis=int(sol.batch is not None)) for name, a in nodes.items()}
+    times = np.asarray(sol.t)[rows]
+    at["t"] = times if sol.batch is None else np.broadcast_to(times, (sol.batch, len(rows)))
+    try:
+        begun = over_rows(eqx.Partial(_started, sol.system, sol.step, sol.equation), sol, (at,))[0]
+    except (KeyError, TypeError, ValueError):  # the scheme does not start from a saved row
+        return None
+    sizes, params = [], jax.tree.map(np.asarray, sol.params_of_one)
+    for begin, t in zip(begun[np.all(np.isfinite(begun), axis=1)], times, strict=False):
+        state, u = begin[None, : stage.state_size], begin[None, stage.state_size :]
+        found = linearized(stage, params, False, u, state, np.array([t]), np.full(1, fraction * sol.step))
         if found is None:
             return None
-        sizes.append(float(np.max(np.abs(found[1][0]) @ np.abs(u))))
+        sizes.append(float(np.max(np.abs(found[1][0]) @ np.abs(u[0]))))
     size = max((s for s in sizes if np.isfinite(s)), default=0.0)
     return size or None
 
 
 def _started(system: Any, step: Any, equation: Any, rows: dict, params: Any):
-    return started(system, step, equation, rows, params)
+    return jnp.concatenate(started(system, step, equation, {name: a[None] for name, a in rows.items()}, params))
