@@ -9,7 +9,7 @@ from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.collocation_nodes import Nodes
 from dirax.engines.native.loops.collocation_plan import CollocationPlan
 from dirax.engines.native.loops.collocation_sweeps import FirstOrder, SecondOrder
-from dirax.engines.native.loops.step_loop import NUMBERS
+from dirax.engines.native.loops.step_loop import NUMBERS, define_run
 from dirax.engines.stopping import EPSILON, STALLED
 
 
@@ -18,16 +18,7 @@ def collocation_module(plan: CollocationPlan, fma: bool) -> str:
     module = Module(fma)
     add_far_reduction(module)
     _Kernel(plan, module).define()
-    sizes = plan.record.size * 8, len(plan.shared.params) * 8, len(plan.rows) * 8
-    body = Body(module)
-    with body.loop(0, "%blocks") as i:
-        moved = [
-            body.at("i8", pointer, body.put(f"mul i64 {i}, {size}"))
-            for pointer, size in zip(("%lanes", "%params", "%outs"), sizes, strict=True)
-        ]
-        body.line(f"call void @block({', '.join(f'ptr {m}' for m in moved)}, {NUMBERS})")
-    body.line("ret void")
-    module.define(f"define void @run(ptr %lanes, ptr %params, ptr %outs, i64 %blocks, {NUMBERS})", body)
+    define_run(module, [8 * count for count in (plan.record.size, len(plan.shared.params), len(plan.rows))])
     return module.text()
 
 

@@ -1,6 +1,6 @@
 """The kernel: rows, steps and stages of `width` trajectories side by side, as LLVM IR."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
@@ -23,7 +23,13 @@ def kernel_module(plan: Plan, width: int, fma: bool) -> str:
     add_far_reduction(module)
     add_dense_solve(module)
     _define_block(plan, module, width)
-    sizes = plan.record.size * width * 8, len(plan.shared.params) * width * 8, len(plan.fields) * width * 8
+    define_run(module, [count * width * 8 for count in (plan.record.size, len(plan.shared.params), len(plan.fields))])
+    return module.text()
+
+
+def define_run(module: Module, sizes: Sequence[int]) -> None:
+    """`run(lanes, params, outs, blocks, …)`: `block` for one block after the other, whose records, parameters and addresses
+    take so many bytes."""
     body = Body(module)
     with body.loop(0, "%blocks") as i:
         moved = [
@@ -33,7 +39,6 @@ def kernel_module(plan: Plan, width: int, fma: bool) -> str:
         body.line(f"call void @block({', '.join(f'ptr {m}' for m in moved)}, {NUMBERS})")
     body.line("ret void")
     module.define(f"define void @run(ptr %lanes, ptr %params, ptr %outs, i64 %blocks, {NUMBERS})", body)
-    return module.text()
 
 
 def _define_block(plan: Plan, module: Module, width: int) -> None:
