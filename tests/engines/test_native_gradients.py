@@ -117,6 +117,24 @@ def test_second_derivatives():
     np.testing.assert_allclose(curvature(mine), curvature(theirs), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize(("engine", "holonomic"), [("xla", False), ("native", True)])
+def test_second_derivatives_of_a_nonlinear_run(engine, holonomic):
+    """In every order of forward and reverse, and for a batch: beside differences of the first."""
+    more = {"holonomic": lambda q: jnp.array([(q @ q - 1) / 2])} if holonomic else {}
+    system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params * q[1] ** 2, **more)
+    q0 = jnp.array([np.sin(0.5), -np.cos(0.5)])
+
+    def end(k):
+        sol = dx.simulate(system, MIDPOINT, q=q0, v=jnp.zeros(2), params=k, step=0.05, steps=3, engine=engine)
+        return sol.q[-1] ** 2 @ jnp.array([1.0, 2.0])
+
+    slope, k, d = jax.grad(end), 9.81, 1e-4
+    wanted = (slope(k + d) - slope(k - d)) / (2 * d)
+    for second in (jax.grad(slope), jax.jacfwd(slope)):
+        np.testing.assert_allclose(second(k), wanted, rtol=1e-7)
+    np.testing.assert_allclose(jax.vmap(jax.grad(slope))(jnp.array([k, k])), wanted, rtol=1e-7)
+
+
 def test_jit_and_vmap():
     (mine, z), (theirs, _) = end_of_swing("native"), end_of_swing("xla")
     expected = jax.jit(jax.jacrev(theirs))(z)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.geometry.numerics import arc_over_sine, norm, radial
 from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
-from dirax.numerics.newton import regular_root
+from dirax.program.roots import regular_root
 
 BATCH = 6
 GROUPS = {"SO2": SO2(), "SE2": SE2(), "SO3": SO3(), "SE3": SE3()}

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.numerics import norm
-from dirax.numerics.newton import regular_root
 from dirax.program.linear_solves import solve
+from dirax.program.roots import regular_root
 
 
 class Submanifold(AbstractManifold):

@@ -4,17 +4,16 @@ The pairing on V ⊕ V* is ⟪(v, α), (w, β)⟫ = ⟨α, w⟩ + ⟨β, v⟩ ([
 Dirac according to how it lies in its orthogonal U^⊥; `LinearDirac` (linear.py) holds the Dirac case.
 """
 
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from dirax.numerics.ranks import decide_rank
 from dirax.numerics.tolerances import STRUCTURE_DEFECT, STRUCTURE_RANK
+from dirax.program.given_tangents import with_tangent
 from dirax.program.user_functions import is_traced
 
 if TYPE_CHECKING:
@@ -89,7 +88,9 @@ def pseudo_inverse(
 
     Differentiable, under the assumption that the rank does not change.
     """
-    return _pseudo_inverse(matrix, tolerance, scale) if is_traced(matrix) else _invert(np, matrix, tolerance, scale)
+    if not is_traced(matrix):
+        return _invert(np, matrix, tolerance, scale)
+    return with_tangent(lambda matrix: _invert(jnp, matrix, tolerance, scale), _pseudo_inverse_tangent, matrix)
 
 
 def _invert(xp, matrix, tolerance, scale):
@@ -100,21 +101,14 @@ def _invert(xp, matrix, tolerance, scale):
     return matrix_transpose(left * inverse[..., None, :] @ right)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
-def _pseudo_inverse(matrix, tolerance, scale):
-    return _invert(jnp, matrix, tolerance, scale)
-
-
-@_pseudo_inverse.defjvp
-def _pseudo_inverse_jvp(tolerance, scale, primals, tangents):
-    # Golub and Pereyra (1973), constant rank.
-    (matrix,), (tangent,) = primals, tangents
-    inverse = _pseudo_inverse(matrix, tolerance, scale)
+def _pseudo_inverse_tangent(inverse, operands, along):
+    """Golub and Pereyra (1973), constant rank."""
+    (matrix,), (tangent,) = operands, along
     inverse_t, tangent_t = matrix_transpose(inverse), matrix_transpose(tangent)
     within = -inverse @ tangent @ inverse
     off_range = inverse @ inverse_t @ tangent_t @ (np.eye(matrix.shape[-2]) - matrix @ inverse)
     off_corange = (np.eye(matrix.shape[-1]) - inverse @ matrix) @ tangent_t @ inverse_t @ inverse
-    return inverse, within + off_range + off_corange
+    return within + off_range + off_corange
 
 
 class PontryaginSubspace(eqx.Module):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac
 from dirax.geometry.generating_functions import GeneratingFunctionDirac
-from dirax.numerics.newton import regular_root
+from dirax.program.roots import regular_root
 
 Vector = Float[Array, " n"]
 Four = tuple[Vector, Vector, Vector, Vector]

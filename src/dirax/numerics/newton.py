@@ -1,4 +1,4 @@
-"""Newton's method for the small equations around a run: a step that is shortened, a search for the nearest zero, regular roots.
+"""Newton's method for the small equations around a run: a step that is shortened, a search for the nearest zero.
 
 The Newton iteration of a step is that of the engines (`dirax.engines.stopping` says when it stops).
 """
@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
 
 from dirax.numerics.tolerances import EPSILON, ON_MANIFOLD
 
@@ -102,35 +100,3 @@ class GaussNewton:
         left = np.abs(np.asarray(function(x)[0])).max()
         on = left <= ON_MANIFOLD * max(largest_slope, self.least_slope) * (1.0 + np.abs(x).max())
         return (x if on else None), float(left) if np.isfinite(left) else np.nan
-
-
-def regular_root(
-    residual: Callable, guess: Float[Array, " k"], tolerance: float = 1e-9, max_steps: int = 40
-) -> Float[Array, " k"]:
-    """A root of `residual` (k,) → (k,) with a regular Jacobian, by Newton's method to the roundoff floor; NaN where it does not
-    converge.
-
-    Traceable, and differentiable any number of times, forwards and backwards, by the implicit function theorem.
-    `tolerance` is on the last residual, relative to 1 + ‖root‖.
-    """
-
-    def solve(residual, guess):
-        def step(carry):
-            z, size, _, count = carry
-            update = jnp.linalg.solve(jax.jacfwd(residual)(z), residual(z))
-            return z - update, jnp.max(jnp.abs(update)), size, count + 1
-
-        def unfinished(carry):
-            _, size, previous, count = carry
-            still_shrinking = (size < 0.5 * previous) | (size > 1e-6)
-            return (count < max_steps) & (size > 0.0) & still_shrinking
-
-        start = (guess, jnp.asarray(1e300), jnp.asarray(jnp.inf), 0)
-        z, *_ = lax.while_loop(unfinished, step, start)
-        converged = jnp.max(jnp.abs(residual(z))) <= tolerance * (1.0 + jnp.max(jnp.abs(z)))
-        return jnp.where(converged, z, jnp.nan)
-
-    def tangent_solve(linear, right_side):
-        return jnp.linalg.solve(jax.jacfwd(linear)(jnp.zeros_like(right_side)), right_side)
-
-    return lax.custom_root(residual, guess, solve, tangent_solve)

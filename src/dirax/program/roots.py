@@ -1,7 +1,7 @@
-"""Roots of small systems of equations, regular or not: damped Newton with a pseudo-inverse, run to the roundoff floor."""
+"""Roots of small systems of equations by Newton's method, run to the roundoff floor: the nearest one, damped and with a
+pseudo-inverse, and that of a regular system."""
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jax.interpreters import ad
 from jaxtyping import Array, Float
 
 from dirax.numerics.newton import damped_step
+from dirax.program.given_tangents import implicit, implicit_tangent
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.primitives import binds, plain_primitive
 from dirax.program.tracing import closed_over, jacobian
@@ -32,33 +33,55 @@ def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int =
     return _root(jax.jit(residual), max_steps, guess, *captured)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _root(residual: Callable, max_steps: int, guess, *captured):
     """The root for a residual of the unknowns and of what it captured."""
-    of_captured = residual
-    residual = lambda u: of_captured(u, *captured)
+    fixed = lax.stop_gradient(captured)
+    of_unknowns = lambda u: residual(u, *fixed)
 
     def step(carry):
         u, _, count = carry
-        inverse, units = scaled_pseudo_inverse(jacobian(residual)(u))
-        u, going = damped_step(lambda u: inverse @ residual(u), u, units, jnp)
+        inverse, units = scaled_pseudo_inverse(jacobian(of_unknowns)(u))
+        u, going = damped_step(lambda u: inverse @ of_unknowns(u), u, units, jnp)
         return u, going, count + 1
 
     unfinished = lambda carry: carry[1] & (carry[2] < max_steps)
-    return lax.while_loop(unfinished, step, (guess, jnp.array(True), 0))[0]
+    root = lax.while_loop(unfinished, step, (lax.stop_gradient(guess), jnp.array(True), 0))[0]
+    return implicit(lambda u, captured: residual(u, *captured), root, captured, _least_change)
 
 
-@_root.defjvp
-def _root_jvp(residual, max_steps, primals, tangents):
-    u = _root(residual, max_steps, *primals)
-    return u, _tangent(residual, u, primals[1:], tangents[1:])
+def _least_change(matrix, right):
+    """The solution of a linear system, regular or not, in the units of its equations and unknowns."""
+    return scaled_pseudo_inverse(matrix)[0] @ right
 
 
-def _tangent(residual: Callable, u, captured, tangents):
-    """The root's derivative by the implicit function theorem; the guess has no influence."""
-    along = jax.jvp(lambda *values: residual(u, *values), tuple(captured), tuple(tangents))[1] if captured else 0.0 * u
-    inverse, _ = scaled_pseudo_inverse(jacobian(residual)(u, *captured))
-    return -(inverse @ along)
+def regular_root(
+    residual: Callable, guess: Float[Array, " k"], tolerance: float = 1e-9, max_steps: int = 40
+) -> Float[Array, " k"]:
+    """A root of `residual` (k,) → (k,) with a regular Jacobian, by Newton's method to the roundoff floor; NaN where it does not
+    converge.
+
+    Traceable, and differentiable any number of times, forwards and backwards, by the implicit function theorem.
+    `tolerance` is on the last residual, relative to 1 + ‖root‖.
+    """
+    closed, captured, _ = closed_over(residual, [guess])
+    of_captured = _unknowns_first(closed)
+    fixed = lambda z: of_captured(z, *lax.stop_gradient(captured))
+
+    def step(carry):
+        z, size, _, count = carry
+        update = jnp.linalg.solve(jax.jacfwd(fixed)(z), fixed(z))
+        return z - update, jnp.max(jnp.abs(update)), size, count + 1
+
+    def unfinished(carry):
+        _, size, previous, count = carry
+        still_shrinking = (size < 0.5 * previous) | (size > 1e-6)
+        return (count < max_steps) & (size > 0.0) & still_shrinking
+
+    start = (lax.stop_gradient(guess), jnp.asarray(1e300), jnp.asarray(jnp.inf), 0)
+    z, *_ = lax.while_loop(unfinished, step, start)
+    converged = jnp.max(jnp.abs(fixed(z))) <= tolerance * (1.0 + jnp.max(jnp.abs(z)))
+    root = jnp.where(converged, z, jnp.nan)
+    return implicit(lambda u, captured: of_captured(u, *captured), root, captured, jnp.linalg.solve)
 
 
 def _unknowns_first(residual: ClosedJaxpr) -> Callable:
@@ -72,8 +95,8 @@ def _by_jax(*operands, residual: ClosedJaxpr, max_steps: int):
 
 def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, max_steps: int):
     u = root_p.bind(*primals, residual=residual, max_steps=max_steps)[0]
-    along = map(ad.instantiate_zeros, tangents[:-1])
-    return [u], [_tangent(_unknowns_first(residual), u, primals[:-1], tuple(along))]
+    along = [None if isinstance(t, ad.Zero) else t for t in tangents[:-1]]
+    return [u], [implicit_tangent(_unknowns_first(residual), u, primals[:-1], along, _least_change)]
 
 
 root_p = plain_primitive("dirax_root", _by_jax, lambda *operands, **_: [operands[-1]])

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.numerics.equilibration import equilibrated
-from dirax.numerics.newton import GaussNewton, regular_root
+from dirax.numerics.newton import GaussNewton
 from dirax.numerics.ranks import numerical_rank
 from dirax.numerics.tolerances import JACOBIAN_NOISE, STEP_RANK
+from dirax.program.roots import regular_root
 from dirax.schemes.step import StepEquation
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintLevel
 

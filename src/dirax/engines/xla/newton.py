@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, STALLED
 from dirax.engines.xla.dense import Dense
+from dirax.program.given_tangents import implicit
 
 
 class Search(NamedTuple):
@@ -69,13 +70,12 @@ def as_function(
 
     solver = linear_solver or Dense()
 
-    def tangent_solve(linear, right):
-        matrix = jax.vmap(linear, out_axes=1)(jnp.eye(root.shape[0]))
+    def solved(matrix, right):
         factors = solver.factorise(jax.lax.stop_gradient(matrix))
         solve, transposed = (lambda _, b, by=by: by(factors, b) for by in (solver.solve, solver.solve_transposed))
         return jax.lax.custom_linear_solve(lambda x: matrix @ x, right, solve, transposed)
 
-    return jax.lax.custom_root(lambda u: residual(u, *args), root, lambda _, u: u, tangent_solve)
+    return implicit(lambda u, args: residual(u, *args), root, args, solved)
 
 
 def newton(

@@ -1,0 +1,107 @@
+"""Functions whose derivative is given: as `jax.custom_jvp`, but the rule is kept wherever the function is differentiated.
+
+JAX forgets the rule of a custom_jvp where it takes a derivative in reverse mode through `scan` or `checkpoint`: a second
+derivative then differentiates the function's own code. For a root that is found elsewhere and handed in, that gives zero.
+A primitive keeps its rule.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray
+from jax.dtypes import float0
+from jax.extend.core import Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+from dirax.program.primitives import is_tracing
+from dirax.program.tracing import closed_over
+
+Axes = tuple[tuple[int | None, ...], ...]
+"""The axes of the operands under each `jax.vmap` that the function went through, the innermost first."""
+
+
+def with_tangent(value: Callable[..., Array], tangent: Callable[..., Array], *operands: Any) -> Array:
+    """`value(*operands)`, one array, whose derivative is `tangent(result, operands, along)`.
+
+    `along` has the tangent of each operand, None for those that do not move. Both functions capture no traced values.
+    """
+    if not is_tracing():
+        return value(*operands)
+    return given_p.bind(*map(jnp.asarray, operands), value=value, tangent=tangent, axes=())
+
+
+def implicit(residual: Callable, root: Array, values: Any, solve: Callable[[Array, Array], Array]) -> Array:
+    """`root` (k,), with its derivatives as the function of `values`, any pytree, that residual(root, values) = 0 makes of it.
+
+    `solve(matrix (k, k), right (k,))` is a solution of the linear system, differentiable itself. What `residual` captures is
+    differentiated by too.
+    """
+    leaves, structure = jax.tree.flatten(values)
+    closed, captured, _ = closed_over(lambda u, *leaves: residual(u, jax.tree.unflatten(structure, leaves)), [root, *leaves])
+    count = len(captured)
+    left = lambda u, *operands: jaxpr_as_fun(closed)(*operands[:count], u, *operands[count:])[0]
+    tangent = lambda root, operands, along: implicit_tangent(left, root, operands[1:], along[1:], solve)
+    return with_tangent(lambda root, *_: root, tangent, jax.lax.stop_gradient(root), *captured, *leaves)
+
+
+def implicit_tangent(residual: Callable, root: Array, operands: Sequence, along: Sequence, solve: Callable) -> Array:
+    """The tangent (k,) of the root of residual(root, *operands) = 0 where the operands move along `along`, None for those
+    that stay; `solve` as in `implicit`."""
+    moving = [k for k, x in enumerate(along) if x is not None]
+    if not moving:
+        return jnp.zeros_like(root)
+
+    def of_moving(*chosen):
+        given = list(operands)
+        for k, x in zip(moving, chosen, strict=True):
+            given[k] = x
+        return residual(root, *given)
+
+    points, directions = (tuple(values[k] for k in moving) for values in (operands, along))
+    right = jax.jvp(of_moving, points, directions)[1]
+    return -solve(jax.jacfwd(lambda u: residual(u, *operands))(root), right)
+
+
+def _over(function: Callable, axes: Axes) -> Callable:
+    for one in axes:
+        function = jax.vmap(function, in_axes=one)
+    return function
+
+
+def _by_jax(*operands, value: Callable, tangent: Callable, axes: Axes) -> Array:
+    return _over(value, axes)(*operands)
+
+
+def _tangents(primals: Sequence, tangents: Sequence, *, value: Callable, tangent: Callable, axes: Axes):
+    result = given_p.bind(*primals, value=value, tangent=tangent, axes=axes)
+    moves = [not isinstance(t, ad.Zero) and t.dtype != float0 for t in tangents]
+    count = len(primals)
+
+    def one(result, *given):
+        along = iter(given[count:])
+        return tangent(result, given[:count], [next(along) if moved else None for moved in moves])
+
+    levels = tuple((0, *level, *(a for a, moved in zip(level, moves, strict=True) if moved)) for level in axes)
+    return result, _over(one, levels)(result, *primals, *(t for t, moved in zip(tangents, moves, strict=True) if moved))
+
+
+def _batched(operands: Sequence, dimensions: Sequence, *, value: Callable, tangent: Callable, axes: Axes):
+    moved = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(operands, dimensions, strict=True)]
+    level = tuple(None if d is None else 0 for d in dimensions)
+    return given_p.bind(*moved, value=value, tangent=tangent, axes=(*axes, level)), 0
+
+
+def _shape(*operands, value: Callable, tangent: Callable, axes: Axes) -> ShapedArray:
+    found = jax.eval_shape(_over(value, axes), *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in operands))
+    return ShapedArray(found.shape, found.dtype)
+
+
+given_p = Primitive("dirax_given_tangent")
+given_p.def_impl(_by_jax)
+given_p.def_abstract_eval(_shape)
+ad.primitive_jvps[given_p] = _tangents
+batching.primitive_batchers[given_p] = _batched
+mlir.register_lowering(given_p, mlir.lower_fun(_by_jax, multiple_results=False))
