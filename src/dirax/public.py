@@ -54,13 +54,13 @@ from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.run.simulate import simulate
-from dirax.schemes.charted import InCharts
 from dirax.schemes.collocation import Collocation
 from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
 from dirax.schemes.discrete_constraints import DiscreteConstraintChain, discrete_constraint_algorithm
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.discrete_gradient import DiscreteGradient
 from dirax.schemes.euler_poincare import DiscreteEulerPoincare
+from dirax.schemes.in_charts import InCharts
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.layout import Layout
 from dirax.schemes.routh import DiscreteRouth

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
-from dirax.geometry.numerics import arc_over_sine, norm, radial
 from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
+from dirax.geometry.squared_angles import arc_over_sine, norm, radial
 from dirax.program.roots import regular_root
 
 BATCH = 6

@@ -9,7 +9,7 @@ import pytest
 from jax.extend.core import jaxpr_as_fun
 
 import dirax as dx
-from dirax.geometry.numerics import arc_over_sine, norm, radial
+from dirax.geometry.squared_angles import arc_over_sine, norm, radial
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import along, gradient, jacobian, once

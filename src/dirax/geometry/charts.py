@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
-from dirax.geometry.numerics import Scalar
+from dirax.geometry.squared_angles import Scalar
 from dirax.program.tracing import gradient, once, value_along
 
 Local = Float[Array, " d"]

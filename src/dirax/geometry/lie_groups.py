@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
-from dirax.geometry.numerics import Scalar, arc_over_sine, norm, radial
+from dirax.geometry.squared_angles import Scalar, arc_over_sine, norm, radial
 
 Algebra: TypeAlias = Float[Array, " d"]
 Rotation: TypeAlias = Float[Array, " r"]

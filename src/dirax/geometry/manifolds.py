@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from dirax.geometry.numerics import Scalar, norm
+from dirax.geometry.squared_angles import Scalar, norm
 from dirax.program.tracing import value_along
 from dirax.program.user_functions import evaluated, is_traced
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
-from dirax.geometry.numerics import norm
+from dirax.geometry.squared_angles import norm
 from dirax.program.linear_solves import solve
 from dirax.program.roots import regular_root
 

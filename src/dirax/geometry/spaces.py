@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, Vector
-from dirax.geometry.numerics import TINY, arc_over_sine, norm, radial
+from dirax.geometry.squared_angles import TINY, arc_over_sine, norm, radial
 from dirax.program.tracing import once
 
 

@@ -23,7 +23,7 @@ Axes = tuple[tuple[int | None, ...], ...]
 """The axes of the operands under each `jax.vmap` that the function went through, the innermost first."""
 
 
-def with_tangent(value: Callable[..., Array], tangent: Callable[..., Array], *operands: Any) -> Array:
+def with_tangent(value: Callable[..., Any], tangent: Callable[..., Array], *operands: Any) -> Array:
     """`value(*operands)`, one array, whose derivative is `tangent(result, operands, along)`.
 
     `along` has the tangent of each operand, None for those that do not move. Both functions capture no traced values.

@@ -7,12 +7,14 @@ from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
 from dirax.geometry.spaces import Euclidean
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.schemes.discrete_structure_maps import PROJECTED, RelationPairs, structure_on_cotangent_bundle
-from dirax.schemes.discretized import discretized_relation
-from dirax.schemes.lagrangian_methods import discretized_lagrangian, resolved_lagrangian, resolved_nonholonomic
-from dirax.schemes.lifted_lagrangian import lift_of, lifted_lagrangian, projected_lagrangian
+from dirax.schemes.discretized_relation import discretized_relation
+from dirax.schemes.map_lift import ThetaLift, lift_of
+from dirax.schemes.method_one_step import MethodOneStep
+from dirax.schemes.method_two_step import NonholonomicStep, ProjectedThetaStep
 from dirax.schemes.nothing_grows import nothing_grows
 from dirax.schemes.nothing_hidden import nothing_hidden_in_lagrangian, nothing_hidden_in_relation
-from dirax.schemes.resolved import projected_field
+from dirax.schemes.projected_field import projected_field
+from dirax.schemes.projected_lift_step import ProjectedLiftStep
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.systems.system import AbstractSystem
 
@@ -78,10 +80,10 @@ class DiscreteDirac(AbstractScheme):
             return discretized_relation(relation, shape.n, self.map)
         lagrangian, theta = system.lagrangian_form(), _theta_of(self.map)
         if lagrangian is not None and theta is not None:
-            return discretized_lagrangian(lagrangian, shape, theta)
+            return MethodOneStep(lagrangian, shape, ThetaLift(theta, shape.n)).equation()
         lagrangian = system.manifold_form() if lagrangian is None else lagrangian
         if lagrangian is not None:
-            return lifted_lagrangian(lagrangian, shape, lift_of(_map_on_q(self.map), lagrangian, shape.n))
+            return MethodOneStep(lagrangian, shape, lift_of(_map_on_q(self.map), lagrangian, shape.n)).equation()
         return None
 
     def _resolved(self, system: AbstractSystem, shape: Shape) -> StepEquation | None:
@@ -102,7 +104,7 @@ class DiscreteDirac(AbstractScheme):
     def _resolved_lagrangian(self, system: AbstractSystem, shape: Shape) -> StepEquation | None:
         theta, metric, lagrangian = _theta_of(self.map), system.metric_form(), system.lagrangian_form()
         if metric is not None and theta is not None and not shape.redundant:
-            return resolved_nonholonomic(metric, shape, theta)
+            return NonholonomicStep(metric, shape, theta).equation()
         lagrangian = system.manifold_form() if lagrangian is None else lagrangian
         if lagrangian is None:
             return None
@@ -111,8 +113,8 @@ class DiscreteDirac(AbstractScheme):
             assert equation is not None
             return nothing_hidden_in_lagrangian(lagrangian, equation)
         if theta is not None and system.manifold_form() is None:
-            return resolved_lagrangian(lagrangian, shape, theta)
-        return projected_lagrangian(lagrangian, shape, lift_of(_map_on_q(self.map), lagrangian, shape.n))
+            return ProjectedThetaStep(lagrangian, shape, theta).equation()
+        return ProjectedLiftStep(lagrangian, shape, lift_of(_map_on_q(self.map), lagrangian, shape.n)).equation()
 
     def discrete_structure(self, system: AbstractSystem, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
         if self.constraints == "discretize":

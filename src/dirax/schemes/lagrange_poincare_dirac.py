@@ -10,7 +10,7 @@ from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
 from dirax.schemes.layout import Layout
-from dirax.schemes.quotient import Quotient
+from dirax.schemes.quotient_state import Quotient
 from dirax.schemes.step import Field
 
 

@@ -10,7 +10,7 @@ from dirax.program.user_functions import UserFunction
 from dirax.reduction.connection import LinearConnection
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.discrete_lagrangian import discrete_lagrangian
-from dirax.schemes.quotient import Quotient
+from dirax.schemes.quotient_state import Quotient
 
 NODES = {"left": ((0.0, 1.0),), "right": ((1.0, 1.0),), "midpoint": ((0.5, 1.0),), "trapezoidal": ((0.0, 0.5), (1.0, 0.5))}
 """The quadrature of each rule: (place in the step, weight)."""

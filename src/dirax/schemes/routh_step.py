@@ -13,7 +13,7 @@ from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.lagrange_poincare_dirac import LagrangePoincareDiracStep
 from dirax.schemes.layout import Layout
-from dirax.schemes.quotient import Quotient
+from dirax.schemes.quotient_state import Quotient
 from dirax.schemes.reduced_discrete_lagrangian import ReducedDiscreteLagrangian
 from dirax.schemes.step import Field
 from dirax.schemes.vertical_velocity import vertical_velocity

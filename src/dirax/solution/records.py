@@ -84,12 +84,12 @@ def decode_scheme(record: Any) -> AbstractScheme | None:
     return scheme
 
 
-def _decode_setting(record: Any, known: dict[tuple[str, str], type]) -> Any:
+def _decode_setting(record: Any, known: dict[str, type]) -> Any:
     match record:
         case {"class": str(name), "module": str(module), "settings": dict(settings)}:
-            if (module, name) not in known:
+            if name not in known or not module.startswith("dirax."):
                 raise NotPlain(f"{module}.{name}")
-            return _record(known[module, name], {k: _decode_setting(v, known) for k, v in settings.items()})
+            return _record(known[name], {k: _decode_setting(v, known) for k, v in settings.items()})
         case {"settings": list(values)}:
             return tuple(_decode_setting(v, known) for v in values)
         case {"text": str(text)}:
@@ -107,12 +107,12 @@ def _record(cls: type, settings: dict[str, Any]) -> Any:
     return made
 
 
-def _classes(bases: tuple[type, ...]) -> dict[tuple[str, str], type]:
-    """The classes of dirax that are kinds of `bases`, by module and name."""
+def _classes(bases: tuple[type, ...]) -> dict[str, type]:
+    """The classes of dirax that are kinds of `bases`, by name: a file may be older than the module that a class is in."""
     found = {}
     for base in bases:
         for cls in base.__subclasses__():
             found |= _classes((cls,))
             if cls.__module__.startswith("dirax."):
-                found[cls.__module__, cls.__name__] = cls
+                found[cls.__name__] = cls
     return found

@@ -1,0 +1,75 @@
+"""Method 1 of [BLM] for Lagrangians with constraints: the cotangent lift of a discretization map on S_0."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dirax.schemes.lagrangian_step import LagrangianStep
+from dirax.schemes.layout import Layout
+from dirax.schemes.map_lift import Base, Lift, ThetaLift
+
+
+@dataclass(frozen=True, eq=False)
+class MethodOneStep(LagrangianStep):
+    """The lifted map on p = ∂L/∂q̇, ṗ = ∂L/∂q + f + Wᵀλ, W q̇ + b = 0 ([BLM] §6, (36)–(38)):
+
+        p0 + D₁Bᵀ(h ṗ, p) = 0,   W(q) v + b = 0,   p1 = D₂Bᵀ(h ṗ, p),
+
+    which for the θ map is p0 = p − (1 − θ)h ṗ, p1 = p + θh ṗ at q = q0 + θh q̇ and the time t + θh. Unknowns are q1 in a local
+    parametrization at q0, as a velocity, and λ. Without constraints these are the discrete Euler–Lagrange equations of
+    L_d = h L(B(q0, q1)/h), also for degenerate L. Of holonomic constraints the Dirac structure has their distribution,
+    G q̇ + ∂g/∂t = 0 at the base point: the midpoint map keeps quadratic g.
+    """
+
+    lift: Lift | ThetaLift
+
+    @property
+    def unknowns(self) -> Layout:
+        return Layout(velocity=self.lift.dimension, multipliers=self.rows.count)
+
+    @property
+    def canonical(self) -> bool:
+        return self.lift.flat and super().canonical
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        balance = tuple(f"momentum balance {i}" for i in range(self.lift.dimension))
+        return balance + tuple(f"constraint {r} at the base point" for r in self.rows.kept)
+
+    def start(self, data: dict[str, Array], h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+        if "q0" not in data:
+            guess = self.unknowns.join(velocity=self.lift.components(data["q"], data["v"]))
+            return self.book.start(data["q"], data["p"]), guess
+        if self.rows.count or not self.lift.flat:
+            raise ValueError("with constraints this scheme starts from q= with v= or p=, not from two points.")
+        q0, u = data["q0"], (data["q1"] - data["q0"]) / h
+        at, rate, momentum = self._at_base(u, q0, data.get("t", 0.0), h, params)
+        return self.book.start(q0, self.lift.first_momentum(at, rate, momentum, h)), u
+
+    def residual(self, u, state, t, h, params):
+        q0, p0, _ = self.state.split(state)
+        at, rate, momentum = self._at_base(u, q0, t, h, params)
+        balance = self.lift.balance(p0, at, rate, momentum, h)
+        if not self.rows.count:
+            return balance
+        return jnp.concatenate([balance, self.rows.velocity_defect(at.t, at.q, at.v, params)])
+
+    def advance(self, u, state, t, h, params):
+        at, rate, momentum = self._at_base(u, self.state.split(state).q, t, h, params)
+        p1 = self.lift.last_momentum(at, rate, momentum, h)
+        return self.book.after(state, [at.q1, p1], at.t, at.q, at.v, h, params)
+
+    def unpack(self, state, u, t, h, params):
+        row = self.row(state)
+        return row | ({"multipliers": self.rows.all(self.unknowns.split(u).multipliers)} if "multipliers" in self.fields else {})
+
+    def _at_base(self, u: Array, q0: Array, t: Any, h: Any, params: Any) -> tuple[Base, Array, Array]:
+        """The base point, and (ṗ, p) there."""
+        velocity, multipliers = self.unknowns.split(u)
+        at = self.lift.step(q0, velocity, t, h)
+        rate, momentum = self.rates(at.t, at.q, at.v, params)
+        if self.rows.count:
+            rate = rate + self.rows.matrix(at.t, at.q, params).T @ multipliers
+        return at, rate, momentum
