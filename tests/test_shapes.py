@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-CHECKED = ("dirax.numerics", "dirax.geometry")
+CHECKED = ("dirax.numerics", "dirax.geometry", "dirax.systems")
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:

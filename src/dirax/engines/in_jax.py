@@ -7,16 +7,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.engines import policy
 from dirax.engines.compensation import increments
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
 from dirax.schemes.step import StepEquation, StepSequence
-
-MOST_OPERATIONS = 6000
-"""Scalar operations of a residual with its Jacobian up to which XLA is given them: it takes some milliseconds to compile each."""
-
 
 _increments: Memo[tuple[Callable, ...]] = Memo(KEPT)
 _equations: Memo[tuple[Any, tuple[Callable, ...] | None]] = Memo(KEPT)
@@ -45,7 +42,7 @@ def in_scalars(equation: Any, params: Any, batch_params: bool) -> tuple[Any, tup
     """The equation with its functions as scalar programs, and the Jacobian (k, k) of the residual of each stage as one,
     (u, state, t, h, params) ↦ J; the same objects for the same program.
 
-    The equation itself, and None, where it is no scalar program or one of more than MOST_OPERATIONS that is not nested."""
+    The equation itself, and None, where it is no scalar program or one of more than policy.MOST_FOR_XLA that is not nested."""
     try:
         made = step_program(equation, params, batch_params)
         return _equations.get(Same(made), lambda: _in_scalars(equation, made))
@@ -66,7 +63,7 @@ def _in_scalars(equation: Any, made: StepProgram) -> tuple[Any, tuple[Callable, 
     outputs = [
         [*e.residual, *(n for row in rows for n in row.values())] for e, rows in zip(made.equations, made.jacobians, strict=True)
     ]
-    large = any(sum(1 for node in g.reachable(nodes) if g.args[node]) > MOST_OPERATIONS for nodes in outputs)
+    large = any(sum(1 for node in g.reachable(nodes) if g.args[node]) > policy.MOST_FOR_XLA for nodes in outputs)
     if large and not made.nested:
         return equation, None
     distinct = {index: stage for (index, _), (stage, _) in zip(made.stages, equation.stages, strict=True)}

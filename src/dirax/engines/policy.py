@@ -55,6 +55,13 @@ LARGEST_NESTED = 96
 """The same as LARGEST_SCALAR for a step that is nested, whatever its batch and device: the array program of a pendulum with its
 tension as a coordinate has 500 000 operations and took XLA 160 s to compile, its graph has 1 263."""
 
+NESTED = 4
+"""Derivatives of derivatives from which on a step is nested: each more takes the array program times 2.6, and the graph
+hardly any."""
+
+MOST_FOR_XLA = 6000
+"""Scalar operations of a residual with its Jacobian up to which XLA is given them: it takes some milliseconds to compile each."""
+
 
 @cache
 def engine_of(name: str, **options: Any) -> AbstractEngine:

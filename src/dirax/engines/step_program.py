@@ -11,6 +11,7 @@ import numpy as np
 from jax.extend.core import jaxprs_in_params
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
+from dirax.engines import policy
 from dirax.engines.parameters import Parameters, parameters
 from dirax.program.derivatives import jacobian
 from dirax.program.evaluation.by_jax import by_jax
@@ -22,10 +23,6 @@ from dirax.program.scalar_program import ScalarProgram
 
 KEPT = 128
 """Programs kept in memory."""
-
-NESTED = 4
-"""Derivatives of derivatives from which on a step is `nested`: each more takes the array program times 2.6, and the graph
-hardly any."""
 
 IN_NUMBERS = 2**22
 """Derivatives of nodes up to which a Jacobian is found in numbers, which is quicker once than to write it as nodes."""
@@ -152,7 +149,7 @@ class StepProgram:
     @property
     def nested(self) -> bool:
         """Whether derivatives lie in one another so deep that an array program is far larger than the graph."""
-        return any(e.nesting >= NESTED for e in self.equations)
+        return any(e.nesting >= policy.NESTED for e in self.equations)
 
     @cached_property
     def jacobians(self) -> list[list[dict[int, int]]]:

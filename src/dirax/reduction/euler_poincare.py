@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
+from dirax.numerics.arrays import Data
 from dirax.numerics.tolerances import INERTIA_RANK
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
@@ -115,7 +116,7 @@ class EulerPoincare(AbstractSystem):
 
     # ------------------------------------------------------------------ AbstractSystem
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         """(d + r, m)."""
         if set(data) - {"t"} == {"q"}:
             refuse_start(self, data, "x", "q, v", "q, p")
@@ -156,7 +157,7 @@ class EulerPoincare(AbstractSystem):
         xi = self.inverse_legendre(momentum, a, params)
         return jacobian(lambda xi: self.legendre(xi, a, params))(xi), self.constraint_forms(a, params)
 
-    def _on_the_dual(self, data: dict[str, Array], params: Any) -> dict[str, Array]:
+    def _on_the_dual(self, data: Data, params: Any) -> dict[str, Array]:
         """x = μ of data q with v or p on the group; other data as they are."""
         if "q" not in data or self.space.advected:
             return data
@@ -167,7 +168,7 @@ class EulerPoincare(AbstractSystem):
         group.check_tangent(q, data["v"], "v")
         return {"x": self.legendre(group.to_algebra(q, data["v"]), jnp.zeros(0), params)}
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         momentum, a = self.space.split(self._on_the_dual(data, params)["x"])
         xi = self.inverse_legendre(momentum, a, params)
         if project and self.one_forms is not None:
@@ -185,16 +186,16 @@ class EulerPoincare(AbstractSystem):
 
         return nearest_root(defect, jnp.concatenate([guess, jnp.zeros(len(forms))]))[:d]
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Array, " m"]:
         if self.one_forms is None:
             return no_constraint()
         return self.constraint_forms(self.space.split(data["x"])[1], params) @ data["v"]
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Array, ""]:
         """⟨μ, ξ⟩ − l(ξ, a)."""
         return self._energy(*self.space.split(row["x"]), params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Array, " m"]:
         """A ξ."""
         if self.one_forms is None:
             return no_constraint()

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.geometry.structures import DiracStructure
+from dirax.numerics.arrays import Data
 from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import no_constraint
@@ -57,7 +58,7 @@ class LiePoisson(AbstractSystem):
     def relation_form(self, shape: Shape) -> RelationForm:
         return self.dirac_system().relation_form(shape)
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         """(d + r, 0)."""
         momentum, a = checked_point(self.space, data, "LiePoisson", "jnp.concatenate([mu, a])")
         out = self.hamiltonian.shape(*((momentum, a) if self.space.advected else (momentum,)), params)
@@ -65,19 +66,19 @@ class LiePoisson(AbstractSystem):
             raise ValueError(f"{self.hamiltonian.signature} must return a scalar, but it returned shape {out.shape}.")
         return self.space.size, 0
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         x, dirac = data["x"], self.dirac_system()
         velocity = dirac.hamiltonian_vector(x, dirac.differential(x, params), params)
         return {"x": x, "velocity": velocity, "v": self.slopes(*self.space.split(x), params)[0]}
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, "0"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Array, "0"]:
         return no_constraint()
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Array, ""]:
         """h(μ, a)."""
         return self.value(*self.space.split(row["x"]), params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, "0"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Array, "0"]:
         return no_constraint()
 
     @property
@@ -85,7 +86,7 @@ class LiePoisson(AbstractSystem):
         return self.space
 
 
-def checked_point(space: SemidirectProduct, data: dict[str, Array], kind: str, way: str) -> tuple[Algebra, Advected]:
+def checked_point(space: SemidirectProduct, data: Data, kind: str, way: str) -> tuple[Algebra, Advected]:
     """(μ, a) of the initial data; raises `ValueError` for data that are no point x of shape (d + r,)."""
     d, r, name = space.dimension, space.advected, type(space.group).__name__
     what = f"x= (μ, a) of shape ({d} + {r},)" if r else f"x= μ of shape ({d},)"

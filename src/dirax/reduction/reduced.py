@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.arrays import Data
 from dirax.numerics.tolerances import INERTIA_RANK, SYMMETRY_DEFECT
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.actions import Translations
@@ -59,14 +60,14 @@ class ReducedLagrangeDirac(AbstractSystem):
         part along the group."""
         return self.system.forces is None and self.system.one_forms is None
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
         sizes = self.system.sizes(data, params)
         self.connection.check(sizes[0])
         if not is_traced(data, params):
             self._refuse_asymmetry(data, params)
         return sizes
 
-    def moves_momentum(self, data: dict[str, Array], params: Any) -> str:
+    def moves_momentum(self, data: Data, params: Any) -> str:
         """What has a part along the group and moves μ, with the part and where, at initial data and near them, which must be
         concrete; empty where nothing does."""
         if self.conserves_momentum:
@@ -95,7 +96,7 @@ class ReducedLagrangeDirac(AbstractSystem):
 
         return jax.vmap(at)(t, q, v)
 
-    def refuse_asymmetric(self, functions: dict[str, UserFunction], data: dict[str, Array], h: float, params: Any) -> None:
+    def refuse_asymmetric(self, functions: dict[str, UserFunction], data: Data, h: float, params: Any) -> None:
         """Raise `ValueError` where functions of ([t, ]q0, q1, h[, params]) are not invariant, at data that must be concrete."""
         found = discrete_invariance(functions, Translations(self.connection.fibre), *sampled(data), h, params)
         if not found.ok:
@@ -124,23 +125,23 @@ class ReducedLagrangeDirac(AbstractSystem):
                 f"{inertia} there and {nearby} nearby. Start elsewhere, or use coordinates that do not end there."
             )
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         return self.system.complete(data, params, project)
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Array, " m"]:
         return self.system.initial_defect(data, params)
 
-    def unreduced_row(self, row: dict[str, Array]) -> dict[str, Array]:
+    def unreduced_row(self, row: Data) -> dict[str, Array]:
         """The row (q, p, …) on T*Q over a reduced row."""
         q = self.connection.join(row["x"], row["g"])
         p = self.connection.untrivialize_covector(row["x"], row["w"], row["mu"])
         return {"q": q, "p": p} | {name: value for name, value in row.items() if name not in ("x", "w", "mu", "g")}
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Array, ""]:
         """The energy of the unreduced system, which the group coordinate does not change."""
         return self.system.energy_at(self.unreduced_row(row), params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Array, " m"]:
         return self.system.constraint_at(self.unreduced_row(row), params)
 
     @property
@@ -148,7 +149,7 @@ class ReducedLagrangeDirac(AbstractSystem):
         return self.system.energy_changes
 
 
-def sampled(data: dict[str, Array]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sampled(data: Data) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Times, points and velocities, (1 + SAMPLES, …) each: the initial data, at t = 0, and random ones near them."""
     q = np.asarray(data["q"] if "q" in data else data["q0"])
     v = np.asarray(data["v"]) if "v" in data else np.ones_like(q)

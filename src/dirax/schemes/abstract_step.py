@@ -5,6 +5,7 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
+from dirax.numerics.arrays import Data
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field, StepEquation
 
@@ -47,7 +48,7 @@ class AbstractStep(ABC):
         return False
 
     @abstractmethod
-    def start(self, data: dict[str, Array], h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+    def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
         """The first state and a first guess of the unknowns."""
 
     @abstractmethod
@@ -62,7 +63,7 @@ class AbstractStep(ABC):
     def unpack(self, state: Float[Array, " s"], u: Float[Array, " k"], t: Any, h: Any, params: Any) -> dict[str, Array]:
         """The arrays that are saved of the row that `state` is at."""
 
-    def check(self, data: dict[str, Array], h: Any, params: Any) -> None:
+    def check(self, data: Data, h: Any, params: Any) -> None:
         """Raise `ValueError` for initial data at which a premise of the method does not hold."""
         return None
 

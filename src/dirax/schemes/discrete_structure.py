@@ -12,6 +12,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.numerics.arrays import Data
+
 
 class Claim(NamedTuple):
     """One thing that a structure says of every step: the `quantity` by its name, the names of its `parts`, the numbers by
@@ -67,7 +69,7 @@ class AbstractDiscreteStructure(eqx.Module):
         """Whether a step imposes constraints between its points, whose terms have the sizes `constraint_size`."""
         return False
 
-    def constraint_size(self, row: dict[str, Array], speed: Array, params: Any) -> Float[Array, " k"]:
+    def constraint_size(self, row: Data, speed: Array, params: Any) -> Float[Array, " k"]:
         """The sizes of the terms of the constraints that a step imposes between its points, at a saved row with its time "t".
         `speed`: the largest |Δq|/h."""
         raise NotImplementedError
@@ -108,7 +110,7 @@ class AbstractStepForm(eqx.Module):
         and the times "t" (points,).
         """
 
-    def refusal(self, equation: Any, row: dict[str, Array], params: Any) -> str:
+    def refusal(self, equation: Any, row: Data, params: Any) -> str:
         """Why the step does not start from a saved row; empty if it does."""
         return ""
 

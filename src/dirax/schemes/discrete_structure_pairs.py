@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector
 from dirax.geometry.tulczyjew import FiniteDifferenceTriple, slot_derivatives
+from dirax.numerics.arrays import Data
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Claim, nonzero
@@ -114,7 +115,7 @@ class LagrangianPairs(AbstractDiscreteStructure):
     def own_constraints(self) -> bool:
         return True
 
-    def constraint_size(self, row: dict[str, Array], speed: Array, params: Any) -> Float[Array, " k"]:
+    def constraint_size(self, row: Data, speed: Array, params: Any) -> Float[Array, " k"]:
         """|W||v| + |b|, the largest of all, and |∂g/∂q||q|."""
         t, constraints = row["t"], self.system.constraints
         matrix = jnp.abs(self.matrix(t, row["q"], params))

@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.numerics.arrays import Data
 from dirax.program.tracing import along, gradient
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows
@@ -66,7 +67,7 @@ class LagrangianStep(AbstractStep):
         return along(lambda q: function(t, q), (q,), (v,))
 
 
-def one_point_only(data: dict[str, Array]) -> None:
+def one_point_only(data: Data) -> None:
     """Refuse a start of Method 2 from two points."""
     if "q0" in data:
         raise ValueError("Method 2 is a one-step method on M_f: start it from q= with v= or p=, not from two points.")

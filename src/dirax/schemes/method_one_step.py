@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.numerics.arrays import Data
 from dirax.schemes.lagrangian_step import LagrangianStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.map_lift import Base, Lift, ThetaLift
@@ -38,7 +39,7 @@ class MethodOneStep(LagrangianStep):
         balance = tuple(f"momentum balance {i}" for i in range(self.lift.dimension))
         return balance + tuple(f"constraint {r} at the base point" for r in self.rows.kept)
 
-    def start(self, data: dict[str, Array], h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+    def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
         if "q0" not in data:
             guess = self.unknowns.join(velocity=self.lift.components(data["q"], data["v"]))
             return self.book.start(data["q"], data["p"]), guess

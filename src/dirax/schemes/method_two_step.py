@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.numerics.arrays import Data
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import along, gradient, jacobian, once
 from dirax.schemes.lagrangian_step import LagrangianStep, numbered, one_point_only
@@ -38,7 +39,7 @@ class NonholonomicStep(ThetaStep):
     def unknowns(self) -> Layout:
         return Layout(v=self.shape.n, sigma=self.shape.m)
 
-    def start(self, data: dict[str, Array], h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+    def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
         one_point_only(data)
         return self.book.start(data["q"], data["p"]), self.unknowns.join(v=data["v"])
 
@@ -94,7 +95,7 @@ class ProjectedThetaStep(ThetaStep):
         n, k, c = self.shape.n, self.rows.count, self.rows.holonomic
         return Layout(v=n, sigma=k, s=c, end_v=n, end_sigma=k, w=n if c else 0, end_s=c)
 
-    def start(self, data: dict[str, Array], h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+    def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
         one_point_only(data)
         v = data["v"]
         guess = self.unknowns.join(v=v, end_v=v, **({"w": v} if self.rows.holonomic else {}))

@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.numerics.arrays import Data
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import gradient, jacobian, once
 from dirax.schemes.lagrangian_step import LagrangianStep, numbered, one_point_only
@@ -41,7 +42,7 @@ class ProjectedLiftStep(LagrangianStep):
     def labels(self) -> tuple[str, ...]:
         return numbered(self.unknowns.size)
 
-    def start(self, data: dict[str, Array], h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+    def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
         one_point_only(data)
         v = self.lift.components(data["q"], data["v"])
         guess = self.unknowns.join(velocity=v, end_v=v, **({"w": v} if self.rows.holonomic else {}))

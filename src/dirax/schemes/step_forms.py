@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.geometry.structures import canonical_two_form
+from dirax.numerics.arrays import Data
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm, nonzero
 
 
@@ -32,7 +33,7 @@ class RowForm(AbstractStepForm):
     def points(self) -> int:
         return 1
 
-    def refusal(self, equation: Any, row: dict[str, Array], params: Any) -> str:
+    def refusal(self, equation: Any, row: Data, params: Any) -> str:
         try:
             jax.eval_shape(lambda row: started(self.system, self.step, equation, row, params), row)
         except (KeyError, TypeError, ValueError) as error:

@@ -7,8 +7,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import OFF_MANIFOLD
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
@@ -77,37 +78,37 @@ class ConstraintChain:
         """Whether no point near the given one has a velocity that stays."""
         return self.verdict == EMPTY
 
-    def constraints(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " c"]:
+    def constraints(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " c"]:
         """All constraint functions of M_f at x, level by level."""
         return self._at(self._constraints, x, params)
 
-    def field(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+    def field(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
         """The tangent field ẋ on M_f; where it is not unique, the one whose undetermined part was zero at `point`.
 
         Raises `ValueError` for a chain that ended empty or irregular.
         """
         return self._at(self._solved(), x, params)[: len(self.coordinates)]
 
-    def multipliers(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " m"]:
+    def multipliers(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " m"]:
         """The multipliers u that keep x on M_f, in the order of `multiplier_names`. Raises as `field`."""
         return self._at(self._solved(), x, params)[len(self.coordinates) :]
 
-    def gauge(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N freedom"]:
+    def gauge(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N freedom"]:
         """A basis, by columns, of the directions of ẋ that the equations leave free. Raises as `field`."""
         if self._kernel is None:
             raise ValueError(f"this constraint chain has no final manifold: {self.explanation}")
         return self._at(self._free_directions, x, params)
 
-    def project(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+    def project(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
         """The point y of M_f nearest to x: y + Dφ(y)ᵀσ = x, φ(y) = 0. Differentiable."""
         self._solved()
         return self._at(self._nearest, x, params)
 
-    def normal(self, covector: Float[Array, " N"]) -> Float[Array, " N"]:
+    def normal(self, covector: Float[Numbers, " N"]) -> Float[Numbers, " N"]:
         """The vector that a combination of the dφ pushes points along: the same numbers, without the time's."""
         return covector.at[-1].set(0.0) if self.clock else covector
 
-    def check(self, x: Float[Array, " N"], params: Any = None) -> None:
+    def check(self, x: Float[Numbers, " N"], params: Any = None) -> None:
         """Raise `ValueError` for a point off M_f, with the first level it is off, the values, and its projection."""
         params = self._with(params)
         if is_traced(x, params):
@@ -119,7 +120,7 @@ class ConstraintChain:
         if text := self.off(x, params):
             raise ValueError(f"{text}: start from chain.project(x).")
 
-    def off(self, x: Float[Array, " N"], params: Any = None) -> str:
+    def off(self, x: Float[Numbers, " N"], params: Any = None) -> str:
         """The first level that x is off, the values of its constraints and the nearest point of M_f, in words; "" on M_f."""
         params = self._with(params)
         for level in self.levels:
@@ -200,17 +201,17 @@ class ResolvedSystem(AbstractSystem):
 
     chain: ConstraintChain = eqx.field(static=True)
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         size = len(self.chain.coordinates)
         if "x" not in data or data["x"].shape != (size,):
             raise ValueError(f"the resolved system starts from x= of shape ({size},) = {', '.join(self.chain.coordinates)}.")
         return size, sum(level.count for level in self.chain.levels)
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         x = self.chain.project(data["x"], params) if project else data["x"]
         return {"x": x, "velocity": self.chain.field(x, params)}
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " m"]:
         """φ(x)."""
         return self.chain.constraints(data["x"], params)
 
@@ -221,13 +222,13 @@ class ResolvedSystem(AbstractSystem):
         nearest = lambda x, covector, params: chain.normal(covector)
         return FinalManifold(chain.constraints, count, chain.field, chain.multipliers, forces, nearest)
 
-    def explain(self, x: Float[Array, " N"]) -> str:
+    def explain(self, x: Float[Numbers, " N"]) -> str:
         """Which manifold of the chain a point is off, and the nearest point of M_f."""
         return self.chain.off(x)
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy of the system that the chain came from."""
         return self.chain._energy(row["x"], self.chain._with(params))
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " m"]:
         return self.chain.constraints(row["x"], params)

@@ -6,15 +6,16 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from dirax.numerics.arrays import Numbers
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import along, jacobian
 from dirax.program.user_functions import UserFunction
 
 
-def no_constraint() -> Float[Array, "0"]:
+def no_constraint() -> Float[Numbers, "0"]:
     """The value of the constraints of a system without any."""
     return jnp.zeros((0,))
 
@@ -49,7 +50,7 @@ class Constraints(eqx.Module):
         """Whether there are constraints."""
         return self.one_forms is not None or self.holonomic is not None
 
-    def sizes(self, q: Float[Array, " n"], params: Any) -> tuple[int, int]:
+    def sizes(self, q: Float[Numbers, " n"], params: Any) -> tuple[int, int]:
         """(m, c); raises `ValueError` where a function returns a wrong shape."""
         n, t = q.shape[0], np.zeros(())
         m = c = 0
@@ -79,31 +80,31 @@ class Constraints(eqx.Module):
             c = out.shape[0]
         return m, c
 
-    def one_forms_at(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, "m n"]:
+    def one_forms_at(self, t: Any, q: Float[Numbers, " n"], params: Any) -> Float[Numbers, "m n"]:
         """W(t, q)."""
         return jnp.zeros((0, q.shape[0])) if self.one_forms is None else self.one_forms.at(t, q, params)
 
-    def holonomic_matrix(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, "c n"]:
+    def holonomic_matrix(self, t: Any, q: Float[Numbers, " n"], params: Any) -> Float[Numbers, "c n"]:
         """G(t, q) = ∂g/∂q."""
         if self.holonomic is None:
             return jnp.zeros((0, q.shape[0]))
         return jacobian(lambda q: self.position_defect(t, q, params), reverse=True)(q)
 
-    def matrix(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, "k n"]:
+    def matrix(self, t: Any, q: Float[Numbers, " n"], params: Any) -> Float[Numbers, "k n"]:
         """[W; G], the one-forms that vanish on Δ."""
         w = self.one_forms_at(t, q, params)
         return w if self.holonomic is None else jnp.concatenate([w, self.holonomic_matrix(t, q, params)])
 
-    def position_defect(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, " c"]:
+    def position_defect(self, t: Any, q: Float[Numbers, " n"], params: Any) -> Float[Numbers, " c"]:
         """g(t, q)."""
         return no_constraint() if self.holonomic is None else self.holonomic.at(t, q, params)
 
-    def nonholonomic_defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " m"]:
+    def nonholonomic_defect(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " m"]:
         """W v + b."""
         rate = self.one_forms_at(t, q, params) @ v
         return rate if self.affine is None else rate + self.affine.at(t, q, params)
 
-    def hidden_defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " c"]:
+    def hidden_defect(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " c"]:
         """G v + ∂g/∂t, the rate of change of g."""
         if self.holonomic is None:
             return no_constraint()
@@ -112,12 +113,12 @@ class Constraints(eqx.Module):
             return along(g, (jnp.asarray(t, float), q), (jnp.ones(()), v))
         return along(lambda q: g(t, q), (q,), (v,))
 
-    def velocity_defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
+    def velocity_defect(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " k"]:
         """(W v + b, G v + ∂g/∂t)."""
         first = self.nonholonomic_defect(t, q, v, params)
         return first if self.holonomic is None else jnp.concatenate([first, self.hidden_defect(t, q, v, params)])
 
-    def defect(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
+    def defect(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " k"]:
         """(W v + b, g, G v + ∂g/∂t)."""
         first = self.nonholonomic_defect(t, q, v, params)
         if self.holonomic is None:
@@ -125,13 +126,15 @@ class Constraints(eqx.Module):
         return jnp.concatenate([first, self.position_defect(t, q, params), self.hidden_defect(t, q, v, params)])
 
     def nearest_velocity(
-        self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], lifted: Float[Array, "n k"], params: Any
-    ) -> Float[Array, " n"]:
+        self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], lifted: Float[Numbers, "n k"], params: Any
+    ) -> Float[Numbers, " n"]:
         """The velocity with W v + b = 0 and G v + ∂g/∂t = 0 that differs from v by a combination of the columns of `lifted`."""
         inverse, _ = scaled_pseudo_inverse(self.matrix(t, q, params) @ lifted)
         return v - lifted @ (inverse @ self.velocity_defect(t, q, v, params))
 
-    def nearest_position(self, t: Any, q: Float[Array, " n"], lifted: Float[Array, "n c"], params: Any) -> Float[Array, " n"]:
+    def nearest_position(
+        self, t: Any, q: Float[Numbers, " n"], lifted: Float[Numbers, "n c"], params: Any
+    ) -> Float[Numbers, " n"]:
         """The point with g = 0 near q that differs from q by a combination of the columns of `lifted`."""
         g = lambda s: self.position_defect(t, q + lifted @ s, params)
         return q + lifted @ nearest_root(g, jnp.zeros(lifted.shape[1]))

@@ -6,9 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from dirax.geometry.structures import DiracStructure
+from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import BRACKET_DEFECT, RATE_RANK
 from dirax.program.linear_solves import pseudo_inverse, solve
 from dirax.program.roots import nearest_root
@@ -52,7 +53,7 @@ class DiracSystem(AbstractSystem):
         self.hamiltonian = UserFunction(hamiltonian, "hamiltonian", ("x",))
         self.holonomic = None if holonomic is None else UserFunction(holonomic, "holonomic", ("x",))
 
-    def differential(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+    def differential(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
         """dH(x)."""
         return gradient(lambda x: self.hamiltonian(x, params))(x)
 
@@ -62,19 +63,19 @@ class DiracSystem(AbstractSystem):
         return Constraints(None, None, self.holonomic)
 
     @once
-    def holonomic_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "c N"]:
+    def holonomic_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "c N"]:
         """G(x) = ∂g/∂x; (0, N) without constraints."""
         return self.constraints.holonomic_matrix(0.0, x, params)
 
     def relation(
         self,
-        x: Float[Array, " N"],
-        velocity: Float[Array, " N"],
-        multipliers: Float[Array, " c"],
+        x: Float[Numbers, " N"],
+        velocity: Float[Numbers, " N"],
+        multipliers: Float[Numbers, " c"],
         t: Any,
         params: Any = None,
-        differential: Float[Array, " N"] | None = None,
-    ) -> Float[Array, " k"]:
+        differential: Float[Numbers, " N"] | None = None,
+    ) -> Float[Numbers, " k"]:
         """F ẋ + E (dH − Gᵀλ), zero iff (ẋ, dH − Gᵀλ) ∈ D_x, and G ẋ; `differential` replaces dH(x)."""
         F, E = self.structure.kernel(x, params)
         dh = self.differential(x, params) if differential is None else differential
@@ -112,7 +113,7 @@ class DiracSystem(AbstractSystem):
         about = "F ẋ = −E (dH − Gᵀλ), g = 0" if c else "F ẋ = −E dH"
         return ImplicitForm(equations, x, names("x", x.size), names("λ", c), energy_of_x(self), about)
 
-    def equations(self, x: Float[Array, " N"], params: Any = None) -> tuple[Array, Array]:
+    def equations(self, x: Float[Numbers, " N"], params: Any = None) -> tuple[Numbers, Numbers]:
         """([F, −E Gᵀ], −E dH), of shapes (N, N + c) and (N,): the linear equations of (ẋ, λ)."""
         F, E = map(jnp.asarray, self.structure.kernel(x, params))
         return jnp.concatenate([F, -E @ self.holonomic_matrix(x, params).T], axis=1), -E @ self.differential(x, params)
@@ -129,7 +130,9 @@ class DiracSystem(AbstractSystem):
         """Whether D is the canonical symplectic structure of T*Q in (q, p)."""
         return self.structure.representation == "two_form" and getattr(self.structure.evaluate, "one_forms", 0) is None
 
-    def hamiltonian_vector(self, x: Float[Array, " N"], covector: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+    def hamiltonian_vector(
+        self, x: Float[Numbers, " N"], covector: Float[Numbers, " N"], params: Any = None
+    ) -> Float[Numbers, " N"]:
         """The ẋ with (ẋ, α) ∈ D_x, unique where D is the graph of a bivector or of a nondegenerate two-form."""
         if self.canonical:
             q, p = jnp.split(covector, 2)
@@ -139,29 +142,29 @@ class DiracSystem(AbstractSystem):
         return v if self.structure.representation == "bivector" else solve(jnp.asarray(F), v)
 
     @once
-    def hidden_defect(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " c"]:
+    def hidden_defect(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " c"]:
         """{g, H} = G ẋ for the ẋ of dH, the rate of change of g."""
         velocity = self.hamiltonian_vector(x, self.differential(x, params), params)
         return self.constraints.hidden_defect(0.0, x, velocity, params)
 
-    def brackets(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "c c"]:
+    def brackets(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "c c"]:
         """{g_i, g_j}: zero for functions of q on T*Q, and wherever N is coisotropic."""
         return self.holonomic_matrix(x, params) @ self.forces(x, params)
 
     @once
-    def forces(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N c"]:
+    def forces(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N c"]:
         """The velocities of the rows of G, by columns: λ changes ẋ by −forces λ."""
         rows = self.holonomic_matrix(x, params)
         return jax.vmap(lambda row: self.hamiltonian_vector(x, row, params))(rows).T
 
-    def tangency_defect(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " c"]:
+    def tangency_defect(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " c"]:
         """The part of {g, H} that no λ takes away by its brackets {g_i, g_j} λ: all of it where they vanish."""
         hidden, brackets = self.hidden_defect(x, params), self.brackets(x, params)
         size = jnp.sum(self.holonomic_matrix(x, params) ** 2)
         normal = brackets.T @ brackets + (BRACKET_DEFECT * size) ** 2 * jnp.eye(hidden.shape[0])
         return hidden - brackets @ solve(normal, brackets.T @ hidden)
 
-    def constrained_field(self, x: Float[Array, " N"], params: Any = None) -> tuple[Float[Array, " N"], Float[Array, " c"]]:
+    def constrained_field(self, x: Float[Numbers, " N"], params: Any = None) -> tuple[Float[Numbers, " N"], Float[Numbers, " c"]]:
         """(ẋ, λ) at a point of M_f = {g = 0, {g, H} = 0}, where the brackets {g_i, g_j} are zero: λ keeps {g, H} = 0."""
         free = self.hamiltonian_vector(x, self.differential(x, params), params)
         forces = self.forces(x, params)
@@ -199,7 +202,7 @@ class DiracSystem(AbstractSystem):
 
     # ------------------------------------------------------------------ AbstractSystem
 
-    def point(self, data: dict[str, Array]) -> Float[Array, " N"]:
+    def point(self, data: Data) -> Float[Numbers, " N"]:
         """x of initial data; raises `ValueError` for others than x, or q and p."""
         if "x" in data:
             return data["x"]
@@ -207,7 +210,7 @@ class DiracSystem(AbstractSystem):
             raise ValueError(f"a DiracSystem starts from x= (or q=, p= with x = (q, p)), but {', '.join(data)} were given.")
         return jnp.concatenate([data["q"], data["p"]])
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
         """(N, 0), or (N, 0, c) with holonomic constraints."""
         x = self.point(data)
         out = self.hamiltonian.shape(x, params)
@@ -221,7 +224,7 @@ class DiracSystem(AbstractSystem):
             )
         return (x.size, 0) if self.holonomic is None else (x.size, *self.constraints.sizes(x, params))
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         """x, ẋ and λ; `project` moves x to M_f where D is a graph."""
         x = self.point(data)
         if project and self.holonomic is not None and self.is_graph:
@@ -233,14 +236,14 @@ class DiracSystem(AbstractSystem):
         rates = pseudo_inverse(matrix, RATE_RANK) @ jnp.concatenate([right, jnp.zeros(count)])
         return {"x": x, "velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
 
-    def project(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+    def project(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
         """A point of M_f near x, for a graph D: g = 0 nearest in x, then {g, H} = 0 along the forces if the brackets vanish."""
         x = self.project_position(x, x, params)
         along, rows = self.forces(x, params), self.holonomic_matrix(x, params)
         end = x + along @ nearest_root(lambda s: self.hidden_defect(x + along @ s, params), jnp.zeros(along.shape[1]))
         return jnp.where(jnp.max(jnp.abs(rows @ along)) <= BRACKET_DEFECT * jnp.sum(rows**2), end, x)
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " k"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " k"]:
         """The part of F ẋ + E dH that no velocity makes zero: x is on M_0 where it vanishes. With holonomic constraints g and
         what no (ẋ, λ) makes zero of (F ẋ + E (dH − Gᵀλ), G ẋ): the tangency defect where D is a graph."""
         x = data["x"]
@@ -250,11 +253,11 @@ class DiracSystem(AbstractSystem):
             return jnp.concatenate([self.holonomic(x, params), self.tangency_defect(x, params)])
         return jnp.concatenate([self.holonomic(x, params), self.relation(x, data["velocity"], data["multipliers"], 0.0, params)])
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(x)."""
         return self.hamiltonian(row["x"], params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
         """The defect of x, as in `initial_defect`."""
         return self.initial_defect(self.complete({"x": row["x"]}, params, False), params)
 

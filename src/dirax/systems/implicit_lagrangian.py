@@ -5,9 +5,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from dirax.geometry.structures import canonical_two_form
+from dirax.numerics.arrays import Numbers
 from dirax.numerics.ranks import significant
 from dirax.numerics.tolerances import HESSIAN_RANK
 from dirax.program.linear_solves import solve
@@ -143,7 +143,7 @@ def _on_pontryagin_bundle(system: Any, x: np.ndarray, params, timed: bool, t: fl
     return in_time(timed, t, equations, x, coordinates, names("λ", m + c), energy, about)
 
 
-def _moving(system: Any, t, q, params) -> tuple[Array, Array]:
+def _moving(system: Any, t, q, params) -> tuple[Numbers, Numbers]:
     """(−b, g): the right-hand sides of W q̇ = −b and 0 = g."""
     constraints = system.constraints
     return -constraints.nonholonomic_defect(t, q, jnp.zeros_like(q), params), constraints.position_defect(t, q, params)

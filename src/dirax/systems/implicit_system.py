@@ -4,8 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from dirax.numerics.arrays import Data, Numbers
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.user_functions import UserFunction
 from dirax.systems.forms import ImplicitForm, RelationForm
@@ -35,19 +36,19 @@ class ImplicitSystem(AbstractSystem):
         self.B = None if B is None else UserFunction(B, "B", ("x",))
         self.hamiltonian = None if hamiltonian is None else UserFunction(hamiltonian, "hamiltonian", ("x",))
 
-    def equations(self, x: Float[Array, " N"], params: Any = None) -> tuple[Array, Array]:
+    def equations(self, x: Float[Numbers, " N"], params: Any = None) -> tuple[Numbers, Numbers]:
         """([E, −B], f), of shapes (r, N + m) and (r,): the linear equations of (ẋ, u)."""
         E, f = self.E(x, params), self.f(x, params)
         return (E if self.B is None else jnp.concatenate([E, -self.B(x, params)], axis=1)), f
 
     def relation(
         self,
-        x: Float[Array, " N"],
-        velocity: Float[Array, " N"],
-        multipliers: Float[Array, " m"],
+        x: Float[Numbers, " N"],
+        velocity: Float[Numbers, " N"],
+        multipliers: Float[Numbers, " m"],
         t: Any,
         params: Any = None,
-    ) -> Float[Array, " r"]:
+    ) -> Float[Numbers, " r"]:
         """E ẋ − f − B u."""
         matrix, f = self.equations(x, params)
         return matrix @ jnp.concatenate([velocity, multipliers]) - f
@@ -61,7 +62,7 @@ class ImplicitSystem(AbstractSystem):
         _, m = self.sizes({"x": jnp.asarray(x)}, params)
         return ImplicitForm(self.equations, x, names("x", x.size), names("u", m), energy_of_x(self), "as stated")
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         if "x" not in data:
             raise ValueError(f"an ImplicitSystem starts from x=, but {', '.join(data)} were given.")
         x = data["x"]
@@ -77,19 +78,19 @@ class ImplicitSystem(AbstractSystem):
             raise ValueError(f"B must have shape ({E[0]}, m), one column a multiplier, but it returned shape {B}.")
         return x.size, B[1]
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         x = data["x"]
         matrix, f = self.equations(x, params)
         velocity = scaled_pseudo_inverse(matrix)[0] @ f
         return {"x": x, "velocity": velocity[: x.size], "defect": matrix @ velocity - f}
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " r"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " r"]:
         """The part of f that no (ẋ, u) reaches: x is on M_0 where it vanishes."""
         return data["defect"]
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(x); NaN for a system stated without one."""
         return jnp.array(jnp.nan) if self.hamiltonian is None else self.hamiltonian(row["x"], params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " r"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " r"]:
         return self.initial_defect(self.complete({"x": row["x"]}, params, False), params)

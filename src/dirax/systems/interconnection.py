@@ -5,8 +5,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from dirax.numerics.arrays import Numbers
 from dirax.systems.port_hamiltonian import PortHamiltonian
 
 KINDS = ("feedback", "joint")
@@ -101,7 +102,7 @@ def interconnect(
     )
 
 
-def _port_columns(one, other, b, c, ports, other_ports, joint: bool) -> Float[Array, "N m"]:
+def _port_columns(one, other, b, c, ports, other_ports, joint: bool) -> Float[Numbers, "N m"]:
     above = jnp.concatenate([b, jnp.zeros((c.shape[0], b.shape[1]))])
     below = jnp.concatenate([jnp.zeros((b.shape[0], c.shape[1])), c])
     shut = [system.closed if isinstance(system.closed, tuple) else () for system in (one, other)]

@@ -6,8 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import METRIC_RANK
 from dirax.program.linear_solves import scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
@@ -74,33 +75,35 @@ class LagrangeDirac(AbstractSystem):
 
     # ------------------------------------------------------------------ geometry of L and W, one point at a time
 
-    def constraint_matrix(self, q: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, "m n"]:
+    def constraint_matrix(self, q: Float[Numbers, " n"], params: Any = None, t: Any = 0.0) -> Float[Numbers, "m n"]:
         """W(q), whose rows are the constraint one-forms; (0, n) without them."""
         return self.constraints.one_forms_at(t, q, params)
 
-    def legendre(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " n"]:
+    def legendre(
+        self, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, " n"]:
         """The Legendre transform: p = ∂L/∂v (q, v)."""
         return gradient(lambda v: self.lagrangian.at(t, q, v, params))(v)
 
     def inverse_legendre(
         self,
-        q: Float[Array, " n"],
-        p: Float[Array, " n"],
+        q: Float[Numbers, " n"],
+        p: Float[Numbers, " n"],
         params: Any = None,
-        guess: Float[Array, " n"] | None = None,
+        guess: Float[Numbers, " n"] | None = None,
         t: Any = 0.0,
-    ) -> Float[Array, " n"]:
+    ) -> Float[Numbers, " n"]:
         """A velocity v with ∂L/∂v (q, v) = p; where L is degenerate the one nearest to `guess` (zero by default)."""
         v0 = jnp.zeros_like(q) if guess is None else guess
         return nearest_root(lambda v: self.legendre(q, v, params, t) - p, v0)
 
-    def energy(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, ""]:
+    def energy(self, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any = None, t: Any = 0.0) -> Float[Numbers, ""]:
         """The energy E(q, v) = ⟨∂L/∂v, v⟩ − L(q, v); it is `generalized_energy` on the image of the Legendre transform."""
         return self.generalized_energy(q, v, self.legendre(q, v, params, t), params, t)
 
     def generalized_energy(
-        self, q: Float[Array, " n"], v: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0
-    ) -> Float[Array, ""]:
+        self, q: Float[Numbers, " n"], v: Float[Numbers, " n"], p: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, ""]:
         """E(q, v, p) = ⟨p, v⟩ − L(q, v) on the Pontryagin bundle ([PY] (56))."""
         return p @ v - self.lagrangian.at(t, q, v, params)
 
@@ -113,7 +116,7 @@ class LagrangeDirac(AbstractSystem):
     def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
         return implicit_lagrangian(self, self, near, params)
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
         """(n, m), or (n, m, c) with holonomic constraints."""
         refuse_start(self, data, "q, v", "q, p", "q0, q1")
         q = data["q"] if "q" in data else data["q0"]
@@ -133,7 +136,7 @@ class LagrangeDirac(AbstractSystem):
         m, c = self.constraints.sizes(q, params)
         return (n, m) if self.holonomic is None else (n, m, c)
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         if "q0" in data:
             return dict(data)
         q, t, constraints = data["q"], data.get("t", 0.0), self.constraints
@@ -166,38 +169,38 @@ class LagrangeDirac(AbstractSystem):
         return solve(jnp.where(regular, hessian, jnp.eye(q.shape[0])), rows.T)
 
     def project_velocity(
-        self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0
-    ) -> Float[Array, " n"]:
+        self, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, " n"]:
         """The velocity with W v + b = 0 and G v + ∂g/∂t = 0 nearest to v, in the metric ∂²L/∂v² where it is positive
         definite and the Euclidean one elsewhere."""
         rows = self.constraints.matrix(t, q, params)
         return self.constraints.nearest_velocity(t, q, v, self._lifted(q, v, rows, params, t), params)
 
     def project_position(
-        self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0
-    ) -> Float[Array, " n"]:
+        self, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, " n"]:
         """A point with g = 0 near q, moved along metric⁻¹ Gᵀ, in the metric of `project_velocity`."""
         if self.holonomic is None:
             return q
         lifted = self._lifted(q, v, self.constraints.holonomic_matrix(t, q, params), params, t)
         return self.constraints.nearest_position(t, q, lifted, params)
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " k"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " k"]:
         """(W v + b, g, G v + ∂g/∂t); g(q0) for two points, whose step has the other constraints."""
         t = data.get("t", 0.0)
         if "q0" in data:
             return no_constraint() if self.holonomic is None else self.constraints.position_defect(t, data["q0"], params)
         return self.constraints.defect(t, data["q"], data["v"], params)
 
-    def _velocity(self, row: dict[str, Array], params: Any) -> Float[Array, " n"]:
+    def _velocity(self, row: Data, params: Any) -> Float[Numbers, " n"]:
         """The velocity that belongs to the saved momentum."""
         return self.inverse_legendre(row["q"], row["p"], params, t=row.get("t", 0.0))
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """E at the node, with the velocity that belongs to the saved momentum."""
         return self.energy(row["q"], self._velocity(row, params), params, row.get("t", 0.0))
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
         """(W v + b, g, G v + ∂g/∂t) at the node, with the velocity that belongs to the saved momentum."""
         if not self.constraints.any:
             return no_constraint()

@@ -5,9 +5,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from dirax.geometry.manifolds import AbstractManifold
+from dirax.numerics.arrays import Data, Numbers
 from dirax.program.linear_solves import solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian
@@ -72,16 +73,16 @@ class ManifoldLagrangian(AbstractSystem):
         """The system itself."""
         return self
 
-    def lagrangian_value(self, t: Any, q: Float[Array, " N"], v: Float[Array, " N"], params: Any) -> Float[Array, ""]:
+    def lagrangian_value(self, t: Any, q: Float[Numbers, " N"], v: Float[Numbers, " N"], params: Any) -> Float[Numbers, ""]:
         return self.lagrangian(q, v, params)
 
     # ------------------------------------------------------------------ geometry of L, one point at a time
 
-    def legendre(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+    def legendre(self, q: Float[Numbers, " N"], v: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
         """The covector ∂L/∂v restricted to the tangent space at q."""
         return self.manifold.projection(q, gradient(lambda v: self.lagrangian(q, v, params))(v))
 
-    def inverse_legendre(self, q: Float[Array, " N"], p: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+    def inverse_legendre(self, q: Float[Numbers, " N"], p: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
         """The tangent vector v at q with legendre(q, v) = p."""
         frame = self.manifold.frame(q)
 
@@ -90,16 +91,16 @@ class ManifoldLagrangian(AbstractSystem):
 
         return frame @ nearest_root(defect, jnp.zeros(self.manifold.dimension))
 
-    def energy(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None) -> Float[Array, ""]:
+    def energy(self, q: Float[Numbers, " N"], v: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, ""]:
         """⟨∂L/∂v, v⟩ − L."""
         value, derivative = jax.value_and_grad(lambda v: self.lagrangian(q, v, params))(v)
         return derivative @ v - value
 
-    def project_position(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None, t: Any = 0.0) -> Array:
+    def project_position(self, q: Float[Numbers, " N"], v: Float[Numbers, " N"], params: Any = None, t: Any = 0.0) -> Numbers:
         """The point of the manifold near q."""
         return self.manifold.nearest(q)
 
-    def project_velocity(self, q: Float[Array, " N"], v: Float[Array, " N"], params: Any = None, t: Any = 0.0) -> Array:
+    def project_velocity(self, q: Float[Numbers, " N"], v: Float[Numbers, " N"], params: Any = None, t: Any = 0.0) -> Numbers:
         """The tangent vector at q with W v + b = 0 nearest to v, in the metric ∂²L/∂v² of the tangent space."""
         v, frame = self.manifold.projection(q, v), self.manifold.frame(q)
         hessian = jacobian(gradient(lambda v: self.lagrangian(q, v, params)))(v)
@@ -109,7 +110,7 @@ class ManifoldLagrangian(AbstractSystem):
 
     # ------------------------------------------------------------------ AbstractSystem
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         """(N, m)."""
         if set(data) - {"t"} == {"q"}:
             refuse_start(self, data, "q, v", "q, p")
@@ -127,7 +128,7 @@ class ManifoldLagrangian(AbstractSystem):
                 raise ValueError(f"forces(t, q, v) must return shape {q.shape} like q, but it returned shape {out.shape}.")
         return q.shape[0], Constraints(self.one_forms, self.affine, None).sizes(q, params)[0]
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         q, t = data["q"], data.get("t", 0.0)
         v = data["v"] if "v" in data else self.inverse_legendre(q, data["p"], params)
         if project and self.constraints.any:
@@ -135,15 +136,15 @@ class ManifoldLagrangian(AbstractSystem):
         keep = "p" in data and not (project and self.constraints.any)
         return {"q": q, "v": v, "p": data["p"] if keep else self.legendre(q, v, params)}
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " m"]:
         """W v + b."""
         return self.constraints.nonholonomic_defect(data.get("t", 0.0), data["q"], data["v"], params)
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy at the saved point and momentum."""
         return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params), params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
         """How far the point is from the manifold, and W v + b with the velocity that belongs to the saved momentum."""
         q, off = row["q"], self.manifold.defect(row["q"])[None]
         if not self.constraints.any:

@@ -6,8 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.program.linear_solves import solve
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
@@ -54,7 +55,9 @@ class NonholonomicMechanics(AbstractSystem):
         self.one_forms, self.affine, self.holonomic = given.one_forms, given.affine, given.holonomic
         self.forces = None if forces is None else UserFunction(forces, "forces", ("t", "q", "v"))
 
-    def lagrangian(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, ""]:
+    def lagrangian(
+        self, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, ""]:
         """½ vᵀ g(q) v − V(q)."""
         return v @ self.metric.at(t, q, params) @ v / 2 - self.potential.at(t, q, params)
 
@@ -84,13 +87,13 @@ class NonholonomicMechanics(AbstractSystem):
         return implicit_lagrangian(self.lagrange_dirac(), self, near, params)
 
     def project_position(
-        self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0
-    ) -> Float[Array, " n"]:
+        self, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, " n"]:
         return self.lagrange_dirac().project_position(q, v, params, t)
 
     def project_velocity(
-        self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None, t: Any = 0.0
-    ) -> Float[Array, " n"]:
+        self, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, " n"]:
         return self.lagrange_dirac().project_velocity(q, v, params, t)
 
     @property
@@ -105,7 +108,7 @@ class NonholonomicMechanics(AbstractSystem):
         """The constraints, as functions of (t, q, params)."""
         return Constraints(self.one_forms, self.affine, self.holonomic)
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
         refuse_start(self, data, "q, v", "q, p", "q0, q1")
         q = data["q"] if "q" in data else data["q0"]
         n, t = q.shape[0], np.zeros(())
@@ -119,17 +122,21 @@ class NonholonomicMechanics(AbstractSystem):
             raise ValueError(f"potential must return a scalar, but it returned shape {potential.shape}.")
         return self.lagrange_dirac().sizes(data, params)
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         return self.lagrange_dirac().complete(data, params, project)
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " m"]:
         return self.lagrange_dirac().initial_defect(data, params)
 
-    def hamiltonian(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, ""]:
+    def hamiltonian(
+        self, q: Float[Numbers, " n"], p: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, ""]:
         """½ pᵀ g(q)⁻¹ p + V(q)."""
         return p @ self.velocity(q, p, params, t) / 2 + self.potential.at(t, q, params)
 
-    def velocity(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " n"]:
+    def velocity(
+        self, q: Float[Numbers, " n"], p: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, " n"]:
         """g(q)⁻¹ p."""
         return solve(self.metric.at(t, q, params), p)
 
@@ -138,7 +145,9 @@ class NonholonomicMechanics(AbstractSystem):
         rows = self.constraints.matrix(t, q, params)
         return rows, solve(self.metric.at(t, q, params), rows.T)
 
-    def projector(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " n"]:
+    def projector(
+        self, q: Float[Numbers, " n"], p: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, " n"]:
         """P_q(p) = p − C_ab (g^{ij} p_j μ^a_i) μ^b: onto the momenta with μ g⁻¹ p = 0 ([BLM] §8), for independent constraints.
 
         The rows μ are those of W and of ∂g/∂q; with affine or moving constraints the momenta are those with W q̇ + b = 0 and
@@ -148,7 +157,9 @@ class NonholonomicMechanics(AbstractSystem):
         defect = self.constraints.velocity_defect(t, q, self.velocity(q, p, params, t), params)
         return p - rows.T @ solve(rows @ lifted, defect)
 
-    def multipliers(self, q: Float[Array, " n"], p: Float[Array, " n"], params: Any = None, t: Any = 0.0) -> Float[Array, " k"]:
+    def multipliers(
+        self, q: Float[Numbers, " n"], p: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
+    ) -> Float[Numbers, " k"]:
         """λ(q, p) (m + c,) that keeps μ g⁻¹ p = 0 along the flow ([BLM] (39)): derivatives of the constraints along (ṫ, q̇, ṗ)."""
         dq, v = jax.grad(self.hamiltonian, argnums=(0, 1))(q, p, params, t)
         rate = -dq if self.forces is None else self.forces(t, q, v, params) - dq
@@ -163,11 +174,11 @@ class NonholonomicMechanics(AbstractSystem):
             _, rate = jax.jvp(lambda q, p: constraint(t, q, p), (q, p), (v, rate))
         return -solve(rows @ lifted, rate)
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(q, p)."""
         return self.hamiltonian(row["q"], row["p"], params, row.get("t", 0.0))
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
         """(μ g⁻¹p + b, g, G g⁻¹p + ∂g/∂t) at the node."""
         q, t = row["q"], row.get("t", 0.0)
         return self.constraints.defect(t, q, self.velocity(q, row["p"], params, t), params)

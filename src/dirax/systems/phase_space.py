@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from typing import Any
 
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from dirax.geometry.structures import DiracStructure
+from dirax.numerics.arrays import Data, Numbers
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import no_constraint
@@ -31,7 +32,7 @@ class PhaseSpaceLagrangian(AbstractSystem):
         self.one_form = UserFunction(one_form, "one_form", ("q",))
         self.hamiltonian = UserFunction(hamiltonian, "hamiltonian", ("q",))
 
-    def lagrangian(self, q: Float[Array, " n"], v: Float[Array, " n"], params: Any = None) -> Float[Array, ""]:
+    def lagrangian(self, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any = None) -> Float[Numbers, ""]:
         """⟨α(q), v⟩ − H(q)."""
         return self.one_form(q, params) @ v - self.hamiltonian(q, params)
 
@@ -51,7 +52,7 @@ class PhaseSpaceLagrangian(AbstractSystem):
     def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
         return implicit_lagrangian(self.lagrange_dirac(), self, near, params)
 
-    def two_form(self, q: Float[Array, " n"], params: Any = None) -> Float[Array, "n n"]:
+    def two_form(self, q: Float[Numbers, " n"], params: Any = None) -> Float[Numbers, "n n"]:
         """The matrix of dα: (dα)_ij = ∂_i α_j − ∂_j α_i."""
         derivative = jacobian(lambda q: self.one_form(q, params))(q)
         return derivative.T - derivative
@@ -63,7 +64,7 @@ class PhaseSpaceLagrangian(AbstractSystem):
             lambda q, params: self.hamiltonian(q, params),
         )
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         refuse_start(self, data, "q", "x", "q, v", "q, p", "q0, q1")
         q = self.point(data)
         form, energy = self.one_form.shape(q, params), self.hamiltonian.shape(q, params)
@@ -73,7 +74,7 @@ class PhaseSpaceLagrangian(AbstractSystem):
             raise ValueError(f"hamiltonian must return a scalar, but it returned shape {energy.shape}.")
         return q.shape[0], 0
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         if "q0" in data:
             return dict(data)
         q = self.point(data)
@@ -81,16 +82,16 @@ class PhaseSpaceLagrangian(AbstractSystem):
         p = p if project or "p" not in data else data["p"]
         return {"q": q, "v": velocity, "p": p, "x": q, "velocity": velocity}
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " n"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " n"]:
         """p − α(q): the primary constraints."""
         if "q0" in data:
             return no_constraint()
         return data["p"] - self.one_form(data["q"], params)
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(q)."""
         return self.hamiltonian(row["q"], params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " n"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " n"]:
         """p − α(q), zero on M_f."""
         return row["p"] - self.one_form(row["q"], params)

@@ -5,8 +5,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import STRUCTURE_DEFECT, TINY
 from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
@@ -61,20 +62,20 @@ class PortHamiltonian(AbstractSystem):
         matrices = (self.J.function, _function(self.B), _function(self.R))
         return PortHamiltonian(self.hamiltonian.function, *matrices, self.closed, inputs)
 
-    def differential(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " N"]:
+    def differential(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
         """dH(x)."""
         return gradient(lambda x: self.hamiltonian(x, params))(x)
 
-    def input_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N m"]:
+    def input_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N m"]:
         """B(x); (N, 0) without ports."""
         return jnp.zeros((x.shape[0], 0)) if self.B is None else self.B(x, params)
 
-    def closed_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N k"]:
+    def closed_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N k"]:
         """The columns of B(x) whose ports are closed."""
         b = self.input_matrix(x, params)
         return b[:, list(self._split(b.shape[1])[0])]
 
-    def open_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N k"]:
+    def open_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N k"]:
         """The columns of B(x) whose ports are open."""
         b = self.input_matrix(x, params)
         return b[:, list(self._split(b.shape[1])[1])]
@@ -83,29 +84,29 @@ class PortHamiltonian(AbstractSystem):
         closed = (tuple(range(ports)) if self.closed else ()) if isinstance(self.closed, bool) else self.closed
         return closed, tuple(port for port in range(ports) if port not in closed)
 
-    def flow_matrix(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, "N N"]:
+    def flow_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N N"]:
         """J(x) − R(x)."""
         return self.J(x, params) if self.R is None else self.J(x, params) - self.R(x, params)
 
-    def input(self, t: Any, x: Float[Array, " N"], params: Any = None) -> Float[Array, " m"]:
+    def input(self, t: Any, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " m"]:
         """u(t, x) of the open ports, zero without inputs."""
         if self.inputs is None:
             return jnp.zeros(self.open_matrix(x, params).shape[1])
         return jnp.asarray(self.inputs(t, x, params))
 
-    def output(self, x: Float[Array, " N"], params: Any = None) -> Float[Array, " m"]:
+    def output(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " m"]:
         """y = B(x)ᵀ dH(x)."""
         return self.input_matrix(x, params).T @ self.differential(x, params)
 
     def relation(
         self,
-        x: Float[Array, " N"],
-        velocity: Float[Array, " N"],
-        multipliers: Float[Array, " m"],
+        x: Float[Numbers, " N"],
+        velocity: Float[Numbers, " N"],
+        multipliers: Float[Numbers, " m"],
         t: Any,
         params: Any = None,
-        differential: Float[Array, " N"] | None = None,
-    ) -> Float[Array, " k"]:
+        differential: Float[Numbers, " N"] | None = None,
+    ) -> Float[Numbers, " k"]:
         """ẋ − (J − R) dH − B u, and y of the closed ports, whose u are `multipliers`; `differential` replaces dH(x)."""
         dh = self.differential(x, params) if differential is None else differential
         closed = self.closed_matrix(x, params)
@@ -114,7 +115,7 @@ class PortHamiltonian(AbstractSystem):
             balance = balance - self.open_matrix(x, params) @ self.input(t, x, params)
         return jnp.concatenate([balance, closed.T @ dh]) if self.closed else balance
 
-    def power(self, x: Float[Array, " N"], velocity: Float[Array, " N"], t: Any, params: Any = None) -> Float[Array, " 3"]:
+    def power(self, x: Float[Numbers, " N"], velocity: Float[Numbers, " N"], t: Any, params: Any = None) -> Float[Numbers, " 3"]:
         """(⟨dH, ẋ⟩, ⟨y, u⟩ of the open ports, ⟨dH, R dH⟩); the first is the second less the third ([BLM] §7.1)."""
         dh = self.differential(x, params)
         supplied = self.input(t, x, params) @ (self.open_matrix(x, params).T @ dh)
@@ -129,8 +130,8 @@ class PortHamiltonian(AbstractSystem):
         return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port", observed=observed, dirac=dirac)
 
     def ports(
-        self, t: Any, x: Float[Array, " N"], gradient: Float[Array, " N"], params: Any = None
-    ) -> tuple[Array, Array, Array]:
+        self, t: Any, x: Float[Numbers, " N"], gradient: Float[Numbers, " N"], params: Any = None
+    ) -> tuple[Numbers, Numbers, Numbers]:
         """(u, y, ⟨α, Rα⟩) with the inputs of the open ports, their outputs y = Bᵀα and the power dissipated, for a covector α
         in place of dH."""
         driven = self.input(t, x, params)
@@ -157,7 +158,7 @@ class PortHamiltonian(AbstractSystem):
         timed = uses_time(self.inputs, x, params)
         return in_time(timed, t, equations, x, names("x", n), names("u", m), energy, about)
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         if "x" not in data:
             raise ValueError(f"a PortHamiltonian starts from x=, but {', '.join(data)} were given.")
         x = data["x"]
@@ -207,31 +208,31 @@ class PortHamiltonian(AbstractSystem):
                 "must not create energy."
             )
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         x = data["x"]
         velocity = self.flow_matrix(x, params) @ self.differential(x, params)
         if self.inputs is not None:
             velocity = velocity + self.open_matrix(x, params) @ self.input(data.get("t", 0.0), x, params)
         return {"x": x, "velocity": velocity}
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " m"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " m"]:
         """y = Bᵀ dH of the closed ports: zero on M_0."""
         if not self.closed:
             return no_constraint()
         return self.closed_matrix(data["x"], params).T @ self.differential(data["x"], params)
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(x)."""
         return self.hamiltonian(row["x"], params)
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " m"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " m"]:
         return self.initial_defect({"x": row["x"]}, params)
 
     @property
     def energy_changes(self) -> str:
         return "does not conserve it" if self.R is not None or self.inputs is not None else ""
 
-    def flow_size(self, x: Float[Array, " N"], params: Any) -> Float[Array, ""]:
+    def flow_size(self, x: Float[Numbers, " N"], params: Any) -> Float[Numbers, ""]:
         """|dH|ᵀ (|J − R| |dH| + 1), where 1 is the unit in which ẋ is solved."""
         dh = jnp.abs(self.differential(x, params))
         return dh @ (jnp.abs(self.flow_matrix(x, params)) @ dh + 1.0)

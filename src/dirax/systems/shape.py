@@ -2,7 +2,9 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from dirax.numerics.arrays import Numbers
 
 
 class Shape(eqx.Module):
@@ -22,12 +24,12 @@ class Shape(eqx.Module):
         """The numbers of the constraints that enter the equations."""
         return tuple(i for i in range(self.m + self.c) if i not in self.redundant)
 
-    def pick(self, values: Array, first: int = 0) -> Array:
+    def pick(self, values: Numbers, first: int = 0) -> Numbers:
         """The kept ones of values that belong to the constraints from number `first` on."""
         kept = [i - first for i in self.kept if i >= first]
         return values if len(kept) == values.shape[0] else jnp.stack([values[i] for i in kept])
 
-    def spread(self, multipliers: Float[Array, " k"]) -> Float[Array, " m_and_c"]:
+    def spread(self, multipliers: Float[Numbers, " k"]) -> Float[Numbers, " m_and_c"]:
         """The multipliers of all constraints: zero for the redundant ones."""
         if len(self.kept) == self.m + self.c:
             return multipliers

@@ -6,9 +6,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from dirax.geometry.semidirect import SemidirectProduct
+from dirax.numerics.arrays import Data, Numbers
 from dirax.program.tracing import gradient, jacobian
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
@@ -41,7 +42,7 @@ class AbstractSystem(eqx.Module):
     # ------------------------------------------------------------------ what every system says
 
     @abstractmethod
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, ...]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
         """(n, m) or (n, m, c): the number of coordinates, of constraints and of holonomic constraints.
 
         `data` are the initial data as they were given: x · q, v · q, p · q0, q1 · q. Raises `ValueError` where they are not
@@ -49,7 +50,7 @@ class AbstractSystem(eqx.Module):
         """
 
     @abstractmethod
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         """The initial data, which hold the time `t` too, with everything a scheme may start from.
 
         - From x: x and `velocity`, the ẋ there (a first guess of it, where the equations do not determine it).
@@ -61,15 +62,15 @@ class AbstractSystem(eqx.Module):
         """
 
     @abstractmethod
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " k"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " k"]:
         """By how much completed initial data violate the constraints, one number a constraint."""
 
     @abstractmethod
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy at one saved row (its node fields, and the time `t`)."""
 
     @abstractmethod
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " k"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
         """The constraints at one saved row (its node fields, and the time `t`), zero where they hold."""
 
     # ------------------------------------------------------------------ the forms in which it can be discretized
@@ -126,28 +127,28 @@ class AbstractSystem(eqx.Module):
         """The constraints that are stated as functions of (t, q), or of (t, x); none by default."""
         return Constraints(None, None, None)
 
-    def point(self, data: dict[str, Array]) -> Array:
+    def point(self, data: Data) -> Numbers:
         """The point in initial data at which the constraints hold: x, q or q0."""
         return next(data[name] for name in ("x", "q", "q0") if name in data)
 
-    def project_position(self, q: Array, v: Array, params: Any = None, t: Any = 0.0) -> Array:
+    def project_position(self, q: Numbers, v: Numbers, params: Any = None, t: Any = 0.0) -> Numbers:
         """A point with g = 0 near q, moved along Gᵀ, G = ∂g/∂q."""
         if self.constraints.holonomic is None:
             return q
         return self.constraints.nearest_position(t, q, self.constraints.holonomic_matrix(t, q, params).T, params)
 
-    def project_velocity(self, q: Array, v: Array, params: Any = None, t: Any = 0.0) -> Array:
+    def project_velocity(self, q: Numbers, v: Numbers, params: Any = None, t: Any = 0.0) -> Numbers:
         """The velocity nearest to v with W v + b = 0 and G v + ∂g/∂t = 0."""
         return self.constraints.nearest_velocity(t, q, v, self.constraints.matrix(t, q, params).T, params)
 
     # ------------------------------------------------------------------ the rest
 
-    def lagrangian_value(self, t: Any, q: Array, v: Array, params: Any) -> Float[Array, ""] | None:
+    def lagrangian_value(self, t: Any, q: Numbers, v: Numbers, params: Any) -> Float[Numbers, ""] | None:
         """L(t, q, v), by which data outside its domain are found; None for a system without a Lagrangian."""
         form = self.lagrangian_form()
         return None if form is None else form.lagrangian.at(t, q, v, params)
 
-    def velocity_hessian(self, t: Any, q: Array, v: Array, params: Any) -> Float[Array, "n n"] | None:
+    def velocity_hessian(self, t: Any, q: Numbers, v: Numbers, params: Any) -> Float[Numbers, "n n"] | None:
         """∂²L/∂v², by which a singular Lagrangian is told; None for a system without a Lagrangian on TQ."""
         form = self.lagrangian_form()
         return None if form is None else jacobian(gradient(lambda v: form.lagrangian.at(t, q, v, params)))(v)
@@ -158,7 +159,7 @@ class AbstractSystem(eqx.Module):
             f"inputs= drives an open dx.PortHamiltonian system, but the system is a {type(self).__name__}: leave it out."
         )
 
-    def explain(self, x: Array) -> str:
+    def explain(self, x: Numbers) -> str:
         """Which constraint the point x is off, and the way back, in words for a message; "" where there is no more to say."""
         return ""
 
@@ -174,7 +175,7 @@ class AbstractSystem(eqx.Module):
         """Whether the constraint is that dE lie in a subspace, so that it has the size of dE."""
         return False
 
-    def flow_size(self, x: Float[Array, " N"], params: Any) -> Float[Array, ""]:
+    def flow_size(self, x: Float[Numbers, " N"], params: Any) -> Float[Numbers, ""]:
         """The sum of the sizes of the terms of ⟨dH, ẋ⟩, which may cancel; 0 where it is not balanced against ports."""
         return jnp.zeros(())
 
@@ -184,7 +185,7 @@ class AbstractSystem(eqx.Module):
         return None
 
 
-def refuse_start(system: AbstractSystem, data: dict[str, Array], *kinds: str) -> None:
+def refuse_start(system: AbstractSystem, data: Data, *kinds: str) -> None:
     """Raise `ValueError` for initial data that are none of `kinds`, such as "q, v"."""
     given = set(data) - {"t"}
     if given in [set(kind.split(", ")) for kind in kinds]:
