@@ -12,9 +12,9 @@ from hypothesis import given, settings
 
 import dirax as dx
 from dirax.diagnostics.drift import SMALLEST_SERIES, judge, oscillations
-from dirax.diagnostics.judging import EPSILON, ROUNDINGS
 from dirax.diagnostics.one_step import differentiated_step
 from dirax.diagnostics.report import Line, Report
+from dirax.diagnostics.verdicts import EPSILON, ROUNDINGS
 from dirax.diagnostics.verify import verify
 from dirax.schemes.step import explicit_step
 

@@ -6,9 +6,9 @@ import pytest
 
 from dirax.engines.native.functions import MACHINE_CODE
 from dirax.engines.native.ir.compiled_function import compiled
-from dirax.program.derivatives import partials
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.graph import Graph
+from dirax.program.graph_derivatives import partials
 from dirax.program.operations import NUMPY, OPERATIONS
 
 COUNT = 250

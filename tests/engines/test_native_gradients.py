@@ -10,7 +10,7 @@ import pytest
 import dirax as dx
 from dirax.engines.contract import Problem
 from dirax.engines.native import Native
-from dirax.engines.native.gradients import host
+from dirax.engines.native.gradients import tangents_on_host
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.schemes.step import Field, StepEquation
 
@@ -148,7 +148,7 @@ def test_jit_and_vmap():
 
 def test_derivatives_of_a_long_run_against_the_closed_form(monkeypatch):
     """Oscillator, 3000 steps in many segments: q_k = q cos kθ + v/ω sin kθ with θ = 2 arctan(hω/2)."""
-    monkeypatch.setattr(host, "SEGMENT_BYTES", 5000)
+    monkeypatch.setattr(tangents_on_host, "SEGMENT_BYTES", 5000)
     system = dx.LagrangeDirac(lambda q, v, omega: (v @ v - omega**2 * q @ q) / 2)
     end = lambda q, v, omega: dx.simulate(
         system, MIDPOINT, q=jnp.stack([q]), v=jnp.stack([v]), params=omega, step=0.1, steps=3000, save_every=500, engine="native"

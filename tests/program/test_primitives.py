@@ -10,8 +10,8 @@ from jax.extend.core import ClosedJaxpr
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines.native.ir.compiled_function import compiled
-from dirax.program.derivatives import jacobian
 from dirax.program.graph import Graph
+from dirax.program.graph_derivatives import jacobian
 from dirax.program.interpreter import Interpreter, Unavailable
 from dirax.program.operations import NUMPY
 

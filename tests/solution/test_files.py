@@ -18,9 +18,9 @@ import xarray as xr
 from numcodecs import zstd
 
 import dirax as dx
-from dirax.solution import placing, saving, zarr_store
+from dirax.solution import atomic_files, saving, zarr_store
 from dirax.solution.description import Description, Variable, describe
-from dirax.solution.records import decode_scheme, encode_scheme
+from dirax.solution.plain_forms import decode_scheme, encode_scheme
 
 ENDINGS = (".zarr", ".nc")
 FILES = Path(__file__).parent / "files"
@@ -286,14 +286,14 @@ def test_an_interrupted_save_leaves_the_old_file(moment, ending, tmp_path, batch
 
         monkeypatch.setitem(saving.FORMATS, ending, (interrupted, is_one))
     else:
-        replace = placing.os.rename if ending == ".zarr" else placing.os.replace
+        replace = atomic_files.os.rename if ending == ".zarr" else atomic_files.os.replace
 
         def stopped(source, target):
             if str(target) == str(path) and "old" not in str(source):
                 raise KeyboardInterrupt
             replace(source, target)
 
-        monkeypatch.setattr(placing.os, "rename" if ending == ".zarr" else "replace", stopped)
+        monkeypatch.setattr(atomic_files.os, "rename" if ending == ".zarr" else "replace", stopped)
     with pytest.raises(KeyboardInterrupt):
         batch.save(path, overwrite=True)
     monkeypatch.undo()
@@ -322,7 +322,7 @@ def test_long_names(ending, tmp_path, two_points):
 
 KILLED = """
 import os, signal, sys
-from dirax.solution.placing import placed
+from dirax.solution.atomic_files import placed
 with placed(sys.argv[1], False) as beside:
     beside.write_text("half a file")
     os.kill(os.getpid(), signal.SIGKILL)
@@ -336,7 +336,7 @@ def test_what_a_killed_save_left_is_swept_by_the_next(ending, tmp_path, two_poin
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     (left,) = tmp_path.iterdir()
     assert left.name.startswith(".run-")
-    with placing.placed(path, False) as beside:  # one that is still at work is left alone
+    with atomic_files.placed(path, False) as beside:  # one that is still at work is left alone
         assert not left.exists() and beside.parent.exists()
         two_points.save(path)
         assert beside.parent.exists()

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.judging import judged, of_lane, relative_changes, roundoff_limit, steps_of
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import over_rows
+from dirax.diagnostics.verdicts import judged, of_lane, relative_changes, roundoff_limit, steps_of
 from dirax.geometry.group_retractions import coadjoint
 from dirax.geometry.semidirect import SemidirectProduct
 from dirax.numerics.ranks import numerical_rank

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.energy_lines import energy_terms
-from dirax.diagnostics.judging import SAMPLED_ROWS, judged, of_lane, roundoff_limit, sampled_terms, spread, worst_place
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import constraint_of, over_rows, times_at
+from dirax.diagnostics.verdicts import SAMPLED_ROWS, judged, of_lane, roundoff_limit, sampled_terms, spread, worst_place
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.solution.solution import Solution
 from dirax.systems.lagrange_dirac import LagrangeDirac

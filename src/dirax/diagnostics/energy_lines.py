@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.books import balances, has_power, keeps_books
 from dirax.diagnostics.drift import judge
-from dirax.diagnostics.judging import ROUNDINGS, of_lane, sampled_terms, steps_of
+from dirax.diagnostics.power_balance import balances, has_power, keeps_books
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Line
 from dirax.diagnostics.rows import energy_of
+from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled_terms, steps_of
 from dirax.numerics.tolerances import EPSILON
 from dirax.solution.solution import Solution
 

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.judging import judged, of_lane, roundoff_limit, worst_place
 from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
 from dirax.diagnostics.rows import initial_of_one, over_rows, shape_of, times_at
+from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, worst_place
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.final_manifold import KEPT, chain_at

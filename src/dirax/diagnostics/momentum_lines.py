@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.judging import judged, of_lane, relative_changes, roundoff_limit, steps_of
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import initial_of_one, over_rows
+from dirax.diagnostics.verdicts import judged, of_lane, relative_changes, roundoff_limit, steps_of
 from dirax.solution.solution import Solution
 
 Symmetries = Mapping[str, Callable] | Sequence[int] | None

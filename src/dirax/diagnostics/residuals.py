@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.judging import spread
 from dirax.diagnostics.rows import over_rows
+from dirax.diagnostics.verdicts import spread
 from dirax.engines.step_program import linearized
 from dirax.schemes.step_forms import started
 from dirax.solution.solution import Solution

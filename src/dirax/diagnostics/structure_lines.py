@@ -3,11 +3,11 @@
 import equinox as eqx
 import numpy as np
 
-from dirax.diagnostics.books import keeps_books
-from dirax.diagnostics.judging import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
 from dirax.diagnostics.one_step import differentiated_step
+from dirax.diagnostics.power_balance import keeps_books
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import consecutive, over_rows, shape_of
+from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
 from dirax.program.memo import Same
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
 from dirax.solution.solution import Solution

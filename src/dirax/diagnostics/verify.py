@@ -6,11 +6,11 @@ from dirax.diagnostics.casimir_lines import casimir_lines
 from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
 from dirax.diagnostics.final_manifold_lines import final_manifold
-from dirax.diagnostics.judging import steps_of
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.report import OK, VIOLATED, Line, Report
 from dirax.diagnostics.residuals import residual_size
 from dirax.diagnostics.structure_lines import membership, structure_of, symplecticity
+from dirax.diagnostics.verdicts import steps_of
 from dirax.engines.stopping import STALLED
 from dirax.solution.reconstruction import reconstruct
 from dirax.solution.solution import Solution

@@ -1,4 +1,4 @@
-"""The engine "auto": native for small systems on a CPU, xla for everything else."""
+"""The engine "auto": native for small systems on a CPU, xla for everything else; `policy.py` says how large is small."""
 
 from dirax.engines import policy
 from dirax.engines.contract import Outcome, Problem, Progress

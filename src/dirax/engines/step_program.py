@@ -13,10 +13,10 @@ from jax.extend.core import jaxprs_in_params
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines import policy
 from dirax.engines.parameters import Parameters, parameters
-from dirax.program.derivatives import jacobian
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_numpy import Values, in_parts
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.graph_derivatives import jacobian
 from dirax.program.interpreter import Nodes, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
 from dirax.program.scalar_program import ScalarProgram

@@ -6,7 +6,8 @@ first two updates: what an update leaves is at most 2·ratio·update. The iterat
 
     update ≤ FLOOR   or   2·ratio·update ≤ NEGLIGIBLE   or   ratio ≥ ½ and update < STALLED.
 
-It is written out in array operations in `xla/newton.py` and in machine code in `native/loops/newton_loop.py`.
+Roots around a run, of initial data say, stop as `dirax/numerics/newton.py` says. The test is
+written out in array operations in `xla/newton.py` and in machine code in `native/loops/newton_loop.py`.
 """
 
 from dirax.numerics.tolerances import EPSILON

@@ -1,0 +1,6 @@
+"""Reduction by symmetry: from a system to the one on the quotient.
+
+reduce.py             dx.reduce; reduced.py the systems it gives, euler_poincare.py and lie_poisson.py those on a Lie algebra
+actions.py            group actions and momentum maps; symmetry.py the search for them; coordinates.py where they are translations
+connection.py         discrete connections; dirac.py the reduced structures of [RL]
+"""

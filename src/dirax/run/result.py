@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Outcome, Problem, cut, saved_steps
-from dirax.run.failures import explain
+from dirax.run.failure_messages import explain
 from dirax.run.validate import Case
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution

@@ -14,9 +14,9 @@ from dirax.run.final_manifold import (
     refuse_leaving_final_manifold,
     refuse_off_final_manifold,
 )
-from dirax.run.premises import refuse_bad_start
 from dirax.run.progress import reporting
 from dirax.run.redundancy import redundant_constraints
+from dirax.run.refused_start import refuse_bad_start
 from dirax.run.result import solution_of
 from dirax.run.start import begun, completed
 from dirax.run.validate import check_kinds, count, engine_from, refuse_more_than_memory, validated_case

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 
 from dirax.schemes.abstract_step import AbstractStep
+from dirax.schemes.growth_premise import NothingGrows
 from dirax.schemes.layout import Layout
-from dirax.schemes.nothing_grows import NothingGrows
 from dirax.schemes.step import Field, StepEquation
 
 

@@ -5,14 +5,14 @@ from typing import Any
 from dirax.geometry.cotangent_lift import CotangentLift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
 from dirax.geometry.spaces import Euclidean
+from dirax.schemes.blm_method_1_step import MethodOneStep
+from dirax.schemes.blm_method_2_step import NonholonomicStep, ProjectedThetaStep
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.schemes.discrete_structure_maps import PROJECTED, RelationPairs, structure_on_cotangent_bundle
 from dirax.schemes.discretized_relation import discretized_relation
+from dirax.schemes.growth_premise import nothing_grows
+from dirax.schemes.hidden_constraint_premise import nothing_hidden_in_lagrangian, nothing_hidden_in_relation
 from dirax.schemes.map_lift import ThetaLift, lift_of
-from dirax.schemes.method_one_step import MethodOneStep
-from dirax.schemes.method_two_step import NonholonomicStep, ProjectedThetaStep
-from dirax.schemes.nothing_grows import nothing_grows
-from dirax.schemes.nothing_hidden import nothing_hidden_in_lagrangian, nothing_hidden_in_relation
 from dirax.schemes.projected_field import projected_field
 from dirax.schemes.projected_lift_step import ProjectedLiftStep
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation

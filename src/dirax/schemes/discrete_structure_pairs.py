@@ -13,7 +13,7 @@ from dirax.numerics.arrays import Data
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Claim, nonzero
-from dirax.schemes.form_on_pairs import FormOnPairs
+from dirax.schemes.two_form_on_pairs import FormOnPairs
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.shape import Shape
 

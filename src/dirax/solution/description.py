@@ -14,7 +14,7 @@ import numpy as np
 
 from dirax.program.user_functions import is_traced
 from dirax.schemes.step import Field
-from dirax.solution.records import NotPlain, encode_params, encode_scheme
+from dirax.solution.plain_forms import NotPlain, encode_params, encode_scheme
 from dirax.solution.trajectory import Trajectory
 from dirax.text.tables import plain
 

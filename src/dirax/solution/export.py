@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dirax.solution.atomic_files import placed
 from dirax.solution.description import describe
-from dirax.solution.placing import placed
 from dirax.solution.trajectory import Trajectory
 
 if TYPE_CHECKING:

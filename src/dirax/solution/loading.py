@@ -12,7 +12,7 @@ import numpy as np
 from dirax.schemes.step import Field, Shape, make_step_equation
 from dirax.solution.file_record import FileRecord, file_record
 from dirax.solution.netcdf import open_netcdf
-from dirax.solution.records import decode_params, decode_scheme
+from dirax.solution.plain_forms import decode_params, decode_scheme
 from dirax.solution.saving import MOVED, SEAL, checked_ending, checksum, seal
 from dirax.solution.solution import Solution
 from dirax.solution.stored import Stored, Unreadable, reading

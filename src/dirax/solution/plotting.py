@@ -1,7 +1,8 @@
 """Pictures of a Solution as matplotlib Axes and Figures, without pyplot and without global state.
 
 Names and units of axes come from `solution.metadata` ("coordinates" and "units"), which gallery systems fill in; a
-solution without them shows q0, q1, … Colours are those of Okabe and Ito, which the colour-blind can tell apart.
+solution without them shows q0, q1, … Colours are those of Okabe and Ito, which the colour-blind can tell apart;
+reports on screen have them a shade darker or lighter (show/assets/report.css).
 """
 
 from collections.abc import Iterator

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from dirax.solution.atomic_files import checked_place, placed
 from dirax.solution.description import Description, Variable, describe
 from dirax.solution.netcdf import write_netcdf
-from dirax.solution.placing import checked_place, placed
 from dirax.solution.trajectory import Trajectory
 from dirax.solution.zarr_store import is_store, write_store
 

@@ -1,0 +1,1 @@
+"""Objects and tables as text."""

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dirax.program.derivatives import partials
 from dirax.program.graph import Graph
+from dirax.program.graph_derivatives import partials
 from dirax.program.interpreter import Nodes
 
 LANES = 1024

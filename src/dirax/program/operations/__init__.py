@@ -11,7 +11,7 @@ from dirax.program.operations import (
     exponential,
     hyperbolic,
     inverse_trigonometric,
-    logarithmic,
+    logarithms_and_powers,
     logic,
     trigonometric,
 )
@@ -19,7 +19,7 @@ from dirax.program.operations.operation import Operation
 
 FAMILIES = (
     *(arithmetic, logic, trigonometric, inverse_trigonometric),
-    *(exponential, logarithmic, hyperbolic, error_function),
+    *(exponential, logarithms_and_powers, hyperbolic, error_function),
 )
 OPERATIONS: dict[str, Operation] = {operation.name: operation for family in FAMILIES for operation in family.OPERATIONS}
 

@@ -13,13 +13,13 @@ from dirax.engines.native.functions import (
     exponential,
     hyperbolic,
     inverse_trigonometric,
-    logarithmic,
+    logarithms_and_powers,
     logic,
     trigonometric,
 )
 
 FAMILIES = (
     *(arithmetic, logic, trigonometric, inverse_trigonometric),
-    *(exponential, logarithmic, hyperbolic, error_function),
+    *(exponential, logarithms_and_powers, hyperbolic, error_function),
 )
 MACHINE_CODE: dict[str, Callable[..., str]] = {name: code for family in FAMILIES for name, code in family.MACHINE_CODE.items()}

@@ -1,8 +1,8 @@
 """Runs of the native engine under JAX transformations: three primitives whose derivatives are each other.
 
 A run's states and unknowns at the saved rows are functions of the first state, the parameters, t0 and h. `run` computes
-them, `jvp` their tangents, `vjp` the cotangents of what they depend on, each on the host (host.py). Derivatives of the
-second order and higher are those of the xla engine's run.
+them, `jvp` their tangents, `vjp` the cotangents of what they depend on, each on the host
+(tangents_on_host.py). Derivatives of the second order and higher are those of the xla engine's run.
 """
 
 import functools
@@ -17,8 +17,8 @@ from jax.interpreters import ad, batching, mlir
 
 from dirax.engines.contract import Outcome, Problem, finished, saved_steps
 from dirax.engines.native.engine import run
-from dirax.engines.native.gradients.host import jvp, vjp
 from dirax.engines.native.gradients.recording import INPUTS, Recorded
+from dirax.engines.native.gradients.tangents_on_host import jvp, vjp
 from dirax.engines.native.kernels import kernels
 from dirax.engines.parameters import parameters
 from dirax.engines.xla import Xla

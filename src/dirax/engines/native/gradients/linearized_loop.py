@@ -18,8 +18,8 @@ from dirax.engines.native.loops.dense import add_dense_solve
 from dirax.engines.native.loops.newton_loop import by_partial_pivoting
 from dirax.engines.native.loops.newton_step import Factors, pivot_order
 from dirax.engines.step_program import Inputs, TracedEquation
-from dirax.program.derivatives import directional, gradient
 from dirax.program.graph import Graph
+from dirax.program.graph_derivatives import directional, gradient
 
 NUMBERS = "double %t0, double %h, i64 %offset, i64 %first, i64 %count"
 """`count` steps from number `first` on of a run, whose own first state is step number `offset`."""

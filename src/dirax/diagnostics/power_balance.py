@@ -5,9 +5,9 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from dirax.diagnostics.judging import roundoff_limit
 from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line
 from dirax.diagnostics.rows import energy_of, over_rows
+from dirax.diagnostics.verdicts import roundoff_limit
 from dirax.solution.solution import Solution
 
 PORTS = 2

@@ -1,4 +1,4 @@
-"""Derivatives of nodes of the scalar graph, as nodes of it."""
+"""Derivatives of nodes of the scalar graph, as nodes of it; those of one operation are in `operations/`."""
 
 from dirax.program.graph import Graph
 from dirax.program.operations import OPERATIONS

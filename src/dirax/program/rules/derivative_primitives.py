@@ -8,8 +8,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from dirax.program.derivatives import gradient, jacobian
 from dirax.program.graph import Graph
+from dirax.program.graph_derivatives import gradient, jacobian
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, Unsupported, elementwise, rule
 from dirax.program.memo import Memo, Same
 from dirax.program.rules import formulas
