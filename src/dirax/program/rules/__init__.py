@@ -3,11 +3,11 @@
 from dirax.program.rules import (
     by_numpy,
     control,
-    derivatives,
+    derivative_primitives,
     elementwise,
     linear_algebra,
     movement,
     reductions,
 )
 
-__all__ = ["by_numpy", "control", "derivatives", "elementwise", "linear_algebra", "movement", "reductions"]
+__all__ = ["by_numpy", "control", "derivative_primitives", "elementwise", "linear_algebra", "movement", "reductions"]
