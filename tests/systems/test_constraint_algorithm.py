@@ -262,3 +262,29 @@ def test_functions_of_the_chain_are_traceable_and_differentiable(pendulum):
     projector = np.eye(4) - np.linalg.pinv(normal) @ normal
     assert np.abs(derivative - projector).max() < 1e-10
     assert np.abs(normal @ np.asarray(pendulum.field(x))).max() < 1e-12
+
+
+ROLLING = dx.DiracStructure.from_annihilator(lambda x: jnp.stack([-x[1], 0.0, 1.0])[None])
+
+
+@pytest.mark.parametrize("near", [(0.001, 0.001, 0.001), (0.0, 0.0, 0.1), (0.3, 0.1, 0.2)])
+def test_a_pivot_that_vanishes_on_the_manifold_is_chosen_again(near):
+    """dH ∥ (−y, 0, 1) and dH = x: M_0 is x = y = 0, where the entry −y of the one-form is zero."""
+    chain = constraint_algorithm(dx.DiracSystem(ROLLING, lambda x: x @ x / 2), near=np.array(near))
+    assert (chain.verdict, chain.dimension, chain.index) == ("determined", 1, 1)
+    np.testing.assert_allclose(chain.point[:2], 0.0, atol=1e-12)
+
+
+def test_the_point_of_a_chain_is_the_nearest_one():
+    """dH = (y, x, z) ∥ (−y, 0, 1): x = 0 with y = 0, .22 away, or with z = −1, .8 away."""
+    near = np.array([0.1, 0.2, -0.2])
+    chain = constraint_algorithm(dx.DiracSystem(ROLLING, lambda x: x[2] ** 2 / 2 + x[0] * x[1]), near=near)
+    np.testing.assert_allclose(chain.point, [0.0, 0.0, -0.2], atol=1e-12)
+    sphere = dx.ImplicitSystem(lambda x: jnp.zeros((1, 3)), lambda x: jnp.stack([x @ x - 1.0]), lambda x: jnp.zeros((1, 0)))
+    point = constraint_algorithm(sphere, near=near).point
+    np.testing.assert_allclose(point, near / np.linalg.norm(near), atol=1e-10)
+
+
+def test_a_search_that_ends_at_the_first_level_has_the_dimension_of_the_whole_space():
+    chain = constraint_algorithm(dx.ImplicitSystem(lambda x: jnp.diag(x), lambda x: jnp.ones(2)), near=np.array([0.0, 1.0]))
+    assert chain.verdict == "irregular" and not chain.levels and chain.dimension == 2

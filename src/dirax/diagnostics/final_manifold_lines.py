@@ -13,8 +13,8 @@ from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.final_manifold import KEPT, chain_at
 from dirax.solution.solution import Solution
-from dirax.systems.constraint_algorithm import rank_of
 from dirax.systems.constraint_chain import ConstraintChain
+from dirax.systems.constraint_search import rank_of
 
 NOTICED = 1e-6
 """Jumps below this, relative to the positions, are not called so."""

@@ -14,8 +14,9 @@ from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.start import Initial, Start, completed
 from dirax.run.validate import Case
-from dirax.systems.constraint_algorithm import constraint_algorithm, rank_of
+from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import EMPTY, IRREGULAR, ConstraintChain
+from dirax.systems.constraint_search import rank_of
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 

@@ -9,7 +9,7 @@ import numpy as np
 from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import evaluated
 from dirax.schemes.step import StepEquation
-from dirax.systems.constraint_algorithm import rank_of
+from dirax.systems.constraint_search import rank_of
 from dirax.systems.forms import RelationForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian

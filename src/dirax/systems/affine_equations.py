@@ -15,13 +15,15 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.numerics.equilibration import equilibrated
 from dirax.numerics.tolerances import PIVOT
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import once
 
 THRESHOLD = 0.1
 """A pivot is at least this fraction of the largest entry left, in units of the rows and columns; among these, a sparse one."""
+
+VANISHING = 1e-3
+"""A square part whose smallest singular value is less, in units of its usual rows and columns, is no good choice there."""
 
 
 class Explicit(NamedTuple):
@@ -59,9 +61,12 @@ def explicit(equations: Callable, entries: np.ndarray, size: int) -> Explicit:
     return Explicit(family, rest, len(rows))
 
 
-def pivots(matrix: np.ndarray, rank: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns, as many as the rank of the matrix, whose square part is regular; sparse ones first (Markowitz)."""
-    left, rows, columns = equilibrated(matrix, rounds=1)[0], [], []
+def pivots(matrix: np.ndarray, rank: int | None = None, usual: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns, as many as the rank of the matrix, whose square part is regular; sparse ones first (Markowitz).
+
+    Entries are measured by the rows and columns of `usual`, of the sizes that they have elsewhere, or of the matrix."""
+    by_row, by_column = _sizes(np.abs(matrix) if usual is None else usual)
+    left, rows, columns = matrix / by_row / by_column, [], []
     while left.size and (rank is None or len(rows) < rank):
         sizes = np.abs(left)
         if sizes.max() <= (PIVOT if rank is None else 0.0):
@@ -76,6 +81,13 @@ def pivots(matrix: np.ndarray, rank: int | None = None) -> tuple[np.ndarray, np.
     return np.array(rows, int), np.array(columns, int)
 
 
+def _sizes(entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The largest entry of each row (r, 1), and then of each column (1, f), 1 where all are zero."""
+    positive = lambda sizes: np.where(sizes > 0.0, sizes, 1.0)
+    by_row = positive(entries.max(axis=1, keepdims=True, initial=0.0))
+    return by_row, positive((entries / by_row).max(axis=0, keepdims=True, initial=0.0))
+
+
 def _whole(top, columns: np.ndarray, free: np.ndarray):
     """Solution and kernel of all unknowns, (n, 1 + f), where those of the solved `columns` are `top` and the others free."""
     return jnp.concatenate([top, np.eye(free.size, free.size + 1, 1)])[np.argsort(np.concatenate([columns, free]))]
@@ -84,18 +96,27 @@ def _whole(top, columns: np.ndarray, free: np.ndarray):
 @dataclass(frozen=True)
 class Solved:
     """Equations of c (f,) with constant rank around a point, functions of (x, params): a `solution`, zero where it is free;
-    the `conditions` s for there to be one, `count` of them; `kernel`, a basis (f, f − rank) of what is left free."""
+    the `conditions` s for there to be one, `count` of them; `kernel`, a basis (f, f − rank) of what is left free; `pivots`, the
+    rows and the columns that were chosen."""
 
     solution: Callable
     conditions: Callable
     count: int
     kernel: Callable
+    pivots: tuple[tuple[int, ...], tuple[int, ...]]
+
+    def regular(self, matrix: np.ndarray, usual: np.ndarray) -> bool:
+        """Whether the equations can be solved by these pivots where A is `matrix`, whose entries elsewhere are of the sizes
+        `usual`."""
+        by_row, by_column = _sizes(usual)
+        core = (matrix / by_row / by_column)[np.ix_(*map(list, self.pivots))]
+        return not core.size or bool(np.all(np.isfinite(core)) and np.linalg.svd(core, compute_uv=False)[-1] > VANISHING)
 
 
-def solved(equations: Callable, matrix: np.ndarray, rank: int, entries: np.ndarray) -> Solved:
+def solved(equations: Callable, matrix: np.ndarray, rank: int, entries: np.ndarray, usual: np.ndarray | None = None) -> Solved:
     """The equations (x, params) ↦ (A, b) around a point where A is `matrix` (r, f) and has this rank; `entries` (r, f) are
-    those of A, NaN where they depend on x."""
-    (r, f), (rows, columns) = matrix.shape, pivots(matrix, rank)
+    those of A, NaN where they depend on x; `usual` as in `pivots`."""
+    (r, f), (rows, columns) = matrix.shape, pivots(matrix, rank, usual)
     rank = len(rows)
     others, free = np.setdiff1d(np.arange(r), rows), np.setdiff1d(np.arange(f), columns)
     zero = np.all(entries[others] == 0.0, axis=1)
@@ -115,4 +136,5 @@ def solved(equations: Callable, matrix: np.ndarray, rank: int, entries: np.ndarr
         lambda x, params: whole(x, params)[1],
         r - rank,
         lambda x, params: whole(x, params)[0][:, 1:],
+        (tuple(rows.tolist()), tuple(columns.tolist())),
     )

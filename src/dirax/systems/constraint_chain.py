@@ -70,8 +70,10 @@ class ConstraintChain:
 
     @property
     def dimension(self) -> int:
-        """The dimension of M_f; −1 where it is empty."""
-        return -1 if self.verdict == EMPTY else self.levels[-1].dimension
+        """The dimension of M_f, −1 where it is empty; of the last level reached where the search ended irregular."""
+        if self.verdict == EMPTY:
+            return -1
+        return self.levels[-1].dimension if self.levels else len(self.coordinates)
 
     @property
     def empty(self) -> bool:
