@@ -10,8 +10,9 @@ from typing import Any
 
 from dirax.text.tables import plain, text_table
 
-AGREES, DIFFERS, WRONG, NEW = "agrees", "DIFFERS", "paper is wrong", "not in paper"
-"""Verdicts. DIFFERS is the one that must not occur: dirax does not reproduce what it should."""
+AGREES, DIFFERS, WRONG, NEW, NOT_OURS = "agrees", "DIFFERS", "paper is wrong", "not in paper", "not reproduced"
+"""Verdicts. NOT_OURS is a number of the paper that belongs to its program and not to its mathematics.
+DIFFERS is the one that must not occur: dirax does not reproduce what it should."""
 
 NOTE_WIDTH = 120
 
