@@ -93,3 +93,14 @@ def test_mistakes():
         pendulums.simulate(q=[0, 0, -1, 0, 0, -1], v=[0, 0, 1, 0, 0, 0], steps=2)
     with pytest.raises(TypeError, match=r"dx\.InCharts steps a dx\.ManifoldLagrangian"):
         gallery.get("kepler").simulate(pendulums.scheme, steps=1)
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_a_change_of_chart_leaves_the_guess_behind(engine):
+    """A fast pendulum on the sphere, over forty changes of chart: the steps of the same L_d without charts."""
+    system = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - 3.0 * q[2], dx.Sphere(3))
+    start = {"q": np.array([0.6, 0.0, 0.8]), "v": np.array([0.8, 0.3, -0.6]), "step": 0.1, "steps": 60}
+    charted = dx.simulate(system, dx.InCharts(dx.RiemannianExp(dx.Sphere(3))), **start, engine=engine)
+    plain = dx.simulate(system, dx.DiscreteDirac(dx.RiemannianExp(dx.Sphere(3))), **start)
+    assert charted.ok and len(np.unique(charted.chart, axis=0)) > 5
+    np.testing.assert_allclose(charted.q, plain.q, atol=1e-11)

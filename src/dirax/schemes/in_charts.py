@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from dirax.geometry.charts import Atlas, RetractionChart
 from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
+from dirax.program.linear_solves import solve
+from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.discrete_lagrangian import LD_ARGUMENTS
@@ -18,6 +20,9 @@ from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation
 from dirax.schemes.step_forms import ChartedForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
+
+NEAR = 0.25
+"""Square of the distance, relative to the velocity of the momentum at the node, up to which an extrapolated one is the guess."""
 
 
 class InCharts(AbstractScheme):
@@ -100,6 +105,20 @@ class StepInCharts(AbstractStep):
         here = self.chart(m)
         x, w = self.map.backward(here.to_manifold(r0), here.to_manifold(r1))
         return h * self.system.lagrangian(x, w / h, params)
+
+    def guess(self, state, previous, h, params):
+        """The velocities extrapolated from the steps before, where they are near that of the momentum at the node: components
+        from before a change of chart are those of other vectors, and then it is that velocity."""
+        m, r, p = self.state.split(state)
+        here = self.chart(m)
+
+        def momentum(v):
+            return gradient(lambda v: self.system.lagrangian(*here.velocity_to_manifold(r, v), params))(v)
+
+        at_rest = jnp.zeros_like(r)
+        velocity = solve(jacobian(momentum)(at_rest), p - momentum(at_rest))
+        apart = previous - velocity
+        return jnp.where(apart @ apart <= NEAR * (velocity @ velocity), previous, velocity)
 
     def residual(self, u, state, t, h, params):
         m, r, p = self.state.split(state)
