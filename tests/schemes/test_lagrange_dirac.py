@@ -4,6 +4,8 @@ Nothing here is differentiated by JAX except inside dirax: derivatives are writt
 extended precision, closed forms of the difference equations, or scipy's DOP853 at tight tolerance.
 """
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import dirax as dx
+from dirax import gallery
 from dirax.schemes.step import Shape
 
 EPS = np.finfo(float).eps
@@ -574,3 +577,21 @@ def test_systems_on_a_smaller_manifold_are_refused():
     vortex = dx.PhaseSpaceLagrangian(lambda q: jnp.array([q[1], 0.0]) / 2, lambda q: q @ q / 2)
     with pytest.raises(TypeError, match=r"a PhaseSpaceLagrangian was given: use dx\.DiscreteDirac"):
         dx.simulate(vortex, dx.LagrangeDAlembert(), q=[1.0, 0.0], v=[0.0, 0.0], step=0.1, steps=1)
+
+
+@pytest.mark.parametrize("scheme", [dx.PlusLagrangeDirac, dx.MinusLagrangeDirac])
+def test_the_momentum_that_is_saved_can_be_chosen(scheme):
+    """The outgoing one is −D1 L_d of the two points ([PY] (54)); what is chosen changes nothing in q, and verify knows it."""
+    disk = gallery.get("rolling-disk")
+    saved = {name: disk.simulate(scheme(momentum=name), steps=20) for name in ("incoming", "mean", "outgoing")}
+    q, h = saved["outgoing"].q, disk.step
+    lagrangian = lambda q0, q1: h * disk.system.lagrangian(q0, (q1 - q0) / h, disk.params)
+    outgoing = np.stack([-jax.grad(lagrangian)(a, b) for a, b in itertools.pairwise(q)])
+    np.testing.assert_allclose(saved["outgoing"].p[1:-1], outgoing[1:], atol=1e-12)
+    between = (saved["incoming"].p + saved["outgoing"].p) / 2
+    np.testing.assert_allclose(saved["mean"].p[1:], between[1:], atol=1e-13)  # a run begins with the p that was given
+    for sol in saved.values():
+        np.testing.assert_allclose(sol.q, q, rtol=0, atol=1e-14)
+        assert dx.verify(sol).ok
+    with pytest.raises(ValueError, match="momentum must be one of"):
+        scheme(momentum="left")

@@ -126,7 +126,8 @@ def test_dataset_names_dimensions_units_and_what_was_run(batch):
     assert about["dirax_version"] == dx.__version__
     assert about["system"] == "LagrangeDirac(lagrangian=skate_lagrangian(q, v, params), one_forms=skate_one_forms(q))"
     assert about["scheme"] == "PlusLagrangeDirac(discrete_lagrangian='left')"
-    assert json.loads(about["scheme_settings"])["settings"] == {"discrete_lagrangian": {"plain": "left"}}
+    settings = {"discrete_lagrangian": {"plain": "left"}, "momentum": {"plain": "incoming"}}
+    assert json.loads(about["scheme_settings"])["settings"] == settings
     assert (about["step"], about["save_every"]) == (0.01, 2)
     assert json.loads(about["stats"])["steps"] == 5
     assert json.loads(about["params"])["dict"]["g"]["array"] == 10.0
@@ -188,6 +189,13 @@ def test_schemes_with_code_come_from_the_argument(tmp_path):
     assert dx.load(path).scheme is None
     assert dx.load(path).metadata["scheme"] == "PlusLagrangeDirac(discrete_lagrangian=midpoint(q0, q1, h))"
     assert dx.load(path, system=oscillator, scheme=scheme).equation is not None
+
+
+def test_a_scheme_from_before_a_setting_and_a_module_had_their_names_comes_back():
+    old = {"class": "PlusLagrangeDirac", "module": "dirax.elsewhere", "settings": {"discrete_lagrangian": {"plain": "left"}}}
+    assert decode_scheme(old) == dx.PlusLagrangeDirac()
+    with pytest.raises(ValueError, match="other settings"):
+        decode_scheme(old | {"settings": {}})
 
 
 def test_nested_schemes_and_parameter_trees_come_back(tmp_path):

@@ -51,9 +51,7 @@ class LagrangeDAlembert(AbstractScheme):
         self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
         self.constraint = checked_rule(constraint, CONSTRAINTS, "constraint")
         one_sided = self.constraint in ("left", "right")
-        self.momentum = momentum or ("incoming" if one_sided else "mean")
-        if self.momentum not in MOMENTA:
-            raise ValueError(f"momentum must be one of {', '.join(map(repr, MOMENTA))}, but {momentum!r} was given.")
+        self.momentum = checked_momentum(("incoming" if one_sided else "mean") if momentum is None else momentum)
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         return _equation(self, system, shape)
@@ -81,24 +79,34 @@ class LagrangeDAlembert(AbstractScheme):
         return structure_on_pairs(system, shape, step, self.discrete_lagrangian, self.constraint, share=share)
 
 
+def checked_momentum(momentum: str) -> str:
+    """The name of what is saved as p; raises `ValueError` for another."""
+    if momentum not in MOMENTA:
+        raise ValueError(f"momentum must be one of {', '.join(map(repr, MOMENTA))}, but {momentum!r} was given.")
+    return momentum
+
+
 class PlusLagrangeDirac(AbstractScheme):
     """The (+)-discrete Lagrange–Dirac scheme ([PY] Def 6.7, (53), (58)): the constraint holds at the new point q_{k+1}.
 
         p_{k+1} = D2 L_d(q_k, q_{k+1}),   p_k + D1 L_d(q_k, q_{k+1}) = W(q_k)ᵀ μ_k,   W(q_{k+1}) (q_{k+1} − q_k)/h = 0.
 
     `discrete_lagrangian` as in `LagrangeDAlembert`, of which this is the case `constraint="right"`; the paper uses "left".
-    First order; on long runs its energy can grow: measure with `dx.verify`.
+    `momentum` as there: p_k of (53) is the incoming one, the default. First order; on long runs its energy can grow: measure
+    with `dx.verify`.
     """
 
     discrete_lagrangian: str | UserFunction
+    momentum: str = "incoming"
 
-    def __init__(self, discrete_lagrangian: str | Callable = "left"):
+    def __init__(self, discrete_lagrangian: str | Callable = "left", momentum: str = "incoming"):
         self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
+        self.momentum = checked_momentum(momentum)
 
     @property
     def lagrange_dalembert(self) -> LagrangeDAlembert:
         """The general scheme of which this is a case."""
-        return LagrangeDAlembert(self.discrete_lagrangian, "right", "incoming")
+        return LagrangeDAlembert(self.discrete_lagrangian, "right", self.momentum)
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         return _equation(self.lagrange_dalembert, system, shape)
@@ -111,7 +119,7 @@ class PlusLagrangeDirac(AbstractScheme):
         return _part(self, self.lagrange_dalembert, system, shape)
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
-        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "right", sign="+")
+        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "right", share=MOMENTA[self.momentum], sign="+")
 
 
 class MinusLagrangeDirac(AbstractScheme):
@@ -119,20 +127,23 @@ class MinusLagrangeDirac(AbstractScheme):
 
         p_{k+1} = D2 L_d(q_k, q_{k+1}),   p_k + D1 L_d(q_k, q_{k+1}) = W(q_k)ᵀ μ_k,   W(q_k) (q_{k+1} − q_k)/h = 0.
 
-    `discrete_lagrangian` as in `LagrangeDAlembert`, of which this is the case `constraint="left"`. The p_k of (54),
-    −D1 L_d(q_k, q_{k+1}), is the outgoing momentum p_k − W(q_k)ᵀ μ_k; the multipliers printed in [PY] for (−) have the
-    opposite sign. First order.
+    `discrete_lagrangian` and `momentum` as in `LagrangeDAlembert`, of which this is the case `constraint="left"`. The p_k of
+    (54), −D1 L_d(q_k, q_{k+1}), is the outgoing momentum p_k − W(q_k)ᵀ μ_k, which `momentum="outgoing"` saves; the default is the
+    incoming one, which a run can begin with and which is that of (+). The multipliers printed in [PY] for (−) have the opposite
+    sign. First order.
     """
 
     discrete_lagrangian: str | UserFunction
+    momentum: str = "incoming"
 
-    def __init__(self, discrete_lagrangian: str | Callable = "left"):
+    def __init__(self, discrete_lagrangian: str | Callable = "left", momentum: str = "incoming"):
         self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
+        self.momentum = checked_momentum(momentum)
 
     @property
     def lagrange_dalembert(self) -> LagrangeDAlembert:
         """The general scheme of which this is a case."""
-        return LagrangeDAlembert(self.discrete_lagrangian, "left", "incoming")
+        return LagrangeDAlembert(self.discrete_lagrangian, "left", self.momentum)
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         return _equation(self.lagrange_dalembert, system, shape, -1)
@@ -145,7 +156,7 @@ class MinusLagrangeDirac(AbstractScheme):
         return _part(self, self.lagrange_dalembert, system, shape)
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
-        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "left", sign="-")
+        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "left", share=MOMENTA[self.momentum], sign="-")
 
 
 class _Part(AbstractScheme):

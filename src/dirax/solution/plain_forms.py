@@ -98,8 +98,10 @@ def _decode_setting(record: Any, known: dict[str, type]) -> Any:
 
 
 def _record(cls: type, settings: dict[str, Any]) -> Any:
-    """The frozen record with these fields; no constructor is called."""
-    if settings.keys() != {field.name for field in dataclasses.fields(cls)}:
+    """The frozen record with these fields; one that the file is too old for has its default. No constructor is called."""
+    fields = {field.name: field.default for field in dataclasses.fields(cls)}
+    settings = {name: value for name, value in fields.items() if value is not dataclasses.MISSING} | settings
+    if settings.keys() != fields.keys():
         raise ValueError(f"{cls.__name__} has other settings: the file is of another version of dirax")
     made = object.__new__(cls)
     for name, value in settings.items():

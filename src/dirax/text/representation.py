@@ -12,9 +12,10 @@ LINE = 100
 
 
 def module_fields(module: Any) -> dict[str, Any]:
-    """The fields of a frozen record by name, in the order of its class, without those left out that are None by default."""
+    """The fields of a frozen record by name, in the order of its class, without those left at a plain default."""
     values = {field.name: (getattr(module, field.name), field.default) for field in dataclasses.fields(module)}
-    return {name: value for name, (value, default) in values.items() if not (value is None and default is None)}
+    left_out = lambda value, default: value is None is default or (isinstance(value, str) and value == default)
+    return {name: value for name, (value, default) in values.items() if not left_out(value, default)}
 
 
 def module_text(module: Any) -> str:
