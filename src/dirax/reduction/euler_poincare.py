@@ -62,6 +62,12 @@ class EulerPoincare(AbstractSystem):
 
     # ------------------------------------------------------------------ l and A
 
+    stated_by_momenta = False
+    """Whether the function of the system is h(μ, a), not l(ξ, a)."""
+
+    def lie_algebra_form(self) -> "EulerPoincare":
+        return self
+
     def value(self, xi: Algebra, a: Advected, params: Any = None) -> Float[Array, ""]:
         """l(ξ, a)."""
         return self.lagrangian(*self._given(xi, a), params)

@@ -42,6 +42,12 @@ class LiePoisson(AbstractSystem):
         self.space = SemidirectProduct(group, advected, representation)
         self.hamiltonian = UserFunction(hamiltonian, "hamiltonian", ("mu", *("a",) * (advected > 0)))
 
+    stated_by_momenta = True
+    """Whether the function of the system is h(μ, a), not l(ξ, a)."""
+
+    def lie_algebra_form(self) -> "LiePoisson":
+        return self
+
     def value(self, momentum: Algebra, a: Advected, params: Any = None) -> Float[Array, ""]:
         """h(μ, a)."""
         return self.hamiltonian(*((momentum, a) if self.space.advected else (momentum,)), params)

@@ -5,8 +5,6 @@ from typing import Any
 import equinox as eqx
 
 from dirax.geometry.group_retractions import RETRACTIONS
-from dirax.reduction.euler_poincare import EulerPoincare
-from dirax.reduction.lie_poisson import LiePoisson
 from dirax.schemes.euler_poincare_step import EulerPoincareStep
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 
@@ -51,9 +49,10 @@ class DiscreteEulerPoincare(AbstractScheme):
         return "D is the graph of a Lie–Poisson bivector: whether a step is a Poisson map is measured instead"
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        if not isinstance(system, EulerPoincare | LiePoisson):
+        reduced = system.lie_algebra_form()
+        if reduced is None:
             raise TypeError(
                 "dx.DiscreteEulerPoincare steps dx.EulerPoincare and dx.LiePoisson systems, but a "
                 f"{type(system).__name__} was given."
             )
-        return EulerPoincareStep(system, shape.m, self.map).equation()
+        return EulerPoincareStep(reduced, shape.m, self.map).equation()

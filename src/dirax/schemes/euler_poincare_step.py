@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.group_retractions import coadjoint, pulled_back, retraction
 from dirax.program.tracing import once
-from dirax.reduction.lie_poisson import LiePoisson
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
@@ -52,7 +51,7 @@ class EulerPoincareStep(AbstractStep):
     @property
     def hamiltonian(self) -> bool:
         """Whether the system is stated by h(μ, a), not l(ξ, a)."""
-        return isinstance(self.system, LiePoisson)
+        return self.system.stated_by_momenta
 
     @cached_property
     def tau(self) -> Callable:

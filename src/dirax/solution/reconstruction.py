@@ -11,9 +11,6 @@ from dirax.geometry.group_retractions import coadjoint
 from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.numerics.tolerances import GROUP_DEFECT
 from dirax.program.user_functions import is_traced
-from dirax.reduction.euler_poincare import EulerPoincare
-from dirax.reduction.lie_poisson import LiePoisson
-from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import Field
@@ -33,13 +30,13 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
 
     Raises `TypeError` for a solution of another system, `ValueError` for a g0 that is no element of the group.
     """
-    system = solution.system
-    if isinstance(system, EulerPoincare | LiePoisson):
-        return _on_group(solution, system.space.group, system.space.dimension, g0)
-    if not isinstance(system, ReducedLagrangeDirac):
+    on_algebra, system = (None, None) if solution.system is None else _reduced_forms(solution.system)
+    if on_algebra is not None:
+        return _on_group(solution, on_algebra.space.group, on_algebra.space.dimension, g0)
+    if system is None:
         raise TypeError(
             "dx.reconstruct takes a solution of a dx.EulerPoincare, dx.LiePoisson or dx.reduce system, but this one is of "
-            f"{system!r}."
+            f"{solution.system!r}."
         )
     if g0 is not None:
         raise ValueError("g0 is for systems on a Lie group: here the initial data name the group coordinate already.")
@@ -54,6 +51,10 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     whole = _lifted(solution, system.system, lifted, about)
     whole.scheme = jax.tree.map(_on_q, solution.scheme, is_leaf=lambda part: isinstance(part, DiscreteRouth))
     return whole if is_traced(lifted) or solution.equation is None else with_code(whole, whole.system, whole.scheme)
+
+
+def _reduced_forms(system: Any) -> tuple[Any, Any]:
+    return system.lie_algebra_form(), system.quotient_form()
 
 
 def _on_q(part: Any) -> Any:

@@ -95,6 +95,11 @@ class AbstractSystem(eqx.Module):
         """The same system as one on the quotient by its symmetry, a `dx.ReducedLagrangeDirac`; None where it is none."""
         return None
 
+    def lie_algebra_form(self) -> Any:
+        """The same system as one on a Lie algebra or its dual, reduced by the group, a `dx.EulerPoincare` or `dx.LiePoisson`;
+        None where it is none."""
+        return None
+
     def metric_form(self) -> Any:
         """The same system as a metric, a potential and one-forms alone, a `dx.NonholonomicMechanics`, for which Method 2 has
         closed forms ([BLM] §8); None where there is none."""
