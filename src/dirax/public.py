@@ -60,6 +60,7 @@ from dirax.schemes.discrete_constraints import DiscreteConstraintChain, discrete
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.discrete_gradient import DiscreteGradient
 from dirax.schemes.euler_poincare import DiscreteEulerPoincare
+from dirax.schemes.hamilton_dirac import MinusHamiltonDirac, PlusHamiltonDirac
 from dirax.schemes.in_charts import InCharts
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
 from dirax.schemes.layout import Layout
@@ -74,6 +75,7 @@ from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.forms import FinalManifold, Observed, RelationForm
+from dirax.systems.hamilton_dirac import HamiltonDirac
 from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.interconnection import interconnect
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -174,10 +176,13 @@ __all__ += [
     "DiscreteGradient",
     "DiscreteRouth",
     "Field",
+    "HamiltonDirac",
     "InCharts",
     "LagrangeDAlembert",
     "Layout",
+    "MinusHamiltonDirac",
     "MinusLagrangeDirac",
+    "PlusHamiltonDirac",
     "PlusLagrangeDirac",
     "Shape",
     "StepEquation",

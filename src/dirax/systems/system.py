@@ -91,6 +91,11 @@ class AbstractSystem(eqx.Module):
         """The same system as a Lagrangian on a manifold in R^N, a `dx.ManifoldLagrangian`; None where there is none."""
         return None
 
+    def hamiltonian_form(self) -> Any:
+        """The same system as a Hamiltonian on T*Q with constraints on velocities, a `dx.HamiltonDirac`; None where there is
+        none."""
+        return None
+
     def quotient_form(self) -> Any:
         """The same system as one on the quotient by its symmetry, a `dx.ReducedLagrangeDirac`; None where it is none."""
         return None
