@@ -68,6 +68,7 @@ class Search:
         return np.full(jax.eval_shape(matrix, self.x, self.params).shape, np.nan) if found is None else found
 
     def constraints(self) -> Callable:
+        """(x, params) ↦ the constraints of all levels so far."""
         parts = tuple(self.parts)
         if not parts:
             return lambda x, params: jnp.zeros(0)
@@ -106,6 +107,7 @@ class Search:
     # ------------------------------------------------------------------ the loop
 
     def run(self) -> ConstraintChain:
+        """Level after level; every end is a chain with its verdict."""
         while True:
             number = len(self.levels)
             points = self.points.around(self.x, self.phi_and_slope if self.parts else None)
@@ -233,6 +235,7 @@ class Search:
     # ------------------------------------------------------------------ ends
 
     def finish(self, found: Solved, null: np.ndarray, rank: int) -> ConstraintChain:
+        """The chain where a level has no new conditions: the last manifold is M_f."""
         n = self.size
         freedom = rank_of(null[:n].T, np.ones(null.shape[1])) if null.size else 0
         redundant = null.shape[1] - freedom
@@ -264,6 +267,7 @@ class Search:
         return self.end(GAUGE if freedom else DETERMINED, "; ".join(words) + ".", index, freedom, redundant, solution, kernel)
 
     def end(self, verdict, explanation, index=None, freedom=0, redundant=0, solution=None, kernel=None) -> ConstraintChain:
+        """The chain with what was found so far."""
         return ConstraintChain(
             levels=tuple(self.levels),
             point=self.x,
