@@ -3,6 +3,7 @@
 A name is added by its import and its line in the list of its room.
 """
 
+from dirax.diagnostics.action import action_sum, action_variation, discrete_energy
 from dirax.diagnostics.compare import compare
 from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.report import Report
@@ -99,7 +100,10 @@ __all__ = [
     "PhaseSpaceLagrangian",
     "PortHamiltonian",
     "RelationForm",
+    "action_sum",
+    "action_variation",
     "constraint_algorithm",
+    "discrete_energy",
     "interconnect",
 ]
 # Symmetries, and systems reduced by them

@@ -1,0 +1,115 @@
+"""Discrete action sums, their variations, and discrete energies of trajectories on Q × Q ([PY] §7, [RL] §2)."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.diagnostics.rows import consecutive, over_rows
+from dirax.diagnostics.structure_lines import structure_of
+from dirax.schemes.discrete_structure_pairs import LagrangianPairs
+from dirax.solution.solution import Solution
+
+
+class Variation(NamedTuple):
+    """The derivative of an action sum along a variation of the path, and the sum of the sizes of its terms, to which it is
+    relative: numbers, or arrays (B,) of a batch."""
+
+    value: Any
+    size: Any
+
+
+def action_sum(solution: Solution) -> Any:
+    """S_d = Σ_k L_d(q_k, q_{k+1}), the discrete action sum of a run ([PY] Definition 7.1; [RL] Theorem 2.9): a float, or (B,).
+
+    At solutions the sum of the Pontryagin principle, Σ L_d(q_k, v_k) + ⟨p_{k+1}, q_{k+1} − v_k⟩ with v_k = q_{k+1}, has the same
+    value. Takes runs of schemes with a discrete Lagrangian on Q × Q, every step saved; raises `TypeError` and `ValueError` for
+    others.
+    """
+    pairs = _pairs(solution)
+    return _plain(solution, _over_steps(_lagrangian, pairs, solution).sum(axis=1))
+
+
+def action_variation(solution: Solution, variation: Any) -> Variation:
+    """The derivative of the action sum, and of the virtual work of the forces, along an admissible variation δq of the path:
+
+        Σ_k ⟨D2 L_d(q_{k−1}, q_k) + D1 L_d(q_k, q_{k+1}) + f_d^+ + f_d^−, δq_k⟩,   δq_k ∈ Δ(q_k),   δq_0 = δq_N = 0,
+
+    zero for every δq along a solution ([PY] Theorem 7.4: the discrete Lagrange–d'Alembert–Pontryagin principle, which varies q
+    alone where v_k = q_{k+1}). `variation` (rows, n), or (B, rows, n): its part in Δ at the inner rows is taken. Raises as
+    `action_sum`, and `ValueError` for another shape.
+    """
+    pairs = _pairs(solution)
+    q = np.asarray(solution.q)
+    if np.shape(variation) != q.shape:
+        raise ValueError(f"variation must have the shape of q, {q.shape}, but it has shape {np.shape(variation)}.")
+    inner = np.arange(solution.rows - 2)
+    items = consecutive(solution, ("q",), 3, inner)
+    along = np.take(np.asarray(variation, float), inner + 1, axis=q.ndim - 2)
+    found = over_rows(eqx.Partial(_varied, pairs), solution, (items, along)).sum(axis=1)
+    return Variation(_plain(solution, found[:, 0]), _plain(solution, found[:, 1]))
+
+
+def discrete_energy(solution: Solution, sign: str | None = None) -> np.ndarray:
+    """The discrete generalized energies of the steps ([PY] Definition 7.3; [RL] §2), of shape (steps,) or (B, steps):
+
+        E⁺ = ⟨p_{k+1}, q_{k+1} − q_k⟩ − L_d(q_k, q_{k+1}),   p_{k+1} = D2 L_d(q_k, q_{k+1}),
+        E⁻ = ⟨p_k, q_{k+1} − q_k⟩ − L_d(q_k, q_{k+1}),       p_k = −D1 L_d(q_k, q_{k+1}),
+
+    h times an energy each, and not the energy of the system at a node, which is `solution.energy()`. `sign`: "+" or "-"; by
+    default that of the scheme, "+" for one that is neither. Raises as `action_sum`, and `ValueError` for another sign.
+    """
+    pairs = _pairs(solution)
+    chosen = sign or pairs.sign or "+"
+    if chosen not in ("+", "-"):
+        raise ValueError(f'sign must be "+" or "-", but {sign!r} was given.')
+    energies = _over_steps(_plus_energy if chosen == "+" else _minus_energy, pairs, solution)
+    return energies if solution.batch is not None else energies[0]
+
+
+def _pairs(solution: Solution) -> LagrangianPairs:
+    pairs = structure_of(solution)
+    if not isinstance(pairs, LagrangianPairs):
+        raise TypeError(
+            "action sums are of schemes with a discrete Lagrangian on Q × Q, such as dx.LagrangeDAlembert and "
+            f"dx.PlusLagrangeDirac, but this run was by {solution.scheme!r}."
+        )
+    if solution.save_every != 1 or solution.rows < 3:
+        raise ValueError(
+            f"action sums need every step of two at least, but {solution.rows} rows were saved with save_every = "
+            f"{solution.save_every}: run again with save_every=1."
+        )
+    return pairs
+
+
+def _over_steps(function: Any, pairs: LagrangianPairs, solution: Solution) -> np.ndarray:
+    """(B, steps)."""
+    return over_rows(eqx.Partial(function, pairs), solution, (consecutive(solution, ("q",), 2, np.arange(solution.rows - 1)),))
+
+
+def _plain(solution: Solution, values: np.ndarray) -> Any:
+    return values if solution.batch is not None else float(values[0])
+
+
+def _lagrangian(pairs, rows, params):
+    return pairs.lagrangian(rows["t"][0], *rows["q"], params)
+
+
+def _plus_energy(pairs, rows, params):
+    q0, q1 = rows["q"]
+    return pairs.slots(rows["t"][0], q0, q1, params)[1] @ (q1 - q0) - _lagrangian(pairs, rows, params)
+
+
+def _minus_energy(pairs, rows, params):
+    q0, q1 = rows["q"]
+    return -pairs.slots(rows["t"][0], q0, q1, params)[0] @ (q1 - q0) - _lagrangian(pairs, rows, params)
+
+
+def _varied(pairs, rows, along, params):
+    """(the term of the inner row, the sum of its sizes)."""
+    t, (q0, q1, q2) = rows["t"], rows["q"]
+    arriving, leaving = pairs.slots(t[0], q0, q1, params)[1], pairs.slots(t[1], q1, q2, params)[0]
+    admissible = along - pairs.annihilator(t[1], q1, params) @ along
+    sizes = (jnp.abs(arriving) + jnp.abs(leaving)) @ jnp.abs(admissible)
+    return jnp.stack([(arriving + leaving) @ admissible, sizes])
