@@ -20,16 +20,24 @@ BLOCK = re.compile(
 )
 
 
+# A row of a table whose last column is headed "shown by" and holds one expression: it must be true.
+SHOWN = re.compile(r"^\|[^\n]*\| `(?P<code>[^`\n]+)` \|$", re.MULTILINE)
+
+
 def program(text: str) -> str:
-    """The Python blocks of a page as one program whose lines keep their numbers on the page."""
+    """The Python blocks of a page, and what its tables show, as one program whose lines keep their numbers on the page."""
     if text.lstrip().startswith(SKIP):
         return ""
-    lines: list[str] = []
+    found = {}
     for block in BLOCK.finditer(text):
-        if text[: block.start()].rstrip().endswith(SKIP):
-            continue
-        first = text.count("\n", 0, block.start("code"))
-        lines += [""] * (first - len(lines)) + textwrap.dedent(block["code"]).splitlines()
+        if not text[: block.start()].rstrip().endswith(SKIP):
+            found[text.count("\n", 0, block.start("code"))] = textwrap.dedent(block["code"]).splitlines()
+    if "| shown by |" in text:
+        for row in SHOWN.finditer(text):
+            found[text.count("\n", 0, row.start())] = [f"assert {row['code']}"]
+    lines: list[str] = []
+    for first, code in sorted(found.items()):
+        lines += [""] * (first - len(lines)) + code
     return "\n".join(lines)
 
 
@@ -54,6 +62,11 @@ def test_blocks_of_a_page_are_one_program_with_the_lines_of_the_page():
     tab = "=== tab\n\n    ```python title='x'\n    b = a + 1\n    ```\n"
     page = f"# Title\n\n```python\na = 1\n```\n\n{tab}\n```sh\nls\n```\n"
     assert program(page).split("\n") == ["", "", "", "a = 1", "", "", "", "", "", "b = a + 1"]
+
+
+def test_what_a_table_shows_is_asserted():
+    page = "```python\na = 1\n```\n\n| in the paper | shown by |\n|---|---|\n| one | `a == 1` |\n"
+    assert program(page).split("\n") == ["", "a = 1", "", "", "", "", "assert a == 1"]
 
 
 def test_marked_blocks_and_pages_are_left_out():

@@ -92,6 +92,7 @@ __all__ = [
     "ConstraintChain",
     "DiracSystem",
     "FinalManifold",
+    "HamiltonDirac",
     "ImplicitSystem",
     "LagrangeDirac",
     "ManifoldLagrangian",
@@ -100,10 +101,7 @@ __all__ = [
     "PhaseSpaceLagrangian",
     "PortHamiltonian",
     "RelationForm",
-    "action_sum",
-    "action_variation",
     "constraint_algorithm",
-    "discrete_energy",
     "interconnect",
 ]
 # Symmetries, and systems reduced by them
@@ -180,7 +178,6 @@ __all__ += [
     "DiscreteGradient",
     "DiscreteRouth",
     "Field",
-    "HamiltonDirac",
     "InCharts",
     "LagrangeDAlembert",
     "Layout",
@@ -209,8 +206,11 @@ __all__ += [
 # Measuring
 __all__ += [
     "Report",
+    "action_sum",
+    "action_variation",
     "compare",
     "convergence",
+    "discrete_energy",
     "verify",
 ]
 # Looked at
