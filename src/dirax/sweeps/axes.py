@@ -28,7 +28,9 @@ class Axes:
     def of(cls, over: Any, zipped: bool) -> "Axes":
         """The axes that a user gave. Raises `TypeError` and `ValueError`, naming the axis."""
         if not isinstance(over, Mapping) or not over:
-            raise TypeError(f'over must be a dict of axes such as {{"mass": np.linspace(0.5, 2, 20)}}, but {over!r:.80} was given.')
+            raise TypeError(
+                f'over must be a dict of axes such as {{"mass": np.linspace(0.5, 2, 20)}}, but {over!r:.80} was given.'
+            )
         values = {name: _axis(name, given) for name, given in over.items()}
         if zipped and len({len(axis) for axis in values.values()}) > 1:
             sizes = ", ".join(f"{name} has {len(axis)}" for name, axis in values.items())

@@ -93,7 +93,7 @@ def _tried_elsewhere(error: BaseException) -> bool:
 def _spare(plan: Plan, executor: Any) -> Place:
     count = parallel(executor, False)
     warnings.warn(
-        f"the executor that was given is broken, since one of its workers died: the sweep goes on in {count} processes of its own.",
+        f"the executor that was given broke when one of its workers died: the sweep goes on in {count} processes of its own.",
         RuntimeWarning,
         stacklevel=2,
     )

@@ -42,8 +42,8 @@ def checked(executor: Any) -> Any:
             raise ImportError('executor="dask" needs dask.distributed: install dirax[dask].') from error
         return executor
     raise TypeError(
-        "executor must be None (here), a number of processes, an executor of concurrent.futures, a client of dask.distributed, or "
-        f'"dask", but {executor!r:.80} was given.'
+        "executor must be None (here), a number of processes, an executor of concurrent.futures, a client of dask.distributed, "
+        f'or "dask", but {executor!r:.80} was given.'
     )
 
 
@@ -54,7 +54,7 @@ def parallel(executor: Any, plan_of_xla: bool) -> int:
     if isinstance(executor, int):
         return executor
     if _is_client(executor):
-        return max(1, sum(executor.nthreads().values()))
+        return _threads_of(executor)
     return max(1, getattr(executor, "_max_workers", 0) or thread_count())
 
 
@@ -135,16 +135,17 @@ def _dask(executor: Any, plan: Plan) -> Iterator[Place]:
             try:
                 client = distributed.get_client()
             except ValueError:
-                client = stack.enter_context(distributed.Client(n_workers=thread_count(), threads_per_worker=1, dashboard_address=None))
+                options = {"n_workers": thread_count(), "threads_per_worker": 1, "dashboard_address": None}
+                client = stack.enter_context(distributed.Client(**options))
         else:
             client = executor
         data = packed(plan)
         pool = client.get_executor(pure=False)
-        slots = lambda: AHEAD * max(1, sum(client.nthreads().values()) if client.status == "running" else 1)
+        slots = lambda: AHEAD * _threads_of(client)
         yield Place(
             lambda task: pool.submit(run_packed, data, task),
             slots,
-            lambda: pool.shutdown(wait=False, cancel_futures=True),
+            lambda: pool.shutdown(wait=False),
         )
 
 
@@ -152,3 +153,8 @@ def _is_client(executor: Any) -> bool:
     """Whether it is a client of dask, without importing that."""
     distributed = sys.modules.get("distributed")
     return distributed is not None and isinstance(executor, distributed.Client)
+
+
+def _threads_of(client: Any) -> int:
+    """The threads of all workers of a cluster; 1 where it has none at this moment, or cannot be asked."""
+    return max(1, sum(client.nthreads().values())) if client.status == "running" else 1

@@ -29,7 +29,9 @@ class Keep:
     def of(cls, function: Any) -> "Keep":
         """A user's function, or None. Raises `TypeError` for anything else."""
         if function is not None and not callable(function):
-            raise TypeError(f"keep must be a function of a solution that returns a dict of arrays, but {function!r:.60} was given.")
+            raise TypeError(
+                f"keep must be a function of a solution that returns a dict of arrays, but {function!r:.60} was given."
+            )
         return cls(function)
 
     def chosen(self, sol: Solution, values: Values) -> "Keep":

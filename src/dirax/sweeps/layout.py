@@ -1,4 +1,4 @@
-"""What a store of a sweep holds: its arrays with the names of their axes, and its files on the disk, which any zarr library opens.
+"""What a store of a sweep holds: arrays with the names of their axes, and the files that any zarr library opens.
 
 Every array over the points has chunks that are blocks of the grid, whole in its other axes: a block is one file of each. The
 block of `status` is written last, by one renaming, and is what says that the others are there.
@@ -15,16 +15,13 @@ import numpy as np
 from dirax.solution.zarr_store import BYTES, LITTLE
 from dirax.sweeps.grid import Grid, Index
 
-FORMAT = 1
-"""Version of the layout; a store of a later one is refused."""
-
 TEXT = "string"
 """The type of arrays of texts."""
 
 TEXTS = {"name": "vlen-utf8"}
 
 OPEN, OK, FAILED, REFUSED = 0, 1, 2, 3
-"""What `status` says of a point: it has not been run; it ran to the end; it failed; its data were refused before the first step."""
+"""What `status` says of a point: it has not been run, ran to the end, failed, or was refused before its first step."""
 
 STATUS, MESSAGE = "status", "message"
 

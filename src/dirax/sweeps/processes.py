@@ -1,5 +1,6 @@
 """Processes of dirax's own for tasks: new interpreters, never forks, each with one thread of this process that speaks with it."""
 
+import contextlib
 import os
 import pickle
 import subprocess
@@ -67,14 +68,14 @@ class Processes:
             if self._ended:
                 raise WorkerDied("the sweep has ended")
             command = [sys.executable, "-m", "dirax.sweeps.worker"]
-            paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}  # as the modules of the user's functions are found here
+            paths = {
+                "PYTHONPATH": os.pathsep.join(filter(None, sys.path))
+            }  # as the modules of the user's functions are found here
             process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | paths)
             self._all.add(process)
         self._local.process = process
-        try:
+        with contextlib.suppress(OSError):  # it has ended, which the first answer will show
             send(process.stdin, self._plan)  # type: ignore[arg-type]
-        except OSError:  # it has ended, which the first answer will show
-            pass
         return process
 
 

@@ -29,7 +29,11 @@ def reporting(progress: Any, state: State, title: str) -> Iterator[Callable[[], 
     """A function to be called whenever the state has changed. `progress`: None for a bar where standard error is a terminal,
     True, False, or a function of (points done, points in all)."""
     if callable(progress):
-        yield lambda: progress(state.done, state.points)
+
+        def told() -> None:
+            progress(state.done, state.points)
+
+        yield told
         return
     if progress is False or (progress is None and not sys.stderr.isatty()):
         yield lambda: None

@@ -1,4 +1,4 @@
-"""A store on the disk: made at once, held by one caller at a time, cleared of what killed processes left, grown by more points."""
+"""A store on the disk: made at once, held by one caller at a time, cleared of what was left there, grown by more points."""
 
 import contextlib
 import json
@@ -16,12 +16,12 @@ except ImportError:  # Windows: nothing is locked
     fcntl = None
 
 from dirax.solution.placing import checked_place, placed
-from dirax.solution.sweep_store import SWEEP
+from dirax.solution.sweep_store import attributes_of, group_of
 from dirax.solution.zarr_store import is_store
 from dirax.sweeps.axes import Axes
 from dirax.sweeps.commit import UNFINISHED, flush_folder, flushed, moved, writing
 from dirax.sweeps.grid import Grid, Index
-from dirax.sweeps.layout import FORMAT, OPEN, STATUS, TEXT, Array, Layout, decoded_texts, encoded_texts
+from dirax.sweeps.layout import OPEN, STATUS, TEXT, Array, Layout, decoded_texts, encoded_texts
 
 NODE = "zarr.json"
 
@@ -58,33 +58,9 @@ def _json(value: Any) -> bytes:
     return json.dumps(value, indent=1).encode()
 
 
-def attributes_of(path: Path) -> dict[str, Any]:
-    """What the store of a sweep says of itself. Raises `ValueError` for anything else at this path."""
-    group = _group(path)
-    attributes = group.get("attributes", {})
-    version = attributes.get(SWEEP)
-    if not isinstance(version, int):
-        raise ValueError(f"{path} is not the store of a sweep: choose another path for to=.")
-    if version > FORMAT:
-        raise ValueError(
-            f"{path} was written by a later dirax ({attributes.get('dirax_version')}, format {version}; this one reads "
-            f"{FORMAT}): update dirax."
-        )
-    return attributes
-
-
-def _group(path: Path) -> dict[str, Any]:
-    if not is_store(path):
-        raise ValueError(f"{path} is not the store of a sweep: choose another path for to=.")
-    try:
-        return json.loads((path / NODE).read_bytes())
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: its zarr.json cannot be read ({error}).") from None
-
-
 def layout_of(path: Path) -> Layout:
     """The layout that a store was written with."""
-    nodes, about = _group(path)["consolidated_metadata"]["metadata"], attributes_of(path)
+    nodes, about = group_of(path)["consolidated_metadata"]["metadata"], attributes_of(path)
     dims = tuple(json.loads(about["dims"]))
     arrays, lead = {}, len(dims)
     for name in json.loads(about["arrays"]):
@@ -99,12 +75,16 @@ def layout_of(path: Path) -> Layout:
 def axes_of(path: Path) -> Axes:
     """The axes of the points of a store."""
     about = attributes_of(path)
-    nodes = _group(path)["consolidated_metadata"]["metadata"]
+    nodes = group_of(path)["consolidated_metadata"]["metadata"]
     values = {}
     for name in json.loads(about["axes"]):
         data = (path / name / "c" / "0").read_bytes()
         kind = nodes[name]["data_type"]
-        values[name] = decoded_texts(data).astype(str) if kind == TEXT else np.frombuffer(data, np.dtype(kind).newbyteorder("<")).astype(kind)
+        values[name] = (
+            decoded_texts(data).astype(str)
+            if kind == TEXT
+            else np.frombuffer(data, np.dtype(kind).newbyteorder("<")).astype(kind)
+        )
     return Axes(values, bool(about["zip"]))
 
 
@@ -190,7 +170,9 @@ def copy_points(old: Path, before: Layout, new: Path, after: Layout, places: tup
         mine = [by_block[axis][block] for axis, block in enumerate(index)]
         if any(not len(chosen) for chosen in mine):
             continue
-        target = tuple(place[chosen] - k * part for place, chosen, k, part in zip(places, mine, index, after.grid.chunk, strict=True))
+        target = tuple(
+            place[chosen] - k * part for place, chosen, k, part in zip(places, mine, index, after.grid.chunk, strict=True)
+        )
         status = _gathered(old, before, STATUS, mine)
         if not np.any(status):
             continue

@@ -116,7 +116,13 @@ def results(plan: Plan, values: Values, stopping: Callable[[], bool] | None = No
         shared = jax.tree.map(lambda leaf: leaf[low:high], params) if batched else plan.params
         try:
             sol = simulate(
-                plan.system, plan.scheme, **given, params=shared, batch_params=batched, progress=_listener(stopping), **plan.options
+                plan.system,
+                plan.scheme,
+                **given,
+                params=shared,
+                batch_params=batched,
+                progress=_listener(stopping),
+                **plan.options,
             )
         except ValueError as error:
             if high - low == 1:
