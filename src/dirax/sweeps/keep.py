@@ -1,73 +1,118 @@
-"""What is kept of each trajectory: its saved rows, or what the user's `keep` makes of them where they were computed."""
+"""What is kept of each trajectory: its saved rows, or what the user's `keep` makes of them where they were computed.
+
+`keep` is written for the Solution of one trajectory. For a million it is called with many at once, in the first of these ways
+that agrees with single calls for some trajectories: with the Solution of a batch; in NumPy, with columns in place of arrays;
+compiled by JAX; or else one by one.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from dirax.program.memo import Memo, Same
 from dirax.solution.solution import Solution
 from dirax.solution.stored import TYPES
 from dirax.solution.trajectory import BLOCK
 from dirax.sweeps.axes import PointError, described
 from dirax.sweeps.case import Values, in_words
+from dirax.sweeps.columns import Column, spread
 
 SAME = 1e-9
-"""How far the result for several trajectories may be from those for each, relative to the size of the numbers."""
+"""How far two ways may be from each other, relative to the size of the numbers."""
+
+DERIVED = ("energy", "constraint_residual")
+"""Quantities of a solution that are computed for all trajectories at once."""
+
+Mode = Literal["rows", "batch", "columns", "jax", "singles"]
 
 
 @dataclass(frozen=True, eq=False)
 class Keep:
-    """`function(sol)` of the Solution of one trajectory, a dict of numbers and arrays; `together` where it gives the same, with
-    an axis in front, for that of a batch. Without a function the saved rows are kept."""
+    """`function(sol)`, a dict of numbers and arrays of the Solution of one trajectory; `mode` is how it is called, `like` its
+    value for one trajectory, and `derived` the quantities that it asks for. Without a function the saved rows are kept."""
 
     function: Callable | None
-    together: bool = False
+    mode: Mode = "rows"
     like: Any = None
+    derived: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, function: Any) -> "Keep":
         """A user's function, or None. Raises `TypeError` for anything else."""
         if function is not None and not callable(function):
-            raise TypeError(
-                f"keep must be a function of a solution that returns a dict of arrays, but {function!r:.60} was given."
-            )
-        return cls(function)
+            raise TypeError(f"keep must be a function of a solution that returns a dict, but {function!r:.60} was given.")
+        return cls(function, "rows" if function is None else "singles")
 
     def chosen(self, sol: Solution, values: Values) -> "Keep":
         """The same as it is to be called, by the trajectories of a batch at these points. Raises `PointError`."""
         if self.function is None:
             return self
-        ones = [self._of_one(sol, lane, values) for lane in range(sol.batch or 0)]
-        like = ones[0]
-        settled = replace(self, like=like)
-        each = settled._stacked(sol, ones, values)
-        try:
-            found = self.function(sol)
-            arrays = {name: np.asarray(value) for name, value in found.items()}
-        except Exception:
-            return settled
-        together = arrays.keys() == each.keys() and all(_close(arrays[name], each[name]) for name in each)
-        return replace(settled, together=together)
+        first = self._of_one(sol, 0, values)
+        settled = replace(self, like=first, derived=self._asked_for(sol))
+        each = settled.at(sol, values)
+        modes: tuple[Mode, ...] = ("batch", "columns", "jax")
+        for mode in modes:
+            tried = replace(settled, mode=mode)
+            try:
+                found = tried._together(sol)
+            except Exception:
+                continue
+            if found.keys() == each.keys() and all(_close(found[name], each[name]) for name in each):
+                return tried
+        return settled
 
     def at(self, sol: Solution, values: Values) -> dict[str, np.ndarray]:
         """What is kept of a batch, arrays (B, …) by name. Raises `PointError`."""
-        if self.function is None:
+        if self.mode == "rows":
             return {name: np.asarray(array) for name, array in sol.fields.items()}
         size = sol.batch or 0
-        if not self.together:
+        if self.mode == "singles":
             return self._stacked(sol, [self._of_one(sol, lane, values) for lane in range(size)], values)
-        most = max(1, BLOCK // sol.rows)  # up to here a quantity is computed in the same way, whatever the size of the batch
-        parts = [sol if size <= most else sol[low : low + most] for low in range(0, size, most)]
-        found = [self._of_batch(part, values, k * most) for k, part in enumerate(parts)]
-        return {name: np.concatenate([part[name] for part in found]) for name in self.like}
+        most = lanes_together(sol.rows)
+        parts = []
+        for low in range(0, size, most):
+            try:
+                parts.append(self._together(sol if size <= most else sol[low : low + most]))
+            except Exception as error:
+                raise PointError(
+                    f"keep fails for the trajectories from {described(values, low)} on: {in_words(error)}"
+                ) from error
+        return {name: np.concatenate([part[name] for part in parts]).astype(like.dtype) for name, like in self.like.items()}
 
-    def _of_batch(self, sol: Solution, values: Values, first: int) -> dict[str, np.ndarray]:
-        try:
-            found = self.function(sol)  # type: ignore[misc]
-            return {name: np.asarray(found[name]).astype(like.dtype) for name, like in self.like.items()}
-        except Exception as error:
-            raise PointError(f"keep fails for the trajectories from {described(values, first)} on: {in_words(error)}") from error
+    # ------------------------------------------------------------------ many at once
+
+    def _together(self, sol: Solution) -> dict[str, np.ndarray]:
+        if self.mode == "batch":
+            return {name: np.asarray(value) for name, value in self.function(sol).items()}  # type: ignore[misc]
+        if self.mode == "columns":
+            found = self.function(_as_columns(sol))  # type: ignore[misc]
+            return {name: spread(value, sol.batch or 0) for name, value in found.items()}
+        return self._in_jax(sol)
+
+    def _in_jax(self, sol: Solution) -> dict[str, np.ndarray]:
+        """Compiled for one number of trajectories, up to which the last repeats itself, so that no result depends on it."""
+        size, most = sol.batch or 0, lanes_together(sol.rows)
+        at = np.minimum(np.arange(most), size - 1)
+        params = jax.tree.map(lambda leaf: np.asarray(leaf)[at], sol.params) if sol.batch_params else sol.params
+        arrays = {name: np.asarray(a)[at] for name, a in sol.fields.items()}
+        derived = {name: np.asarray(getattr(sol, name)())[at] for name in self.derived}
+        bare = sol.replace(t=jnp.asarray(sol.t), fields={}, derived={}, params=None, message="", initial={}, ok=True)
+
+        def one(fields: Any, derived: Any, params: Any) -> Any:
+            return dict(self.function(bare.replace(fields=fields, derived=derived, params=params, batch_params=False)))  # type: ignore[misc]
+
+        def make() -> Callable:
+            return jax.jit(jax.vmap(one, in_axes=(0, 0, 0 if sol.batch_params and params is not None else None)))
+
+        key = Same(self.function), Same(sol.equation), sol.rows, sol.step, sol.batch_params
+        found = _jitted.get(key, make)(arrays, derived, params)
+        return {name: np.asarray(value)[:size] for name, value in found.items()}
+
+    # ------------------------------------------------------------------ one by one
 
     def _of_one(self, sol: Solution, lane: int, values: Values) -> dict[str, np.ndarray]:
         try:
@@ -96,6 +141,53 @@ class Keep:
                 )
             ones[lane] = {name: _nothing(like) for name, like in self.like.items()}
         return {name: np.stack([one[name] for one in ones]).astype(like.dtype) for name, like in self.like.items()}
+
+    def _asked_for(self, sol: Solution) -> tuple[str, ...]:
+        """The derived quantities that a call for one trajectory computes."""
+        one = single(sol, 0)
+        self.function(one)  # type: ignore[misc]
+        return tuple(name for name in DERIVED if name in one.derived)
+
+
+_jitted: Memo[Callable] = Memo(8)
+
+
+def lanes_together(rows: int) -> int:
+    """Trajectories for which `keep` is called at once: a power of two, and no more rows than are computed in one way."""
+    return 1 << max(0, (BLOCK // rows).bit_length() - 1)
+
+
+class _Together(Solution):
+    """A batch as if it were one trajectory, with columns in place of arrays."""
+
+    together: Solution
+
+    def energy(self) -> Any:
+        return Column(self.together.energy())
+
+    def constraint_residual(self) -> Any:
+        return Column(self.together.constraint_residual())
+
+    def momentum_map(self, generator: Callable) -> Any:
+        return Column(np.asarray(self.together.momentum_map(generator)))
+
+    def map_rows(self, function: Callable) -> Any:
+        return jax.tree.map(lambda a: Column(np.asarray(a)), self.together.map_rows(function))
+
+
+def _as_columns(sol: Solution) -> Solution:
+    given = {name: getattr(sol, name) for name in ("field_info", "step", "save_every", "stats", "system", "scheme", "equation")}
+    params = jax.tree.map(lambda leaf: Column(np.asarray(leaf)), sol.params) if sol.batch_params else sol.params
+    shown = _Together(
+        **given,
+        t=Column(np.broadcast_to(sol.t, (sol.batch or 0, len(sol.t)))),
+        fields={name: Column(np.asarray(a)) for name, a in sol.fields.items()},
+        params=params,
+        ok=Column(np.asarray(sol.ok)),
+        initial={name: Column(a) for name, a in sol.initial.items()},
+    )
+    shown.together = sol
+    return shown
 
 
 def single(sol: Solution, lane: int) -> Solution:
