@@ -15,8 +15,8 @@ ALONG_AXIS = {"cumsum", "cumprod", "diff", "flip", "sort", "gradient", "unwrap"}
 
 
 class Column(np.lib.mixins.NDArrayOperatorsMixin):
-    """An array (…) at every point, `values` (B, …). Arithmetic, indices, and the functions of NumPy above act at each point; anything
-    else raises `TypeError`, as what is no number does in an `if` or in `math`."""
+    """An array (…) at every point, `values` (B, …). Arithmetic, indices, and the functions of NumPy above act at each point;
+    anything else raises `TypeError`, as what is no number does in an `if` or in `math`."""
 
     def __init__(self, values: np.ndarray):
         self.values = np.asarray(values)

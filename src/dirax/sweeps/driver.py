@@ -9,7 +9,7 @@ from typing import Any
 from dirax.sweeps.axes import PointError, described
 from dirax.sweeps.case import in_words
 from dirax.sweeps.commit import StoreError
-from dirax.sweeps.executors import Place, own_processes, parallel
+from dirax.sweeps.executors import Place, PlaceLost, own_processes, parallel
 from dirax.sweeps.progress import State
 from dirax.sweeps.task import Plan, Task
 
@@ -18,10 +18,6 @@ ATTEMPTS = 3
 
 LOOK = 0.2
 """Seconds between looks at a place that does not answer."""
-
-
-class PlaceLost(ConnectionError):
-    """The executor has gone, and with it what it was doing."""
 
 
 def drive(tasks: Iterable[Task], place: Place, executor: Any, plan: Plan, state: State, changed: Callable[[], None]) -> list[str]:

@@ -3,6 +3,7 @@
 import contextlib
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,6 +17,13 @@ from dirax.sweeps.task import Done, Plan, Task, run_task
 
 AHEAD = 2
 """Tasks that an executor which is not here is given for each of its workers, so that none waits for the next."""
+
+ASK_AGAIN = 5.0
+"""Seconds after which a cluster is asked again how many workers it has."""
+
+
+class PlaceLost(ConnectionError):
+    """The executor has gone, and with it what it was doing."""
 
 
 @dataclass
@@ -141,7 +149,16 @@ def _dask(executor: Any, plan: Plan) -> Iterator[Place]:
             client = executor
         data = packed(plan)
         pool = client.get_executor(pure=False)
-        slots = lambda: AHEAD * _threads_of(client)
+        count, asked = _threads_of(client), time.monotonic()
+
+        def slots() -> int:
+            nonlocal count, asked
+            if client.status != "running":
+                raise PlaceLost("the scheduler has gone")
+            if time.monotonic() > asked + ASK_AGAIN:  # workers come and go
+                count, asked = _threads_of(client), time.monotonic()
+            return AHEAD * count
+
         yield Place(
             lambda task: pool.submit(run_packed, data, task),
             slots,
@@ -156,5 +173,8 @@ def _is_client(executor: Any) -> bool:
 
 
 def _threads_of(client: Any) -> int:
-    """The threads of all workers of a cluster; 1 where it has none at this moment, or cannot be asked."""
-    return max(1, sum(client.nthreads().values())) if client.status == "running" else 1
+    """The threads of all workers of a cluster; 1 where it has none at this moment. Raises `PlaceLost`."""
+    try:
+        return max(1, sum(client.nthreads().values()))
+    except OSError as error:
+        raise PlaceLost("the scheduler has gone") from error

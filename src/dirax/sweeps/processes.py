@@ -40,7 +40,7 @@ class Processes:
             process.kill()
         self._pool.shutdown(wait=True, cancel_futures=True)
         for process in running:
-            process.wait()
+            _close(process)
 
     def _ask(self, task: Task) -> Done:
         process = getattr(self._local, "process", None) or self._started()
@@ -52,9 +52,7 @@ class Processes:
         if answer is None:
             self._local.process = None
             process.kill()
-            code = process.wait()
-            for pipe in (process.stdin, process.stdout):
-                pipe.close() if pipe else None
+            code = _close(process)
             with self._lock:
                 self._all.discard(process)
             raise WorkerDied(f"the process that ran it ended ({_ending(code)})")
@@ -77,6 +75,14 @@ class Processes:
         with contextlib.suppress(OSError):  # it has ended, which the first answer will show
             send(process.stdin, self._plan)  # type: ignore[arg-type]
         return process
+
+
+def _close(process: subprocess.Popen) -> int:
+    """The exit status of a process that has ended, its pipes closed."""
+    for pipe in (process.stdin, process.stdout):
+        with contextlib.suppress(OSError):
+            pipe.close() if pipe else None
+    return process.wait()
 
 
 def send(pipe: BinaryIO, data: bytes) -> None:

@@ -19,7 +19,7 @@ class State:
     given_up: int = 0
 
     def __str__(self) -> str:
-        parts = [f"{counted(self.done, 'point')} of {counted(self.points, 'point')[: -len(' points')].rstrip()} done"]
+        parts = [f"{self.done} of {counted(self.points, 'point')} done"]
         parts += [f"{counted(self.failed, 'trajectory', 'trajectories')} failed"] * bool(self.failed)
         return ", ".join([*parts, *[f"{self.given_up} given up"] * bool(self.given_up)])
 

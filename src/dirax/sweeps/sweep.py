@@ -19,7 +19,7 @@ from dirax.sweeps.arrange import arranged, sized
 from dirax.sweeps.axes import Axes
 from dirax.sweeps.case import Case
 from dirax.sweeps.commit import StoreError
-from dirax.sweeps.driver import PlaceLost, drive
+from dirax.sweeps.driver import drive
 from dirax.sweeps.grid import Grid
 from dirax.sweeps.keep import Keep
 from dirax.sweeps.layout import Layout
@@ -183,7 +183,7 @@ def _going_on(path: Path, state: State) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; {words()}.") from None
-    except PlaceLost as error:
-        raise PlaceLost(f"{error}; {words()}.") from error
+    except executors.PlaceLost as error:
+        raise executors.PlaceLost(f"{error}; {words()}.") from error
     except StoreError as error:
         raise StoreError(error.errno or 0, f"{error} ({state}).") from error
