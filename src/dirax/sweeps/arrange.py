@@ -30,7 +30,8 @@ def arranged(axes: Axes, trial: Trial, units: Any, coordinates: Any) -> tuple[La
     """What the store holds: its arrays over the points, not yet cut, and the axes with their values."""
     sol = trial.sol.replace(system=None)
     units = dict(units or {})
-    own = {name: str(units.pop(name)) for name in list(units) if name in axes.values}
+    kept = trial.keep.like or {}
+    own = {name: str(units.pop(name)) for name in list(units) if name in axes.values or name in kept}
     said = describe(sol, units or None, coordinates)
     named = {}
     for name, values in axes.values.items():
@@ -39,7 +40,7 @@ def arranged(axes: Axes, trial: Trial, units: Any, coordinates: Any) -> tuple[La
             Array(dims, (), TEXT if values.dtype.kind == "U" else values.dtype.name, {"units": own.get(name, "")}),
             values,
         )
-    arrays = _kept(trial.keep, units) if trial.keep.function is not None else _rows(sol, said)
+    arrays = _kept(trial.keep, own) if trial.keep.function is not None else _rows(sol, said)
     inner = {dim for array in arrays.values() for dim in array.dims}
     for dim in ("time", "interval", "coordinate"):
         if dim in said.axes and dim in inner:
