@@ -1,5 +1,6 @@
 """What a store belongs to: digests of the user's functions, by their traced program or their code, and every setting."""
 
+import dis
 import hashlib
 import json
 import re
@@ -191,8 +192,10 @@ def _add_function(add: Callable[[bytes], None], function: types.FunctionType, se
 
 
 def _names(code: types.CodeType) -> set[str]:
+    """The global names that code reads, that of functions inside it too."""
+    own = {i.argval for i in dis.get_instructions(code) if i.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
-    return {*code.co_names, *(name for c in inner for name in _names(c))}
+    return own.union(*map(_names, inner))
 
 
 def _add_instructions(add: Callable[[bytes], None], code: types.CodeType, seen: set[int]) -> None:
