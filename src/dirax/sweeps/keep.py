@@ -20,6 +20,7 @@ from dirax.solution.trajectory import BLOCK
 from dirax.sweeps.axes import PointError, described
 from dirax.sweeps.case import Values, in_words
 from dirax.sweeps.columns import Column, spread
+from dirax.sweeps.energy import energy_of, is_quick
 
 SAME = 1e-9
 """How far two ways may be from each other, relative to the size of the numbers."""
@@ -32,13 +33,15 @@ Mode = Literal["rows", "batch", "columns", "jax", "singles"]
 
 @dataclass(frozen=True, eq=False)
 class Keep:
-    """`function(sol)`, a dict of numbers and arrays of the Solution of one trajectory; `mode` is how it is called, `like` its
-    value for one trajectory, and `derived` the quantities that it asks for. Without a function the saved rows are kept."""
+    """`function(sol)`, a dict of numbers and arrays of the Solution of one trajectory. `mode` is how it is called, `like` its
+    value for one trajectory, `derived` the quantities that it asks for, and `quick` says that the energy is had by compiled code.
+    Without a function the saved rows are kept."""
 
     function: Callable | None
     mode: Mode = "rows"
     like: Any = None
     derived: tuple[str, ...] = ()
+    quick: bool = False
 
     @classmethod
     def of(cls, function: Any) -> "Keep":
@@ -53,6 +56,7 @@ class Keep:
             return self
         first = self._of_one(sol, 0, values)
         settled = replace(self, like=first, derived=self._asked_for(sol))
+        settled = replace(settled, quick="energy" in settled.derived and is_quick(sol))
         each = settled.at(sol, values)
         modes: tuple[Mode, ...] = ("batch", "columns", "jax")
         for mode in modes:
@@ -70,6 +74,8 @@ class Keep:
         if self.mode == "rows":
             return {name: np.asarray(array) for name, array in sol.fields.items()}
         size = sol.batch or 0
+        if self.quick:
+            sol.derived["energy"] = energy_of(sol)
         if self.mode == "singles":
             return self._stacked(sol, [self._of_one(sol, lane, values) for lane in range(size)], values)
         most = lanes_together(sol.rows)
