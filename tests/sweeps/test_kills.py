@@ -37,7 +37,7 @@ def marks(path):
     """How many tasks are done; the store opens at any moment."""
     if not path.exists():
         return 0
-    found = len(list(path.glob("status/c/*/*")))
+    found = len(list(path.glob("status/c.*")))
     assert xr.open_zarr(path, consolidated=None).sizes["angle"] == 20
     return found
 
@@ -45,7 +45,7 @@ def marks(path):
 def wait_for(path, process, count, patience=120.0):
     """Until so many tasks are done, or the process has ended."""
     end = time.monotonic() + patience
-    while process.poll() is None and (not path.exists() or len(list(path.glob("status/c/*/*"))) < count):
+    while process.poll() is None and (not path.exists() or len(list(path.glob("status/c.*"))) < count):
         assert time.monotonic() < end
         time.sleep(0.01)
 
@@ -54,8 +54,8 @@ def finished(path, uninterrupted):
     """The same call again: the bits and the files of an uninterrupted run."""
     marks(path)
     data = study(path, **LONG)
-    names = {name for name in files(path) if "/c/" not in name or name.split("/")[0] in ("g", "angle", "time")}
-    there = {name for name in uninterrupted[1] if "/c/" not in name or name.split("/")[0] in ("g", "angle", "time")}
+    names = {name for name in files(path) if "/c." not in name or name.split("/")[0] in ("g", "angle", "time")}
+    there = {name for name in uninterrupted[1] if "/c." not in name or name.split("/")[0] in ("g", "angle", "time")}
     assert same(data, uninterrupted[0]) and names == there and not list(path.parent.glob(".*"))
 
 

@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import os
-import shutil
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -46,20 +45,21 @@ def commit(folder: Path, layout: Layout, index: Index, blocks: Mapping[str, np.n
     """Write the blocks of a task, `status` last. Raises `StoreError`; the store is then as it was, or has some more of the
     numbers that belong there."""
     with writing(folder):
-        bench = folder / UNFINISHED / uuid.uuid4().hex
-        bench.mkdir(parents=True)
+        bench, own = folder / UNFINISHED, uuid.uuid4().hex
+        beside = {
+            name: bench / f"{own}-{name}" for name in layout.arrays if not _empty(folder, layout, name, index, blocks[name])
+        }
         try:
-            names = [name for name in layout.arrays if name != STATUS and not _empty(folder, layout, name, index, blocks[name])]
-            for name in (*names, STATUS):
-                flushed(bench / name, layout.encoded(name, blocks[name]))
-            touched = set()
-            for name in names:
-                touched.add(moved(bench / name, folder / layout.file(name, index)))
-            for place in touched:
-                flush_folder(place)
-            flush_folder(moved(bench / STATUS, folder / layout.file(STATUS, index)))
-        finally:
-            shutil.rmtree(bench, ignore_errors=True)
+            for name in beside.keys() - {STATUS}:
+                flushed(beside[name], layout.encoded(name, blocks[name]))
+                os.replace(beside[name], folder / layout.file(name, index))
+            # a file system with a journal has the names above on the disk when this file is
+            flushed(beside[STATUS], layout.encoded(STATUS, blocks[STATUS]))
+            os.replace(beside[STATUS], folder / layout.file(STATUS, index))
+        except BaseException:
+            for path in beside.values():
+                path.unlink(missing_ok=True)
+            raise
 
 
 def _empty(folder: Path, layout: Layout, name: str, index: Index, block: np.ndarray) -> bool:
@@ -74,16 +74,6 @@ def flushed(path: Path, data: bytes) -> None:
         while len(view):
             view = view[file.write(view) :]
         os.fsync(file.fileno())
-
-
-def moved(path: Path, place: Path) -> Path:
-    """Move a file to its place, and return the folder that it is in now."""
-    try:
-        os.replace(path, place)
-    except FileNotFoundError:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(path, place)
-    return place.parent
 
 
 def flush_folder(folder: Path) -> None:

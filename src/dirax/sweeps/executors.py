@@ -108,7 +108,7 @@ def _here(plan: Plan) -> Iterator[Place]:
     """Threads, of which each runs a batch of its own; for the xla engine one a device, on that device."""
     stop = threading.Event()
     devices = jax.local_devices() if plan.filled else []
-    count = len(devices) if plan.filled else thread_count()
+    count = len(devices) if plan.filled else thread_count() + 1  # one waits for the disk
     free = list(devices)
 
     def run(task: Task) -> Done:
@@ -128,7 +128,7 @@ def _here(plan: Plan) -> Iterator[Place]:
         pool.shutdown(wait=True, cancel_futures=True)
 
     try:
-        yield Place(lambda task: pool.submit(run, task), lambda: count + 1, end)
+        yield Place(lambda task: pool.submit(run, task), lambda: count, end)
     finally:
         end()
 

@@ -56,7 +56,7 @@ class Layout:
 
     def file(self, name: str, index: Index) -> Path:
         """Where a block of an array is, in the folder of the store."""
-        return Path(name, "c", *map(str, (*index, *(0 for _ in self.arrays[name].inner))))
+        return Path(name, ".".join(map(str, ("c", *index, *(0 for _ in self.arrays[name].inner)))))
 
     def blank(self, name: str) -> np.ndarray:
         """A block of an array to which nothing has been written."""
@@ -99,7 +99,7 @@ def _node(array: Array, shape: tuple[int, ...], chunk: tuple[int, ...], dims: tu
         "shape": list(shape),
         "data_type": array.dtype,
         "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [max(1, size) for size in chunk]}},
-        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "."}},
         "fill_value": "NaN" if fill != fill else bool(fill) if array.dtype == "bool" else fill,
         "codecs": [TEXTS if text else BYTES if np.dtype(array.dtype).itemsize == 1 else LITTLE],
         "attributes": array.about,

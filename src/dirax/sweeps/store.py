@@ -19,7 +19,7 @@ from dirax.solution.placing import checked_place, placed
 from dirax.solution.sweep_store import attributes_of, group_of
 from dirax.solution.zarr_store import is_store
 from dirax.sweeps.axes import Axes
-from dirax.sweeps.commit import UNFINISHED, flush_folder, flushed, moved, writing
+from dirax.sweeps.commit import UNFINISHED, flush_folder, flushed, writing
 from dirax.sweeps.grid import Grid, Index
 from dirax.sweeps.layout import OPEN, STATUS, TEXT, Array, Layout, decoded_texts, encoded_texts
 
@@ -44,10 +44,9 @@ def write_description(folder: Path, layout: Layout, axes: Mapping[str, tuple[Arr
         (folder / name).mkdir()
         flushed(folder / name / NODE, _json(node))
     for name, (array, values) in axes.items():
-        (folder / name / "c").mkdir()
         values = np.asarray(values)
         data = encoded_texts(values) if array.dtype == TEXT else np.ascontiguousarray(values, array.dtype).tobytes()
-        flushed(folder / name / "c" / "0", data)
+        flushed(folder / name / "c.0", data)
     consolidated = {"kind": "inline", "must_understand": False, "metadata": nodes}
     group = {"zarr_format": 3, "node_type": "group", "attributes": attributes, "consolidated_metadata": consolidated}
     flushed(folder / NODE, _json(group))
@@ -78,7 +77,7 @@ def axes_of(path: Path) -> Axes:
     nodes = group_of(path)["consolidated_metadata"]["metadata"]
     values = {}
     for name in json.loads(about["axes"]):
-        data = (path / name / "c" / "0").read_bytes()
+        data = (path / name / "c.0").read_bytes()
         kind = nodes[name]["data_type"]
         values[name] = (
             decoded_texts(data).astype(str)
@@ -133,8 +132,8 @@ def _locked(descriptor: int) -> bool:
 
 def _clear(folder: Path) -> None:
     for left in (folder / UNFINISHED).iterdir():
-        if left.is_dir():
-            shutil.rmtree(left, ignore_errors=True)
+        if left.name != LOCK:
+            left.unlink(missing_ok=True)
 
 
 def open_points(path: Path, layout: Layout) -> dict[Index, np.ndarray | None]:
@@ -181,7 +180,7 @@ def copy_points(old: Path, before: Layout, new: Path, after: Layout, places: tup
             block[np.ix_(*target)] = _gathered(old, before, name, mine)
             temporary = new / f"{name}-block"
             flushed(temporary, after.encoded(name, block))
-            moved(temporary, new / after.file(name, index))
+            os.replace(temporary, new / after.file(name, index))
 
 
 def _gathered(path: Path, layout: Layout, name: str, chosen: list[np.ndarray]) -> np.ndarray:
