@@ -31,7 +31,7 @@ ROOMS = (
     "cli",
 )
 RANK = {room: rank for rank, room in enumerate(ROOMS)}
-LOADED_ON_DEMAND = ("matplotlib", "xarray", "zarr", "h5netcdf", "h5py", "pandas", "typer", "rich", "cloudpickle", "distributed")
+LOADED_ON_DEMAND = ("matplotlib", "xarray", "zarr", "h5netcdf", "h5py", "pandas", "typer", "rich", "distributed")
 
 CIRCLES: tuple[set[str], ...] = ({"engines.native.engine", "engines.native.gradients.differentiate"},)
 """Circles of modules that are still to be opened; there are to be none."""

@@ -94,7 +94,7 @@ def _affine_root(interpreter: Interpreter, equation: Any, *operands: Nodes) -> l
     first = len(g)
     unknowns = np.array([g.input(f"u{first + k}") for k in range(root.size)], np.int64).reshape(root.shape)
     matrix = interpreter.run(slope, *captured, unknowns)[0]
-    if not isinstance(matrix, np.ndarray) or not set(unknowns.tolist()).isdisjoint(g.reachable(matrix.ravel().tolist())):
+    if not isinstance(matrix, np.ndarray) or np.any(np.isin(unknowns, g.reachable(matrix.ravel().tolist()))):
         raise Unsupported("is not affine in its unknowns")
     for _ in range(2):
         residual = interpreter.run(closed, *captured, root)[0]

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from dirax.solution.records import encode_scheme
+from dirax.solution.plain_forms import encode_scheme
 from dirax.sweeps.case import Case
 from dirax.sweeps.keep import Keep
 

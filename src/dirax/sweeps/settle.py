@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dirax.solution.placing import clear_leftovers
+from dirax.solution.atomic_files import clear_leftovers
 from dirax.solution.sweep_store import FORMAT, SWEEP, attributes_of
 from dirax.sweeps import fingerprint
 from dirax.sweeps.axes import Axes

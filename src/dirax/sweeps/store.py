@@ -15,7 +15,7 @@ try:
 except ImportError:  # Windows: nothing is locked
     fcntl = None
 
-from dirax.solution.placing import checked_place, placed
+from dirax.solution.atomic_files import checked_place, placed
 from dirax.solution.sweep_store import attributes_of, group_of
 from dirax.solution.zarr_store import is_store
 from dirax.sweeps.axes import Axes

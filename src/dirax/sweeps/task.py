@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from dirax.engines.native.lanes import at_most
-from dirax.run.failures import brief
+from dirax.run.failure_messages import brief
 from dirax.run.simulate import simulate
 from dirax.solution.solution import Solution
 from dirax.sweeps.case import Case, Values
