@@ -2,10 +2,17 @@
 
 import sys
 
-from benchmarks import batches, first_call, reduction, saving, xla_vs_c
+from benchmarks import batches, first_call, reduction, saving, sweep, xla_vs_c
 from benchmarks.harness import RESULTS
 
-BENCHMARKS = {"xla_vs_c": xla_vs_c, "saving": saving, "batches": batches, "first_call": first_call, "reduction": reduction}
+BENCHMARKS = {
+    "xla_vs_c": xla_vs_c,
+    "saving": saving,
+    "batches": batches,
+    "first_call": first_call,
+    "reduction": reduction,
+    "sweep": sweep,
+}
 
 
 def main(arguments: list[str]) -> int:

@@ -23,6 +23,7 @@ ROOMS = (
     "solution",
     "run",
     "diagnostics",
+    "sweeps",
     "show",
     "gallery",
     "public",
@@ -30,7 +31,7 @@ ROOMS = (
     "cli",
 )
 RANK = {room: rank for rank, room in enumerate(ROOMS)}
-LOADED_ON_DEMAND = ("matplotlib", "xarray", "zarr", "h5netcdf", "h5py", "pandas", "typer", "rich")
+LOADED_ON_DEMAND = ("matplotlib", "xarray", "zarr", "h5netcdf", "h5py", "pandas", "typer", "rich", "distributed")
 
 CIRCLES: tuple[set[str], ...] = ({"engines.native.engine", "engines.native.gradients.differentiate"},)
 """Circles of modules that are still to be opened; there are to be none."""

@@ -72,6 +72,7 @@ from dirax.show.report import report
 from dirax.solution.loading import load
 from dirax.solution.reconstruction import reconstruct
 from dirax.solution.solution import Solution
+from dirax.sweeps.sweep import sweep
 from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.dirac_system import DiracSystem
@@ -202,6 +203,7 @@ __all__ += [
     "load",
     "reconstruct",
     "simulate",
+    "sweep",
 ]
 # Measuring
 __all__ += [

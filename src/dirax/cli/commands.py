@@ -217,6 +217,41 @@ def bench(
 
 @app.command()
 @with_messages
+def sweep(
+    file: Annotated[
+        Path | None, typer.Argument(help="a Python file that defines what dx.sweep takes", show_default=False)
+    ] = None,
+    to: Annotated[Path | None, typer.Option(help="the store that is filled: PATH.zarr", show_default=False)] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="processes on this machine", show_default=False)] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="a scheduler of dask, tcp://HOST:PORT", show_default=False)
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="begin anew where a store exists")] = False,
+    status: Annotated[
+        Path | None,
+        typer.Option("--status", metavar="STORE", help="show how far a sweep is, and run nothing", show_default=False),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Run a study of many points into a store; the same command again goes on where it ended.
+
+    The file defines `system`, `over`, `case`, `step` and `steps`, and whatever else dx.sweep takes by these names: scheme,
+    save_every, keep, params, seed … The exit status is 1 where tasks were left open.
+    """
+    from dirax.cli.sweep import STATUS_HEADER, run_file, status_of, status_rows
+
+    found = status_of(status) if status is not None else run_file(file, to, workers, scheduler, overwrite)
+    if as_json:
+        show_json(found)
+    else:
+        rows = status_rows(found)
+        show_table(found["store"], STATUS_HEADER, rows, "\n".join(f"{name:10} {value}" for name, value in rows))
+    if status is None and found["not run"]:
+        raise typer.Exit(1)
+
+
+@app.command()
+@with_messages
 def cache(
     clear: Annotated[bool, typer.Option("--clear", help="remove all kernels")] = False,
     as_json: Json = False,

@@ -33,8 +33,8 @@ def with_messages(command: Callable) -> Callable:
         except REPORTED as error:
             typer.echo(f"dirax: {error}", err=True)
             raise typer.Exit(1) from error
-        except KeyboardInterrupt:
-            typer.echo("dirax: interrupted.", err=True)
+        except KeyboardInterrupt as end:
+            typer.echo(f"dirax: {end or 'interrupted.'}", err=True)
             raise typer.Exit(130) from None
 
     return run

@@ -36,16 +36,7 @@ def from_file(path: Path) -> Example:
 
     Raises `ValueError` where the file fails (with the line) or does not define them, `FileNotFoundError` without a file.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}: check the path, or give a name that `dirax list` shows.")
-    try:
-        found = runpy.run_path(str(path), run_name="dirax_file")
-    except SyntaxError as error:
-        raise ValueError(f"{path}, line {error.lineno}: {error.msg}.") from error
-    except Exception as error:
-        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename) == path]
-        where = f", line {lines[-1]}" if lines else ""
-        raise ValueError(f"{path}{where}: {type(error).__name__}: {error}") from error
+    found = namespace(path)
     _require(path, found, "system", AbstractSystem, "a dirax system such as dx.LagrangeDirac(…)")
     _require(path, found, "initial", Mapping, "a dict of initial data such as dict(q=[…], v=[…])")
     unknown = set(found["initial"]) - set(INITIAL)
@@ -69,6 +60,20 @@ def from_file(path: Path) -> Example:
         coordinates=(),
         scene=found.get("scene"),
     )
+
+
+def namespace(path: Path) -> dict[str, Any]:
+    """What a Python file defines. Raises `ValueError` where it fails, with the line, `FileNotFoundError` without a file."""
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}: check the path, or give a name that `dirax list` shows.")
+    try:
+        return runpy.run_path(str(path), run_name="dirax_file")
+    except SyntaxError as error:
+        raise ValueError(f"{path}, line {error.lineno}: {error.msg}.") from error
+    except Exception as error:
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename) == path]
+        where = f", line {lines[-1]}" if lines else ""
+        raise ValueError(f"{path}{where}: {type(error).__name__}: {error}") from error
 
 
 def _require(path: Path, found: dict[str, Any], name: str, kind: type, expected: str) -> None:

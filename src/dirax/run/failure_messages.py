@@ -1,14 +1,19 @@
 """Why a trajectory ended early, in words: which step, which equation, how near to singular."""
 
+from contextvars import ContextVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.contract import OK, Outcome, Problem
+from dirax.engines.contract import NOT_FINITE, OK, Outcome, Problem
 from dirax.engines.stopping import STALLED
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
 
 SMALLER = "a smaller step may help"
+
+brief: ContextVar[bool] = ContextVar("brief", default=False)
+"""Whether the failed step is not computed again to see where it breaks: of a million trajectories many may fail."""
 
 
 def explain(problem: Problem, outcome: Outcome, lane: int, kept: int | None = None) -> str:
@@ -22,8 +27,13 @@ def explain(problem: Problem, outcome: Outcome, lane: int, kept: int | None = No
     rows = f"kept up to step {p.first_step + kept} (t = {time_of(kept):.6g})"
     if int(outcome.status[lane]) == OK:
         return f"interrupted by the user; {rows}."
-    reason = _reason(p, outcome, lane, time_of(completed))
+    reason = _by_status(outcome, lane) if brief.get() else _reason(p, outcome, lane, time_of(completed))
     return f"step {p.first_step + completed + 1} (from t = {time_of(completed):.6g}) failed: {reason}; {rows}."
+
+
+def _by_status(outcome: Outcome, lane: int) -> str:
+    not_finite = int(outcome.status[lane]) == NOT_FINITE
+    return "the new state is not finite" if not_finite else "Newton's method did not converge"
 
 
 def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:

@@ -38,27 +38,27 @@ def placed(path: str | os.PathLike, overwrite: bool, replaceable: Callable[[Path
     """A path to write a file or a folder to, which is moved to `path` at the end of the block if nothing was raised.
 
     An older file stays as it was until then. What killed processes have left beside it is removed. Raises as
-    `checked_place` does.
+    `checked_place` does, and `OSError` for a folder that another process has put there meanwhile, unless `overwrite`.
     """
     path = Path(path)
     checked_place(path, overwrite, replaceable)
     workshop = path.parent / f".{path.stem[:40]}-{uuid.uuid4().hex}"
-    _sweep(path)
+    clear_leftovers(path)
     workshop.mkdir()
     lock = _locked(workshop)
     try:
         new = workshop / f"new{path.suffix}"
         yield new
-        _move_into_place(new, path, workshop / f"old{path.suffix}")
+        _move_into_place(new, path, workshop / f"old{path.suffix}", overwrite)
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
         if lock is not None:
             os.close(lock)
 
 
-def _move_into_place(new: Path, path: Path, old: Path) -> None:
+def _move_into_place(new: Path, path: Path, old: Path, overwrite: bool) -> None:
     """Files are replaced in one action; a folder is first moved aside, and back if its successor cannot be moved in."""
-    if not path.is_dir():
+    if not (path.is_dir() and overwrite):
         os.replace(new, path)
         return
     os.rename(path, old)
@@ -82,7 +82,7 @@ def _locked(folder: Path) -> int | None:
     return descriptor
 
 
-def _sweep(path: Path) -> None:
+def clear_leftovers(path: Path) -> None:
     """Remove what processes that were killed have left beside `path`; an older folder that was moved aside is put back."""
     for left in path.parent.glob(f".{escape(path.stem[:40])}-{'[0-9a-f]' * 32}"):
         with suppress(OSError):

@@ -16,6 +16,7 @@ from dirax.solution.plain_forms import decode_params, decode_scheme
 from dirax.solution.saving import MOVED, SEAL, checked_ending, checksum, seal
 from dirax.solution.solution import Solution
 from dirax.solution.stored import Stored, Unreadable, reading
+from dirax.solution.sweep_store import is_sweep, opened
 from dirax.solution.zarr_store import open_store
 
 MOST_ATTRIBUTE = 2**28
@@ -24,8 +25,8 @@ MOST_ATTRIBUTE = 2**28
 NOT_OURS = "its description is not one that dirax wrote"
 
 
-def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params: Any = None) -> Solution:
-    """The solution in a file that `Solution.save` wrote, bit for bit.
+def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params: Any = None) -> Any:
+    """The Solution in a file that `Solution.save` wrote, bit for bit; the `xarray.Dataset` of a store that `dx.sweep` fills.
 
     Code is not stored: `system` (and `scheme`, if it is not one of dirax with plain settings) supply it where it is needed,
     as for `dx.verify`; energies and constraint residuals are in the file. `params` replaces the stored parameters.
@@ -37,6 +38,8 @@ def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params
     ending = checked_ending(path)
     if not _exists(path):
         raise FileNotFoundError(f"there is no file {path}: check the path.")
+    if ending == ".zarr" and is_sweep(path):
+        return opened(path)
     try:
         sol = reading("it cannot be read, being damaged or incomplete", _read, path, ending, params)
     except Unreadable as error:

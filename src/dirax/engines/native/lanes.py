@@ -4,6 +4,7 @@ import itertools
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
 
 import numpy as np
 
@@ -25,8 +26,14 @@ def width_for(batch: int) -> int:
     return 1 if batch == 1 else next((w for w in (2, 4) if batch <= w <= widest), widest)
 
 
+at_most: ContextVar[int | None] = ContextVar("at_most", default=None)
+"""Threads for batches in this context, where several batches run side by side."""
+
+
 def thread_count() -> int:
-    """Threads for batches: DIRAX_THREADS, else the processors this process may use."""
+    """Threads for batches: as many as the context has, else DIRAX_THREADS, else the processors this process may use."""
+    if (most := at_most.get()) is not None:
+        return most
     chosen = os.environ.get("DIRAX_THREADS", "")
     if chosen.isdigit() and int(chosen) > 0:
         return int(chosen)

@@ -1,0 +1,116 @@
+"""The energy at every row of a batch by compiled code: a velocity that belongs to a momentum takes a decomposition of a matrix in
+NumPy, which for some rows would take longer than the steps between them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+import dirax.program.rules  # noqa: F401  (registers the rules)
+from dirax.engines.native import compile as llvm
+from dirax.engines.native.ir.compiled_function import compiled
+from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.interpreter import Interpreter, Nodes, Unsupported, UnsupportedPrimitive
+from dirax.program.memo import Memo, Same
+from dirax.program.rules.linear_algebra import solve_blocks
+from dirax.program.scalar_program import ScalarProgram
+from dirax.program.tracing import jacobian, of_one_result
+from dirax.solution.solution import Solution
+
+SAME = 1e-9
+"""How far it may be from `Solution.energy`, relative to the size of the energy."""
+
+
+def energy_of(sol: Solution) -> np.ndarray:
+    """`sol.energy()` (B, rows) of a batch: by compiled code, and as it is where that has no answer."""
+    made = _compiled(sol)
+    if made is None:
+        return np.asarray(sol.energy())
+    found = made(sol)
+    nodes = [np.asarray(a).reshape(*found.shape, -1) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
+    there = np.all(np.isfinite(np.concatenate(nodes, axis=-1)), axis=-1)
+    lost = np.flatnonzero(np.any(there & ~np.isfinite(found), axis=1))
+    if len(lost):  # where a matrix is singular
+        found[lost] = sol[lost].energy()
+    return found
+
+
+def is_quick(sol: Solution) -> bool:
+    """Whether the compiled code gives the energy of these trajectories."""
+    try:
+        made = _compiled(sol)
+        return made is not None and bool(np.allclose(made(sol), sol.energy(), rtol=SAME, atol=SAME, equal_nan=True))
+    except (ImportError, OSError, RuntimeError):
+        return False
+
+
+_functions: Memo[Callable | None] = Memo(16)
+
+
+def _compiled(sol: Solution) -> Callable[[Solution], np.ndarray] | None:
+    """The energies (B, rows) of a batch of solutions like this one; None where their system has no scalar program."""
+    names = tuple(k for k in sol.fields if sol.field_info[k].place == "node")
+    leaves, structure = jax.tree.flatten(sol.params)
+    shapes = tuple(np.shape(leaf)[1:] if sol.batch_params else np.shape(leaf) for leaf in leaves)
+    kinds = tuple(np.asarray(leaf).dtype for leaf in leaves)
+    if any(kind.kind not in "fiub" for kind in kinds):
+        return None
+    key = Same(sol.system), names, structure, shapes, tuple(kind.str for kind in kinds)
+
+    def make() -> Callable | None:
+        row = [jax.ShapeDtypeStruct(sol.field_info[name].shape, np.float64) for name in names]
+        given = [*row, jax.ShapeDtypeStruct((), np.float64), *map(jax.ShapeDtypeStruct, shapes, kinds)]
+
+        def one(*values: Any) -> Any:
+            fields = dict(zip((*names, "t"), values, strict=False))
+            return sol.system.energy_at(fields, jax.tree.unflatten(structure, values[len(names) + 1 :]))
+
+        return _function(one, given)
+
+    run = _functions.get(key, make)
+    return None if run is None else lambda sol: _run(run, sol, names)
+
+
+def _function(one: Callable, given: list[Any]) -> Callable | None:
+    """A compiled function (numbers, entries) → (1, entries); None where there is none."""
+    closed = jax.make_jaxpr(one)(*given)
+    made = ScalarProgram(Graph(NODE_LIMIT), [])
+    made.inputs = [made.fresh(kind.shape) for kind in given]
+    try:
+        made.run(closed, {"dirax_root": _affine_root})
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return None
+    inputs = [node for nodes in made.inputs for node in nodes.ravel().tolist()]
+    return compiled(made.graph, inputs, made.results[0].ravel().tolist(), llvm.vector_width())
+
+
+def _affine_root(interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
+    """The root of equations that are affine in their unknowns, such as p = ∂L/∂v for a kinetic energy: by one elimination, and
+    once more for what rounding left."""
+    closed, g = equation.params["residual"], interpreter.graph
+    *captured, root = operands
+    slope = jax.make_jaxpr(jacobian(of_one_result(closed), len(captured)))(*closed.in_avals)
+    first = len(g)
+    unknowns = np.array([g.input(f"u{first + k}") for k in range(root.size)], np.int64).reshape(root.shape)
+    matrix = interpreter.run(slope, *captured, unknowns)[0]
+    if not isinstance(matrix, np.ndarray) or np.any(np.isin(unknowns, g.reachable(matrix.ravel().tolist()))):
+        raise Unsupported("is not affine in its unknowns")
+    for _ in range(2):
+        residual = interpreter.run(closed, *captured, root)[0]
+        change = solve_blocks(g, matrix, residual[:, None])[:, 0]
+        root = np.array([g.sub(a, b) for a, b in zip(root.tolist(), change.tolist(), strict=True)], np.int64)
+    return [root]
+
+
+def _run(run: Callable, sol: Solution, names: tuple[str, ...]) -> np.ndarray:
+    lanes, rows = sol.batch or 0, sol.rows
+    columns = [np.asarray(sol.fields[name]).reshape(lanes * rows, -1).T for name in names]
+    columns.append(np.tile(np.asarray(sol.t), lanes)[None])
+    for leaf in jax.tree.leaves(sol.params):
+        values = np.asarray(leaf, dtype=np.float64)
+        if sol.batch_params:
+            columns.append(np.repeat(values.reshape(lanes, -1), rows, axis=0).T)
+        else:
+            columns.append(np.broadcast_to(values.reshape(-1, 1), (values.size, lanes * rows)))
+    return run(np.concatenate(columns)).reshape(lanes, rows)

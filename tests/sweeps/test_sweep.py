@@ -1,0 +1,441 @@
+"""Sweeps: the same bits as single runs, gone on with, grown, refused; what is wrong at a point is said with the point."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+import dirax as dx
+from dirax.sweeps import commit, executors, store, task
+from dirax.sweeps.case import Case
+from dirax.sweeps.grid import cut
+from dirax.sweeps.layout import decoded_texts, encoded_texts
+from swept_pendulums import OVER, SYSTEM, case, files, same, single, study
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """The finished study, and where it is."""
+    path = tmp_path_factory.mktemp("done") / "study.zarr"
+    return study(path), path
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """The numbers of trajectories of the tasks that are run."""
+    found = []
+
+    def counting(plan, given, stopping=None):
+        found.append(given.points)
+        return task.run_task(plan, given, stopping)
+
+    monkeypatch.setattr(executors, "run_task", counting)
+    return found
+
+
+# ------------------------------------------------------------------ what comes out
+
+
+def test_every_point_has_the_bits_of_a_run_by_itself(done):
+    data, _ = done
+    assert dict(data.sizes) == {"g": 12, "angle": 20, "time": 5, "coordinate": 2}
+    for i, j in ((0, 0), (5, 7), (11, 19), (3, 18)):
+        sol = single(OVER["g"][i], OVER["angle"][j])
+        assert np.array_equal(data.q.values[i, j], sol.q) and np.array_equal(data.p.values[i, j], sol.p)
+        assert np.array_equal(data.time.values, sol.t)
+    assert np.all(data.status == 1) and not np.any(data.message.values != "")
+    assert np.array_equal(data.g, OVER["g"]) and np.array_equal(data.angle, OVER["angle"])
+    assert data.attrs["scheme"] == repr(dx.LagrangeDAlembert()) and data.attrs["step"] == 0.01
+
+
+def test_any_zarr_library_opens_the_store_and_so_does_load(done):
+    data, path = done
+    assert same(data, xr.open_zarr(path, consolidated=None)) and same(data, dx.load(path))
+    assert ".unfinished" not in {name.split("/")[0] for name in files(path)}
+
+
+@pytest.mark.parametrize("changes", [{"task_seconds": 1e-6}, {"task_seconds": 10.0}, {"executor": ThreadPoolExecutor(2)}])
+def test_bits_do_not_depend_on_the_size_of_tasks_or_where_they_run(done, tmp_path, changes):
+    assert same(done[0], study(tmp_path / "other.zarr", **changes))
+
+
+def test_processes_give_the_same_bits_and_a_pool_that_would_fork_is_not_used(done, tmp_path):
+    assert same(done[0], study(tmp_path / "two.zarr", executor=2))
+    with ProcessPoolExecutor(1) as pool:
+        assert same(done[0], study(tmp_path / "pool.zarr", executor=pool))
+        assert not pool._processes
+
+
+def test_units_and_names_of_coordinates(tmp_path):
+    units = {"angle": "rad", "q": ["rad", "rad"], "t": "s"}
+    data = study(tmp_path / "units.zarr", {"g": [1.0], "angle": [0.1, 0.2]}, units=units, coordinates=["θ1", "θ2"])
+    assert data.angle.attrs["units"] == "rad" and data.q.attrs["units"] == "rad" and data.time.attrs["units"] == "s"
+    assert data.coordinate.values.tolist() == ["θ1", "θ2"]
+
+
+def test_axes_side_by_side(tmp_path):
+    data = study(tmp_path / "pairs.zarr", {"g": [0.5, 1.0, 2.0], "angle": [1.0, 2.0, 3.0]}, zip=True)
+    assert data.q.dims == ("point", "time", "coordinate") and data.angle.dims == ("point",)
+    assert np.array_equal(data.q.values[1], single(1.0, 2.0).q)
+
+
+def test_a_system_of_the_xla_engine_one_batch_a_device(tmp_path):
+    over = {"g": OVER["g"][:3], "angle": OVER["angle"][:3]}
+    data = study(tmp_path / "xla.zarr", over, engine="xla", steps=20)
+    one = single(over["g"][1], over["angle"][2], steps=20, engine="xla")
+    assert (
+        np.allclose(data.q.values[1, 2, -1], one.q[-1], rtol=1e-12, atol=1e-14)
+        and json.loads(data.fingerprint)["engine"] == "xla"
+    )
+
+
+TWO_DEVICES = """
+import sys, jax, numpy as np
+from pathlib import Path
+sys.path.insert(0, {folder!r})
+from swept_pendulums import study, SYSTEM
+from dirax.sweeps import executors
+import dirax.sweeps.arrange as arrange
+arrange.DEVICE_BATCH = 8
+used = set()
+plain = executors.run_task
+def noting(*given):
+    used.add(jax.config.jax_default_device)
+    return plain(*given)
+executors.run_task = noting
+data = study({path!r}, engine="xla", steps=20, task_seconds=1e-6)
+print(len(jax.local_devices()), len(used), bool((data.status == 1).all()))
+"""
+
+
+def test_on_two_devices_a_task_runs_on_one_of_them(tmp_path):
+    environment = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"}
+    program = TWO_DEVICES.format(folder=str(Path(__file__).parents[1]), path=str(tmp_path / "two.zarr"))
+    ended = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert ended.stdout.split() == ["2", "2", "True"], ended.stderr
+
+
+# ------------------------------------------------------------------ going on, growing
+
+
+def test_the_same_call_again_runs_what_is_missing(done, tmp_path, ran):
+    path = tmp_path / "study.zarr"
+    study(path)
+    first = sum(ran)
+    study(path)
+    assert first == sum(ran) == 240
+    removed = sorted(path.glob("status/c.*"))[0]
+    removed.unlink()
+    assert np.sum(xr.open_zarr(path).status == 0) > 0
+    assert same(study(path), done[0]) and first < sum(ran) < 2 * first
+
+
+def test_more_points_are_added_and_those_that_are_there_not_run_again(done, tmp_path, ran):
+    path = tmp_path / "study.zarr"
+    study(path, {"g": OVER["g"][::2], "angle": OVER["angle"][1::3]})
+    there = sum(ran)
+    assert same(study(path), done[0])
+    assert sum(ran) == 240 and there == 6 * 7
+    with pytest.raises(ValueError, match="leave out none"):
+        study(path, {"g": OVER["g"][:3], "angle": OVER["angle"]})
+
+
+def test_more_points_side_by_side(tmp_path, ran):
+    path = tmp_path / "pairs.zarr"
+    study(path, {"g": OVER["g"][:3], "angle": OVER["angle"][:3]}, zip=True)
+    data = study(path, {"g": OVER["g"][4::-1], "angle": OVER["angle"][4::-1]}, zip=True)
+    assert sum(ran) == 5 and np.array_equal(data.q.values[1], single(OVER["g"][3], OVER["angle"][3]).q)
+
+
+def test_the_store_of_another_sweep_is_refused_with_what_differs(done):
+    _, path = done
+    before = {name: (path / name).read_bytes() for name in files(path)}
+    other = lambda g, angle: {"q": [angle, 0.1], "v": [0.0, 0.0], "params": {"g": g}}
+    with pytest.raises(ValueError, match=r"differs in step \(0\.01 there, 0\.02 here\).*another path"):
+        study(path, step=0.02)
+    with pytest.raises(ValueError, match=r"differs in case \(scalars"):
+        study(path, case=other)
+    with pytest.raises(ValueError, match="differs in keep"):
+        study(path, keep=lambda sol: {"end": sol.q[-1]})
+    assert before == {name: (path / name).read_bytes() for name in files(path)}
+    renamed = lambda g, angle: dict(v=[0.0, 0.0], q=[1.0 * angle, 0.0], params={"g": g})
+    assert renamed(1.0, 2.0) == case(1.0, 2.0)
+
+
+def test_a_later_dirax_and_other_stores_are_refused(done, tmp_path):
+    path = tmp_path / "study.zarr"
+    study(path, {"g": [1.0], "angle": [0.5]})
+    node = json.loads((path / "zarr.json").read_text())
+    for change in ({"dirax_version": "99.1.0"}, {"dirax_sweep_format": 99, "dirax_version": "99.1.0"}):
+        (path / "zarr.json").write_text(json.dumps(node | {"attributes": node["attributes"] | change}))
+        with pytest.raises(ValueError, match=r"later dirax \(99\.1\.0"):
+            study(path, {"g": [1.0], "angle": [0.5]})
+    with pytest.raises(ValueError, match="later dirax"):
+        dx.load(path)
+    single(1.0, 0.5).save(tmp_path / "one.zarr")
+    with pytest.raises(ValueError, match="not the store of a sweep"):
+        study(tmp_path / "one.zarr")
+    with pytest.raises(ValueError, match=r"ends in \.zarr"):
+        study(tmp_path / "study.nc")
+    assert np.all(study(path, {"g": [1.0], "angle": [0.5]}, overwrite=True).status == 1)
+
+
+def test_one_caller_at_a_time(done):
+    _, path = done
+    hold = store.Hold()
+    assert hold.take(path)
+    try:
+        with pytest.raises(OSError, match="another call is filling the store"):
+            study(path)
+    finally:
+        hold.release(path)
+    assert same(study(path), done[0])
+
+
+# ------------------------------------------------------------------ disks
+
+
+def test_a_full_disk_is_one_error_and_the_same_call_goes_on(done, tmp_path, monkeypatch):
+    path, calls, real = tmp_path / "study.zarr", [], os.fsync
+
+    def full(descriptor):
+        calls.append(descriptor)
+        if len(calls) > 25:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(descriptor)
+
+    monkeypatch.setattr(commit.os, "fsync", full)
+    with pytest.raises(OSError, match=r"no space left for it.*same call again goes on \(.* of 240 points done") as raised:
+        study(path)
+    assert raised.value.errno == errno.ENOSPC
+    monkeypatch.setattr(commit.os, "fsync", real)
+    assert not any("unfinished" in name for name in files(path))
+    assert same(study(path), done[0])
+
+
+def test_a_study_larger_than_the_disk_is_refused_before_it_begins(tmp_path):
+    with pytest.raises(OSError, match="GiB of the disk are free"):
+        study(
+            tmp_path / "huge.zarr", {"g": np.linspace(1, 2, 10**5), "angle": np.linspace(0, 3, 10**6)}, steps=10_000, save_every=1
+        )
+
+
+def test_a_store_that_cannot_be_written_is_one_error(tmp_path, monkeypatch):
+    path = tmp_path / "study.zarr"
+    study(path, {"g": [1.0], "angle": [0.5]})
+
+    def refusing(*_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(store.Path, "mkdir", refusing)
+    with pytest.raises(OSError, match=r"cannot be written .*ead-only"):
+        study(path, {"g": [1.0], "angle": [0.5]})
+
+
+# ------------------------------------------------------------------ case
+
+
+def by_numpy(g, angle):
+    return {"q": np.array([angle, 0.0]), "v": np.zeros(2), "params": {"g": np.abs(-g)}}
+
+
+def by_jax(g, angle):
+    return {"q": jnp.array([angle, 0.0]), "v": jnp.zeros(2), "params": {"g": jnp.abs(g)}}
+
+
+def by_python(g, angle):
+    return {"q": [float(angle), 0.0 if angle < 9 else 1.0], "v": [0.0, 0.0], "params": {"g": float(g)}}
+
+
+@pytest.mark.parametrize(
+    ("function", "mode"), [(case, "scalars"), (by_numpy, "columns"), (by_jax, "scalars"), (by_python, "points")]
+)
+def test_ways_to_write_case_have_one_result(function, mode):
+    values = {"g": np.linspace(0.5, 2.0, 50), "angle": np.linspace(0.0, 3.0, 50)}
+    few = {name: axis[::10] for name, axis in values.items()}
+    chosen = Case.of(function, tuple(values), 0).chosen(few)
+    assert chosen.mode == mode
+    data, params = chosen.at(values)
+    assert np.array_equal(data["q"], np.stack([values["angle"], np.zeros(50)], axis=1)) and np.array_equal(
+        params["g"], values["g"]
+    )
+
+
+def test_a_wrong_case_names_the_point(tmp_path):
+    at = r"g = 1\.[0-9]+, angle = 2\.[0-9]+"
+    wrong = lambda g, angle: (g > 1.0) & (g < 2.0) & (angle > 2.0) & (angle < 3.0)
+
+    def fails(g, angle):
+        if wrong(g, angle):
+            raise RuntimeError("no such pendulum")
+        return case(g, angle)
+
+    grown = lambda g, angle: {"q": [angle, 0.0], "v": [0.0] * (3 if wrong(g, angle) else 2), "params": {"g": g}}
+    undefined = lambda g, angle: {"q": [jnp.where(wrong(g, angle), jnp.nan, angle), 0.0], "v": [0.0, 0.0], "params": {"g": g}}
+    for function, text in ((fails, "no such pendulum"), (grown, r"shape \(3,\)"), (undefined, "finite")):
+        with pytest.raises(ValueError, match=text) as raised:
+            study(tmp_path / "wrong.zarr", case=function)
+        assert raised.match(at)
+    for function, text in (
+        (lambda g, angle: [angle], "must return a dict"),
+        (lambda g, angle: {"angle": [angle]}, "may return q, v"),
+        (lambda g, angle: {"q": [[angle]], "v": [0.0]}, "a row of real numbers"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            study(tmp_path / "wrong.zarr", case=function)
+    with pytest.raises(TypeError, match="case takes mass, but the axes in over are g, angle"):
+        study(tmp_path / "wrong.zarr", case=lambda mass: {})
+    assert not (tmp_path / "wrong.zarr").exists()
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda sample, rng: {"q": rng.normal(size=2), "v": [0.0, 0.0], "params": {"g": 1.0}},
+        lambda sample, key: {"q": jax.random.normal(key, (2,)), "v": [0.0, 0.0], "params": {"g": 1.0}},
+    ],
+)
+def test_random_numbers_belong_to_the_point(tmp_path, function):
+    some = study(tmp_path / "some.zarr", {"sample": range(0, 40, 3)}, case=function, steps=5)
+    more = study(tmp_path / "more.zarr", {"sample": range(40)}, case=function, steps=5, task_seconds=1.0)
+    assert np.array_equal(some.q.values, more.q.values[::3]) and len(np.unique(more.q.values[:, 0, 0])) == 40
+    other = study(tmp_path / "seed.zarr", {"sample": range(40)}, case=function, steps=5, seed=1)
+    assert not np.any(other.q.values[:, 0] == more.q.values[:, 0])
+
+
+def test_random_numbers_of_ones_own_are_refused(tmp_path):
+    generator = np.random.default_rng(0)
+    with pytest.raises(ValueError, match="let it take an argument rng"):
+        study(tmp_path / "own.zarr", case=lambda g, angle: {"q": generator.normal(size=2), "v": [0.0, 0.0], "params": {"g": g}})
+
+
+# ------------------------------------------------------------------ keep
+
+
+@pytest.mark.parametrize(
+    "keep",
+    [
+        lambda sol: {"end": sol.q[-1], "error": np.max(np.abs(sol.energy() - sol.energy()[0]))},
+        lambda sol: {"end": sol.q[-1], "error": jnp.max(jnp.abs(sol.energy() - sol.energy()[0]))},
+        lambda sol: {"end": sol.q[..., -1, :], "error": np.abs(sol.energy() - sol.energy()[..., :1]).max(axis=-1)},
+        lambda sol: {"end": [float(x) for x in sol.q[-1]], "error": float(max(abs(sol.energy() - sol.energy()[0])))},
+    ],
+)
+def test_ways_to_write_keep_have_one_result(done, tmp_path, keep):
+    over = {"g": OVER["g"][:3], "angle": OVER["angle"]}
+    data = study(tmp_path / "kept.zarr", over, keep=keep)
+    assert set(data.data_vars) == {"end", "error", "message", "status"} and "time" not in data.coords
+    assert np.array_equal(data.end.values, done[0].q.values[:3, :, -1])
+    sol = single(over["g"][2], over["angle"][11])
+    assert np.isclose(data.error.values[2, 11], np.abs(sol.energy() - sol.energy()[0]).max(), rtol=1e-6, atol=1e-15)
+
+
+def test_a_wrong_keep_is_one_error(tmp_path):
+    with pytest.raises(ValueError, match=r"keep fails for the trajectory at g = 0\.5, angle = 0\.0: KeyError"):
+        study(tmp_path / "wrong.zarr", keep=lambda sol: {"x": sol.fields["x"]})
+    with pytest.raises(ValueError, match="keep must return a dict"):
+        study(tmp_path / "wrong.zarr", keep=lambda sol: sol.q)
+    with pytest.raises(ValueError, match="'g' is the name of an axis and of what is kept"):
+        study(tmp_path / "wrong.zarr", keep=lambda sol: {"g": sol.q[-1]})
+
+
+# ------------------------------------------------------------------ points that fail
+
+FALLING = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sqrt(q[0]) - 2 * q[0])
+
+
+def test_trajectories_that_fail_are_nan_from_there_on_and_others_unchanged(tmp_path):
+    heights = np.array([0.1, 3.0, -1.0, 4.0])  # falls out of the domain, stays, begins outside, stays
+    data = dx.sweep(
+        FALLING,
+        dx.PlusLagrangeDirac(),
+        over={"height": heights},
+        case=lambda height: {"q": [height], "v": [-1.0]},
+        step=0.01,
+        steps=40,
+        save_every=5,
+        to=tmp_path / "falling.zarr",
+    )
+    assert data.status.values.tolist() == [2, 1, 3, 1]
+    alone = dx.simulate(FALLING, dx.PlusLagrangeDirac(), q=[0.1], v=[-1.0], step=0.01, steps=40, save_every=5)
+    rows = np.sum(~np.isnan(data.q.values[0, :, 0]))
+    assert 0 < rows < 9 and np.array_equal(data.q.values[0, :rows, 0], alone.q[:rows, 0])
+    assert "failed: " in data.message.values[0] and "domain" in data.message.values[2] and not data.message.values[1]
+    assert np.all(np.isnan(data.q.values[2])) and np.all(np.isfinite(data.q.values[[1, 3]]))
+
+
+def test_a_study_that_is_refused_everywhere_says_so(tmp_path):
+    with pytest.raises(ValueError, match=r"all points that were tried are refused.*height = -1\.0"):
+        dx.sweep(
+            FALLING,
+            dx.PlusLagrangeDirac(),
+            over={"height": [-3.0, -1.0]},
+            case=lambda height: {"q": [height], "v": [-1.0]},
+            step=0.01,
+            steps=10,
+            to=tmp_path / "none.zarr",
+        )
+
+
+# ------------------------------------------------------------------ parts
+
+
+def test_wrong_axes_name_the_axis(tmp_path):
+    for over, error, text in (
+        ([1.0], TypeError, "over must be a dict"),
+        ({"g": [1.0, np.nan]}, ValueError, r"over\['g'\] must be finite"),
+        ({"g": [[1.0]]}, ValueError, "a row of numbers"),
+        ({"g": [1.0, 2.0, 1.0]}, ValueError, "the value 1.0 of g twice"),
+        ({"time": [1.0]}, ValueError, "names an axis 'time'"),
+    ):
+        with pytest.raises(error, match=text):
+            study(tmp_path / "wrong.zarr", over)
+    with pytest.raises(ValueError, match="g has 2, angle has 1"):
+        study(tmp_path / "wrong.zarr", {"g": [1.0, 2.0], "angle": [1.0]}, zip=True)
+    with pytest.raises(TypeError, match="executor must be"):
+        study(tmp_path / "wrong.zarr", executor="cluster")
+
+
+@pytest.mark.parametrize(("shape", "points"), [((7,), 3), ((5, 6, 7), 20), ((5, 6, 7), 1), ((3, 4), 100), ((1, 9), 4)])
+def test_blocks_cover_the_grid_once(shape, points):
+    grid = cut(shape, points)
+    numbers = np.concatenate([grid.numbers(index).ravel() for index in grid])
+    assert sorted(numbers.tolist()) == list(range(int(np.prod(shape)))) and grid.points <= max(points, 1)
+
+
+def test_texts_in_a_store():
+    texts = np.array(["", "θ = 1", "a\nb"], object)
+    assert decoded_texts(encoded_texts(texts)).tolist() == texts.tolist()
+
+
+def test_texts_as_an_axis(tmp_path):
+    signs = {"left": -1.0, "right": 1.0}
+    start = lambda side: {"q": [signs[side], 0.0], "v": [0.0, 0.0], "params": {"g": 1.0}}
+    data = study(tmp_path / "sides.zarr", {"side": ["left", "right"]}, case=start)
+    assert np.array_equal(data.sel(side="right").q.values, single(1.0, 1.0).q) and data.side.values.tolist() == ["left", "right"]
+
+
+def test_the_system_is_read_by_its_program(tmp_path):
+    from dirax.sweeps import fingerprint
+
+    a = lambda q, g: g * jnp.sin(q) + 1.0
+    b = lambda position, field: field * jnp.sin(position) + 1.0
+    c = lambda q, g: g * jnp.sin(q) + 2.0
+    kinds = (jax.ShapeDtypeStruct((2,), np.float64), 1.0)
+    of = lambda f: fingerprint.of_functions([(f, kinds)])
+    assert of(a) == of(b) != of(c)
+    table = np.arange(3.0)
+    assert fingerprint.of_code(lambda x: table + x) == fingerprint.of_code(lambda x: table + x)
+    first = fingerprint.of_code(lambda x: table + x)
+    table = np.arange(4.0)
+    assert first != fingerprint.of_code(lambda x: table + x)
+    assert SYSTEM is not None
