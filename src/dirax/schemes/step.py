@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from dirax.program.memo import Memo
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
 from dirax.schemes.layout import Layout
-from dirax.schemes.stage_relation import StageRelation
+from dirax.schemes.stage_relation import MeanRelation, StageRelation
 from dirax.schemes.step_forms import form_of_steps
 from dirax.systems.shape import Shape
 from dirax.text.representation import counted, fields_html, module_html, module_text
@@ -68,7 +68,7 @@ class StepEquation(eqx.Module):
       does not hold;
     - `guess(state, previous, h, params) -> u`: where Newton's method starts, if that is not `previous` (k,), the unknowns
       extrapolated from the steps before;
-    - `collocation`, the stage relation of which the unknowns are copies: a fact that engines may use or ignore.
+    - `collocation`, the stage relation or mean relation of which the unknowns are copies: a fact that engines may use or ignore.
 
     Equations are compared by the identity of their functions. One with other functions is made by `dataclasses.replace`.
     Raises `ValueError` where sizes, layouts and labels do not fit.
@@ -87,7 +87,7 @@ class StepEquation(eqx.Module):
     guess: Callable = eqx.field(static=True)
     state_layout: Layout = eqx.field(static=True)
     unknown_layout: Layout = eqx.field(static=True)
-    collocation: StageRelation | None = eqx.field(static=True)
+    collocation: StageRelation | MeanRelation | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class StepEquation(eqx.Module):
         canonical: bool = False,
         check: Callable | None = None,
         guess: Callable | None = None,
-        collocation: StageRelation | None = None,
+        collocation: StageRelation | MeanRelation | None = None,
     ):
         self.start, self.residual, self.advance, self.unpack = start, residual, advance, unpack
         self.fields, self.canonical = dict(fields), canonical

@@ -7,13 +7,13 @@ from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.collocation_nodes import Nodes
-from dirax.engines.native.loops.collocation_plan import CollocationPlan
-from dirax.engines.native.loops.collocation_sweeps import FirstOrder, SecondOrder
+from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
+from dirax.engines.native.loops.collocation_sweeps import FirstOrder, Means, SecondOrder, Sweep
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
 from dirax.engines.stopping import EPSILON, STALLED
 
 
-def collocation_module(plan: CollocationPlan, fma: bool) -> str:
+def collocation_module(plan: CollocationPlan | MeanPlan, fma: bool) -> str:
     """IR of `run(lanes, params, outs, blocks, …)`: one trajectory a block."""
     module = Module(fma)
     add_far_reduction(module)
@@ -25,7 +25,7 @@ def collocation_module(plan: CollocationPlan, fma: bool) -> str:
 class _Kernel:
     """Emits `block`: the steps of one trajectory."""
 
-    def __init__(self, plan: CollocationPlan, module: Module):
+    def __init__(self, plan: CollocationPlan | MeanPlan, module: Module):
         self.plan, self.body = plan, Body(module)
         self.nodes = Nodes(plan, self.body)
         self.one, self.all = self.nodes.one, self.nodes.all
@@ -111,16 +111,21 @@ class _Kernel:
             here.bind(node, value)
         with b.when(saves):
             self._save(here, number)
-        kind = FirstOrder if plan.gain is None else SecondOrder
+        kind = Means if isinstance(plan, MeanPlan) else FirstOrder if plan.gain is None else SecondOrder
         sweep = kind(self.nodes, here, state, time)
         converged, size, count = self._attempts(sweep, one.compare("ogt", done, one.const(0.0)))
-        increments = sweep.increments([b.load(self.all.real, pointer, 64) for pointer in self.iterates])
+        iterates = [b.load(self.all.real, pointer, 64) for pointer in self.iterates]
+        increments = sweep.increments(iterates)
         new, lost = [], []
         finite = one.true
         for old, pointer, increment in zip(state, self.lost, increments, strict=True):
             total, error = one.two_sum(old, one.add(increment, b.load("double", pointer)))
             new.append(total)
             lost.append(error)
+        for i, more in enumerate(sweep.settled(iterates, new)):
+            new[i], error = one.two_sum(new[i], more)
+            lost[i] = one.add(lost[i], error)
+        for total in new:
             finite = one.both(finite, one.compare("olt", one.abs(total), one.const(float("inf"))))
         good = one.both(finite, converged)
         failure = one.select(finite, one.const(float(NOT_CONVERGED)), one.const(float(NOT_FINITE)))
@@ -132,7 +137,7 @@ class _Kernel:
             b.store("double", one.add(done, one.const(1.0)), self.completed)
             b.store("double", one.max(size, b.load("double", self.worst)), self.worst)
 
-    def _attempts(self, sweep: FirstOrder | SecondOrder, later: str) -> tuple[str, str, str]:
+    def _attempts(self, sweep: Sweep, later: str) -> tuple[str, str, str]:
         """The iteration from the polynomial of the step before, where that fails from constants: (converged, the largest last
         change, sweeps)."""
         b, e = self.body, self.all
@@ -151,7 +156,7 @@ class _Kernel:
         count = b.put(f"sitofp i64 {b.load('i64', sweeps)} to double")
         return b.load("i1", converged, 1), largest, count
 
-    def _iterate(self, sweep: FirstOrder | SecondOrder, change: str, sweeps: str) -> str:
+    def _iterate(self, sweep: Sweep, change: str, sweeps: str) -> str:
         """Sweeps until the next change of every entry of an iterate is below its roundoff, or no smaller than a change before;
         whether that is a root."""
         b, e = self.body, self.all

@@ -1,10 +1,11 @@
-"""The two fixed-point iterations of a collocation step in IR: for the rates at the nodes, or for the accelerations."""
+"""The fixed-point iterations of a collocation step in IR: for the rates at the nodes, for the accelerations, or by means."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+from dirax.engines.native.ir.emitter import Emitter
 from dirax.engines.native.ir.lower import Region
-from dirax.engines.native.loops.collocation_nodes import Nodes
+from dirax.engines.native.loops.collocation_nodes import Nodes, lanes_for
 
 
 @dataclass
@@ -48,6 +49,18 @@ class Sweep(ABC):
             out.append(choose(later, choose(first, k.product(k.extrapolation, vector), constant), start))
         return out
 
+    @abstractmethod
+    def sweep(self, old: list[str]) -> tuple[list[str], str]:
+        """The iterates after one more sweep, and whether it was stable, node by node."""
+
+    @abstractmethod
+    def increments(self, iterates: list[str]) -> list[str]:
+        """What the step adds to the state by sums over the nodes."""
+
+    def settled(self, iterates: list[str], after: list[str]) -> list[str]:
+        """What is added at the end, to the state after these sums: nothing."""
+        return []
+
     def _ends(self, region: Region) -> list[str]:
         """h Σ b_i ḃ_i."""
         k, r = self.nodes, self.nodes.plan.relation
@@ -63,7 +76,7 @@ class FirstOrder(Sweep):
         return before
 
     def sweep(self, old: list[str]) -> tuple[list[str], str]:
-        """The iterates after one more sweep, and whether the elimination was stable, node by node."""
+        """Newton's method at each node, once; whether the elimination was stable."""
         k, plan = self.nodes, self.nodes.plan
         region = self.region([k.along(y, a) for y, a in zip(old, self.first, strict=True)], old)
         region.require([plan.relation.rates[i] for i in plan.carried])
@@ -128,3 +141,58 @@ class SecondOrder(Sweep):
         k = self.nodes
         rates = [k.along(f, k.all.splat(v)) for f, v in zip(forces, self.rates, strict=True)]
         return rates, self.region([k.along(v, a) for v, a in zip(rates, self.first, strict=True)], rates)
+
+
+class Means(Sweep):
+    """The iterates are the rates y at the nodes, of means over the step."""
+
+    nodes: Nodes
+
+    def __post_init__(self):
+        super().__post_init__()
+        k, table = self.nodes, self.nodes.plan.quadrature
+        self.many = e = Emitter(k.body, lanes_for(len(table.points)))
+        self.constants = k.constants(e)
+        vector = lambda values: k.vector(values, e.width)
+        self.matrix = [e.mul(vector(column), e.splat("%h")) for column in table.matrix.T]
+        self.values = [vector(column) for column in table.values.T]
+        self.means = [k.vector(column) for column in table.means.T]
+        self.instants = e.add(e.splat(self.time), e.mul(vector(table.points), e.splat("%h")))
+
+    def start(self, before: list[str]) -> list[str]:
+        """What the record holds."""
+        return before
+
+    def sweep(self, old: list[str]) -> tuple[list[str], str]:
+        rates = self._rates(old)
+        return rates[: len(old)], self.nodes.all.true
+
+    def increments(self, rates: list[str]) -> list[str]:
+        k = self.nodes
+        return [k.total(k.all.mul(k.weights, value)) for value in self._rates(rates)]
+
+    def _rates(self, old: list[str]) -> list[str]:
+        """(ȧ, ḃ) at the nodes."""
+        k, e, r = self.nodes, self.many, self.nodes.plan.relation
+        points = Region(e, k.plan.graph, self.constants)
+        points.bind(k.plan.shared.t, self.instants)
+        for node, y, a in zip(r.first, old, self.state, strict=False):
+            points.bind(node, k.product(self.matrix, y, e.splat(a), k.all, e))
+        for node, y in zip(r.unknowns, old, strict=True):
+            points.bind(node, k.product(self.values, y, None, k.all, e))
+        points.require(r.slopes)
+        inside = self.region([k.along(y, a) for y, a in zip(old, self.first, strict=False)], None)
+        for mean, slope in zip(r.means, r.slopes, strict=True):
+            inside.bind(mean, k.product(self.means, points.value(slope), None, e, k.all))
+        inside.require(r.rates)
+        return [inside.value(node) for node in r.rates]
+
+    def settled(self, rates: list[str], after: list[str]) -> list[str]:
+        k, plan = self.nodes, self.nodes.plan
+        region, end = Region(k.one, plan.graph, self.here), k.vector(plan.quadrature.end)
+        for node, value in zip(plan.relation.after, after, strict=True):
+            region.bind(node, value)
+        for node, rate in zip(plan.relation.unknowns, rates, strict=True):
+            region.bind(node, k.total(k.all.mul(end, rate)))
+        region.require(plan.relation.settled)
+        return [region.value(node) for node in plan.relation.settled]
