@@ -1,10 +1,12 @@
 """One step of energy-preserving collocation, on a Hamiltonian with a bracket, or on a Lagrangian with constraints."""
 
+import warnings
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.program.linear_solves import solve
@@ -12,6 +14,7 @@ from dirax.program.tracing import along, gradient, jacobian, once
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.collocation_step import combined
 from dirax.schemes.collocation_tables import Quadrature, Tableau
+from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.program.legendre import constrained_velocity
 from dirax.schemes.layout import Layout
 from dirax.schemes.stage_relation import MeanRelation
@@ -19,6 +22,9 @@ from dirax.schemes.step import Field, StepEquation
 from dirax.systems.forms import EnergyForm, RelationForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.shape import Shape
+
+NOTICED = 1e-12
+"""Changes of the energy in a step, relative to its terms, from which on they are more than roundoff."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +96,17 @@ class EnergyCollocationStep(AbstractStep):
         """The field that every step saves."""
         about = "largest change of the energy in a step, less its work, relative to the terms of the energy"
         return {"energy_defect": Field((), "node", (), about)}
+
+    def review(self, fields):
+        defect = float(np.nanmax(fields["energy_defect"], initial=0.0))
+        if defect > NOTICED:
+            warnings.warn(
+                f"the energy changed by {defect:.1e} of the size of its terms in a step of dx.EnergyCollocation, more than "
+                f"roundoff: the quadrature with {len(self.quadrature.points)} points is not exact for such steps. Take smaller "
+                "steps, or more points=.",
+                stacklevel=4,
+            )
+        return {"energy_defect": defect}
 
     def equation(self) -> StepEquation:
         """The StepEquation, with the mean relation that it is made of."""
@@ -267,6 +284,20 @@ class HamiltonianEnergyCollocation(EnergyCollocationStep):
         balance = (lambda change: change[0] - change[1])(now.work - old.work) if self.form.ports is not None else 0.0
         size = jnp.abs(energy) + jnp.abs(now.x) @ jnp.abs(self.form.differential(now.x, params))
         return self.state.join(**self.settled(before, after, energy, balance, size))
+
+    def check(self, data, h, params):
+        if self.form.ports is not None:
+            return
+        point = data["x"] if "x" in data else data["q"]
+        x = jnp.asarray(point if len(point) == self.n else np.concatenate([point, data["p"]]))
+        rate = lambda mean: self.rates(x, mean, data.get("t", 0.0), params)[: self.n]
+        bracket = np.asarray(jacobian(rate)(jnp.zeros(self.n)))
+        worst = np.max(np.abs(bracket + bracket.T))
+        if worst > STRUCTURE_DEFECT * np.max(np.abs(bracket)):
+            raise ValueError(
+                f"the bracket Π of ẋ = Π dH is not antisymmetric at the initial point: max |Π + Πᵀ| = {worst:.3g}, so that the "
+                "energy is not kept. Put the symmetric part into R of a dx.PortHamiltonian."
+            )
 
     def start(self, data, h, params):
         if "x" not in data:

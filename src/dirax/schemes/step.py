@@ -68,6 +68,8 @@ class StepEquation(eqx.Module):
       does not hold;
     - `guess(state, previous, h, params) -> u`: where Newton's method starts, if that is not `previous` (k,), the unknowns
       extrapolated from the steps before;
+    - `review(fields) -> dict`, which looks at the saved arrays of a run, concrete ones, for what is to stand in its `stats`, and
+      warns of what is wrong with them;
     - `collocation`, the stage relation or mean relation of which the unknowns are copies: a fact that engines may use or ignore.
 
     Equations are compared by the identity of their functions. One with other functions is made by `dataclasses.replace`.
@@ -84,6 +86,7 @@ class StepEquation(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
     canonical: bool = eqx.field(static=True)
     check: Callable = eqx.field(static=True)
+    review: Callable = eqx.field(static=True)
     guess: Callable = eqx.field(static=True)
     state_layout: Layout = eqx.field(static=True)
     unknown_layout: Layout = eqx.field(static=True)
@@ -104,6 +107,7 @@ class StepEquation(eqx.Module):
         labels: tuple[str, ...] | None = None,
         canonical: bool = False,
         check: Callable | None = None,
+        review: Callable | None = None,
         guess: Callable | None = None,
         collocation: StageRelation | MeanRelation | None = None,
     ):
@@ -113,6 +117,7 @@ class StepEquation(eqx.Module):
         self.unknown_layout, self.unknowns = _layout("u", unknown_layout, "unknowns", unknowns)
         self.labels = labels or tuple(f"equation {i}" for i in range(self.unknowns))
         self.check = check or nothing_to_check
+        self.review = review or nothing_to_report
         self.guess = guess or previous_unknowns
         self.collocation = collocation
         if len(self.labels) != self.unknowns:
@@ -233,6 +238,11 @@ def previous_unknowns(state, previous, h, params):
 
 def nothing_to_check(data, h, params) -> None:
     """The default check of initial data."""
+
+
+def nothing_to_report(fields) -> dict[str, Any]:
+    """The default review of saved arrays."""
+    return {}
 
 
 def explicit_step(u, state, t, h, params) -> Float[Array, "0"]:
