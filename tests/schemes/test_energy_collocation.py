@@ -294,8 +294,12 @@ def test_systems_that_it_does_not_step_are_refused():
         run(SYSTEMS["no constraints"][0], q0=[0.0, 0.0], q1=[0.1, 0.0])
 
 
-def test_a_distribution_that_loses_its_rank_ends_the_run_there():
-    rows = lambda q: jnp.array([[q[0], q[1], 0.0], [0.0, 0.0, 1.0]])  # nothing is left of the first at the origin
-    system = dx.LagrangeDirac(lambda q, v: v @ v / 2, rows)
-    with pytest.raises(ValueError, match="depend|rank|contradict"):
-        dx.simulate(system, dx.EnergyCollocation(), q=[0.0, 0.0, 0.0], v=[1.0, 0.0, 0.0], step=0.1, steps=1)
+def test_a_distribution_that_changes_its_rank_is_refused_with_the_place():
+    parallel = lambda q: jnp.array([[1.0, 0.0, 0.0, 0.0], [jnp.cos(q[3]), jnp.sin(q[3]), 0.0, 0.0]])  # where q[3] = 0
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + q[0] * q[1] - q[2] ** 2 / 2, parallel)
+    run = lambda q, v: dx.simulate(system, dx.EnergyCollocation(), q=q, v=v, step=0.125, steps=20)
+    with pytest.raises(ValueError, match="depend"):
+        run([0.3, 0.2, 0.1, 0.0], [0.0, 0.0, 0.1, 0.1])
+    sol = run([0.3, 0.2, 0.1, -1.0], [0.0, 0.0, 0.1, 1.0])
+    assert not sol.ok and "changes its rank" in sol.message and "q = [0.3" in sol.message
+    assert run([0.3, 0.2, 0.1, -0.97], [0.0, 0.0, 0.1, 1.0]).ok

@@ -27,6 +27,9 @@ NOTICED = 1e-11
 """Changes of the energy in a step, relative to its terms, from which on they are more than roundoff of the rows, whose angles may
 have run to 10⁶. What is less is given back in the momenta, so that it does not add up over many steps."""
 
+NEARLY_DEPENDENT = 1e-2
+"""The smallest singular value of one-forms of length 1 from which on they are called dependent where a step has failed."""
+
 STEEP = 1e-3
 """Of the terms of the energy, ⟨p, v⟩ below which little is given back."""
 
@@ -72,8 +75,8 @@ class EnergyCollocationStep(AbstractStep):
         y, start, table = u.reshape(self.tableau.stages, -1), state[: self.moving], self.quadrature
         slopes = lambda a, rate, t: self.slopes(a, rate, t, params)
         rates = lambda a, mean, t: self.rates(a, mean, t, params)
-        found = jax.vmap(slopes)(start + h * (table.matrix @ y), table.values @ y, t + h * table.points)
-        return jax.vmap(rates)(start + h * (self.tableau.matrix @ y), table.means @ found, t + h * self.tableau.nodes)
+        found = jax.vmap(slopes)(start[None] + h * (table.matrix @ y), table.values @ y, t + h * table.points)
+        return jax.vmap(rates)(start[None] + h * (self.tableau.matrix @ y), table.means @ found, t + h * self.tableau.nodes)
 
     def residual(self, u, state, t, h, params):
         return u - self.nodes(u, state, t, h, params)[:, : self.moving].ravel()
@@ -100,8 +103,8 @@ class EnergyCollocationStep(AbstractStep):
         if defect > NOTICED:
             warnings.warn(
                 f"the energy changed by {defect:.1e} of the size of its terms in a step of dx.EnergyCollocation, more than "
-                f"roundoff: the quadrature with {len(self.quadrature.points)} points is not exact for such steps. Take smaller "
-                "steps, or more points=.",
+                f"roundoff: the quadrature with {len(self.quadrature.points)} points is not exact for such steps, or one of them "
+                "passed a place where the equations are nearly singular. Take smaller steps, or more points=.",
                 stacklevel=4,
             )
         return {"energy_defect": defect}
@@ -231,6 +234,23 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         scale = jnp.where(kept, left, 0.0) * power / (power * power + (STEEP * size) ** 2)
         book["energy"] = book["energy"] + jnp.where(kept, left, 0.0)
         return self.state.join(p=moved + scale * (now.p + moved), **changes, **book)
+
+    def remark(self, state, t, h, params):
+        """Whether the distribution changes its rank within the step."""
+        now = self.state.split(jnp.asarray(state))
+        v = self.velocity(t, now.q, now.p, jnp.zeros(self.n), params)[0]
+        points = [(t + share * h, now.q + share * h * v) for share in np.linspace(0.0, 1.0, 17)] if self.shape.m else []
+        for t, q in points:
+            rows = np.asarray(self.constraint(t, q, params)[0])
+            lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+            least = np.linalg.svd(rows / np.where(lengths > 0.0, lengths, 1.0), compute_uv=False)[-1]
+            if not least > NEARLY_DEPENDENT:
+                place = np.array2string(np.asarray(q), precision=4)
+                return (
+                    f"near q = {place} the one-forms depend on each other (smallest singular value {least:.1g} of rows of length "
+                    "1), so that the distribution changes its rank there, where this scheme does not pass"
+                )
+        return ""
 
     def start(self, data, h, params):
         if "q0" in data:

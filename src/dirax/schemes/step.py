@@ -68,6 +68,7 @@ class StepEquation(eqx.Module):
       does not hold;
     - `guess(state, previous, h, params) -> u`: where Newton's method starts, if that is not `previous` (k,), the unknowns
       extrapolated from the steps before;
+    - `remark(state, t, h, params) -> str`, what there is to say of a place from which a step fails, or "";
     - `review(fields) -> dict`, which looks at the saved arrays of a run, concrete ones, for what is to stand in its `stats`, and
       warns of what is wrong with them;
     - `collocation`, the stage relation or mean relation of which the unknowns are copies: a fact that engines may use or ignore.
@@ -86,6 +87,7 @@ class StepEquation(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
     canonical: bool = eqx.field(static=True)
     check: Callable = eqx.field(static=True)
+    remark: Callable = eqx.field(static=True)
     review: Callable = eqx.field(static=True)
     guess: Callable = eqx.field(static=True)
     state_layout: Layout = eqx.field(static=True)
@@ -107,6 +109,7 @@ class StepEquation(eqx.Module):
         labels: tuple[str, ...] | None = None,
         canonical: bool = False,
         check: Callable | None = None,
+        remark: Callable | None = None,
         review: Callable | None = None,
         guess: Callable | None = None,
         collocation: StageRelation | MeanRelation | None = None,
@@ -117,6 +120,7 @@ class StepEquation(eqx.Module):
         self.unknown_layout, self.unknowns = _layout("u", unknown_layout, "unknowns", unknowns)
         self.labels = labels or tuple(f"equation {i}" for i in range(self.unknowns))
         self.check = check or nothing_to_check
+        self.remark = remark or nothing_to_say
         self.review = review or nothing_to_report
         self.guess = guess or previous_unknowns
         self.collocation = collocation
@@ -238,6 +242,11 @@ def previous_unknowns(state, previous, h, params):
 
 def nothing_to_check(data, h, params) -> None:
     """The default check of initial data."""
+
+
+def nothing_to_say(state, t, h, params) -> str:
+    """The default remark on a place where a step fails."""
+    return ""
 
 
 def nothing_to_report(fields) -> dict[str, Any]:
