@@ -219,7 +219,7 @@ def test_gradients_are_those_of_differences(engine):
 
     def end(k):
         sol = dx.simulate(
-            system, dx.EnergyCollocation(1, 2), q=[1.0, 0.5, 0.0], v=[0.1, 0.3, 0.05], params={"k": k}, step=0.1, steps=4, engine=engine
+            system, dx.EnergyCollocation(1, 4), q=[1.0, 0.5, 0.0], v=[0.1, 0.3, 0.05], params={"k": k}, step=0.1, steps=4, engine=engine
         )
         return sol.q[-1, 1]
 
