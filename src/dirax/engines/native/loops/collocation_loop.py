@@ -174,9 +174,10 @@ class _Kernel:
             b.store(e.real, a, pointer, 64)
             moved, size, smallest = e.abs(e.sub(a, before)), e.abs(a), b.load(e.real, least_of, 64)
             shrinks = e.both(e.compare("olt", moved, smallest), e.compare("ogt", moved, e.mul(size, e.const(EPSILON))))
-            left = e.div(e.mul(moved, moved), smallest)  # what the next change will be; before the second, nothing is known
+            # the next change will be moved²/smallest; before the second, nothing is known
             known = e.compare("olt", smallest, e.const(float("inf")))
-            enough = e.both(known, e.compare("olt", left, e.mul(size, e.const(EPSILON / 2.0))))
+            floor = e.mul(e.mul(size, e.const(EPSILON / 2.0)), smallest)
+            enough = e.both(known, e.compare("olt", e.mul(moved, moved), floor))
             going = e.either(going, e.both(shrinks, e.invert(enough)))
             b.store(e.real, e.select(e.compare("olt", moved, smallest), moved, smallest), least_of, 64)
             worst = e.max(moved, worst)
