@@ -2,6 +2,7 @@
 
 from dirax.schemes.collocation_step import LagrangianCollocation, RelationCollocation
 from dirax.schemes.collocation_tables import MOST_STAGES, gauss, lobatto
+from dirax.schemes.constrained_collocation_step import HolonomicCollocation, NonholonomicCollocation
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.systems.system import AbstractSystem
 
@@ -22,7 +23,12 @@ class Collocation(AbstractScheme):
     matrix of Lobatto IIIA, momenta by that of IIIB, P_i = p_k + h Σ_j â_ij Ṗ_j, a symplectic and self-adjoint pair (IV.2.2;
     two stages are the Störmer–Verlet scheme where the mass matrix is constant).
 
-    Takes systems without constraints: regular `dx.LagrangeDirac`, `dx.DiracSystem` with a Hamiltonian vector field,
+    With constraints of a regular Lagrangian, at Lobatto nodes: holonomic ones, g = 0 at every node and G q̇ = 0 at the rows, a
+    symplectic map of the constraint manifold (two stages are RATTLE); or one-forms, W q̇ + b = 0 at every node, with the λ_1 of a
+    step that of λ_s before. Order 2s − 2 in q and p; the `reactions` λ at the nodes have less, as measured: s − 1 for holonomic
+    constraints, s or s − 1, whichever is even, for one-forms.
+
+    Takes systems without constraints at both kinds of nodes: regular `dx.LagrangeDirac`, `dx.DiracSystem` with a Hamiltonian vector field,
     `dx.PortHamiltonian` without closed ports, `dx.LiePoisson`, and `dx.PhaseSpaceLagrangian` on its final manifold.
     Raises `ValueError` for stages that are not 1 to 16 and nodes that do not exist, and `TypeError` for other systems.
 
@@ -53,10 +59,7 @@ class Collocation(AbstractScheme):
 
     def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         if shape.m + shape.c:
-            raise TypeError(
-                f"dx.Collocation does not keep constraints, of which the system has {shape.m + shape.c}: use "
-                'dx.DiscreteDirac(constraints="resolve") or dx.LagrangeDAlembert(), and dx.Composition of it for higher order.'
-            )
+            return self._constrained(system, shape)
         tableau = gauss(self.stages) if self.nodes == "gauss" else lobatto(self.stages)
         relation = system.relation_form(shape) or system.final_relation(shape)
         if relation is not None and not relation.multipliers:
@@ -73,3 +76,19 @@ class Collocation(AbstractScheme):
             "dx.Collocation steps systems with a relation between x and ẋ or with a Lagrangian in coordinates, but a "
             f"{type(system).__name__} was given."
         )
+
+    def _constrained(self, system: AbstractSystem, shape: Shape) -> StepEquation:
+        lagrangian = system.lagrangian_form()
+        if self.nodes == "gauss" or lagrangian is None:
+            raise TypeError(
+                f"dx.Collocation at Gauss nodes does not keep constraints, of which the system has {shape.m + shape.c}: take "
+                'nodes="lobatto" for Lagrangians, dx.EnergyCollocation() for nonholonomic ones, or '
+                'dx.DiscreteDirac(constraints="resolve").'
+            )
+        if shape.m and shape.c:
+            raise TypeError(
+                f"dx.Collocation at Lobatto nodes keeps holonomic constraints or one-forms, but the system has both, {shape.m} and "
+                f'{shape.c}: take dx.DiscreteDirac(constraints="resolve"), and dx.Composition of it for higher order.'
+            )
+        kind = HolonomicCollocation if shape.c else NonholonomicCollocation
+        return kind(lobatto(self.stages), shape, lagrangian).equation()
