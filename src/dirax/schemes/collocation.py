@@ -1,9 +1,12 @@
 """Collocation: steps of high order whose unknowns are the rates at s nodes, coupled by constant matrices."""
 
+from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.schemes.collocation_step import LagrangianCollocation, RelationCollocation
-from dirax.schemes.collocation_tables import MOST_STAGES, gauss, lobatto
+from dirax.schemes.collocation_tables import MOST_STAGES, Tableau, gauss, lobatto
 from dirax.schemes.constrained_collocation_step import HolonomicCollocation, NonholonomicCollocation
+from dirax.schemes.manifold_collocation_step import ManifoldCollocation
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
+from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 from dirax.systems.system import AbstractSystem
 
 NODES = ("gauss", "lobatto")
@@ -27,6 +30,9 @@ class Collocation(AbstractScheme):
     symplectic map of the constraint manifold (two stages are RATTLE); or one-forms, W q̇ + b = 0 at every node, with the λ_1 of a
     step that of λ_s before. Order 2s − 2 in q and p; the `reactions` λ at the nodes have less, as measured: s − 1 for holonomic
     constraints, s or s − 1, whichever is even, for one-forms.
+
+    On a manifold, for a `dx.ManifoldLagrangian` at Gauss nodes: the same in the chart at q_k that belongs to the manifold's
+    retraction; symplectic on T*Q, order 2s, every q on the manifold.
 
     Takes systems without constraints at both kinds of nodes: regular `dx.LagrangeDirac`, `dx.DiracSystem` with a Hamiltonian vector field,
     `dx.PortHamiltonian` without closed ports, `dx.LiePoisson`, and `dx.PhaseSpaceLagrangian` on its final manifold.
@@ -72,10 +78,24 @@ class Collocation(AbstractScheme):
         lagrangian = system.lagrangian_form()
         if lagrangian is not None:
             return LagrangianCollocation(tableau, shape.n, lagrangian).equation()
+        on_manifold = system.manifold_form()
+        if on_manifold is not None:
+            return self._on_manifold(tableau, on_manifold, shape)
         raise TypeError(
-            "dx.Collocation steps systems with a relation between x and ẋ or with a Lagrangian in coordinates, but a "
+            "dx.Collocation steps systems with a relation between x and ẋ or with a Lagrangian, but a "
             f"{type(system).__name__} was given."
         )
+
+    def _on_manifold(self, tableau: Tableau, system: ManifoldLagrangian, shape: Shape) -> StepEquation:
+        if self.nodes == "lobatto" or system.forces is not None:
+            what = "Lobatto nodes are for coordinates" if self.nodes == "lobatto" else "forces are not taken there"
+            raise TypeError(
+                f'dx.Collocation on a manifold takes nodes="gauss" and a Lagrangian alone, and {what}: take dx.DiscreteDirac(map).'
+            )
+        manifold = system.manifold
+        if not isinstance(manifold, AbstractGeodesicManifold):
+            raise TypeError(f"dx.Collocation needs a manifold with a retraction, and {manifold!r} has none.")
+        return ManifoldCollocation(tableau, system, manifold, shape.n).equation()
 
     def _constrained(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         lagrangian = system.lagrangian_form()
