@@ -39,8 +39,8 @@ def test_a_pendulum_on_the_sphere():
     assert line.verdict == "bounded", line
 
 
-@pytest.mark.parametrize("stages", [2, 3])
-def test_a_free_body_on_so3_has_its_order_and_keeps_its_spatial_momentum(stages):
+def test_a_free_body_on_so3_has_its_order_and_keeps_its_spatial_momentum():
+    stages = 2
     group, inertia = dx.SO3(), jnp.array([1.0, 2.0, 3.0])
 
     def kinetic(q, v):
@@ -59,6 +59,8 @@ def test_a_free_body_on_so3_has_its_order_and_keeps_its_spatial_momentum(stages)
         errors.append(np.max(np.abs(group.body_momentum(sol.q[-1], sol.p[-1]) - exact)))
     assert abs(np.log2(errors[0] / errors[1]) - 2 * stages) < 0.4, errors
     assert max(float(group.defect(q)) for q in sol.q) < 2e-14
+    spatial = [group.matrix(q) @ group.body_momentum(q, p) for q, p in zip(sol.q, sol.p, strict=True)]
+    np.testing.assert_allclose(spatial, np.broadcast_to(spatial[0], (17, 3)), atol=1e-13)
 
 
 def test_both_engines_agree_on_the_sphere():
