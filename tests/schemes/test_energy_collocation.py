@@ -86,7 +86,15 @@ def test_energy_and_constraint_of_irreversible_systems(name):
     data = {name: example.initial[name] for name in ("q", "v")}
     system = example.system.lagrangian_form()
     sol = dx.simulate(
-        system, dx.EnergyCollocation(), step=0.05, steps=20_000, save_every=500, params=params, project=True, engine="native", **data
+        system,
+        dx.EnergyCollocation(),
+        step=0.05,
+        steps=20_000,
+        save_every=500,
+        params=params,
+        project=True,
+        engine="native",
+        **data,
     )
     energy = sol.energy()
     assert sol.ok and np.max(np.abs(energy - energy[0])) < 5e-15
@@ -204,7 +212,9 @@ def test_self_adjoint():
 
 
 def test_where_the_fixed_point_does_not_converge_newton_goes_on():
-    stiff = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 5000.0 * q[0] ** 2 / 2 - q[1] ** 4 / 4, lambda q: jnp.array([[0.0, q[0], 1.0]]))
+    stiff = dx.LagrangeDirac(
+        lambda q, v: v @ v / 2 - 5000.0 * q[0] ** 2 / 2 - q[1] ** 4 / 4, lambda q: jnp.array([[0.0, q[0], 1.0]])
+    )
     data = {"q": [1e-3, 1.0, 0.0], "v": [0.0, 0.1, -1e-4]}
     sol = dx.simulate(stiff, dx.EnergyCollocation(2), step=0.2, steps=50, engine="native", **data)
     energy = sol.energy()
@@ -213,13 +223,18 @@ def test_where_the_fixed_point_does_not_converge_newton_goes_on():
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
 def test_gradients_are_those_of_differences(engine):
-    system = dx.LagrangeDirac(
-        lambda q, v, params: v @ v / 2 - params["k"] * q @ q / 2, lambda q: jnp.array([[q[1], 0.0, -1.0]])
-    )
+    system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["k"] * q @ q / 2, lambda q: jnp.array([[q[1], 0.0, -1.0]]))
 
     def end(k):
         sol = dx.simulate(
-            system, dx.EnergyCollocation(1, 4), q=[1.0, 0.5, 0.0], v=[0.1, 0.3, 0.05], params={"k": k}, step=0.1, steps=4, engine=engine
+            system,
+            dx.EnergyCollocation(1, 4),
+            q=[1.0, 0.5, 0.0],
+            v=[0.1, 0.3, 0.05],
+            params={"k": k},
+            step=0.1,
+            steps=4,
+            engine=engine,
         )
         return sol.q[-1, 1]
 
@@ -279,9 +294,7 @@ def test_systems_that_it_does_not_step_are_refused():
     sphere = dx.LagrangeDirac(lambda q, v: v @ v / 2, holonomic=lambda q: jnp.array([q @ q - 1.0]))
     with pytest.raises(TypeError, match="does not keep holonomic constraints"):
         run(sphere, q=[1.0, 0.0], v=[0.0, 1.0])
-    skewed = dx.DiracSystem(
-        dx.DiracStructure.from_bivector(lambda x: jnp.array([[0.0, 1.0], [-0.9, 0.0]])), lambda x: x @ x / 2
-    )
+    skewed = dx.DiracSystem(dx.DiracStructure.from_bivector(lambda x: jnp.array([[0.0, 1.0], [-0.9, 0.0]])), lambda x: x @ x / 2)
     with pytest.raises(ValueError, match="not antisymmetric"):
         run(skewed, x=[1.0, 0.0])
     with pytest.raises(TypeError, match="ManifoldLagrangian was given"):

@@ -34,8 +34,8 @@ class Collocation(AbstractScheme):
     On a manifold, for a `dx.ManifoldLagrangian` at Gauss nodes: the same in the chart at q_k that belongs to the manifold's
     retraction; symplectic on T*Q, order 2s, every q on the manifold.
 
-    Takes systems without constraints at both kinds of nodes: regular `dx.LagrangeDirac`, `dx.DiracSystem` with a Hamiltonian vector field,
-    `dx.PortHamiltonian` without closed ports, `dx.LiePoisson`, and `dx.PhaseSpaceLagrangian` on its final manifold.
+    Takes systems without constraints at Gauss nodes: regular `dx.LagrangeDirac`, `dx.DiracSystem` with a Hamiltonian vector
+    field, `dx.PortHamiltonian` without closed ports, `dx.LiePoisson`, and `dx.PhaseSpaceLagrangian` on its final manifold.
     Raises `ValueError` for stages that are not 1 to 16 and nodes that do not exist, and `TypeError` for other systems.
 
         sol = dx.simulate(system, dx.Collocation(stages=4), q=…, v=…, step=0.1, steps=1000)
@@ -90,7 +90,7 @@ class Collocation(AbstractScheme):
         if self.nodes == "lobatto" or system.forces is not None:
             what = "Lobatto nodes are for coordinates" if self.nodes == "lobatto" else "forces are not taken there"
             raise TypeError(
-                f'dx.Collocation on a manifold takes nodes="gauss" and a Lagrangian alone, and {what}: take dx.DiscreteDirac(map).'
+                f'dx.Collocation on a manifold takes nodes="gauss" and L alone, and {what}: take dx.DiscreteDirac(map).'
             )
         manifold = system.manifold
         if not isinstance(manifold, AbstractGeodesicManifold):
@@ -107,8 +107,8 @@ class Collocation(AbstractScheme):
             )
         if shape.m and shape.c:
             raise TypeError(
-                f"dx.Collocation at Lobatto nodes keeps holonomic constraints or one-forms, but the system has both, {shape.m} and "
-                f'{shape.c}: take dx.DiscreteDirac(constraints="resolve"), and dx.Composition of it for higher order.'
+                "dx.Collocation at Lobatto nodes keeps holonomic constraints or one-forms, but the system has both, "
+                f'{shape.c} and {shape.m}: take dx.DiscreteDirac(constraints="resolve"), composed for higher order.'
             )
         kind = HolonomicCollocation if shape.c else NonholonomicCollocation
         return kind(lobatto(self.stages), shape, lagrangian).equation()

@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -80,7 +80,7 @@ class ConstrainedCollocation(AbstractStep):
     def slope(self, t, q, v, params):
         """∂L/∂q + f, and the power of f."""
         slope = gradient(lambda q: self.system.lagrangian.at(t, q, v, params))(q)
-        if not self.forced:
+        if self.system.forces is None:
             return slope, jnp.zeros(())
         force = self.system.forces(t, q, v, params)
         return slope + force, force @ v
@@ -214,9 +214,7 @@ class NonholonomicCollocation(ConstrainedCollocation):
         nodes, velocities = self.nodes(u, state, t, h, params), list(self.unknowns.split(u).constrained)
         places = list(zip(nodes.times, nodes.q, strict=True))[1:]
         given = self.momenta(self.tableau.matrix, state, nodes, h)[1:]
-        momenta = [
-            p - self.system.legendre(q, v, params, at) for p, v, (at, q) in zip(given, velocities, places, strict=True)
-        ]
+        momenta = [p - self.system.legendre(q, v, params, at) for p, v, (at, q) in zip(given, velocities, places, strict=True)]
         kept = [self.rows.velocity_defect(at, q, v, params) for v, (at, q) in zip(velocities, places, strict=True)]
         return jnp.concatenate([*self.inner(nodes, state, h, params), *momenta, *kept])
 

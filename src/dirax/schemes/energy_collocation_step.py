@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.tolerances import STRUCTURE_DEFECT
+from dirax.program.legendre import constrained_velocity
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import along, gradient, jacobian, once
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.collocation_tables import Quadrature, Tableau
-from dirax.numerics.tolerances import STRUCTURE_DEFECT
-from dirax.program.legendre import constrained_velocity
 from dirax.schemes.layout import Layout
 from dirax.schemes.stage_relation import MeanRelation
 from dirax.schemes.step import Field, StepEquation
@@ -73,8 +73,8 @@ class EnergyCollocationStep(AbstractStep):
     def nodes(self, u, state, t, h, params) -> Float[Array, "stages s"]:
         """(ȧ, ḃ) at every node."""
         y, start, table = u.reshape(self.tableau.stages, -1), state[: self.moving], self.quadrature
-        slopes = lambda a, rate, t: self.slopes(a, rate, t, params)
-        rates = lambda a, mean, t: self.rates(a, mean, t, params)
+        slopes = lambda a, rate, t: once(self.slopes)(a, rate, t, params)
+        rates = lambda a, mean, t: once(self.rates)(a, mean, t, params)
         found = jax.vmap(slopes)(start[None] + h * (table.matrix @ y), table.values @ y, t + h * table.points)
         return jax.vmap(rates)(start[None] + h * (self.tableau.matrix @ y), table.means @ found, t + h * self.tableau.nodes)
 
@@ -83,8 +83,8 @@ class EnergyCollocationStep(AbstractStep):
 
     def advance(self, u, state, t, h, params):
         after = state + h * (self.tableau.weights @ self.nodes(u, state, t, h, params))
-        end = self.quadrature.end @ u.reshape(self.tableau.stages, -1)
-        return after + self.settle(state, after, end, t, h, params)
+        end = jnp.asarray(self.quadrature.end) @ u.reshape(self.tableau.stages, -1)
+        return after + once(self.settle)(state, after, end, t, h, params)
 
     def settled(self, before: Array, after: Array, energy: Any, work: Any, size: Any) -> dict[str, Array]:
         """The parts of what is added that belong to the energy at the end, with the work of the step and the size of the
@@ -175,7 +175,6 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         rows, offset = self.constraint(t, q, params)
         return constrained_velocity(lambda v: self.system.lagrangian.at(t, q, v, params), p, rows, offset, guess)
 
-    @once
     def slopes(self, a, rate, t, params):
         q, p = a[: self.n], a[self.n :]
         v, multipliers = self.velocity(t, q, p, rate[: self.n], params)
@@ -189,7 +188,6 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
             parts.append(gradient(lambda t: energy(t, q))(jnp.asarray(t, float))[None])
         return jnp.concatenate(parts)
 
-    @once
     def rates(self, a, mean, t, params):
         n, q = self.n, a[: self.n]
         slope, velocity, multipliers = mean[:n], mean[n : 2 * n], mean[2 * n : 2 * n + len(self.shape.kept)]
@@ -200,7 +198,11 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         pull = jnp.zeros(n)
         if len(rows):
             reaction = lambda t, q: self.constraint(t, q, params)[0].T @ multipliers
-            power = lambda q: (lambda rows, offset: multipliers @ (rows @ rate + offset))(*self.constraint(t, q, params))
+
+            def power(q):
+                rows, offset = self.constraint(t, q, params)
+                return multipliers @ (rows @ rate + offset)
+
             pull = gradient(power)(q) - along(reaction, (jnp.asarray(t, float), q), (jnp.ones(()), rate))
         force = jnp.zeros(n) if self.system.forces is None else self.system.forces(t, q, rate, params)
         out = [rate, inside(pull + force - slope)]
@@ -217,7 +219,6 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         """α ↦ P α."""
         return lambda vector: vector - rows.T @ solve(rows @ rows.T, rows @ vector) if len(rows) else vector
 
-    @once
     def settle(self, before, after, rate, t, h, params):
         now = self.state.split(after)
         v, multipliers = self.velocity(t + h, now.q, now.p, rate[: self.n], params)
@@ -287,11 +288,9 @@ class HamiltonianEnergyCollocation(EnergyCollocationStep):
         work = {"work": Field((2,), "node", ("work",), "energy supplied and energy dissipated since the start")}
         return {name: Field((self.n,)) for name in self.relation.names} | (work if self.form.ports else {}) | self.book
 
-    @once
     def slopes(self, a, rate, t, params):
         return self.form.differential(a, params)
 
-    @once
     def rates(self, a, mean, t, params):
         defect = lambda rate: self.form.residual(a, rate, jnp.zeros(0), t, params, mean)
         zero = jnp.zeros(self.n)
@@ -301,7 +300,6 @@ class HamiltonianEnergyCollocation(EnergyCollocationStep):
             out += [(driven @ outputs)[None], loss[None]]
         return jnp.concatenate([*out, jnp.zeros(2)])
 
-    @once
     def settle(self, before, after, rate, t, h, params):
         old, now = self.state.split(before), self.state.split(after)
         energy = self.form.hamiltonian(now.x, params)

@@ -83,7 +83,8 @@ class ManifoldCollocation(AbstractStep):
         weights, end = self.tableau.weights.tolist(), self.unknowns.split(u).momentum
         left = [[b - a for a, b in zip(row, weights, strict=True)] for row in self.tableau.matrix.tolist()]
         inner = [end - momentum - h * combined(row, slopes) for momentum, row in zip(momenta, left, strict=True)]
-        (q, p), (_, last), here = self.state.split(state), self.end(u, state, h), self.chart(self.state.split(state).q)
+        now, (_, last) = self.state.split(state), self.end(u, state, h)
+        here = self.chart(now.q)
         points = [h * combined(row, rates) for row in self.tableau.matrix.tolist()]
         arrival = h * combined(weights, rates)
 
@@ -92,10 +93,12 @@ class ManifoldCollocation(AbstractStep):
             base = here.to_manifold(s)
             frame = jax.vmap(lambda column: self.manifold.projection(base, column), 1, 1)(here.frame)
             there = RetractionChart(self.manifold, base, frame)
-            values = [self.system.lagrangian(*there.velocity_to_manifold(r, v), params) for r, v in zip(points, rates, strict=True)]
+            values = [
+                self.system.lagrangian(*there.velocity_to_manifold(r, v), params) for r, v in zip(points, rates, strict=True)
+            ]
             return h * sum(b * value for b, value in zip(weights, values, strict=True)) - last @ there.to_manifold(arrival)
 
-        start = here.frame.T @ p + gradient(action)(jnp.zeros(self.manifold.dimension))
+        start = here.frame.T @ now.p + gradient(action)(jnp.zeros(self.manifold.dimension))
         return jnp.concatenate([*inner, start])
 
     def advance(self, u, state, t, h, params):

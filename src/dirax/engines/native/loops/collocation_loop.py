@@ -74,6 +74,7 @@ class _Kernel:
     def _give_rates(self, places: list[str]) -> None:
         """The rates where the steps end, for every node: where Newton's method begins if it has to go on."""
         plan = self.plan
+        assert isinstance(plan, CollocationPlan)
         region = Region(self.one, plan.graph, self.nodes.scalar)
         for node, pointer in zip([*plan.relation.first, *plan.relation.second], self.state, strict=True):
             region.bind(node, self.body.load("double", pointer))
