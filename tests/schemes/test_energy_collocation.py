@@ -295,7 +295,7 @@ def test_systems_that_it_does_not_step_are_refused():
     with pytest.raises(TypeError, match="does not keep holonomic constraints"):
         run(sphere, q=[1.0, 0.0], v=[0.0, 1.0])
     skewed = dx.DiracSystem(dx.DiracStructure.from_bivector(lambda x: jnp.array([[0.0, 1.0], [-0.9, 0.0]])), lambda x: x @ x / 2)
-    with pytest.raises(ValueError, match="not skew|not antisymmetric"):
+    with pytest.raises(ValueError, match=r"not (skew|antisymmetric)"):
         run(skewed, x=[1.0, 0.0])
     with pytest.raises(TypeError, match="ManifoldLagrangian was given"):
         run(dx.ManifoldLagrangian(lambda q, v: v @ v / 2, dx.Sphere(3)), q=[1.0, 0.0, 0.0], v=[0.0, 1.0, 0.0])
