@@ -23,6 +23,8 @@ SCHEMES = {
     "Method 1": dx.DiscreteDirac(constraints="discretize"),
     "Method 2": METHOD_2,
     "Method 2, order 4": dx.Composition(METHOD_2, "suzuki4"),
+    "energy collocation, order 4": dx.EnergyCollocation(2),
+    "energy collocation, order 6": dx.EnergyCollocation(3),
 }
 ROWS = 20_000
 ROUNDINGS = 32
@@ -80,6 +82,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=1_000_000)
     parser.add_argument("systems", nargs="*", help="parts of names")
+    parser.add_argument("--scheme", default="", help="part of the name of the schemes to run")
     chosen = parser.parse_args()
     print("| system, h | scheme | \\|H − H(0)\\|, first tenth, last tenth |\n|---|---|---|")
     for name, (example, changes) in cases().items():
@@ -87,6 +90,8 @@ def main() -> None:
             continue
         label = f"{name}, {changes.get('step', example.step):g}; H(0) = {initial_energy(example, changes):.3g}"
         for scheme_name, scheme in SCHEMES.items():
+            if chosen.scheme not in scheme_name:
+                continue
             try:
                 cell = verdict(example, scheme, chosen.steps, changes)
             except (TypeError, ValueError) as error:

@@ -60,6 +60,7 @@ from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
 from dirax.schemes.discrete_constraints import DiscreteConstraintChain, discrete_constraint_algorithm
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.discrete_gradient import DiscreteGradient
+from dirax.schemes.energy_collocation import EnergyCollocation
 from dirax.schemes.euler_poincare import DiscreteEulerPoincare
 from dirax.schemes.hamilton_dirac import MinusHamiltonDirac, PlusHamiltonDirac
 from dirax.schemes.in_charts import InCharts
@@ -178,6 +179,7 @@ __all__ += [
     "DiscreteEulerPoincare",
     "DiscreteGradient",
     "DiscreteRouth",
+    "EnergyCollocation",
     "Field",
     "InCharts",
     "LagrangeDAlembert",

@@ -258,5 +258,8 @@ def test_systems_that_it_does_not_step_are_refused():
     with pytest.raises(ValueError, match="one-step method"):
         dx.simulate(dx.LagrangeDirac(henon_heiles), dx.Collocation(2), q0=[0.0, 0.0], q1=[0.1, 0.0], step=0.1, steps=1)
     sphere = dx.ManifoldLagrangian(lambda q, v: v @ v / 2, dx.Sphere(3))
-    with pytest.raises(TypeError, match="ManifoldLagrangian was given"):
-        dx.simulate(sphere, dx.Collocation(2), q=[1.0, 0.0, 0.0], v=[0.0, 1.0, 0.0], step=0.1, steps=1)
+    with pytest.raises(TypeError, match="Lobatto nodes are for coordinates"):
+        dx.simulate(sphere, dx.Collocation(2, "lobatto"), q=[1.0, 0.0, 0.0], v=[0.0, 1.0, 0.0], step=0.1, steps=1)
+    body = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ xi / 2)
+    with pytest.raises(TypeError, match="EulerPoincare was given"):
+        dx.simulate(body, dx.Collocation(2), x=body.state([0.0, 1.0, 0.0]), step=0.1, steps=1)

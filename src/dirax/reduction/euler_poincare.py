@@ -12,11 +12,14 @@ from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.numerics.arrays import Data
 from dirax.numerics.tolerances import INERTIA_RANK
+from dirax.program.legendre import constrained_velocity, moves
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.lie_poisson import LiePoisson, checked_point
 from dirax.systems.constraints import no_constraint
+from dirax.systems.forms import EnergyForm
+from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem, refuse_start
 
 
@@ -121,6 +124,32 @@ class EulerPoincare(AbstractSystem):
         return momentum @ xi - self.value(xi, a, params)
 
     # ------------------------------------------------------------------ AbstractSystem
+
+    def energy_form(self, shape: Shape) -> EnergyForm | None:
+        """h(μ, a) with the Lie–Poisson bivector; None where there are constraints."""
+        if self.one_forms is not None:
+            return None
+
+        def velocity(momentum, a, params):
+            of_xi = lambda xi: self.value(xi, a, params)
+            if moves(jax.hessian(of_xi), momentum):
+                return self.inverse_legendre(momentum, a, params)
+            return constrained_velocity(of_xi, momentum, jnp.zeros((0, len(momentum))), jnp.zeros(0), momentum)[0]
+
+        def hamiltonian(x, params):
+            momentum, a = self.space.split(x)
+            xi = velocity(momentum, a, params)
+            return momentum @ xi - self.value(xi, a, params)
+
+        def differential(x, params):
+            momentum, a = self.space.split(x)
+            xi = velocity(momentum, a, params)
+            return jnp.concatenate([xi, -self.slopes(xi, a, params)[1]])
+
+        def residual(x, rate, multipliers, t, params, gradient):
+            return rate - self.space.bivector(x) @ gradient
+
+        return EnergyForm(hamiltonian, differential, residual)
 
     def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         """(d + r, m)."""

@@ -14,7 +14,7 @@ from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import no_constraint
 from dirax.systems.dirac_system import DiracSystem
-from dirax.systems.forms import RelationForm
+from dirax.systems.forms import EnergyForm, RelationForm
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -63,6 +63,9 @@ class LiePoisson(AbstractSystem):
 
     def relation_form(self, shape: Shape) -> RelationForm:
         return self.dirac_system().relation_form(shape)
+
+    def energy_form(self, shape: Shape) -> EnergyForm:
+        return self.dirac_system().energy_form(shape)
 
     def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         """(d + r, 0)."""

@@ -27,13 +27,22 @@ def explain(problem: Problem, outcome: Outcome, lane: int, kept: int | None = No
     rows = f"kept up to step {p.first_step + kept} (t = {time_of(kept):.6g})"
     if int(outcome.status[lane]) == OK:
         return f"interrupted by the user; {rows}."
-    reason = _by_status(outcome, lane) if brief.get() else _reason(p, outcome, lane, time_of(completed))
-    return f"step {p.first_step + completed + 1} (from t = {time_of(completed):.6g}) failed: {reason}; {rows}."
+    at = time_of(completed)
+    reason = _by_status(outcome, lane) if brief.get() else _reason(p, outcome, lane, at) + _remark(p, outcome, lane, at)
+    return f"step {p.first_step + completed + 1} (from t = {at:.6g}) failed: {reason}; {rows}."
 
 
 def _by_status(outcome: Outcome, lane: int) -> str:
     not_finite = int(outcome.status[lane]) == NOT_FINITE
     return "the new state is not finite" if not_finite else "Newton's method did not converge"
+
+
+def _remark(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
+    """What the first equation says of the place, after a semicolon."""
+    params = jax.tree.map(lambda a: jnp.asarray(a[lane] if p.batch_params else a), p.params)
+    stage, fraction = p.equation.stages[0]
+    said = stage.remark(jnp.asarray(outcome.last_state[lane]), t, fraction * p.h, params)
+    return f"; {said}" if said else ""
 
 
 def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:

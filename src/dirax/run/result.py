@@ -47,7 +47,7 @@ def solution_of(
         field_info=p.fields,
         step=p.h,
         save_every=p.save_every,
-        stats=_stats(p, outcome, traced),
+        stats=_stats(p, outcome, traced) | ({} if traced else p.equation.stages[0][0].review(fields)),
         ok=ok,
         message=message,
         system=system,

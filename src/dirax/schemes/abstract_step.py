@@ -67,6 +67,14 @@ class AbstractStep(ABC):
         """Raise `ValueError` for initial data at which a premise of the method does not hold."""
         return None
 
+    def remark(self, state: Float[Array, " s"], t: Any, h: Any, params: Any) -> str:
+        """What there is to say of a place from which a step fails."""
+        return ""
+
+    def review(self, fields: dict[str, Array]) -> dict[str, Any]:
+        """What the saved arrays of a run say for its `stats`; warns of what is wrong with them."""
+        return {}
+
     def guess(self, state: Float[Array, " s"], previous: Float[Array, " k"], h: Any, params: Any) -> Float[Array, " k"]:
         """Where Newton's method starts: at the unknowns extrapolated from the steps before."""
         return previous
@@ -84,5 +92,7 @@ class AbstractStep(ABC):
             labels=self.labels,
             canonical=self.canonical,
             check=self.check,
+            remark=self.remark,
+            review=self.review,
             guess=self.guess,
         )

@@ -1,8 +1,12 @@
 """Collocation: steps of high order whose unknowns are the rates at s nodes, coupled by constant matrices."""
 
+from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.schemes.collocation_step import LagrangianCollocation, RelationCollocation
-from dirax.schemes.collocation_tables import MOST_STAGES, gauss, lobatto
+from dirax.schemes.collocation_tables import MOST_STAGES, Tableau, gauss, lobatto
+from dirax.schemes.constrained_collocation_step import HolonomicCollocation, NonholonomicCollocation
+from dirax.schemes.manifold_collocation_step import ManifoldCollocation
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
+from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 from dirax.systems.system import AbstractSystem
 
 NODES = ("gauss", "lobatto")
@@ -22,8 +26,16 @@ class Collocation(AbstractScheme):
     matrix of Lobatto IIIA, momenta by that of IIIB, P_i = p_k + h Σ_j â_ij Ṗ_j, a symplectic and self-adjoint pair (IV.2.2;
     two stages are the Störmer–Verlet scheme where the mass matrix is constant).
 
-    Takes systems without constraints: regular `dx.LagrangeDirac`, `dx.DiracSystem` with a Hamiltonian vector field,
-    `dx.PortHamiltonian` without closed ports, `dx.LiePoisson`, and `dx.PhaseSpaceLagrangian` on its final manifold.
+    With constraints of a regular Lagrangian, at Lobatto nodes: holonomic ones, g = 0 at every node and G q̇ = 0 at the rows, a
+    symplectic map of the constraint manifold (two stages are RATTLE); or one-forms, W q̇ + b = 0 at every node, with the λ_1 of a
+    step that of λ_s before. Order 2s − 2 in q and p; the `reactions` λ at the nodes have less, as measured: s − 1 for holonomic
+    constraints, s or s − 1, whichever is even, for one-forms.
+
+    On a manifold, for a `dx.ManifoldLagrangian` at Gauss nodes: the same in the chart at q_k that belongs to the manifold's
+    retraction; symplectic on T*Q, order 2s, every q on the manifold.
+
+    Takes systems without constraints at Gauss nodes: regular `dx.LagrangeDirac`, `dx.DiracSystem` with a Hamiltonian vector
+    field, `dx.PortHamiltonian` without closed ports, `dx.LiePoisson`, and `dx.PhaseSpaceLagrangian` on its final manifold.
     Raises `ValueError` for stages that are not 1 to 16 and nodes that do not exist, and `TypeError` for other systems.
 
         sol = dx.simulate(system, dx.Collocation(stages=4), q=…, v=…, step=0.1, steps=1000)
@@ -53,10 +65,7 @@ class Collocation(AbstractScheme):
 
     def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         if shape.m + shape.c:
-            raise TypeError(
-                f"dx.Collocation does not keep constraints, of which the system has {shape.m + shape.c}: use "
-                'dx.DiscreteDirac(constraints="resolve") or dx.LagrangeDAlembert(), and dx.Composition of it for higher order.'
-            )
+            return self._constrained(system, shape)
         tableau = gauss(self.stages) if self.nodes == "gauss" else lobatto(self.stages)
         relation = system.relation_form(shape) or system.final_relation(shape)
         if relation is not None and not relation.multipliers:
@@ -69,7 +78,37 @@ class Collocation(AbstractScheme):
         lagrangian = system.lagrangian_form()
         if lagrangian is not None:
             return LagrangianCollocation(tableau, shape.n, lagrangian).equation()
+        on_manifold = system.manifold_form()
+        if on_manifold is not None:
+            return self._on_manifold(tableau, on_manifold, shape)
         raise TypeError(
-            "dx.Collocation steps systems with a relation between x and ẋ or with a Lagrangian in coordinates, but a "
+            "dx.Collocation steps systems with a relation between x and ẋ or with a Lagrangian, but a "
             f"{type(system).__name__} was given."
         )
+
+    def _on_manifold(self, tableau: Tableau, system: ManifoldLagrangian, shape: Shape) -> StepEquation:
+        if self.nodes == "lobatto" or system.forces is not None:
+            what = "Lobatto nodes are for coordinates" if self.nodes == "lobatto" else "forces are not taken there"
+            raise TypeError(
+                f'dx.Collocation on a manifold takes nodes="gauss" and L alone, and {what}: take dx.DiscreteDirac(map).'
+            )
+        manifold = system.manifold
+        if not isinstance(manifold, AbstractGeodesicManifold):
+            raise TypeError(f"dx.Collocation needs a manifold with a retraction, and {manifold!r} has none.")
+        return ManifoldCollocation(tableau, system, manifold, shape.n).equation()
+
+    def _constrained(self, system: AbstractSystem, shape: Shape) -> StepEquation:
+        lagrangian = system.lagrangian_form()
+        if self.nodes == "gauss" or lagrangian is None:
+            raise TypeError(
+                f"dx.Collocation at Gauss nodes does not keep constraints, of which the system has {shape.m + shape.c}: take "
+                'nodes="lobatto" for Lagrangians, dx.EnergyCollocation() for nonholonomic ones, or '
+                'dx.DiscreteDirac(constraints="resolve").'
+            )
+        if shape.m and shape.c:
+            raise TypeError(
+                "dx.Collocation at Lobatto nodes keeps holonomic constraints or one-forms, but the system has both, "
+                f'{shape.c} and {shape.m}: take dx.DiscreteDirac(constraints="resolve"), composed for higher order.'
+            )
+        kind = HolonomicCollocation if shape.c else NonholonomicCollocation
+        return kind(lobatto(self.stages), shape, lagrangian).equation()

@@ -7,6 +7,7 @@ the rest by exact integrals of Lagrange polynomials.
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -59,6 +60,53 @@ def lobatto(stages: int) -> Tableau:
         context.prec = DIGITS
         inner = _roots(_derivative(_legendre(stages - 1)), stages - 2)
         return _tableau([Decimal(0), *inner, Decimal(1)])
+
+
+@dataclass(frozen=True, eq=False)
+class Quadrature:
+    """Gauss quadrature with r points τ_k over a step of a Gauss method of s stages, of functions times the ℓ_i of its nodes.
+
+    `points` τ (r,); `matrix` (r, s), ∫_0^{τ_k} ℓ_j, takes rates at the nodes to points; `values` (r, s), ℓ_j(τ_k), to rates at
+    the points; `means` (s, r) takes values g_k at the points to (1/b_i) Σ_k w_k ℓ_i(τ_k) g_k; `end` (s,), ℓ_j(1), takes rates to
+    the one at the end.
+    """
+
+    points: np.ndarray
+    matrix: np.ndarray
+    values: np.ndarray
+    means: np.ndarray
+    end: np.ndarray
+
+
+@cache
+def quadrature(stages: int, points: int) -> Quadrature:
+    """Gauss quadrature with so many points over a step of the Gauss method of so many stages."""
+    with localcontext() as context:
+        context.prec = DIGITS
+        nodes, inner = _roots(_legendre(stages), stages), _roots(_legendre(points), points)
+        basis, weights = [_lagrange(nodes, j) for j in range(stages)], _weights(inner)
+        integrals, shares = [_integral(polynomial) for polynomial in basis], _weights(nodes)
+        return _rounded(
+            Quadrature,
+            inner,
+            [[_value(integral, x) for integral in integrals] for x in inner],
+            [[_value(polynomial, x) for polynomial in basis] for x in inner],
+            [[w * _value(basis[i], x) / shares[i] for x, w in zip(inner, weights, strict=True)] for i in range(stages)],
+            [_value(polynomial, Decimal(1)) for polynomial in basis],
+        )
+
+
+def _weights(nodes: list[Decimal]) -> list[Decimal]:
+    """∫_0^1 ℓ_j."""
+    return [_value(_integral(_lagrange(nodes, j)), Decimal(1)) for j in range(len(nodes))]
+
+
+def _rounded(kind: Any, *tables: Any) -> Any:
+    """A record of tables in double precision, which nobody changes."""
+    arrays = [np.array([[float(x) for x in row] if isinstance(row, list) else float(row) for row in table]) for table in tables]
+    for array in arrays:
+        array.flags.writeable = False
+    return kind(*arrays)
 
 
 def _tableau(nodes: list[Decimal]) -> Tableau:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from dirax.program.memo import Memo
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
 from dirax.schemes.layout import Layout
-from dirax.schemes.stage_relation import StageRelation
+from dirax.schemes.stage_relation import MeanRelation, StageRelation
 from dirax.schemes.step_forms import form_of_steps
 from dirax.systems.shape import Shape
 from dirax.text.representation import counted, fields_html, module_html, module_text
@@ -68,7 +68,10 @@ class StepEquation(eqx.Module):
       does not hold;
     - `guess(state, previous, h, params) -> u`: where Newton's method starts, if that is not `previous` (k,), the unknowns
       extrapolated from the steps before;
-    - `collocation`, the stage relation of which the unknowns are copies: a fact that engines may use or ignore.
+    - `remark(state, t, h, params) -> str`, what there is to say of a place from which a step fails, or "";
+    - `review(fields) -> dict`, which looks at the saved arrays of a run, concrete ones, for what is to stand in its `stats`, and
+      warns of what is wrong with them;
+    - `collocation`, the stage relation or mean relation of which the unknowns are copies: a fact that engines may use or ignore.
 
     Equations are compared by the identity of their functions. One with other functions is made by `dataclasses.replace`.
     Raises `ValueError` where sizes, layouts and labels do not fit.
@@ -84,10 +87,12 @@ class StepEquation(eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)
     canonical: bool = eqx.field(static=True)
     check: Callable = eqx.field(static=True)
+    remark: Callable = eqx.field(static=True)
+    review: Callable = eqx.field(static=True)
     guess: Callable = eqx.field(static=True)
     state_layout: Layout = eqx.field(static=True)
     unknown_layout: Layout = eqx.field(static=True)
-    collocation: StageRelation | None = eqx.field(static=True)
+    collocation: StageRelation | MeanRelation | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -104,8 +109,10 @@ class StepEquation(eqx.Module):
         labels: tuple[str, ...] | None = None,
         canonical: bool = False,
         check: Callable | None = None,
+        remark: Callable | None = None,
+        review: Callable | None = None,
         guess: Callable | None = None,
-        collocation: StageRelation | None = None,
+        collocation: StageRelation | MeanRelation | None = None,
     ):
         self.start, self.residual, self.advance, self.unpack = start, residual, advance, unpack
         self.fields, self.canonical = dict(fields), canonical
@@ -113,6 +120,8 @@ class StepEquation(eqx.Module):
         self.unknown_layout, self.unknowns = _layout("u", unknown_layout, "unknowns", unknowns)
         self.labels = labels or tuple(f"equation {i}" for i in range(self.unknowns))
         self.check = check or nothing_to_check
+        self.remark = remark or nothing_to_say
+        self.review = review or nothing_to_report
         self.guess = guess or previous_unknowns
         self.collocation = collocation
         if len(self.labels) != self.unknowns:
@@ -233,6 +242,16 @@ def previous_unknowns(state, previous, h, params):
 
 def nothing_to_check(data, h, params) -> None:
     """The default check of initial data."""
+
+
+def nothing_to_say(state, t, h, params) -> str:
+    """The default remark on a place where a step fails."""
+    return ""
+
+
+def nothing_to_report(fields) -> dict[str, Any]:
+    """The default review of saved arrays."""
+    return {}
 
 
 def explicit_step(u, state, t, h, params) -> Float[Array, "0"]:

@@ -11,7 +11,7 @@ from dirax.program.tracing import jacobian
 from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import no_constraint
 from dirax.systems.dirac_system import DiracSystem
-from dirax.systems.forms import ImplicitForm, RelationForm
+from dirax.systems.forms import EnergyForm, ImplicitForm, RelationForm
 from dirax.systems.implicit_lagrangian import implicit_lagrangian
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.shape import Shape
@@ -48,6 +48,10 @@ class PhaseSpaceLagrangian(AbstractSystem):
         form = self.dirac_system().relation_form(Shape(shape.n))
         node = lambda q, params: {"q": q, "p": self.one_form(q, params)}
         return form._replace(names=("q", "p"), node=node, dirac="(ẋ, dH) ∈ graph dα")
+
+    def energy_form(self, shape: Shape) -> EnergyForm:
+        """That of the Dirac system on M_f."""
+        return self.dirac_system().energy_form(Shape(shape.n))
 
     def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
         return implicit_lagrangian(self.lagrange_dirac(), self, near, params)

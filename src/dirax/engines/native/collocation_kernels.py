@@ -1,6 +1,7 @@
 """The kernels of a collocation step: nodes in lanes, a fixed-point iteration; Newton's method where that does not converge."""
 
 import hashlib
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,25 +11,24 @@ import numpy as np
 from dirax.engines.native import compile as llvm
 from dirax.engines.native.kernels import SIGNATURE, linked, source_digest, too_large
 from dirax.engines.native.loops.collocation_loop import collocation_module
-from dirax.engines.native.loops.collocation_plan import CollocationPlan, TracedRelation, depends
+from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan, TracedMean, TracedRelation, depends
 from dirax.engines.native.loops.record import Record
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.memo import Memo, Same
 from dirax.program.scalar_program import ScalarProgram
+from dirax.schemes.stage_relation import MeanRelation, StageRelation
 
 
 class CollocationKernels:
     """The machine code of a collocation step, for one trajectory at a time."""
 
-    def __init__(self, step: StepProgram, plan: CollocationPlan):
+    def __init__(self, step: StepProgram, plan: CollocationPlan | MeanPlan):
         self.step, self.plan = step, plan
         g = plan.graph
-        outputs = [*plan.solved, *plan.relation.rates, *(node for _, nodes in plan.rows for node in nodes)]
-        self.operations = sum(1 for node in g.reachable(outputs) if g.args[node])
+        self.operations = sum(1 for node in g.reachable(plan.outputs) if g.args[node])
         digest = hashlib.sha256(source_digest().encode())
-        kept = (plan.relation, plan.solved, plan.stable, plan.gain, plan.carried, plan.rows, plan.shared, plan.tableau.stages)
-        for part in (g.op, g.args, sorted(g.value.items()), kept, plan.tableau.matrix.tolist()):
+        for part in (g.op, g.args, sorted(g.value.items()), plan.identity):
             digest.update(repr(part).encode() + b"\0")
         self.digest = digest.hexdigest()
         self._run: tuple[Any, Any] | None = None
@@ -41,8 +41,12 @@ class CollocationKernels:
     @property
     def notes(self) -> dict[str, Any]:
         """What `stats` say of the iteration."""
-        kind = "rates" if self.plan.gain is None else "accelerations"
-        return {"iteration": f"fixed point of the {kind}, {self.plan.tableau.stages} nodes side by side"}
+        plan = self.plan
+        kind = "rates" if plan.gain is None else "accelerations"
+        side = f"{plan.tableau.stages} nodes side by side"
+        if isinstance(plan, MeanPlan):
+            side = f"{len(plan.quadrature.points)} points of the quadrature side by side, then {side}"
+        return {"iteration": f"fixed point of the {kind}, {side}"}
 
     def kernel(self, width: int) -> tuple[Any, bool]:
         """The compiled `run`, and whether it came from a cache."""
@@ -76,30 +80,46 @@ def _made(stage: Any, step: StepProgram) -> CollocationKernels | None:
     if depends(g, [node for _, nodes in rows for node in nodes], [*equation.unknowns, step.shared.t, step.shared.h]):
         return None
     try:
-        return CollocationKernels(step, CollocationPlan(g, step.shared, _traced(g, stage, step), stage.tableau, rows))
+        if isinstance(stage, MeanRelation):
+            plan = MeanPlan(g, step.shared, _traced_mean(g, stage, step), stage.tableau, stage.quadrature, rows)
+        else:
+            plan = CollocationPlan(g, step.shared, _traced(g, stage, step), stage.tableau, rows)
+        return CollocationKernels(step, plan)
     except GraphTooLarge as error:
         raise too_large(error) from None
 
 
-def _traced(g: Graph, stage: Any, step: StepProgram) -> TracedRelation:
-    p, equation = step.parameters, step.equations[0]
-    vector = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float64)
-    leaves = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in p.shapes]
+def _traced(g: Graph, stage: StageRelation, step: StepProgram) -> TracedRelation:
+    equation, t = step.equations[0], step.shared.t
+    a, b, y = equation.state[: stage.first], equation.state[stage.first :], equation.unknowns[: stage.first]
+    both = lambda a, b, y, t, params: (stage.rates(a, y, t, params), stage.relation(a, b, y, t, params))
+    rates, relation = _nodes(g, both, [a, b, y, t], step)
+    return TracedRelation(a, b, y, rates.tolist(), relation.tolist())
 
-    def both(a, b, y, t, leaves):
-        params = p.rebuild(leaves)
-        return stage.rates(a, y, t, params), stage.relation(a, b, y, t, params)
 
-    closed = jax.make_jaxpr(both)(vector(stage.first), vector(stage.second), vector(stage.first), vector(), leaves)
-    a, b = equation.state[: stage.first], equation.state[stage.first :]
-    y = equation.unknowns[: stage.first]
-    ids = lambda nodes, shape: np.array(nodes, dtype=np.int64).reshape(shape)
-    arguments, at = [ids(a, (-1,)), ids(b, (-1,)), ids(y, (-1,)), ids(step.shared.t, ())], 0
+def _traced_mean(g: Graph, stage: MeanRelation, step: StepProgram) -> TracedMean:
+    equation, t, h = step.equations[0], step.shared.t, step.shared.h
+    a, b, y = equation.state[: stage.first], equation.state[stage.first :], equation.unknowns[: stage.first]
+    (slopes,) = _nodes(g, stage.slopes, [a, y, t], step)
+    means = [g.input(f"mean{i}") for i in range(len(slopes))]
+    after = [g.input(f"after{i}") for i in range(len(equation.state))]
+    (rates,) = _nodes(g, stage.rates, [a, means, t], step)
+    (settled,) = _nodes(g, stage.settle, [equation.state, after, y, t, h], step)
+    return TracedMean(a, b, y, means, after, slopes.tolist(), rates.tolist(), settled.tolist())
+
+
+def _nodes(g: Graph, function: Callable, arguments: list[list[int] | int], step: StepProgram) -> list[np.ndarray]:
+    """The results of `function(*arguments, params)` for vectors and numbers of nodes."""
+    p = step.parameters
+    shapes = [(len(nodes),) if isinstance(nodes, list) else () for nodes in arguments]
+    kinds = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in (*shapes, *p.shapes)]
+    many = len(arguments)
+    closed = jax.make_jaxpr(lambda *values: function(*values[:many], p.rebuild(list(values[many:]))))(*kinds)
+    ids, at = [np.array(nodes, dtype=np.int64).reshape(shape) for nodes, shape in zip(arguments, shapes, strict=True)], 0
     for shape in p.shapes:
         count = int(np.prod(shape))
-        arguments.append(ids(step.shared.params[at : at + count], shape))
+        ids.append(np.array(step.shared.params[at : at + count], dtype=np.int64).reshape(shape))
         at += count
-    program = ScalarProgram(g, arguments)
+    program = ScalarProgram(g, ids)
     program.run(closed)
-    rates, relation = program.results
-    return TracedRelation(a, b, y, rates.tolist(), relation.tolist())
+    return program.results

@@ -7,13 +7,13 @@ from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.collocation_nodes import Nodes
-from dirax.engines.native.loops.collocation_plan import CollocationPlan
-from dirax.engines.native.loops.collocation_sweeps import FirstOrder, SecondOrder
+from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
+from dirax.engines.native.loops.collocation_sweeps import FirstOrder, Means, SecondOrder, Sweep
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
 from dirax.engines.stopping import EPSILON, STALLED
 
 
-def collocation_module(plan: CollocationPlan, fma: bool) -> str:
+def collocation_module(plan: CollocationPlan | MeanPlan, fma: bool) -> str:
     """IR of `run(lanes, params, outs, blocks, …)`: one trajectory a block."""
     module = Module(fma)
     add_far_reduction(module)
@@ -25,7 +25,7 @@ def collocation_module(plan: CollocationPlan, fma: bool) -> str:
 class _Kernel:
     """Emits `block`: the steps of one trajectory."""
 
-    def __init__(self, plan: CollocationPlan, module: Module):
+    def __init__(self, plan: CollocationPlan | MeanPlan, module: Module):
         self.plan, self.body = plan, Body(module)
         self.nodes = Nodes(plan, self.body)
         self.one, self.all = self.nodes.one, self.nodes.all
@@ -74,6 +74,7 @@ class _Kernel:
     def _give_rates(self, places: list[str]) -> None:
         """The rates where the steps end, for every node: where Newton's method begins if it has to go on."""
         plan = self.plan
+        assert isinstance(plan, CollocationPlan)
         region = Region(self.one, plan.graph, self.nodes.scalar)
         for node, pointer in zip([*plan.relation.first, *plan.relation.second], self.state, strict=True):
             region.bind(node, self.body.load("double", pointer))
@@ -111,16 +112,21 @@ class _Kernel:
             here.bind(node, value)
         with b.when(saves):
             self._save(here, number)
-        kind = FirstOrder if plan.gain is None else SecondOrder
+        kind = Means if isinstance(plan, MeanPlan) else FirstOrder if plan.gain is None else SecondOrder
         sweep = kind(self.nodes, here, state, time)
         converged, size, count = self._attempts(sweep, one.compare("ogt", done, one.const(0.0)))
-        increments = sweep.increments([b.load(self.all.real, pointer, 64) for pointer in self.iterates])
+        iterates = [b.load(self.all.real, pointer, 64) for pointer in self.iterates]
+        increments = sweep.increments(iterates)
         new, lost = [], []
         finite = one.true
         for old, pointer, increment in zip(state, self.lost, increments, strict=True):
             total, error = one.two_sum(old, one.add(increment, b.load("double", pointer)))
             new.append(total)
             lost.append(error)
+        for i, more in enumerate(sweep.settled(iterates, new)):
+            new[i], error = one.two_sum(new[i], more)
+            lost[i] = one.add(lost[i], error)
+        for total in new:
             finite = one.both(finite, one.compare("olt", one.abs(total), one.const(float("inf"))))
         good = one.both(finite, converged)
         failure = one.select(finite, one.const(float(NOT_CONVERGED)), one.const(float(NOT_FINITE)))
@@ -132,7 +138,7 @@ class _Kernel:
             b.store("double", one.add(done, one.const(1.0)), self.completed)
             b.store("double", one.max(size, b.load("double", self.worst)), self.worst)
 
-    def _attempts(self, sweep: FirstOrder | SecondOrder, later: str) -> tuple[str, str, str]:
+    def _attempts(self, sweep: Sweep, later: str) -> tuple[str, str, str]:
         """The iteration from the polynomial of the step before, where that fails from constants: (converged, the largest last
         change, sweeps)."""
         b, e = self.body, self.all
@@ -151,7 +157,7 @@ class _Kernel:
         count = b.put(f"sitofp i64 {b.load('i64', sweeps)} to double")
         return b.load("i1", converged, 1), largest, count
 
-    def _iterate(self, sweep: FirstOrder | SecondOrder, change: str, sweeps: str) -> str:
+    def _iterate(self, sweep: Sweep, change: str, sweeps: str) -> str:
         """Sweeps until the next change of every entry of an iterate is below its roundoff, or no smaller than a change before;
         whether that is a root."""
         b, e = self.body, self.all
@@ -169,9 +175,10 @@ class _Kernel:
             b.store(e.real, a, pointer, 64)
             moved, size, smallest = e.abs(e.sub(a, before)), e.abs(a), b.load(e.real, least_of, 64)
             shrinks = e.both(e.compare("olt", moved, smallest), e.compare("ogt", moved, e.mul(size, e.const(EPSILON))))
-            left = e.div(e.mul(moved, moved), smallest)  # what the next change will be; before the second, nothing is known
+            # the next change will be moved²/smallest; before the second, nothing is known
             known = e.compare("olt", smallest, e.const(float("inf")))
-            enough = e.both(known, e.compare("olt", left, e.mul(size, e.const(EPSILON / 2.0))))
+            floor = e.mul(e.mul(size, e.const(EPSILON / 2.0)), smallest)
+            enough = e.both(known, e.compare("olt", e.mul(moved, moved), floor))
             going = e.either(going, e.both(shrinks, e.invert(enough)))
             b.store(e.real, e.select(e.compare("olt", moved, smallest), moved, smallest), least_of, 64)
             worst = e.max(moved, worst)

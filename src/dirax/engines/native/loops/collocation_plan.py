@@ -7,7 +7,7 @@ from dirax.engines.native.loops.record import Record
 from dirax.engines.step_program import Inputs
 from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import jacobian
-from dirax.schemes.collocation_tables import Tableau
+from dirax.schemes.collocation_tables import Quadrature, Tableau
 
 
 @dataclass
@@ -72,9 +72,69 @@ class CollocationPlan:
 
     @property
     def record(self) -> Record:
-        """What is kept of a trajectory: the iterates of the step before among the unknowns, and sums with their errors."""
+        """What is kept of a trajectory."""
+        return record_of(self.relation, self.tableau)
+
+    @property
+    def outputs(self) -> list[int]:
+        """Every node that the kernel computes for its own sake."""
+        return [*self.solved, *self.relation.rates, *(node for _, nodes in self.rows for node in nodes)]
+
+    @property
+    def identity(self) -> tuple:
+        """What tells two plans of equal graphs apart."""
+        own = (self.relation, self.solved, self.stable, self.gain, self.carried)
+        return *own, self.rows, self.shared, self.tableau.stages, self.tableau.matrix.tolist()
+
+
+@dataclass
+class TracedMean:
+    """A `MeanRelation` as nodes: inputs a, b, ȧ and means with the slopes and the rates as functions of them; and what is added
+    at the end of a step as a function of a, b, of those after the sums (`after`) and of ȧ."""
+
+    first: list[int]
+    second: list[int]
+    unknowns: list[int]
+    means: list[int]
+    after: list[int]
+    slopes: list[int]
+    rates: list[int]
+    settled: list[int]
+
+
+@dataclass
+class MeanPlan:
+    """A fixed-point iteration for the rates at the nodes by the means of slopes over the step: all points of the quadrature
+    side by side, then all nodes."""
+
+    graph: Graph
+    shared: Inputs
+    relation: TracedMean
+    tableau: Tableau
+    quadrature: Quadrature
+    rows: list[tuple[str, list[int]]]
+    gain = None
+
+    @property
+    def record(self) -> Record:
+        """What is kept of a trajectory."""
+        return record_of(self.relation, self.tableau)
+
+    @property
+    def outputs(self) -> list[int]:
+        """Every node that the kernel computes for its own sake."""
         r = self.relation
-        return Record(len(r.first) + len(r.second), 1, self.tableau.stages * len(r.first), True)
+        return [*r.slopes, *r.rates, *r.settled, *(node for _, nodes in self.rows for node in nodes)]
+
+    @property
+    def identity(self) -> tuple:
+        """What tells two plans of equal graphs apart."""
+        return self.relation, self.rows, self.shared, self.tableau.matrix.tolist(), self.quadrature.means.tolist()
+
+
+def record_of(relation: TracedRelation | TracedMean, tableau: Tableau) -> Record:
+    """The iterates of the step before among the unknowns, and sums with their errors."""
+    return Record(len(relation.first) + len(relation.second), 1, tableau.stages * len(relation.first), True)
 
 
 def depends(g: Graph, nodes: list[int], inputs: list[int]) -> bool:

@@ -1,0 +1,232 @@
+"""One step at Lobatto nodes of a Lagrangian with constraints: the pair IIIA–IIIB, with the constraints at every node."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dirax.program.linear_solves import solve
+from dirax.program.tracing import along, gradient, jacobian, once
+from dirax.schemes.abstract_step import AbstractStep
+from dirax.schemes.collocation_step import combined
+from dirax.schemes.collocation_tables import Tableau
+from dirax.schemes.constraint_rows import ConstraintRows
+from dirax.schemes.layout import Layout
+from dirax.schemes.step import Field
+from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.shape import Shape
+
+
+class Nodes(NamedTuple):
+    """What holds at the nodes of a step, a list of one entry a node each."""
+
+    times: list
+    q: list
+    v: list
+    rates: list
+    """ṗ = ∂L/∂q + f − [W; G]ᵀλ."""
+    works: list
+    """The power of the forces."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConstrainedCollocation(AbstractStep):
+    """Q_i = q_k + h Σ_j a_ij V_j with the matrix of Lobatto IIIA, ∂L/∂v(Q_i, V_i) = p_k + h Σ_j â_ij Ṗ_j with that of IIIB, and
+    p_{k+1} = p_k + h Σ_i b_i Ṗ_i, where Ṗ_i = ∂L/∂q + f − [W; G]ᵀ λ_i.
+
+    The last column of â is zero, so that λ_s acts on p_{k+1} alone. Saved are `multipliers`, h Σ_i b_i λ_i, and `reactions`,
+    the λ_i of every node.
+    """
+
+    tableau: Tableau
+    shape: Shape
+    system: LagrangeDirac
+
+    @property
+    def n(self) -> int:
+        """The number of coordinates."""
+        return self.shape.n
+
+    @cached_property
+    def rows(self) -> ConstraintRows:
+        """The constraints that enter the equations."""
+        return ConstraintRows(self.system, self.shape)
+
+    @property
+    def forced(self) -> int:
+        """How many numbers the work of the forces is: one, or none without forces."""
+        return int(self.system.forces is not None)
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        stages, size = self.tableau.stages, self.shape.m + self.shape.c
+        about = "Lagrange multipliers at the nodes of the step, per unit of time"
+        found = {
+            "q": Field((self.n,)),
+            "p": Field((self.n,)),
+            "multipliers": Field((size,), "step", ("constraint",), "Lagrange multipliers of the constraints", "sum"),
+            "reactions": Field((stages, size), "step", ("node_of_step", "constraint"), about),
+        }
+        return found | ({"work": Field((), "node", (), "work of the forces since the start")} if self.forced else {})
+
+    @abstractmethod
+    def reactions(self, u: Array, state: Array) -> list[Float[Array, " k"]]:
+        """λ_i at every node."""
+
+    @once
+    def slope(self, t, q, v, params):
+        """∂L/∂q + f, and the power of f."""
+        slope = gradient(lambda q: self.system.lagrangian.at(t, q, v, params))(q)
+        if self.system.forces is None:
+            return slope, jnp.zeros(())
+        force = self.system.forces(t, q, v, params)
+        return slope + force, force @ v
+
+    def nodes(self, u, state, t, h, params) -> Nodes:
+        """The nodes of a step."""
+        times = [t + c * h for c in self.tableau.nodes.tolist()]
+        v = list(self.unknowns.split(u).velocities)
+        start = self.state.split(state).q
+        q = [start + h * combined(row, v) for row in self.tableau.matrix.tolist()]
+        rates, works = [], []
+        for at, place, velocity, pull in zip(times, q, v, self.reactions(u, state), strict=True):
+            slope, work = self.slope(at, place, velocity, params)
+            rates.append(slope - self.rows.matrix(at, place, params).T @ pull)
+            works.append(work)
+        return Nodes(times, q, v, rates, works)
+
+    def momenta(self, matrix, state, nodes: Nodes, h) -> list[Float[Array, " n"]]:
+        """p_k + h Σ_j a_ij Ṗ_j for the rows of a matrix."""
+        return [self.state.split(state).p + h * combined(row, nodes.rates) for row in matrix.tolist()]
+
+    def inner(self, nodes: Nodes, state, h, params) -> list[Float[Array, " n"]]:
+        """P_i − ∂L/∂v(Q_i, V_i)."""
+        given = self.momenta(self.tableau.conjugate, state, nodes, h)
+        parts = zip(given, nodes.q, nodes.v, nodes.times, strict=True)
+        return [p - self.system.legendre(q, v, params, t) for p, q, v, t in parts]
+
+    def ends(self, nodes: Nodes, state, h) -> dict[str, Array]:
+        """The parts of the new state."""
+        now, weights = self.state.split(state), self.tableau.weights.tolist()
+        moved = {"q": now.q + h * combined(weights, nodes.v), "p": now.p + h * combined(weights, nodes.rates)}
+        return moved | ({"work": now.work + h * combined(weights, nodes.works)} if self.forced else {})
+
+    def first_reaction(self, data, params) -> Float[Array, " k"]:
+        """λ of the equations of motion at the initial data: the one that keeps W v + b = 0 and G v + ∂g/∂t = 0."""
+        t, q, v = jnp.asarray(data.get("t", 0.0), float), data["q"], data["v"]
+        momentum = lambda t, q: self.system.legendre(q, v, params, t)
+        here, ahead = (t, q), (jnp.ones(()), v)
+        free = self.slope(t, q, v, params)[0] - along(momentum, here, ahead)
+        drift = along(lambda t, q: self.rows.velocity_defect(t, q, v, params), here, ahead)
+        matrix = self.rows.matrix(t, q, params)
+        hessian = jacobian(lambda v: self.system.legendre(q, v, params, t))(v)
+        solved = solve(hessian, jnp.concatenate([free[:, None], matrix.T], axis=1))
+        return solve(matrix @ solved[:, 1:], matrix @ solved[:, 0] + drift)
+
+    def begun(self, data) -> dict[str, Array]:
+        """The parts of the first state that every method has."""
+        if "q0" in data:
+            raise ValueError("collocation is a one-step method: start it from q= with v= or p=, not from two points.")
+        return {"q": data["q"], "p": data["p"]}
+
+    def unpack(self, state, u, t, h, params):
+        now, reactions = self.state.split(state), self.reactions(u, state)
+        impulse = h * combined(self.tableau.weights.tolist(), reactions)
+        nodes = jnp.stack([self.rows.all(pull) for pull in reactions])
+        row = {"q": now.q, "p": now.p, "multipliers": self.rows.all(impulse), "reactions": nodes}
+        return row | ({"work": now.work[0]} if self.forced else {})
+
+
+@dataclass(frozen=True, eq=False)
+class HolonomicCollocation(ConstrainedCollocation):
+    """g(Q_i) = 0 at every node, and G q̇ + ∂g/∂t = 0 at the end for the velocity of p_{k+1} (Jay 1996; Hairer, Lubich, Wanner,
+    VII.1.4): symplectic on the constraint manifold. Two stages are RATTLE."""
+
+    @property
+    def state(self) -> Layout:
+        return Layout(q=self.n, p=self.n, work=self.forced)
+
+    @property
+    def canonical(self) -> bool:
+        return not self.forced
+
+    @property
+    def unknowns(self) -> Layout:
+        s, k = self.tableau.stages, self.rows.count
+        return Layout(velocities=(s, self.n), reactions=(s, k), end=self.n)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        s, n, k = self.tableau.stages, self.n, self.rows.count
+        inner = tuple(f"equation {i} at node {j + 1}" for j in range(s) for i in range(n))
+        positions = tuple(f"holonomic constraint {i} at node {j + 1}" for j in range(1, s) for i in range(k))
+        ends = tuple(f"momentum {i} at the end" for i in range(n)) + tuple(f"rate of constraint {i} at the end" for i in range(k))
+        return inner + positions + ends
+
+    def reactions(self, u, state):
+        return list(self.unknowns.split(u).reactions)
+
+    def residual(self, u, state, t, h, params):
+        nodes, end = self.nodes(u, state, t, h, params), self.unknowns.split(u).end
+        out = self.ends(nodes, state, h)
+        # a step moves g by about h² λ, so that g/h and not g is of the size of the other equations
+        positions = [self.rows.position(at, q, params) / h for at, q in zip(nodes.times[1:], nodes.q[1:], strict=True)]
+        last = [out["p"] - self.system.legendre(out["q"], end, params, t + h), self.rows.hidden(t + h, out["q"], end, params)]
+        return jnp.concatenate([*self.inner(nodes, state, h, params), *positions, *last])
+
+    def advance(self, u, state, t, h, params):
+        return self.state.join(**self.ends(self.nodes(u, state, t, h, params), state, h))
+
+    def start(self, data, h, params):
+        begun, pull = self.state.join(**self.begun(data)), self.first_reaction(data, params)
+        s = self.tableau.stages
+        return begun, self.unknowns.join(velocities=jnp.tile(data["v"], (s, 1)), reactions=jnp.tile(pull, (s, 1)), end=data["v"])
+
+
+@dataclass(frozen=True, eq=False)
+class NonholonomicCollocation(ConstrainedCollocation):
+    """W v + b = 0 at every node for the velocity v̂_i that belongs to p_k + h Σ_j a_ij Ṗ_j, with the matrix of IIIA; λ_1 is λ_s
+    of the step before (Jay's SPARK methods; Sato Martín de Almagro, arXiv 1810.10926). The state carries it."""
+
+    @property
+    def state(self) -> Layout:
+        return Layout(q=self.n, p=self.n, reaction=self.rows.count, work=self.forced)
+
+    @property
+    def unknowns(self) -> Layout:
+        s, k = self.tableau.stages, self.rows.count
+        return Layout(velocities=(s, self.n), reactions=(s - 1, k), constrained=(s - 1, self.n))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        s, n, k = self.tableau.stages, self.n, self.rows.count
+        inner = tuple(f"equation {i} at node {j + 1}" for j in range(s) for i in range(n))
+        momenta = tuple(f"momentum {i} at node {j + 1}" for j in range(1, s) for i in range(n))
+        return inner + momenta + tuple(f"constraint {i} at node {j + 1}" for j in range(1, s) for i in range(k))
+
+    def reactions(self, u, state):
+        return [self.state.split(state).reaction, *self.unknowns.split(u).reactions]
+
+    def residual(self, u, state, t, h, params):
+        nodes, velocities = self.nodes(u, state, t, h, params), list(self.unknowns.split(u).constrained)
+        places = list(zip(nodes.times, nodes.q, strict=True))[1:]
+        given = self.momenta(self.tableau.matrix, state, nodes, h)[1:]
+        momenta = [p - self.system.legendre(q, v, params, at) for p, v, (at, q) in zip(given, velocities, places, strict=True)]
+        kept = [self.rows.velocity_defect(at, q, v, params) for v, (at, q) in zip(velocities, places, strict=True)]
+        return jnp.concatenate([*self.inner(nodes, state, h, params), *momenta, *kept])
+
+    def advance(self, u, state, t, h, params):
+        ends = self.ends(self.nodes(u, state, t, h, params), state, h)
+        return self.state.join(reaction=self.unknowns.split(u).reactions[-1], **ends)
+
+    def start(self, data, h, params):
+        pull, s = self.first_reaction(data, params), self.tableau.stages
+        v = data["v"]
+        guess = {"velocities": jnp.tile(v, (s, 1)), "constrained": jnp.tile(v, (s - 1, 1))}
+        return (
+            self.state.join(reaction=pull, **self.begun(data)),
+            self.unknowns.join(reactions=jnp.tile(pull, (s - 1, 1)), **guess),
+        )

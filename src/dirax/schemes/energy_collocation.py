@@ -1,0 +1,83 @@
+"""Energy-preserving collocation: steps of high order that keep the energy of any system with a bracket."""
+
+from typing import Any
+
+from dirax.schemes.collocation_tables import MOST_STAGES, gauss, quadrature
+from dirax.schemes.energy_collocation_step import HamiltonianEnergyCollocation, LagrangianEnergyCollocation
+from dirax.schemes.step import AbstractScheme, Shape, StepEquation
+from dirax.systems.forms import RelationForm
+from dirax.systems.system import AbstractSystem
+
+POINTS = (8, 16)
+"""Points of the quadrature, of up to four stages and of more: as many as are computed side by side."""
+
+
+class EnergyCollocation(AbstractScheme):
+    """Collocation with s stages that keeps the energy: for ẏ = Π(y) ∇H(y) with Π antisymmetric, y(τ) of degree s with
+
+        ẏ(c_i) = Π(y(c_i)) (1/b_i) ∫_0^1 ℓ_i(τ) ∇H(y(τ)) dτ
+
+    at Gauss nodes (Hairer 2010; Cohen, Hairer 2011): order 2s, self-adjoint, H(y_{k+1}) = H(y_k) as far as the quadrature of
+    the integral is exact; Jacobi's identity is not needed.
+
+    - a regular `dx.LagrangeDirac` or `dx.NonholonomicMechanics`, with one-forms or without: the almost-Poisson bracket on D*
+      (Celledoni, Farré Puiggalí, Høiseth, Martín de Diego, arXiv 1605.02845), from L and the one-forms alone. The
+      constraint holds at every row to roundoff. Forces, affine constraints and explicit time enter with their `work`: the
+      energy less the work is kept;
+    - `dx.DiracSystem` of a bivector or of a two-form, `dx.LiePoisson`, `dx.EulerPoincare`, and `dx.PhaseSpaceLagrangian` on M_f;
+    - `dx.PortHamiltonian` without closed ports: H(x_{k+1}) − H(x_k) is the energy supplied less the energy dissipated,
+      which are saved as `work`.
+
+    `points` is the number of points of the quadrature, by default 8 and from five stages on 16. Saved is `energy_defect`, the
+    largest change of the energy in a step so far that is not work, relative to the terms of the energy.
+
+    It is neither symplectic nor a (±)-discrete Dirac structure, and keeps no other invariant.
+    Raises `ValueError` for stages that are not 1 to 16 and fewer points than stages, and `TypeError` for other systems.
+
+        sol = dx.simulate(system, dx.EnergyCollocation(stages=3), q=…, v=…, step=0.05, steps=1000)
+    """
+
+    stages: int
+    points: int
+
+    def __init__(self, stages: int = 2, points: int | None = None):
+        if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MOST_STAGES:
+            raise ValueError(f"stages must be a whole number from 1 to {MOST_STAGES}, but {stages!r} was given.")
+        points = POINTS[stages > 4] if points is None else points
+        if isinstance(points, bool) or not isinstance(points, int) or not stages <= points <= MOST_STAGES:
+            raise ValueError(
+                f"points must be a whole number from the number of stages, {stages}, to {MOST_STAGES}, but {points!r} was given."
+            )
+        self.stages, self.points = stages, points
+
+    @property
+    def order(self) -> int:
+        """The order of convergence on smooth systems: 2s."""
+        return 2 * self.stages
+
+    def adjoint(self, system: AbstractSystem) -> "EnergyCollocation":
+        """The scheme itself, for nodes that lie symmetrically."""
+        return self
+
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
+        return "energy-preserving collocation is no discrete Dirac structure; its energy is measured instead"
+
+    def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
+        if shape.c:
+            raise TypeError(
+                f"dx.EnergyCollocation does not keep holonomic constraints, of which the system has {shape.c}: state them as "
+                'one-forms, remove them by coordinates, or take dx.DiscreteDirac(constraints="resolve").'
+            )
+        tables = gauss(self.stages), quadrature(self.stages, self.points)
+        energy = system.energy_form(shape)
+        relation = system.relation_form(shape) or system.final_relation(shape)
+        relation = RelationForm(energy.residual) if relation is None and energy is not None else relation
+        if relation is not None and energy is not None and not relation.multipliers:
+            return HamiltonianEnergyCollocation(*tables, relation, energy, shape.n).equation()
+        lagrangian = system.lagrangian_form()
+        if lagrangian is not None:
+            return LagrangianEnergyCollocation(*tables, lagrangian, shape).equation()
+        raise TypeError(
+            "dx.EnergyCollocation steps Lagrangians in coordinates, and Hamiltonians whose bracket determines ẋ, but a "
+            f"{type(system).__name__} was given."
+        )

@@ -1,0 +1,149 @@
+"""Collocation at Lobatto nodes with constraints: orders of positions, momenta and multipliers, the constraints, symplecticity."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dirax as dx
+
+
+def reference(lagrangian, rows, forces, q, v, t):
+    """(q, p, work) at t and λ as a function of the time, by DOP853 from the equations with multipliers."""
+    n = len(q)
+
+    @jax.jit
+    def solved(t, x):
+        q, v = x[:n], x[n : 2 * n]
+        mass = jax.hessian(lambda v: lagrangian(q, v))(v)
+        force = forces(t, q, v)
+        free = jax.grad(lagrangian)(q, v) + force - jax.jvp(lambda q: jax.grad(lagrangian, 1)(q, v), (q,), (v,))[1]
+        w, drift = rows(q), jax.jvp(lambda q: rows(q) @ v, (q,), (v,))[1]
+        matrix = jnp.block([[mass, w.T], [w, jnp.zeros((len(w), len(w)))]])
+        return jnp.append(jnp.linalg.solve(matrix, jnp.concatenate([free, -drift])), force @ v)
+
+    rates = lambda t, x: np.concatenate([x[n : 2 * n], np.asarray(solved(t, x))[[*range(n), -1]]])
+    found = solve_ivp(rates, (0.0, t), [*q, *v, 0.0], method="DOP853", rtol=1e-13, atol=1e-14, dense_output=True)
+    x = found.y[:, -1]
+    p = np.asarray(jax.grad(lagrangian, 1)(x[:n], x[n : 2 * n]))
+    return x[:n], p, x[-1], lambda t: np.asarray(solved(t, found.sol(t)))[n:-1]
+
+
+def two_bobs(q, v):
+    return v @ v / 2 + 0.3 * q[0] ** 2 * v[2] ** 2 - 9.8 * (q[1] + q[3]) - 0.2 * q[0] * q[2] ** 2
+
+
+def rods(q):
+    return jnp.array([q[0] ** 2 + q[1] ** 2 - 1.0, (q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2 - 1.0])
+
+
+def hanging(angles):
+    """The bobs at two angles."""
+    first = jnp.stack([jnp.sin(angles[0]), -jnp.cos(angles[0])])
+    return jnp.concatenate([first, first + jnp.stack([jnp.sin(angles[1]), -jnp.cos(angles[1])])])
+
+
+def rolling(q, v):
+    return v @ v / 2 + q[1] ** 2 * v[0] ** 2 / 2 + 0.4 * q[0] * v[2] - q @ q / 2 - 0.1 * q[0] ** 3
+
+
+def one_forms(q):
+    return jnp.array([[q[1], 0.3 * jnp.sin(q[0]), 1.0]])
+
+
+def pushed(t, q, v):
+    return -0.1 * v + jnp.zeros_like(v).at[1].set(jnp.sin(t))
+
+
+ANGLES, RATES = jnp.array([1.0, 0.5]), jnp.array([0.5, -0.3])
+START = {
+    "holonomic": (hanging(ANGLES), jax.jvp(hanging, (ANGLES,), (RATES,))[1]),
+    "nonholonomic": (jnp.array([0.5, 0.4, 0.1]), jnp.array([0.3, 0.2, -(0.4 * 0.3 + 0.3 * np.sin(0.5) * 0.2)])),
+}
+KINDS = {
+    "holonomic": (two_bobs, jax.jacobian(rods), dx.LagrangeDirac(two_bobs, holonomic=rods, forces=pushed)),
+    "nonholonomic": (rolling, one_forms, dx.LagrangeDirac(rolling, one_forms, forces=pushed)),
+}
+STEPS = {2: (100, 200), 3: (40, 80), 4: (14, 28)}
+OF_MULTIPLIERS = {("holonomic", 2): 1, ("holonomic", 3): 2, ("holonomic", 4): 3}
+OF_MULTIPLIERS |= {("nonholonomic", 2): 2, ("nonholonomic", 3): 2, ("nonholonomic", 4): 4}
+"""The orders of λ at the nodes that are measured: less than the 2s − 2 of the rest."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("stages", STEPS)
+def test_orders_and_constraints(kind, stages):
+    lagrangian, rows, system = KINDS[kind]
+    q, v = START[kind]
+    *ends, multiplier = reference(lagrangian, rows, pushed, q, v, 1.0)
+    errors = []
+    for n in STEPS[stages]:
+        sol = dx.simulate(system, dx.Collocation(stages, "lobatto"), q=q, v=v, step=1.0 / n, steps=n)
+        assert sol.ok
+        found = (sol.q[-1], sol.p[-1], sol.work[-1], sol.reactions[-1, -1])
+        errors.append([np.max(np.abs(a - b)) for a, b in zip(found, (*ends, multiplier(1.0)), strict=True)])
+    measured = np.log2(np.divide(*errors))
+    assert np.all(np.abs(measured[:3] - (2 * stages - 2)) < 0.35), measured
+    assert abs(measured[3] - OF_MULTIPLIERS[kind, stages]) < 0.5, measured
+    defect = jax.jit(jax.vmap(lambda q, p: system.constraint_at({"q": q, "p": p}, None)))(sol.q, sol.p)
+    assert np.max(np.abs(defect)) < 1e-14
+    impulse = np.sum(np.asarray(sol.multipliers), axis=0)
+    times = np.linspace(0.0, 1.0, 201)
+    mean = np.trapezoid([multiplier(t) for t in times], times, axis=0)
+    np.testing.assert_allclose(impulse, mean, rtol=2e-3)
+
+
+def test_two_stages_are_rattle():
+    q, v = START["holonomic"]
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.8 * (q[1] + q[3]), holonomic=rods)
+    run = lambda scheme: dx.simulate(system, scheme, q=q, v=v, step=0.02, steps=20)
+    ours, theirs = run(dx.Collocation(2, "lobatto")), run(dx.LagrangeDAlembert("trapezoidal"))
+    np.testing.assert_allclose(ours.q, theirs.q, atol=1e-13)
+    np.testing.assert_allclose(ours.p, theirs.p, atol=1e-13)
+
+
+def test_symplectic_on_the_constraint_manifold():
+    system = dx.LagrangeDirac(two_bobs, holonomic=rods)
+
+    def point(z):
+        q, v = hanging(z[:2]), jax.jvp(hanging, (z[:2],), (z[2:],))[1]
+        return q, system.legendre(q, v)
+
+    def moved(z):
+        q, p = point(z)
+        sol = dx.simulate(system, dx.Collocation(2, "lobatto"), q=q, p=p, step=0.1, steps=1, engine="xla", check_initial=False)
+        return sol.q[-1], sol.p[-1]
+
+    def pulled_back(function):
+        q, p = jax.jacobian(function)(jnp.concatenate([ANGLES, RATES]))
+        return np.asarray(q.T @ p - p.T @ q)
+
+    before, after = pulled_back(point), pulled_back(moved)
+    assert np.max(np.abs(before)) > 0.5
+    np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_self_adjoint_and_the_same_on_both_engines(kind):
+    lagrangian = KINDS[kind][0]
+    even = lambda q, v: (lagrangian(q, v) + lagrangian(q, -v)) / 2  # reversible
+    system = dx.LagrangeDirac(even, holonomic=rods) if kind == "holonomic" else dx.LagrangeDirac(even, one_forms)
+    q, v = START[kind]
+    native, arrays = (
+        dx.simulate(system, dx.Collocation(3, "lobatto"), q=q, v=v, step=0.05, steps=20, engine=engine)
+        for engine in ("native", "xla")
+    )
+    for field, values in native.fields.items():
+        np.testing.assert_allclose(values, arrays.fields[field], atol=1e-10 if field == "reactions" else 1e-12)
+    back = dx.simulate(system, dx.Collocation(3, "lobatto"), q=native.q[-1], p=-native.p[-1], step=0.05, steps=20)
+    # λ at the start of the way back is not the λ at the end of the way there, by its error
+    np.testing.assert_allclose(back.q[-1], q, atol=1e-11 if kind == "holonomic" else 1e-5)
+
+
+def test_what_it_does_not_keep_is_refused():
+    both = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[0.0, 0.0, 1.0]]), holonomic=lambda q: q[:1])
+    with pytest.raises(TypeError, match="but the system has both, 1 and 1"):
+        dx.simulate(both, dx.Collocation(3, "lobatto"), q=[0.0, 0.0, 0.0], v=[0.0, 1.0, 0.0], step=0.1, steps=1)
+    with pytest.raises(TypeError, match="at Gauss nodes does not keep constraints"):
+        dx.simulate(KINDS["nonholonomic"][2], dx.Collocation(3), q=[0.0, 0.0, 0.0], v=[0.0, 1.0, 0.0], step=0.1, steps=1)

@@ -1,0 +1,317 @@
+"""Energy-preserving collocation: orders against motions found in another way, the energy and the books, both engines."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dirax as dx
+from dirax import gallery
+from dirax.gallery import contact_particle, transmission
+from dirax.schemes.collocation_tables import gauss, quadrature
+
+DATA = {"q": [0.5, 0.4, 0.1], "v": [0.3, 0.2, -0.12]}
+
+
+def lagrangian(q, v):
+    return v @ v / 2 + q[1] ** 2 * v[0] ** 2 / 2 + 0.4 * q[0] * v[2] - q @ q / 2 - 0.1 * q[0] ** 3
+
+
+def one_forms(t, q):
+    return jnp.array([[q[1] * jnp.cos(t), 0.3 * jnp.sin(q[0]), 1.0]])
+
+
+def affine(t, q):
+    return jnp.array([0.2 * q[1] * jnp.sin(t)])
+
+
+def forces(t, q, v):
+    return -0.1 * v + jnp.array([0.0, jnp.sin(t), 0.0])
+
+
+def reference(t, q, v, moving):
+    """(q, p, work) by DOP853 from the equations with multipliers, the constraint differentiated by finite formulas of JAX."""
+    b = affine if moving else (lambda t, q: jnp.zeros(1))
+    rows = one_forms if moving else (lambda t, q: one_forms(0.0, q))
+
+    @jax.jit
+    def rates(t, x):
+        q, v = x[:3], x[3:6]
+        mass = jax.hessian(lambda v: lagrangian(q, v))(v)
+        free = jax.grad(lagrangian)(q, v) + forces(t, q, v) - jax.jvp(lambda q: jax.grad(lagrangian, 1)(q, v), (q,), (v,))[1]
+        defect = lambda t, q: rows(t, q) @ v + b(t, q)
+        drift = jax.jvp(defect, (t, q), (1.0, v))[1]
+        w = rows(t, q)
+        found = jnp.linalg.solve(jnp.block([[mass, w.T], [w, jnp.zeros((1, 1))]]), jnp.concatenate([free, -drift]))
+        reaction = -w.T @ found[3:]
+        return jnp.concatenate([v, found[:3], jnp.array([(forces(t, q, v) + reaction) @ v])])
+
+    x = solve_ivp(rates, (0.0, t), [*q, *v, 0.0], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    return x[:3], np.asarray(jax.grad(lagrangian, 1)(x[:3], x[3:6])), x[6]
+
+
+def orders(errors, h):
+    return np.diff(np.log(errors)) / np.diff(np.log(h))
+
+
+@pytest.mark.parametrize(("stages", "steps"), [(1, (20, 40, 80)), (2, (10, 20, 40)), (3, (7, 10, 14))])
+@pytest.mark.parametrize("moving", [False, True], ids=["linear", "affine in time"])
+def test_order_in_positions_momenta_and_work(stages, steps, moving):
+    if moving:
+        system = dx.LagrangeDirac(lagrangian, one_forms, affine=affine, forces=forces)
+    else:
+        system = dx.LagrangeDirac(lagrangian, lambda q: one_forms(0.0, q), forces=forces)
+    start = system.complete({name: jnp.array(a) for name, a in DATA.items()}, None, True)
+    expected = reference(1.5, start["q"], start["v"], moving)
+    errors = []
+    for n in steps:
+        sol = dx.simulate(system, dx.EnergyCollocation(stages), step=1.5 / n, steps=n, project=True, **DATA)
+        assert sol.ok
+        found = sol.q[-1], sol.p[-1], sol.work[-1]
+        errors.append([np.max(np.abs(a - b)) for a, b in zip(found, expected, strict=True)])
+    energy = sol.energy()
+    np.testing.assert_allclose(energy - energy[0], sol.work, atol=2e-15)
+    measured = orders(np.array(errors).T, 1.5 / np.array(steps))
+    assert np.all(np.abs(measured[:, -1] - 2 * stages) < 0.25), measured
+
+
+IRREVERSIBLE = {"contact-particle": contact_particle.CASES, "transmission": transmission.CASES}
+
+
+@pytest.mark.parametrize("name", IRREVERSIBLE)
+def test_energy_and_constraint_of_irreversible_systems(name):
+    example = gallery.get(name)
+    params = {**example.params, **IRREVERSIBLE[name]["irreversible"]}
+    data = {name: example.initial[name] for name in ("q", "v")}
+    system = example.system.lagrangian_form()
+    sol = dx.simulate(
+        system,
+        dx.EnergyCollocation(),
+        step=0.05,
+        steps=20_000,
+        save_every=500,
+        params=params,
+        project=True,
+        engine="native",
+        **data,
+    )
+    energy = sol.energy()
+    assert sol.ok and np.max(np.abs(energy - energy[0])) < 5e-15
+    velocity = jax.jit(lambda q, p: system.inverse_legendre(q, p, params))
+    for q, p in zip(sol.q[::10], sol.p[::10], strict=True):
+        assert np.max(np.abs(system.constraint_matrix(q, params) @ velocity(q, p))) < 1e-15
+    assert sol.stats["energy_defect"] < 1e-14 and "8 points of the quadrature" in sol.stats["iteration"]
+
+
+def test_a_knife_edge_turns_through_every_direction():
+    example = gallery.get("knife-edge")
+    data = {"params": example.params, "project": True} | {name: example.initial[name] for name in ("q", "v")}
+    sol = dx.simulate(example.system.lagrangian_form(), dx.EnergyCollocation(3), step=0.05, steps=400, **data)
+    fine = dx.simulate(
+        example.system, dx.Composition(dx.DiscreteDirac(constraints="resolve"), "suzuki4"), step=0.01, steps=2000, **data
+    )
+    energy = sol.energy()
+    assert np.max(np.abs(energy - energy[0])) < 1e-14
+    np.testing.assert_allclose(sol.q[::40], fine.q[::200], atol=2e-6)
+
+
+def test_a_lagrangian_that_is_not_quadratic_in_v():
+    system = dx.LagrangeDirac(
+        lambda q, v: jnp.cosh(v[0]) + v[1] ** 2 / 2 + v[2] ** 2 / 2 + 0.1 * (v[0] * v[1]) ** 2 - q @ q / 2,
+        lambda q: jnp.array([[q[1], 0.0, -1.0]]),
+    )
+    data = {"q": [0.7, 0.2, 0.0], "v": [0.4, 0.1, 0.08]}
+    sol = dx.simulate(system, dx.EnergyCollocation(3), step=0.1, steps=100, **data)
+    fine = dx.simulate(system, dx.LagrangeDAlembert(), step=0.001, steps=10_000, save_every=100, **data)
+    energy = sol.energy()
+    assert np.max(np.abs(energy - energy[0])) < 1e-14
+    np.testing.assert_allclose(sol.q, fine.q, atol=1e-5)
+
+
+def so3(x):
+    return jnp.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]])
+
+
+def pendulum(q, v):
+    kinetic = v[0] ** 2 + v[1] ** 2 / 2 + v[0] * v[1] * jnp.cos(q[0] - q[1])
+    return kinetic + 9.8 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+
+
+BODY = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ (jnp.array([1.0, 2.0, 3.0]) * xi) / 2)
+TOP = dx.EulerPoincare(dx.SO3(), lambda xi, a: xi @ (jnp.array([1.0, 1.0, 0.3]) * xi) / 2 - a[2], advected=3)
+SYSTEMS = {
+    "no constraints": (dx.LagrangeDirac(pendulum), {"q": [1.0, 0.5], "v": [0.0, 0.3]}, 0.05),
+    "explicit time": (
+        dx.LagrangeDirac(lambda t, q, v: pendulum(q, v) * (1 + 0.2 * jnp.sin(t))), {"q": [1.0, 0.5], "v": [0.0, 0.3]}, 0.05,
+    ),
+    "Poisson": (
+        dx.DiracSystem(dx.DiracStructure.from_bivector(so3), lambda x: x[0] ** 2 / 2 + x[1] ** 2 / 4 + jnp.sin(x[2])),
+        {"x": [0.3, 0.9, -0.4]}, 0.2,
+    ),
+    "almost Poisson": (
+        dx.DiracSystem(dx.DiracStructure.from_bivector(lambda x: so3(x + x[::-1] ** 2)), lambda x: jnp.cos(x[0]) + x @ x / 2),
+        {"x": [0.3, 0.9, -0.4]}, 0.2,
+    ),
+    "canonical": (
+        dx.DiracSystem(dx.induced_dirac(None, 1), lambda x: x[1] ** 2 / 2 - jnp.cos(x[0])), {"q": [1.0], "p": [0.2]}, 0.2,
+    ),
+    "Lie–Poisson": (dx.LiePoisson(dx.SO3(), lambda m: m @ (m / jnp.array([1.0, 2.0, 3.0])) / 2), {"x": [0.3, 0.9, -0.4]}, 0.2),
+    "Euler–Poincaré": (BODY, {"x": [0.3, 1.8, -1.2]}, 0.2),
+    "heavy top": (TOP, {"x": [0.3, 0.8, 1.2, 0.0, 0.6, 0.8]}, 0.1),
+    "ports": (
+        dx.PortHamiltonian(
+            lambda x: x @ x / 2 + x[0] ** 4 / 4,
+            J=lambda x: jnp.array([[0.0, 1.0], [-1.0, 0.0]]),
+            R=lambda x: jnp.diag(jnp.array([0.0, 0.3 + x[0] ** 2])),
+            B=lambda x: jnp.array([[0.0], [1.0]]),
+            inputs=lambda t, x: jnp.array([jnp.cos(t)]),
+        ),
+        {"x": [1.0, 0.2]}, 0.1,
+    ),
+    "phase-space Lagrangian": (
+        dx.PhaseSpaceLagrangian(lambda q: jnp.array([-q[1] - q[1] ** 3 / 3, 0.0]), lambda q: q @ q / 2 + q[0] ** 4 / 4),
+        {"q": [0.8, 0.1]}, 0.2,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_system_with_a_bracket(name):
+    system, data, step = SYSTEMS[name]
+    run = lambda scheme, h, n, **more: dx.simulate(system, scheme, step=h, steps=n, **data, **more)
+    native, arrays = (run(dx.EnergyCollocation(2), step, 20, engine=engine) for engine in ("native", "xla"))
+    assert native.ok and arrays.ok and native.stats["engine"] == "native"
+    place = next(field for field in ("x", "q") if field in native.fields)
+    for field, values in native.fields.items():
+        if field != "energy_defect":
+            np.testing.assert_allclose(values, arrays.fields[field], atol=1e-13, rtol=1e-13)
+    energy = native.energy()
+    work = np.asarray(native.fields.get("work", 0.0))
+    work = work[:, 0] - work[:, 1] if work.ndim == 2 else work
+    np.testing.assert_allclose(energy - energy[0], work, atol=3e-14 * max(1.0, np.max(np.abs(energy))))
+    errors = []
+    for stages in (2, 3):
+        ends = [run(dx.EnergyCollocation(stages), step / k, 4 * k).fields[place][-1] for k in (1, 2, 16)]
+        errors.append([np.max(np.abs(end - ends[2])) for end in ends[:2]])
+    assert np.log2(errors[0][0] / errors[0][1]) > 3.7 and errors[1][1] < errors[0][1] / 20, errors
+
+
+def test_the_books_of_ports_are_verified():
+    system, data, step = SYSTEMS["ports"]
+    sol = dx.simulate(system, dx.EnergyCollocation(3), step=step, steps=500, **data)
+    (line,) = [line for line in dx.verify(sol).lines if line.quantity == "books of the energy"]
+    assert line.verdict == "ok", line
+
+
+def test_self_adjoint():
+    system, data, step = SYSTEMS["no constraints"]
+    sol = dx.simulate(system, dx.EnergyCollocation(2), step=step, steps=30, **data)
+    back = dx.simulate(system, dx.EnergyCollocation(2), q=sol.q[-1], p=-sol.p[-1], step=step, steps=30)
+    np.testing.assert_allclose(back.q[-1], data["q"], atol=1e-12)
+
+
+def test_where_the_fixed_point_does_not_converge_newton_goes_on():
+    stiff = dx.LagrangeDirac(
+        lambda q, v: v @ v / 2 - 5000.0 * q[0] ** 2 / 2 - q[1] ** 4 / 4, lambda q: jnp.array([[0.0, q[0], 1.0]])
+    )
+    data = {"q": [1e-3, 1.0, 0.0], "v": [0.0, 0.1, -1e-4]}
+    sol = dx.simulate(stiff, dx.EnergyCollocation(2), step=0.2, steps=50, engine="native", **data)
+    energy = sol.energy()
+    assert sol.ok and np.max(np.abs(energy - energy[0])) < 1e-13
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_gradients_are_those_of_differences(engine):
+    system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["k"] * q @ q / 2, lambda q: jnp.array([[q[1], 0.0, -1.0]]))
+
+    def end(k):
+        sol = dx.simulate(
+            system,
+            dx.EnergyCollocation(1, 4),
+            q=[1.0, 0.5, 0.0],
+            v=[0.1, 0.3, 0.05],
+            params={"k": k},
+            step=0.1,
+            steps=4,
+            engine=engine,
+        )
+        return sol.q[-1, 1]
+
+    difference = (float(end(1.3 + 1e-4)) - float(end(1.3 - 1e-4))) / 2e-4
+    assert float(jax.grad(end)(1.3)) == pytest.approx(difference, rel=1e-7)
+
+
+def test_a_batch_and_a_stored_run(tmp_path):
+    system, data, step = SYSTEMS["no constraints"]
+    many = {name: np.array([value, np.multiply(value, 0.9)]) for name, value in data.items()}
+    batch = dx.simulate(system, dx.EnergyCollocation(2), step=step, steps=10, **many)
+    alone = dx.simulate(system, dx.EnergyCollocation(2), step=step, steps=10, **data)
+    np.testing.assert_array_equal(batch.q[0], alone.q)
+    alone.save(tmp_path / "run.nc")
+    loaded = dx.load(tmp_path / "run.nc")
+    np.testing.assert_array_equal(loaded.p, alone.p)
+    assert loaded.stats["energy_defect"] == alone.stats["energy_defect"]
+
+
+def test_what_the_quadrature_leaves_is_reported():
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.cos(3 * q[0]))
+    with pytest.warns(UserWarning, match="quadrature with 2 points is not exact"):
+        sol = dx.simulate(system, dx.EnergyCollocation(2, points=2), q=[1.0], v=[0.5], step=0.3, steps=50)
+    energy = sol.energy()
+    assert 1e-6 < np.max(np.abs(np.diff(energy))) < 10 * sol.stats["energy_defect"]
+    better = dx.simulate(system, dx.EnergyCollocation(2), q=[1.0], v=[0.5], step=0.3, steps=50)
+    assert better.stats["energy_defect"] < 1e-12
+
+
+def test_tables_of_the_quadrature():
+    table, nodes = quadrature(3, 7), gauss(3)
+    degree = np.arange(3)
+    np.testing.assert_allclose(table.values @ nodes.nodes[:, None] ** degree, table.points[:, None] ** degree, atol=1e-15)
+    np.testing.assert_allclose(
+        table.matrix @ nodes.nodes[:, None] ** degree, table.points[:, None] ** (degree + 1) / (degree + 1), atol=1e-15
+    )
+    np.testing.assert_allclose(table.means @ table.points[:, None] ** degree, nodes.nodes[:, None] ** degree, atol=1e-14)
+    np.testing.assert_allclose(table.end @ nodes.nodes[:, None] ** degree, 1.0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"stages": 0}, "from 1 to 16"),
+        ({"stages": 2.0}, "whole number"),
+        ({"stages": 3, "points": 2}, "from the number of stages, 3"),
+        ({"stages": 3, "points": 17}, "to 16"),
+    ],
+)
+def test_bad_arguments(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        dx.EnergyCollocation(**arguments)
+
+
+def test_systems_that_it_does_not_step_are_refused():
+    run = lambda system, **data: dx.simulate(system, dx.EnergyCollocation(), step=0.1, steps=1, **data)
+    sphere = dx.LagrangeDirac(lambda q, v: v @ v / 2, holonomic=lambda q: jnp.array([q @ q - 1.0]))
+    with pytest.raises(TypeError, match="does not keep holonomic constraints"):
+        run(sphere, q=[1.0, 0.0], v=[0.0, 1.0])
+    skewed = dx.DiracSystem(dx.DiracStructure.from_bivector(lambda x: jnp.array([[0.0, 1.0], [-0.9, 0.0]])), lambda x: x @ x / 2)
+    with pytest.raises(ValueError, match=r"not (skew|antisymmetric)"):
+        run(skewed, x=[1.0, 0.0])
+    with pytest.raises(TypeError, match="ManifoldLagrangian was given"):
+        run(dx.ManifoldLagrangian(lambda q, v: v @ v / 2, dx.Sphere(3)), q=[1.0, 0.0, 0.0], v=[0.0, 1.0, 0.0])
+    suslov = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ xi / 2, jnp.array([[1.0, 0.0, 0.0]]))
+    with pytest.raises(TypeError, match="EulerPoincare was given"):
+        run(suslov, x=suslov.state([0.0, 1.0, 0.0]))
+    with pytest.raises(ValueError, match="one-step method"):
+        run(SYSTEMS["no constraints"][0], q0=[0.0, 0.0], q1=[0.1, 0.0])
+
+
+def test_a_distribution_that_changes_its_rank_is_refused_with_the_place():
+    parallel = lambda q: jnp.array([[1.0, 0.0, 0.0, 0.0], [jnp.cos(q[3]), jnp.sin(q[3]), 0.0, 0.0]])  # where q[3] = 0
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + q[0] * q[1] - q[2] ** 2 / 2, parallel)
+    run = lambda q, v: dx.simulate(system, dx.EnergyCollocation(), q=q, v=v, step=0.125, steps=20)
+    with pytest.raises(ValueError, match="depend"):
+        run([0.3, 0.2, 0.1, 0.0], [0.0, 0.0, 0.1, 0.1])
+    sol = run([0.3, 0.2, 0.1, -1.0], [0.0, 0.0, 0.1, 1.0])
+    assert not sol.ok and "changes its rank" in sol.message and "near q = [" in sol.message
+    assert run([0.3, 0.2, 0.1, -0.97], [0.0, 0.0, 0.1, 1.0]).ok
