@@ -114,7 +114,12 @@ def finished(problem: Problem, outcome: Outcome, held: bool = False) -> Outcome:
 
     With `held` the closing row stands in the rows after the end, too: functions of those have finite derivatives.
     """
-    numbers, fields, completed = saved_steps(problem), outcome.fields, outcome.completed
+    fields, completed = outcome.fields, outcome.completed
+    if isinstance(completed, np.ndarray) and np.all(completed == problem.steps):
+        for name in filter(problem.is_node, fields):
+            fields[name][:, -1] = outcome.closing[name]
+        return outcome
+    numbers = saved_steps(problem)
     if not isinstance(completed, np.ndarray):
         good = completed.astype(float)
         for name, values in fields.items():
