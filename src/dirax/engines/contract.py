@@ -18,6 +18,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -65,7 +66,13 @@ class Problem:
         """Number of saved rows, the first and the last included."""
         return -(-self.steps // self.save_every) + 1
 
-    @property
+    def with_numbers(self, **numbers: Any) -> "Problem":
+        """The same problem with other numbers, steps or rows; what was found of its equation is kept."""
+        problem = object.__new__(Problem)
+        problem.__dict__.update(self.__dict__, **numbers)
+        return problem
+
+    @cached_property
     def fields(self) -> dict[str, Field]:
         """The named arrays of a row: those of the first stage, at which every row is."""
         return self.equation.stages[0][0].fields

@@ -152,7 +152,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int) -> Begun
     special = redundant or singular or by_values or by_jax
 
     def plan() -> Plan | None:
-        return None if special else planned(settings, given, shape, equation, initial, start)
+        return None if special else planned(settings, given, shape, initial, start, problem)
 
     return Begun(case, problem, redundant, start.row0, traced, plan)
 

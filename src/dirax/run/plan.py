@@ -31,8 +31,11 @@ class Plan:
     the general way decides, and says what is wrong. What it found for the first case is where a plan begins.
     """
 
-    def __init__(self, settings: Settings, case: Case, shape: Shape, equation: Any, initial: Initial, start: Start):
-        self.settings, self.equation = settings, equation
+    def __init__(
+        self, settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem
+    ):
+        self.settings, self.template = settings, problem
+        equation = problem.equation
         self.checks = [check for check in dict.fromkeys(stage.check for stage, _ in equation.stages) if not _is_trivial(check)]
         self.complete = program_of_completion(settings.system, case, settings.project)
         self.begun = program_of_beginning(equation, case, initial.data)
@@ -52,7 +55,7 @@ class Plan:
         self.hessian: Floats | None = None
         self.places = _places(initial.data)
         self.regular = {bytes_of(case.params)}
-        self.row_bytes = 8 * (1 + sum(math.prod(field.shape) for field in equation.stages[0][0].fields.values()))
+        self.row_bytes = 8 * (1 + sum(math.prod(field.shape) for field in problem.fields.values()))
 
     @property
     def whole(self) -> bool:
@@ -68,7 +71,7 @@ class Plan:
             initial = self.complete((*data, *last))
             complete = initial[: self.data_size]
             start = self.begun((*complete, *last))
-            if not (self._holds(initial) and self._steps(start, case, leaves) and self._has_regular_hessian(complete, case)):
+            if not (self._holds(initial) and self._steps(start, case, leaves) and self._has_regular_hessian(complete, case, last)):
                 return None
         except (ArithmeticError, ValueError):  # what Python's floats do not have
             return None
@@ -78,8 +81,7 @@ class Plan:
         for size in self.guesses:
             guess.append(np.array(start[at : at + size]))
             at += size
-        return Problem(
-            equation=self.equation,
+        return self.template.with_numbers(
             state=np.array(start[: self.state_size]),
             guess=tuple(guess),
             h=case.h,
@@ -87,8 +89,6 @@ class Plan:
             steps=steps,
             save_every=save_every,
             params=case.params,
-            max_iterations=self.settings.max_iterations,
-            compensated=self.settings.compensated,
         )
 
     def _holds(self, initial: Sequence[float]) -> bool:
@@ -102,8 +102,7 @@ class Plan:
             return False
         if self.matrix is None:
             return True
-        matrix = np.array(initial[at + 1 + self.has_lagrangian :]).reshape(self.matrix.shape)
-        return surely_independent(matrix * self.matrix, SURELY_REGULAR)
+        return surely_independent(_scaled(initial[at + 1 + self.has_lagrangian :], self.matrix), SURELY_REGULAR)
 
     def _steps(self, start: Sequence[float], case: Case, leaves: list[Any]) -> bool:
         """Whether the first step has a unique solution."""
@@ -112,22 +111,21 @@ class Plan:
             return True
         params = [x for leaf, moves in zip(leaves, self.moving, strict=True) if moves for x in leaf.ravel().tolist()]
         found = self.first_step((*start[s : s + k], *start[:s], case.t0, self.fraction * case.h, *params))
-        return math.isfinite(sum(found[:k])) and surely_independent(np.array(found[k:]).reshape(k, k) * self.jacobian)
+        return math.isfinite(sum(found[:k])) and surely_independent(_scaled(found[k:], self.jacobian))
 
-    def _has_regular_hessian(self, complete: Sequence[float], case: Case) -> bool:
+    def _has_regular_hessian(self, complete: Sequence[float], case: Case, last: Sequence[float]) -> bool:
         """Whether ∂²L/∂v² is regular; what is so once is not asked again for the same params."""
         if not self.asks_hessian or (given := bytes_of(case.params)) in self.regular:
             return True
-        q, v = (np.array(complete[self.places[name]]) for name in ("q", "v"))
-        values = np.asarray(case.t0), q, v, case.params
+        q, v = (complete[self.places[name]] for name in ("q", "v"))
         if self.hessian is None:
+            values = np.asarray(case.t0), np.array(q), np.array(v), case.params
             program = program_at(self.settings.system.velocity_hessian, values)
             self.hessian = program and program.in_floats
         if self.hessian is None:
             return False
-        numbers = [x for leaf in jax.tree.leaves(values) for x in leaf.ravel().tolist()]
-        matrix = np.array(self.hessian(numbers)).reshape(len(q), len(q))
-        regular = surely_independent(matrix / (np.max(np.abs(matrix)) or 1.0), SURELY_REGULAR)
+        entries, n = self.hessian((case.t0, *q, *v, *last[:-2])), len(q)
+        regular = surely_independent([entries[i * n : i * n + n] for i in range(n)], SURELY_REGULAR)
         if regular:
             self.learn(given)
         return regular
@@ -144,16 +142,17 @@ def bytes_of(params: Any) -> tuple:
     return tuple([leaf.tobytes() for leaf in jax.tree.leaves(params)])
 
 
-def planned(settings: Settings, case: Case, shape: Shape, equation: Any, initial: Initial, start: Start) -> Plan | None:
+def planned(settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem) -> Plan | None:
     """The plan for cases like one that the general way took; None for those that always need it: batches, two points, steps
     whose functions have no program or a large one, and compositions that might leave a final manifold."""
-    stages, system = equation.stages, settings.system
+    equation, system = problem.equation, settings.system
+    stages = equation.stages
     if case.batch is not None or case.two_points or (stages[0][0].unknowns and start.jacobian is None):
         return None
     fields = stages[0][0].fields
     if len(stages) > 1 and not system.constraints.any and "p" in fields and system.final_relation(shape) is not None:
         return None
-    plan = Plan(settings, case, shape, equation, initial, start)
+    plan = Plan(settings, case, shape, initial, start, problem)
     return plan if plan.whole else None
 
 
@@ -161,12 +160,18 @@ def _is_trivial(check: Any) -> bool:
     return check is nothing_to_check or getattr(check, "__func__", None) is AbstractStep.check
 
 
-def _scales(matrix: np.ndarray) -> np.ndarray:
+def _scaled(entries: Sequence[float], scales: list[list[float]]) -> list[list[float]]:
+    """The rows of a matrix with these entries, each times its scale."""
+    width = len(scales[0])
+    return [[x * y for x, y in zip(entries[i * width :], row, strict=False)] for i, row in enumerate(scales)]
+
+
+def _scales(matrix: np.ndarray) -> list[list[float]]:
     """What the entries of a matrix are to be multiplied by to be those of the equilibrated one."""
     scaled, units = equilibrated(matrix)
     row, column = np.arange(len(matrix)), np.argmax(np.abs(scaled), axis=1)
     with np.errstate(all="ignore"):
-        return units * (scaled[row, column] / matrix[row, column] / units[0, column])[:, None]
+        return (units * (scaled[row, column] / matrix[row, column] / units[0, column])[:, None]).tolist()
 
 
 def _places(data: dict[str, Any]) -> dict[str, slice]:

@@ -3,10 +3,12 @@
 import time
 from typing import Any
 
+import jax
+
 from dirax.engines.engine import AbstractEngine
 from dirax.run.carry_out import Kind, carried_out, prepared
-from dirax.run.settings import Settings, kind_of, stated
-from dirax.run.validate import KINDS, Case, batch_size, count, finite, initial_data, params_of_case, positive
+from dirax.run.settings import Settings, stated
+from dirax.run.validate import KINDS, Case, batch_size, count, finite, initial_data, params_of_case, plain_floats, positive
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
@@ -25,7 +27,7 @@ class PreparedRun:
 
     def __init__(self, settings: Settings, case: Case, steps: int, save_every: int, kind: Kind | None):
         self._settings, self._case, self._steps, self._save_every, self._kind = settings, case, steps, save_every, kind
-        self._of_kind = kind and kind_of(case)
+        self._leaves, self._structure = jax.tree.flatten(case.params)
 
     def __call__(
         self,
@@ -39,42 +41,73 @@ class PreparedRun:
     ) -> Solution:
         """The Solution of the run with these numbers. Raises as `dx.simulate`."""
         entered = time.perf_counter()
-        base = self._case
-        data, params, batch = base.data, base.params, base.batch
-        new_params = "params" in given
-        if new_params:
-            params = params_of_case(given.pop("params"))
-        if given:
-            if unknown := next((name for name in given if name not in NUMBERS), None):
-                raise TypeError(
-                    f"a prepared run takes initial data, params, step, steps, save_every, t0 and progress, but {unknown}= was "
-                    "given: prepare another one."
-                )
-            kept = {name: a for name, a in data.items() if name not in given} if data.keys() >= given.keys() else {}
-            data, batch = initial_data({name: given.get(name, kept.get(name)) for name in (*given, *kept)})
-            data = {name: data[name] for name in base.data} if data.keys() == base.data.keys() else data
-        if given or new_params:
-            batch = batch_size(batch, params, base.batch_params)
+        base, kind = self._case, self._kind
+        data, params = self._alike(given) if given and kind is not None else (base.data, base.params)
+        if data is None:
+            data, params, kind = *self._other(given), None
         case = Case(
             data,
             params,
             base.h if step is None else positive(step, "step"),
             base.t0 if t0 is None else finite(t0, "t0"),
-            batch,
+            base.batch if data is base.data and params is base.params else batch_size(_batch_of(data), params, base.batch_params),
             base.batch_params,
         )
+        if type(case.h) is not float or type(case.t0) is not float:  # traced by JAX
+            kind = None
         return carried_out(
             self._settings,
             case,
             self._steps if steps is None else count(steps, "steps"),
             self._save_every if save_every is None else count(save_every, "save_every"),
             progress,
-            self._kind if self._kind is not None and case.plain and kind_of(case) == self._of_kind else None,
+            kind,
             entered,
         )
 
+    def _alike(self, given: dict[str, Any]) -> tuple[Any, Any]:
+        """Data and params where all that is given is finite floats of the shapes that were prepared; else (None, None)."""
+        base = self._case
+        data, params = base.data, base.params
+        for name, value in given.items():
+            if name == "params":
+                leaves, structure = jax.tree.flatten(value)
+                before = self._leaves
+                if structure != self._structure:
+                    return None, None
+                leaves = [plain_floats(leaf) for leaf in leaves]
+                if any([a is None or a.shape != b.shape or b.dtype.char != "d" for a, b in zip(leaves, before, strict=True)]):
+                    return None, None
+                params = jax.tree.unflatten(structure, leaves)
+                continue
+            array = plain_floats(value)
+            if array is None or name not in data or array.shape != data[name].shape:
+                return None, None
+            data = data | {name: array}
+        return data, params
+
+    def _other(self, given: dict[str, Any]) -> tuple[dict[str, Any], Any]:
+        """The same for anything that is given. Raises `TypeError` and `ValueError`."""
+        base = self._case
+        params = params_of_case(given["params"]) if "params" in given else base.params
+        given = {name: value for name, value in given.items() if name != "params" and value is not None}
+        if unknown := next((name for name in given if name not in NUMBERS), None):
+            raise TypeError(
+                f"a prepared run takes initial data, params, step, steps, save_every, t0 and progress, but {unknown}= was "
+                "given: prepare another one."
+            )
+        if not given:
+            return dict(base.data), params
+        kept = base.data if base.data.keys() >= given.keys() else {}
+        return initial_data({**kept, **given})[0], params
+
     def __repr__(self) -> str:
         return f"PreparedRun({self._settings.scheme!r} on {self._settings.system!r}, {self._steps} steps of {self._case.h})"
+
+
+def _batch_of(data: dict[str, Any]) -> int | None:
+    array = next(iter(data.values()))
+    return array.shape[0] if array.ndim == 2 else None
 
 
 def prepare(

@@ -80,7 +80,9 @@ def _times(p: Problem, numbers: np.ndarray, traced: bool):
 
 
 def _stats(p: Problem, outcome: Outcome, traced: bool) -> dict[str, Any]:
-    total, worst = outcome.iterations.sum(), outcome.max_residual.max()
+    one = len(outcome.iterations) == 1
+    total = outcome.iterations[0] if one else outcome.iterations.sum()
+    worst = outcome.max_residual[0] if one else outcome.max_residual.max()
     return {
         "engine": outcome.engine,
         "steps": p.steps + p.first_step,

@@ -19,6 +19,9 @@ from dirax.systems.system import AbstractSystem
 ROOM = 4
 """How many times the rows of a run should fit into memory."""
 
+FEW = 32
+"""Numbers up to which Python is quicker than NumPy to see whether they are finite."""
+
 KINDS = ({"q", "v"}, {"q", "p"}, {"q0", "q1"}, {"x"}, {"q"})
 
 
@@ -69,7 +72,7 @@ def validated_case(given: dict[str, Any], params: Any, batch_params: bool, step:
 def params_of_case(params: Any) -> Any:
     """The params with arrays for leaves. Raises `TypeError` and `ValueError` for leaves that are no finite numbers."""
     leaves, structure = jax.tree.flatten(params)
-    plain = [_plain_floats(leaf) for leaf in leaves]
+    plain = [plain_floats(leaf) for leaf in leaves]
     if not any([leaf is None for leaf in plain]):
         return jax.tree.unflatten(structure, plain)
     params = _arrays(params)
@@ -134,7 +137,7 @@ def spread(array: Any, batch: int) -> Any:
 
 
 def _real_array(name: str, value: Any) -> Any:
-    if (array := _plain_floats(value)) is not None and array.ndim in (1, 2) and array.size:
+    if (array := plain_floats(value)) is not None and array.ndim in (1, 2) and array.size:
         return array
     try:
         array = jnp.asarray(value) if is_traced(value) else np.asarray(value)
@@ -149,7 +152,7 @@ def _real_array(name: str, value: Any) -> Any:
     return array.astype(np.float64)
 
 
-def _plain_floats(value: Any) -> np.ndarray | None:
+def plain_floats(value: Any) -> np.ndarray | None:
     """A copy of finite float64 numbers that need no further look; None for anything else."""
     if type(value) not in (list, tuple, np.ndarray, float):
         return None
@@ -157,7 +160,10 @@ def _plain_floats(value: Any) -> np.ndarray | None:
         array = np.array(value)
     except Exception:  # values that JAX traces among them, or what is no array
         return None
-    return array if array.dtype.char == "d" and np.isfinite(array).all() else None
+    if array.dtype.char != "d":
+        return None
+    finite = all(map(math.isfinite, array.ravel().tolist())) if array.size <= FEW else np.isfinite(array).all()
+    return array if finite else None
 
 
 def refuse_more_than_memory(problem: Any) -> None:

@@ -120,12 +120,13 @@ class Ready:
         closing = lanes.close(self.kernel)
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
         table, record = lanes.table(), lanes.record
+        counts = table[:, record.completed : record.iterations + 1].astype(np.int64)
         outcome = Outcome(
             fields=fields,
             closing=closing,
-            completed=table[:, record.completed].astype(np.int64),
-            status=table[:, record.status].astype(np.int64),
-            iterations=table[:, record.iterations].astype(np.int64),
+            completed=counts[:, 0],
+            status=counts[:, 1],
+            iterations=counts[:, 2],
             max_residual=table[:, record.max_residual],
             last_state=table[:, record.state],
             last_unknowns=table[:, self.first_unknowns],
