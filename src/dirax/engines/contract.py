@@ -40,6 +40,9 @@ class Problem:
     `state` (s,) or (B, s) and `guess` (k,) or (B, k), one guess per stage; `params` a pytree, with a leading batch axis
     when `batch_params`. Rows are saved every `save_every` steps, and the last one always. Steps are numbered from
     `first_step` (1 after a two-point start), so the first state is at time t0 + first_step·h.
+
+    A run that goes on has the `record` that the engine gave after its first `after` steps: rows of these need not be computed
+    again, and whatever stands in them is written over. An engine may run all of it instead, since the bits are the same.
     """
 
     equation: Any
@@ -55,6 +58,8 @@ class Problem:
     batch_params: bool = False
     max_iterations: int = 50
     compensated: bool = False
+    after: int = 0
+    record: Any = None
 
     @property
     def size(self) -> int:
@@ -90,7 +95,8 @@ class Outcome:
     fields, with one row less for step fields. `completed` (B,) counts good steps; `status` is one of the outcomes above;
     `closing` is the row at each trajectory's last good step; `last_state` and `last_unknowns` are the state there and the
     unknowns before it, for the message. `iterations` (B,) are updates of Newton's method, `max_residual` (B,) the largest
-    entry of the residual that any good step left. `notes` go to `Solution.stats`.
+    entry of the residual that any good step left. `notes` go to `Solution.stats`. `record` is what the engine needs to go on
+    after the last step, None where it would begin anew.
     """
 
     fields: dict[str, Any]
@@ -105,6 +111,7 @@ class Outcome:
     interrupted: bool = False
     compile_seconds: float = 0.0
     run_seconds: float = 0.0
+    record: Any = None
     notes: dict[str, Any] = field(default_factory=dict)
 
 

@@ -2,11 +2,12 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dirax.engines.contract import Outcome, Problem
 from dirax.program.memo import Memo
@@ -23,7 +24,7 @@ from dirax.run.progress import reporting
 from dirax.run.redundancy import redundant_constraints
 from dirax.run.result import solution_of
 from dirax.run.settings import Settings, kind_of
-from dirax.run.start import Start, begun, completed
+from dirax.run.start import begun, completed
 from dirax.run.validate import Case, refuse_more_than_memory
 from dirax.schemes.step import Shape, make_step_equation
 from dirax.solution.solution import Solution
@@ -61,6 +62,8 @@ class Begun:
     redundant: tuple[int, ...]
     row0: dict | None
     traced: bool
+    rows: dict[str, np.ndarray] | None = field(default=None, kw_only=True)
+    """Rows that were saved by the run that this one goes on with."""
     plan: Callable[[], Plan | None]
     """Makes the plan for others of its kind."""
 
@@ -173,10 +176,13 @@ def _run(
         ready = time.perf_counter()
         outcome = _outcome(run, problem, steps, progress)
         ended = time.perf_counter()
+    for name, rows in (found.rows or {}).items():
+        outcome.fields[name][:, : rows.shape[1]] = rows
     if found.redundant:
         outcome.notes["redundant_constraints"] = list(found.redundant)
     solution = solution_of(settings.system, settings.scheme, found.case, problem, outcome, found.row0, traced)
     if not traced:
+        solution.continuation = Continuation(settings, kind, found, outcome.record, steps)
         solution.stats |= {
             "validate_seconds": began - entered if entered else 0.0,
             "start_seconds": started - began,
@@ -184,6 +190,43 @@ def _run(
             "result_seconds": time.perf_counter() - ended + max(0.0, ended - ready - outcome.run_seconds),
         }
     return solution
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """What goes on with a run: `sol.extend` calls it."""
+
+    settings: Settings
+    kind: Kind | None
+    begun: Begun
+    record: Any
+    steps: int
+    """Those of the run, with the one between two given points."""
+
+    def __call__(self, sol: Solution, more: int, progress: Any) -> Solution:
+        """The solution of the whole run of so many more steps, bit by bit."""
+        began, old = time.perf_counter(), self.begun.problem
+        after = old.steps if self.record is not None else 0
+        problem = old.with_numbers(steps=old.steps + more, after=after, record=self.record)
+        refuse_more_than_memory(problem)
+        before = _rows_before(sol, problem)
+        found = replace(self.begun, problem=problem, rows=before)
+        longer = _run(self.settings, self.kind, found, self.steps + more, progress, 0.0, began)
+        longer.metadata, longer.example = sol.metadata, sol.example
+        return longer
+
+
+def _rows_before(sol: Solution, problem: Problem) -> dict[str, np.ndarray]:
+    """The saved rows of the steps that are done, (B, rows, …), without the last one, which may not be among those of the longer
+    run, and without the given row 0 of two points."""
+    lead = 1 if sol.batch is None else sol.batch
+    good = sol.rows - 1 - problem.first_step if sol.batch is None else problem.steps
+    count = min(-(-problem.after // problem.save_every), good)
+    found = {}
+    for name, values in sol.fields.items():
+        rows = values.reshape(lead, -1, *sol.field_info[name].shape) if sol.batch is None else values
+        found[name] = rows[:, problem.first_step : problem.first_step + count]
+    return found
 
 
 def _outcome(run: Callable, problem: Problem, steps: int, progress: Any) -> Outcome:

@@ -31,9 +31,7 @@ class Plan:
     the general way decides, and says what is wrong. What it found for the first case is where a plan begins.
     """
 
-    def __init__(
-        self, settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem
-    ):
+    def __init__(self, settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem):
         self.settings, self.template = settings, problem
         equation = problem.equation
         self.checks = [check for check in dict.fromkeys(stage.check for stage, _ in equation.stages) if not _is_trivial(check)]
@@ -71,7 +69,9 @@ class Plan:
             initial = self.complete((*data, *last))
             complete = initial[: self.data_size]
             start = self.begun((*complete, *last))
-            if not (self._holds(initial) and self._steps(start, case, leaves) and self._has_regular_hessian(complete, case, last)):
+            if not (
+                self._holds(initial) and self._steps(start, case, leaves) and self._has_regular_hessian(complete, case, last)
+            ):
                 return None
         except (ArithmeticError, ValueError):  # what Python's floats do not have
             return None

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, Self
 
 from dirax.solution import export, plotting, saving, selection
 from dirax.solution.trajectory import Trajectory
@@ -25,6 +26,22 @@ class Solution(Trajectory):
 
     report: Callable[..., Path]
     """`sol.report(path)`: a page for a browser; `dirax.show`, which stands above this room, puts the method here."""
+
+    def extend(self, steps: int, progress: Any = False) -> Self:
+        """The solution of the run with `steps` more steps, with the bits of one run: the steps that are done are not repeated,
+        except where Ctrl-C has interrupted them. Rows are saved as before; the last row of this solution is one of the longer
+        run's if its number is a multiple of `save_every`. A trajectory that has failed stays as it is.
+
+        Raises `ValueError` for a part of a solution, one from a file and one that JAX traces, which do not know how they were run.
+        """
+        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+            raise ValueError(f"steps must be a whole number ≥ 1, but {steps!r} was given.")
+        if self.continuation is None:
+            raise ValueError(
+                "only what dx.simulate or a prepared run has returned, outside of jax.grad, jit and vmap, knows how to go on: "
+                "extend that, before a part of it is taken or it is saved."
+            )
+        return self.continuation(self, steps, progress)
 
     __getitem__ = selection.select
     __len__ = selection.count

@@ -31,6 +31,9 @@ class Trajectory:
     example: Any = None
     """The example of the gallery that was run, which knows a scene and an exact solution; None for other systems."""
 
+    continuation: Any = None
+    """(solution, more steps, progress) ↦ the solution of the longer run; None where it is not known how it was run."""
+
     def __init__(
         self,
         *,

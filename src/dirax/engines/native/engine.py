@@ -99,10 +99,10 @@ class Ready:
         lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
         fields = lanes.fields
         compile_seconds, cached, started = self.compile_seconds, self.notes["kernel_cached"], time.perf_counter()
-        done, interrupted, threads = 0, False, 1
+        done, interrupted, threads = p.after, False, 1
         count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
         try:
-            while done < p.steps and (done == 0 or lanes.going):
+            while done < p.steps and (done == p.after or lanes.going):
                 count = min(count, p.steps - done)
                 tick = time.perf_counter()
                 lanes.advance(self.kernel, done, done + count, threads)
@@ -114,8 +114,7 @@ class Ready:
                     progress(done, p.steps)
         except KeyboardInterrupt:
             interrupted = True
-        if self.is_collocation and not interrupted:
-            _by_newton(lanes)
+        by_newton = self.is_collocation and not interrupted and _by_newton(lanes)
         run_seconds = time.perf_counter() - started
         closing = lanes.close(self.kernel)
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
@@ -133,6 +132,7 @@ class Ready:
             interrupted=interrupted,
             compile_seconds=compile_seconds,
             run_seconds=run_seconds,
+            record=None if interrupted or by_newton else table,
             engine="native",
             notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
         )
@@ -140,10 +140,12 @@ class Ready:
         return outcome if whole else finished(p, outcome)
 
 
-def _by_newton(lanes: Lanes | OneLane) -> None:
-    """Go on with trajectories whose fixed-point iteration has not converged, by Newton's method for all nodes together."""
+def _by_newton(lanes: Lanes | OneLane) -> bool:
+    """Go on with trajectories whose fixed-point iteration has not converged, by Newton's method for all nodes together; whether
+    there are any."""
     if left := lanes.left():
         p = lanes.problem
         newton, _ = kernels(p.equation, p.params, p.batch_params, True).kernel(1)
         for lane in left:
             lanes.again(newton, lane)
+    return bool(left)

@@ -71,10 +71,13 @@ class Lanes:
         self.lanes = p.batch or 1
         self.blocks = -(-self.lanes // width)
         self.threads = min(thread_count(), self.blocks) if self.blocks > 1 else 1
-        table = np.zeros((self.lanes, self.record.size))
-        table[:, self.record.state] = p.state
-        for stage, guess in enumerate(p.guess):
-            table[:, self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+        if p.record is None:
+            table = np.zeros((self.lanes, self.record.size))
+            table[:, self.record.state] = p.state
+            for stage, guess in enumerate(p.guess):
+                table[:, self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+        else:
+            table = np.array(p.record)
         self.records = self._blocked(table)
         leaves = made.step.parameters.flatten(p.params, p.batch if p.batch_params else None)
         self.params = self._blocked(np.broadcast_to(leaves, (self.lanes, leaves.shape[-1])))

@@ -47,10 +47,13 @@ class OneLane:
     def __init__(self, p: Problem, made: Kernels | CollocationKernels, places: Places):
         self.problem, self.record, self.places = p, made.record, places
         memory = self.memory = np.empty(places.size)
-        memory[: places.record] = 0.0
-        memory[self.record.state] = p.state
-        for stage, guess in enumerate(p.guess):
-            memory[self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+        if p.record is None:
+            memory[: places.record] = 0.0
+            memory[self.record.state] = p.state
+            for stage, guess in enumerate(p.guess):
+                memory[self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+        else:
+            memory[: places.record] = p.record[0]
         if places.outs > places.params:
             memory[places.params : places.outs] = made.step.parameters.flatten(p.params, None)
         self.address = memory.ctypes.data

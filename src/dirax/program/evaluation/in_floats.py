@@ -70,7 +70,7 @@ class _Writer:
     def _need(self, nodes: Sequence[int]) -> None:
         for node in self.graph.reachable(nodes, self.texts):
             text = self._expression(node)
-            if self.uses[node] > 1 and self.graph.args[node] or len(text) > LONGEST:
+            if (self.uses[node] > 1 and self.graph.args[node]) or len(text) > LONGEST:
                 self.lines.append(f"x{node} = {text}")
                 text = f"x{node}"
             self.texts[node] = text
