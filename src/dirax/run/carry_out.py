@@ -167,7 +167,7 @@ def _run(
     started = time.perf_counter()
     if traced:
         outcome = on.run_traced(problem)
-        ready = ended = started
+        ready = started
     else:
         planned = kind is not None and not found.redundant
         run = kind.engine if planned and kind.engine is not None else on.prepared(problem)
@@ -175,7 +175,6 @@ def _run(
             kind.engine = run
         ready = time.perf_counter()
         outcome = _outcome(run, problem, steps, progress)
-        ended = time.perf_counter()
     for name, rows in (found.rows or {}).items():
         outcome.fields[name][:, : rows.shape[1]] = rows
     if found.redundant:
@@ -183,11 +182,15 @@ def _run(
     solution = solution_of(settings.system, settings.scheme, found.case, problem, outcome, found.row0, traced)
     if not traced:
         solution.continuation = Continuation(settings, kind, found, outcome.record, steps)
+        found_in_run = outcome.compile_seconds > ready - started  # by an engine that prepares nothing
         solution.stats |= {
             "validate_seconds": began - entered if entered else 0.0,
             "start_seconds": started - began,
-            "trace_seconds": max(0.0, ready - started - outcome.compile_seconds),
-            "result_seconds": time.perf_counter() - ended + max(0.0, ended - ready - outcome.run_seconds),
+            "trace_seconds": ready - started - (0.0 if found_in_run else outcome.compile_seconds),
+            "result_seconds": max(
+                0.0,
+                time.perf_counter() - ready - outcome.run_seconds - (outcome.compile_seconds if found_in_run else 0.0),
+            ),
         }
     return solution
 

@@ -1,5 +1,6 @@
 """simulate(): validate → discretize → start → engine → Solution, each once."""
 
+import time
 from typing import Any
 
 from dirax.engines.engine import AbstractEngine
@@ -58,8 +59,9 @@ def simulate(
     A run that fails midway, or is stopped by Ctrl-C, raises nothing: what was computed is
     kept, and `Solution.ok` and `.message` say what happened.
     """
+    entered = time.perf_counter()
     settings, case, steps, save_every = stated(
         system, scheme, step, steps, {"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, inputs, params, batch_params,
         save_every, engine, project, check_initial, t0, max_iterations, compensated,
     )  # fmt: skip
-    return carried_out(settings, case, steps, save_every, progress)
+    return carried_out(settings, case, steps, save_every, progress, entered=entered)
