@@ -21,6 +21,10 @@ from dirax.program.tracing import once
 from dirax.text.representation import value_text
 
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+NO_MULTIPLIERS = (
+    "forces that see the multipliers are for dx.LagrangeDAlembert, its (+) and (−) cases and their compositions, and for "
+    'dx.DiscreteDirac(constraints="resolve")'
+)
 INDEXING = ("dynamic_slice", "gather")
 """What JAX turns an index into when it is not known to be inside the array."""
 
@@ -70,6 +74,10 @@ class UserFunction(eqx.Module):
                 f"{name} must be a function {expected}, but {value_text(function)} was given: "
                 "wrap the value in a function, e.g. a lambda."
             )
+        if "multipliers" not in arguments and "multipliers" in _parameters_of(function):
+            raise TypeError(
+                f"{name} cannot see the multipliers here, where it is {expected}: {NO_MULTIPLIERS} of a dx.LagrangeDirac."
+            )
         self.takes_time = timed and _takes_time(function, len(arguments))
         self.arguments = ("t", *arguments) if self.takes_time else tuple(arguments)
         self.takes_params = _takes_params(function, name, expected, len(self.arguments))
@@ -77,6 +85,11 @@ class UserFunction(eqx.Module):
 
     def __call__(self, *values: Any):
         *args, params = values
+        if len(args) != len(self.arguments):
+            raise TypeError(
+                f"{self._call} is not called with its {len(self.arguments)} arguments here, but with {len(args)}"
+                + (f": {NO_MULTIPLIERS}." if "multipliers" in self.arguments else ".")
+            )
         return once(self.function)(*args, *((params,) if self.takes_params else ()))
 
     def at(self, t: Any, *values: Any):
@@ -160,6 +173,13 @@ class UserFunction(eqx.Module):
     def _without_params(self, values) -> str:
         missing = self.takes_params and values[-1] is None
         return " and params=None (it takes params, which were not given: pass params=…)" if missing else ""
+
+
+def _parameters_of(function: Callable) -> tuple[str, ...]:
+    try:
+        return tuple(inspect.signature(function).parameters)
+    except (TypeError, ValueError):
+        return ()
 
 
 def _takes_time(function: Callable, count: int) -> bool:

@@ -125,17 +125,21 @@ class ProjectedThetaStep(ThetaStep):
         at, q, q1 = self._base(u, state, t, h)
         parts = self.unknowns.split(u)
         end = [q1, self.system.legendre(q1, parts.end_v, params, t + h)]
-        return self.book.after(state, end, at, q, parts.v, h, params)
+        return self.book.after(state, end, at, q, parts.v, h, params, self._forces(parts.multipliers))
 
     def unpack(self, state, u, t, h, params):
         return self.row(state) | {"multipliers": self.rows.all(self.unknowns.split(u).multipliers)}
+
+    def _forces(self, multipliers: Array) -> Any:
+        """The forces where these are the multipliers, which are those of the system with the opposite sign."""
+        return self.system.forces_at(-self.rows.all(multipliers))
 
     def _flow(self, t: Any, q: Array, v: Array, a: Array, multipliers: Array, params: Any) -> tuple[Array, Array, Array]:
         return once(self._at_point)(t, q, v, a, multipliers, params)
 
     def _at_point(self, t: Any, q: Array, v: Array, a: Array, multipliers: Array, params: Any) -> tuple[Array, Array, Array]:
         """(p, ṗ, what is zero where a and λ are those of the flow) at a point of M_f."""
-        rate, p = self.rates(t, q, v, params)
+        rate, p = self.rates(t, q, v, params, self._forces(multipliers))
         rate = rate + self.rows.matrix(t, q, params).T @ multipliers
         turning = self._along(lambda t, q, v: self.system.legendre(q, v, params, t), t, q, v, a)
         drift = self._along(lambda t, q, v: self.rows.velocity_defect(t, q, v, params), t, q, v, a)
