@@ -73,6 +73,7 @@ from dirax.show.report import report
 from dirax.solution.loading import load
 from dirax.solution.reconstruction import reconstruct
 from dirax.solution.solution import Solution
+from dirax.systems.circuit import Circuit, circuit
 from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.dirac_system import DiracSystem
@@ -90,6 +91,7 @@ from dirax.systems.system import AbstractSystem
 # What a user states
 __all__ = [
     "AbstractSystem",
+    "Circuit",
     "ConstraintChain",
     "DiracSystem",
     "FinalManifold",
@@ -103,6 +105,7 @@ __all__ = [
     "RelationForm",
     "action_sum",
     "action_variation",
+    "circuit",
     "constraint_algorithm",
     "discrete_energy",
     "interconnect",
