@@ -1,6 +1,7 @@
 """The rank of a matrix in floating point: how many singular values are not zero."""
 
 import math
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -45,7 +46,7 @@ SMALL = 8
 20 µs."""
 
 
-def surely_independent(rows: list[list[float]], most: float = SURE) -> bool:
+def surely_independent(rows: Sequence[Sequence[float]], most: float = SURE) -> bool:
     """Whether the rows of a matrix (k, l), which someone has scaled, are independent beyond doubt: the product of its norm and
     that of a right inverse, which is no less than its condition number, is below `most`. False also where it is not finite.
 
@@ -63,7 +64,7 @@ def surely_independent(rows: list[list[float]], most: float = SURE) -> bool:
         return bool(norm * math.sqrt(k * inverse_norm) < most * most)
 
 
-def _inverse_norm(rows: list[list[float]]) -> float:
+def _inverse_norm(rows: Sequence[Sequence[float]]) -> float:
     """The sum of the squares of the entries of the inverse of a square matrix; infinite where it has none."""
     k = len(rows)
     if k == 2:
@@ -76,18 +77,18 @@ def _inverse_norm(rows: list[list[float]]) -> float:
         except np.linalg.LinAlgError:
             return math.inf
         return float(np.vdot(inverse, inverse))
-    rows = [[*row, *[float(i == j) for j in range(k)]] for i, row in enumerate(rows)]
+    both = [[*row, *[float(i == j) for j in range(k)]] for i, row in enumerate(rows)]
     for i in range(k):
-        pivot = max(range(i, k), key=lambda j: abs(rows[j][i]))
-        rows[i], rows[pivot] = rows[pivot], rows[i]
-        if not rows[i][i]:
+        pivot = max(range(i, k), key=lambda j: abs(both[j][i]))
+        both[i], both[pivot] = both[pivot], both[i]
+        if not both[i][i]:
             return math.inf
-        factor = 1.0 / rows[i][i]
-        rows[i] = own = [x * factor for x in rows[i]]
+        factor = 1.0 / both[i][i]
+        both[i] = own = [x * factor for x in both[i]]
         for j in range(k):
-            if j != i and (slope := rows[j][i]):
-                rows[j] = [x - slope * y for x, y in zip(rows[j], own, strict=True)]
-    return sum([x * x for row in rows for x in row[k:]])
+            if j != i and (slope := both[j][i]):
+                both[j] = [x - slope * y for x, y in zip(both[j], own, strict=True)]
+    return sum([x * x for row in both for x in row[k:]])
 
 
 def decide_rank(

@@ -169,10 +169,10 @@ def _run(
         outcome = on.run_traced(problem)
         ready = started
     else:
-        planned = kind is not None and not found.redundant
-        run = kind.engine if planned and kind.engine is not None else on.prepared(problem)
-        if planned:
-            kind.engine = run
+        of_kind = None if found.redundant else kind
+        run = (of_kind and of_kind.engine) or on.prepared(problem)
+        if of_kind is not None:
+            of_kind.engine = run
         ready = time.perf_counter()
         outcome = _outcome(run, problem, steps, progress)
     for name, rows in (found.rows or {}).items():

@@ -35,8 +35,9 @@ class Plan:
         self.settings, self.template = settings, problem
         equation = problem.equation
         self.checks = [check for check in dict.fromkeys(stage.check for stage, _ in equation.stages) if not _is_trivial(check)]
-        self.complete = program_of_completion(settings.system, case, settings.project)
-        self.begun = program_of_beginning(equation, case, initial.data)
+        self.complete: Any = program_of_completion(settings.system, case, settings.project)
+        self.begun: Any = program_of_beginning(equation, case, initial.data)
+        self.first_step: Any = None
         self.data_size = sum(np.size(a) for a in jax.tree.leaves(initial.data))
         self.defects, self.has_lagrangian = np.size(initial.defect), initial.lagrangian is not None
         self.matrix = None

@@ -1,6 +1,7 @@
 """prepare(): a run that is said once, and carried out again with other numbers in microseconds."""
 
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -68,7 +69,7 @@ class PreparedRun:
     def _alike(self, given: dict[str, Any]) -> tuple[Any, Any]:
         """Data and params where all that is given is finite floats of the shapes that were prepared; else (None, None)."""
         base = self._case
-        data, params = base.data, base.params
+        data, params = dict(base.data), base.params
         for name, value in given.items():
             if name == "params":
                 leaves, structure = jax.tree.flatten(value)
@@ -105,7 +106,7 @@ class PreparedRun:
         return f"PreparedRun({self._settings.scheme!r} on {self._settings.system!r}, {self._steps} steps of {self._case.h})"
 
 
-def _batch_of(data: dict[str, Any]) -> int | None:
+def _batch_of(data: Mapping[str, Any]) -> int | None:
     array = next(iter(data.values()))
     return array.shape[0] if array.ndim == 2 else None
 

@@ -20,7 +20,8 @@ class LagrangeDAlembertPart(AbstractStep):
 
     The inner step takes p modulo the constraint forces, so that σ changes nothing in q. The impulse of the step, μ + σ, is
     that of both its ends: with it (q, p, ∫λ dt) is a one-step map, self-adjoint where the inner step is, and a composition
-    has its order in all three. Forces that see the multipliers are given the mean of the step, (μ + σ)/h. The state is (q, p, work), the unknowns are (v, μ, v̂, σ).
+    has its order in all three. Forces that see the multipliers are given the mean of the step, (μ + σ)/h. The state is
+    (q, p, work), the unknowns are (v, μ, v̂, σ).
     """
 
     inner: LagrangeDAlembertStep

@@ -68,9 +68,11 @@ class LagrangeDAlembertStep(AbstractStep):
         return discrete_constraint(self.system.constraints, self.constraint, self.shape.m)
 
     def impulses(self, t, q, v, h, params, of_constraints=None):
-        """(f_d^−, f_d^+), for forces; `of_constraints` are the impulses (μ, λ) of the step, for forces that see the multipliers."""
+        """(f_d^−, f_d^+), for forces; `of_constraints` are the impulses (μ, λ) of the step, for those that see the multipliers."""
         seen = None if of_constraints is None else self.rows.all(of_constraints) / h
-        return discrete_forces(self.system.forces_at(seen), self.rule)(t, q, v, h, params)
+        forces = self.system.forces_at(seen)
+        assert forces is not None
+        return discrete_forces(forces, self.rule)(t, q, v, h, params)
 
     @property
     def projects(self) -> bool:

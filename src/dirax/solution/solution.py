@@ -32,7 +32,8 @@ class Solution(Trajectory):
         except where Ctrl-C has interrupted them. Rows are saved as before; the last row of this solution is one of the longer
         run's if its number is a multiple of `save_every`. A trajectory that has failed stays as it is.
 
-        Raises `ValueError` for a part of a solution, one from a file and one that JAX traces, which do not know how they were run.
+        Raises `ValueError` for a part of a solution, one from a file and one that JAX traces, which do not know how they were
+        run.
         """
         if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
             raise ValueError(f"steps must be a whole number ≥ 1, but {steps!r} was given.")

@@ -125,7 +125,9 @@ class Circuit(AbstractSystem):
 
     def currents(self, voltages: Float[Array, " r"]) -> Float[Array, " r"]:
         """The currents of the resistors at their voltages."""
-        found = [value(u) if callable(value) else u / value for (*_, value), u in zip(self.elements("R"), voltages, strict=True)]
+        found: list[Any] = [
+            value(u) if callable(value) else u / value for (*_, value), u in zip(self.elements("R"), voltages, strict=True)
+        ]
         return jnp.stack(found) if found else jnp.zeros(0)
 
     def source(self, kind: str, t: Any) -> Array:
@@ -175,7 +177,7 @@ class Circuit(AbstractSystem):
         return self.energy(row["x"])
 
     def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " r"]:
-        return self.complete({"x": row["x"], "t": row.get("t", 0.0)}, params, False)["defect"]
+        return self.complete({"x": row["x"], "t": jnp.asarray(row.get("t", 0.0))}, params, False)["defect"]
 
     @property
     def energy_changes(self) -> str:

@@ -89,11 +89,12 @@ class LagrangeDirac(AbstractSystem):
         """Whether the forces depend on those of the constraints."""
         return self.forces is not None and "multipliers" in self.forces.arguments
 
-    def forces_at(self, multipliers: Float[Array, " k"] | None) -> Callable:
-        """The forces (t, q, v, params) ↦ (n,) where the multipliers of the constraints are these."""
-        if not self.forces_see_multipliers or multipliers is None:
-            return self.forces
-        return lambda t, q, v, params: self.forces(t, q, v, multipliers, params)
+    def forces_at(self, multipliers: Float[Array, " k"] | None) -> Callable | None:
+        """The forces (t, q, v, params) ↦ (n,) where the multipliers of the constraints are these; None without forces."""
+        forces = self.forces
+        if forces is None or not self.forces_see_multipliers or multipliers is None:
+            return forces
+        return lambda t, q, v, params: forces(t, q, v, multipliers, params)
 
     @property
     def depends_on_time(self) -> bool:
@@ -159,8 +160,9 @@ class LagrangeDirac(AbstractSystem):
             seen = (np.zeros(sum(self.constraints.sizes(q, params))),) * self.forces_see_multipliers
             out = self.forces.shape(t, q, q, *seen, params)
             if out.shape != (n,):
+                call = f"forces({', '.join(self.forces.arguments)})"
                 raise ValueError(
-                    f"forces({', '.join(self.forces.arguments)}) must return shape ({n},), one number a coordinate, but it returned shape {out.shape}."
+                    f"{call} must return shape ({n},), one number a coordinate, but it returned shape {out.shape}."
                 )
         m, c = self.constraints.sizes(q, params)
         return (n, m) if self.holonomic is None else (n, m, c)

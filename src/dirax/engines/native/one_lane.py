@@ -23,7 +23,7 @@ class Places:
         self.closing_outs = self.outs + len(saved)
         at = self.closing_outs + len(saved)
         self.fields, self.closing, starts, closing, last = [], [], [], [], []
-        for name, shape, size, ends_before in saved:
+        for name, shape, size, _ in saved:
             self.closing.append((name, at, at + size, (1, *shape)))
             closing.append(at)
             at += size

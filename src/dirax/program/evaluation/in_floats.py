@@ -31,7 +31,8 @@ def in_floats(
     graph: Graph, inputs: Sequence[int], outputs: Sequence[int], between: Sequence[Any] = (), most: int = MOST_NODES
 ) -> Floats | None:
     """(values of the inputs) ↦ values of the outputs, with the opaque computations `between` of a scalar program; None for a
-    program of more than `most` nodes. The function raises `ArithmeticError` or `ValueError` where a float has no such operation."""
+    program of more than `most` nodes. The function raises `ArithmeticError` or `ValueError` where a float has no such
+    operation."""
     needed = set(graph.reachable([*outputs, *(n for step in between for operand in step.operands for n in _flat(operand))]))
     return None if len(needed) > most else _Writer(graph, needed, inputs, outputs, between).function()
 
