@@ -161,9 +161,7 @@ class LagrangeDirac(AbstractSystem):
             out = self.forces.shape(t, q, q, *seen, params)
             if out.shape != (n,):
                 call = f"forces({', '.join(self.forces.arguments)})"
-                raise ValueError(
-                    f"{call} must return shape ({n},), one number a coordinate, but it returned shape {out.shape}."
-                )
+                raise ValueError(f"{call} must return shape ({n},), one number a coordinate, but it returned shape {out.shape}.")
         m, c = self.constraints.sizes(q, params)
         return (n, m) if self.holonomic is None else (n, m, c)
 

@@ -34,9 +34,7 @@ def in_numpy(function: Callable, leaves: list[np.ndarray], key: Hashable) -> Any
     return None if found is None else jax.tree.unflatten(found[1], found[0].in_numpy(leaves))
 
 
-def program_of(
-    function: Callable, shapes: list[jax.ShapeDtypeStruct], key: Hashable
-) -> tuple[ScalarProgram, Any] | None:
+def program_of(function: Callable, shapes: list[jax.ShapeDtypeStruct], key: Hashable) -> tuple[ScalarProgram, Any] | None:
     """The program by which `in_numpy` evaluates arguments of these shapes, and the structure of what the function returns."""
     return _programs.get((key, *((s.shape, s.dtype.str) for s in shapes)), lambda: _traced(function, shapes, True))
 
