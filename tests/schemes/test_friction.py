@@ -87,7 +87,7 @@ def test_what_does_not_see_the_multipliers_says_so():
         dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v, multipliers: v)
     with pytest.raises(TypeError, match="forces cannot see the multipliers here"):
         dx.ManifoldLagrangian(lambda q, v: v @ v / 2, dx.Sphere(3), forces=lambda t, q, v, multipliers: v)
-    with pytest.raises(TypeError, match="forces that see the multipliers are for dx.LagrangeDAlembert"):
+    with pytest.raises(TypeError, match=r"forces that see the multipliers are for dx\.LagrangeDAlembert"):
         dx.simulate(HOOP, dx.DiscreteDirac(), q=[1.0, 0.0], v=[0.0, 1.0], step=0.1, steps=2)
 
 

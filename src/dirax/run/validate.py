@@ -1,5 +1,6 @@
 """The arguments of a run, checked: each mistake is one error that names the argument, what came and what was expected."""
 
+import dataclasses
 import math
 import os
 from collections.abc import Mapping
@@ -70,7 +71,9 @@ def validated_case(given: dict[str, Any], params: Any, batch_params: bool, step:
 
 
 def params_of_case(params: Any) -> Any:
-    """The params with arrays for leaves. Raises `TypeError` and `ValueError` for leaves that are no finite numbers."""
+    """The params with arrays for leaves; dataclasses in them become pytrees. Raises `TypeError` and `ValueError` for leaves that
+    are no finite numbers."""
+    _register_dataclasses(params)
     leaves, structure = jax.tree.flatten(params)
     plain = [plain_floats(leaf) for leaf in leaves]
     if not any([leaf is None for leaf in plain]):
@@ -78,6 +81,16 @@ def params_of_case(params: Any) -> Any:
     params = _arrays(params)
     check_finite("params", params)
     return params
+
+
+def _register_dataclasses(params: Any) -> None:
+    """Have JAX look into dataclasses, whose fields are all taken for numbers and arrays or pytrees of them; none that it knows."""
+    for leaf in jax.tree.leaves(params):
+        if dataclasses.is_dataclass(leaf) and not isinstance(leaf, type):
+            names = [field.name for field in dataclasses.fields(leaf)]
+            jax.tree_util.register_dataclass(type(leaf), data_fields=names, meta_fields=[])
+            for name in names:
+                _register_dataclasses(getattr(leaf, name))
 
 
 def check_kinds(system: Any, scheme: Any) -> None:

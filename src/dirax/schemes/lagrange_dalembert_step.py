@@ -68,7 +68,7 @@ class LagrangeDAlembertStep(AbstractStep):
         return discrete_constraint(self.system.constraints, self.constraint, self.shape.m)
 
     def impulses(self, t, q, v, h, params, of_constraints=None):
-        """(f_d^−, f_d^+), for forces; `of_constraints` are the impulses (μ, λ) of the step, for those that see the multipliers."""
+        """(f_d^−, f_d^+), for forces; `of_constraints` are the impulses (μ, λ) of the step, for those that see them."""
         seen = None if of_constraints is None else self.rows.all(of_constraints) / h
         forces = self.system.forces_at(seen)
         assert forces is not None
