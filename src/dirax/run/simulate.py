@@ -39,8 +39,9 @@ def simulate(
 
     Initial data: `q=, v=` · `q=, p=` · `q0=, q1=` (rows 0 and 1 as they are) · `x=`; each of shape (n,), or (B, n) for a
     batch of B trajectories. `params` is handed to user functions that take it, a pytree of numbers and arrays, in which
-    dataclasses count as pytrees; with `batch_params` its leaves have the batch axis too. Rows are saved every `save_every` steps, the last one always. `step` and `t` have the user's unit of
-    time, and `t0` is the time of the first row. `inputs(t, x[, params])` drives an open port-Hamiltonian system.
+    dataclasses count as pytrees; with `batch_params` its leaves have the batch axis too. Rows are saved every `save_every`
+    steps, the last one always. `step` and `t` have the user's unit of time, and `t0` is the time of the first row.
+    `inputs(t, x[, params])` drives an open port-Hamiltonian system.
     `progress`: True for a bar, or a function of (steps done, steps in all). `project` moves initial data onto the
     constraint; `check_initial=False` accepts data off it as they are. `max_iterations` bounds Newton's iterations a step.
     `compensated` keeps what rounding takes from the state and gives it back at the next step (Kahan), so that conserved
