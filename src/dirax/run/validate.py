@@ -84,7 +84,7 @@ def params_of_case(params: Any) -> Any:
 
 
 def _register_dataclasses(params: Any) -> None:
-    """Have JAX look into dataclasses, whose fields are all taken for pytrees of numbers and arrays; not into those that it knows."""
+    """Have JAX look into dataclasses, whose fields are all taken for pytrees; into those that it knows it does already."""
     for leaf in jax.tree.leaves(params):
         if dataclasses.is_dataclass(leaf) and not isinstance(leaf, type):
             names = [field.name for field in dataclasses.fields(leaf)]
