@@ -19,9 +19,9 @@ from dirax.run.final_manifold import (
     refuse_off_final_manifold,
 )
 from dirax.run.plan import Plan, bytes_of, planned
-from dirax.run.refused_start import refuse_bad_start
 from dirax.run.progress import reporting
 from dirax.run.redundancy import redundant_constraints
+from dirax.run.refused_start import refuse_bad_start
 from dirax.run.result import solution_of
 from dirax.run.settings import Settings, kind_of
 from dirax.run.start import begun, completed

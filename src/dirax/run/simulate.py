@@ -1,4 +1,4 @@
-"""simulate(): validate → discretize → start → engine → Solution, each once."""
+"""simulate(): what a user calls to run a scheme on a system."""
 
 import time
 from typing import Any

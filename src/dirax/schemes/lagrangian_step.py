@@ -54,9 +54,7 @@ class LagrangianStep(AbstractStep):
         parts = self.state.split(state)
         return self.book.row(state) | {"q": parts.q, "p": parts.p}
 
-    def rates(
-        self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any, forces: Any = None
-    ) -> tuple[Array, Array]:
+    def rates(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any, forces: Any = None) -> tuple[Array, Array]:
         """(∂L/∂q + f, ∂L/∂v) at (t, q, v), with these forces or those of the system."""
         lagrangian, forces = self.system.lagrangian, self.system.forces if forces is None else forces
         dq, dv = gradient(lambda q, v: lagrangian.at(t, q, v, params), (0, 1))(q, v)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.numerics.arrays import Data, Numbers
 from dirax.program.roots import nearest_root
 from dirax.systems.forms import RelationForm
 from dirax.systems.implicit_system import ImplicitSystem
@@ -118,12 +119,12 @@ class Circuit(AbstractSystem):
 
         return ImplicitSystem(lambda x: jnp.asarray(E), f, lambda x: jnp.asarray(B), self.energy)
 
-    def energy(self, x: Float[Array, " N"]) -> Float[Array, ""]:
+    def energy(self, x: Float[Numbers, " N"]) -> Float[Numbers, ""]:
         """That of the capacitors and inductors."""
         c, l = self.values("C"), self.values("L")
         return jnp.sum(x[: len(c)] ** 2 / c) / 2 + jnp.sum(x[len(c) :] ** 2 / l) / 2
 
-    def currents(self, voltages: Float[Array, " r"]) -> Float[Array, " r"]:
+    def currents(self, voltages: Float[Numbers, " r"]) -> Float[Numbers, " r"]:
         """The currents of the resistors at their voltages."""
         found: list[Any] = [
             value(u) if callable(value) else u / value for (*_, value), u in zip(self.elements("R"), voltages, strict=True)
@@ -135,7 +136,7 @@ class Circuit(AbstractSystem):
         found = [jnp.asarray(value(t) if callable(value) else value, float) for *_, value in self.elements(kind)]
         return jnp.stack(found) if found else jnp.zeros(0)
 
-    def relation(self, x: Array, velocity: Array, multipliers: Array, t: Any, params: Any = None) -> Float[Array, " r"]:
+    def relation(self, x: Array, velocity: Array, multipliers: Array, t: Any, params: Any = None) -> Float[Numbers, " r"]:
         """Kirchhoff's laws: currents of the nodes; voltages of the inductors, capacitors, sources, transformers."""
         c, l, r, v = (jnp.asarray(self.incidence(kind)) for kind in "CLRV")
         i, sides = jnp.asarray(self.incidence("I")), jnp.asarray(self.transformers)
@@ -148,7 +149,7 @@ class Circuit(AbstractSystem):
 
     # ------------------------------------------------------------------ AbstractSystem
 
-    def sizes(self, data: dict[str, Array], params: Any) -> tuple[int, int]:
+    def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         refuse_start(self, data, "x")
         expected = len(self.elements("C")) + len(self.elements("L"))
         if data["x"].shape[0] != expected:
@@ -162,21 +163,21 @@ class Circuit(AbstractSystem):
         labels = (*(f"potential of node {node}" for node in self.nodes), *currents)
         return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port")
 
-    def complete(self, data: dict[str, Array], params: Any, project: bool) -> dict[str, Array]:
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
         x, t, n = data["x"], data.get("t", 0.0), data["x"].shape[0]
         m = len(self.nodes) + len(self.elements("V")) + len(self.elements("T"))
         laws = lambda z: self.relation(x, z[:n], z[n:], t, params)
         found = nearest_root(laws, jnp.zeros(n + m))
         return {"x": x, "velocity": found[:n], "defect": laws(found)}
 
-    def initial_defect(self, data: dict[str, Array], params: Any) -> Float[Array, " r"]:
+    def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " r"]:
         """What is left of the laws where no currents and potentials satisfy them."""
         return data["defect"]
 
-    def energy_at(self, row: dict[str, Array], params: Any) -> Float[Array, ""]:
+    def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         return self.energy(row["x"])
 
-    def constraint_at(self, row: dict[str, Array], params: Any) -> Float[Array, " r"]:
+    def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " r"]:
         return self.complete({"x": row["x"], "t": jnp.asarray(row.get("t", 0.0))}, params, False)["defect"]
 
     @property

@@ -89,7 +89,7 @@ class LagrangeDirac(AbstractSystem):
         """Whether the forces depend on those of the constraints."""
         return self.forces is not None and "multipliers" in self.forces.arguments
 
-    def forces_at(self, multipliers: Float[Array, " k"] | None) -> Callable | None:
+    def forces_at(self, multipliers: Float[Numbers, " k"] | None) -> Callable | None:
         """The forces (t, q, v, params) ↦ (n,) where the multipliers of the constraints are these; None without forces."""
         forces = self.forces
         if forces is None or not self.forces_see_multipliers or multipliers is None:
