@@ -15,6 +15,9 @@ from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field, Shape
 from dirax.schemes.work_of_forces import WorkOfForces
 
+METHOD_2 = "of Method 2"
+"""How the labels of its equations end."""
+
 
 @dataclass(frozen=True, eq=False)
 class LagrangianStep(AbstractStep):
@@ -75,4 +78,4 @@ def one_point_only(data: Data) -> None:
 
 def numbered(count: int) -> tuple[str, ...]:
     """The labels of the equations of Method 2."""
-    return tuple(f"equation {i} of Method 2" for i in range(count))
+    return tuple(f"equation {i} {METHOD_2}" for i in range(count))
