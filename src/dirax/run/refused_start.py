@@ -103,12 +103,13 @@ def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool)
             "The Lagrangian is singular together with its constraints: remove the coordinates that it does not determine, or "
             "choose another discrete Lagrangian"
         )
+        direction = np.array2string(directions[lane], precision=2, suppress_small=True, max_line_width=1000)
         if singular and labels[0].endswith(METHOD_2):
             way = f"This is since the Lagrangian is singular (∂²L/∂v²), and this scheme {FINAL_MANIFOLD}"
         raise ValueError(
             f"the first step has no unique solution: its matrix ([PY] (21)) has rank {ranks[lane]} of {unknowns} at the "
             f"initial data{_which(ranks < unknowns)}, and leaves the direction "
-            f"{np.array2string(directions[lane], precision=2, suppress_small=True, max_line_width=1000)} of the unknowns free. {way}."
+            f"{direction} of the unknowns free. {way}."
         )
 
 
