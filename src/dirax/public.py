@@ -54,6 +54,7 @@ from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
+from dirax.run.prepare import PreparedRun, prepare
 from dirax.run.simulate import simulate
 from dirax.schemes.collocation import Collocation
 from dirax.schemes.composition import Adjoint, Composition, SymmetricComposition
@@ -74,6 +75,7 @@ from dirax.solution.loading import load
 from dirax.solution.reconstruction import reconstruct
 from dirax.solution.solution import Solution
 from dirax.sweeps.sweep import sweep
+from dirax.systems.circuit import Circuit, circuit
 from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.dirac_system import DiracSystem
@@ -91,6 +93,7 @@ from dirax.systems.system import AbstractSystem
 # What a user states
 __all__ = [
     "AbstractSystem",
+    "Circuit",
     "ConstraintChain",
     "DiracSystem",
     "FinalManifold",
@@ -103,6 +106,7 @@ __all__ = [
     "PhaseSpaceLagrangian",
     "PortHamiltonian",
     "RelationForm",
+    "circuit",
     "constraint_algorithm",
     "interconnect",
 ]
@@ -199,10 +203,12 @@ __all__ += [
 __all__ += [
     "AbstractEngine",
     "AbstractLinearSolver",
+    "PreparedRun",
     "Solution",
     "clear_caches",
     "configure",
     "load",
+    "prepare",
     "reconstruct",
     "simulate",
     "sweep",

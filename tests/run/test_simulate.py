@@ -1,5 +1,7 @@
 """simulate(): rows and times, batches, parameters, gradients, transformations, starts, progress, reuse of compiled code."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -283,3 +285,30 @@ def test_runs_are_reproducible(engine):
     one, other = run(), run()
     for name in one.fields:
         np.testing.assert_array_equal(one.fields[name], other.fields[name])
+
+
+@dataclasses.dataclass(frozen=True)
+class Spring:
+    """Params of one's own."""
+
+    k: float
+
+
+@dataclasses.dataclass
+class Oscillator:
+    spring: Spring
+    m: float = 1.0
+
+
+def test_params_are_dataclasses_that_nobody_has_registered():
+    system = dx.LagrangeDirac(lambda q, v, params: (params.m * v @ v - params.spring.k * q @ q) / 2)
+    given = {"q": [1.0], "v": [0.5], "step": 0.1, "steps": 5}
+    sol = dx.simulate(system, PLUS, params=Oscillator(Spring(2.0), 3.0), **given)
+    same = dx.simulate(SPRING, PLUS, params={"m": 3.0, "k": 2.0}, **given)
+    np.testing.assert_array_equal(sol.q, same.q)
+    np.testing.assert_allclose(sol.energy(), same.energy(), rtol=1e-15)
+    end = lambda k: dx.simulate(system, PLUS, params=Oscillator(Spring(k)), **given).q[-1, 0]
+    expected = (end(2.0 + 1e-5) - end(2.0 - 1e-5)) / 2e-5
+    assert jax.grad(end)(2.0) == pytest.approx(expected, rel=1e-7)
+    with pytest.raises(TypeError, match=r"params\.spring\.k is 'stiff'"):
+        dx.simulate(system, PLUS, params=Oscillator(Spring("stiff")), **given)

@@ -1,5 +1,7 @@
 """The engine "auto": native for small systems on a CPU, xla for everything else; `policy.py` says how large is small."""
 
+from collections.abc import Callable
+
 from dirax.engines import policy
 from dirax.engines.contract import Outcome, Problem, Progress
 from dirax.engines.engine import AbstractEngine
@@ -18,6 +20,10 @@ class Auto(AbstractEngine):
 
     def run(self, problem: Problem, progress: Progress | None = None) -> Outcome:
         """By the native engine or by the xla engine."""
+        return self.prepared(problem)(problem, progress)
+
+    def prepared(self, problem: Problem) -> Callable[[Problem, Progress | None], Outcome]:
+        """`run` of the engine that takes the problem."""
         reason = policy.kept_from_native(problem)
         if reason is None:
             try:
@@ -27,10 +33,14 @@ class Auto(AbstractEngine):
                 reason = str(error)
             else:
                 if reason is None:
-                    return native.run(problem, progress)
-        outcome = Xla().run(problem, progress)
-        outcome.notes["not_native"] = reason
-        return outcome
+                    return native.prepared(problem)
+
+        def by_xla(problem: Problem, progress: Progress | None = None) -> Outcome:
+            outcome = Xla().run(problem, progress)
+            outcome.notes["not_native"] = reason
+            return outcome
+
+        return by_xla
 
     def run_traced(self, problem: Problem) -> Outcome:
         """The same, for smaller systems: their derivatives are compiled, too."""

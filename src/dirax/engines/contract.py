@@ -18,6 +18,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -39,6 +40,9 @@ class Problem:
     `state` (s,) or (B, s) and `guess` (k,) or (B, k), one guess per stage; `params` a pytree, with a leading batch axis
     when `batch_params`. Rows are saved every `save_every` steps, and the last one always. Steps are numbered from
     `first_step` (1 after a two-point start), so the first state is at time t0 + first_step·h.
+
+    A run that goes on has the `record` that the engine gave after its first `after` steps: rows of these need not be computed
+    again, and whatever stands in them is written over. An engine may run all of it instead, since the bits are the same.
     """
 
     equation: Any
@@ -54,6 +58,8 @@ class Problem:
     batch_params: bool = False
     max_iterations: int = 50
     compensated: bool = False
+    after: int = 0
+    record: Any = None
 
     @property
     def size(self) -> int:
@@ -65,7 +71,13 @@ class Problem:
         """Number of saved rows, the first and the last included."""
         return -(-self.steps // self.save_every) + 1
 
-    @property
+    def with_numbers(self, **numbers: Any) -> "Problem":
+        """The same problem with other numbers, steps or rows; what was found of its equation is kept."""
+        problem = object.__new__(Problem)
+        problem.__dict__.update(self.__dict__, **numbers)
+        return problem
+
+    @cached_property
     def fields(self) -> dict[str, Field]:
         """The named arrays of a row: those of the first stage, at which every row is."""
         return self.equation.stages[0][0].fields
@@ -83,7 +95,8 @@ class Outcome:
     fields, with one row less for step fields. `completed` (B,) counts good steps; `status` is one of the outcomes above;
     `closing` is the row at each trajectory's last good step; `last_state` and `last_unknowns` are the state there and the
     unknowns before it, for the message. `iterations` (B,) are updates of Newton's method, `max_residual` (B,) the largest
-    entry of the residual that any good step left. `notes` go to `Solution.stats`.
+    entry of the residual that any good step left. `notes` go to `Solution.stats`. `record` is what the engine needs to go on
+    after the last step, None where it would begin anew.
     """
 
     fields: dict[str, Any]
@@ -98,6 +111,7 @@ class Outcome:
     interrupted: bool = False
     compile_seconds: float = 0.0
     run_seconds: float = 0.0
+    record: Any = None
     notes: dict[str, Any] = field(default_factory=dict)
 
 
@@ -114,7 +128,12 @@ def finished(problem: Problem, outcome: Outcome, held: bool = False) -> Outcome:
 
     With `held` the closing row stands in the rows after the end, too: functions of those have finite derivatives.
     """
-    numbers, fields, completed = saved_steps(problem), outcome.fields, outcome.completed
+    fields, completed = outcome.fields, outcome.completed
+    if isinstance(completed, np.ndarray) and np.all(completed == problem.steps):
+        for name in filter(problem.is_node, fields):
+            fields[name][:, -1] = outcome.closing[name]
+        return outcome
+    numbers = saved_steps(problem)
     if not isinstance(completed, np.ndarray):
         good = completed.astype(float)
         for name, values in fields.items():

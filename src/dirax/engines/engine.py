@@ -1,6 +1,7 @@
 """AbstractEngine: what runs a problem. One package each beside this module, and one line in `policy.py`."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -31,6 +32,14 @@ class AbstractEngine(eqx.Module):
 
         `progress` is called now and then. Raises `UnsupportedPrimitive` for a problem that the engine does not support.
         """
+
+    def prepared(self, problem: Problem) -> Callable[[Problem, Progress | None], Outcome]:
+        """`run` for this problem and for others that differ from it in numbers alone: state, guess, h, t0, floating params, and
+        how many steps there are and how many of them are saved. Raises as `run`, at once or when it is called.
+
+        An engine that finds something once for all of them overrides it.
+        """
+        return self.run
 
     @abstractmethod
     def run_traced(self, problem: Problem) -> Outcome:

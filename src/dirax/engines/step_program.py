@@ -14,6 +14,7 @@ import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines import policy
 from dirax.engines.parameters import Parameters, parameters
 from dirax.program.evaluation.by_jax import by_jax
+from dirax.program.evaluation.in_floats import Floats, in_floats
 from dirax.program.evaluation.in_numpy import Values, in_parts
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.graph_derivatives import jacobian
@@ -26,6 +27,9 @@ KEPT = 128
 
 IN_NUMBERS = 2**22
 """Derivatives of nodes up to which a Jacobian is found in numbers, which is quicker once than to write it as nodes."""
+
+WRITTEN = 50_000
+"""Unknowns times nodes of a step up to which its Jacobian is written as nodes for one entry in floats."""
 
 
 @dataclass
@@ -155,6 +159,22 @@ class StepProgram:
     def jacobians(self) -> list[list[dict[int, int]]]:
         """The rows {column: node} of the Jacobian of every equation's residual. Raises `GraphTooLarge`."""
         return [jacobian(self.graph, e.residual, e.unknowns) for e in self.equations]
+
+    @cached_property
+    def first_in_floats(self) -> Floats | None:
+        """(unknowns, state, t, h, params) ↦ residual and Jacobian of the first stage, for one entry, all of them in one row;
+        None for a large step."""
+        first, shared = self.equations[self.stages[0][0]], self.shared
+        k = len(first.unknowns)
+        if k * self.size > WRITTEN:
+            return None
+        try:
+            rows = self.jacobians[self.stages[0][0]]
+        except GraphTooLarge:
+            return None
+        entries = [row.get(j, self.graph.zero) for row in rows for j in range(k)]
+        inputs = [*first.unknowns, *first.state, shared.t, shared.h, *shared.params]
+        return in_floats(self.graph, inputs, [*first.residual, *entries])
 
     def in_jax(self, index: int, outputs: list[int], graph: Graph | None = None) -> Callable:
         """(u, state, t, h, params) ↦ nodes of an equation as one array, of this graph or a copy of it with more nodes."""

@@ -12,6 +12,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from dirax.program.evaluation.by_jax import by_jax
+from dirax.program.evaluation.in_floats import Floats, in_floats
 from dirax.program.evaluation.in_numpy import Values, in_parts
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
@@ -84,6 +85,12 @@ class ScalarProgram:
             for nodes, array in zip(step.results, step.function([known.read(o) for o in step.operands]), strict=True):
                 known.bind(nodes, array)
         return [known.read(nodes) for nodes in self.results]
+
+    @functools.cached_property
+    def in_floats(self) -> Floats | None:
+        """The results for one entry, as floats in order of floats in order; None for a program that is too large."""
+        flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
+        return in_floats(self.graph, flat(self.inputs), flat(self.results), self.opaque)
 
     @functools.cached_property
     def in_jax(self) -> Callable[..., list[Any]]:

@@ -2,7 +2,9 @@
 called uniformly."""
 
 import inspect
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import equinox as eqx
@@ -14,12 +16,39 @@ from jax.experimental import checkify
 from jax.extend.core import jaxprs_in_params
 
 from dirax.program.compiled import compiled
+from dirax.program.memo import Memo
 from dirax.program.tracing import once
 from dirax.text.representation import value_text
 
 POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+NO_MULTIPLIERS = (
+    "forces that see the multipliers are for dx.LagrangeDAlembert, its (+) and (−) cases and their compositions, and for "
+    'dx.DiscreteDirac(constraints="resolve")'
+)
 INDEXING = ("dynamic_slice", "gather")
 """What JAX turns an index into when it is not known to be inside the array."""
+
+
+_shapes: Memo[tuple[jax.ShapeDtypeStruct, Any]] = Memo(512)
+
+_noting = threading.local()
+
+
+@contextmanager
+def values_matter() -> Iterator[list[bool]]:
+    """Within, the list that is given becomes longer where a check of a user's function depends on the values of its arguments,
+    and not on their shapes alone."""
+    before, _noting.found = getattr(_noting, "found", None), []
+    try:
+        yield _noting.found
+    finally:
+        _noting.found = before
+
+
+def note_values_matter() -> None:
+    """Say to `values_matter` that a check depends on values."""
+    if getattr(_noting, "found", None) is not None:
+        _noting.found.append(True)
 
 
 class UserFunction(eqx.Module):
@@ -45,6 +74,10 @@ class UserFunction(eqx.Module):
                 f"{name} must be a function {expected}, but {value_text(function)} was given: "
                 "wrap the value in a function, e.g. a lambda."
             )
+        if "multipliers" not in arguments and "multipliers" in _parameters_of(function):
+            raise TypeError(
+                f"{name} cannot see the multipliers here, where it is {expected}: {NO_MULTIPLIERS} of a dx.LagrangeDirac."
+            )
         self.takes_time = timed and _takes_time(function, len(arguments))
         self.arguments = ("t", *arguments) if self.takes_time else tuple(arguments)
         self.takes_params = _takes_params(function, name, expected, len(self.arguments))
@@ -52,6 +85,11 @@ class UserFunction(eqx.Module):
 
     def __call__(self, *values: Any):
         *args, params = values
+        if len(args) != len(self.arguments):
+            raise TypeError(
+                f"{self._call} is not called with its {len(self.arguments)} arguments here, but with {len(args)}"
+                + (f": {NO_MULTIPLIERS}." if "multipliers" in self.arguments else ".")
+            )
         return once(self.function)(*args, *((params,) if self.takes_params else ()))
 
     def at(self, t: Any, *values: Any):
@@ -74,26 +112,45 @@ class UserFunction(eqx.Module):
         Raises `TypeError` if the function cannot be traced or does not return one array of float64, and `ValueError` if
         it reads an entry that its arguments do not have (JAX itself would silently read another one).
         """
-        call = f"{self.name}({', '.join(self.arguments)})"
-        shapes = ", ".join(str(jnp.shape(v)) for v in values[:-1])
+        if is_traced(values):
+            out, jaxpr = self._shape(values)
+        else:
+            leaves, structure = jax.tree.flatten(values)
+            kinds = tuple((np.shape(leaf), getattr(leaf, "dtype", type(leaf))) for leaf in leaves)
+            out, jaxpr = _shapes.get((self.function, *self.signed, structure, kinds), lambda: self._shape(values))
+        if jaxpr is not None and not is_traced(values, jaxpr.consts):
+            note_values_matter()
+            if not _reads_inside(jaxpr, values) and (outside := compiled(_Indexing(self))(*values)[0].get()):
+                raise ValueError(
+                    f"{self._call} reads an entry that its arguments, of shapes {_shapes_of(values)}, do not have "
+                    f"({_first_line(outside)}): check the length of the initial data and the indices."
+                )
+        return out
+
+    def _shape(self, values: tuple) -> tuple[jax.ShapeDtypeStruct, Any]:
+        """Shape and dtype of the result; and the jaxpr of a function whose indices may leave their arrays, at other values at
+        least, else None."""
         try:
             jaxpr, out = jax.make_jaxpr(lambda *v: self(*v), return_shape=True)(*values)
         except Exception as error:
             raise TypeError(
-                f"{call} could not be traced by JAX on float64 arrays of shapes {shapes}{self._without_params(values)}: "
-                f"{type(error).__name__}: {_first_line(error)}{_way_out(error, values[-1])}"
+                f"{self._call} could not be traced by JAX on float64 arrays of shapes {_shapes_of(values)}"
+                f"{self._without_params(values)}: {type(error).__name__}: {_first_line(error)}{_way_out(error, values[-1])}"
             ) from error
         if not isinstance(out, jax.ShapeDtypeStruct) or out.dtype != jnp.float64:
             what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
-            raise TypeError(f"{call} must return one array of real numbers (float64), but it returned {what}.")
-        if _indexes(jaxpr.jaxpr) and not is_traced(values, jaxpr.consts) and not _reads_inside(jaxpr, values):
-            outside = compiled(_Indexing(self))(*values)[0].get()
-            if outside:
-                raise ValueError(
-                    f"{call} reads an entry that its arguments, of shapes {shapes}, do not have "
-                    f"({_first_line(outside)}): check the length of the initial data and the indices."
-                )
-        return out
+            raise TypeError(f"{self._call} must return one array of real numbers (float64), but it returned {what}.")
+        traced = is_traced(values, jaxpr.consts)
+        return out, jaxpr if _indexes(jaxpr.jaxpr) and (traced or not _reads_inside(jaxpr, None)) else None
+
+    @property
+    def signed(self) -> tuple:
+        """What it is called with, and in whose name."""
+        return self.name, self.arguments, self.takes_params, self.takes_time
+
+    @property
+    def _call(self) -> str:
+        return f"{self.name}({', '.join(self.arguments)})"
 
     def returning(self, shape: tuple[int, ...]) -> Callable:
         """The same function, which raises `ValueError` when it is traced and its result does not have this shape."""
@@ -116,6 +173,13 @@ class UserFunction(eqx.Module):
     def _without_params(self, values) -> str:
         missing = self.takes_params and values[-1] is None
         return " and params=None (it takes params, which were not given: pass params=…)" if missing else ""
+
+
+def _parameters_of(function: Callable) -> tuple[str, ...]:
+    try:
+        return tuple(inspect.signature(function).parameters)
+    except (TypeError, ValueError):
+        return ()
 
 
 def _takes_time(function: Callable, count: int) -> bool:
@@ -203,6 +267,10 @@ def _reads_inside(jaxpr, values) -> bool:
     from dirax.program.evaluation.indices import reads_inside
 
     return reads_inside(jaxpr, values)
+
+
+def _shapes_of(values: tuple) -> str:
+    return ", ".join(str(jnp.shape(v)) for v in values[:-1])
 
 
 def _first_line(message: Any) -> str:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import NOT_FINITE, OK, Outcome, Problem
+from dirax.engines.in_numbers import InJax, InNumbers, in_numbers
 from dirax.engines.stopping import STALLED
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
 
@@ -47,32 +48,33 @@ def _remark(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
 
 def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     """The stages of the failing step are replayed one by one, to see where it breaks."""
-    params = jax.tree.map(lambda a: jnp.asarray(a[lane] if p.batch_params else a), p.params)
-    state, last = jnp.asarray(outcome.last_state[lane]), jnp.asarray(outcome.last_unknowns[lane])
-    solved = []
+    params = jax.tree.map(lambda a: np.asarray(a[lane] if p.batch_params else a), p.params)
+    state, last = np.asarray(outcome.last_state[lane]), np.asarray(outcome.last_unknowns[lane])
+    solved, known = [], {}
     for stage, fraction in p.equation.stages:
-        args = (state, jnp.asarray(t), fraction * p.h, params)
-        guess = jnp.asarray(stage.guess(state, last if len(last) == stage.unknowns else jnp.zeros(stage.unknowns), *args[2:]))
-        reason, u = _replay_newton(stage, guess, args, p.max_iterations)
+        if id(stage) not in known:
+            known[id(stage)] = in_numbers(stage, params)
+        numbers, h = known[id(stage)], fraction * p.h
+        guess = numbers.guess(state, last if len(last) == stage.unknowns else np.zeros(stage.unknowns), h)
+        reason, u = _replay_newton(stage, numbers, guess, (state, t, h), p.max_iterations)
         if reason:
             return reason
-        solved.append((stage, guess, args))
-        state, t = stage.advance(u, *args), t + fraction * p.h
+        solved.append((stage, numbers, guess, (state, t, h)))
+        state, t = numbers.advance(u, state, t, h), t + h
         if not np.all(np.isfinite(state)):
             return "the new state is not finite: it has left the domain of the system's functions, or overflowed"
     advice = next((found for place in solved if (found := _advice(*place)) != SMALLER), SMALLER)
     return f"Newton did not converge from the values extrapolated from the steps before: {advice}"
 
 
-def _replay_newton(stage, guess, args, max_iterations: int):
+def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, max_iterations: int):
     """(what went wrong or nothing, unknowns) of one stage."""
     u = guess
     if not stage.unknowns:
         return "", u
-    evaluate = jax.jit(lambda u: (stage.residual(u, *args), jax.jacfwd(stage.residual)(u, *args)))
     size, worst, condition = np.inf, 0, np.nan
     for iteration in range(max_iterations):
-        residual, jacobian = (np.asarray(a) for a in evaluate(u))
+        residual, jacobian = numbers.linearized(u, *args)
         broken = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
         if np.any(broken):
             label = stage.labels[int(np.argmax(broken))]
@@ -86,16 +88,16 @@ def _replay_newton(stage, guess, args, max_iterations: int):
         return "", u
     return (
         f"Newton did not converge in {max_iterations} iterations (largest residual in {stage.labels[worst]}, "
-        f"condition number {condition:.2g}): {_advice(stage, guess, args)}"
+        f"condition number {condition:.2g}): {_advice(stage, numbers, guess, args)}"
     ), u
 
 
-def _advice(stage, u, args) -> str:
+def _advice(stage, numbers: InNumbers | InJax, u, args) -> str:
     """What to do about a stage without a root: a larger step where roundoff hides it, and hides less of it in a larger one."""
-    state, t, h, params = args
+    state, t, h = args
     if not stage.unknowns:
         return SMALLER
-    here, there = (_roundoff(stage, u, (state, t, step, params)) for step in (h, 10 * h))
+    here, there = (_roundoff(numbers, u, (state, t, step)) for step in (h, 10 * h))
     if not (here > STALLED and there < here / 2):
         return SMALLER
     return (
@@ -104,10 +106,10 @@ def _advice(stage, u, args) -> str:
     )
 
 
-def _roundoff(stage, u, args) -> float:
+def _roundoff(numbers: InNumbers | InJax, u, args) -> float:
     """The change of the unknowns, relative to their size, that follows from a last place of every number that the residual
     is a function of."""
-    by_u, by_state = map(np.asarray, jax.jacfwd(stage.residual, argnums=(0, 1))(u, *args))
+    by_u, by_state = numbers.slopes(u, *args)
     left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
     if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and np.linalg.cond(by_u) < LARGEST_CONDITION):
         return np.inf

@@ -7,7 +7,13 @@ import numpy as np
 from dirax.numerics.ranks import rank_of_equations
 from dirax.numerics.tolerances import CONSTRAINT_DEFECT
 from dirax.run.start import Initial, Start
+from dirax.schemes.lagrangian_step import METHOD_2
 from dirax.systems.system import AbstractSystem
+
+FINAL_MANIFOLD = (
+    'needs its final manifold: simulate dx.constraint_algorithm(system, near={"q": …, "v": …}).resolved() instead of the system, '
+    "from x=chain.point"
+)
 
 
 def refuse_bad_start(
@@ -82,8 +88,7 @@ def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool)
         if singular:
             raise ValueError(
                 f"the first step is not finite at the initial data{_which(~finite)}, since the Lagrangian is singular (∂²L/∂v²), "
-                'and this scheme needs its final manifold: simulate dx.constraint_algorithm(system, near={"q": …, "v": …})'
-                ".resolved() instead of the system, from x=chain.point."
+                f"and this scheme {FINAL_MANIFOLD}."
             )
         row = int(np.argmin(rows[np.argmin(finite)]))
         raise ValueError(
@@ -94,12 +99,17 @@ def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool)
     unknowns = jacobian.shape[1]
     if np.any(ranks < unknowns):
         lane = int(np.argmax(ranks < unknowns))
+        way = (
+            "The Lagrangian is singular together with its constraints: remove the coordinates that it does not determine, or "
+            "choose another discrete Lagrangian"
+        )
+        direction = np.array2string(directions[lane], precision=2, suppress_small=True, max_line_width=1000)
+        if singular and labels[0].endswith(METHOD_2):
+            way = f"This is since the Lagrangian is singular (∂²L/∂v²), and this scheme {FINAL_MANIFOLD}"
         raise ValueError(
             f"the first step has no unique solution: its matrix ([PY] (21)) has rank {ranks[lane]} of {unknowns} at the "
             f"initial data{_which(ranks < unknowns)}, and leaves the direction "
-            f"{np.array2string(directions[lane], precision=2, suppress_small=True)} of the unknowns free. The Lagrangian is "
-            "singular together with its constraints: remove the coordinates that it does not determine, or choose another "
-            "discrete Lagrangian."
+            f"{direction} of the unknowns free. {way}."
         )
 
 

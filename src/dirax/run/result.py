@@ -25,7 +25,9 @@ def solution_of(
     """The Solution of a run; `row0` is the given row 0 of a two-point start."""
     p, fields, numbers = problem, outcome.fields, saved_steps(problem)
     ok, message = outcome.completed == p.steps, ""
-    if traced:
+    if not traced and p.batch is None and ok[0]:
+        ok = True
+    elif traced:
         ok = ok if p.batch is not None else ok[0]
     else:
         message = _messages(p, outcome, numbers)
@@ -78,8 +80,9 @@ def _times(p: Problem, numbers: np.ndarray, traced: bool):
 
 
 def _stats(p: Problem, outcome: Outcome, traced: bool) -> dict[str, Any]:
-    xp = jnp if traced else np
-    total, worst = xp.sum(outcome.iterations), xp.max(outcome.max_residual)
+    one = len(outcome.iterations) == 1
+    total = outcome.iterations[0] if one else outcome.iterations.sum()
+    worst = outcome.max_residual[0] if one else outcome.max_residual.max()
     return {
         "engine": outcome.engine,
         "steps": p.steps + p.first_step,

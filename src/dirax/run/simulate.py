@@ -1,26 +1,12 @@
-"""simulate(): validate → discretize → start → engine → Solution, each once."""
+"""simulate(): what a user calls to run a scheme on a system."""
 
+import time
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
-from dirax.engines.contract import Problem
 from dirax.engines.engine import AbstractEngine
-from dirax.program.user_functions import is_traced
-from dirax.run.final_manifold import (
-    is_singular,
-    projected_onto_manifold,
-    refuse_leaving_final_manifold,
-    refuse_off_final_manifold,
-)
-from dirax.run.progress import reporting
-from dirax.run.redundancy import redundant_constraints
-from dirax.run.refused_start import refuse_bad_start
-from dirax.run.result import solution_of
-from dirax.run.start import begun, completed
-from dirax.run.validate import check_kinds, count, engine_from, refuse_more_than_memory, validated_case
-from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
+from dirax.run.carry_out import carried_out
+from dirax.run.settings import stated
+from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
 
@@ -52,9 +38,10 @@ def simulate(
     """Run `scheme` on `system` for `steps` steps of size `step` and return the Solution.
 
     Initial data: `q=, v=` · `q=, p=` · `q0=, q1=` (rows 0 and 1 as they are) · `x=`; each of shape (n,), or (B, n) for a
-    batch of B trajectories. `params` is handed to user functions that take it; with `batch_params` its leaves have the
-    batch axis too. Rows are saved every `save_every` steps, the last one always. `step` and `t` have the user's unit of
-    time, and `t0` is the time of the first row. `inputs(t, x[, params])` drives an open port-Hamiltonian system.
+    batch of B trajectories. `params` is handed to user functions that take it, a pytree of numbers and arrays, in which
+    dataclasses count as pytrees; with `batch_params` its leaves have the batch axis too. Rows are saved every `save_every`
+    steps, the last one always. `step` and `t` have the user's unit of time, and `t0` is the time of the first row.
+    `inputs(t, x[, params])` drives an open port-Hamiltonian system.
     `progress`: True for a bar, or a function of (steps done, steps in all). `project` moves initial data onto the
     constraint; `check_initial=False` accepts data off it as they are. `max_iterations` bounds Newton's iterations a step.
     `compensated` keeps what rounding takes from the state and gives it back at the next step (Kahan), so that conserved
@@ -73,57 +60,9 @@ def simulate(
     A run that fails midway, or is stopped by Ctrl-C, raises nothing: what was computed is
     kept, and `Solution.ok` and `.message` say what happened.
     """
-    # validate
-    check_kinds(system, scheme)
-    on, steps, save_every, max_iterations = (
-        engine_from(engine), count(steps, "steps"), count(save_every, "save_every"), count(max_iterations, "max_iterations")
+    entered = time.perf_counter()
+    settings, case, steps, save_every = stated(
+        system, scheme, step, steps, {"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, inputs, params, batch_params,
+        save_every, engine, project, check_initial, t0, max_iterations, compensated,
     )  # fmt: skip
-    case = validated_case({"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, params, batch_params, step, t0)
-    system = system if inputs is None else system.with_inputs(inputs)
-    data, own = case.first
-    # discretize: constraints that follow from others at the completed data are left out of the equation
-    shape, redundant, singular = Shape(*system.sizes(data, own)), (), False
-    initial = completed(system, case, project, on.compiles_start)
-    if not (traced := case.traced or is_traced(initial)):
-        redundant = redundant_constraints(system, initial.constraints, data, own, case.t0)
-        if (
-            (singular := is_singular(system, shape, case, initial))
-            and project
-            and (moved := projected_onto_manifold(system, case, initial))
-        ):
-            case, initial = moved, completed(system, moved, False, on.compiles_start)
-    shape = Shape(shape.n, shape.m, shape.c, redundant=redundant) if redundant else shape
-    equation = make_step_equation(scheme, system, shape)
-    # start
-    start = begun(equation, case, initial, on.compiles_start)
-    # user functions that close over a traced value make the start traced although nothing that was passed is
-    if not (traced := traced or is_traced(start)):
-        for stage in dict.fromkeys(stage.check for stage, _ in equation.stages):
-            stage(data, case.h, own)
-        refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial, singular)
-        if check_initial and singular:
-            refuse_off_final_manifold(system, case, initial)
-        if check_initial:
-            refuse_leaving_final_manifold(system, equation, shape, case, initial, start, singular)
-    problem = Problem(
-        equation=equation,
-        state=start.state,
-        guess=start.guess,
-        h=case.h,
-        t0=case.t0,
-        steps=steps - int(case.two_points),
-        save_every=save_every,
-        first_step=int(case.two_points),
-        params=jax.tree.map(jnp.asarray, case.params) if traced else case.params,
-        batch=case.batch,
-        batch_params=batch_params,
-        max_iterations=max_iterations,
-        compensated=bool(compensated),
-    )
-    refuse_more_than_memory(problem)
-    # engine
-    with reporting(False if traced else progress, steps) as report:
-        outcome = on.run_traced(problem) if traced else on.run(problem, report)
-    if redundant:
-        outcome.notes["redundant_constraints"] = list(redundant)
-    return solution_of(system, scheme, case, problem, outcome, start.row0, traced)
+    return carried_out(settings, case, steps, save_every, progress, entered=entered)

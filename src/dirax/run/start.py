@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.program.compiled import compiled
+from dirax.program.evaluation.in_floats import Floats
+from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
 from dirax.run.validate import Case, spread
@@ -135,15 +137,49 @@ def _compiled(one: Any, arguments: tuple, axes: tuple | None) -> Any:
 
 def _in_numpy(one: Any, kept: tuple, case: Case, given: Any) -> Any:
     """The same from the scalar program of `one`; None where it has none."""
-    from dirax.program.evaluation.functions import in_numpy  # imported when it is used
+    leaves, found = _program(one, kept, case, given)
+    if found is None:
+        return None
+    whole = jax.tree.unflatten(found[1], found[0].in_numpy(leaves))
+    return whole if case.batch is not None else jax.tree.map(lambda leaf: leaf[0], whole)
+
+
+def _program(one: Any, kept: tuple, case: Case, given: Any) -> tuple[list[np.ndarray], Any]:
+    """The arguments of `one` for every trajectory, and its scalar program with the structure of its results, or None."""
+    from dirax.program.evaluation.functions import program_of  # imported when it is used
 
     lead = lambda leaf: np.asarray(leaf) if case.batch is not None else np.asarray(leaf)[None]
     repeated = lambda leaf: np.broadcast_to(np.asarray(leaf), (case.batch or 1, *np.shape(leaf)))
     params = jax.tree.map(lead if case.batch_params else repeated, case.params)
     leaves, structure = jax.tree.flatten((jax.tree.map(lead, given), params, repeated(case.h), repeated(case.t0)))
     options = type(one), case.two_points, getattr(one, "project", None), structure
-    found = in_numpy(lambda *leaves: one(*jax.tree.unflatten(structure, leaves)), leaves, (*map(Same, kept), options))
-    return found if case.batch is not None or found is None else jax.tree.map(lambda leaf: leaf[0], found)
+    shapes = [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves]
+    function = lambda *leaves: one(*jax.tree.unflatten(structure, leaves))
+    return leaves, program_of(function, shapes, (*map(Same, kept), options))
+
+
+def program_of_completion(system: Any, case: Case, project: bool) -> Floats | None:
+    """(data by their names, params, h, t0) ↦ the numbers of an Initial, for one trajectory; None where there is none."""
+    _, found = _program(_Completion(system, case.two_points, project), (system,), case, dict(case.data))
+    return found and found[0].in_floats
+
+
+def program_of_beginning(equation: Any, case: Case, complete: dict[str, Any]) -> Floats | None:
+    """(complete data by their names, params, h, t0) ↦ the numbers of a Start without the first step; None as above."""
+    _, found = _program(_Beginning(equation, case.two_points), (equation,), case, complete)
+    return found and found[0].in_floats
+
+
+def program_of_first_step(equation: Any, case: Case) -> tuple[Floats | None, tuple[bool, ...]]:
+    """(unknowns, state, t, fraction of h, params that move) ↦ the numbers of the residual and of the Jacobian of the first
+    stage, None as above; and which of the params move."""
+    from dirax.engines.step_program import step_program  # imported when it is used
+
+    try:
+        step = step_program(equation, case.params, case.batch_params)
+    except UnsupportedPrimitive:
+        return None, ()
+    return step.first_in_floats, step.parameters.dynamic
 
 
 def _first_step_in_numbers(equation: Any, case: Case, start: Start) -> tuple[np.ndarray, np.ndarray] | None:

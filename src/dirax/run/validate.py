@@ -1,5 +1,6 @@
 """The arguments of a run, checked: each mistake is one error that names the argument, what came and what was expected."""
 
+import dataclasses
 import math
 import os
 from collections.abc import Mapping
@@ -18,6 +19,9 @@ from dirax.systems.system import AbstractSystem
 
 ROOM = 4
 """How many times the rows of a run should fit into memory."""
+
+FEW = 32
+"""Numbers up to which Python is quicker than NumPy to see whether they are finite."""
 
 KINDS = ({"q", "v"}, {"q", "p"}, {"q0", "q1"}, {"x"}, {"q"})
 
@@ -46,6 +50,13 @@ class Case:
         return "q0" in self.data
 
     @property
+    def plain(self) -> bool:
+        """Whether all values are numbers and NumPy's arrays."""
+        leaves = (*self.data.values(), *jax.tree.leaves(self.params))
+        numbers = type(self.h) is type(self.t0) is float
+        return numbers and all([type(leaf) is np.ndarray for leaf in leaves])
+
+    @property
     def traced(self) -> bool:
         """Whether any value is traced by JAX."""
         return is_traced(self.data, self.params, self.h, self.t0)
@@ -55,9 +66,31 @@ def validated_case(given: dict[str, Any], params: Any, batch_params: bool, step:
     """The case of initial data by name, None for those that were not given."""
     h, t0 = positive(step, "step"), finite(t0, "t0")
     data, batch = initial_data({name: a for name, a in given.items() if a is not None})
+    params = params_of_case(params)
+    return Case(data, params, h, t0, batch_size(batch, params, batch_params), batch_params)
+
+
+def params_of_case(params: Any) -> Any:
+    """The params with arrays for leaves; dataclasses in them become pytrees. Raises `TypeError` and `ValueError` for leaves that
+    are no finite numbers."""
+    _register_dataclasses(params)
+    leaves, structure = jax.tree.flatten(params)
+    plain = [plain_floats(leaf) for leaf in leaves]
+    if not any([leaf is None for leaf in plain]):
+        return jax.tree.unflatten(structure, plain)
     params = _arrays(params)
     check_finite("params", params)
-    return Case(data, params, h, t0, _batch_size(batch, params, batch_params), batch_params)
+    return params
+
+
+def _register_dataclasses(params: Any) -> None:
+    """Have JAX look into dataclasses, whose fields are all taken for pytrees; into those that it knows it does already."""
+    for leaf in jax.tree.leaves(params):
+        if dataclasses.is_dataclass(leaf) and not isinstance(leaf, type):
+            names = [field.name for field in dataclasses.fields(leaf)]
+            jax.tree_util.register_dataclass(type(leaf), data_fields=names, meta_fields=[])
+            for name in names:
+                _register_dataclasses(getattr(leaf, name))
 
 
 def check_kinds(system: Any, scheme: Any) -> None:
@@ -93,6 +126,8 @@ def initial_data(given: dict[str, Any]) -> tuple[dict[str, Any], int | None]:
             f"initial data must be one of q=, v= · q=, p= · q0=, q1= · x=, but {came if given else 'none'} was given."
         )
     arrays = {name: _real_array(name, value) for name, value in given.items()}
+    if len({array.shape for array in arrays.values()}) == 1 and next(iter(arrays.values())).ndim == 1:
+        return arrays, None
     shapes = {name: array.shape for name, array in arrays.items()}
     if len({shape[-1] for shape in shapes.values()}) > 1:
         a, b = shapes
@@ -115,6 +150,8 @@ def spread(array: Any, batch: int) -> Any:
 
 
 def _real_array(name: str, value: Any) -> Any:
+    if (array := plain_floats(value)) is not None and array.ndim in (1, 2) and array.size:
+        return array
     try:
         array = jnp.asarray(value) if is_traced(value) else np.asarray(value)
     except ValueError as error:
@@ -126,6 +163,20 @@ def _real_array(name: str, value: Any) -> Any:
         raise ValueError(f"{name} must have shape (n,), or (B, n) for a batch of B trajectories, but its shape is {array.shape}.")
     check_finite(name, array)
     return array.astype(np.float64)
+
+
+def plain_floats(value: Any) -> np.ndarray | None:
+    """A copy of finite float64 numbers that need no further look; None for anything else."""
+    if type(value) not in (list, tuple, np.ndarray, float):
+        return None
+    try:
+        array = np.array(value)
+    except Exception:  # values that JAX traces among them, or what is no array
+        return None
+    if array.dtype.char != "d":
+        return None
+    finite = all(map(math.isfinite, array.ravel().tolist())) if array.size <= FEW else np.isfinite(array).all()
+    return array if finite else None
 
 
 def refuse_more_than_memory(problem: Any) -> None:
@@ -150,6 +201,8 @@ def _memory() -> int:
 
 def finite(value, name: str):
     """The number, or the traced value as it is; raises `ValueError` for anything that is not one finite number."""
+    if type(value) is float and math.isfinite(value):
+        return value
     if is_traced(value):
         return value
     if not _is_number(value) or np.ndim(value) != 0 or not np.isfinite(value):
@@ -159,6 +212,8 @@ def finite(value, name: str):
 
 def positive(value, name: str):
     """The same for a positive number."""
+    if type(value) is float and 0.0 < value < math.inf:
+        return value
     if not is_traced(value) and (not _is_number(value) or np.ndim(value) != 0 or not 0 < value < np.inf):
         raise ValueError(f"{name} must be a positive finite number, but {value!r} was given.")
     return value if is_traced(value) else float(value)
@@ -166,6 +221,8 @@ def positive(value, name: str):
 
 def count(value, name: str) -> int:
     """The whole number; raises `ValueError` for anything else, and below 1."""
+    if type(value) is int and value >= 1:
+        return value
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise ValueError(f"{name} must be a whole number ≥ 1, but {value!r} was given.")
     return int(value)
@@ -197,7 +254,8 @@ def _arrays(params):
     return jax.tree.map(lambda leaf: jnp.asarray(leaf) if is_traced(leaf) else np.array(leaf), params)
 
 
-def _batch_size(batch: int | None, params, batch_params: bool) -> int | None:
+def batch_size(batch: int | None, params, batch_params: bool) -> int | None:
+    """The number of trajectories, of the data and of the params; None for one. Raises `ValueError` where they differ."""
     if not batch_params:
         return batch
     shapes = [np.shape(leaf) for leaf in jax.tree.leaves(params)]

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data
 from dirax.program.linear_solves import solve
-from dirax.program.tracing import along, gradient, jacobian, once
+from dirax.program.tracing import along, gradient, once
 from dirax.schemes.lagrangian_step import LagrangianStep, numbered, one_point_only
 from dirax.schemes.layout import Layout
 from dirax.systems.nonholonomic import NonholonomicMechanics
@@ -86,79 +86,89 @@ class ProjectedThetaStep(ThetaStep):
         (q_k, p_k) = P(q − θh v, p − (1 − θ)h ṗ),   (q_{k+1}, p_{k+1}) = P(q + (1 − θ)h v, p + θh ṗ),
 
     P(q̃, p̃) = (q', p'): q̃ = q' + M⁻¹G(q')ᵀs with g(q') = 0, and p̃ = p' + [W; G](q')ᵀσ with the velocity of p' on the other
-    constraints; M = ∂²L/∂v² at (q', v). Unknowns are (v, σ, s) of the first half and (v', σ', w, s') of the second, where h w
-    moves q and M(w − v) = Gᵀs'. Constraints at the times t_k, t_k + θh and t_k + h hold to roundoff at all three points.
+    constraints; M = ∂²L/∂v² at (q', v). Unknowns are v, σ, the acceleration a and λ of the base point, and s and w of the first
+    half, where h w moves q and M(w − v) = Gᵀs; and v', σ', s' and w' of the second. No matrix is inverted in the equations:
+    (∂L/∂v)˙ = ∂L/∂q + f + [W; G]ᵀλ and ([W; G] v + …)˙ = 0 along v̇ = a. Constraints at the times t_k, t_k + θh and t_k + h hold
+    to roundoff at all three points.
     """
 
     @property
     def unknowns(self) -> Layout:
         n, k, c = self.shape.n, self.rows.count, self.rows.holonomic
-        return Layout(v=n, sigma=k, s=c, end_v=n, end_sigma=k, w=n if c else 0, end_s=c)
+        moved = n if c else 0
+        return Layout(
+            v=n, sigma=k, a=n, multipliers=k, s=c, w=moved, end_v=n, end_sigma=k, end_s=c, end_w=moved
+        )  # fmt: skip
 
     def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
         one_point_only(data)
         v = data["v"]
-        guess = self.unknowns.join(v=v, end_v=v, **({"w": v} if self.rows.holonomic else {}))
+        guess = self.unknowns.join(v=v, end_v=v, **({"w": v, "end_w": v} if self.rows.holonomic else {}))
         return self.book.start(data["q"], data["p"]), guess
 
     def residual(self, u, state, t, h, params):
         (q0, p0, _), parts, rows = self.state.split(state), self.unknowns.split(u), self.rows
-        at, q, q1 = self._base(u, state, t, h, params)
-        p, rate, _ = self._flow(at, q, parts.v, params)
+        at, q, q1 = self._base(u, state, t, h)
+        p, rate, along_flow = self._flow(at, q, parts.v, parts.a, parts.multipliers, params)
         begun = p0 + rows.matrix(t, q0, params).T @ parts.sigma - (p - (1.0 - self.theta) * h * rate)
         ended = self.system.legendre(q1, parts.end_v, params, t + h) + rows.matrix(t + h, q1, params).T @ parts.end_sigma
         ends = [
             begun,
             rows.velocity_defect(at, q, parts.v, params),
+            along_flow,
             ended - (p + self.theta * h * rate),
             rows.velocity_defect(t + h, q1, parts.end_v, params),
         ]
         return jnp.concatenate([*ends, self._position(u, state, t, h, params)] if rows.holonomic else ends)
 
     def advance(self, u, state, t, h, params):
-        at, q, q1 = self._base(u, state, t, h, params)
+        at, q, q1 = self._base(u, state, t, h)
         parts = self.unknowns.split(u)
         end = [q1, self.system.legendre(q1, parts.end_v, params, t + h)]
-        return self.book.after(state, end, at, q, parts.v, h, params)
+        return self.book.after(state, end, at, q, parts.v, h, params, self._forces(parts.multipliers))
 
     def unpack(self, state, u, t, h, params):
-        at, q, _ = self._base(u, state, t, h, params)
-        multipliers = self.rows.all(self._flow(at, q, self.unknowns.split(u).v, params)[2])
-        return self.row(state) | {"multipliers": multipliers}
+        return self.row(state) | {"multipliers": self.rows.all(self.unknowns.split(u).multipliers)}
 
-    def _mass(self, t: Any, q: Array, v: Array, params: Any) -> Float[Array, "n n"]:
-        return jacobian(gradient(lambda v: self.system.lagrangian.at(t, q, v, params)))(v)
+    def _forces(self, multipliers: Array) -> Any:
+        """The forces where these are the multipliers, which are those of the system with the opposite sign."""
+        return self.system.forces_at(-self.rows.all(multipliers))
 
-    def _flow(self, t: Any, q: Array, v: Array, params: Any) -> tuple[Array, Array, Array]:
-        return once(self._at_point)(t, q, v, params)
+    def _flow(self, t: Any, q: Array, v: Array, a: Array, multipliers: Array, params: Any) -> tuple[Array, Array, Array]:
+        return once(self._at_point)(t, q, v, a, multipliers, params)
 
-    def _at_point(self, t: Any, q: Array, v: Array, params: Any) -> tuple[Array, Array, Array]:
-        """(p, ṗ, λ) at a point of M_f."""
-        rate, p = self.rates(t, q, v, params)
-        w = self.rows.matrix(t, q, params)
-        coupling = self.along_flow(lambda t, q: self.system.legendre(q, v, params, t), t, q, v)
-        turning = self.along_flow(lambda t, q: self.rows.velocity_defect(t, q, v, params), t, q, v)
-        lifted = solve(self._mass(t, q, v, params), w.T)
-        multipliers = -solve(w @ lifted, turning + lifted.T @ (rate - coupling))
-        return p, rate + w.T @ multipliers, multipliers
+    def _at_point(self, t: Any, q: Array, v: Array, a: Array, multipliers: Array, params: Any) -> tuple[Array, Array, Array]:
+        """(p, ṗ, what is zero where a and λ are those of the flow) at a point of M_f."""
+        rate, p = self.rates(t, q, v, params, self._forces(multipliers))
+        rate = rate + self.rows.matrix(t, q, params).T @ multipliers
+        turning = self._along(lambda t, q, v: self.system.legendre(q, v, params, t), t, q, v, a)
+        drift = self._along(lambda t, q, v: self.rows.velocity_defect(t, q, v, params), t, q, v, a)
+        return p, rate, jnp.concatenate([turning - rate, drift])
 
-    def _pushed(self, t: Any, q: Array, v: Array, s: Array, params: Any) -> Float[Array, " n"]:
-        """v + M⁻¹G(q)ᵀs, the direction of the projection onto g = 0 at q."""
-        return v + solve(self._mass(t, q, v, params), self.rows.holonomic_matrix(t, q, params).T @ s)
+    def _along(self, function: Any, t: Any, q: Array, v: Array, a: Array) -> Array:
+        """The derivative of function(t, q, v) along q̇ = v, v̇ = a, ṫ = 1."""
+        if self.system.depends_on_time:
+            return along(function, (jnp.asarray(t, float), q, v), (jnp.ones(()), v, a))
+        return along(lambda q, v: function(t, q, v), (q, v), (v, a))
 
-    def _base(self, u: Array, state: Array, t: Any, h: Any, params: Any) -> tuple[Any, Array, Array]:
+    def _pushed(self, t: Any, q: Array, v: Array, w: Array, s: Array, params: Any) -> Float[Array, " n"]:
+        """M(w − v) − G(q)ᵀs, zero where w is the direction of the projection onto g = 0 at q."""
+        change = along(lambda v: self.system.legendre(q, v, params, t), (v,), (w - v,))
+        return change - self.rows.holonomic_matrix(t, q, params).T @ s
+
+    def _base(self, u: Array, state: Array, t: Any, h: Any) -> tuple[Any, Array, Array]:
         """The time of the base point, the base point, and where the second half ends."""
         q0, parts, theta = self.state.split(state).q, self.unknowns.split(u), self.theta
-        v, at = parts.v, t + theta * h
-        if not self.rows.holonomic:
-            return at, q0 + theta * h * v, q0 + h * v
-        q = q0 + (theta * h * self._pushed(t, q0, v, parts.s, params) if theta else 0.0)
-        return at, q, q + (1.0 - theta) * h * parts.w
+        first, second = (parts.w, parts.end_w) if self.rows.holonomic else (parts.v, parts.v)
+        q = q0 + theta * h * first
+        return t + theta * h, q, q + (1.0 - theta) * h * second
 
     def _position(self, u: Array, state: Array, t: Any, h: Any, params: Any) -> Array:
-        """g at the base and at the end, and the direction of the second half; a half of length zero needs no force."""
-        at, q, q1 = self._base(u, state, t, h, params)
-        parts = self.unknowns.split(u)
-        onto = self.rows.position(at, q, params) / h if self.theta else parts.s
-        last = self.rows.position(t + h, q1, params) / h if self.theta < 1.0 else parts.end_s
-        return jnp.concatenate([onto, parts.w - self._pushed(t + h, q1, parts.v, parts.end_s, params), last])
+        """g at the base and at the end, and the directions of both halves; a half of length zero needs no force."""
+        (q0, _, _), parts, rows = self.state.split(state), self.unknowns.split(u), self.rows
+        at, q, q1 = self._base(u, state, t, h)
+        onto = rows.position(at, q, params) / h if self.theta else parts.s
+        last = rows.position(t + h, q1, params) / h if self.theta < 1.0 else parts.end_s
+        begun = self._pushed(t, q0, parts.v, parts.w, parts.s, params)
+        ended = self._pushed(t + h, q1, parts.v, parts.end_w, parts.end_s, params)
+        return jnp.concatenate([onto, begun, ended, last])

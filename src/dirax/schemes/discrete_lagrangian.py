@@ -74,7 +74,7 @@ def discrete_constraint(constraints: Constraints, rule, m: int | None = None) ->
     return one_point
 
 
-def discrete_forces(forces: UserFunction, rule) -> Callable:
+def discrete_forces(forces: Callable, rule) -> Callable:
     """(f_d^−, f_d^+) as a function (t0, q0, v, h, params): the impulses of the force in a step at its first and its last point,
     by the quadrature of L_d; by that of "midpoint" for the user's L_d.
 

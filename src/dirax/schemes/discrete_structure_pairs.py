@@ -208,4 +208,6 @@ def structure_on_pairs(
     lagrangian = system.lagrangian_form()
     if lagrangian is None:
         return f"the points of a {type(system).__name__} are not those of a Lagrangian on Q × Q"
+    if lagrangian.forces_see_multipliers:
+        return "the forces see the multipliers, which pairs of points do not say"
     return LagrangianPairs(lagrangian, rule, constraint, step, shape, sign, share)

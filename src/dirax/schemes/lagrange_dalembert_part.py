@@ -20,7 +20,8 @@ class LagrangeDAlembertPart(AbstractStep):
 
     The inner step takes p modulo the constraint forces, so that σ changes nothing in q. The impulse of the step, μ + σ, is
     that of both its ends: with it (q, p, ∫λ dt) is a one-step map, self-adjoint where the inner step is, and a composition
-    has its order in all three. The state is (q, p, work), the unknowns are (v, μ, v̂, σ).
+    has its order in all three. Forces that see the multipliers are given the mean of the step, (μ + σ)/h. The state is
+    (q, p, work), the unknowns are (v, μ, v̂, σ).
     """
 
     inner: LagrangeDAlembertStep
@@ -56,7 +57,7 @@ class LagrangeDAlembertPart(AbstractStep):
         """(q_{k+1}, p_{k+1})."""
         v, sigma = self.unknowns.split(u).v, self.unknowns.split(u).sigma
         q = self.state.split(state).q
-        q1, p1 = q + h * v, self.inner.slots(t, q, v, h, params)[1]
+        q1, p1 = q + h * v, self.inner.slots(t, q, v, h, params, self.of_constraints(u))[1]
         return q1, p1 - self.rows.matrix(t + h, q1, params).T @ sigma
 
     def residual(self, u, state, t, h, params):
@@ -65,13 +66,19 @@ class LagrangeDAlembertPart(AbstractStep):
         q1, p1 = self.end(u, state, t, h, params)
         missed = self.inner.system.legendre(q1, end_v, params, t + h) - p1
         left = self.rows.velocity_defect(t + h, q1, end_v, params)
-        return jnp.concatenate([self.inner.equations(v, multipliers, q, p, t, h, params), missed, left])
+        balance = self.inner.equations(v, multipliers, q, p, t, h, params, self.of_constraints(u))
+        return jnp.concatenate([balance, missed, left])
 
     def advance(self, u, state, t, h, params):
-        work = self.inner.state.split(self.inner.advance(self.of_inner(u), state, t, h, params))
+        work = self.inner.state.split(self.inner.advance(self.of_inner(u), state, t, h, params, self.of_constraints(u)))
         q1, p1 = self.end(u, state, t, h, params)
         # the inner step marks the domain of L in its momentum
         return self.state.join(q=q1, p=jnp.where(jnp.isfinite(work.p), p1, jnp.nan), work=work.work)
+
+    def of_constraints(self, u):
+        """The impulses of the constraints at both ends, which forces may see; None for forces that do not."""
+        u = self.unknowns.split(u)
+        return u.multipliers + u.sigma if self.inner.system.forces_see_multipliers else None
 
     def of_inner(self, u):
         """The unknowns of the inner step, without its projection."""
@@ -86,5 +93,8 @@ class LagrangeDAlembertPart(AbstractStep):
 
     def start(self, data, h, params):
         if "q0" in data:
-            raise ValueError("a composition starts from q= with v= or p=, not from two points, which belong to one step.")
+            raise ValueError(
+                "a composition, and a step whose forces see the multipliers, starts from q= with v= or p=, not from two points, "
+                "which belong to one step."
+            )
         return self.inner.work.start(data["q"], data["p"]), self.unknowns.join(v=data["v"], end_v=data["v"])

@@ -67,10 +67,12 @@ class LagrangeDAlembertStep(AbstractStep):
         """w_d as a function (t0, q0, v, h, params)."""
         return discrete_constraint(self.system.constraints, self.constraint, self.shape.m)
 
-    @cached_property
-    def impulses(self):
-        """(f_d^−, f_d^+) as a function (t0, q0, v, h, params), None without forces."""
-        return None if self.system.forces is None else discrete_forces(self.system.forces, self.rule)
+    def impulses(self, t, q, v, h, params, of_constraints=None):
+        """(f_d^−, f_d^+), for forces; `of_constraints` are the impulses (μ, λ) of the step, for those that see them."""
+        seen = None if of_constraints is None else self.rows.all(of_constraints) / h
+        forces = self.system.forces_at(seen)
+        assert forces is not None
+        return discrete_forces(forces, self.rule)(t, q, v, h, params)
 
     @property
     def projects(self) -> bool:
@@ -109,21 +111,21 @@ class LagrangeDAlembertStep(AbstractStep):
     # -------------------------------------------------------------------------------------------------- the equations
 
     @once
-    def slots(self, t, q, v, h, params):
+    def slots(self, t, q, v, h, params, of_constraints=None):
         """(D1 L_d + f_d^−, D2 L_d + f_d^+): a step leaves its first point with minus the one, and arrives with the other."""
         d1, d2 = slot_derivatives(self.discrete_lagrangian, t, q, v, h, params)
-        if self.impulses is None:
+        if self.system.forces is None:
             return d1, d2
-        first, last = self.impulses(t, q, v, h, params)
+        first, last = self.impulses(t, q, v, h, params, of_constraints)
         return d1 + first, d2 + last
 
     def step_constraint(self, t, q, v, h, params, unit=1.0):
         """(w_d(q0, q1), g(q1)/unit), of all constraints."""
         return step_constraints(self.rows, self.discrete_constraint)(t, q, v, h, params, unit)
 
-    def equations(self, v, multipliers, q, p, t, h, params):
+    def equations(self, v, multipliers, q, p, t, h, params, of_constraints=None):
         """The balance of momentum and the constraints, all in the unit of W v."""
-        balance = p + self.slots(t, q, v, h, params)[0]
+        balance = p + self.slots(t, q, v, h, params, of_constraints)[0]
         if not self.rows.count:
             return balance
         imposed = self.rows.pick(self.step_constraint(t, q, v, h, params, unit=h))
@@ -148,13 +150,15 @@ class LagrangeDAlembertStep(AbstractStep):
             return missed
         return jnp.concatenate([missed, self.projection(u.saved_v, u.sigma, u.multipliers, q, p, t, params)])
 
-    def advance(self, u, state, t, h, params):
+    def advance(self, u, state, t, h, params, of_constraints=None):
         q, v = self.state.split(state).q, self.unknowns.split(u).v
-        _, p1 = self.slots(t, q, v, h, params)
+        _, p1 = self.slots(t, q, v, h, params, of_constraints)
         # outside the domain of L its derivatives can still be numbers: those of log q are, for q < 0
         inside = jnp.isfinite(self.system.lagrangian.at(t + h, q + h * v, v, params))
         end = [q + h * v, jnp.where(inside, p1, jnp.nan)]
-        return self.work.add(state, end, None if self.impulses is None else sum(self.impulses(t, q, v, h, params)) @ v)
+        return self.work.add(
+            state, end, None if self.system.forces is None else sum(self.impulses(t, q, v, h, params, of_constraints)) @ v
+        )
 
     def unpack(self, state, u, t, h, params):
         u, (q, p, _) = self.unknowns.split(u), self.state.split(state)

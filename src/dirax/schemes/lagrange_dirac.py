@@ -27,6 +27,9 @@ class LagrangeDAlembert(AbstractScheme):
     for a function L_d): discrete Lagrange–d'Alembert forces (Marsden, West 2001, §3.2). Their work ⟨f_d^− + f_d^+, Δq/h⟩
     is summed up in `sol.work`, so that E_N − E_0 − work is what the method itself changes.
 
+    Forces that see the multipliers are given the mean of the step, so that they keep its order; then a step begins and ends at
+    the momentum projected onto the constraints, as it does in a composition.
+
     Holonomic constraints g = 0 hold at every node: p_k + D1 L_d − W(q_k)ᵀ μ_k − G(q_k)ᵀ λ_k = 0, g(q_{k+1}) = 0, the
     (SHAKE) discrete Dirac equations of Δ = ker W ∩ ker G. The saved p is projected along im Gᵀ onto G q̇ + ∂g/∂t = 0
     (RATTLE), which changes nothing in q; without W the map of saved (q, p) is symplectic on the constraint manifold, and
@@ -177,5 +180,7 @@ def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, s
     """The discrete Lagrange–d'Alembert equations of a system on Q, or on the quotient by its symmetry."""
     quotient = system.quotient_form()
     if quotient is None:
-        return scheme.step_on_q(system, shape).equation()
+        step = scheme.step_on_q(system, shape)
+        # forces that see the multipliers are given those of both ends, which are of the order of the step
+        return (LagrangeDAlembertPart(step) if step.system.forces_see_multipliers else step).equation()
     return LagrangePoincareDiracStep(quotient, scheme.step_on_q(quotient.unreduced(), shape), sign).equation()

@@ -15,6 +15,9 @@ from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field, Shape
 from dirax.schemes.work_of_forces import WorkOfForces
 
+METHOD_2 = "of Method 2"
+"""How the labels of its equations end."""
+
 
 @dataclass(frozen=True, eq=False)
 class LagrangianStep(AbstractStep):
@@ -54,9 +57,9 @@ class LagrangianStep(AbstractStep):
         parts = self.state.split(state)
         return self.book.row(state) | {"q": parts.q, "p": parts.p}
 
-    def rates(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> tuple[Array, Array]:
-        """(∂L/∂q + f, ∂L/∂v) at (t, q, v)."""
-        lagrangian, forces = self.system.lagrangian, self.system.forces
+    def rates(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any, forces: Any = None) -> tuple[Array, Array]:
+        """(∂L/∂q + f, ∂L/∂v) at (t, q, v), with these forces or those of the system."""
+        lagrangian, forces = self.system.lagrangian, self.system.forces if forces is None else forces
         dq, dv = gradient(lambda q, v: lagrangian.at(t, q, v, params), (0, 1))(q, v)
         return (dq if forces is None else dq + forces(t, q, v, params)), dv
 
@@ -75,4 +78,4 @@ def one_point_only(data: Data) -> None:
 
 def numbered(count: int) -> tuple[str, ...]:
     """The labels of the equations of Method 2."""
-    return tuple(f"equation {i} of Method 2" for i in range(count))
+    return tuple(f"equation {i} {METHOD_2}" for i in range(count))

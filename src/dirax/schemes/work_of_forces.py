@@ -28,9 +28,12 @@ class WorkOfForces:
         """The first state."""
         return self.layout.join(q=q, p=p)
 
-    def after(self, state: Array, end: list[Array], t: Any, q: Array, v: Array, h: Any, params: Any) -> Float[Array, " s"]:
-        """The state (q1, p1) = `end` with the work h⟨f(t, q, v), v⟩ added."""
-        return self.add(state, end, None if self.forces is None else h * self.forces(t, q, v, params) @ v)
+    def after(
+        self, state: Array, end: list[Array], t: Any, q: Array, v: Array, h: Any, params: Any, forces: Any = None
+    ) -> Float[Array, " s"]:
+        """The state (q1, p1) = `end` with the work h⟨f(t, q, v), v⟩ added, of these forces or those of the system."""
+        forces = self.forces if forces is None else forces
+        return self.add(state, end, None if forces is None else h * forces(t, q, v, params) @ v)
 
     def add(self, state: Array, end: list[Array], work: Array | None) -> Float[Array, " s"]:
         """The state (q1, p1) = `end` with this work added, None without forces."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, Self
 
 from dirax.solution import export, plotting, saving, selection
 from dirax.solution.trajectory import Trajectory
@@ -15,7 +16,10 @@ class Solution(Trajectory):
     - `ok` (bool, or (B,) in a batch) and `message` (str, or a list): whether every step was solved, and otherwise which
       step failed and why. What was computed is kept: one trajectory ends at its last good row, in a batch the rows after
       it are NaN.
-    - `stats`: newton_iterations, max_residual, engine, compile_seconds, run_seconds, steps.
+    - `stats`: newton_iterations, max_residual, engine, steps, and where the time of the call went: `validate_seconds` (the
+      arguments), `start_seconds` (initial data completed, premises checked, the equation made), `trace_seconds` (the step as a
+      scalar program, and what it is compiled from), `compile_seconds` (machine code, from the disk where it is there),
+      `run_seconds` (the steps), `result_seconds` (rows put together, failures explained).
     - `system`, `scheme`, `equation`, `step`, `save_every`, `params`, `initial`: what was run; None for a loaded file where
       it is code. `metadata`: names and units ("coordinates", "units") for plots and files. `derived`: computed quantities.
     - `sol[i]` is a trajectory of a batch, `sol[t0:t1]` with floats a stretch of time, `sol[i:j]` with whole numbers several
@@ -25,6 +29,23 @@ class Solution(Trajectory):
 
     report: Callable[..., Path]
     """`sol.report(path)`: a page for a browser; `dirax.show`, which stands above this room, puts the method here."""
+
+    def extend(self, steps: int, progress: Any = False) -> Self:
+        """The solution of the run with `steps` more steps, with the bits of one run: the steps that are done are not repeated,
+        except where Ctrl-C has interrupted them. Rows are saved as before; the last row of this solution is one of the longer
+        run's if its number is a multiple of `save_every`. A trajectory that has failed stays as it is.
+
+        Raises `ValueError` for a part of a solution, one from a file and one that JAX traces, which do not know how they were
+        run.
+        """
+        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+            raise ValueError(f"steps must be a whole number ≥ 1, but {steps!r} was given.")
+        if self.continuation is None:
+            raise ValueError(
+                "only what dx.simulate or a prepared run has returned, outside of jax.grad, jit and vmap, knows how to go on: "
+                "extend that, before a part of it is taken or it is saved."
+            )
+        return self.continuation(self, steps, progress)
 
     __getitem__ = selection.select
     __len__ = selection.count

@@ -18,6 +18,9 @@ from dirax.text.representation import counted, fields_html
 BLOCK = 2**16
 """Rows that a quantity is computed for at a time, which bounds the memory that it takes."""
 
+BY_NUMPY = 2**18
+"""Rows up to which NumPy is quicker than to compile for them."""
+
 GIVEN = (
     *("t", "fields", "field_info", "step", "save_every", "stats", "ok", "message", "system", "scheme", "equation"),
     *("batch_params", "initial", "derived", "metadata"),
@@ -30,6 +33,9 @@ class Trajectory:
 
     example: Any = None
     """The example of the gallery that was run, which knows a scene and an exact solution; None for other systems."""
+
+    continuation: Any = None
+    """(solution, more steps, progress) ↦ the solution of the longer run; None where it is not known how it was run."""
 
     def __init__(
         self,
@@ -157,7 +163,7 @@ class Trajectory:
         nodes = {k: a for k, a in self.fields.items() if self.field_info[k].place == "node"}
         leaves, structure = jax.tree.flatten(self._params)
         count = self.batch or 1
-        if is_traced(self.t, nodes, leaves) or self.rows * count > BLOCK or not all(map(_is_numeric, leaves)):
+        if is_traced(self.t, nodes, leaves) or self.rows * count > BY_NUMPY or not all(map(_is_numeric, leaves)):
             return None
         lead = (self.rows,) if self.batch is None else (self.batch, self.rows)
         rows = {k: np.asarray(a).reshape(self.rows * count, *np.shape(a)[len(lead) :]) for k, a in nodes.items()}

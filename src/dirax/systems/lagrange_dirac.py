@@ -1,5 +1,6 @@
 """Lagrange–Dirac systems: a Lagrangian, possibly degenerate, with constraints and forces."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +21,20 @@ from dirax.systems.implicit_lagrangian import implicit_lagrangian
 from dirax.systems.system import AbstractSystem, refuse_start
 
 
+def force_function(forces: Callable, constrained: bool) -> UserFunction:
+    """The forces of a user, with or without `multipliers` among their arguments. Raises `ValueError` for forces of constraints
+    that there are not."""
+    try:
+        names = list(inspect.signature(forces).parameters)
+    except (TypeError, ValueError):
+        names = []
+    if names[3:4] != ["multipliers"]:
+        return UserFunction(forces, "forces", ("t", "q", "v"))
+    if not constrained:
+        raise ValueError("forces sees the multipliers of constraints, but there are none: give one_forms= or holonomic=.")
+    return UserFunction(forces, "forces", ("t", "q", "v", "multipliers"))
+
+
 class LagrangeDirac(AbstractSystem):
     """A Lagrangian with constraints ⟨ω^r(q), q̇⟩ = 0: the system (29) of [PY], X ⊕ d_D L ∈ D on T*Q, and with holonomic and
     affine constraints, forces and explicit time.
@@ -28,7 +43,9 @@ class LagrangeDirac(AbstractSystem):
     `one_forms(q[, params])` returns the matrix W(q) of shape (m, n) whose rows are the constraint one-forms; without
     it there are no nonholonomic constraints. `affine(q[, params])` (m,) makes them W(q) q̇ + b(q) = 0: surfaces that move.
     `holonomic(q[, params])` returns the constraints g(q) = 0, shape (c,). `forces(t, q, v[, params])` is the covector (n,)
-    of external, control and dissipative forces. Every other function may take the time too, as its first argument `t`:
+    of external, control and dissipative forces; `forces(t, q, v, multipliers[, params])` sees those of the constraints,
+    (μ, λ) of shape (m + c,), as friction does: of the equations below, so that their forces are −Wᵀμ − Gᵀλ. They are those of
+    the step that the forces act in, found with it. Every other function may take the time too, as its first argument `t`:
     `lagrangian(t, q, v[, params])`.
 
     Equations, with G = ∂g/∂q: ṗ = ∂L/∂q + f − Wᵀμ − Gᵀλ, p = ∂L/∂v, q̇ = v, W v + b = 0, g = 0.
@@ -60,12 +77,24 @@ class LagrangeDirac(AbstractSystem):
         self.lagrangian = UserFunction(lagrangian, "lagrangian", ("q", "v"), timed=True)
         given = Constraints.of(one_forms, affine, holonomic)
         self.one_forms, self.affine, self.holonomic = given.one_forms, given.affine, given.holonomic
-        self.forces = None if forces is None else UserFunction(forces, "forces", ("t", "q", "v"))
+        self.forces = None if forces is None else force_function(forces, given.any)
 
     @property
     def constraints(self) -> Constraints:
         """All constraints, as functions of (t, q, params)."""
         return Constraints(self.one_forms, self.affine, self.holonomic)
+
+    @property
+    def forces_see_multipliers(self) -> bool:
+        """Whether the forces depend on those of the constraints."""
+        return self.forces is not None and "multipliers" in self.forces.arguments
+
+    def forces_at(self, multipliers: Float[Numbers, " k"] | None) -> Callable | None:
+        """The forces (t, q, v, params) ↦ (n,) where the multipliers of the constraints are these; None without forces."""
+        forces = self.forces
+        if forces is None or not self.forces_see_multipliers or multipliers is None:
+            return forces
+        return lambda t, q, v, params: forces(t, q, v, multipliers, params)
 
     @property
     def depends_on_time(self) -> bool:
@@ -128,11 +157,11 @@ class LagrangeDirac(AbstractSystem):
                 "sum or index its result."
             )
         if self.forces is not None:
-            out = self.forces.shape(t, q, q, params)
+            seen = (np.zeros(sum(self.constraints.sizes(q, params))),) * self.forces_see_multipliers
+            out = self.forces.shape(t, q, q, *seen, params)
             if out.shape != (n,):
-                raise ValueError(
-                    f"forces(t, q, v) must return shape ({n},), one number a coordinate, but it returned shape {out.shape}."
-                )
+                call = f"forces({', '.join(self.forces.arguments)})"
+                raise ValueError(f"{call} must return shape ({n},), one number a coordinate, but it returned shape {out.shape}.")
         m, c = self.constraints.sizes(q, params)
         return (n, m) if self.holonomic is None else (n, m, c)
 

@@ -1,5 +1,6 @@
 """The kernels of a collocation step: nodes in lanes, a fixed-point iteration; Newton's method where that does not converge."""
 
+import functools
 import hashlib
 from collections.abc import Callable
 from typing import Any
@@ -31,9 +32,12 @@ class CollocationKernels:
         for part in (g.op, g.args, sorted(g.value.items()), plan.identity):
             digest.update(repr(part).encode() + b"\0")
         self.digest = digest.hexdigest()
+        self.saved: Any = None
+        """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
+        self.places: Any = None
         self._run: tuple[Any, Any] | None = None
 
-    @property
+    @functools.cached_property
     def record(self) -> Record:
         """What is kept of a trajectory."""
         return self.plan.record

@@ -35,6 +35,9 @@ class Kernels:
         self.step, self.compensated, self.rules = step, compensated, rules
         self.plan: Plan | None = None
         self.operations = 0
+        self.saved: Any = None
+        """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
+        self.places: Any = None
         self.digest = _digest(self)
         self._runs: dict[int, tuple[Any, Any]] = {}
         self._linearizations: dict[tuple[bool, int], tuple[Any, Any]] = {}
@@ -44,7 +47,7 @@ class Kernels:
         """The plan without corrections: sizes and names only."""
         return self.plan or self._plan(self.step.graph)
 
-    @property
+    @functools.cached_property
     def record(self) -> Record:
         """What is kept of a lane."""
         return self.bare.record

@@ -5,10 +5,12 @@ import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from dirax.engines.contract import OK, Problem
+from dirax.engines.contract import NOT_CONVERGED, OK, Problem
 from dirax.engines.native import compile as llvm
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
@@ -40,6 +42,30 @@ def thread_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+class Saved(NamedTuple):
+    """An array that a kernel saves: its name and shape in a row, and whether the last row has none."""
+
+    name: str
+    shape: tuple[int, ...]
+    size: int
+    ends_before: bool
+
+
+def arrays_saved(p: Problem, made: Kernels | CollocationKernels) -> list[Saved]:
+    """The arrays of a kernel, in its order."""
+    if made.saved is None:
+        rows = made.step.equations[made.step.stages[0][0]].rows
+        stages = len(p.equation.stages)
+        front = lambda name: (stages,) if stages > 1 and p.fields[name].rule == "each" else ()
+        shapes = {name: (*front(name), *rows[name].shape) for name in sorted(rows)}
+        made.saved = [Saved(name, shape, math.prod(shape), not p.is_node(name)) for name, shape in shapes.items()]
+    return made.saved
+
+
+def _address(array: np.ndarray) -> int:
+    return array.ctypes.data
+
+
 class Lanes:
     """The records of all trajectories in blocks of `width` lanes: (blocks, quantities, width) doubles.
 
@@ -48,30 +74,62 @@ class Lanes:
 
     def __init__(self, problem: Problem, made: Kernels | CollocationKernels, width: int):
         p = self.problem = problem
-        self.width = width
+        self.width, self.record = width, made.record
         self.lanes = p.batch or 1
         self.blocks = -(-self.lanes // width)
         self.threads = min(thread_count(), self.blocks) if self.blocks > 1 else 1
-        self.source = np.arange(self.blocks * width)
-        self.source[self.lanes :] = (self.blocks - 1) * width
-        self.record = made.record
-        table = np.zeros((self.lanes, self.record.size))
-        table[:, self.record.state] = np.asarray(p.state).reshape(self.lanes, -1)
-        for stage, guess in enumerate(p.guess):
-            values = np.asarray(guess).reshape(self.lanes, -1)
-            table[:, self.record.unknowns(stage, values.shape[1])] = values
+        if p.record is None:
+            table = np.zeros((self.lanes, self.record.size))
+            table[:, self.record.state] = p.state
+            for stage, guess in enumerate(p.guess):
+                table[:, self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+        else:
+            table = np.array(p.record)
         self.records = self._blocked(table)
         leaves = made.step.parameters.flatten(p.params, p.batch if p.batch_params else None)
         self.params = self._blocked(np.broadcast_to(leaves, (self.lanes, leaves.shape[-1])))
-        rows = made.step.equations[made.step.stages[0][0]].rows
-        stages = len(p.equation.stages)
-        front = lambda name: (stages,) if stages > 1 and p.fields[name].rule == "each" else ()
-        self.shapes = {name: (*front(name), *rows[name].shape) for name in sorted(rows)}
-        self.ends_before = [not p.is_node(name) for name in self.shapes]
-        self.sizes = [math.prod(shape) for shape in self.shapes.values()]
-        self._at = self.params.ctypes.data, self.params.strides[0]
+        self.saved = arrays_saved(p, made)
+        self.outs: Any = None
+        self._at = _address(self.params), self.params.strides[0]
+
+    @cached_property
+    def source(self) -> np.ndarray:
+        """The trajectory of every lane."""
+        source = np.arange(self.blocks * self.width)
+        source[self.lanes :] = (self.blocks - 1) * self.width
+        return source
+
+    @cached_property
+    def fields(self) -> dict[str, np.ndarray]:
+        """The saved arrays of the run."""
+        made, self.outs = self.arrays(self.problem.rows)
+        return made
+
+    def advance(self, kernel, first: int, stop: int, threads: int = 1) -> None:
+        """Steps `first` to `stop` − 1 of all trajectories."""
+        assert self.fields
+        self.call(kernel, self.records, self.outs, first, stop, self.problem.save_every, threads)
+
+    def left(self) -> list[int]:
+        """The trajectories that have not converged; of blocks of one lane."""
+        return np.flatnonzero(self.records[:, self.record.status, 0] == NOT_CONVERGED).tolist()
+
+    def again(self, kernel, lane: int) -> None:
+        """Go on with a trajectory, in a block of its own, by another kernel."""
+        p, record, one = self.problem, self.record, self.records[lane : lane + 1]
+        one[:, record.status] = OK
+        one[:, record.differences] = 0.0
+        self.call(kernel, one, self.outs[lane : lane + 1], int(one[0, record.completed, 0]), p.steps, p.save_every, 1, lane)
+
+    def close(self, kernel) -> dict[str, np.ndarray]:
+        """The rows of the last states."""
+        closing, outs = self.arrays(2)
+        self.call(kernel, self.records.copy(), outs, 0, 1, 1, self.threads)
+        return {name: rows[:, 0] for name, rows in closing.items()}
 
     def _blocked(self, table: np.ndarray) -> np.ndarray:
+        if self.lanes == self.width == 1:
+            return table.reshape(1, -1, 1)
         return np.ascontiguousarray(table[self.source].reshape(self.blocks, self.width, -1).swapaxes(1, 2))
 
     def table(self) -> np.ndarray:
@@ -85,21 +143,22 @@ class Lanes:
 
     def arrays(self, rows: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Room for the saved arrays of so many rows, and the (blocks, fields, width) addresses of their rows 0."""
-        lanes, counts = self.lanes, [rows - step for step in self.ends_before]
-        sizes = [lanes * count * size for count, size in zip(counts, self.sizes, strict=True)]
+        lanes = self.lanes
+        counts = [rows - saved.ends_before for saved in self.saved]
+        sizes = [lanes * count * saved.size for count, saved in zip(counts, self.saved, strict=True)]
         ends = list(itertools.accumulate(sizes, initial=0))
         if ends[-1] <= TOGETHER:
             whole = np.empty(ends[-1])
-            parts, first = [whole[a:b] for a, b in itertools.pairwise(ends)], whole.ctypes.data
+            parts, first = [whole[a:b] for a, b in itertools.pairwise(ends)], _address(whole)
             begins = [first + 8 * end for end in ends[:-1]]
         else:
             parts = [np.empty(size) for size in sizes]
-            begins = [part.ctypes.data for part in parts]
+            begins = [_address(part) for part in parts]
         made = {
-            name: part.reshape(lanes, count, *shape)
-            for (name, shape), part, count in zip(self.shapes.items(), parts, counts, strict=True)
+            saved.name: part.reshape(lanes, count, *saved.shape)
+            for saved, part, count in zip(self.saved, parts, counts, strict=True)
         }
-        if len(self.source) == 1:
+        if lanes == self.width == 1:
             return made, np.array(begins).reshape(1, -1, 1)
         steps = 8 * np.array(sizes)[:, None] // lanes
         table = np.array(begins)[:, None] + steps * self.source
@@ -113,7 +172,10 @@ class Lanes:
         p = self.problem
         numbers = (p.t0, p.h, p.first_step, first, stop, every, p.max_iterations)
         params, stride = self._at
-        places = (records.ctypes.data, records.strides[0]), (params + block * stride, stride), (outs.ctypes.data, outs.strides[0])
+        if len(records) == 1:
+            kernel(_address(records), params + block * stride, _address(outs), 1, *numbers)
+            return
+        places = (_address(records), records.strides[0]), (params + block * stride, stride), (_address(outs), outs.strides[0])
 
         def part(low: int, high: int) -> None:
             kernel(*[place + low * stride for place, stride in places], high - low, *numbers)

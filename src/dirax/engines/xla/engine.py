@@ -53,7 +53,9 @@ class Xla(AbstractEngine):
         p, numerics, notes = self._planned(problem)
         chunk = compiled_chunk(jax.default_backend())
         axes, capacity, params = axes_of(p), row_capacity(p), jax.device_put(p.params)
-        lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, numerics.increments is not None)
+        lanes = p.record
+        if lanes is None:
+            lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, numerics.increments is not None)
 
         def call(lanes, start, stop, closing=False):
             t0, h, first_step = map(np.float64, (p.t0, p.h, p.first_step))
@@ -66,7 +68,7 @@ class Xla(AbstractEngine):
         compile_seconds, started = time.perf_counter() - started, time.perf_counter()
 
         fields = _host_arrays(p, empty)
-        done, count, interrupted = 0, FIRST_CHUNK, False
+        done, count, interrupted = p.after, FIRST_CHUNK, False
         try:
             while done < p.steps and not np.all(np.asarray(lanes.counts)[..., 1] != OK):
                 first = next_row(done, p.save_every)
@@ -88,6 +90,7 @@ class Xla(AbstractEngine):
             p, jax.tree.map(np.asarray, lanes), fields, {name: values[:, 0] for name, values in rows.items()}, notes
         )
         outcome.interrupted, outcome.compile_seconds = interrupted, compile_seconds
+        outcome.record = None if interrupted else lanes
         outcome.run_seconds = time.perf_counter() - started
         return finished(p, outcome)
 

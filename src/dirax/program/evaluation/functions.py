@@ -30,9 +30,13 @@ def in_numpy(function: Callable, leaves: list[np.ndarray], key: Hashable) -> Any
     None where the function has a primitive for which there is no rule, or closes over values that JAX traces. `key` is
     equal for functions that are, and has everything in it on which `function` depends.
     """
-    shapes = [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves]
-    found = _programs.get((key, *((s.shape, s.dtype.str) for s in shapes)), lambda: _traced(function, shapes, True))
+    found = program_of(function, [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves], key)
     return None if found is None else jax.tree.unflatten(found[1], found[0].in_numpy(leaves))
+
+
+def program_of(function: Callable, shapes: list[jax.ShapeDtypeStruct], key: Hashable) -> tuple[ScalarProgram, Any] | None:
+    """The program by which `in_numpy` evaluates arguments of these shapes, and the structure of what the function returns."""
+    return _programs.get((key, *((s.shape, s.dtype.str) for s in shapes)), lambda: _traced(function, shapes, True))
 
 
 def at_values(function: Callable, values: tuple) -> tuple | None:
@@ -47,6 +51,14 @@ def at_values(function: Callable, values: tuple) -> tuple | None:
     arrays = [np.asarray(leaf)[None] for leaf in leaves]
     found = in_numpy(_flat(function, structure), arrays, (function, structure))
     return None if found is None else (jax.tree.map(lambda leaf: leaf[0], found),)
+
+
+def program_at(function: Callable, values: tuple) -> ScalarProgram | None:
+    """The program of `at_values`, a function of the leaves of the values; None where there is none."""
+    leaves, structure = jax.tree.flatten(values)
+    shapes = [jax.ShapeDtypeStruct(np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves]
+    found = program_of(_flat(function, structure), shapes, (function, structure))
+    return found and found[0]
 
 
 def in_scalars(function: Callable, values: tuple) -> tuple | None:

@@ -1,5 +1,6 @@
 """Whether the indices of a function stay inside its arrays."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -11,8 +12,9 @@ from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable
 
 
-def reads_inside(jaxpr: Any, values: tuple) -> bool:
-    """Whether every index of a closed jaxpr is inside its array at these values; False where that is not found."""
+def reads_inside(jaxpr: Any, values: tuple | None) -> bool:
+    """Whether every index of a closed jaxpr is inside its array at these values, at any by default; False where that is not
+    found."""
     inside: list[bool] = []
 
     def watched(name: str) -> Callable:
@@ -22,13 +24,21 @@ def reads_inside(jaxpr: Any, values: tuple) -> bool:
 
         return read
 
-    interpreter = Interpreter(Graph(NODE_LIMIT), {name: watched(name) for name in ("gather", "dynamic_slice")})
-    operands = [interpreter.constants(leaf) for leaf in jax.tree.leaves(values)]
+    graph = Graph(NODE_LIMIT)
+    interpreter = Interpreter(graph, {name: watched(name) for name in ("gather", "dynamic_slice")})
     try:
+        if values is None:
+            operands = [_unknown(graph, f"x{number}", v.aval.shape) for number, v in enumerate(jaxpr.jaxpr.invars)]
+        else:
+            operands = [interpreter.constants(leaf) for leaf in jax.tree.leaves(values)]
         results = interpreter.run(jaxpr, *operands)
     except GraphTooLarge:
         return False
     return all(inside) and not any(isinstance(result, Unavailable) for result in results)
+
+
+def _unknown(graph: Graph, name: str, shape: tuple[int, ...]) -> Nodes:
+    return np.array([graph.input(f"{name}_{i}") for i in range(math.prod(shape))], np.int64).reshape(shape)
 
 
 def _inside(interpreter: Interpreter, equation: Any, shape: tuple[int, ...], starts: tuple[Nodes, ...]) -> bool:

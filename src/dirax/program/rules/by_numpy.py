@@ -122,8 +122,12 @@ def scaled_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any,
 
 
 def _inverted(matrices: np.ndarray) -> list[np.ndarray]:
-    """The scaled pseudo-inverses and their units."""
-    return _of_finite(functools.partial(equilibrated_inverse, np), matrices)
+    """The scaled pseudo-inverses and their units; of a matrix that all entries have, once."""
+    inverted = functools.partial(equilibrated_inverse, np)
+    if len(matrices) > 1 and np.all(matrices == matrices[:1]):
+        once = _of_finite(inverted, matrices[:1])
+        return [np.repeat(a, len(matrices), axis=0) for a in once]
+    return _of_finite(inverted, matrices)
 
 
 def _of_finite(function: Callable, matrices: np.ndarray) -> list[np.ndarray]:

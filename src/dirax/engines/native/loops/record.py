@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 from dirax.engines.native.ir.emitter import Emitter
 
@@ -20,21 +21,21 @@ class Record:
     """Unknowns kept for a stage: those of the largest equation."""
     compensated: bool
 
-    @property
+    @cached_property
     def kept(self) -> int:
         """Unknowns of all stages."""
         return self.stages * self.history
 
-    @property
+    @cached_property
     def lost(self) -> int:
         """Quantities that say what rounding took."""
         return self.state_size if self.compensated else 0
 
-    @property
+    @cached_property
     def size(self) -> int:
         return self.state_size + 3 * self.kept + self.lost + 4
 
-    @property
+    @cached_property
     def state(self) -> slice:
         return slice(self.state_size)
 
@@ -43,24 +44,24 @@ class Record:
         first = self.state_size + stage * self.history
         return slice(first, first + count)
 
-    @property
+    @cached_property
     def differences(self) -> slice:
         """First and second differences of the unknowns of all stages."""
         return slice(self.state_size + self.kept, self.state_size + 3 * self.kept)
 
-    @property
+    @cached_property
     def completed(self) -> int:
         return self.size - 4
 
-    @property
+    @cached_property
     def status(self) -> int:
         return self.size - 3
 
-    @property
+    @cached_property
     def iterations(self) -> int:
         return self.size - 2
 
-    @property
+    @cached_property
     def max_residual(self) -> int:
         return self.size - 1
 

@@ -7,7 +7,7 @@ from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.dense import add_dense_solve
 from dirax.engines.native.loops.plan import RUN, Plan, frontier
-from dirax.engines.native.loops.record import Frame
+from dirax.engines.native.loops.record import Frame, Record
 from dirax.engines.native.loops.stage import Block, emit_stage
 
 WRITTEN_OUT = 64
@@ -46,9 +46,8 @@ def _define_block(plan: Plan, module: Module, width: int) -> None:
     level, b = plan.levels(), Body(module)
     e, record = Emitter(b, width), plan.record
     frame = Frame.of(e, record)
-    places = frame.slots("%lanes", record.size)
-    memory = frame.in_order(record)
-    frame.stores(frame.loads(places), memory)
+    load, give = _transfers(frame, record)
+    load()
     known = Region(e, plan.graph)
     for i, node in enumerate(plan.shared.params):
         known.bind(node, b.load(e.real, b.at(e.real, "%params", i)))
@@ -57,13 +56,38 @@ def _define_block(plan: Plan, module: Module, width: int) -> None:
     known.require(frontier(plan.graph, level, plan.outputs, RUN))
 
     def give_back() -> None:
-        frame.stores(frame.loads(memory), places)
+        give()
         b.line("ret void")
 
     _emit_steps(Block(plan, level, frame, known), give_back)
     give_back()
     pointers = "ptr noalias %lanes, ptr noalias %params, ptr noalias %outs"
     module.define(f"define internal void @block({pointers}, {NUMBERS}) noinline", b)
+
+
+def _transfers(frame: Frame, record: Record) -> tuple[Callable[[], None], Callable[[], None]]:
+    """What writes the record into the frame, and the frame into the record: unknowns one by one, or in loops where they are
+    many."""
+    e, first, kept = frame.emitter, record.state_size, record.kept
+    if kept <= WRITTEN_OUT:
+        places, memory = frame.slots("%lanes", record.size), frame.in_order(record)
+        return lambda: frame.stores(frame.loads(places), memory), lambda: frame.stores(frame.loads(memory), places)
+    after = first + 3 * kept
+    singles = [*frame.state, *frame.lost, frame.completed, frame.status, frame.iterations, frame.max_residual]
+    places = [e.body.at(e.real, "%lanes", i) for i in (*range(first), *range(after, record.size))]
+    arrays = [(base, first + number * kept) for number, base in enumerate((frame.unknowns, frame.slopes, frame.bends))]
+
+    def transfer(into_frame: bool) -> None:
+        b = e.body
+        sources, targets = (places, singles) if into_frame else (singles, places)
+        frame.stores(frame.loads(sources), targets)
+        for base, begin in arrays:
+            with b.loop(0, kept) as i:
+                place, own = b.at(e.real, "%lanes", b.put(f"add i64 {i}, {begin}")), b.at(e.real, base, i)
+                source, target = (place, own) if into_frame else (own, place)
+                b.store(e.real, b.load(e.real, source), target)
+
+    return lambda: transfer(True), lambda: transfer(False)
 
 
 def _emit_steps(block: Block, give_back: Callable[[], None]) -> None:

@@ -1,0 +1,120 @@
+"""A single short trajectory in memory: its record, its parameters and all that it saves in one array, with few calls of NumPy."""
+
+import math
+from functools import cached_property
+
+import numpy as np
+
+from dirax.engines.contract import NOT_CONVERGED, OK, Problem
+from dirax.engines.native.collocation_kernels import CollocationKernels
+from dirax.engines.native.kernels import Kernels
+from dirax.engines.native.lanes import TOGETHER, arrays_saved
+
+
+class Places:
+    """Where things stand in the array of a run of so many rows, in numbers: record · its copy · parameters · addresses of the
+    rows · addresses of the closing row · closing row · rows."""
+
+    def __init__(self, p: Problem, made: Kernels | CollocationKernels, rows: int):
+        self.rows, saved = rows, arrays_saved(p, made)
+        self.record = made.record.size
+        self.params = 2 * self.record
+        self.outs = self.params + made.step.parameters.size
+        self.closing_outs = self.outs + len(saved)
+        at = self.closing_outs + len(saved)
+        self.fields, self.closing, starts, closing, last = [], [], [], [], []
+        for name, shape, size, _ in saved:
+            self.closing.append((name, at, at + size, (1, *shape)))
+            closing.append(at)
+            at += size
+        for name, shape, size, ends_before in saved:
+            count = rows - ends_before
+            self.fields.append((name, at, at + count * size, (1, count, *shape)))
+            starts.append(at)
+            last.append(closing[len(last)] if ends_before else at + (count - 1) * size)
+            at += count * size
+        self.size = at
+        self.ended, self.completed = (8 * np.array([*starts, *others]) for others in (closing, last))
+        """The addresses in bytes, for a trajectory that ends early and for one whose closing row is the last one."""
+        self.nodes = [(name, a, b - a, shape) for (name, a, b, shape), s in zip(self.closing, saved, strict=True) if not s[3]]
+
+
+class OneLane:
+    """What `Lanes` is for many trajectories."""
+
+    threads = 1
+
+    def __init__(self, p: Problem, made: Kernels | CollocationKernels, places: Places):
+        self.problem, self.record, self.places = p, made.record, places
+        memory = self.memory = np.empty(places.size)
+        if p.record is None:
+            memory[: places.record] = 0.0
+            memory[self.record.state] = p.state
+            for stage, guess in enumerate(p.guess):
+                memory[self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+        else:
+            memory[: places.record] = p.record[0]
+        if places.outs > places.params:
+            memory[places.params : places.outs] = made.step.parameters.flatten(p.params, None)
+        self.address = memory.ctypes.data
+        self._point(places.ended)
+        self.numbers = p.t0, p.h, p.first_step
+
+    def _point(self, addresses: np.ndarray) -> None:
+        """Have the kernel write there."""
+        places = self.places
+        np.add(addresses, self.address, out=self.memory[places.outs : places.outs + len(addresses)].view(np.int64))
+
+    def advance(self, kernel, first: int, stop: int, threads: int = 1) -> None:
+        """Steps `first` to `stop` − 1."""
+        p, places, at = self.problem, self.places, self.address
+        numbers = (*self.numbers, first, stop, p.save_every, p.max_iterations)
+        kernel(at, at + 8 * places.params, at + 8 * places.outs, 1, *numbers)
+
+    @property
+    def going(self) -> bool:
+        """Whether the trajectory has neither failed nor ended before its time."""
+        return self.memory[self.record.status] == OK
+
+    def left(self) -> list[int]:
+        """The trajectories that have not converged."""
+        return [0] if self.memory[self.record.status] == NOT_CONVERGED else []
+
+    def again(self, kernel, lane: int) -> None:
+        """Go on with a trajectory by another kernel."""
+        memory, record = self.memory, self.record
+        memory[record.status], memory[record.differences] = OK, 0.0
+        self.advance(kernel, int(memory[record.completed]), self.problem.steps)
+
+    @cached_property
+    def fields(self) -> dict[str, np.ndarray]:
+        """The saved arrays."""
+        return {name: self.memory[a:b].reshape(shape) for name, a, b, shape in self.places.fields}
+
+    def close(self, kernel) -> dict[str, np.ndarray]:
+        """The row of the last state, which is the last one saved where the trajectory did not end early."""
+        memory, places, at = self.memory, self.places, self.address
+        done = memory[self.record.completed] == self.problem.steps
+        if done:
+            self._point(places.completed)
+        memory[places.record : places.params] = memory[: places.record]
+        kernel(at + 8 * places.record, at + 8 * places.params, at + 8 * places.closing_outs, 1, *self.numbers, 0, 1, 1,
+               self.problem.max_iterations)  # fmt: skip
+        closing = {name: memory[a:b].reshape(shape) for name, a, b, shape in places.closing}
+        return closing | {name: self.fields[name][:, -1] for name, *_ in places.nodes} if done else closing
+
+    def table(self) -> np.ndarray:
+        """The record, (1, quantities)."""
+        return self.memory[: self.places.record][None]
+
+
+def places_of(p: Problem, made: Kernels | CollocationKernels) -> Places | None:
+    """Where things stand in a run; None for one that is not short, and for a batch."""
+    if p.batch is not None:
+        return None
+    rows = p.rows
+    if made.places is None or made.places.rows != rows:
+        if rows * sum(math.prod(saved.shape) for saved in arrays_saved(p, made)) > TOGETHER:
+            return None
+        made.places = Places(p, made, rows)
+    return made.places

@@ -1,0 +1,239 @@
+"""A run carried out: by the plan for its kind where there is one, else discretize → start → engine; then its Solution."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.engines.contract import Outcome, Problem
+from dirax.program.memo import Memo
+from dirax.program.user_functions import is_traced, values_matter
+from dirax.run.final_manifold import (
+    is_singular,
+    projected_onto_manifold,
+    refuse_leaving_final_manifold,
+    refuse_off_final_manifold,
+)
+from dirax.run.plan import Plan, bytes_of, planned
+from dirax.run.progress import reporting
+from dirax.run.redundancy import redundant_constraints
+from dirax.run.refused_start import refuse_bad_start
+from dirax.run.result import solution_of
+from dirax.run.settings import Settings, kind_of
+from dirax.run.start import begun, completed
+from dirax.run.validate import Case, refuse_more_than_memory
+from dirax.schemes.step import Shape, make_step_equation
+from dirax.solution.solution import Solution
+
+MANY_BYTES = 2**26
+"""Saved bytes from which on it is asked whether the memory has room for them."""
+
+
+@dataclass
+class Kind:
+    """Runs of one kind: the plan for them, once there is one, and the engine that has found what it needs for them."""
+
+    runs: int = 0
+    plan: Plan | None = None
+    engine: Callable | None = None
+
+
+_kinds: Memo[Kind] = Memo(128)
+
+
+def kind_for(settings: Settings, case: Case) -> Kind | None:
+    """The kind that a case belongs to, the same object for equal settings, a new one where they have no hash; None for a batch
+    and where values are traced."""
+    if case.batch is not None or not case.plain:
+        return None
+    return _kinds.get((settings.key, kind_of(case)), Kind)
+
+
+@dataclass
+class Begun:
+    """A problem, and what else is known of its beginning."""
+
+    case: Case
+    problem: Problem
+    redundant: tuple[int, ...]
+    row0: dict | None
+    traced: bool
+    rows: dict[str, np.ndarray] | None = field(default=None, kw_only=True)
+    """Rows that were saved by the run that this one goes on with."""
+    plan: Callable[[], Plan | None]
+    """Makes the plan for others of its kind."""
+
+
+def carried_out(
+    settings: Settings, case: Case, steps: int, save_every: int, progress: Any, kind: Kind | None = None, entered: float = 0.0
+) -> Solution:
+    """The Solution of a run. Raises `ValueError` for data that a premise excludes."""
+    began = time.perf_counter()
+    kind = kind or kind_for(settings, case)
+    if kind is not None and kind.plan is not None:
+        problem = kind.plan.problem(case, steps, save_every)
+        if problem is not None:
+            if problem.rows * kind.plan.row_bytes > MANY_BYTES:
+                refuse_more_than_memory(problem)
+            return _run(settings, kind, Begun(case, problem, (), None, False, _no_plan), steps, progress, entered, began)
+    found = _begun(settings, case, steps, save_every)
+    if kind is not None and not found.traced:
+        if kind.plan is not None and not found.redundant:
+            kind.plan.learn(bytes_of(case.params))
+        kind.runs += 1
+        if kind.runs == 2:
+            kind.plan = found.plan()
+    return _run(settings, kind, found, steps, progress, entered, began)
+
+
+def prepared(settings: Settings, case: Case, steps: int, save_every: int) -> Kind | None:
+    """The kind of a case with its plan made and its engine ready. Raises `ValueError` for data that a premise excludes."""
+    kind = kind_for(settings, case)
+    if kind is None or (kind.plan is not None and kind.engine is not None and kind.plan.problem(case, steps, save_every)):
+        return kind
+    found = _begun(settings, case, steps, save_every)
+    if not found.traced and not found.redundant:
+        kind.plan = kind.plan or found.plan()
+        kind.engine = kind.engine or settings.engine.prepared(found.problem)
+    return kind
+
+
+def _no_plan() -> None:
+    return None
+
+
+def _begun(settings: Settings, case: Case, steps: int, save_every: int) -> Begun:
+    """The general way from a case to its problem."""
+    system, scheme, by_jax = settings.system, settings.scheme, settings.engine.compiles_start
+    given, check_initial = case, settings.check_initial
+    data, own = case.first
+    # discretize: constraints that follow from others at the completed data are left out of the equation
+    with values_matter() as by_values:
+        shape, redundant, singular = Shape(*system.sizes(data, own)), (), False
+    initial = completed(system, case, settings.project, by_jax)
+    if not (traced := case.traced or is_traced(initial)):
+        redundant = redundant_constraints(system, initial.constraints, data, own, case.t0)
+        if (
+            (singular := is_singular(system, shape, case, initial))
+            and settings.project
+            and (moved := projected_onto_manifold(system, case, initial))
+        ):
+            case, initial = moved, completed(system, moved, False, by_jax)
+    shape = Shape(shape.n, shape.m, shape.c, redundant=redundant) if redundant else shape
+    equation = make_step_equation(scheme, system, shape)
+    # start
+    start = begun(equation, case, initial, by_jax)
+    # user functions that close over a traced value make the start traced although nothing that was passed is
+    if not (traced := traced or is_traced(start)):
+        for stage in dict.fromkeys(stage.check for stage, _ in equation.stages):
+            stage(data, case.h, own)
+        refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial, singular)
+        if check_initial and singular:
+            refuse_off_final_manifold(system, case, initial)
+        if check_initial:
+            refuse_leaving_final_manifold(system, equation, shape, case, initial, start, singular)
+    problem = Problem(
+        equation=equation,
+        state=start.state,
+        guess=start.guess,
+        h=case.h,
+        t0=case.t0,
+        steps=steps - int(case.two_points),
+        save_every=save_every,
+        first_step=int(case.two_points),
+        params=jax.tree.map(jnp.asarray, case.params) if traced else case.params,
+        batch=case.batch,
+        batch_params=case.batch_params,
+        max_iterations=settings.max_iterations,
+        compensated=settings.compensated,
+    )
+    refuse_more_than_memory(problem)
+    special = redundant or singular or by_values or by_jax
+
+    def plan() -> Plan | None:
+        return None if special else planned(settings, given, shape, initial, start, problem)
+
+    return Begun(case, problem, redundant, start.row0, traced, plan)
+
+
+def _run(
+    settings: Settings, kind: Kind | None, found: Begun, steps: int, progress: Any, entered: float, began: float
+) -> Solution:
+    problem, traced, on = found.problem, found.traced, settings.engine
+    started = time.perf_counter()
+    if traced:
+        outcome = on.run_traced(problem)
+        ready = started
+    else:
+        of_kind = None if found.redundant else kind
+        run = (of_kind and of_kind.engine) or on.prepared(problem)
+        if of_kind is not None:
+            of_kind.engine = run
+        ready = time.perf_counter()
+        outcome = _outcome(run, problem, steps, progress)
+    for name, rows in (found.rows or {}).items():
+        outcome.fields[name][:, : rows.shape[1]] = rows
+    if found.redundant:
+        outcome.notes["redundant_constraints"] = list(found.redundant)
+    solution = solution_of(settings.system, settings.scheme, found.case, problem, outcome, found.row0, traced)
+    if not traced:
+        solution.continuation = Continuation(settings, kind, found, outcome.record, steps)
+        found_in_run = outcome.compile_seconds > ready - started  # by an engine that prepares nothing
+        solution.stats |= {
+            "validate_seconds": began - entered if entered else 0.0,
+            "start_seconds": started - began,
+            "trace_seconds": ready - started - (0.0 if found_in_run else outcome.compile_seconds),
+            "result_seconds": max(
+                0.0,
+                time.perf_counter() - ready - outcome.run_seconds - (outcome.compile_seconds if found_in_run else 0.0),
+            ),
+        }
+    return solution
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """What goes on with a run: `sol.extend` calls it."""
+
+    settings: Settings
+    kind: Kind | None
+    begun: Begun
+    record: Any
+    steps: int
+    """Those of the run, with the one between two given points."""
+
+    def __call__(self, sol: Solution, more: int, progress: Any) -> Solution:
+        """The solution of the whole run of so many more steps, bit by bit."""
+        began, old = time.perf_counter(), self.begun.problem
+        after = old.steps if self.record is not None else 0
+        problem = old.with_numbers(steps=old.steps + more, after=after, record=self.record)
+        refuse_more_than_memory(problem)
+        before = _rows_before(sol, problem)
+        found = replace(self.begun, problem=problem, rows=before)
+        longer = _run(self.settings, self.kind, found, self.steps + more, progress, 0.0, began)
+        longer.metadata, longer.example = sol.metadata, sol.example
+        return longer
+
+
+def _rows_before(sol: Solution, problem: Problem) -> dict[str, np.ndarray]:
+    """The saved rows of the steps that are done, (B, rows, …), without the last one, which may not be among those of the longer
+    run, and without the given row 0 of two points."""
+    lead = 1 if sol.batch is None else sol.batch
+    good = sol.rows - 1 - problem.first_step if sol.batch is None else problem.steps
+    count = min(-(-problem.after // problem.save_every), good)
+    found = {}
+    for name, values in sol.fields.items():
+        rows = values.reshape(lead, -1, *sol.field_info[name].shape) if sol.batch is None else values
+        found[name] = rows[:, problem.first_step : problem.first_step + count]
+    return found
+
+
+def _outcome(run: Callable, problem: Problem, steps: int, progress: Any) -> Outcome:
+    if not progress:
+        return run(problem, None)
+    with reporting(progress, steps) as report:
+        return run(problem, report)

@@ -1,0 +1,184 @@
+"""Plan: the start of a run found once, so that another one of its kind begins in microseconds."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from dirax.engines.contract import Problem
+from dirax.numerics.equilibration import equilibrated
+from dirax.numerics.ranks import surely_independent
+from dirax.numerics.tolerances import CONSTRAINT_DEFECT
+from dirax.program.evaluation.functions import program_at
+from dirax.program.evaluation.in_floats import Floats
+from dirax.run.final_manifold import MOST
+from dirax.run.settings import Settings
+from dirax.run.start import Initial, Start, program_of_beginning, program_of_completion, program_of_first_step
+from dirax.run.validate import Case
+from dirax.schemes.abstract_step import AbstractStep
+from dirax.schemes.step import Shape, nothing_to_check
+
+SURELY_REGULAR = 1e6
+"""Condition number of ∂²L/∂v², and of the matrix of the constraints, up to which there is no doubt of their rank."""
+
+
+class Plan:
+    """The way from a case of one kind to its problem in floats, with the bits of the general way.
+
+    Every premise that the general way checks is checked, by numbers that leave no doubt; where they do, `begin` gives None and
+    the general way decides, and says what is wrong. What it found for the first case is where a plan begins.
+    """
+
+    def __init__(self, settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem):
+        self.settings, self.template = settings, problem
+        equation = problem.equation
+        self.checks = [check for check in dict.fromkeys(stage.check for stage, _ in equation.stages) if not _is_trivial(check)]
+        self.complete: Any = program_of_completion(settings.system, case, settings.project)
+        self.begun: Any = program_of_beginning(equation, case, initial.data)
+        self.first_step: Any = None
+        self.data_size = sum(np.size(a) for a in jax.tree.leaves(initial.data))
+        self.defects, self.has_lagrangian = np.size(initial.defect), initial.lagrangian is not None
+        self.matrix = None
+        if initial.constraints is not None and np.size(initial.constraints):
+            self.matrix = _scales(np.asarray(initial.constraints))
+        self.state_size, self.guesses = len(start.state), [len(guess) for guess in start.guess]
+        self.fraction, self.unknowns = equation.stages[0][1], equation.stages[0][0].unknowns
+        if self.unknowns:
+            self.first_step, self.moving = program_of_first_step(equation, case)
+            self.jacobian = _scales(np.asarray(start.jacobian))
+        system = settings.system
+        never = system.metric_form() is not None or system.lagrangian_form() is None or system.final_relation(shape) is not None
+        self.asks_hessian = not never and len(case.data) > 1 and "q" in case.data and len(case.data["q"]) <= MOST
+        self.hessian: Floats | None = None
+        self.places = _places(initial.data)
+        self.regular = {bytes_of(case.params)}
+        self.row_bytes = 8 * (1 + sum(math.prod(field.shape) for field in problem.fields.values()))
+
+    @property
+    def whole(self) -> bool:
+        """Whether it has all the programs that it needs."""
+        return None not in (self.complete, self.begun, self.first_step if self.unknowns else True)
+
+    def problem(self, case: Case, steps: int, save_every: int) -> Problem | None:
+        """The problem of a case; None where a premise is in doubt."""
+        leaves = jax.tree.leaves(case.params)
+        data = [x for name in sorted(case.data) for x in case.data[name].tolist()]
+        last = [*(x for leaf in leaves for x in leaf.ravel().tolist()), case.h, case.t0]
+        try:
+            initial = self.complete((*data, *last))
+            complete = initial[: self.data_size]
+            start = self.begun((*complete, *last))
+            if not (
+                self._holds(initial) and self._steps(start, case, leaves) and self._has_regular_hessian(complete, case, last)
+            ):
+                return None
+        except (ArithmeticError, ValueError):  # what Python's floats do not have
+            return None
+        for check in self.checks:
+            check(case.data, case.h, case.params)
+        guess, at = [], self.state_size
+        for size in self.guesses:
+            guess.append(np.array(start[at : at + size]))
+            at += size
+        return self.template.with_numbers(
+            state=np.array(start[: self.state_size]),
+            guess=tuple(guess),
+            h=case.h,
+            t0=case.t0,
+            steps=steps,
+            save_every=save_every,
+            params=case.params,
+        )
+
+    def _holds(self, initial: Sequence[float]) -> bool:
+        """Whether the data are on the constraints, and inside the domain of the functions, and no constraint is redundant."""
+        at = self.data_size + self.defects
+        defects, size = initial[self.data_size : at], initial[at]
+        allowed = CONSTRAINT_DEFECT * max(size, 1.0) if self.settings.check_initial else math.inf
+        if not all([abs(defect) <= allowed and defect - defect == 0.0 for defect in defects]):
+            return False
+        if self.has_lagrangian and not math.isfinite(initial[at + 1]):
+            return False
+        if self.matrix is None:
+            return True
+        return surely_independent(_scaled(initial[at + 1 + self.has_lagrangian :], self.matrix), SURELY_REGULAR)
+
+    def _steps(self, start: Sequence[float], case: Case, leaves: list[Any]) -> bool:
+        """Whether the first step has a unique solution."""
+        k, s = self.unknowns, self.state_size
+        if not k:
+            return True
+        params = [x for leaf, moves in zip(leaves, self.moving, strict=True) if moves for x in leaf.ravel().tolist()]
+        found = self.first_step((*start[s : s + k], *start[:s], case.t0, self.fraction * case.h, *params))
+        return math.isfinite(sum(found[:k])) and surely_independent(_scaled(found[k:], self.jacobian))
+
+    def _has_regular_hessian(self, complete: Sequence[float], case: Case, last: Sequence[float]) -> bool:
+        """Whether ∂²L/∂v² is regular; what is so once is not asked again for the same params."""
+        if not self.asks_hessian or (given := bytes_of(case.params)) in self.regular:
+            return True
+        q, v = (complete[self.places[name]] for name in ("q", "v"))
+        if self.hessian is None:
+            values = np.asarray(case.t0), np.array(q), np.array(v), case.params
+            program = program_at(self.settings.system.velocity_hessian, values)
+            self.hessian = program and program.in_floats
+        if self.hessian is None:
+            return False
+        entries, n = self.hessian((case.t0, *q, *v, *last[:-2])), len(q)
+        regular = surely_independent([entries[i * n : i * n + n] for i in range(n)], SURELY_REGULAR)
+        if regular:
+            self.learn(given)
+        return regular
+
+    def learn(self, given: tuple) -> None:
+        """Note that the Lagrangian is regular for params of these bytes."""
+        if len(self.regular) > 256:
+            self.regular.clear()
+        self.regular.add(given)
+
+
+def bytes_of(params: Any) -> tuple:
+    """Equal for equal params of one kind."""
+    return tuple([leaf.tobytes() for leaf in jax.tree.leaves(params)])
+
+
+def planned(settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem) -> Plan | None:
+    """The plan for cases like one that the general way took; None for those that always need it: batches, two points, steps
+    whose functions have no program or a large one, and compositions that might leave a final manifold."""
+    equation, system = problem.equation, settings.system
+    stages = equation.stages
+    if case.batch is not None or case.two_points or (stages[0][0].unknowns and start.jacobian is None):
+        return None
+    fields = stages[0][0].fields
+    if len(stages) > 1 and not system.constraints.any and "p" in fields and system.final_relation(shape) is not None:
+        return None
+    plan = Plan(settings, case, shape, initial, start, problem)
+    return plan if plan.whole else None
+
+
+def _is_trivial(check: Any) -> bool:
+    return check is nothing_to_check or getattr(check, "__func__", None) is AbstractStep.check
+
+
+def _scaled(entries: Sequence[float], scales: list[list[float]]) -> list[list[float]]:
+    """The rows of a matrix with these entries, each times its scale."""
+    width = len(scales[0])
+    return [[x * y for x, y in zip(entries[i * width :], row, strict=False)] for i, row in enumerate(scales)]
+
+
+def _scales(matrix: np.ndarray) -> list[list[float]]:
+    """What the entries of a matrix are to be multiplied by to be those of the equilibrated one."""
+    scaled, units = equilibrated(matrix)
+    row, column = np.arange(len(matrix)), np.argmax(np.abs(scaled), axis=1)
+    with np.errstate(all="ignore"):
+        return (units * (scaled[row, column] / matrix[row, column] / units[0, column])[:, None]).tolist()
+
+
+def _places(data: dict[str, Any]) -> dict[str, slice]:
+    """Where each of the complete data stands among their numbers."""
+    found, at = {}, 0
+    for name in sorted(data):
+        found[name] = slice(at, at + np.size(data[name]))
+        at += np.size(data[name])
+    return found

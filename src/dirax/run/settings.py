@@ -1,0 +1,54 @@
+"""What is said of a run: Settings besides its numbers, and the Case that are its numbers."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+
+from dirax.engines.engine import AbstractEngine
+from dirax.run.validate import Case, check_kinds, count, engine_from, validated_case
+from dirax.schemes.step import AbstractScheme
+from dirax.systems.system import AbstractSystem
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is run and how; `system` is with its inputs, and `engine` is one."""
+
+    system: AbstractSystem
+    scheme: AbstractScheme
+    engine: AbstractEngine
+    project: bool
+    check_initial: bool
+    max_iterations: int
+    compensated: bool
+
+    @cached_property
+    def key(self) -> tuple:
+        """Equal for equal settings: systems and schemes are compared by value, with what is static in them."""
+        of_value = (jax.tree.flatten(module) for module in (self.system, self.scheme, self.engine))
+        modules = ((structure, *leaves) for leaves, structure in of_value)
+        return *modules, self.project, self.check_initial, self.compensated, self.max_iterations
+
+
+def stated(
+    system: Any, scheme: Any, step: Any, steps: Any, data: dict[str, Any], inputs: Any, params: Any, batch_params: bool,
+    save_every: Any, engine: Any, project: bool, check_initial: bool, t0: Any, max_iterations: Any, compensated: bool,
+) -> tuple[Settings, Case, int, int]:  # fmt: skip
+    """The settings and the case that the arguments of `simulate` state, steps and save_every; raises as it does."""
+    check_kinds(system, scheme)
+    on, steps, save_every, max_iterations = (
+        engine_from(engine), count(steps, "steps"), count(save_every, "save_every"), count(max_iterations, "max_iterations")
+    )  # fmt: skip
+    case = validated_case(data, params, batch_params, step, t0)
+    system = system if inputs is None else system.with_inputs(inputs)
+    return Settings(system, scheme, on, project, check_initial, max_iterations, bool(compensated)), case, steps, save_every
+
+
+def kind_of(case: Case) -> tuple:
+    """What a plan for a case depends on: which data are given and their shapes, and the kinds of the params; and the values of
+    those params that are no floats."""
+    leaves, structure = jax.tree.flatten(case.params)
+    kinds = tuple([(a.shape,) if a.dtype.char == "d" else (a.shape, a.dtype.char, a.tobytes()) for a in leaves])
+    return tuple([(name, a.shape) for name, a in case.data.items()]), structure, kinds, case.batch_params

@@ -1,0 +1,167 @@
+"""dx.prepare and repeated runs: the bits of a first run, and every premise of it, whatever changes from call to call."""
+
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax import gallery
+from dirax.run.plan import Plan
+
+STEP = {"step": 0.1, "steps": 3}
+HENON = dx.LagrangeDirac(lambda q, v: (v @ v - q @ q) / 2 - (q[0] ** 2 * q[1] - q[1] ** 3 / 3))
+MASS = dx.LagrangeDirac(lambda q, v, params: jnp.sum(params["m"] * v * v) / 2 - jnp.sum(jnp.cos(q)))
+SKATE = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0], lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]]))
+MIDPOINT = dx.LagrangeDAlembert()
+
+
+@pytest.fixture
+def planned(monkeypatch):
+    """How many runs began by a plan."""
+    found, problem = [], Plan.problem
+
+    def counted(*arguments):
+        made = problem(*arguments)
+        found.extend([made] * (made is not None))
+        return made
+
+    monkeypatch.setattr(Plan, "problem", counted)
+    return found
+
+
+def assert_same(a, b):
+    assert list(a.fields) == list(b.fields) and a.ok == b.ok
+    np.testing.assert_array_equal(a.t, b.t)
+    for name in a.fields:
+        np.testing.assert_array_equal(a.fields[name], b.fields[name])
+
+
+def fresh(system, scheme, **arguments):
+    """A first run."""
+    dx.clear_caches()
+    return dx.simulate(system, scheme, **arguments)
+
+
+@pytest.mark.parametrize("name", ["rolling-disk", "henon-heiles", "heavy-top", "cartesian-double-pendulum", "lc-ladder"])
+def test_later_runs_of_the_gallery_have_the_bits_of_the_first(name, planned):
+    example = gallery.get(name)
+    first, *later = (example.simulate(steps=4) for _ in range(4))
+    assert len(planned) >= 2
+    for other in later:
+        assert_same(first, other)
+
+
+def test_other_data_steps_times_and_rows(planned):
+    run = dx.prepare(HENON, MIDPOINT, q=[0.3, 0.1], v=[0.2, 0.35], **STEP)
+    changes = {"q": [0.1, 0.2], "step": 0.05, "steps": 7, "t0": 2.0, "save_every": 3}
+    found, at_once = run(**changes), run()
+    assert len(planned) >= 2
+    assert_same(found, fresh(HENON, MIDPOINT, **{"q": [0.3, 0.1], "v": [0.2, 0.35], **changes}))
+    assert_same(at_once, fresh(HENON, MIDPOINT, q=[0.3, 0.1], v=[0.2, 0.35], **STEP))
+    assert found.rows == 4 and found.t[0] == 2.0 and found.stats["steps"] == 7
+
+
+def test_other_params_and_other_kinds_of_data(planned):
+    run = dx.prepare(MASS, MIDPOINT, q=[0.3, 0.1], v=[0.2, 0.35], params={"m": 1.0}, **STEP)
+    for params in ({"m": 2.0}, {"m": np.float64(0.5)}, {"m": np.array([1.0, 3.0])}):
+        assert_same(run(params=params), fresh(MASS, MIDPOINT, q=[0.3, 0.1], v=[0.2, 0.35], params=params, **STEP))
+    given = {"q": [0.3, 0.1], "p": [0.2, 0.4]}
+    assert_same(run(**given), fresh(MASS, MIDPOINT, **given, params={"m": 1.0}, **STEP))
+    batch = {"q": [[0.3, 0.1], [0.2, 0.2]]}
+    np.testing.assert_array_equal(run(**batch, v=np.ones((2, 2))).q[0], run(q=[0.3, 0.1], v=[1.0, 1.0]).q)
+
+
+@pytest.mark.parametrize(
+    "system, data, params, changes, message",
+    [
+        (HENON, {"q": [0.3, 0.1], "v": [0.2, 0.3]}, None, {"q": [0.3, np.nan]}, "q must be finite"),
+        (HENON, {"q": [0.3, 0.1], "v": [0.2, 0.3]}, None, {"q": [0.3]}, "must have the same length"),
+        (HENON, {"q": [0.3, 0.1], "v": [0.2, 0.3]}, None, {"step": -1.0}, "step must be a positive"),
+        (HENON, {"q": [0.3, 0.1], "v": [0.2, 0.3]}, None, {"p": [1.0, 1.0], "v": [1.0, 1.0]}, "p=, v= was given"),
+        (MASS, {"q": [0.3, 0.1], "v": [0.2, 0.3]}, {"m": 1.0}, {"params": {"m": 0.0}}, "singular"),
+        (MASS, {"q": [0.3, 0.1], "v": [0.2, 0.3]}, {"m": 1.0}, {"params": {"m": np.inf}}, "params must be finite"),
+        (SKATE, {"q": [0.0] * 3, "v": [1.0, 0, 1]}, None, {"v": [1.0, 0.5, 1.0]}, "off the constraint"),
+        (
+            dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sum(jnp.sqrt(q))),
+            {"q": [1.0], "v": [1.0]}, None, {"q": [-1.0]}, "lagrangian is nan",
+        ),
+    ],
+)  # fmt: skip
+def test_every_premise_is_checked(system, data, params, changes, message, planned):
+    run = dx.prepare(system, MIDPOINT, **data, params=params, **STEP)
+    run()
+    assert planned
+    with pytest.raises(ValueError, match=message):
+        run(**changes)
+
+
+def test_what_is_no_number_is_not_taken():
+    run = dx.prepare(HENON, MIDPOINT, q=[0.3, 0.1], v=[0.2, 0.3], **STEP)
+    with pytest.raises(TypeError, match="but engine= was given: prepare another one"):
+        run(engine="xla")
+
+
+def test_functions_that_index_by_values_are_checked_each_time(planned):
+    system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - q[params] ** 2)
+    run = dx.prepare(system, MIDPOINT, q=[0.3, 0.1], v=[0.2, 0.3], params=1, **STEP)
+    assert run().ok and not planned
+    with pytest.raises(ValueError, match="reads an entry"):
+        run(params=2)
+
+
+@pytest.mark.parametrize("scheme", [MIDPOINT, dx.Composition(MIDPOINT, "suzuki4"), dx.Collocation(stages=3)])
+@pytest.mark.parametrize("first, more, every", [(6, 5, 1), (6, 6, 3), (7, 6, 3), (2, 1, 5)])
+def test_extending_has_the_bits_of_one_run(scheme, first, more, every):
+    given = {"q": [0.3, 0.1], "v": [0.2, 0.35], "step": 0.2, "save_every": every, "t0": 1.0}
+    sol = dx.simulate(HENON, scheme, **given, steps=first).extend(more)
+    whole = dx.simulate(HENON, scheme, **given, steps=first + more)
+    assert_same(sol, whole)
+    for name in ("steps", "newton_iterations", "max_residual"):
+        assert sol.stats[name] == whole.stats[name]
+    assert_same(sol.extend(2), dx.simulate(HENON, scheme, **given, steps=first + more + 2))
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_extending_batches_and_two_points(engine):
+    rng = np.random.default_rng(0)
+    given = {"q": rng.uniform(size=(5, 2)), "v": rng.uniform(size=(5, 2)), "step": 0.1, "save_every": 2, "engine": engine}
+    sol, whole = (dx.simulate(HENON, MIDPOINT, **given, steps=steps) for steps in (5, 12))
+    sol = sol.extend(7)
+    assert_equal_batches(sol, whole)
+    two = {"q0": [0.3, 0.1], "q1": [0.31, 0.12], "step": 0.1, "engine": engine}
+    assert_same(dx.simulate(HENON, MIDPOINT, **two, steps=4).extend(3), dx.simulate(HENON, MIDPOINT, **two, steps=7))
+
+
+def assert_equal_batches(a, b):
+    assert list(a.message) == list(b.message)
+    for name in a.fields:
+        np.testing.assert_array_equal(a.fields[name], b.fields[name])
+
+
+def test_a_failed_trajectory_stays_as_it_is_when_the_others_go_on():
+    edge = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sum(jnp.sqrt(q)))
+    given = {"q": [[1.0], [0.25]], "v": [[0.0], [-1.0]], "step": 0.1}
+    sol, whole = (dx.simulate(edge, MIDPOINT, **given, steps=steps) for steps in (6, 9))
+    assert list(whole.ok) == [True, False]
+    assert_equal_batches(sol.extend(3), whole)
+    assert_same(sol[1], dx.simulate(edge, MIDPOINT, q=[0.25], v=[-1.0], step=0.1, steps=6).extend(3))
+
+
+def test_extending_what_does_not_know_how_it_was_run():
+    sol = dx.simulate(HENON, MIDPOINT, q=[0.3, 0.1], v=[0.2, 0.3], **STEP)
+    with pytest.raises(ValueError, match="extend that"):
+        sol[0:2].extend(3)
+    with pytest.raises(ValueError, match="steps must be a whole number"):
+        sol.extend(0)
+
+
+def test_stats_account_for_the_time_of_a_call():
+    system = dx.LagrangeDirac(lambda q, v: (v @ v - q @ q) / 2 - jnp.sum(jnp.cos(q)) * jnp.sin(q[0]) * v[1])
+    for _ in range(2):
+        began = time.perf_counter()
+        sol = dx.simulate(system, MIDPOINT, q=[0.3, 0.1], v=[0.2, 0.3], step=1e-3, steps=200_000)
+        wall = time.perf_counter() - began
+        accounted = sum(value for name, value in sol.stats.items() if name.endswith("_seconds"))
+        assert 0.95 * wall <= accounted <= wall

@@ -1,0 +1,91 @@
+"""dx.circuit: linear ones as implicit systems, diode-like resistors and sources in time as Circuits, against exact solutions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+
+MIDPOINT = dx.DiscreteDirac()
+DIODE = ("R", 1, 2, lambda u: 0.1 * jnp.expm1(5.0 * u))
+
+
+def test_a_transformer_transforms_an_inductor():
+    """A capacitor sees n²L through a transformer: ω = 1/√(n² L C)."""
+    system = dx.circuit([("C", 1, 0, 2.0), ("T", (1, 0), (2, 0), 3.0), ("L", 2, 0, 0.5)])
+    assert isinstance(system, dx.ImplicitSystem)
+    sol = dx.simulate(system, dx.Composition(MIDPOINT, "suzuki8"), x=[1.0, 0.0], step=0.5, steps=40)
+    np.testing.assert_allclose(sol.x[:, 0], 1.0 * np.cos(sol.t / 3.0), atol=1e-10)
+
+
+@pytest.mark.parametrize("value", [2.0, lambda t: 2.0 + 0.0 * t], ids=["constant", "function"])
+def test_a_current_source_charges_a_capacitor(value):
+    """From the ground into node 1: q̇ = I − u/R, q = I R C (1 − exp(−t/RC))."""
+    system = dx.circuit([("I", 0, 1, value), ("C", 1, 0, 0.5), ("R", 1, 0, 4.0)])
+    sol = dx.simulate(system, MIDPOINT, x=[0.0], step=0.01, steps=200)
+    np.testing.assert_allclose(sol.x[:, 0], 4.0 * (1 - np.exp(-sol.t / 2.0)), atol=1e-4)
+
+
+def test_a_diode_discharges_a_capacitor_as_it_should():
+    """q̇ = −I_s (exp(q/C v) − 1), solved by exp(−u/v) − 1 = (exp(−u_0/v) − 1) exp(−…): w = 1 − e^{−5u} decays by e^{−t/2}."""
+    system = dx.circuit([("C", 1, 0, 1.0), ("R", 1, 0, lambda u: 0.1 * jnp.expm1(5.0 * u))])
+    assert isinstance(system, dx.Circuit)
+    errors = []
+    for step in (0.02, 0.01):
+        sol = dx.simulate(system, MIDPOINT, x=[0.8], step=step, steps=round(2 / step))
+        w = (1 - np.exp(-4.0)) * np.exp(-0.5 * sol.t)
+        errors.append(np.max(np.abs(sol.x[:, 0] + np.log1p(-w) / 5.0)))
+    assert errors[1] < 2e-4 and np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_the_books_of_a_rectifier_close(engine):
+    """The midpoint rule keeps a quadratic energy but for what sources and resistors exchange, to roundoff."""
+    netlist = [("V", 1, 0, lambda t: jnp.sin(t)), DIODE, ("C", 2, 0, 2.0), ("L", 2, 3, 1.0), ("R", 3, 0, 5.0)]
+    system = dx.circuit(netlist)
+    sol = dx.simulate(system, MIDPOINT, x=[0.0, 0.0], step=0.05, steps=200, engine=engine)
+    assert sol.ok and sol.stats["engine"] == engine
+    e1, e2, e3, current = sol.multipliers.T
+    np.testing.assert_allclose(e1, np.sin(sol.t[:-1] + 0.025), atol=1e-13)
+    lost = np.asarray(jax.vmap(DIODE[3])(e1 - e2)) * (e1 - e2) + e3**2 / 5.0
+    np.testing.assert_allclose(np.diff(sol.energy()), 0.05 * (-e1 * current - lost), atol=1e-14)
+    assert sol.x[-1, 0] > 0.5 and "drifts" not in str(dx.verify(sol)).split("energy")[0]
+
+
+def test_a_linear_circuit_is_the_same_as_a_function():
+    """One with a constant source stated as a number and one stated as a function of the time."""
+    elements = [("C", 2, 0, 2.0), ("R", 1, 2, 3.0), ("L", 2, 0, 1.5)]
+    one, other = (
+        dx.simulate(dx.circuit([("V", 1, 0, value), *elements]), MIDPOINT, x=[0.3, 0.1], step=0.05, steps=50)
+        for value in (1.5, lambda t: 1.5 + 0.0 * t)
+    )
+    np.testing.assert_allclose(one.x, other.x, atol=1e-13)
+    np.testing.assert_allclose(one.multipliers, other.multipliers, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "element, error, message",
+    [
+        (("D", 1, 0, 1.0), ValueError, "an element is"),
+        (("R", 1, 1, 1.0), ValueError, "between two nodes"),
+        (("L", 1, 0, -1.0), ValueError, "value > 0"),
+        (("T", 1, 0, 1.0), ValueError, r"a transformer is \(T, \(a, b\), \(c, d\), ratio\)"),
+        (("C", 1, 0, lambda t: t), TypeError, "only R, V and I may be functions"),
+        (("V", 1, 0, "1"), TypeError, "a finite number, or a function"),
+        (("R", 1, 0, lambda u: -u), ValueError, "has the sign of its voltage"),
+        (("R", 1, 0, lambda u: u / (1 + 100 * u * u)), ValueError, "never falls"),
+        (("C", 5, 6, 1.0), ValueError, "not connected to the ground"),
+    ],
+)
+def test_what_is_no_element_is_refused(element, error, message):
+    with pytest.raises(error, match=message):
+        dx.circuit([("C", 1, 0, 1.0), element])
+
+
+def test_data_of_the_wrong_length_and_off_the_laws():
+    system = dx.circuit([("V", 1, 0, jnp.sin), ("C", 1, 0, 1.0)])
+    with pytest.raises(ValueError, match="x are the charges"):
+        dx.simulate(system, MIDPOINT, x=[0.0, 1.0], step=0.1, steps=2)
+    with pytest.raises(ValueError, match="off the constraint"):
+        dx.simulate(system, MIDPOINT, x=[1.0], step=0.1, steps=2)
