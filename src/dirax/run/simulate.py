@@ -19,7 +19,15 @@ from dirax.run.redundancy import redundant_constraints
 from dirax.run.refused_start import refuse_bad_start
 from dirax.run.result import solution_of
 from dirax.run.start import begun, completed
-from dirax.run.validate import check_kinds, count, engine_from, refuse_more_than_memory, validated_case
+from dirax.run.validate import (
+    MOST_ITERATIONS,
+    check_kinds,
+    count,
+    engine_from,
+    refuse_clock_that_stands,
+    refuse_more_than_memory,
+    validated_case,
+)
 from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
 from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
@@ -75,10 +83,10 @@ def simulate(
     """
     # validate
     check_kinds(system, scheme)
-    on, steps, save_every, max_iterations = (
-        engine_from(engine), count(steps, "steps"), count(save_every, "save_every"), count(max_iterations, "max_iterations")
-    )  # fmt: skip
+    on, steps, save_every = engine_from(engine), count(steps, "steps"), count(save_every, "save_every")
+    max_iterations = count(max_iterations, "max_iterations", MOST_ITERATIONS)
     case = validated_case({"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, params, batch_params, step, t0)
+    refuse_clock_that_stands(case.t0, case.h, steps)
     system = system if inputs is None else system.with_inputs(inputs)
     data, own = case.first
     # discretize: constraints that follow from others at the completed data are left out of the equation
@@ -112,7 +120,7 @@ def simulate(
         h=case.h,
         t0=case.t0,
         steps=steps - int(case.two_points),
-        save_every=save_every,
+        save_every=min(save_every, max(1, steps - int(case.two_points))),
         first_step=int(case.two_points),
         params=jax.tree.map(jnp.asarray, case.params) if traced else case.params,
         batch=case.batch,
