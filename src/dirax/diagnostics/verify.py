@@ -7,6 +7,7 @@ from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
 from dirax.diagnostics.final_manifold_lines import final_manifold
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
+from dirax.diagnostics.replay_lines import replayed
 from dirax.diagnostics.report import OK, VIOLATED, Line, Report
 from dirax.diagnostics.residuals import residual_size
 from dirax.diagnostics.structure_lines import membership, structure_of, symplecticity
@@ -58,6 +59,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     structure = structure_of(whole)
     lines = [
         _completion(sol),
+        replayed(sol, tolerance),
         *membership(whole, structure, tolerance),
         constraint(whole, structure, tolerance),
         hidden_constraint(whole, tolerance),

@@ -79,6 +79,10 @@ class AbstractStep(ABC):
         """Where Newton's method starts: at the unknowns extrapolated from the steps before."""
         return previous
 
+    def resume(self, state: Float[Array, " s"], row: dict[str, Array], h: Any, params: Any) -> Float[Array, " s"]:
+        """The state that a saved row was left at: the one that a run from the row would start from."""
+        return state
+
     def equation(self) -> StepEquation:
         """The StepEquation of the step."""
         return StepEquation(
@@ -95,4 +99,5 @@ class AbstractStep(ABC):
             remark=self.remark,
             review=self.review,
             guess=self.guess,
+            resume=self.resume,
         )

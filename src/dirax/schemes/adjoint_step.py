@@ -65,6 +65,9 @@ class AdjointStep(AbstractStep):
         increment, inner = self.unknowns.split(previous)
         return self.unknowns.replace(previous, inner=self.inner.guess(state + h * increment, inner, -h, params))
 
+    def resume(self, state, row, h, params):
+        return self.inner.resume(state, row, -h, params)
+
     def check(self, data, h, params):
         self.inner.check(data, -h, params)
         if isinstance(self.inner.check, NothingGrows):

@@ -119,6 +119,12 @@ class DiscreteGradientStep(AbstractStep):
         state = self.state.join(x=data["x"], first=self.energy.hamiltonian(data["x"], params))
         return state, self.unknowns.join(velocity=data["velocity"])
 
+    def resume(self, state, row, h, params):
+        """With the books since the start, which say what H was there."""
+        supplied, dissipated = row["work"]
+        first = self.energy.hamiltonian(row["x"], params) - (supplied - dissipated)
+        return self.state.join(x=row["x"], supplied=supplied, dissipated=dissipated, first=first)
+
 
 def _along(change, gradient, missing, blurred):
     """The multiple a Δx of the step with ⟨a Δx, Δx⟩ = `missing`, faded out where |∇̄H||Δx| is lost in what is `blurred`.

@@ -139,3 +139,8 @@ class StepInCharts(AbstractStep):
         here, r, p = self.atlas.enter(data["q"], data["p"])
         # the unknowns are a first guess of the velocity
         return self.state.join(chart=here.base, r=r, p=p), here.components(data["v"])
+
+    def resume(self, state, row, h, params):
+        """In the chart that was in use."""
+        r, p = self.chart(row["chart"]).momentum_to_local(row["q"], row["p"])
+        return self.state.join(chart=row["chart"], r=r, p=p)

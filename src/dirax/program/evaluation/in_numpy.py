@@ -23,6 +23,18 @@ class Values:
         columns = np.asarray(array, dtype=np.float64).reshape(self.entries, -1).T
         self._known.update(zip(nodes.ravel().tolist(), columns, strict=True))
 
+    def without(self, nodes: set[int]) -> "Values":
+        """What is known of all other nodes."""
+        other = Values(self.graph, self.entries)
+        other._known = {node: value for node, value in self._known.items() if node not in nodes}
+        return other
+
+    def at(self, entries: np.ndarray) -> "Values":
+        """What is known at some of the entries."""
+        other = Values(self.graph, len(entries))
+        other._known = {n: v[entries] if isinstance(v, np.ndarray) and v.ndim else v for n, v in self._known.items()}
+        return other
+
     def read(self, nodes: Nodes) -> np.ndarray:
         """The values of nodes (…), an array (entries, …)."""
         table = np.empty((nodes.size, self.entries))

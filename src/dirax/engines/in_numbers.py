@@ -1,0 +1,224 @@
+"""Steps of many states at once in NumPy, by the scalar program of the step: nothing is compiled, and no engine is asked."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dirax.engines.step_program import StepProgram, step_program
+from dirax.numerics.tolerances import EPSILON
+from dirax.program.evaluation.in_numpy import LANES, Values
+from dirax.schemes.step import StepEquation, StepSequence, needs_every_part
+
+UPDATES = 40
+"""Updates of Newton's method after which a step has no solution."""
+
+FOUND = 8 * EPSILON
+"""Relative updates below this are roundoff."""
+
+KEPT = 1e-5
+"""An update below this is made by the Jacobian of the one before."""
+
+LEFT = 1e-6
+"""The last update of a step that has a solution, however badly it is conditioned."""
+
+
+@dataclass
+class Attempts:
+    """Steps that were tried from as many states: unknowns and first state of each stage, the states after the step, and which
+    steps have a solution. Every array has an axis of the states in front."""
+
+    unknowns: list[np.ndarray]
+    states: list[np.ndarray]
+    after: np.ndarray
+    good: np.ndarray
+
+
+@dataclass(eq=False)
+class StepsInNumbers:
+    """The steps of an equation as functions of arrays with an axis of states in front; `params` (states, numbers) in all."""
+
+    equation: StepEquation | StepSequence
+    program: StepProgram
+    _depends: list[set[int]] = field(init=False)
+
+    def __post_init__(self):
+        _ = self.program.jacobians  # with which the graph has all its nodes
+        self._depends = [self._moving(e.unknowns) for e in self.program.equations]
+
+    @classmethod
+    def of(cls, equation: StepEquation | StepSequence, params: Any, batch_params: bool) -> "StepsInNumbers":
+        """Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for one with too large a Jacobian."""
+        return cls(equation, step_program(equation, params, batch_params))
+
+    @property
+    def operations(self) -> int:
+        """About how many scalar operations a step takes."""
+        return 4 * len(self.program.graph) * len(self.program.stages)
+
+    def parameters(self, params: Any, batch: int | None) -> np.ndarray:
+        """The numbers of `params`, (numbers,) or with a batch axis (B, numbers)."""
+        return self.program.parameters.flatten(params, batch)
+
+    def step(
+        self,
+        states: np.ndarray,
+        guesses: Sequence[np.ndarray],
+        t: np.ndarray,
+        h: float,
+        params: np.ndarray,
+        noise: "Noise | None" = None,
+    ) -> Attempts:
+        """A step of each state (states, s), with one guess (states, k) a stage."""
+        parts = []
+        for low in range(0, max(len(states), 1), LANES):
+            some = slice(low, low + LANES)
+            parts.append(self._step(states[some], [g[some] for g in guesses], t[some], h, params[some], noise))
+        join = np.concatenate
+        return Attempts(
+            [join(a) for a in zip(*(p.unknowns for p in parts), strict=True)],
+            [join(a) for a in zip(*(p.states for p in parts), strict=True)],
+            join([p.after for p in parts]),
+            join([p.good for p in parts]),
+        )
+
+    def _step(self, states, guesses, t, h, params, noise) -> Attempts:
+        unknowns, begun, good = [], [], np.ones(len(states), bool)
+        for (index, fraction), guess in zip(self.program.stages, guesses, strict=True):
+            e, at = self.program.equations[index], (t, np.full(len(t), fraction * h), params)
+            states = noise.of_states(states) if noise else states
+            u, solved = self._solved(index, guess, states, at, noise)
+            known = self._values(index, u, states, at)
+            begun.append(states)
+            unknowns.append(u)
+            states, t, good = known.read(_nodes(e.advance)), t + fraction * h, good & solved
+        return Attempts(unknowns, begun, states, good & np.all(np.isfinite(states), axis=1))
+
+    def taken(self, state: np.ndarray, u: np.ndarray, t: np.ndarray, h: float, params: np.ndarray) -> Attempts:
+        """The steps of one stage with these unknowns, which nothing solves."""
+        known = self._values(self.program.stages[0][0], u, state, (t, np.full(len(t), h), params))
+        after = known.read(_nodes(self.program.equations[self.program.stages[0][0]].advance))
+        return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
+
+    def rows(self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray) -> dict[str, np.ndarray]:
+        """The named arrays of the rows that the steps leave."""
+        parts = []
+        stages = self.program.stages if needs_every_part(self.equation) else self.program.stages[:1]
+        for i, (index, fraction) in enumerate(stages):
+            rows, pieces = self.program.equations[index].rows, {}
+            for low in range(0, max(len(t), 1), LANES):
+                some = slice(low, low + LANES)
+                at = (t[some], np.full(len(t[some]), fraction * h), params[some])
+                known = self._values(index, made.unknowns[i][some], made.states[i][some], at)
+                for name, nodes in rows.items():
+                    pieces.setdefault(name, []).append(known.read(nodes))
+            parts.append({name: np.concatenate(a) for name, a in pieces.items()})
+            t = t + fraction * h
+        if len(parts) == 1:
+            return parts[0]
+        whole = {}
+        for name, about in self.equation.fields.items():
+            arrays = [about.weight(f) * row[name] for row, (_, f) in zip(parts, self.program.stages, strict=True)]
+            each = about.rule == "each"
+            whole[name] = parts[0][name] if about.rule == "first" else np.stack(arrays, axis=1) if each else sum(arrays)
+        return whole
+
+    def _solved(self, index: int, guess, states, at, noise) -> tuple[np.ndarray, np.ndarray]:
+        """The unknowns (states, k) of a stage by Newton's method, and where it has a solution."""
+        e = self.program.equations[index]
+        count, k = guess.shape
+        if not k:
+            return guess, np.ones(count, bool)
+        known = self._values(index, guess, states, at, previous=guess)
+        u = known.read(_nodes(e.guess))
+        aim, inverse = np.zeros((count, k)), np.zeros((count, k, k))
+        fixed = known.without(self._depends[index])
+        last, good, left = np.full(count, np.inf), np.zeros(count, bool), np.arange(count)
+        for update in range(UPDATES):
+            some = fixed.at(left)
+            some.bind(_nodes(e.unknowns), u[left])
+            residual = some.read(_nodes(e.residual)) - aim[left]
+            renewed = last[left] > KEPT
+            if np.any(renewed):
+                slopes = self._slopes(index, some if np.all(renewed) else some.at(np.flatnonzero(renewed)))
+                inverse[left[renewed]] = _inverses(slopes)
+                if noise and update == 0:
+                    aim = noise.of_residuals(np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u)))
+                    residual = residual - aim
+            change = np.einsum("rij,rj->ri", inverse[left], residual)
+            u[left] -= change
+            size = np.maximum(np.abs(u[left]), np.nanmax(np.abs(u), axis=0, initial=0.0))
+            moved = np.max(np.divide(np.abs(change), size, out=np.zeros_like(change), where=size > 0), axis=1)
+            moved = np.where(np.all(np.isfinite(change), axis=1), moved, np.nan)
+            ended = (moved <= FOUND) | ((moved >= last[left] / 2) & (moved < LEFT)) | np.isnan(moved)
+            good[left] = moved < LEFT
+            last[left] = moved
+            left = left[~ended]
+            if not len(left):
+                break
+        return u, good
+
+    def _values(self, index: int, u, states, at, previous: np.ndarray | None = None) -> Values:
+        e, shared = self.program.equations[index], self.program.shared
+        known = Values(self.program.graph, len(states))
+        pairs = [(e.unknowns, u), (e.state, states), (shared.t, at[0]), (shared.h, at[1]), (shared.params, at[2])]
+        for nodes, array in pairs + ([] if previous is None else [(e.previous, previous)]):
+            known.bind(_nodes(nodes), array)
+        return known
+
+    def _slopes(self, index: int, known: Values) -> np.ndarray:
+        """The Jacobians (states, k, k) of a residual."""
+        rows = self.program.jacobians[index]
+        places = [(i, j, node) for i, row in enumerate(rows) for j, node in row.items()]
+        out = np.zeros((known.entries, len(rows), len(rows)))
+        if places:
+            i, j, nodes = zip(*places, strict=True)
+            out[:, list(i), list(j)] = known.read(_nodes(nodes))
+        return out
+
+    def _moving(self, inputs: list[int]) -> set[int]:
+        """The nodes that depend on these."""
+        moving, args = set(inputs), self.program.graph.args
+        for node in range(len(args)):
+            if node not in moving and any(a in moving for a in args[node]):
+                moving.add(node)
+        return moving
+
+
+@dataclass
+class Noise:
+    """Changes of states and of equations at random, by `size` of their terms, to see what their rounding does."""
+
+    size: float
+    draw: np.random.Generator
+    scales: np.ndarray
+    """The sizes of the entries of a state over the run."""
+
+    def of_states(self, states: np.ndarray) -> np.ndarray:
+        """The states with every entry changed."""
+        return states + self.size * self.draw.uniform(-1, 1, states.shape) * np.maximum(np.abs(states), self.scales)
+
+    def of_residuals(self, terms: np.ndarray) -> np.ndarray:
+        """What is left of equations with terms of these sizes."""
+        return self.size * self.draw.uniform(-1, 1, terms.shape) * terms
+
+
+def _inverses(matrices: np.ndarray) -> np.ndarray:
+    """The inverses (rows, k, k), NaN where there is none."""
+    with np.errstate(all="ignore"):
+        try:
+            return np.linalg.inv(matrices)
+        except np.linalg.LinAlgError:
+            return np.stack([_inverse(matrix) for matrix in matrices])
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
+
+
+def _nodes(nodes: Any) -> np.ndarray:
+    return np.asarray(nodes, dtype=np.int64)
