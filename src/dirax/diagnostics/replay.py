@@ -151,6 +151,8 @@ class Replay:
         program, sol = self.steps.program, self.sol
         sizes = [len(program.equations[index].unknowns) for index, _ in program.stages]
         states, *guesses = np.split(self._started(lanes, rows), np.cumsum([self.state_size, *sizes])[:-1], axis=1)
+        for i in self.constants:
+            states[:, i] = self._started(np.arange(self.sol.batch or 1), np.zeros(self.sol.batch or 1, int))[lanes, i]
         for i, (name, place) in self.held.items():
             states[:, i] = self.saved[name].reshape(*self.saved[name].shape[:2], -1)[lanes, rows, place]
         gaps = np.append(np.diff(self.counts), 1.0)
@@ -162,6 +164,12 @@ class Replay:
     def state_size(self) -> int:
         """Numbers of a state."""
         return len(self.steps.program.equations[self.steps.program.stages[0][0]].state)
+
+    @cached_property
+    def constants(self) -> list[int]:
+        """The entries of a state that no row holds and no step changes: they are those of the first row."""
+        equations = self.steps.program.equations
+        return [i for i in range(self.state_size) if i not in self.held and all(e.advance[i] == e.state[i] for e in equations)]
 
     def _started(self, lanes: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """States and first guesses of all stages, (entries, numbers), of runs that would start from the rows."""
@@ -184,7 +192,7 @@ class Replay:
         """The steps that leave these rows, up to the next saved ones."""
         h, steps = float(self.sol.step), self.steps
         made = steps.step(at.states, guesses or at.guesses, at.t, h, at.params, noise)
-        here = steps.rows(made, at.t, h, at.params)
+        here = steps.rows(made, at.t, h, at.params, noise)
         last, after, good = made, made.after.copy(), made.good.copy()
         unknowns = [u.copy() for u in made.unknowns]
         left, bends = np.arange(len(at.rows)), [np.zeros_like(u) for u in made.unknowns]
@@ -205,8 +213,8 @@ class Replay:
         there = None
         if self.hides:
             t = at.t + at.steps * h
-            then = steps.step(after, unknowns, t, h, at.params)
-            there = steps.rows(then, t, h, at.params)
+            then = steps.step(after, unknowns, t, h, at.params, noise)
+            there = steps.rows(then, t, h, at.params, noise)
             there = {name: np.where(_column(then.good & good, a), a, np.nan) for name, a in there.items()}
         here = {name: np.where(_column(made.good, a), a, np.nan) for name, a in here.items()}
         return Again(here, np.where(good[:, None], after, np.nan), good, there, made.unknowns, made.states[0])

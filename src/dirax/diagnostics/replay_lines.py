@@ -180,15 +180,14 @@ class _Comparison:
     def _scale_at(self, entries: np.ndarray) -> np.ndarray:
         """How far the numbers that the steps of these entries say move, relative to the disturbance of all that they are
         made of."""
-        at, draw = self.at[entries], np.random.default_rng(0)
+        at = self.at[entries]
         if not len(entries):
             return np.zeros((0, self.saved.shape[1]))
         guesses = [u[entries] for u in self.again.unknowns]
-        sizes = np.max(np.abs(self.at.states), axis=0)
         said = self._said(self.replay.again(at, guesses=guesses))
         moved = np.zeros_like(said[0])
-        for _ in range(OFTEN):
-            noise = Noise(DISTURBANCE, draw, sizes)
+        for seed in range(OFTEN):
+            noise = Noise(DISTURBANCE, seed)
             for one, other in zip(said, self._said(self.replay.again(at, noise, guesses)), strict=True):
                 moved = np.maximum(moved, np.nan_to_num(np.abs(one - other), posinf=0.0))
         return moved / DISTURBANCE

@@ -1,6 +1,6 @@
 """Steps of many states at once in NumPy, by the scalar program of the step: nothing is compiled, and no engine is asked."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 from dirax.engines.step_program import StepProgram, step_program
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Values
+from dirax.program.operations import BOOLEAN, NUMPY
 from dirax.schemes.step import StepEquation, StepSequence, needs_every_part
 
 UPDATES = 40
@@ -87,9 +88,8 @@ class StepsInNumbers:
         unknowns, begun, good = [], [], np.ones(len(states), bool)
         for (index, fraction), guess in zip(self.program.stages, guesses, strict=True):
             e, at = self.program.equations[index], (t, np.full(len(t), fraction * h), params)
-            states = noise.of_states(states) if noise else states
             u, solved = self._solved(index, guess, states, at, noise)
-            known = self._values(index, u, states, at)
+            known = self._values(index, u, states, at, noise)
             begun.append(states)
             unknowns.append(u)
             states, t, good = known.read(_nodes(e.advance)), t + fraction * h, good & solved
@@ -101,7 +101,9 @@ class StepsInNumbers:
         after = known.read(_nodes(self.program.equations[self.program.stages[0][0]].advance))
         return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
 
-    def rows(self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray) -> dict[str, np.ndarray]:
+    def rows(
+        self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: "Noise | None" = None
+    ) -> dict[str, np.ndarray]:
         """The named arrays of the rows that the steps leave."""
         parts = []
         stages = self.program.stages if needs_every_part(self.equation) else self.program.stages[:1]
@@ -110,7 +112,7 @@ class StepsInNumbers:
             for low in range(0, max(len(t), 1), LANES):
                 some = slice(low, low + LANES)
                 at = (t[some], np.full(len(t[some]), fraction * h), params[some])
-                known = self._values(index, made.unknowns[i][some], made.states[i][some], at)
+                known = self._values(index, made.unknowns[i][some], made.states[i][some], at, noise)
                 for name, nodes in rows.items():
                     pieces.setdefault(name, []).append(known.read(nodes))
             parts.append({name: np.concatenate(a) for name, a in pieces.items()})
@@ -130,41 +132,39 @@ class StepsInNumbers:
         count, k = guess.shape
         if not k:
             return guess, np.ones(count, bool)
-        known = self._values(index, guess, states, at, previous=guess)
-        u = known.read(_nodes(e.guess))
-        aim, inverse = np.zeros((count, k)), np.zeros((count, k, k))
-        fixed = known.without(self._depends[index])
-        last, good, left = np.full(count, np.inf), np.zeros(count, bool), np.arange(count)
-        for update in range(UPDATES):
+        known = self._values(index, guess, states, at)
+        known.bind(_nodes(e.previous), guess)
+        u, fixed = known.read(_nodes(e.guess)), known.without(self._depends[index])
+        inverse, size = np.zeros((count, k, k)), np.zeros((count, k))
+        last, left = np.full(count, np.inf), np.arange(count)
+        for _ in range(UPDATES):
             some = fixed.at(left)
             some.bind(_nodes(e.unknowns), u[left])
-            residual = some.read(_nodes(e.residual)) - aim[left]
-            renewed = last[left] > KEPT
-            if np.any(renewed):
+            if np.any(renewed := last[left] > KEPT):
                 slopes = self._slopes(index, some if np.all(renewed) else some.at(np.flatnonzero(renewed)))
-                inverse[left[renewed]] = _inverses(slopes)
-                if noise and update == 0:
-                    aim = noise.of_residuals(np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u)))
-                    residual = residual - aim
-            change = np.einsum("rij,rj->ri", inverse[left], residual)
+                new = left[renewed]
+                inverse[new] = _inverses(slopes)
+                terms = np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u[new]))
+                size[new] = np.einsum("rij,rj->ri", np.abs(inverse[new]), terms)
+            change = np.einsum("rij,rj->ri", inverse[left], some.read(_nodes(e.residual)))
             u[left] -= change
-            size = np.maximum(np.abs(u[left]), np.nanmax(np.abs(u), axis=0, initial=0.0))
-            moved = np.max(np.divide(np.abs(change), size, out=np.zeros_like(change), where=size > 0), axis=1)
-            moved = np.where(np.all(np.isfinite(change), axis=1), moved, np.nan)
+            moved = _largest_ratio(change, np.maximum(np.abs(u[left]), size[left]))
             ended = (moved <= FOUND) | ((moved >= last[left] / 2) & (moved < LEFT)) | np.isnan(moved)
-            good[left] = moved < LEFT
             last[left] = moved
             left = left[~ended]
             if not len(left):
                 break
-        return u, good
+        if noise:
+            known = self._values(index, u, states, at, noise)
+            u = u - np.einsum("rij,rj->ri", inverse, known.read(_nodes(e.residual)))
+        return u, last < LEFT
 
-    def _values(self, index: int, u, states, at, previous: np.ndarray | None = None) -> Values:
+    def _values(self, index: int, u, states, at, noise: "Noise | None" = None) -> Values:
         e, shared = self.program.equations[index], self.program.shared
-        known = Values(self.program.graph, len(states))
+        known = Values(self.program.graph, len(states), noise.table if noise else None)
         pairs = [(e.unknowns, u), (e.state, states), (shared.t, at[0]), (shared.h, at[1]), (shared.params, at[2])]
-        for nodes, array in pairs + ([] if previous is None else [(e.previous, previous)]):
-            known.bind(_nodes(nodes), array)
+        for nodes, array in pairs:
+            known.bind(_nodes(nodes), noise.off(array) if noise else array)
         return known
 
     def _slopes(self, index: int, known: Values) -> np.ndarray:
@@ -186,22 +186,24 @@ class StepsInNumbers:
         return moving
 
 
-@dataclass
 class Noise:
-    """Changes of states and of equations at random, by `size` of their terms, to see what their rounding does."""
+    """Arithmetic in which the result of every operation is off at random, by up to `size` of itself (Vignes 1978): what
+    happens to the numbers that come out is what rounding does to them, ε/2 in place of `size`."""
 
-    size: float
-    draw: np.random.Generator
-    scales: np.ndarray
-    """The sizes of the entries of a state over the run."""
+    def __init__(self, size: float, seed: int):
+        self.size, self._draw = size, np.random.default_rng(seed)
+        self.table = {name: function if name in EXACT else self._off(function) for name, function in NUMPY.items()}
 
-    def of_states(self, states: np.ndarray) -> np.ndarray:
-        """The states with every entry changed."""
-        return states + self.size * self.draw.uniform(-1, 1, states.shape) * np.maximum(np.abs(states), self.scales)
+    def off(self, values: np.ndarray) -> np.ndarray:
+        """Numbers as they would be if they had been rounded."""
+        return values * (1.0 + self.size * self._draw.uniform(-1.0, 1.0, np.shape(values)))
 
-    def of_residuals(self, terms: np.ndarray) -> np.ndarray:
-        """What is left of equations with terms of these sizes."""
-        return self.size * self.draw.uniform(-1, 1, terms.shape) * terms
+    def _off(self, function: Callable) -> Callable:
+        return lambda *operands: self.off(function(*operands))
+
+
+EXACT = BOOLEAN | {"select", "neg", "abs", "sign", "max", "min", "floor", "ceil"}
+"""The operations that do not round."""
 
 
 def _inverses(matrices: np.ndarray) -> np.ndarray:
@@ -218,6 +220,12 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
         return np.linalg.inv(matrix)
     except np.linalg.LinAlgError:
         return np.full_like(matrix, np.nan)
+
+
+def _largest_ratio(values: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """The largest |value|/size of each row, NaN where one is not finite."""
+    ratios = np.divide(np.abs(values), sizes, out=np.zeros_like(values), where=sizes > 0)
+    return np.where(np.all(np.isfinite(values), axis=1), np.max(ratios, axis=1), np.nan)
 
 
 def _nodes(nodes: Any) -> np.ndarray:
