@@ -150,9 +150,12 @@ class Replay:
         """Where the steps that leave these rows begin. Raises `CannotReplay` where the rows do not say it."""
         program, sol = self.steps.program, self.sol
         sizes = [len(program.equations[index].unknowns) for index, _ in program.stages]
-        states, *guesses = np.split(self._started(lanes, rows), np.cumsum([self.state_size, *sizes])[:-1], axis=1)
-        for i in self.constants:
-            states[:, i] = self._started(np.arange(self.sol.batch or 1), np.zeros(self.sol.batch or 1, int))[lanes, i]
+        states, *guesses = np.split(self._started(lanes, rows, False), np.cumsum([self.state_size, *sizes])[:-1], axis=1)
+        lane = np.arange(sol.batch or 1)
+        first = self._started(lane, np.zeros_like(lane), True)
+        states[:, self.constants] = first[lanes][:, self.constants]
+        at_start = np.flatnonzero(rows == 0)
+        states[at_start] = first[lanes[at_start], : self.state_size]
         for i, (name, place) in self.held.items():
             states[:, i] = self.saved[name].reshape(*self.saved[name].shape[:2], -1)[lanes, rows, place]
         gaps = np.append(np.diff(self.counts), 1.0)
@@ -171,15 +174,15 @@ class Replay:
         equations = self.steps.program.equations
         return [i for i in range(self.state_size) if i not in self.held and all(e.advance[i] == e.state[i] for e in equations)]
 
-    def _started(self, lanes: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """States and first guesses of all stages, (entries, numbers), of runs that would start from the rows."""
+    def _started(self, lanes: np.ndarray, rows: np.ndarray, anew: bool) -> np.ndarray:
+        """States and first guesses of all stages, (entries, numbers), of runs that go on from the rows, or start `anew`."""
         sol, equation = self.sol, self.sol.equation
         every, back = np.unique(rows, return_inverse=True)
         items: dict[str, Any] = {name: np.asarray(sol.fields[name]) for name in self.nodes}
         items = {name: np.take(a, every, axis=int(sol.batch is not None)) for name, a in items.items()}
         items["t"] = times_at(sol, every)
         try:
-            found = over_rows(eqx.Partial(_begun, sol.system, sol.step, Same(equation)), sol, (items,))
+            found = over_rows(eqx.Partial(_begun, sol.system, sol.step, Same(equation), anew), sol, (items,))
             return found[lanes, back]
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             if self.hides:
@@ -243,14 +246,13 @@ class Replay:
         return numbers[lanes] if sol.batch_params else np.broadcast_to(numbers, (len(lanes), len(numbers)))
 
 
-def _begun(system: Any, step: Any, same: Same, row: dict, params: Any):
-    """State and first guesses of all stages of a step that leaves a saved row."""
+def _begun(system: Any, step: Any, same: Same, anew: bool, row: dict, params: Any):
+    """State and first guesses of all stages of the step that leaves a saved row, or of a run that starts `anew` from it."""
     equation = same.object
-    data = {**system.complete(row, params, False), "t": row["t"]}
+    data = {**row, **system.complete(row, params, False), "t": row["t"]}
     (first, fraction), *others = equation.stages
-    state, u = first.start(data, fraction * step, params)
-    state = first.resume(state, row, fraction * step, params)
-    return jnp.concatenate([state, u, *(stage.start(data, part * step, params)[1] for stage, part in others)])
+    state, u = (first.start if anew else first.resume)(data, fraction * step, params)
+    return jnp.concatenate([state, u, *((s.start if anew else s.resume)(data, part * step, params)[1] for s, part in others)])
 
 
 def _from_points(system: Any, step: Any, same: Same, data: dict, params: Any):

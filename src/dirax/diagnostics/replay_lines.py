@@ -5,7 +5,7 @@ import numpy as np
 from dirax.diagnostics.judging import judged, of_lane, roundoff_limit, spread
 from dirax.diagnostics.replay import Again, CannotReplay, Replay, Rows
 from dirax.diagnostics.report import NOT_CHECKED, Line
-from dirax.engines.in_numbers import Noise
+from dirax.engines.in_numbers import SMALLEST, Noise
 from dirax.solution.solution import Solution
 
 NAME = "steps replayed"
@@ -122,7 +122,7 @@ class _Comparison:
 
     def _expect(self, entries: np.ndarray, here: np.ndarray, there: np.ndarray, if_nearer: bool = False) -> None:
         """Take what the steps of some entries say of their rows and of the next ones."""
-        first = np.full(len(entries), True) if not self.replay.hides else self.previous[entries] < 0
+        first = np.full(len(entries), True) if not self.replay.hides else self.at.rows[entries] == 0
         after = self.next[entries]
         for which, rows, said in ((first, entries, here), (after >= 0, after, there)):
             rows, said = rows[which], said[which]
@@ -155,8 +155,8 @@ class _Comparison:
     def ratios(self, limit: float) -> np.ndarray:
         """`missed`, relative to the terms of each number: those of a typical row, and in a row in doubt its own."""
         several = np.flatnonzero(self.next >= 0)
-        scale = self._scale_at(several[spread(len(several), SAMPLED)])
-        usual = np.nan_to_num(np.quantile(scale, TYPICAL, axis=0)) if len(scale) else np.zeros(self.saved.shape[1])
+        scale = np.maximum(*self._scales_at(several[spread(len(several), SAMPLED)]))
+        usual = np.quantile(scale, TYPICAL, axis=0)
         usual[-1] = np.max(np.abs(self.saved[:, -1])) + float(self.replay.sol.step)
         ratio = _ratio(self.missed, usual)
         doubted = self._worst(ratio, limit)
@@ -166,8 +166,9 @@ class _Comparison:
         ratio = _ratio(self.missed, usual)
         doubted = self._worst(ratio, limit)
         if len(doubted):
-            before = np.where(self.previous[doubted] >= 0, self.previous[doubted], doubted)
-            own = np.maximum(self._scale_at(doubted), self._scale_at(before))
+            before = self.previous[doubted]
+            said_before = np.where((before >= 0)[:, None], self._scales_at(np.maximum(before, 0))[1], 0.0)
+            own = np.maximum(self._scales_at(doubted)[0], said_before)
             ratio[doubted] = _ratio(self.missed[doubted], np.maximum(own, usual))
         return ratio
 
@@ -177,20 +178,17 @@ class _Comparison:
         doubted = np.flatnonzero(most > limit)
         return doubted if len(doubted) <= DOUBTED else np.sort(doubted[np.argsort(-most[doubted])[:DOUBTED]])
 
-    def _scale_at(self, entries: np.ndarray) -> np.ndarray:
-        """How far the numbers that the steps of these entries say move, relative to the disturbance of all that they are
-        made of."""
-        at = self.at[entries]
-        if not len(entries):
-            return np.zeros((0, self.saved.shape[1]))
-        guesses = [u[entries] for u in self.again.unknowns]
+    def _scales_at(self, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far the numbers that the steps of these entries say of their rows, and of the next ones, move, relative to what
+        every operation is off."""
+        at, guesses = self.at[entries], [u[entries] for u in self.again.unknowns]
         said = self._said(self.replay.again(at, guesses=guesses))
-        moved = np.zeros_like(said[0])
+        moved = [np.zeros_like(part) for part in said]
         for seed in range(OFTEN):
-            noise = Noise(DISTURBANCE, seed)
-            for one, other in zip(said, self._said(self.replay.again(at, noise, guesses)), strict=True):
-                moved = np.maximum(moved, np.nan_to_num(np.abs(one - other), posinf=0.0))
-        return moved / DISTURBANCE
+            off = self._said(self.replay.again(at, Noise(DISTURBANCE, seed), guesses))
+            for most, one, other in zip(moved, said, off, strict=True):
+                np.maximum(most, np.nan_to_num(np.abs(one - other), posinf=0.0), out=most)
+        return moved[0] / DISTURBANCE, moved[1] / DISTURBANCE
 
     def _try_from_neighbours(self, entries: np.ndarray) -> None:
         """Steps again from the unknowns of the steps before them, as the run had it: an equation may have several solutions."""
@@ -203,4 +201,4 @@ class _Comparison:
 def _ratio(missed: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """missed/scale; infinite where something is missed that nothing moves."""
     with np.errstate(all="ignore"):
-        return np.where(missed > 0, missed / scale, 0.0)
+        return np.where(missed > SMALLEST, missed / scale, 0.0)

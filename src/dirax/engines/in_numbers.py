@@ -21,6 +21,9 @@ FOUND = 8 * EPSILON
 KEPT = 1e-5
 """An update below this is made by the Jacobian of the one before."""
 
+SMALLEST = float(np.finfo(float).tiny) / EPSILON
+"""Numbers below this do not have all their digits, and count as zero."""
+
 LEFT = 1e-6
 """The last update of a step that has a solution, however badly it is conditioned."""
 
@@ -224,7 +227,7 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
 
 def _largest_ratio(values: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """The largest |value|/size of each row, NaN where one is not finite."""
-    ratios = np.divide(np.abs(values), sizes, out=np.zeros_like(values), where=sizes > 0)
+    ratios = np.divide(np.abs(values), sizes, out=np.zeros_like(values), where=sizes > SMALLEST)
     return np.where(np.all(np.isfinite(values), axis=1), np.max(ratios, axis=1), np.nan)
 
 

@@ -79,9 +79,9 @@ class AbstractStep(ABC):
         """Where Newton's method starts: at the unknowns extrapolated from the steps before."""
         return previous
 
-    def resume(self, state: Float[Array, " s"], row: dict[str, Array], h: Any, params: Any) -> Float[Array, " s"]:
-        """The state that a saved row was left at: the one that a run from the row would start from."""
-        return state
+    def resume(self, data: dict[str, Array], h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+        """Where the step that leaves a saved row begins: the state and a first guess of the unknowns."""
+        return self.start(data, h, params)
 
     def equation(self) -> StepEquation:
         """The StepEquation of the step."""

@@ -56,7 +56,13 @@ class AdjointStep(AbstractStep):
         return here | of_step
 
     def start(self, data, h, params):
-        state, u = self.inner.start(data, -h, params)
+        return self.before(data, h, params, *self.inner.start(data, -h, params))
+
+    def resume(self, data, h, params):
+        return self.before(data, h, params, *self.inner.resume(data, -h, params))
+
+    def before(self, data, h, params, state, u):
+        """The state and a first guess, of those of the step back."""
         back = self.inner.advance(u, state, data.get("t", 0.0), -h, params)
         return state, self.unknowns.join(increment=(state - back) / h, inner=u)
 
@@ -64,9 +70,6 @@ class AdjointStep(AbstractStep):
         """Where the inner step starts, from the state that the increment of the steps before leads to."""
         increment, inner = self.unknowns.split(previous)
         return self.unknowns.replace(previous, inner=self.inner.guess(state + h * increment, inner, -h, params))
-
-    def resume(self, state, row, h, params):
-        return self.inner.resume(state, row, -h, params)
 
     def check(self, data, h, params):
         self.inner.check(data, -h, params)

@@ -119,11 +119,12 @@ class DiscreteGradientStep(AbstractStep):
         state = self.state.join(x=data["x"], first=self.energy.hamiltonian(data["x"], params))
         return state, self.unknowns.join(velocity=data["velocity"])
 
-    def resume(self, state, row, h, params):
+    def resume(self, data, h, params):
         """With the books since the start, which say what H was there."""
-        supplied, dissipated = row["work"]
-        first = self.energy.hamiltonian(row["x"], params) - (supplied - dissipated)
-        return self.state.join(x=row["x"], supplied=supplied, dissipated=dissipated, first=first)
+        supplied, dissipated = data["work"]
+        first = self.energy.hamiltonian(data["x"], params) - (supplied - dissipated)
+        state = self.state.join(x=data["x"], supplied=supplied, dissipated=dissipated, first=first)
+        return state, self.unknowns.join(velocity=data["velocity"])
 
 
 def _along(change, gradient, missing, blurred):

@@ -140,7 +140,8 @@ class StepInCharts(AbstractStep):
         # the unknowns are a first guess of the velocity
         return self.state.join(chart=here.base, r=r, p=p), here.components(data["v"])
 
-    def resume(self, state, row, h, params):
+    def resume(self, data, h, params):
         """In the chart that was in use."""
-        r, p = self.chart(row["chart"]).momentum_to_local(row["q"], row["p"])
-        return self.state.join(chart=row["chart"], r=r, p=p)
+        here = self.chart(data["chart"])
+        r, p = here.momentum_to_local(data["q"], data["p"])
+        return self.state.join(chart=here.base, r=r, p=p), here.velocity_to_local(data["q"], data["v"])[1]

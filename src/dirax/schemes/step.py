@@ -71,9 +71,8 @@ class StepEquation(eqx.Module):
     - `remark(state, t, h, params) -> str`, what there is to say of a place from which a step fails, or "";
     - `review(fields) -> dict`, which looks at the saved arrays of a run, concrete ones, for what is to stand in its `stats`, and
       warns of what is wrong with them;
-    - `resume(state, row, h, params) -> state`: the state that a saved row was left at, of the one that a run from the row would
-      start from, where this is another: one with sums since the start, in another chart. What a row holds of a state as it is
-      need not be said;
+    - `resume(data, h, params) -> (state, u)`: where the step that leaves a saved row begins, of which `data` has the fields too,
+      and which need not be the first: `start` sets sums since the start to zero, and may choose another chart, or take longer;
     - `collocation`, the stage relation or mean relation of which the unknowns are copies: a fact that engines may use or ignore.
 
     Equations are compared by the identity of their functions. One with other functions is made by `dataclasses.replace`.
@@ -128,7 +127,7 @@ class StepEquation(eqx.Module):
         self.remark = remark or nothing_to_say
         self.review = review or nothing_to_report
         self.guess = guess or previous_unknowns
-        self.resume = resume or state_of_start
+        self.resume = resume or start
         self.collocation = collocation
         if len(self.labels) != self.unknowns:
             raise ValueError(f"labels need one entry per unknown ({self.unknowns}), but {len(self.labels)} were given.")
@@ -244,11 +243,6 @@ def _layout(part: str, layout: Layout | None, name: str, size: int | None) -> tu
 def previous_unknowns(state, previous, h, params):
     """The default guess: the unknowns extrapolated from the steps before."""
     return previous
-
-
-def state_of_start(state, row, h, params):
-    """The default state that a saved row was left at: the one that a run from the row would start from."""
-    return state
 
 
 def nothing_to_check(data, h, params) -> None:
