@@ -46,6 +46,7 @@ class StepsInNumbers:
     equation: StepEquation | StepSequence
     program: StepProgram
     _depends: list[set[int]] = field(init=False)
+    _orders: dict[bytes, list[int]] = field(init=False, default_factory=dict)
 
     def __post_init__(self):
         _ = self.program.jacobians  # with which the graph has all its nodes
@@ -95,13 +96,13 @@ class StepsInNumbers:
             known = self._values(index, u, states, at, noise)
             begun.append(states)
             unknowns.append(u)
-            states, t, good = known.read(_nodes(e.advance)), t + fraction * h, good & solved
+            states, t, good = self._read(known, e.advance), t + fraction * h, good & solved
         return Attempts(unknowns, begun, states, good & np.all(np.isfinite(states), axis=1))
 
     def taken(self, state: np.ndarray, u: np.ndarray, t: np.ndarray, h: float, params: np.ndarray) -> Attempts:
         """The steps of one stage with these unknowns, which nothing solves."""
         known = self._values(self.program.stages[0][0], u, state, (t, np.full(len(t), h), params))
-        after = known.read(_nodes(self.program.equations[self.program.stages[0][0]].advance))
+        after = self._read(known, self.program.equations[self.program.stages[0][0]].advance)
         return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
 
     def rows(
@@ -117,7 +118,7 @@ class StepsInNumbers:
                 at = (t[some], np.full(len(t[some]), fraction * h), params[some])
                 known = self._values(index, made.unknowns[i][some], made.states[i][some], at, noise)
                 for name, nodes in rows.items():
-                    pieces.setdefault(name, []).append(known.read(nodes))
+                    pieces.setdefault(name, []).append(self._read(known, nodes))
             parts.append({name: np.concatenate(a) for name, a in pieces.items()})
             t = t + fraction * h
         if len(parts) == 1:
@@ -137,11 +138,14 @@ class StepsInNumbers:
             return guess, np.ones(count, bool)
         known = self._values(index, guess, states, at)
         known.bind(_nodes(e.previous), guess)
-        u, fixed = known.read(_nodes(e.guess)), known.without(self._depends[index])
+        u = self._read(known, e.guess)
+        known = known.without(self._depends[index])
+        known.bind(_nodes(e.unknowns), u)
+        fixed = None
         inverse, size = np.zeros((count, k, k)), np.zeros((count, k))
         last, left = np.full(count, np.inf), np.arange(count)
         for _ in range(UPDATES):
-            some = fixed.at(left)
+            some = known if fixed is None else fixed.at(left) if len(left) < count else fixed.without(set())
             some.bind(_nodes(e.unknowns), u[left])
             if np.any(renewed := last[left] > KEPT):
                 slopes = self._slopes(index, some if np.all(renewed) else some.at(np.flatnonzero(renewed)))
@@ -149,7 +153,8 @@ class StepsInNumbers:
                 inverse[new] = _inverses(slopes)
                 terms = np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u[new]))
                 size[new] = np.einsum("rij,rj->ri", np.abs(inverse[new]), terms)
-            change = np.einsum("rij,rj->ri", inverse[left], some.read(_nodes(e.residual)))
+            change = np.einsum("rij,rj->ri", inverse[left], self._read(some, e.residual))
+            fixed = known.without(self._depends[index]) if fixed is None else fixed
             u[left] -= change
             moved = _largest_ratio(change, np.maximum(np.abs(u[left]), size[left]))
             ended = (moved <= FOUND) | ((moved >= last[left] / 2) & (moved < LEFT)) | np.isnan(moved)
@@ -159,7 +164,7 @@ class StepsInNumbers:
                 break
         if noise:
             known = self._values(index, u, states, at, noise)
-            u = u - np.einsum("rij,rj->ri", inverse, known.read(_nodes(e.residual)))
+            u = u - np.einsum("rij,rj->ri", inverse, self._read(known, e.residual))
         return u, last < LEFT
 
     def _values(self, index: int, u, states, at, noise: "Noise | None" = None) -> Values:
@@ -177,8 +182,16 @@ class StepsInNumbers:
         out = np.zeros((known.entries, len(rows), len(rows)))
         if places:
             i, j, nodes = zip(*places, strict=True)
-            out[:, list(i), list(j)] = known.read(_nodes(nodes))
+            out[:, list(i), list(j)] = self._read(known, nodes)
         return out
+
+    def _read(self, known: Values, nodes: Any) -> np.ndarray:
+        """The values of nodes, in an order that is found once."""
+        nodes = _nodes(nodes)
+        key = nodes.tobytes()
+        if key not in self._orders:
+            self._orders[key] = self.program.graph.reachable(nodes.ravel().tolist())
+        return known.read(nodes, self._orders[key])
 
     def _moving(self, inputs: list[int]) -> set[int]:
         """The nodes that depend on these."""

@@ -36,11 +36,11 @@ class Values:
         other._known = {n: v[entries] if isinstance(v, np.ndarray) and v.ndim else v for n, v in self._known.items()}
         return other
 
-    def read(self, nodes: Nodes) -> np.ndarray:
-        """The values of nodes (…), an array (entries, …)."""
+    def read(self, nodes: Nodes, order: list[int] | None = None) -> np.ndarray:
+        """The values of nodes (…), an array (entries, …); `order` as in `Graph.evaluate`."""
         table = np.empty((nodes.size, self.entries))
         with np.errstate(all="ignore"):
-            for row, value in enumerate(self.graph.evaluate(nodes.ravel().tolist(), {}, self.table, self._known)):
+            for row, value in enumerate(self.graph.evaluate(nodes.ravel().tolist(), {}, self.table, self._known, order)):
                 table[row] = value
         return table.T.reshape(self.entries, *nodes.shape)
 
