@@ -89,7 +89,11 @@ def test_also_where_not_every_step_is_saved(name):
 
 
 def test_also_in_a_batch():
-    start = {"q": np.array([[1.0, 0.2], [0.4, 0.3], [0.0, -2.0]]), "v": np.ones((3, 2)), "params": {"c": np.array([0.1, 0.2, 0.0])}}
+    start = {
+        "q": np.array([[1.0, 0.2], [0.4, 0.3], [0.0, -2.0]]),
+        "v": np.ones((3, 2)),
+        "params": {"c": np.array([0.1, 0.2, 0.0])},
+    }
     assert_seen(run("collocation", batch_params=True, **start))
 
 

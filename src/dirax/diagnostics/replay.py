@@ -20,6 +20,10 @@ MOST_OPERATIONS = 4e9
 """Scalar operations of the steps that are taken again, some ten seconds: of longer runs as many rows, evenly spread."""
 
 
+APART = 16
+"""Rows from one to the next that is asked where its step begins."""
+
+
 class CannotReplay(Exception):
     """Why the rows of a run are not computed again."""
 
@@ -147,21 +151,49 @@ class Replay:
         return lanes, rows
 
     def begun(self, lanes: np.ndarray, rows: np.ndarray) -> Rows:
-        """Where the steps that leave these rows begin. Raises `CannotReplay` where the rows do not say it."""
+        """Where the steps that leave these rows, in order, begin. Raises `CannotReplay` where the rows do not say it.
+
+        Rows that hold their states are asked for first guesses now and then; between them these are interpolated.
+        """
+        ends = np.append(np.diff(lanes) != 0, True)
+        some = (np.arange(len(rows)) % APART == 0) | ends | np.roll(ends, 1)
+        if self.hides or len(rows) < 4 * APART:
+            return self.resumed(lanes, rows)
+        few = self.resumed(lanes[some], rows[some])
+        made = self.steps.step(few.states, few.guesses, few.t, float(self.sol.step), few.params)
+        place = lanes.astype(float) * self.sol.rows + rows
+        good = np.flatnonzero(some)[made.good]
+        if not len(good):
+            return self.resumed(lanes, rows)
+        between = lambda u: np.stack([np.interp(place, place[good], column) for column in u[made.good].T], axis=1)
+        guesses = [between(u) if u.shape[1] else np.zeros((len(rows), 0)) for u in made.unknowns]
+        states = np.zeros((len(rows), self.state_size))
+        self._hold(states, lanes, rows)
+        return Rows(lanes, rows, states, guesses, self.times()[rows], self._gaps(lanes, rows), self.params_of(lanes))
+
+    def resumed(self, lanes: np.ndarray, rows: np.ndarray) -> Rows:
+        """The same, of every row as the scheme says."""
         program, sol = self.steps.program, self.sol
         sizes = [len(program.equations[index].unknowns) for index, _ in program.stages]
         states, *guesses = np.split(self._started(lanes, rows, False), np.cumsum([self.state_size, *sizes])[:-1], axis=1)
-        lane = np.arange(sol.batch or 1)
-        first = self._started(lane, np.zeros_like(lane), True)
-        states[:, self.constants] = first[lanes][:, self.constants]
-        at_start = np.flatnonzero(rows == 0)
-        states[at_start] = first[lanes[at_start], : self.state_size]
+        if self.hides:
+            lane = np.arange(sol.batch or 1)
+            first = self._started(lane, np.zeros_like(lane), True)[lanes, : self.state_size]
+            states[:, self.constants] = first[:, self.constants]
+            states[rows == 0] = first[rows == 0]
+        self._hold(states, lanes, rows)
+        guesses = [np.nan_to_num(guess) for guess in guesses]
+        return Rows(lanes, rows, states, guesses, self.times()[rows], self._gaps(lanes, rows), self.params_of(lanes))
+
+    def _hold(self, states: np.ndarray, lanes: np.ndarray, rows: np.ndarray) -> None:
+        """Write what the rows hold into the states."""
         for i, (name, place) in self.held.items():
             states[:, i] = self.saved[name].reshape(*self.saved[name].shape[:2], -1)[lanes, rows, place]
+
+    def _gaps(self, lanes: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Steps from the rows to the next saved ones."""
         gaps = np.append(np.diff(self.counts), 1.0)
-        steps = np.where(rows < self.ends[lanes], gaps[rows], 1.0).astype(int)
-        guesses = [np.nan_to_num(guess) for guess in guesses]
-        return Rows(lanes, rows, states, guesses, self.times()[rows], steps, self.params_of(lanes))
+        return np.where(rows < self.ends[lanes], gaps[rows], 1.0).astype(int)
 
     @property
     def state_size(self) -> int:
@@ -195,6 +227,10 @@ class Replay:
         """The steps that leave these rows, up to the next saved ones."""
         h, steps = float(self.sol.step), self.steps
         made = steps.step(at.states, guesses or at.guesses, at.t, h, at.params, noise)
+        bad = ~made.good & (at.rows < self.ends[at.lanes])
+        if np.any(bad) and guesses is None and noise is None:
+            other = self.resumed(at.lanes[bad], at.rows[bad])
+            made.put(bad, steps.step(at.states[bad], other.guesses, at.t[bad], h, at.params[bad]))
         here = steps.rows(made, at.t, h, at.params, noise)
         last, after, good = made, made.after.copy(), made.good.copy()
         unknowns = [u.copy() for u in made.unknowns]

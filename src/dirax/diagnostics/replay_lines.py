@@ -111,7 +111,9 @@ class _Comparison:
     def _said(self, again: Again) -> tuple[np.ndarray, np.ndarray]:
         """What steps say of the rows that they leave, and of the next ones; NaN where nothing."""
         count = len(again.after)
-        flat = lambda rows: np.concatenate([*(rows[n].reshape(count, -1) for n in self.sizes), np.full((count, 1), np.nan)], axis=1)
+        flat = lambda rows: np.concatenate(
+            [*(rows[n].reshape(count, -1) for n in self.sizes), np.full((count, 1), np.nan)], axis=1
+        )
         here = flat(again.here)
         if again.there is not None:
             return here, flat(again.there)

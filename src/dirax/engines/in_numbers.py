@@ -38,6 +38,13 @@ class Attempts:
     after: np.ndarray
     good: np.ndarray
 
+    def put(self, some: np.ndarray, others: "Attempts") -> None:
+        """Take other attempts in place of some."""
+        for own, other in ((self.unknowns, others.unknowns), (self.states, others.states)):
+            for array, values in zip(own, other, strict=True):
+                array[some] = values
+        self.after[some], self.good[some] = others.after, others.good
+
 
 @dataclass(eq=False)
 class StepsInNumbers:
