@@ -1,4 +1,4 @@
-"""verify() takes every step again: a saved number that is off by a millionth is seen, in any field, and no right run is accused."""
+"""verify() takes every step again: a saved number off by a millionth is seen, in any field, and no right run is accused."""
 
 import dataclasses
 

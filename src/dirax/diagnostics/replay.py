@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.rows import over_rows, times_at
-from dirax.engines.in_numbers import Attempts, Noise, StepsInNumbers
+from dirax.engines.in_numbers import Noise, StepsInNumbers
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same

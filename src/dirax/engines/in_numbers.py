@@ -61,7 +61,7 @@ class StepsInNumbers:
 
     @classmethod
     def of(cls, equation: StepEquation | StepSequence, params: Any, batch_params: bool) -> "StepsInNumbers":
-        """Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for one with too large a Jacobian."""
+        """Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for too large a Jacobian."""
         return cls(equation, step_program(equation, params, batch_params))
 
     @property

@@ -203,7 +203,7 @@ def refuse_clock_that_stands(t0: Any, h: Any, steps: int) -> None:
     at = max(t0, end, key=abs)
     if at + h == at or at - h == at:
         raise ValueError(
-            f"the times of this run are as large as {at:.6g}, where floats are {np.spacing(abs(at)):.3g} apart, so that a step of "
+            f"the times of this run are as large as {at:.6g}, where floats are {np.spacing(abs(at)):.3g} apart, and a step of "
             f"{h:.3g} is lost (t + h = t): take a larger step, or count time from a t0 near 0."
         )
 
