@@ -1,1 +1,1 @@
-"""Random Lagrangian systems with every kind of constraint, run by every scheme and examined: `python -m fuzz 100` (from tests)."""
+"""Random Lagrangian systems with every kind of constraint, run by every scheme and examined: `make fuzz`."""

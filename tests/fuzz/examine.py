@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fuzz.reference import motion
-from fuzz.systems import Kind, RandomSystem
 
 import dirax as dx
 from dirax.diagnostics.replay_lines import replayed
+from fuzz.reference import motion
+from fuzz.systems import Kind, RandomSystem
 
 LAGRANGE = dx.LagrangeDAlembert()
 SCHEMES = {

@@ -5,8 +5,9 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fuzz.systems import RandomSystem
 from scipy.integrate import solve_ivp
+
+from fuzz.systems import RandomSystem
 
 
 @functools.lru_cache(maxsize=64)
