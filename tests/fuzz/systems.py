@@ -1,5 +1,7 @@
-"""Random systems: L = ½ vᵀM(q)v + A(t, q)·v − V(t, q) with forces, one-forms, affine parts, holonomic constraints, moving ones and
-ones that follow from others. All coefficients are parameters, so that what is compiled serves every system of one kind."""
+"""Random systems: L = ½ vᵀM(q)v + A(q)·v − V(t, q) with forces, one-forms, affine parts, holonomic constraints, moving ones and
+ones that follow from others.
+
+All coefficients are parameters, so that what is compiled serves every system of one kind."""
 
 from dataclasses import dataclass
 from typing import Any
