@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from dirax.diagnostics.judging import judged, of_lane, roundoff_limit, spread
 from dirax.diagnostics.replay import Again, CannotReplay, Replay, Rows
 from dirax.diagnostics.report import NOT_CHECKED, Line
+from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread
 from dirax.engines.in_numbers import SMALLEST, Noise
 from dirax.solution.solution import Solution
 
