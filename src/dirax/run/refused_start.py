@@ -94,12 +94,24 @@ def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool)
     unknowns = jacobian.shape[1]
     if np.any(ranks < unknowns):
         lane = int(np.argmax(ranks < unknowns))
+        reason = (
+            "The Lagrangian is singular together with its constraints: remove the coordinates that it does not determine, or "
+            "choose another discrete Lagrangian."
+        )
+        if singular and any(label.startswith("projection") for label in labels):
+            reason = (
+                "The Lagrangian is singular (∂²L/∂v²), and a part of a composition ends at the momentum of a velocity on the "
+                "constraints, which such a Lagrangian does not determine: take the scheme by itself, with smaller steps."
+            )
+        elif singular:
+            reason = (
+                "The Lagrangian is singular (∂²L/∂v²), and this discrete Lagrangian does not say where the coordinates go whose "
+                'velocities it leaves out: take one that does, such as "midpoint", or dx.DiscreteDirac(constraints="resolve").'
+            )
         raise ValueError(
             f"the first step has no unique solution: its matrix ([PY] (21)) has rank {ranks[lane]} of {unknowns} at the "
             f"initial data{_which(ranks < unknowns)}, and leaves the direction "
-            f"{np.array2string(directions[lane], precision=2, suppress_small=True)} of the unknowns free. The Lagrangian is "
-            "singular together with its constraints: remove the coordinates that it does not determine, or choose another "
-            "discrete Lagrangian."
+            f"{np.array2string(directions[lane], precision=2, suppress_small=True)} of the unknowns free. {reason}"
         )
 
 
