@@ -10,8 +10,8 @@ import jax
 from dirax.program.memo import Memo
 
 KEPT = 96
-"""Functions kept in memory: some thirty systems on the xla engine, whose executables take 140 memory maps and up to ten megabytes a
-system, of 65 530 maps that a process may have."""
+"""Functions kept in memory: those of some thirty systems on the xla engine, whose executables take 140 memory maps and up to
+ten megabytes a system, of the 65 530 maps that a process may have."""
 
 _jitted: Memo[Callable] = Memo(KEPT)
 
