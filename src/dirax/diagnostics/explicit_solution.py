@@ -65,10 +65,10 @@ def explicit_solution(system: AbstractSystem, run: Mapping[str, Any]) -> Explici
     inputs, params = run.get("inputs"), jax.tree.map(jnp.asarray, run.get("params"))
     system, t0 = system if inputs is None else system.with_inputs(inputs), float(run.get("t0", 0.0))
     if run.get("project"):
-        complete = system.complete({**data, "t": t0}, params, True)
+        complete = system.complete({**data, "t": jnp.asarray(t0)}, params, True)
         data = {name: complete[name] for name in ("q", "v", "x") if name in complete and (name != "v" or "q" in complete)}
     try:
-        ode = explicit_ode(system, {**data, "t": t0}, params)
+        ode = explicit_ode(system, {**data, "t": jnp.asarray(t0)}, params)
     except (KeyError, ValueError, TypeError) as error:
         raise Skipped(f"no explicit equations: {error}") from None
     return ExplicitSolution(system, ode, params, t0)
