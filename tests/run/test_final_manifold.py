@@ -81,8 +81,6 @@ def test_a_lagrangian_that_is_singular_in_some_trajectories():
 
 
 def test_the_reason_of_a_singular_first_step():
-    with pytest.raises(ValueError, match=r"∂²L/∂v².*does not say where the coordinates go"):
-        dx.simulate(FLAT, dx.PlusLagrangeDirac(), q=[1.0, 0.0], v=[0.0, 0.0], step=0.1, steps=5)
     held = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - q @ q / 2, one_forms=lambda q: jnp.array([[1.0, 0.0, 1.0]]))
     with pytest.raises(ValueError, match="a part of a composition ends at the momentum of a velocity"):
         dx.simulate(

@@ -98,15 +98,10 @@ def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool)
             "The Lagrangian is singular together with its constraints: remove the coordinates that it does not determine, or "
             "choose another discrete Lagrangian."
         )
-        if singular and any(label.startswith("projection") for label in labels):
+        if singular and len(start.guess) > 1 and any(label.startswith("projection") for label in labels):
             reason = (
                 "The Lagrangian is singular (∂²L/∂v²), and a part of a composition ends at the momentum of a velocity on the "
                 "constraints, which such a Lagrangian does not determine: take the scheme by itself, with smaller steps."
-            )
-        elif singular:
-            reason = (
-                "The Lagrangian is singular (∂²L/∂v²), and this discrete Lagrangian does not say where the coordinates go whose "
-                'velocities it leaves out: take one that does, such as "midpoint", or dx.DiscreteDirac(constraints="resolve").'
             )
         raise ValueError(
             f"the first step has no unique solution: its matrix ([PY] (21)) has rank {ranks[lane]} of {unknowns} at the "
