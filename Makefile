@@ -4,6 +4,7 @@
 PYTHON ?= python3
 WORKERS ?= 2
 OUT ?= out
+SYSTEMS ?= 10000
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -18,7 +19,7 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo test lint types format docs soak bench vendor lock clean
+.PHONY: help install demo test lint types format docs soak fuzz bench vendor lock clean
 
 help:  ## List the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1 \t\2/p' $(MAKEFILE_LIST)
@@ -45,8 +46,11 @@ format: $(READY)  ## Repair style with ruff
 docs: $(READY)  ## Build the documentation in site/, every warning an error
 	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict
 
-soak: $(READY)  ## The long tests that `make test` leaves out
+soak: $(READY) fuzz  ## The long tests that `make test` leaves out
 	$(RUN) pytest -m soak
+
+fuzz: $(READY)  ## Examine SYSTEMS=10000 random systems by every scheme against equations derived apart
+	PYTHONPATH=tests $(RUN) fuzz $(SYSTEMS)
 
 bench: $(READY)  ## Measure speed
 	$(RUN) benchmarks

@@ -110,3 +110,52 @@ def test_a_failed_run_is_named():
     falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sqrt(q[0]) - 2 * q[0])
     with pytest.raises(ValueError, match=r"the run with steps of 0\.1 failed"):
         dx.convergence(falling, dx.PlusLagrangeDirac(), step_sizes=[0.1, 0.05, 0.025], time=1.0, q=[0.1], v=[-1.0])
+
+
+def test_explicit_equations_are_the_reference_where_there_are_some():
+    run = {"step_sizes": [0.2, 0.1, 0.05], "time": 2.0}
+    found = dx.convergence(oscillator, dx.LagrangeDAlembert(), **run, **START)
+    exact = lambda t: {"q": np.cos(t)[:, None], "p": -np.sin(t)[:, None]}
+    by_cosine = dx.convergence(oscillator, dx.LagrangeDAlembert(), reference=exact, **run, **START)
+    assert "explicit equations" in found.reference
+    assert found.agrees
+    for name in ("q", "p"):
+        np.testing.assert_allclose(found.slopes[name].errors, by_cosine.slopes[name].errors, rtol=1e-9)
+    top = gallery.get("free-top")
+    found = dx.convergence(top.system, top.scheme, step_sizes=[0.02, 0.01, 0.005], time=0.2, params=top.params, **top.initial)
+    assert found.agrees is None
+    assert "for want of another (no ordinary differential equation is derived" in found.reference
+
+
+@pytest.mark.parametrize("name", ["kepler", "rolling-disk", "snakeboard", "lotka-volterra", "dc-motor"])
+def test_the_explicit_solution_is_that_of_dop853(name):
+    from dirax.diagnostics.bench.ode_solvers import compiled_field
+    from dirax.diagnostics.explicit_solution import explicit_solution
+
+    example, t = gallery.get(name), np.linspace(0.0, 1.0, 6)
+    ours = explicit_solution(example.system, {"params": example.params, **example.initial})
+    field = compiled_field(ours.ode)
+    theirs = solve_ivp(field, (0.0, 1.0), ours.ode.start, method="DOP853", rtol=1e-13, atol=1e-14, t_eval=t).y.T
+    found = next(iter(ours(t).values()))
+    np.testing.assert_allclose(found, theirs[:, : found.shape[1]], rtol=1e-11, atol=1e-12)
+
+
+class Heavier(dx.AbstractScheme):
+    """The midpoint scheme of a mass that is larger by a tenth: of order 2, to another motion."""
+
+    def step_equation(self, system, shape):
+        other = dx.LagrangeDirac(lambda q, v: 1.1 * v @ v / 2 - q @ q / 2)
+        return dx.LagrangeDAlembert().step_equation(other, shape)
+
+
+def test_a_scheme_that_converges_to_something_else_has_no_order():
+    run = {"step_sizes": [0.2, 0.1, 0.05], "time": 2.0, **START}
+    with pytest.raises(ValueError, match="Heavier does not come to the explicit equations of motion"):
+        dx.convergence(oscillator, Heavier(), **run)
+    by_itself = dx.convergence(oscillator, Heavier(), reference=Heavier(), **run)
+    assert by_itself.order == pytest.approx(2.0, abs=0.05)
+    table = dx.compare(oscillator, [dx.LagrangeDAlembert(), Heavier()], step=0.1, steps=40, repeats=1, **START)
+    assert "against the explicit equations of motion" in table.title
+    assert table["LagrangeDAlembert"].order == pytest.approx(2.0, abs=0.05)
+    assert table["Heavier"].order is None
+    assert "does not come to" in table["Heavier"].note

@@ -197,6 +197,35 @@ def test_steps_sizes(bad):
     complaint(ValueError, "step must be a positive finite number", f"{bad!r} was given", step=bad)
 
 
+@pytest.mark.parametrize(("name", "most"), [("steps", 2**63 - 1), ("save_every", 2**63 - 1), ("max_iterations", 10**6)])
+def test_counts_beyond_what_is_counted(name, most):
+    for value in (most + 1, 2**64, 2**80):
+        complaint(ValueError, f"{name} must be at most", **{name: value})
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_largest_counts(engine):
+    """Rows 0 and 3 alone are saved; the derivative takes as long as the run does."""
+    run = lambda q, **more: dx.simulate(OSCILLATOR, PLUS, **(GOOD | {"q": q, "engine": engine, "save_every": 2**63 - 1} | more))
+    sol, whole = run([1.0, 0.0], max_iterations=10**6), run([1.0, 0.0], save_every=1)
+    np.testing.assert_array_equal(sol.q, whole.q[[0, 3]])
+    np.testing.assert_array_equal(sol.t, whole.t[[0, 3]])
+    slope = jax.grad(lambda q: run(q).q[-1, 0])(jnp.array([1.0, 0.0]))
+    np.testing.assert_allclose(slope, jax.grad(lambda q: run(q, save_every=1).q[-1, 0])(jnp.array([1.0, 0.0])), rtol=1e-14)
+
+
+def test_times_that_a_step_does_not_change():
+    complaint(ValueError, "1e+20", "a step of 0.1 is lost", t0=1e20)
+    complaint(ValueError, "9.0072e+15", "a step of 1 is lost", t0=2.0**53 - 5, step=1.0, steps=20)
+    complaint(ValueError, "9.0072e+15", "a step of 1 is lost", t0=-(2.0**53) - 5, step=1.0, steps=20)
+    complaint(ValueError, "end at t = t0 + steps·step = inf", step=1e308)
+    assert dx.simulate(OSCILLATOR, PLUS, **(GOOD | {"t0": 2.0**52, "step": 1.0})).ok
+
+
+def test_a_step_that_underflows():
+    complaint(ValueError, "step must be at least 2.23e-308", "unit of time", step=5e-324)
+
+
 @pytest.mark.parametrize("name", ["steps", "save_every", "max_iterations"])
 @pytest.mark.parametrize("bad", [0, -3, 2.0, "2", True])
 def test_counts(name, bad):

@@ -69,3 +69,20 @@ def test_a_linear_one_form_keeps_the_order_of_a_composition():
         linear, dx.Composition(dx.DiscreteDirac(), "suzuki4"), q=[0.5, 1.2], v=[0.0, 0.0], time=1.6, step_sizes=[0.4, 0.2, 0.1]
     )
     assert abs(found.order - 4) < 0.3
+
+
+def test_a_lagrangian_that_is_singular_in_some_trajectories():
+    """The first one is regular, and says nothing of the others."""
+    system = dx.LagrangeDirac(lambda q, v, params: params["m"] @ (v * v) / 2 - q @ q / 2)
+    masses = {"params": {"m": np.array([[1.0, 1.0], [1.0, 0.0]])}, "batch_params": True}
+    with pytest.raises(ValueError, match=r"singular at the initial data of trajectory 1"):
+        dx.simulate(system, dx.LagrangeDAlembert(), **OFF, **masses)
+    assert np.all(dx.simulate(system, dx.LagrangeDAlembert(), **(OFF | {"q": [1.0, 0.0]}), **masses).ok)
+
+
+def test_the_reason_of_a_singular_first_step():
+    held = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - q @ q / 2, one_forms=lambda q: jnp.array([[1.0, 0.0, 1.0]]))
+    with pytest.raises(ValueError, match="a part of a composition ends at the momentum of a velocity"):
+        dx.simulate(
+            held, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"), q=[1.0, 0.0, 0.0], v=[0.0, 0.0, 0.0], step=0.1, steps=5
+        )

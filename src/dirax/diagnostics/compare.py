@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from dirax.diagnostics.bench.subject import Skipped
 from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.energy_lines import energy_less_work
+from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
@@ -88,8 +90,9 @@ def compare(
 ) -> Comparison:
     """Run every scheme on one system with the same data and tabulate what it costs and what it keeps.
 
-    `schemes`: a dict by name, or a list (named by class). `reference` as in `dx.convergence`; without it each scheme is
-    compared with the refinement of the one whose measured order is highest. `run`: initial data and the other keywords
+    `schemes`: a dict by name, or a list (named by class). `reference` as in `dx.convergence`; without it, and for systems without
+    explicit equations of motion, each scheme is compared with the refinement of the one whose measured order is highest. The
+    title says which it was, and notes which schemes do not come to it. `run`: initial data and the other keywords
     of `dx.simulate`, one trajectory. Times are medians of `repeats` interleaved runs of compiled code, saving included.
 
     Raises what `dx.simulate` raises for bad data; a scheme that fails midway has that in its row.
@@ -104,6 +107,14 @@ def compare(
             tick = clock.perf_counter()
             sol = simulate(system, scheme, step=step, steps=steps, **run)
             seconds[name].append(sol.stats.get("run_seconds", clock.perf_counter() - tick))
+    label = "its own" if reference is None else "the reference that was given"
+    if reference is None:
+        try:
+            reference = explicit_solution(system, run)
+            reference(np.array([float(run.get("t0", 0.0)) + min(steps, ORDER_STEPS) * step]))
+            label = ExplicitSolution.label
+        except Skipped:
+            reference = None
     orders = {name: _order(system, scheme, step, steps, reference, run) for name, scheme in named.items()}
     best = max((name for name in named if orders[name][0] is not None), key=lambda n: orders[n][0] or 0.0, default=None)
     target = reference if reference is not None else named[best] if best is not None else None
@@ -111,9 +122,10 @@ def compare(
     for name, sol in sols.items():
         order, error, note = orders[name]
         if target is not None and order is not None and name != best and reference is None:
+            label = f"{best} refined"
             _, error, note = _order(system, named[name], step, steps, target, run)
         entries.append(_entry(name, sol, order, error, note, float(np.median(seconds[name]))))
-    return Comparison(f"{type(system).__name__}: {steps} steps of {step:g}", tuple(entries))
+    return Comparison(f"{type(system).__name__}: {steps} steps of {step:g}, errors against {label}", tuple(entries))
 
 
 def _named(schemes: Sequence[AbstractScheme]) -> dict[str, AbstractScheme]:
@@ -135,7 +147,7 @@ def _order(system, scheme, step, steps, reference, run) -> tuple[float | None, f
     except ValueError as reason:
         return None, None, str(reason)
     first = next(iter(found.slopes.values()))
-    return first.order, float(first.errors[0]), ""
+    return first.order, float(first.errors[0]), " ".join(found.notes) if found.agrees is False else ""
 
 
 def _entry(name: str, sol: Solution, order, error, note: str, seconds: float) -> Entry:

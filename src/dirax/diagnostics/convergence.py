@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from dirax.diagnostics.bench.subject import Skipped
+from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
@@ -20,6 +22,13 @@ PLATEAU = 100.0
 
 STILL_FALLING = 0.9
 """A smaller step must bring the error below this fraction of that before, or the plateau has begun."""
+
+APART = 0.25
+"""What is left of an error after the step is divided by REFINEMENT; of first order it is a sixteenth."""
+
+SOLVED = 1e-9
+"""Relative error of the explicit solution over the time of a measurement, at most: a tenth of roundoff a step, times what a
+motion makes of that."""
 
 USABLE = 3
 """Step sizes that a slope needs."""
@@ -49,6 +58,8 @@ class Convergence:
     slopes: dict[str, Slope]
     reference: str
     notes: tuple[str, ...] = field(default_factory=tuple)
+    agrees: bool | None = None
+    """Whether the scheme refined comes to the reference, which is of another kind; None where that was not asked."""
 
     @property
     def orders(self) -> dict[str, float]:
@@ -63,7 +74,7 @@ class Convergence:
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain Python values, fit for JSON."""
         slopes = {name: vars(slope) for name, slope in self.slopes.items()}
-        head = {"title": self.title, "step_sizes": self.step_sizes, "reference": self.reference}
+        head = {"title": self.title, "step_sizes": self.step_sizes, "reference": self.reference, "agrees": self.agrees}
         return plain({**head, "quantities": slopes, "notes": self.notes})
 
     def _table(self):
@@ -101,12 +112,16 @@ def convergence(
     `run`: initial data, `params` and the other keywords of `dx.simulate`, without step and steps. Every step size must
     divide the largest, and the largest `time`; errors are the largest over the common times. `reference`: a function
     t (rows,) -> q (rows, n), or -> a dict of such arrays by name; a scheme, run with 16 times smaller steps than the
-    smallest; or None for `scheme` itself so refined (the slope then allows for the reference's own error).
+    smallest; or None for the explicit equations of motion, solved by extrapolation to roundoff. Where the system has none, it is
+    `scheme` itself so refined (the slope then allows for the reference's own error), and so always for multipliers. Before an
+    order is told the explicit solution and the scheme so refined are compared: one that converges to something else has no
+    order, and the notes say so, as `agrees` does. `Convergence.reference` says which was used.
     `quantities`: names of saved fields, by default all of q, p, x that the reference has, and the multipliers of discrete
     Lagrange–d'Alembert schemes, compared as μ_k/h at their nodes from the second on.
 
     The slope is a regression over the step sizes above the roundoff plateau. Raises `ValueError` for step sizes that do
-    not fit, a run that fails, or fewer than three step sizes that can be used.
+    not fit, a run that fails, or fewer than three step sizes that can be used, among them those of a scheme that converges to
+    something else.
     """
     h = _checked(step_sizes, time)
     if "q0" in run or "q1" in run:
@@ -115,15 +130,31 @@ def convergence(
     stride = np.round(h[0] / h).astype(int)
     runs = [_run(system, scheme, size, time, int(every), run) for size, every in zip(h, stride, strict=True)]
     common = runs[0].t
-    if exact is not None:
-        expected, label, finest = _evaluated(exact, common), "the exact solution", None
-    else:
-        by = reference if isinstance(reference, AbstractScheme) else scheme
-        finest = h[-1] / REFINEMENT if by is scheme else None
-        refined = _run(system, by, h[-1] / REFINEMENT, time, int(stride[-1]) * REFINEMENT, run)
-        expected = _quantities(refined)
-        label = f"{type(by).__name__} with steps of {h[-1] / REFINEMENT:.3g}"
-    measured = [_quantities(sol) for sol in runs]
+    measured, notes = [_quantities(sol) for sol in runs], []
+    explicit, by = None, reference if isinstance(reference, AbstractScheme) else scheme
+    refined, label = {}, f"{type(by).__name__} with steps of {h[-1] / REFINEMENT:.3g}"
+    if reference is None:
+        try:
+            exact = explicit_solution(system, run)
+            explicit = exact(common)
+        except Skipped as reason:
+            exact, label = None, f"{label}, for want of another ({reason})"
+    elif isinstance(reference, ExplicitSolution):
+        explicit = reference(common)
+    if explicit is not None or exact is None:
+        refined = _quantities(_run(system, by, h[-1] / REFINEMENT, time, int(stride[-1]) * REFINEMENT, run))
+    own = {name for name in refined if explicit is None or name not in explicit} if by is scheme else set()
+    if explicit is not None:
+        label = f"{ExplicitSolution.label}" + (f", {', '.join(sorted(own))} against {label}" if own else "")
+    elif exact is not None:
+        label = "the exact solution"
+    expected = refined | (explicit if explicit is not None else _evaluated(exact, common) if exact is not None else {})
+    apart = {} if explicit is None else _apart(measured, refined, explicit, h)
+    for name, (distance, needed) in apart.items():
+        notes.append(
+            f"{name}: {type(scheme).__name__} does not come to the explicit equations of motion: with steps of "
+            f"{h[-1] / REFINEMENT:.3g} it is off by {number(distance)}, where {number(needed)} was to be expected of it."
+        )
     names = list(quantities) if quantities is not None else [name for name in measured[0] if name in expected]
     missing = [name for name in names if name not in measured[0] or name not in expected]
     if missing or not names:
@@ -131,23 +162,43 @@ def convergence(
             f"quantities {missing or names} are not in both the run ({', '.join(measured[0])}) and the reference "
             f"({', '.join(expected)}): choose among those in both."
         )
-    slopes, notes = {}, []
+    slopes = {}
     for name in names:
         errors = np.array([np.max(np.abs(m[name] - expected[name])) for m in measured])
         at_end = np.array([np.max(np.abs((m[name] - expected[name])[..., -1, :])) for m in measured])
+        finest = h[-1] / REFINEMENT if name in own else None
         size = max(float(np.max(np.abs(expected[name]))), np.finfo(float).tiny)
         used = _above_plateau(errors, np.finfo(float).eps * size * np.sqrt(time / h) * PLATEAU)
         if np.sum(used) < USABLE:
             if name != names[0]:
                 notes.append(f"{name}: too few errors above roundoff for an order ({', '.join(number(e) for e in errors)}).")
                 continue
+            if name in apart:
+                raise ValueError(f"no order can be measured. {next(note for note in notes if note.startswith(name))}")
             raise ValueError(
                 f"only {int(np.sum(used))} of the step sizes give errors of {name} that fall and lie above roundoff, and an "
                 f"order needs {USABLE}: errors {', '.join(number(e) for e in errors)} for steps "
                 f"{', '.join(number(s) for s in h)}; take larger steps, or more of them."
             )
         slopes[name] = Slope(*_slope(h[used], errors[used], finest), errors, used, at_end)
-    return Convergence(f"{type(scheme).__name__} on {type(system).__name__}, t ≤ {time:g}", h, slopes, label, tuple(notes))
+    title = f"{type(scheme).__name__} on {type(system).__name__}, t ≤ {time:g}"
+    return Convergence(title, h, slopes, label, tuple(notes), None if explicit is None else not apart)
+
+
+def _apart(measured: list, refined: dict, explicit: dict, h: np.ndarray) -> dict[str, tuple[float, float]]:
+    """The quantities in which the scheme refined is further from the explicit solution than a scheme of first order would be:
+    (how far, how far that is at most), by name."""
+    found = {}
+    for name in refined.keys() & explicit.keys():
+        distance = float(np.max(np.abs(refined[name] - explicit[name])))
+        last = float(np.max(np.abs(measured[-1][name] - explicit[name])))
+        size = float(np.max(np.abs(explicit[name]), initial=np.finfo(float).tiny))
+        needed = max(
+            APART * last, PLATEAU * np.finfo(float).eps * size * np.sqrt(REFINEMENT * len(explicit[name])), SOLVED * size
+        )
+        if not distance <= needed:
+            found[name] = distance, needed
+    return dict(sorted(found.items(), reverse=True))
 
 
 def _checked(step_sizes, time: float) -> np.ndarray:

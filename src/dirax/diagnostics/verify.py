@@ -7,7 +7,8 @@ from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
 from dirax.diagnostics.final_manifold_lines import final_manifold
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
-from dirax.diagnostics.report import OK, VIOLATED, Line, Report
+from dirax.diagnostics.replay_lines import replayed
+from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line, Report
 from dirax.diagnostics.residuals import residual_size
 from dirax.diagnostics.structure_lines import membership, structure_of, symplecticity
 from dirax.diagnostics.verdicts import steps_of
@@ -26,6 +27,9 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     absolute values of the terms that should cancel, and of their change when every saved number is changed by itself
     (absolute Jacobian times |q|). The tolerances are roundoff's:
 
+    - steps replayed: every saved number of every row, of any scheme and of compositions, against the step from the row before,
+      taken again in NumPy: 32 ε of what it would be off if every operation were; of very long runs as many rows as ten seconds
+      are enough for, and the line says so;
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
     - steps solved: the largest residual of a run, relative to the terms of its equations, which Newton's method brings to
@@ -58,6 +62,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     structure = structure_of(whole)
     lines = [
         _completion(sol),
+        _replayed(sol, whole, tolerance),
         *membership(whole, structure, tolerance),
         constraint(whole, structure, tolerance),
         hidden_constraint(whole, tolerance),
@@ -70,6 +75,12 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         symplecticity(whole, tolerance),
     ]
     return Report(_title(sol), tuple(line for line in lines if line is not None))
+
+
+def _replayed(sol: Solution, whole: Solution, tolerance: float | None) -> Line:
+    """The line of the run; of the motion that is reconstructed, where the rows on a quotient do not say where a step begins."""
+    line = replayed(sol, tolerance)
+    return line if line.verdict != NOT_CHECKED or whole is sol else replayed(whole, tolerance)
 
 
 def _completion(sol: Solution) -> Line:

@@ -9,7 +9,11 @@ import jax
 
 from dirax.program.memo import Memo
 
-_jitted: Memo[Callable] = Memo(256)
+KEPT = 96
+"""Functions kept in memory: those of some thirty systems on the xla engine, whose executables take 140 memory maps and up to
+ten megabytes a system, of the 65 530 maps that a process may have."""
+
+_jitted: Memo[Callable] = Memo(KEPT)
 
 
 def compiled(function: Callable, **options: Any) -> Callable:

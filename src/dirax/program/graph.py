@@ -287,14 +287,22 @@ class Graph:
                 stack.extend(self.args[node])
         return sorted(seen)
 
-    def evaluate(self, outputs: Sequence[int], inputs: dict[str, Any], table: dict | None = None, values: dict | None = None):
+    def evaluate(
+        self,
+        outputs: Sequence[int],
+        inputs: dict[str, Any],
+        table: dict | None = None,
+        values: dict | None = None,
+        order: Sequence[int] | None = None,
+    ):
         """The list of the outputs for given inputs; NumPy by default, any array library whose functions are in `table`.
 
-        `values` holds nodes that are known from before, and then those that were needed.
+        `values` holds nodes that are known from before, and then those that were needed; `order` is what is reachable from the
+        outputs, where that has been found before.
         """
         functions = table or NUMPY
         values = {} if values is None else values
-        for node in self.reachable(outputs, values):
+        for node in self.reachable(outputs, values) if order is None else [n for n in order if n not in values]:
             op, args = self.op[node], self.args[node]
             if len(args) == 2:
                 values[node] = functions[op](values[args[0]], values[args[1]])

@@ -25,7 +25,7 @@ from dirax.run.refused_start import refuse_bad_start
 from dirax.run.result import solution_of
 from dirax.run.settings import Settings, kind_of
 from dirax.run.start import begun, completed
-from dirax.run.validate import Case, refuse_more_than_memory
+from dirax.run.validate import Case, refuse_clock_that_stands, refuse_more_than_memory
 from dirax.schemes.step import Shape, make_step_equation
 from dirax.solution.solution import Solution
 
@@ -73,6 +73,7 @@ def carried_out(
 ) -> Solution:
     """The Solution of a run. Raises `ValueError` for data that a premise excludes."""
     began = time.perf_counter()
+    save_every = _checked_times(case, steps, save_every)
     kind = kind or kind_for(settings, case)
     if kind is not None and kind.plan is not None:
         problem = kind.plan.problem(case, steps, save_every)
@@ -92,6 +93,7 @@ def carried_out(
 
 def prepared(settings: Settings, case: Case, steps: int, save_every: int) -> Kind | None:
     """The kind of a case with its plan made and its engine ready. Raises `ValueError` for data that a premise excludes."""
+    save_every = _checked_times(case, steps, save_every)
     kind = kind_for(settings, case)
     if kind is None or (kind.plan is not None and kind.engine is not None and kind.plan.problem(case, steps, save_every)):
         return kind
@@ -100,6 +102,12 @@ def prepared(settings: Settings, case: Case, steps: int, save_every: int) -> Kin
         kind.plan = kind.plan or found.plan()
         kind.engine = kind.engine or settings.engine.prepared(found.problem)
     return kind
+
+
+def _checked_times(case: Case, steps: int, save_every: int) -> int:
+    """How often rows are saved, at the last step at the latest. Raises `ValueError` for times that floats do not tell apart."""
+    refuse_clock_that_stands(case.t0, case.h, steps)
+    return min(save_every, max(1, steps - int(case.two_points)))
 
 
 def _no_plan() -> None:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import NOT_FINITE, OK, Outcome, Problem
-from dirax.engines.in_numbers import InJax, InNumbers, in_numbers
+from dirax.engines.stage_in_numbers import InJax, InNumbers, in_numbers
 from dirax.engines.stopping import STALLED
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
 

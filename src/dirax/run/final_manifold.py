@@ -32,6 +32,9 @@ MOVED = 2.0**-10
 MOST = 200
 """Coordinates up to which it is asked: the matrix of all of them is not for a chain of thousands."""
 
+SEVERAL = 64
+"""Trajectories of a batch that are asked, evenly spread."""
+
 DOUBTFUL = 1e-6
 """Smallest singular value of that change, rows and columns scaled to 1, that leaves no doubt of a regular Lagrangian."""
 
@@ -39,37 +42,49 @@ _chains: Memo[ConstraintChain | None] = Memo(64)
 
 
 def is_singular(system: AbstractSystem, shape: Shape, case: Case, initial: Initial) -> bool:
-    """Whether ∂²L/∂v² is singular at the data of the first trajectory, of a system that does not say its final manifold itself.
+    """Whether ∂²L/∂v² is singular at the data of a trajectory, of a system that does not say its final manifold itself.
 
     Asked first is how p follows v, or v follows p, in numbers of the program that completes the data; the Hessian where that
-    leaves a doubt. What is regular once is not asked again.
+    leaves a doubt. What is regular once is not asked again. Of a batch SEVERAL trajectories are asked, the first and the last
+    among them.
     """
     if case.two_points or "q" not in case.data or len(case.data) < 2:
         return False
-    data, params = case.first
-    given = tuple(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params))
-    return _singular.get((Same(system), given, *data), lambda: _is_singular(system, shape, case, data, params, initial))
+    given = tuple(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(case.params))
+    return _singular.get((Same(system), given, case.batch, *case.data), lambda: _is_singular(system, shape, case, initial))
 
 
 _singular: Memo[bool] = Memo(256)
 
 
-def _is_singular(system: AbstractSystem, shape: Shape, case: Case, data: dict, params: Any, initial: Initial) -> bool:
+def _is_singular(system: AbstractSystem, shape: Shape, case: Case, initial: Initial) -> bool:
     if system.metric_form() is not None or system.lagrangian_form() is None or system.final_relation(shape) is not None:
         return False
-    if len(data["q"]) > MOST:
+    lanes = np.unique(np.linspace(0, (case.batch or 1) - 1, SEVERAL).astype(int))
+    arrays = {name: np.atleast_2d(np.asarray(a, float)) for name, a in case.data.items()}
+    data = {name: np.broadcast_to(a, (case.batch or 1, a.shape[1]))[lanes] for name, a in arrays.items()}
+    count, n = data["q"].shape
+    if n > MOST:
         return False
     moved, answers = ("v", "p") if "v" in data else ("p", "v")
-    n, at = len(data["q"]), np.asarray(data[moved], float)
-    near = np.tile(at, (n + 1, 1)) + MOVED * (np.max(np.abs(at)) or 1.0) * np.eye(n + 1, n, -1)
-    varied = Case({"q": np.tile(data["q"], (n + 1, 1)), moved: near}, params, case.h, case.t0, n + 1)
-    answer = np.asarray(completed(system, varied, False).data[answers])
-    response = equilibrated(answer[1:] - answer[:1], rounds=1)[0]
-    if np.all(np.isfinite(response)) and np.linalg.svd(response, compute_uv=False)[-1] > DOUBTFUL:
-        return False
-    first = lambda name: np.asarray(initial.data[name])[0] if case.batch is not None else np.asarray(initial.data[name])
-    hessian = np.asarray(evaluated(system.velocity_hessian, np.asarray(case.t0), first("q"), first("v"), params))
-    return bool(np.all(np.isfinite(hessian))) and rank_of(hessian) < n
+    sizes = np.max(np.abs(data[moved]), axis=1)
+    changes = MOVED * np.where(sizes > 0, sizes, 1.0)[:, None, None] * np.eye(n + 1, n, -1)
+    near = {"q": np.repeat(data["q"], n + 1, axis=0), moved: (data[moved][:, None] + changes).reshape(-1, n)}
+    own = lambda leaf: np.repeat(np.asarray(leaf)[lanes], n + 1, axis=0)
+    params = jax.tree.map(own, case.params) if case.batch_params else case.params
+    varied = Case(near, params, case.h, case.t0, count * (n + 1), case.batch_params)
+    answer = np.asarray(completed(system, varied, False).data[answers]).reshape(count, n + 1, n)
+    response = equilibrated(answer[:, 1:] - answer[:, :1], rounds=1)[0]
+    finite = np.all(np.isfinite(response), axis=(1, 2))
+    smallest = np.linalg.svd(np.where(finite[:, None, None], response, 0.0), compute_uv=False)[:, -1]
+    of_lane = lambda a, lane: np.asarray(a)[lane] if case.batch is not None else np.asarray(a)
+    for lane in lanes[smallest <= DOUBTFUL].tolist():
+        at = [of_lane(initial.data[name], lane) for name in ("q", "v")]
+        params = jax.tree.map(lambda leaf, lane=lane: leaf[lane], case.params) if case.batch_params else case.params
+        hessian = np.asarray(evaluated(system.velocity_hessian, np.asarray(case.t0), *at, params))
+        if np.all(np.isfinite(hessian)) and rank_of(hessian) < n:
+            return True
+    return False
 
 
 def chain_at(system: AbstractSystem, q: Any, v: Any, t: float, params: Any) -> ConstraintChain | None:
@@ -155,7 +170,8 @@ def _on_known_manifold(system: AbstractSystem, q: Any, p: Any, v: Any, t: float,
     if chain is None or chain.empty:
         return False
     x = on_chain(chain, q, p, v, t, params)
-    return bool(np.all(np.isfinite(np.asarray(chain.constraints(x, params))))) and not chain.off(x, params)
+    values = np.asarray(chain.constraints(x, params))  # none of a trajectory that is regular, which says nothing of others
+    return values.size > 0 and bool(np.all(np.isfinite(values))) and not chain.off(x, params)
 
 
 def refuse_leaving_final_manifold(

@@ -103,9 +103,14 @@ def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool)
             "The Lagrangian is singular together with its constraints: remove the coordinates that it does not determine, or "
             "choose another discrete Lagrangian"
         )
-        direction = np.array2string(directions[lane], precision=2, suppress_small=True, max_line_width=1000)
         if singular and labels[0].endswith(METHOD_2):
             way = f"This is since the Lagrangian is singular (∂²L/∂v²), and this scheme {FINAL_MANIFOLD}"
+        elif singular and len(start.guess) > 1 and any(label.startswith("projection") for label in labels):
+            way = (
+                "The Lagrangian is singular (∂²L/∂v²), and a part of a composition ends at the momentum of a velocity on the "
+                "constraints, which such a Lagrangian does not determine: take the scheme by itself, with smaller steps"
+            )
+        direction = np.array2string(directions[lane], precision=2, suppress_small=True, max_line_width=1000)
         raise ValueError(
             f"the first step has no unique solution: its matrix ([PY] (21)) has rank {ranks[lane]} of {unknowns} at the "
             f"initial data{_which(ranks < unknowns)}, and leaves the direction "

@@ -7,7 +7,14 @@ from typing import Any
 import jax
 
 from dirax.engines.engine import AbstractEngine
-from dirax.run.validate import Case, check_kinds, count, engine_from, validated_case
+from dirax.run.validate import (
+    MOST_ITERATIONS,
+    Case,
+    check_kinds,
+    count,
+    engine_from,
+    validated_case,
+)
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
 
@@ -38,9 +45,8 @@ def stated(
 ) -> tuple[Settings, Case, int, int]:  # fmt: skip
     """The settings and the case that the arguments of `simulate` state, steps and save_every; raises as it does."""
     check_kinds(system, scheme)
-    on, steps, save_every, max_iterations = (
-        engine_from(engine), count(steps, "steps"), count(save_every, "save_every"), count(max_iterations, "max_iterations")
-    )  # fmt: skip
+    on, steps, save_every = engine_from(engine), count(steps, "steps"), count(save_every, "save_every")
+    max_iterations = count(max_iterations, "max_iterations", MOST_ITERATIONS)
     case = validated_case(data, params, batch_params, step, t0)
     system = system if inputs is None else system.with_inputs(inputs)
     return Settings(system, scheme, on, project, check_initial, max_iterations, bool(compensated)), case, steps, save_every

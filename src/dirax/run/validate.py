@@ -23,6 +23,19 @@ ROOM = 4
 FEW = 32
 """Numbers up to which Python is quicker than NumPy to see whether they are finite."""
 
+MOST_COUNTED = 2**63 - 1
+"""The largest number of steps: engines count them in 64 bits."""
+
+MOST_ITERATIONS = 1_000_000
+"""Of Newton's method in a step: what has not converged by then goes round in circles, and a compiled loop hears no Ctrl-C."""
+
+TINIEST = float(np.finfo(float).tiny)
+"""The smallest number with all its digits."""
+
+EXACT_STEPS = 2**53
+"""Steps up to which a float tells each from the next. Nobody waits for the end of a longer run: of such the start alone is
+looked at."""
+
 KINDS = ({"q", "v"}, {"q", "p"}, {"q0", "q1"}, {"x"}, {"q"})
 
 
@@ -219,13 +232,40 @@ def positive(value, name: str):
     return value if is_traced(value) else float(value)
 
 
-def count(value, name: str) -> int:
-    """The whole number; raises `ValueError` for anything else, and below 1."""
-    if type(value) is int and value >= 1:
+def count(value, name: str, most: int = MOST_COUNTED) -> int:
+    """The whole number; raises `ValueError` for anything else, below 1 and above `most`."""
+    if type(value) is int and 1 <= value <= most:
         return value
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ValueError(f"{name} must be a whole number ≥ 1, but {value!r} was given.")
+        raise ValueError(f"{name} must be a whole number ≥ 1, but {value!r:.80} was given.")
+    if value > most:
+        bound = "2⁶³ − 1, which is what 64 bits count" if most == MOST_COUNTED else f"{most}"
+        raise ValueError(f"{name} must be at most {bound}, but {_shown(int(value))} was given.")
     return int(value)
+
+
+def _shown(value: int) -> str:
+    return str(value) if abs(value) < 10**21 else f"a number of {value.bit_length()} bits"
+
+
+def refuse_clock_that_stands(t0: Any, h: Any, steps: int) -> None:
+    """Raise `ValueError` for a step that is no normal number, and for one that is lost in the times of the run, t + h = t."""
+    if is_traced(t0, h):
+        return
+    if h < TINIEST:
+        raise ValueError(
+            f"step must be at least {TINIEST:.3g}, the smallest number with all its digits, but {h!r} was given: "
+            "choose a larger unit of time."
+        )
+    end = t0 + steps * h if steps < EXACT_STEPS else t0
+    if not np.isfinite(end):
+        raise ValueError(f"the run would end at t = t0 + steps·step = {end}: take fewer steps, smaller ones, or another t0.")
+    at = max(t0, end, key=abs)
+    if at + h == at or at - h == at:
+        raise ValueError(
+            f"the times of this run are as large as {at:.6g}, where floats are {np.spacing(abs(at)):.3g} apart, and a step of "
+            f"{h:.3g} is lost (t + h = t): take a larger step, or count time from a t0 near 0."
+        )
 
 
 def _is_number(leaf) -> bool:

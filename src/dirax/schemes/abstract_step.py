@@ -79,6 +79,10 @@ class AbstractStep(ABC):
         """Where Newton's method starts: at the unknowns extrapolated from the steps before."""
         return previous
 
+    def resume(self, data: dict[str, Array], h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+        """Where the step that leaves a saved row begins: the state and a first guess of the unknowns."""
+        return self.start(data, h, params)
+
     def equation(self) -> StepEquation:
         """The StepEquation of the step."""
         return StepEquation(
@@ -95,4 +99,5 @@ class AbstractStep(ABC):
             remark=self.remark,
             review=self.review,
             guess=self.guess,
+            resume=self.resume,
         )

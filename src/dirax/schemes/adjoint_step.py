@@ -56,7 +56,13 @@ class AdjointStep(AbstractStep):
         return here | of_step
 
     def start(self, data, h, params):
-        state, u = self.inner.start(data, -h, params)
+        return self.before(data, h, params, *self.inner.start(data, -h, params))
+
+    def resume(self, data, h, params):
+        return self.before(data, h, params, *self.inner.resume(data, -h, params))
+
+    def before(self, data, h, params, state, u):
+        """The state and a first guess, of those of the step back."""
         back = self.inner.advance(u, state, data.get("t", 0.0), -h, params)
         return state, self.unknowns.join(increment=(state - back) / h, inner=u)
 

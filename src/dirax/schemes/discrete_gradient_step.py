@@ -119,6 +119,13 @@ class DiscreteGradientStep(AbstractStep):
         state = self.state.join(x=data["x"], first=self.energy.hamiltonian(data["x"], params))
         return state, self.unknowns.join(velocity=data["velocity"])
 
+    def resume(self, data, h, params):
+        """With the books since the start, which say what H was there."""
+        supplied, dissipated = data["work"]
+        first = self.energy.hamiltonian(data["x"], params) - (supplied - dissipated)
+        state = self.state.join(x=data["x"], supplied=supplied, dissipated=dissipated, first=first)
+        return state, self.unknowns.join(velocity=data["velocity"])
+
 
 def _along(change, gradient, missing, blurred):
     """The multiple a Δx of the step with ⟨a Δx, Δx⟩ = `missing`, faded out where |∇̄H||Δx| is lost in what is `blurred`.

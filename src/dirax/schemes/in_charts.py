@@ -139,3 +139,9 @@ class StepInCharts(AbstractStep):
         here, r, p = self.atlas.enter(data["q"], data["p"])
         # the unknowns are a first guess of the velocity
         return self.state.join(chart=here.base, r=r, p=p), here.components(data["v"])
+
+    def resume(self, data, h, params):
+        """In the chart that was in use."""
+        here = self.chart(data["chart"])
+        r, p = here.momentum_to_local(data["q"], data["p"])
+        return self.state.join(chart=here.base, r=r, p=p), here.velocity_to_local(data["q"], data["v"])[1]

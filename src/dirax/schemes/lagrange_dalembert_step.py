@@ -180,6 +180,11 @@ class LagrangeDAlembertStep(AbstractStep):
             return self.work.start(q, p), u
         return self.work.start(q, p), self.unknowns.join(v=v)
 
+    def resume(self, data, h, params):
+        """With the saved momentum, which is p_k modulo the forces of the constraints: the step takes no notice of these."""
+        u = self.unknowns.join(v=data["v"], saved_v=data["v"] if self.projects else jnp.zeros(0))
+        return self.state.join(q=data["q"], p=data["p"]), u
+
     def _start_from_two_points(self, q, v, t, h, params):
         p = -self.slots(t, q, v, h, params)[0]
         if not self.projects:

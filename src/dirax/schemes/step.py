@@ -71,6 +71,8 @@ class StepEquation(eqx.Module):
     - `remark(state, t, h, params) -> str`, what there is to say of a place from which a step fails, or "";
     - `review(fields) -> dict`, which looks at the saved arrays of a run, concrete ones, for what is to stand in its `stats`, and
       warns of what is wrong with them;
+    - `resume(data, h, params) -> (state, u)`: where the step that leaves a saved row begins, of which `data` has the fields too,
+      and which need not be the first: `start` sets sums since the start to zero, and may choose another chart, or take longer;
     - `collocation`, the stage relation or mean relation of which the unknowns are copies: a fact that engines may use or ignore.
 
     Equations are compared by the identity of their functions. One with other functions is made by `dataclasses.replace`.
@@ -90,6 +92,7 @@ class StepEquation(eqx.Module):
     remark: Callable = eqx.field(static=True)
     review: Callable = eqx.field(static=True)
     guess: Callable = eqx.field(static=True)
+    resume: Callable = eqx.field(static=True)
     state_layout: Layout = eqx.field(static=True)
     unknown_layout: Layout = eqx.field(static=True)
     collocation: StageRelation | MeanRelation | None = eqx.field(static=True)
@@ -112,6 +115,7 @@ class StepEquation(eqx.Module):
         remark: Callable | None = None,
         review: Callable | None = None,
         guess: Callable | None = None,
+        resume: Callable | None = None,
         collocation: StageRelation | MeanRelation | None = None,
     ):
         self.start, self.residual, self.advance, self.unpack = start, residual, advance, unpack
@@ -123,6 +127,7 @@ class StepEquation(eqx.Module):
         self.remark = remark or nothing_to_say
         self.review = review or nothing_to_report
         self.guess = guess or previous_unknowns
+        self.resume = resume or start
         self.collocation = collocation
         if len(self.labels) != self.unknowns:
             raise ValueError(f"labels need one entry per unknown ({self.unknowns}), but {len(self.labels)} were given.")

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.diagnostics.bench.subject import Skipped
+from dirax.program.user_functions import evaluated
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import NonholonomicMechanics
@@ -111,7 +112,7 @@ def _open_ports(system: PortHamiltonian, params: Any) -> Callable:
 
 def _solved(equations: LinearEquations, start: Any, shown: int) -> ExplicitODE:
     """The equations with z eliminated in scalars; the order of the pivots is the one at the start."""
-    matrix = np.asarray(equations(0.0, start)[0])
+    matrix = np.asarray(evaluated(lambda y: equations(0.0, y)[0], jnp.asarray(start)))
     if not np.all(np.isfinite(matrix)) or np.linalg.cond(matrix) > SINGULAR:
         raise Skipped("its equations do not determine the derivatives (singular)")
     order = pivot_order(matrix)

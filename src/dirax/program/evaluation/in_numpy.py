@@ -15,19 +15,32 @@ LANES = 1024
 class Values:
     """What nodes of a graph are at some entries; operands are computed where something needs them."""
 
-    def __init__(self, graph: Graph, entries: int):
-        self.graph, self.entries, self._known = graph, entries, {}
+    def __init__(self, graph: Graph, entries: int, table: dict[str, Callable] | None = None):
+        """`table`: other functions for the operations than NumPy's."""
+        self.graph, self.entries, self.table, self._known = graph, entries, table, {}
 
     def bind(self, nodes: Nodes, array: np.ndarray) -> None:
         """Nodes (…) are the entries of `array` (entries, …)."""
         columns = np.asarray(array, dtype=np.float64).reshape(self.entries, -1).T
         self._known.update(zip(nodes.ravel().tolist(), columns, strict=True))
 
-    def read(self, nodes: Nodes) -> np.ndarray:
-        """The values of nodes (…), an array (entries, …)."""
+    def without(self, nodes: set[int]) -> "Values":
+        """What is known of all other nodes."""
+        other = Values(self.graph, self.entries, self.table)
+        other._known = {node: value for node, value in self._known.items() if node not in nodes}
+        return other
+
+    def at(self, entries: np.ndarray) -> "Values":
+        """What is known at some of the entries."""
+        other = Values(self.graph, len(entries), self.table)
+        other._known = {n: v[entries] if isinstance(v, np.ndarray) and v.ndim else v for n, v in self._known.items()}
+        return other
+
+    def read(self, nodes: Nodes, order: list[int] | None = None) -> np.ndarray:
+        """The values of nodes (…), an array (entries, …); `order` as in `Graph.evaluate`."""
         table = np.empty((nodes.size, self.entries))
         with np.errstate(all="ignore"):
-            for row, value in enumerate(self.graph.evaluate(nodes.ravel().tolist(), {}, values=self._known)):
+            for row, value in enumerate(self.graph.evaluate(nodes.ravel().tolist(), {}, self.table, self._known, order)):
                 table[row] = value
         return table.T.reshape(self.entries, *nodes.shape)
 

@@ -1,0 +1,206 @@
+"""The line of `dx.verify` on every saved number: each row is what the step from the row before it makes of that."""
+
+import numpy as np
+
+from dirax.diagnostics.replay import Again, CannotReplay, Replay, Rows
+from dirax.diagnostics.report import NOT_CHECKED, Line
+from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread
+from dirax.engines.steps_in_numbers import SMALLEST, Noise
+from dirax.solution.solution import Solution
+
+NAME = "steps replayed"
+
+DISTURBANCE = 2.0**-30
+"""Relative changes that show what rounding does: far above it, and small enough to do the same, only more."""
+
+SAMPLED = 48
+"""Steps of a run at which that is seen, besides those in doubt."""
+
+OFTEN = 4
+"""Times that a step is disturbed."""
+
+TYPICAL = 0.9
+"""The share of the sampled steps in which a number moves by no more than its scale: one in which the chart changes does not set
+the scale of all."""
+
+
+DOUBTED = 2000
+"""Rows of which it is asked how far rounding moves them: the worst."""
+
+
+def replayed(sol: Solution, tolerance: float | None) -> Line:
+    """The line: the difference of a saved number from what it should be, relative to its terms, the largest of all."""
+    try:
+        replay = Replay.of(sol)
+        at = replay.begun(*replay.chosen())
+    except CannotReplay as reason:
+        return Line(NAME, None, None, NOT_CHECKED, str(reason))
+    limit = roundoff_limit(tolerance, 1)
+    found = _Comparison(replay, at)
+    ratio = found.ratios(limit)
+    entry, number = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+    lane, row = int(at.lanes[entry]), int(at.rows[entry])
+    where = f"{found.name(int(number))} at t = {float(sol.t[row]):.6g}{of_lane(sol, lane)}"
+    per_trajectory = np.zeros(sol.batch or 1)
+    np.maximum.at(per_trajectory, at.lanes, np.max(ratio, axis=1))
+    return judged(sol, NAME, per_trajectory, limit, f"{found.told()}; worst {where}, off by {found.missed[entry, number]:.2g}")
+
+
+class _Comparison:
+    """What was saved of some rows beside what their steps make of it, and how far rounding may move each number.
+
+    Arrays are (entries, numbers): an entry is a row of a trajectory, a number one of all fields, and the time.
+    """
+
+    def __init__(self, replay: Replay, at: Rows):
+        self.replay, self.at = replay, at
+        self.sizes = {name: int(np.prod(a.shape[2:])) for name, a in replay.saved.items()}
+        starts = dict(zip(self.sizes, np.cumsum([0, *self.sizes.values()]).tolist(), strict=False))
+        self.held = {i: starts[name] + place for i, (name, place) in replay.held.items()}
+        self.next, self.previous = self._neighbours()
+        self.saved = self._saved()
+        self.again = replay.again(at)
+        self.expected = np.full_like(self.saved, np.nan)
+        everywhere = np.arange(len(at.rows))
+        self._expect(everywhere, *self._said(self.again))
+        if replay.from_points:
+            self._expect_given_points()
+        self.expected[:, -1] = replay.times()[at.rows]
+
+    def name(self, number: int) -> str:
+        """What a number is called."""
+        for name, size in self.sizes.items():
+            if number < size:
+                return f"{name}[{number}]" if size > 1 else name
+            number -= size
+        return "t"
+
+    def told(self) -> str:
+        """What was computed again."""
+        replay, count = self.replay, len(self.at.rows)
+        whole = int(np.sum(replay.ends + 1))
+        rows = f"{count} of {whole} rows" if count < whole else "each row"
+        steps = f" by {replay.sol.save_every} steps" if replay.sol.save_every > 1 else ""
+        failed = int(np.sum(~self.again.good & (self.next >= 0)))
+        missing = f", {failed} steps could not be solved again" if failed else ""
+        return f"every number of {rows} from the row before{steps}, relative to its terms{missing}"
+
+    # ------------------------------------------------------------------------------------------ what is expected
+
+    @property
+    def missed(self) -> np.ndarray:
+        """|saved − expected|, 0 where nothing is expected, infinite where a number should be and none is."""
+        missed = np.abs(self.saved - self.expected)
+        return np.where(np.isfinite(self.expected), np.where(np.isfinite(missed), missed, np.inf), 0.0)
+
+    def _neighbours(self) -> tuple[np.ndarray, np.ndarray]:
+        """The entries of the row after each and before each, −1 where there is none."""
+        order = self.at.lanes.astype(np.int64) * (self.replay.sol.rows + 1) + self.at.rows
+        following = np.append((np.diff(order) == 1), False)
+        numbers = np.arange(len(order))
+        return np.where(following, numbers + 1, -1), np.where(np.roll(following, 1), numbers - 1, -1)
+
+    def _saved(self) -> np.ndarray:
+        pieces = []
+        for name in self.sizes:
+            values = self.replay.saved[name]
+            values = values.reshape(*values.shape[:2], -1)
+            pieces.append(values[self.at.lanes, np.minimum(self.at.rows, values.shape[1] - 1)])
+        return np.concatenate([*pieces, np.asarray(self.replay.sol.t, float)[self.at.rows][:, None]], axis=1)
+
+    def _said(self, again: Again) -> tuple[np.ndarray, np.ndarray]:
+        """What steps say of the rows that they leave, and of the next ones; NaN where nothing."""
+        count = len(again.after)
+        flat = lambda rows: np.concatenate(
+            [*(rows[n].reshape(count, -1) for n in self.sizes), np.full((count, 1), np.nan)], axis=1
+        )
+        here = flat(again.here)
+        if again.there is not None:
+            return here, flat(again.there)
+        there = np.full_like(here, np.nan)
+        for i, number in self.held.items():
+            there[:, number], here[:, number] = again.after[:, i], np.nan
+        return here, there
+
+    def _expect(self, entries: np.ndarray, here: np.ndarray, there: np.ndarray, if_nearer: bool = False) -> None:
+        """Take what the steps of some entries say of their rows and of the next ones."""
+        first = np.full(len(entries), True) if not self.replay.hides else self.at.rows[entries] == 0
+        after = self.next[entries]
+        for which, rows, said in ((first, entries, here), (after >= 0, after, there)):
+            rows, said = rows[which], said[which]
+            said = np.where(self._exist(rows), said, np.nan)
+            old = self.expected[rows]
+            if if_nearer:
+                saved = self.saved[rows]
+                said = np.where(np.abs(said - saved) < np.nan_to_num(np.abs(old - saved), nan=np.inf), said, old)
+            self.expected[rows] = np.where(np.isnan(said), old, said)
+
+    def _exist(self, entries: np.ndarray) -> np.ndarray:
+        """Which numbers the rows have: those of steps are not in the last one of a trajectory."""
+        last = self.at.rows[entries] >= self.replay.ends[self.at.lanes[entries]]
+        of_step = [self.replay.sol.field_info[name].place == "step" for name, size in self.sizes.items() for _ in range(size)]
+        return ~(last[:, None] & np.array([*of_step, False])[None])
+
+    def _expect_given_points(self) -> None:
+        """Row 0 is what was given, and row 1 follows from it alone."""
+        again = self.replay.of_given_points()
+        first = np.flatnonzero(self.at.rows == 0)
+        here, there = (a[self.at.lanes[first]] for a in self._said(again))
+        for i, number in self.held.items():  # the row holds of the state what it was given
+            here[:, number] = again.begun[self.at.lanes[first], i]
+        self.expected[first] = np.where(self._exist(first), here, np.nan)
+        after = self.next[first]
+        self.expected[after[after >= 0]] = np.where(np.isnan(there), self.expected[after], there)[after >= 0]
+
+    # ------------------------------------------------------------------------------------------ how far rounding moves it
+
+    def ratios(self, limit: float) -> np.ndarray:
+        """`missed`, relative to the terms of each number: those of a typical row, and in a row in doubt its own."""
+        several = np.flatnonzero(self.next >= 0)
+        scale = np.maximum(*self._scales_at(several[spread(len(several), SAMPLED)]))
+        usual = np.quantile(scale, TYPICAL, axis=0)
+        usual[-1] = np.max(np.abs(self.saved[:, -1])) + float(self.replay.sol.step)
+        ratio = _ratio(self.missed, usual)
+        doubted = self._worst(ratio, limit)
+        if not len(doubted):
+            return ratio
+        self._try_from_neighbours(np.union1d(doubted, self.previous[doubted][self.previous[doubted] >= 0]))
+        ratio = _ratio(self.missed, usual)
+        doubted = self._worst(ratio, limit)
+        if len(doubted):
+            before = self.previous[doubted]
+            said_before = np.where((before >= 0)[:, None], self._scales_at(np.maximum(before, 0))[1], 0.0)
+            own = np.maximum(self._scales_at(doubted)[0], said_before)
+            ratio[doubted] = _ratio(self.missed[doubted], np.maximum(own, usual))
+        return ratio
+
+    def _worst(self, ratio: np.ndarray, limit: float) -> np.ndarray:
+        """The entries in doubt, at most DOUBTED."""
+        most = np.max(ratio, axis=1)
+        doubted = np.flatnonzero(most > limit)
+        return doubted if len(doubted) <= DOUBTED else np.sort(doubted[np.argsort(-most[doubted])[:DOUBTED]])
+
+    def _scales_at(self, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far the numbers that the steps of these entries say of their rows, and of the next ones, move, relative to what
+        every operation is off."""
+        at, guesses = self.at[entries], [u[entries] for u in self.again.unknowns]
+        said = self._said(self.replay.again(at, guesses=guesses))
+        moved = [np.zeros_like(part) for part in said]
+        for seed in range(OFTEN):
+            off = self._said(self.replay.again(at, Noise(DISTURBANCE, seed), guesses))
+            for most, one, other in zip(moved, said, off, strict=True):
+                np.maximum(most, np.nan_to_num(np.abs(one - other), posinf=0.0), out=most)
+        return moved[0] / DISTURBANCE, moved[1] / DISTURBANCE
+
+    def _try_from_neighbours(self, entries: np.ndarray) -> None:
+        """Steps again from the unknowns of the steps before them, as the run had it: an equation may have several solutions."""
+        one = np.where(self.previous[entries] >= 0, self.previous[entries], entries)
+        two = np.where(self.previous[one] >= 0, self.previous[one], one)
+        for guesses in ([u[one] for u in self.again.unknowns], [2 * u[one] - u[two] for u in self.again.unknowns]):
+            self._expect(entries, *self._said(self.replay.again(self.at[entries], guesses=guesses)), if_nearer=True)
+
+
+def _ratio(missed: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """missed/scale; infinite where something is missed that nothing moves."""
+    with np.errstate(all="ignore"):
+        return np.where(missed > SMALLEST, missed / scale, 0.0)

@@ -1,0 +1,255 @@
+"""Steps of many states at once in NumPy, by the scalar program of the step: nothing is compiled, and no engine is asked."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dirax.engines.step_program import StepProgram, step_program
+from dirax.numerics.tolerances import EPSILON
+from dirax.program.evaluation.in_numpy import LANES, Values
+from dirax.program.operations import BOOLEAN, NUMPY
+from dirax.schemes.step import StepEquation, StepSequence, needs_every_part
+
+UPDATES = 40
+"""Updates of Newton's method after which a step has no solution."""
+
+FOUND = 8 * EPSILON
+"""Relative updates below this are roundoff."""
+
+KEPT = 1e-5
+"""An update below this is made by the Jacobian of the one before."""
+
+SMALLEST = float(np.finfo(float).tiny) / EPSILON
+"""Numbers below this do not have all their digits, and count as zero."""
+
+LEFT = 1e-6
+"""The last update of a step that has a solution, however badly it is conditioned."""
+
+
+@dataclass
+class Attempts:
+    """Steps that were tried from as many states: unknowns and first state of each stage, the states after the step, and which
+    steps have a solution. Every array has an axis of the states in front."""
+
+    unknowns: list[np.ndarray]
+    states: list[np.ndarray]
+    after: np.ndarray
+    good: np.ndarray
+
+    def put(self, some: np.ndarray, others: "Attempts") -> None:
+        """Take other attempts in place of some."""
+        for own, other in ((self.unknowns, others.unknowns), (self.states, others.states)):
+            for array, values in zip(own, other, strict=True):
+                array[some] = values
+        self.after[some], self.good[some] = others.after, others.good
+
+
+@dataclass(eq=False)
+class StepsInNumbers:
+    """The steps of an equation as functions of arrays with an axis of states in front; `params` (states, numbers) in all."""
+
+    equation: StepEquation | StepSequence
+    program: StepProgram
+    _depends: list[set[int]] = field(init=False)
+    _orders: dict[bytes, list[int]] = field(init=False, default_factory=dict)
+
+    def __post_init__(self):
+        _ = self.program.jacobians  # with which the graph has all its nodes
+        self._depends = [self._moving(e.unknowns) for e in self.program.equations]
+
+    @classmethod
+    def of(cls, equation: StepEquation | StepSequence, params: Any, batch_params: bool) -> "StepsInNumbers":
+        """Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for too large a Jacobian."""
+        return cls(equation, step_program(equation, params, batch_params))
+
+    @property
+    def operations(self) -> int:
+        """About how many scalar operations a step takes."""
+        return 4 * len(self.program.graph) * len(self.program.stages)
+
+    def parameters(self, params: Any, batch: int | None) -> np.ndarray:
+        """The numbers of `params`, (numbers,) or with a batch axis (B, numbers)."""
+        return self.program.parameters.flatten(params, batch)
+
+    def step(
+        self,
+        states: np.ndarray,
+        guesses: Sequence[np.ndarray],
+        t: np.ndarray,
+        h: float,
+        params: np.ndarray,
+        noise: "Noise | None" = None,
+    ) -> Attempts:
+        """A step of each state (states, s), with one guess (states, k) a stage."""
+        parts = []
+        for low in range(0, max(len(states), 1), LANES):
+            some = slice(low, low + LANES)
+            parts.append(self._step(states[some], [g[some] for g in guesses], t[some], h, params[some], noise))
+        join = np.concatenate
+        return Attempts(
+            [join(a) for a in zip(*(p.unknowns for p in parts), strict=True)],
+            [join(a) for a in zip(*(p.states for p in parts), strict=True)],
+            join([p.after for p in parts]),
+            join([p.good for p in parts]),
+        )
+
+    def _step(self, states, guesses, t, h, params, noise) -> Attempts:
+        unknowns, begun, good = [], [], np.ones(len(states), bool)
+        for (index, fraction), guess in zip(self.program.stages, guesses, strict=True):
+            e, at = self.program.equations[index], (t, np.full(len(t), fraction * h), params)
+            u, solved = self._solved(index, guess, states, at, noise)
+            known = self._values(index, u, states, at, noise)
+            begun.append(states)
+            unknowns.append(u)
+            states, t, good = self._read(known, e.advance), t + fraction * h, good & solved
+        return Attempts(unknowns, begun, states, good & np.all(np.isfinite(states), axis=1))
+
+    def taken(self, state: np.ndarray, u: np.ndarray, t: np.ndarray, h: float, params: np.ndarray) -> Attempts:
+        """The steps of one stage with these unknowns, which nothing solves."""
+        known = self._values(self.program.stages[0][0], u, state, (t, np.full(len(t), h), params))
+        after = self._read(known, self.program.equations[self.program.stages[0][0]].advance)
+        return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
+
+    def rows(
+        self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: "Noise | None" = None
+    ) -> dict[str, np.ndarray]:
+        """The named arrays of the rows that the steps leave."""
+        parts = []
+        stages = self.program.stages if needs_every_part(self.equation) else self.program.stages[:1]
+        for i, (index, fraction) in enumerate(stages):
+            rows, pieces = self.program.equations[index].rows, {}
+            for low in range(0, max(len(t), 1), LANES):
+                some = slice(low, low + LANES)
+                at = (t[some], np.full(len(t[some]), fraction * h), params[some])
+                known = self._values(index, made.unknowns[i][some], made.states[i][some], at, noise)
+                for name, nodes in rows.items():
+                    pieces.setdefault(name, []).append(self._read(known, nodes))
+            parts.append({name: np.concatenate(a) for name, a in pieces.items()})
+            t = t + fraction * h
+        if len(parts) == 1:
+            return parts[0]
+        whole = {}
+        for name, about in self.equation.fields.items():
+            arrays = [about.weight(f) * row[name] for row, (_, f) in zip(parts, self.program.stages, strict=True)]
+            each = about.rule == "each"
+            whole[name] = parts[0][name] if about.rule == "first" else np.stack(arrays, axis=1) if each else sum(arrays)
+        return whole
+
+    def _solved(self, index: int, guess, states, at, noise) -> tuple[np.ndarray, np.ndarray]:
+        """The unknowns (states, k) of a stage by Newton's method, and where it has a solution."""
+        e = self.program.equations[index]
+        count, k = guess.shape
+        if not k:
+            return guess, np.ones(count, bool)
+        known = self._values(index, guess, states, at)
+        known.bind(_nodes(e.previous), guess)
+        u = self._read(known, e.guess)
+        known = known.without(self._depends[index])
+        known.bind(_nodes(e.unknowns), u)
+        fixed = None
+        inverse, size = np.zeros((count, k, k)), np.zeros((count, k))
+        last, left = np.full(count, np.inf), np.arange(count)
+        for _ in range(UPDATES):
+            some = known if fixed is None else fixed.at(left) if len(left) < count else fixed.without(set())
+            some.bind(_nodes(e.unknowns), u[left])
+            if np.any(renewed := last[left] > KEPT):
+                slopes = self._slopes(index, some if np.all(renewed) else some.at(np.flatnonzero(renewed)))
+                new = left[renewed]
+                inverse[new] = _inverses(slopes)
+                terms = np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u[new]))
+                size[new] = np.einsum("rij,rj->ri", np.abs(inverse[new]), terms)
+            change = np.einsum("rij,rj->ri", inverse[left], self._read(some, e.residual))
+            fixed = known.without(self._depends[index]) if fixed is None else fixed
+            u[left] -= change
+            moved = _largest_ratio(change, np.maximum(np.abs(u[left]), size[left]))
+            ended = (moved <= FOUND) | ((moved >= last[left] / 2) & (moved < LEFT)) | np.isnan(moved)
+            last[left] = moved
+            left = left[~ended]
+            if not len(left):
+                break
+        if noise:
+            known = self._values(index, u, states, at, noise)
+            u = u - np.einsum("rij,rj->ri", inverse, self._read(known, e.residual))
+        return u, last < LEFT
+
+    def _values(self, index: int, u, states, at, noise: "Noise | None" = None) -> Values:
+        e, shared = self.program.equations[index], self.program.shared
+        known = Values(self.program.graph, len(states), noise.table if noise else None)
+        pairs = [(e.unknowns, u), (e.state, states), (shared.t, at[0]), (shared.h, at[1]), (shared.params, at[2])]
+        for nodes, array in pairs:
+            known.bind(_nodes(nodes), noise.off(array) if noise else array)
+        return known
+
+    def _slopes(self, index: int, known: Values) -> np.ndarray:
+        """The Jacobians (states, k, k) of a residual."""
+        rows = self.program.jacobians[index]
+        places = [(i, j, node) for i, row in enumerate(rows) for j, node in row.items()]
+        out = np.zeros((known.entries, len(rows), len(rows)))
+        if places:
+            i, j, nodes = zip(*places, strict=True)
+            out[:, list(i), list(j)] = self._read(known, nodes)
+        return out
+
+    def _read(self, known: Values, nodes: Any) -> np.ndarray:
+        """The values of nodes, in an order that is found once."""
+        nodes = _nodes(nodes)
+        key = nodes.tobytes()
+        if key not in self._orders:
+            self._orders[key] = self.program.graph.reachable(nodes.ravel().tolist())
+        return known.read(nodes, self._orders[key])
+
+    def _moving(self, inputs: list[int]) -> set[int]:
+        """The nodes that depend on these."""
+        moving, args = set(inputs), self.program.graph.args
+        for node in range(len(args)):
+            if node not in moving and any(a in moving for a in args[node]):
+                moving.add(node)
+        return moving
+
+
+class Noise:
+    """Arithmetic in which the result of every operation is off at random, by up to `size` of itself (Vignes 1978): what
+    happens to the numbers that come out is what rounding does to them, ε/2 in place of `size`."""
+
+    def __init__(self, size: float, seed: int):
+        self.size, self._draw = size, np.random.default_rng(seed)
+        self.table = {name: function if name in EXACT else self._off(function) for name, function in NUMPY.items()}
+
+    def off(self, values: np.ndarray) -> np.ndarray:
+        """Numbers as they would be if they had been rounded."""
+        return values * (1.0 + self.size * self._draw.uniform(-1.0, 1.0, np.shape(values)))
+
+    def _off(self, function: Callable) -> Callable:
+        return lambda *operands: self.off(function(*operands))
+
+
+EXACT = BOOLEAN | {"select", "neg", "abs", "sign", "max", "min", "floor", "ceil"}
+"""The operations that do not round."""
+
+
+def _inverses(matrices: np.ndarray) -> np.ndarray:
+    """The inverses (rows, k, k), NaN where there is none."""
+    with np.errstate(all="ignore"):
+        try:
+            return np.linalg.inv(matrices)
+        except np.linalg.LinAlgError:
+            return np.stack([_inverse(matrix) for matrix in matrices])
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
+
+
+def _largest_ratio(values: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """The largest |value|/size of each row, NaN where one is not finite."""
+    ratios = np.divide(np.abs(values), sizes, out=np.zeros_like(values), where=sizes > SMALLEST)
+    return np.where(np.all(np.isfinite(values), axis=1), np.max(ratios, axis=1), np.nan)
+
+
+def _nodes(nodes: Any) -> np.ndarray:
+    return np.asarray(nodes, dtype=np.int64)

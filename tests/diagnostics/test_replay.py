@@ -1,0 +1,140 @@
+"""verify() takes every step again: a saved number off by a millionth is seen, in any field, and no right run is accused."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.diagnostics.replay_lines import replayed
+
+DAMAGE = 1e-6
+
+PENDULUM = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.81 * q[1], holonomic=lambda q: jnp.array([(q @ q - 1) / 2]))
+HANGING = {"q": [np.sin(0.5), -np.cos(0.5)], "v": [0.0, 0.0]}
+BLADE = dx.LagrangeDirac(
+    lambda q, v: v @ v / 2 + 0.3 * v[2] ** 2 + q[0] + 0.2 * jnp.sin(q[1]),
+    one_forms=lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]]),
+    forces=lambda t, q, v: -0.3 * v,
+)
+GLIDING = {"q": [0.0, 0.0, 0.4], "v": [np.cos(0.4), np.sin(0.4), 1.5]}
+BLADE_WITHOUT_FORCES = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 0.3 * v[2] ** 2 + q[0], BLADE.one_forms.function)
+DRIVEN = dx.LagrangeDirac(
+    lambda t, q, v: v @ v / 2 - q @ q / 2 + jnp.sin(t) * q[0], forces=lambda t, q, v, params: -params["c"] * v
+)
+CIRCUIT = dx.PortHamiltonian(
+    lambda x: x[0] ** 2 / 2 + x[1] ** 4 / 4,
+    np.array([[0.0, 1.0], [-1.0, 0.0]]),
+    np.array([[0.0], [1.0]]),
+    np.diag([0.0, 0.2]),
+    inputs=lambda t, x: jnp.array([jnp.sin(t)]),
+)
+PLUS, MINUS, MIDPOINT = dx.PlusLagrangeDirac(), dx.MinusLagrangeDirac(), dx.LagrangeDAlembert()
+
+RUNS = {
+    "plain": (BLADE, MIDPOINT, GLIDING),
+    "plus": (BLADE, PLUS, GLIDING),
+    "minus": (BLADE_WITHOUT_FORCES, MINUS, GLIDING),
+    "holonomic": (PENDULUM, MIDPOINT, HANGING),
+    "holonomic plus": (PENDULUM, PLUS, HANGING),
+    "Method 1": (BLADE, dx.DiscreteDirac(), GLIDING),
+    "Method 2": (BLADE, dx.DiscreteDirac(constraints="resolve"), GLIDING),
+    "composed": (PENDULUM, dx.Composition(MIDPOINT, "suzuki4"), HANGING),
+    "composed with one-forms and forces": (BLADE, dx.Composition(MIDPOINT, "yoshida4"), GLIDING),
+    "symmetric composition": (PENDULUM, dx.SymmetricComposition(PLUS), HANGING),
+    "composed Method 1": (BLADE_WITHOUT_FORCES, dx.Composition(dx.DiscreteDirac(), "suzuki4"), GLIDING),
+    "adjoint": (DRIVEN, dx.Adjoint(dx.DiscreteDirac(dx.Theta(0.3))), {"q": [1.0, 0.2], "v": [0.0, 0.5], "params": {"c": 0.1}}),
+    "collocation": (DRIVEN, dx.Collocation(3), {"q": [1.0, 0.2], "v": [0.0, 0.5], "params": {"c": 0.1}}),
+    "discrete gradient": (CIRCUIT, dx.DiscreteGradient(), {"x": [0.4, 0.1]}),
+    "discrete gradient at rest": (CIRCUIT, dx.DiscreteGradient(), {"x": [0.0, 0.0]}),
+}
+
+
+def run(name, **options):
+    system, scheme, start = RUNS[name]
+    return dx.simulate(system, scheme, **({"step": 0.02, "steps": 60} | start | options))
+
+
+def damaged(sol, seed=0):
+    """The run with one saved number off by a millionth of the largest of its field: each field twice, and a time."""
+    draw = np.random.default_rng(seed)
+    for name, values in sol.fields.items():
+        for _ in range(2):
+            changed = np.array(values)
+            place = tuple(draw.integers(size) for size in changed.shape)
+            largest = np.nanmax(np.abs(changed))
+            changed[place] += DAMAGE * (largest if largest > 1e-9 else 1.0)
+            yield f"{name}{list(map(int, place))}", sol.replace(fields=sol.fields | {name: changed})
+    t = np.array(sol.t)
+    t[len(t) // 2] += DAMAGE * sol.step
+    yield "t", sol.replace(t=t)
+
+
+def assert_seen(sol):
+    line = replayed(sol, None)
+    assert line.verdict == "ok", line
+    missed = [what for what, other in damaged(sol) if replayed(other, None).verdict != "VIOLATED"]
+    assert not missed
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_every_damage_is_seen(name):
+    assert_seen(run(name))
+
+
+@pytest.mark.parametrize("name", ["plain", "composed", "discrete gradient", "holonomic"])
+def test_also_where_not_every_step_is_saved(name):
+    assert_seen(run(name, save_every=7))
+
+
+def test_also_in_a_batch():
+    start = {
+        "q": np.array([[1.0, 0.2], [0.4, 0.3], [0.0, -2.0]]),
+        "v": np.ones((3, 2)),
+        "params": {"c": np.array([0.1, 0.2, 0.0])},
+    }
+    assert_seen(run("collocation", batch_params=True, **start))
+
+
+@pytest.mark.parametrize("scheme", [PLUS, MINUS, MIDPOINT])
+def test_also_from_two_points(scheme):
+    angle = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 9.81 * jnp.cos(q[0]))
+    assert_seen(dx.simulate(angle, scheme, q0=[0.5], q1=[0.51], step=0.02, steps=60))
+
+
+def test_also_on_manifolds():
+    sphere = dx.Sphere(3)
+    system = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - 9.81 * q[2], sphere)
+    for scheme in (dx.InCharts(dx.RiemannianExp(sphere)), dx.DiscreteDirac(dx.SphereProjection())):
+        assert_seen(dx.simulate(system, scheme, q=[1.0, 0.0, 0.0], v=[0.0, 2.0, 0.0], step=0.05, steps=60))
+
+
+def test_a_run_that_fails_is_replayed_up_to_its_end():
+    falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.log(q[0]))
+    sol = dx.simulate(falling, MIDPOINT, q=[1.0], v=[0.0], step=0.1, steps=60)
+    assert not sol.ok
+    assert sol.rows > 5
+    assert_seen(sol)
+
+
+def test_the_xla_engine_compensated_sums_and_files(tmp_path):
+    for options in ({"engine": "xla"}, {"compensated": True}):
+        assert replayed(run("plain", **options), None).verdict == "ok"
+    system, _, _ = RUNS["composed with one-forms and forces"]
+    run("composed with one-forms and forces").save(tmp_path / "run.nc")
+    assert replayed(dx.load(tmp_path / "run.nc"), None).verdict == "not checked"
+    assert replayed(dx.load(tmp_path / "run.nc", system=system), None).verdict == "ok"
+
+
+def test_a_scheme_whose_state_is_not_saved_says_so():
+    class Hidden(dx.AbstractScheme):
+        def step_equation(self, system, shape):
+            whole = MIDPOINT.step_equation(system, shape)
+            fields = {"q": dx.Field((shape.n,))}
+            return dataclasses.replace(whole, unpack=lambda *a: {"q": whole.unpack(*a)["q"]}, fields=fields)
+
+    sol = dx.simulate(dx.LagrangeDirac(lambda q, v: (v @ v - q @ q) / 2), Hidden(), q=[1.0], v=[0.0], step=0.1, steps=9)
+    line = replayed(sol, None)
+    assert line.verdict == "not checked"
+    assert "does not start from a saved row" in line.explanation
