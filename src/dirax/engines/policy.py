@@ -18,6 +18,7 @@ ENGINES = {
     "auto": "dirax.engines.auto:Auto",
     "xla": "dirax.engines.xla:Xla",
     "native": "dirax.engines.native:Native",
+    "sparse": "dirax.engines.sparse.engine:Sparse",
 }
 """Name → the class, imported when it is used."""
 

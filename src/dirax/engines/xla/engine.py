@@ -85,7 +85,7 @@ class Xla(AbstractEngine):
             interrupted = True
         _, rows = call(lanes, 0, 1, closing=True)
         outcome = _outcome(
-            p, jax.tree.map(np.asarray, lanes), fields, {name: values[:, 0] for name, values in rows.items()}, notes
+            p, jax.tree.map(np.asarray, lanes), fields, {name: values[:, 0] for name, values in rows.items()}, notes, self.name
         )
         outcome.interrupted, outcome.compile_seconds = interrupted, compile_seconds
         outcome.run_seconds = time.perf_counter() - started
@@ -125,7 +125,7 @@ class Xla(AbstractEngine):
             packed = jnp.concatenate([packed, step(lanes, p.steps)[1][None]])
         rows = {name: by_lane(a, p.batch, jnp) for name, a in unpack_rows(p.equation, axes, packed, p.params, clock).items()}
         fields = {name: values if p.is_node(name) else values[:, :-1] for name, values in rows.items()}
-        return finished(p, _outcome(p, lanes, fields, {name: values[:, -1] for name, values in rows.items()}, notes))
+        return finished(p, _outcome(p, lanes, fields, {name: values[:, -1] for name, values in rows.items()}, notes, self.name))
 
     def _planned(self, p: Problem) -> tuple[Problem, Numerics, dict[str, Any]]:
         """The run with its equations in scalars where the policy has them so, how its steps are computed, and what `stats` say
@@ -145,7 +145,7 @@ class Xla(AbstractEngine):
         return p, Numerics(self.linear_solver, increments, jacobians), notes
 
 
-def _outcome(p: Problem, lanes: Lane, fields: dict[str, Any], closing: dict[str, Any], notes: dict[str, Any]) -> Outcome:
+def _outcome(p: Problem, lanes: Lane, fields: dict[str, Any], closing: dict[str, Any], notes: dict[str, Any], name: str) -> Outcome:
     lanes = lanes if p.batch is not None else jax.tree.map(lambda a: a[None], lanes)
     return Outcome(
         fields=fields,
@@ -156,7 +156,7 @@ def _outcome(p: Problem, lanes: Lane, fields: dict[str, Any], closing: dict[str,
         max_residual=lanes.max_residual,
         last_state=lanes.state,
         last_unknowns=lanes.unknowns[0],
-        engine="xla",
+        engine=name,
         notes=notes,
     )
 

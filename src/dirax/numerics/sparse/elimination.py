@@ -77,7 +77,8 @@ def _band_kernels(below: int, width: int) -> tuple[Kernel, Kernel, Kernel]:
 class BandElimination:
     """Elimination with partial pivoting in the band that the unknowns have in `order` and the equations in `rows`."""
 
-    name = "band"
+    work_of_factor = 0
+    """How many of the results of a factorization are no factors."""
 
     def __init__(self, pattern: sp.csr_matrix, order: np.ndarray, rows: np.ndarray, below: int, above: int):
         self.size, self.order, self.rows = pattern.shape[0], _whole(order), _whole(rows)
@@ -120,6 +121,11 @@ class BandElimination:
         solver = "tridiagonal" if self.below <= 1 and self.above <= 1 else "band"
         return {"solver": solver, "bandwidth": [self.below, self.above], "fill": self.size * self.width}
 
+    @property
+    def operations(self) -> int:
+        """Multiplications of a factorization."""
+        return self.size * self.below * self.width
+
 
 _fixed_kernels = (
     Kernel(kernels.fixed_factor, 5), Kernel(kernels.fixed_solve, 2), Kernel(kernels.fixed_solve_transposed, 2),
@@ -130,7 +136,7 @@ class FixedElimination:
     """Elimination whose pivots are taken in an order found once: of least fill, and what has no diagonal after its neighbours,
     so that its pivot is made by theirs (the multipliers of a saddle point)."""
 
-    name = "fixed"
+    work_of_factor = 2
 
     def __init__(self, pattern: sp.csr_matrix, rows: np.ndarray, both: sp.csr_matrix):
         self.size = pattern.shape[0]

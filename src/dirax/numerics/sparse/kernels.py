@@ -172,8 +172,8 @@ def band_solve_transposed(
 
 
 def fixed_factor(
-    starts: "i4[]", places: "i4[]", sources: "i4[]", values: "f8[]", fill_starts: "i8[]", fill_rows: "i4[]",
-    left_starts: "i8[]", left: "i4[]", left_places: "i8[]", sizes: "i8[]",
+    starts: "i4[]", places: "i4[]", sources: "i4[]", fill_starts: "i8[]", fill_rows: "i4[]",
+    left_starts: "i8[]", left: "i4[]", left_places: "i8[]", values: "f8[]", sizes: "i8[]",
     x: "f8[]", y: "f8[]", lower: "f8[]", upper: "f8[]", inverse: "f8[]",
 ):  # fmt: skip
     """L by columns and U by rows of a matrix whose pivots are taken in order, both with the pattern `fill_rows`.
