@@ -84,6 +84,13 @@ class SparseEquations(eqx.Module):
         data = np.asarray(values)[np.asarray(self.colours)[entries.col].astype(np.int64) * size + entries.row]
         return sp.csr_matrix((data, pattern.indices, pattern.indptr), pattern.shape)
 
+    def values_of(self, matrix: sp.csr_matrix) -> np.ndarray:
+        """The values of a matrix of this pattern."""
+        entries = matrix.tocoo()
+        values = np.zeros(self.count * matrix.shape[0])
+        values[np.asarray(self.colours)[entries.col].astype(np.int64) * matrix.shape[0] + entries.row] = entries.data
+        return values
+
     def factorise(self, values: Float[Array, " colours*k"]) -> Any:
         """The factors of the Jacobian with these values."""
         made = self.elimination
@@ -95,6 +102,30 @@ class SparseEquations(eqx.Module):
         made = self.elimination
         shapes = [jax.ShapeDtypeStruct((n,), np.float64) for n in (*made.work, made.size)]
         return made.kernels[1 + transposed].in_jax(shapes, *self.solve_tables, *factors, right, self.size)[-1]
+
+    def root(self, function: Callable, root: Float[Array, " k"]) -> Float[Array, " k"]:
+        """`root`, with its derivatives as the function of what `function` captures that function(root) = 0 makes of it."""
+
+        def solved(linear, right):
+            factors = self.factorise(jax.lax.stop_gradient(self.values(function, root)))
+            of_factors = lambda transposed: lambda _, b: self.solve(factors, b, transposed)
+            return jax.lax.custom_linear_solve(linear, right, of_factors(False), of_factors(True))
+
+        return jax.lax.custom_root(function, root, lambda _, u: u, solved)
+
+    def in_numpy(self, values: np.ndarray) -> Callable[..., np.ndarray]:
+        """(right, transposed=False) ↦ the solution with the Jacobian of these values, in NumPy."""
+        made, size = self.elimination, np.asarray(self.size)
+        factors = [np.zeros(shape, kind) for shape, kind in made.factor_shapes]
+        made.kernels[0](*map(np.asarray, self.tables), np.ascontiguousarray(values, float), size, *factors)
+
+        def solve(right: np.ndarray, transposed: bool = False) -> np.ndarray:
+            *work, found = (np.zeros(n) for n in (*made.work, made.size))
+            given = map(np.asarray, self.solve_tables), factors[made.work_of_factor :]
+            made.kernels[1 + transposed](*(a for part in given for a in part), np.ascontiguousarray(right), size, *work, found)
+            return found
+
+        return solve
 
 
 class _Static:

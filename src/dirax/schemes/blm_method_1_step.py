@@ -72,5 +72,5 @@ class MethodOneStep(LagrangianStep):
         at = self.lift.step(q0, velocity, t, h)
         rate, momentum = self.rates(at.t, at.q, at.v, params)
         if self.rows.count:
-            rate = rate + self.rows.matrix(at.t, at.q, params).T @ multipliers
+            rate = rate + self.rows.force(at.t, at.q, multipliers, params)
         return at, rate, momentum

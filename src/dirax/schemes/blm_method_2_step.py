@@ -105,8 +105,8 @@ class ProjectedThetaStep(ThetaStep):
         (q0, p0, _), parts, rows = self.state.split(state), self.unknowns.split(u), self.rows
         at, q, q1 = self._base(u, state, t, h, params)
         p, rate, _ = self._flow(at, q, parts.v, params)
-        begun = p0 + rows.matrix(t, q0, params).T @ parts.sigma - (p - (1.0 - self.theta) * h * rate)
-        ended = self.system.legendre(q1, parts.end_v, params, t + h) + rows.matrix(t + h, q1, params).T @ parts.end_sigma
+        begun = p0 + rows.force(t, q0, parts.sigma, params) - (p - (1.0 - self.theta) * h * rate)
+        ended = self.system.legendre(q1, parts.end_v, params, t + h) + rows.force(t + h, q1, parts.end_sigma, params)
         ends = [
             begun,
             rows.velocity_defect(at, q, parts.v, params),
@@ -144,7 +144,7 @@ class ProjectedThetaStep(ThetaStep):
 
     def _pushed(self, t: Any, q: Array, v: Array, s: Array, params: Any) -> Float[Array, " n"]:
         """v + M⁻¹G(q)ᵀs, the direction of the projection onto g = 0 at q."""
-        return v + solve(self._mass(t, q, v, params), self.rows.holonomic_matrix(t, q, params).T @ s)
+        return v + solve(self._mass(t, q, v, params), self.rows.holonomic_force(t, q, s, params))
 
     def _base(self, u: Array, state: Array, t: Any, h: Any, params: Any) -> tuple[Any, Array, Array]:
         """The time of the base point, the base point, and where the second half ends."""

@@ -57,7 +57,7 @@ class LagrangeDAlembertPart(AbstractStep):
         v, sigma = self.unknowns.split(u).v, self.unknowns.split(u).sigma
         q = self.state.split(state).q
         q1, p1 = q + h * v, self.inner.slots(t, q, v, h, params)[1]
-        return q1, p1 - self.rows.matrix(t + h, q1, params).T @ sigma
+        return q1, p1 - self.rows.force(t + h, q1, sigma, params)
 
     def residual(self, u, state, t, h, params):
         v, multipliers, end_v, _ = self.unknowns.split(u)

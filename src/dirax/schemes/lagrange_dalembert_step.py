@@ -127,14 +127,14 @@ class LagrangeDAlembertStep(AbstractStep):
         if not self.rows.count:
             return balance
         imposed = self.rows.pick(self.step_constraint(t, q, v, h, params, unit=h))
-        return jnp.concatenate([balance - self.rows.matrix(t, q, params).T @ multipliers, imposed])
+        return jnp.concatenate([balance - self.rows.force(t, q, multipliers, params), imposed])
 
     def saved_momentum(self, multipliers, sigma, q, p, t, params):
         """p_k − share·Wᵀμ − Gᵀσ."""
         if self.share:
             count = self.rows.nonholonomic
             p = p - self.share * (self.rows.matrix(t, q, params)[:count].T @ multipliers[:count])
-        return p - self.rows.holonomic_matrix(t, q, params).T @ sigma if self.projects else p
+        return p - self.rows.holonomic_force(t, q, sigma, params) if self.projects else p
 
     def projection(self, saved_v, sigma, multipliers, q, p, t, params):
         """∂L/∂v(q, v̂) is the saved momentum, and G v̂ + ∂g/∂t = 0."""
@@ -214,16 +214,16 @@ class LagrangeDAlembertStep(AbstractStep):
         mu = leaving.multipliers[: rows.nonholonomic]
         jump = share / (1.0 - share) * mu if share < 1.0 else 0.0 * mu
         if not self.projects:
-            return p + rows.matrix(t, q, params).T @ jump, self.unknowns.join(v=leaving.v, multipliers=mu + jump)
+            return p + rows.force(t, q, jump, params), self.unknowns.join(v=leaving.v, multipliers=mu + jump)
         sigma = step.split(found.arriving).multipliers[rows.nonholonomic :]
         jump = jnp.concatenate([jump, sigma])
         u = self.unknowns.join(v=leaving.v, multipliers=leaving.multipliers + jump, saved_v=v, sigma=sigma)
-        return p + rows.matrix(t, q, params).T @ jump, u
+        return p + rows.force(t, q, jump, params), u
 
     def _arriving(self, v, multipliers, q, p, t, h, params):
         """The equations of (v, μ, σ) for a step from q − h v on the constraints to (q, p)."""
         rows, before = self.rows, q - h * v
-        missed = p - self.slots(t - h, before, v, h, params)[1] + rows.matrix(t, q, params).T @ multipliers
+        missed = p - self.slots(t - h, before, v, h, params)[1] + rows.force(t, q, multipliers, params)
         g = rows.constraints.position_defect(t - h, before, params) / h
         imposed = rows.pick(jnp.concatenate([self.discrete_constraint(t - h, before, v, h, params), g]))
         return jnp.concatenate([missed, imposed])

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
 from dirax.engines.linear_solver import AbstractLinearSolver
-from dirax.engines.sparse.solver import SparseSolver
 from dirax.engines.xla.newton import as_function, solve
 from dirax.schemes.step import composed_row, needs_every_part
 
@@ -25,7 +24,7 @@ class Numerics(NamedTuple):
     linear_solver: AbstractLinearSolver | None = None
     increments: tuple[Callable, ...] | None = None
     jacobians: tuple[Callable, ...] | None = None
-    sparse: tuple[SparseSolver, ...] | None = None
+    sparse: tuple[Any, ...] | None = None
 
     def of_stages(self, equation) -> list[tuple]:
         """(linear solver, increment, Jacobian) of every stage."""
