@@ -14,9 +14,10 @@ from dirax.numerics.sparse.colours import column_colours
 from dirax.numerics.sparse.elimination import elimination
 from dirax.program.sparsity import pattern_of
 
-MOST_OPERATIONS = 0.02
-"""Multiplications of an elimination, relative to those of the dense one (k³/3), from which on it is not worth its while: LAPACK
-does some 20 of them in the time of one that follows indices."""
+DENSE_OPERATION, DENSE_ENTRY = 0.05, 4.0
+SPARSE_OPERATION, SPARSE_ROW = 1.2, 60.0
+"""Nanoseconds that elimination takes: LAPACK for each of its k³/3 multiplications, and the columns of a dense Jacobian for each
+entry; elimination that follows indices for each multiplication, and each equation."""
 
 
 class NotSparse(Exception):
@@ -51,11 +52,12 @@ class SparseEquations(eqx.Module):
         size = pattern.shape[0]
         colours = column_colours(pattern)
         count = int(np.max(colours, initial=-1)) + 1
-        if 3 * count > size:
-            raise NotSparse(f"{count} products are needed to find the Jacobian of {size} equations")
+        dense = size**2 * (DENSE_OPERATION * size / 3 + DENSE_ENTRY)
+        if (cost := size * (SPARSE_ROW + DENSE_ENTRY * count)) > dense:
+            raise NotSparse(f"the Jacobian of {size} equations is found from {count} products")
         made = elimination(pattern)
-        if made.operations > MOST_OPERATIONS * size**3 / 3:
-            raise NotSparse(f"elimination takes {made.operations} operations, of {size} equations")
+        if cost + SPARSE_OPERATION * made.operations > dense:
+            raise NotSparse(f"elimination takes {made.operations} multiplications, of {size} equations")
         entries = pattern.tocoo()
         numbers = 1 + colours[entries.col].astype(np.int64) * size + entries.row
         places = sp.csr_matrix((numbers, pattern.indices, pattern.indptr), pattern.shape)

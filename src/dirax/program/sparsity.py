@@ -1,13 +1,14 @@
 """Which results of a function depend on which of its unknowns: index sets through the jaxpr, an array of them at a time.
 
 The set of every entry of an array is a row of one sparse matrix of booleans. What moves entries about takes rows, what computes
-entry by entry unites them, a sum is a product of matrices. Nothing is found by trying values: a set can be too large and never
+entry by entry unites them, a sum is a product of matrices. Entries that are zero whatever the unknowns are followed too, so that a
+matrix of zeros with some entries is as sparse as it looks. Nothing is found by trying values: a set can be too large and never
 too small.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -56,64 +57,85 @@ def pattern_of(function: Callable, unknowns: Any, *others: Any) -> sp.csr_matrix
     shaped = lambda x: x if isinstance(x, jax.ShapeDtypeStruct) else jax.ShapeDtypeStruct(np.shape(x), jax.numpy.result_type(x))
     closed = jax.make_jaxpr(function)(*jax.tree.map(shaped, (unknowns, *others)))
     size = math.prod(unknowns.shape)
-    known = [_known(leaf) for leaf in jax.tree.leaves(others)]
-    (found,) = _Sets(size).run(closed, [sp.identity(size, bool, "csr"), *known])
-    return found if isinstance(found, sp.csr_matrix) else sp.csr_matrix((closed.out_avals[0].size, size), dtype=bool)
+    whole = lambda leaf: None if jax.numpy.issubdtype(jax.numpy.result_type(leaf), np.inexact) else _concrete(leaf)
+    given = [Value(known=whole(leaf)) for leaf in jax.tree.leaves(others)]
+    (found,) = _Sets(size).run(closed, [Value(sp.identity(size, bool, "csr")), *given])
+    return sp.csr_matrix((closed.out_avals[0].size, size), dtype=bool) if found.sets is None else found.sets
 
 
-def _known(value: Any) -> np.ndarray | None:
-    """A value that index sets may depend on; None for one that is not known."""
-    if isinstance(value, Tracer | jax.ShapeDtypeStruct):
-        return None
-    return np.asarray(value)
+def _concrete(value: Any) -> np.ndarray | None:
+    return None if isinstance(value, Tracer | jax.ShapeDtypeStruct) else np.asarray(value)
+
+
+class Value(NamedTuple):
+    """What is known of an array: the index sets of its entries (entries, unknowns), None for empty ones; its numbers, where they
+    are known; which entries are zero whatever the unknowns, None for no entries."""
+
+    sets: sp.csr_matrix | None = None
+    known: np.ndarray | None = None
+    zero: np.ndarray | None = None
+
+    def zeros(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Which entries are known to be zero."""
+        if self.known is not None:
+            return np.broadcast_to(self.known == 0, shape)
+        return np.zeros(shape, bool) if self.zero is None else self.zero
 
 
 class _Sets:
-    """Runs jaxprs on index sets: a value is a matrix of them, an array that is known, or None for anything else."""
+    """Runs jaxprs on `Value`s."""
 
     def __init__(self, size: int):
         self.size = size
 
-    def run(self, closed: ClosedJaxpr, operands: Sequence[Any]) -> list[Any]:
+    def run(self, closed: ClosedJaxpr, operands: Sequence[Value]) -> list[Value]:
         jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))[:2]
         operands = [operand for operand, needed in zip(operands, used, strict=True) if needed]
-        values: dict[Any, Any] = dict(zip(closed.jaxpr.constvars, map(_known, closed.consts), strict=True))
-        values.update(zip(jaxpr.constvars, (values[v] for v in jaxpr.constvars), strict=True))
+        constants = [Value(known=_concrete(c)) for c in closed.consts]
+        values: dict[Any, Value] = dict(zip(closed.jaxpr.constvars, constants, strict=True))
         values.update(zip(jaxpr.invars, operands, strict=True))
-        read = lambda atom: np.asarray(atom.val) if isinstance(atom, Literal) else values[atom]
+        read = lambda atom: Value(known=np.asarray(atom.val)) if isinstance(atom, Literal) else values[atom]
         for equation in jaxpr.eqns:
             results = self.equation(equation, [read(atom) for atom in equation.invars])
             for variable, result in zip(equation.outvars, results, strict=True):
-                if isinstance(result, sp.csr_matrix):
-                    if not np.issubdtype(variable.aval.dtype, np.inexact):
-                        result = None  # what is not a float has no derivative
-                    elif result.nnz > MOST_PER_UNKNOWN * (self.size + result.shape[0]):
-                        raise Dense(f"the results of '{equation.primitive.name}' depend on too many unknowns each")
-                values[variable] = result
+                values[variable] = self.trimmed(equation, variable, result)
         return [read(atom) for atom in jaxpr.outvars]
 
-    def equation(self, equation: Any, operands: list[Any]) -> list[Any]:
+    def trimmed(self, equation: Any, variable: Any, value: Value) -> Value:
+        """Without the sets of what has no derivative. Raises `Dense` where there is too much of them."""
+        sets, zero = value.sets, value.zero
+        if sets is not None and not np.issubdtype(variable.aval.dtype, np.inexact):
+            sets = None
+        if zero is not None and not np.any(zero):
+            zero = None
+        if sets is not None and zero is not None:
+            sets = self.rows(sets, np.where(zero.ravel(), 0, np.arange(1, zero.size + 1)))
+        if sets is not None and sets.nnz > MOST_PER_UNKNOWN * (self.size + sets.shape[0]):
+            raise Dense(f"the results of '{equation.primitive.name}' depend on too many unknowns each")
+        return Value(sets, value.known, zero)
+
+    def equation(self, equation: Any, operands: list[Value]) -> list[Value]:
         name, p, count = equation.primitive.name, equation.params, len(equation.outvars)
-        moves = any(isinstance(o, sp.csr_matrix) for o in operands)
         if name in CALLS:
             inner = p[CALLS[name]]
-            closed = inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ())
-            return self.run(closed, operands)
+            return self.run(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), operands)
         if name.startswith("dirax_"):
-            if not moves:
-                return [None] * count
             impl = lambda *given: equation.primitive.impl(*given, **p)
             return self.run(jax.make_jaxpr(impl)(*(v.aval for v in equation.invars)), operands)
         if name in MOVES or name == "pad":
             return self.moved(equation, operands)
-        if not moves:
-            return self.values(equation, operands)
+        if name in IN_NUMPY and all(o.known is not None for o in operands):
+            return [Value(known=IN_NUMPY[name](*(o.known for o in operands)).astype(equation.outvars[0].aval.dtype))]
+        if name == "iota":
+            return [Value(known=_iota(equation))]
+        if self.is_whole(equation) and all(o.known is not None for o in operands):
+            return [Value(known=a) for a in _evaluated(equation, [o.known for o in operands])]
         if name == "select_n":
             return [self.selected(equation, *operands)]
         if name in BY_ENTRY:
             return [self.united(equation, operands)] * count
         if name in FOLDS and "axes" in p:
-            return [self.folded(operands[0], equation.invars[0].aval.shape, p["axes"])]
+            return [self.folded_value(equation, operands[0])]
         if name == "dot_general":
             return [self.product(equation, *operands)]
         if name in ("gather", "dynamic_slice"):
@@ -124,28 +146,42 @@ class _Sets:
             return [self.updated(equation, *operands)]
         if name == "cond":
             return self.branches(equation, operands)
+        if not any(o.sets is not None for o in operands):
+            return [Value()] * count
         if name in BY_MATRIX:
             return self.by_matrix(equation, operands)
         return self.all_of_all(equation, operands)
 
+    def is_whole(self, equation: Any) -> bool:
+        """Whether results are whole numbers, which can be indices, of a primitive that is quickly evaluated."""
+        whole = all(np.issubdtype(v.aval.dtype, np.integer) or v.aval.dtype == np.bool_ for v in equation.outvars)
+        name = equation.primitive.name
+        return whole and not equation.effects and (name in BY_ENTRY or name in INDEXING)
+
     # ---------------------------------------------------------------------------------------------- what moves entries
 
-    def moved(self, equation: Any, operands: list[Any]) -> list[Any]:
-        """Numbers of entries are moved; the number 0 is that of an entry which depends on nothing."""
+    def moved(self, equation: Any, operands: list[Value]) -> list[Value]:
+        """Numbers of entries are moved, counted from 1; 0 is that of an entry which depends on nothing."""
         rule = _pad if equation.primitive.name == "pad" else RULES[equation.primitive.name]
-        if not any(isinstance(o, sp.csr_matrix) for o in operands):
-            return [None] * len(equation.outvars) if any(o is None for o in operands) else list(rule(None, equation, *operands))
-        numbers, parts, first = [], [], 1
-        for variable, operand in zip(equation.invars, operands, strict=True):
-            shape = variable.aval.shape
-            if isinstance(operand, sp.csr_matrix):
-                numbers.append(np.arange(first, first + operand.shape[0]).reshape(shape))
-                parts.append(operand)
-                first += operand.shape[0]
-            else:
-                numbers.append(np.zeros(shape, np.int64))
-        sets = parts[0] if len(parts) == 1 else sp.vstack(parts, "csr")
-        return [self.rows(sets, moved) for moved in rule(None, equation, *numbers)]
+        if all(o.known is not None for o in operands):
+            return [Value(known=np.asarray(a)) for a in rule(None, equation, *(o.known for o in operands))]
+        shapes = [v.aval.shape for v in equation.invars]
+        results, count = [Value()] * len(equation.outvars), len(equation.outvars)
+        zeros: list[Any] = [None] * count
+        if any(o.known is not None or o.zero is not None for o in operands):
+            zeros = rule(None, equation, *(o.zeros(shape) for o, shape in zip(operands, shapes, strict=True)))
+        if any(o.sets is not None for o in operands):
+            numbers, parts, first = [], [], 1
+            for shape, operand in zip(shapes, operands, strict=True):
+                if operand.sets is None:
+                    numbers.append(np.zeros(shape, np.int64))
+                    continue
+                numbers.append(np.arange(first, first + operand.sets.shape[0]).reshape(shape))
+                parts.append(operand.sets)
+                first += operand.sets.shape[0]
+            sets = parts[0] if len(parts) == 1 else sp.vstack(parts, "csr")
+            results = [Value(self.rows(sets, moved)) for moved in rule(None, equation, *numbers)]
+        return [Value(r.sets, None, zero) for r, zero in zip(results, zeros, strict=True)]
 
     def rows(self, sets: sp.csr_matrix, numbers: np.ndarray) -> sp.csr_matrix:
         """The sets of entries with these numbers, counted from 1; 0 for the empty set."""
@@ -156,82 +192,103 @@ class _Sets:
         extended = sp.csr_matrix((sets.data, sets.indices, pointers), (sets.shape[0] + 1, self.size))
         return extended[np.where(flat > 0, flat - 1, sets.shape[0])]
 
-    def gathered(self, equation: Any, sets: Any, *indices: Any) -> Any:
-        if not isinstance(sets, sp.csr_matrix):
-            return None  # an index has no derivative
-        if any(not isinstance(i, np.ndarray) for i in indices):
+    def gathered(self, equation: Any, value: Value, *indices: Value) -> Value:
+        if value.sets is None and value.known is None and value.zero is None:
+            return Value()
+        if any(i.known is None for i in indices):
+            if value.sets is None:
+                return Value()
             raise Dense(f"'{equation.primitive.name}' has indices that depend on values")
-        numbers = np.arange(1, sets.shape[0] + 1).reshape(equation.invars[0].aval.shape)
+        shape = equation.invars[0].aval.shape
+        numbers = np.arange(1, math.prod(shape) + 1).reshape(shape)
         options = {"fill_value": 0} if equation.primitive.name == "gather" else {}
-        return self.rows(sets, _evaluated(equation, [numbers, *indices], **options)[0])
+        places = _evaluated(equation, [numbers, *(i.known for i in indices)], **options)[0]
+        zero = np.append(False, value.zeros(shape))[places] if value.known is not None or value.zero is not None else None
+        return Value(None if value.sets is None else self.rows(value.sets, places), None, zero)
 
-    def scattered(self, equation: Any, sets: Any, indices: Any, updates: Any) -> Any:
-        if not isinstance(indices, np.ndarray):
+    def scattered(self, equation: Any, value: Value, indices: Value, updates: Value) -> Value:
+        if indices.known is None:
+            if value.sets is None and updates.sets is None:
+                return Value()
             raise Dense(f"'{equation.primitive.name}' has indices that depend on values")
-        shape = equation.invars[0].aval.shape
-        put = lambda updates: _scatter_add(equation, np.zeros(shape), indices, updates)
-        numbers = np.arange(1.0, math.prod(shape) + 1).reshape(shape)
+        shape, given = equation.invars[0].aval.shape, equation.invars[2].aval.shape
+        total, name = math.prod(shape), equation.primitive.name
+        put = lambda updates: _scatter_add(equation, np.zeros(shape), indices.known, updates)
         with jax.ensure_compile_time_eval():
-            given = jax.ShapeDtypeStruct(equation.invars[2].aval.shape, np.float64)
-            places = np.asarray(jax.linear_transpose(put, given)(jax.numpy.asarray(numbers))[0]).ravel().astype(int)
-        total = math.prod(shape)
-        kept = sets if isinstance(sets, sp.csr_matrix) else None
-        if kept is not None and equation.primitive.name == "scatter":  # what is written over is gone
-            keep = np.ones(total, bool)
-            keep[places[places > 0] - 1] = False
-            kept = self.rows(kept, np.where(keep, np.arange(1, total + 1), 0))
-        if not isinstance(updates, sp.csr_matrix):
-            return kept
+            numbers = jax.numpy.arange(1.0, total + 1).reshape(shape)
+            found = jax.linear_transpose(put, jax.ShapeDtypeStruct(given, np.float64))(numbers)[0]
+            places = np.asarray(found).ravel().astype(int)
         inside = np.flatnonzero(places > 0)
-        put = sp.csr_matrix((np.ones(len(inside), bool), (places[inside] - 1, inside)), (total, len(places)))
-        return _union(kept, put @ updates)
+        targets = places[inside] - 1
+        kept, zero = value.sets, value.zeros(shape).ravel().copy()
+        fresh = updates.zeros(given).ravel()[inside]
+        if name == "scatter":  # what is written over is gone
+            over = np.zeros(total, bool)
+            over[targets] = True
+            kept = None if kept is None else self.rows(kept, np.where(over, 0, np.arange(1, total + 1)))
+            zero |= over
+        elif name not in ("scatter-add", "scatter-sub"):
+            zero[:] = False
+        zero[targets[~fresh]] = False
+        if updates.sets is not None:
+            there = sp.csr_matrix((np.ones(len(inside), bool), (targets, inside)), (total, len(places)))
+            kept = _union(kept, there @ updates.sets)
+        return Value(kept, None, zero.reshape(shape))
 
-    def updated(self, equation: Any, sets: Any, updates: Any, *starts: Any) -> Any:
-        if any(not isinstance(s, np.ndarray) for s in starts):
+    def updated(self, equation: Any, value: Value, updates: Value, *starts: Value) -> Value:
+        if any(s.known is None for s in starts):
+            if value.sets is None and updates.sets is None:
+                return Value()
             raise Dense("'dynamic_update_slice' has indices that depend on values")
-        shape = equation.invars[0].aval.shape
-        size = math.prod(shape)
-        count = equation.invars[1].aval.size
-        numbers = np.arange(1, size + 1).reshape(shape)
-        new = np.arange(size + 1, size + count + 1).reshape(equation.invars[1].aval.shape)
-        place = _evaluated(equation, [numbers, new, *starts])[0]
+        shapes = [v.aval.shape for v in equation.invars[:2]]
+        size, count = map(math.prod, shapes)
+        numbers = np.arange(1, size + 1).reshape(shapes[0]), np.arange(size + 1, size + count + 1).reshape(shapes[1])
+        places = _evaluated(equation, [*numbers, *(s.known for s in starts)])[0]
+        zero = np.concatenate([v.zeros(shape).ravel() for v, shape in zip((value, updates), shapes, strict=True)])[places - 1]
+        if value.sets is None and updates.sets is None:
+            return Value(zero=zero)
         empty = lambda rows: sp.csr_matrix((rows, self.size), dtype=bool)
-        both = [s if isinstance(s, sp.csr_matrix) else empty(n) for s, n in ((sets, size), (updates, count))]
-        return self.rows(sp.vstack(both, "csr"), place)
+        both = [empty(n) if v.sets is None else v.sets for v, n in ((value, size), (updates, count))]
+        return Value(self.rows(sp.vstack(both, "csr"), places), None, zero)
 
     # ------------------------------------------------------------------------------------------- what computes entries
 
-    def spread(self, operand: sp.csr_matrix, variable: Any, size: int) -> sp.csr_matrix:
-        """The sets of an operand of one entry, for each of `size` entries."""
-        return operand if variable.aval.size == size else self.rows(operand, np.ones(size, int))
+    def united(self, equation: Any, operands: list[Value]) -> Value:
+        shape, name = equation.outvars[0].aval.shape, equation.primitive.name
+        size, found, zero = math.prod(shape), None, None
+        for operand, variable in zip(operands, equation.invars, strict=True):
+            if operand.sets is not None:
+                spread = variable.aval.size == size
+                found = _union(found, operand.sets if spread else self.rows(operand.sets, np.ones(size, int)))
+        if any(o.known is not None or o.zero is not None for o in operands):
+            zeros = [np.broadcast_to(o.zeros(v.aval.shape), shape) for o, v in zip(operands, equation.invars, strict=True)]
+            if name == "mul":
+                zero = zeros[0] | zeros[1]
+            elif name in ("add", "add_any", "sub"):
+                zero = zeros[0] & zeros[1]
+            elif name == "div" or (name in ODD and len(zeros) == 1):
+                zero = zeros[0]
+        return Value(found, None, zero)
 
-    def united(self, equation: Any, operands: list[Any]) -> Any:
-        size = equation.outvars[0].aval.size
-        given = list(zip(operands, equation.invars, strict=True))
-        found = None
-        for operand, variable in given:
-            if isinstance(operand, sp.csr_matrix):
-                found = _union(found, self.spread(operand, variable, size))
-        if equation.primitive.name == "mul":
-            for operand, _ in given:
-                if isinstance(operand, np.ndarray) and not np.all(operand):
-                    zero = np.broadcast_to(operand.ravel() == 0.0, size)
-                    found = self.rows(found, np.where(zero, 0, np.arange(1, size + 1)))
-        return found
+    def selected(self, equation: Any, which: Value, *cases: Value) -> Value:
+        shape = equation.outvars[0].aval.shape
+        size, found = math.prod(shape), None
+        zeros = [case.zeros(shape) for case in cases]
+        if which.known is None:
+            for case in cases:
+                found = found if case.sets is None else _union(found, case.sets)
+            return Value(found, None, np.all(zeros, axis=0))
+        chosen = np.broadcast_to(which.known, shape).astype(int)
+        for k, case in enumerate(cases):
+            if case.sets is not None:
+                found = _union(found, self.rows(case.sets, np.where(chosen.ravel() == k, np.arange(1, size + 1), 0)))
+        return Value(found, None, np.choose(chosen, zeros))
 
-    def selected(self, equation: Any, which: Any, *cases: Any) -> Any:
-        size = equation.outvars[0].aval.size
-        if isinstance(which, np.ndarray):
-            which, found = np.broadcast_to(which.ravel(), size), None
-            for k, case in enumerate(cases):
-                if isinstance(case, sp.csr_matrix):
-                    found = _union(found, self.rows(case, np.where(which == k, np.arange(1, size + 1), 0)))
-            return found
-        found = None
-        for case in cases:
-            if isinstance(case, sp.csr_matrix):
-                found = _union(found, case)
-        return found
+    def folded_value(self, equation: Any, value: Value) -> Value:
+        shape, axes = equation.invars[0].aval.shape, equation.params["axes"]
+        sets = None if value.sets is None else self.folded(value.sets, shape, axes)
+        zero = None if value.zero is None and value.known is None else np.all(value.zeros(shape), axis=tuple(axes))
+        return Value(sets, None, zero)
 
     def folded(self, sets: sp.csr_matrix, shape: tuple[int, ...], axes: Sequence[int]) -> sp.csr_matrix:
         kept = [n for axis, n in enumerate(shape) if axis not in axes]
@@ -240,88 +297,94 @@ class _Sets:
         total = sp.csr_matrix((np.ones(len(groups), bool), (groups, np.arange(len(groups)))), (math.prod(kept), len(groups)))
         return total @ sets
 
-    def product(self, equation: Any, a: Any, b: Any) -> Any:
-        (ca, cb), (ba, bb) = equation.params["dimension_numbers"]
-        of = [(a, equation.invars[0].aval.shape, ca, ba), (b, equation.invars[1].aval.shape, cb, bb)]
-        sizes = []
-        for _, shape, contracted, batched in of:
-            free = [i for i in range(len(shape)) if i not in (*contracted, *batched)]
-            sizes.append((*(math.prod(shape[i] for i in axes) for axes in (batched, free, contracted)), free))
-        (batch, rows, length, _), (_, columns, _, _) = sizes
-        found = None
-        for k, (operand, shape, contracted, batched) in enumerate(of):
-            if not isinstance(operand, sp.csr_matrix):
+    def product(self, equation: Any, *operands: Value) -> Value:
+        """Sums of the products that are not zero: of each batch, rows of the one with columns of the other."""
+        contracted, batched = equation.params["dimension_numbers"]
+        shapes = [v.aval.shape for v in equation.invars]
+        orders, sizes = [], []
+        for shape, own, lead in zip(shapes, contracted, batched, strict=True):
+            free = [i for i in range(len(shape)) if i not in (*own, *lead)]
+            orders.append(np.arange(math.prod(shape)).reshape(shape).transpose((*lead, *free, *own)).ravel())
+            sizes.append([math.prod(shape[i] for i in axes) for axes in (lead, free, own)])
+        (batch, rows, length), (_, columns, _) = sizes
+        whole, has_zeros = (batch, rows, columns), [o.known is not None or o.zero is not None for o in operands]
+        there = [
+            ~o.zeros(shape).ravel()[order].reshape(size) if z else None
+            for o, shape, order, size, z in zip(operands, shapes, orders, sizes, has_zeros, strict=True)
+        ]
+        found, zero = None, None
+        if all(has_zeros) or (any(has_zeros) and not all(np.all(t) for t in there if t is not None)):
+            zero = self.zero_products(there, sizes).reshape(equation.outvars[0].aval.shape)
+        for k, operand in enumerate(operands):
+            if operand.sets is None:
                 continue
-            free = sizes[k][3]
-            order = np.arange(math.prod(shape)).reshape(shape).transpose((*batched, *free, *contracted)).ravel()
-            sets = operand[order]
-            other, own = of[1 - k][0], sizes[k][1]
-            if isinstance(other, np.ndarray):
-                across = _arranged(*of[1 - k]) != 0.0  # (batch, free of the other, length)
-            else:
-                across = None
-            outer = rows if k else columns
+            sets, own, across = operand.sets[orders[k]], sizes[k][1], there[1 - k]
             if across is None or np.all(across):
                 sums = self.folded(sets, (batch * own, length), (1,))
-                index = np.broadcast_to(np.arange(batch * own).reshape(batch, own, 1), (batch, own, outer))
-                index = index if k == 0 else index.transpose(0, 2, 1)
-                part = self.rows(sums, index + 1)
+                numbers = np.arange(1, batch * own + 1).reshape(batch, own, 1)
+                numbers = numbers if k == 0 else numbers.transpose(0, 2, 1)
+                part = self.rows(sums, np.broadcast_to(numbers, whole))
             else:
-                where, row, at = np.nonzero(across)
-                i = np.arange(own)
-                out = (where[:, None] * rows + i) * columns + row[:, None] if k == 0 else (
-                    (where[:, None] * rows + row[:, None]) * columns + i
-                )  # fmt: skip
-                source = (where[:, None] * own + i) * length + at[:, None]
-                ones = np.ones(out.size, bool)
-                taken = sp.csr_matrix((ones, (out.ravel(), source.ravel())), (batch * rows * columns, len(order)))
+                group, other, at = (a[:, None] for a in np.nonzero(across))
+                mine = np.arange(own)
+                if (count := group.size * own) > MOST_PER_UNKNOWN * (self.size + math.prod(whole)):
+                    raise Dense(f"a product of arrays takes {count} multiplications")
+                out = (group * rows + (mine if k == 0 else other)) * columns + (other if k == 0 else mine)
+                source = (group * own + mine) * length + at
+                taken = sp.csr_matrix((np.ones(out.size, bool), (out.ravel(), source.ravel())), (math.prod(whole), len(orders[k])))
                 part = taken @ sets
             found = _union(found, part)
-        return found
+        return Value(found, None, zero)
 
-    def by_matrix(self, equation: Any, operands: list[Any]) -> list[Any]:
+    def zero_products(self, there: list[Any], sizes: list[list[int]]) -> np.ndarray:
+        """Which sums of products have no term."""
+        full = [np.ones(size, bool) if t is None else t for t, size in zip(there, sizes, strict=True)]
+        return np.stack([(sp.csr_matrix(a) @ sp.csr_matrix(b).T).toarray() == 0 for a, b in zip(*full, strict=True)])
+
+    def by_matrix(self, equation: Any, operands: list[Value]) -> list[Value]:
         """Each matrix of a batch by itself."""
-        lead = equation.invars[0].aval.shape[:-2]
-        batch, found = math.prod(lead), None
+        batch, found = math.prod(equation.invars[0].aval.shape[:-2]), None
         for variable, operand in zip(equation.invars, operands, strict=True):
-            if isinstance(operand, sp.csr_matrix):
-                found = _union(found, self.folded(operand, (batch, variable.aval.size // max(batch, 1)), (1,)))
+            if operand.sets is not None:
+                found = _union(found, self.folded(operand.sets, (batch, variable.aval.size // max(batch, 1)), (1,)))
         each = [variable.aval.size // max(batch, 1) for variable in equation.outvars]
-        return [self.rows(found, np.repeat(np.arange(1, batch + 1), count)) for count in each]
+        if found.nnz * sum(each) > MOST_PER_UNKNOWN * (self.size + batch * sum(each)):
+            raise Dense(f"'{equation.primitive.name}' is of a large matrix")
+        return [Value(self.rows(found, np.repeat(np.arange(1, batch + 1), count))) for count in each]
 
-    def branches(self, equation: Any, operands: list[Any]) -> list[Any]:
+    def branches(self, equation: Any, operands: list[Value]) -> list[Value]:
         found: list[Any] = [None] * len(equation.outvars)
         for branch in equation.params["branches"]:
             results = self.run(branch, operands[1:])
-            found = [_union(a, b) if isinstance(b, sp.csr_matrix) else a for a, b in zip(found, results, strict=True)]
-        return found
+            found = [a if b.sets is None else _union(a, b.sets) for a, b in zip(found, results, strict=True)]
+        return [Value(sets) for sets in found]
 
-    def all_of_all(self, equation: Any, operands: list[Any]) -> list[Any]:
+    def all_of_all(self, equation: Any, operands: list[Value]) -> list[Value]:
         """What is not known: every result depends on everything."""
         found = None
         for operand in operands:
-            if isinstance(operand, sp.csr_matrix):
-                found = _union(found, self.folded(operand, (operand.shape[0],), (0,)))
-        assert found is not None
+            if operand.sets is not None:
+                found = _union(found, self.folded(operand.sets, (operand.sets.shape[0],), (0,)))
         sizes = [variable.aval.size for variable in equation.outvars]
         if found.nnz * sum(sizes) > MOST_PER_UNKNOWN * (self.size + sum(sizes)):
             raise Dense(f"'{equation.primitive.name}' is not followed")
-        return [self.rows(found, np.ones(size, int)) for size in sizes]
-
-    def values(self, equation: Any, operands: list[Any]) -> list[Any]:
-        """Of what depends on no unknown the whole numbers are followed, for they can be indices, and constants that are moved."""
-        whole = all(np.issubdtype(v.aval.dtype, np.integer) or v.aval.dtype == np.bool_ for v in equation.outvars)
-        if not whole or equation.effects or any(not isinstance(o, np.ndarray) for o in operands):
-            return [None] * len(equation.outvars)
-        if equation.primitive.name == "iota":
-            return list(_iota(equation))
-        if equation.primitive.name in BY_ENTRY or equation.primitive.name in COMPARISONS or equation.primitive.name in INDEXING:
-            return _evaluated(equation, operands)
-        return [None] * len(equation.outvars)
+        return [Value(self.rows(found, np.ones(size, int))) for size in sizes]
 
 
-COMPARISONS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "xor", "is_finite", "select_n"))
-INDEXING = frozenset(("gather", "dynamic_slice", "cumsum", "reduce_sum", "scatter", "scatter-add", "sort", "argsort"))
+IN_NUMPY: dict[str, Callable] = {
+    "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative,
+    "max": np.maximum, "min": np.minimum, "abs": np.abs, "convert_element_type": np.asarray, "copy": np.asarray,
+    "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
+    "and": np.bitwise_and, "or": np.bitwise_or, "not": np.invert, "square": np.square, "sqrt": np.sqrt,
+}  # fmt: skip
+"""What is evaluated where all numbers are known: masks, indices, constants of a linear part."""
+
+ODD = frozenset(("neg", "convert_element_type", "copy", "copy_p", "reduce_precision", "real", "abs", "square", "sin", "tan"))
+"""Functions of one number that are zero at zero."""
+
+INDEXING = frozenset(
+    ("gather", "dynamic_slice", "cumsum", "reduce_sum", "scatter", "scatter-add", "sort", "xor", "is_finite", "select_n", "rem")
+)
 
 
 def _union(a: sp.csr_matrix | None, b: sp.csr_matrix) -> sp.csr_matrix:
@@ -330,14 +393,7 @@ def _union(a: sp.csr_matrix | None, b: sp.csr_matrix) -> sp.csr_matrix:
     return a if b.nnz == 0 else b if a.nnz == 0 else sp.csr_matrix(a + b)
 
 
-def _arranged(array: Any, shape: tuple[int, ...], contracted: Sequence[int], batched: Sequence[int]) -> np.ndarray:
-    """(batch, free, contracted)."""
-    free = [i for i in range(len(shape)) if i not in (*contracted, *batched)]
-    sizes = (math.prod(shape[i] for i in axes) for axes in (batched, free, contracted))
-    return np.asarray(array).reshape(shape).transpose((*batched, *free, *contracted)).reshape(*sizes)
-
-
-def _evaluated(equation: Any, operands: list[np.ndarray], **options: Any) -> list[np.ndarray]:
+def _evaluated(equation: Any, operands: list[Any], **options: Any) -> list[np.ndarray]:
     """The results of an equation for known operands, also while JAX traces."""
     with jax.ensure_compile_time_eval():
         found = equation.primitive.bind(*map(jax.numpy.asarray, operands), **(equation.params | options))
@@ -364,8 +420,8 @@ def _pad(_: Any, equation: Any, x: np.ndarray, filler: np.ndarray) -> list[np.nd
     return [out]
 
 
-def _iota(equation: Any) -> list[np.ndarray]:
+def _iota(equation: Any) -> np.ndarray:
     shape, along = equation.outvars[0].aval.shape, equation.params["dimension"]
     inner = [1] * len(shape)
     inner[along] = -1
-    return [np.broadcast_to(np.arange(shape[along], dtype=equation.outvars[0].aval.dtype).reshape(inner), shape)]
+    return np.broadcast_to(np.arange(shape[along], dtype=equation.outvars[0].aval.dtype).reshape(inner), shape)
