@@ -255,11 +255,10 @@ class _Sets:
 
     def united(self, equation: Any, operands: list[Value]) -> Value:
         shape, name = equation.outvars[0].aval.shape, equation.primitive.name
-        size, found, zero = math.prod(shape), None, None
+        found, zero = None, None
         for operand, variable in zip(operands, equation.invars, strict=True):
             if operand.sets is not None:
-                spread = variable.aval.size == size
-                found = _union(found, operand.sets if spread else self.rows(operand.sets, np.ones(size, int)))
+                found = _union(found, self.spread(operand.sets, variable.aval.shape, shape))
         if any(o.known is not None or o.zero is not None for o in operands):
             zeros = [np.broadcast_to(o.zeros(v.aval.shape), shape) for o, v in zip(operands, equation.invars, strict=True)]
             if name == "mul":
@@ -270,18 +269,28 @@ class _Sets:
                 zero = zeros[0]
         return Value(found, None, zero)
 
+    def spread(self, sets: sp.csr_matrix, shape: tuple[int, ...], whole: tuple[int, ...]) -> sp.csr_matrix:
+        """The sets of an operand that is repeated along axes of length 1, or is a number."""
+        if shape == whole:
+            return sets
+        return self.rows(sets, np.broadcast_to(np.arange(1, math.prod(shape) + 1).reshape(shape), whole))
+
     def selected(self, equation: Any, which: Value, *cases: Value) -> Value:
         shape = equation.outvars[0].aval.shape
         size, found = math.prod(shape), None
-        zeros = [case.zeros(shape) for case in cases]
+        shapes = [v.aval.shape for v in equation.invars[1:]]
+        zeros = [np.broadcast_to(case.zeros(own), shape) for case, own in zip(cases, shapes, strict=True)]
+        spread = [
+            None if case.sets is None else self.spread(case.sets, own, shape) for case, own in zip(cases, shapes, strict=True)
+        ]
         if which.known is None:
-            for case in cases:
-                found = found if case.sets is None else _union(found, case.sets)
+            for sets in spread:
+                found = found if sets is None else _union(found, sets)
             return Value(found, None, np.all(zeros, axis=0))
         chosen = np.broadcast_to(which.known, shape).astype(int)
-        for k, case in enumerate(cases):
-            if case.sets is not None:
-                found = _union(found, self.rows(case.sets, np.where(chosen.ravel() == k, np.arange(1, size + 1), 0)))
+        for k, sets in enumerate(spread):
+            if sets is not None:
+                found = _union(found, self.rows(sets, np.where(chosen.ravel() == k, np.arange(1, size + 1), 0)))
         return Value(found, None, np.choose(chosen, zeros))
 
     def folded_value(self, equation: Any, value: Value) -> Value:

@@ -89,8 +89,8 @@ def _with_sparse_first_step(equation: Any, case: Case, start: Start) -> Start:
     first = _of_every(_FirstStep(equation, case.two_points, known), (equation,), case, start._replace(row0=None), True)
     if known is None:
         return start._replace(residual=first[0], jacobian=first[1])
-    residual, *values = (np.asarray(a) if case.batch is not None else np.asarray(a)[None] for a in first)
-    return start._replace(residual=residual, jacobian=SparseJacobians(known, *values))
+    residual, values, product = (np.asarray(a) if case.batch is not None else np.asarray(a)[None] for a in first)
+    return start._replace(residual=residual[:, 0], jacobian=SparseJacobians(known, values, product))
 
 
 class SparseJacobians(NamedTuple):
@@ -99,6 +99,10 @@ class SparseJacobians(NamedTuple):
     equations: Any
     values: np.ndarray
     product: np.ndarray
+
+
+AWAY = 1e-3
+"""How far from the first guess, relative to it, Jacobians are compared: an entry may be zero at it by symmetry."""
 
 
 def direction(size: int) -> np.ndarray:
@@ -156,9 +160,13 @@ class _FirstStep(eqx.Module):
         t = t0 + int(self.two_points) * h
         solved = lambda u: stage.residual(u, start.state, t, fraction * h, params)
         if self.sparse is not None:
-            u = start.guess[0]
-            residual, product = jax.jvp(solved, (u,), (jnp.asarray(direction(u.shape[0])),))
-            return residual, self.sparse.values(solved, u), product
+            u, along = start.guess[0], jnp.asarray(direction(start.guess[0].shape[0]))
+
+            def at(u):
+                residual, product = jax.jvp(solved, (u,), (along,))
+                return residual, self.sparse.values(solved, u), product
+
+            return jax.lax.map(at, jnp.stack([u, u + AWAY * (1.0 + jnp.max(jnp.abs(u))) * along]))
         return solved(start.guess[0]), jax.jacfwd(solved)(start.guess[0])
 
 

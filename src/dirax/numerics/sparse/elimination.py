@@ -26,29 +26,43 @@ class StructurallySingular(ValueError):
 
 
 def matched_rows(pattern: sp.csr_matrix) -> np.ndarray:
-    """For each unknown the equation that stands at its place on the diagonal: its own where the pattern is symmetric, as that of
-    a saddle point is, or has no zero there. Raises `StructurallySingular`."""
-    size = pattern.shape[0]
-    matched = csgraph.maximum_bipartite_matching(pattern, perm_type="row")  # for every column, a row
+    """For each unknown an equation that it stands in, every equation once. Raises `StructurallySingular`."""
+    matched = csgraph.maximum_bipartite_matching(pattern, perm_type="row")
     if np.any(matched < 0):
-        raise StructurallySingular(np.setdiff1d(np.arange(size), matched))
-    symmetric = (pattern != pattern.T).nnz == 0
-    return np.arange(size) if symmetric or np.all(pattern.diagonal()) else matched.astype(int)
+        raise StructurallySingular(np.setdiff1d(np.arange(pattern.shape[0]), matched))
+    return matched.astype(int)
 
 
 def elimination(pattern: sp.csr_matrix) -> "BandElimination | FixedElimination":
-    """The way to factor matrices of this pattern. Raises `StructurallySingular`."""
-    rows = matched_rows(pattern)
-    turned = pattern[rows]
-    both = sp.csr_matrix(turned + turned.T)
-    natural = _width(turned, np.arange(len(rows)))
-    order = csgraph.reverse_cuthill_mckee(both, symmetric_mode=True).astype(int)
-    below, above = _width(turned, order)
-    if natural[0] + sum(natural) <= below + below + above:
-        order, (below, above) = np.arange(len(rows)), natural
-    if 2 * below + above + 1 <= WIDEST_BAND:
+    """The way to factor matrices of this pattern. Raises `StructurallySingular`.
+
+    Equations stand beside the unknowns of the same numbers, or beside those that they are matched with, where that makes a
+    narrower band.
+    """
+    own = np.arange(pattern.shape[0])
+    choices = [_in_band(pattern, rows) for rows in (own, matched_rows(pattern))]
+    width, order, rows, below, above = min(choices, key=lambda choice: choice[0])
+    if width <= WIDEST_BAND:
         return BandElimination(pattern, order, rows[order], below, above)
-    return FixedElimination(pattern, rows, both)
+    rows = own if _has_pivots(pattern) else choices[1][2]
+    turned = pattern[rows]
+    return FixedElimination(pattern, rows, sp.csr_matrix(turned + turned.T))
+
+
+def _in_band(pattern: sp.csr_matrix, rows: np.ndarray) -> tuple[int, np.ndarray, np.ndarray, int, int]:
+    """(diagonals with those of exchanged rows, order of the unknowns, rows beside them, diagonals below, above)."""
+    turned, own = pattern[rows], np.arange(len(rows))
+    both = sp.csr_matrix(turned + turned.T)
+    orders = own, csgraph.reverse_cuthill_mckee(both, symmetric_mode=True).astype(int)
+    found = [(order, *_width(turned, order)) for order in orders]
+    order, below, above = min(found, key=lambda choice: 2 * choice[1] + choice[2])
+    return 2 * below + above + 1, order, rows, below, above
+
+
+def _has_pivots(pattern: sp.csr_matrix) -> bool:
+    """Whether each unknown stands in the equation of its number, or has neighbours that do, with which it is symmetric."""
+    without = np.flatnonzero(~pattern.diagonal())
+    return (pattern[without] != pattern.T.tocsr()[without]).nnz == 0
 
 
 def _width(pattern: sp.csr_matrix, order: np.ndarray) -> tuple[int, int]:
