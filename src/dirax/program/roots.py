@@ -137,6 +137,8 @@ def _by_jax(*operands, residual: ClosedJaxpr, max_steps: int):
 
 
 def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, max_steps: int):
+    if primals[-1].shape[0] >= FEWEST_SPARSE:
+        return _as_plain(primals, tangents, residual=residual, max_steps=max_steps)
     u = root_p.bind(*primals, residual=residual, max_steps=max_steps)[0]
     along = [None if isinstance(t, ad.Zero) else t for t in tangents[:-1]]
     return [u], [implicit_tangent(_unknowns_first(residual), u, primals[:-1], along, _least_change)]
@@ -144,4 +146,5 @@ def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, max_steps: int
 
 root_p = plain_primitive("dirax_root", _by_jax, lambda *operands, **_: [operands[-1]])
 """The root of a jaxpr of (*captured, unknowns) from the last operand on, the others being what it captured."""
+_as_plain = ad.primitive_jvps[root_p]
 ad.primitive_jvps[root_p] = _root_p_tangents

@@ -1,5 +1,6 @@
 """Why a trajectory ended early, in words: which step, which equation, how near to singular."""
 
+from collections.abc import Callable
 from contextvars import ContextVar
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 from dirax.engines.contract import NOT_FINITE, OK, Outcome, Problem
 from dirax.engines.stopping import STALLED
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
+from dirax.program.roots import FEWEST_SPARSE, sparse_equations
 
 SMALLER = "a smaller step may help"
 
@@ -69,18 +71,17 @@ def _replay_newton(stage, guess, args, max_iterations: int):
     u = guess
     if not stage.unknowns:
         return "", u
-    evaluate = jax.jit(lambda u: (stage.residual(u, *args), jax.jacfwd(stage.residual)(u, *args)))
+    linearized = _sparse(stage, args) or _dense(stage, args)
     size, worst, condition = np.inf, 0, np.nan
     for iteration in range(max_iterations):
-        residual, jacobian = (np.asarray(a) for a in evaluate(u))
-        broken = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
+        residual, broken, solve, condition = linearized(u)
         if np.any(broken):
             label = stage.labels[int(np.argmax(broken))]
             return f"{label} is not finite (outside the domain of the system's functions) in Newton iteration {iteration + 1}", u
-        worst, condition = int(np.argmax(np.abs(residual))), np.linalg.cond(jacobian)
+        worst = int(np.argmax(np.abs(residual)))
         if not condition < LARGEST_CONDITION:
             return f"the Jacobian of the step is singular (condition number {condition:.2g})", u
-        change = np.linalg.solve(jacobian, residual)
+        change = solve(residual)
         u, size = u - change, np.max(np.abs(change) / (np.abs(u) + 1.0))
     if size < STALLED:
         return "", u
@@ -90,10 +91,48 @@ def _replay_newton(stage, guess, args, max_iterations: int):
     ), u
 
 
+def _dense(stage, args) -> Callable:
+    """u ↦ (residual, which rows of it or of its Jacobian are not finite, solution with the Jacobian, its condition number)."""
+    evaluate = jax.jit(lambda u: (stage.residual(u, *args), jax.jacfwd(stage.residual)(u, *args)))
+
+    def linearized(u):
+        residual, jacobian = (np.asarray(a) for a in evaluate(u))
+        broken = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
+        condition = np.inf if np.any(broken) else np.linalg.cond(jacobian)
+        return residual, broken, lambda right: np.linalg.solve(jacobian, right), condition
+
+    return linearized
+
+
+def _sparse(stage, args) -> Callable | None:
+    """The same of many unknowns with a sparse Jacobian; None of others."""
+    equations = sparse_equations(stage.residual, jax.ShapeDtypeStruct((stage.unknowns,), float), *args)
+    if equations is None:
+        return None
+    from dirax.numerics.sparse.ranks import smallest_singular_value  # imported when it is used
+
+    def both(u):
+        residual = lambda u: stage.residual(u, *args)
+        return residual(u), equations.values(residual, u)
+
+    evaluate = jax.jit(both)
+
+    def linearized(u):
+        residual, values = (np.asarray(a) for a in evaluate(u))
+        matrix = equations.matrix(values)
+        broken = ~np.isfinite(residual) | ~np.isfinite(matrix @ np.ones(len(residual)))
+        if np.any(broken):
+            return residual, broken, None, np.inf
+        smallest, _ = smallest_singular_value(equations, matrix)
+        return residual, broken, equations.in_numpy(values), np.max(np.abs(matrix.data)) / smallest
+
+    return linearized
+
+
 def _advice(stage, u, args) -> str:
     """What to do about a stage without a root: a larger step where roundoff hides it, and hides less of it in a larger one."""
     state, t, h, params = args
-    if not stage.unknowns:
+    if not 0 < stage.unknowns < FEWEST_SPARSE:
         return SMALLER
     here, there = (_roundoff(stage, u, (state, t, step, params)) for step in (h, 10 * h))
     if not (here > STALLED and there < here / 2):

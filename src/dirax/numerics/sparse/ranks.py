@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from dirax.numerics.tolerances import EQUATION_RANK
+from dirax.numerics.tolerances import EQUATION_RANK, TINY
 
 ROUNDS = 4
 """Solutions with the matrix and its transpose by which the smallest singular value is found, up to a small factor."""
@@ -20,16 +20,23 @@ def free_direction(equations: Any, matrix: sp.csr_matrix) -> np.ndarray | None:
     scaled = sp.diags(rows) @ matrix
     columns = _inverse(np.asarray(abs(scaled).max(axis=0).todense()).ravel())
     scaled = sp.csr_matrix(scaled @ sp.diags(columns))
-    solve = equations.in_numpy(equations.values_of(scaled))
-    x = np.random.default_rng(0).normal(size=matrix.shape[0])
+    smallest, direction = smallest_singular_value(equations, scaled)
+    return None if smallest > EQUATION_RANK else columns * direction
+
+
+def smallest_singular_value(equations: Any, matrix: sp.csr_matrix) -> tuple[float, np.ndarray]:
+    """The smallest singular value of a matrix, up to a small factor, and its direction, as far as they are numbers."""
+    solve = equations.in_numpy(equations.values_of(matrix))
+    x, smallest = np.random.default_rng(0).normal(size=matrix.shape[0]), np.inf
     with np.errstate(all="ignore"):
         for _ in range(ROUNDS):
             x = solve(x / np.linalg.norm(x))
             size = np.linalg.norm(x)
-            if not np.isfinite(size) or size > 1 / EQUATION_RANK:
-                return columns * np.where(np.isfinite(x), x, 1.0)
-            x = solve(x / size, True)
-    return None
+            if not np.isfinite(size) or size > 1 / TINY:
+                return 0.0, np.where(np.isfinite(x), x, 1.0)
+            smallest, direction = min(smallest, 1 / size), x / size
+            x = solve(direction, True)
+    return smallest, direction
 
 
 def _inverse(sizes: np.ndarray) -> np.ndarray:
