@@ -52,7 +52,7 @@ class Auto(AbstractEngine):
         if problem.size < policy.FEWEST_SPARSE:
             return Xla(), {}
         try:
-            sparse = policy.engine_of("sparse")
+            sparse = policy.engine_of("sparse", only_quicker=True)
             reason = sparse.supports(problem)
         except ImportError as error:
             reason = str(error)

@@ -88,13 +88,14 @@ def sparse_equations(residual: Callable, unknowns: Any, *others: Any) -> Any:
     if unknowns.shape[0] < FEWEST_SPARSE or jax.default_backend() != "cpu":
         return None
     from dirax.numerics.sparse.elimination import StructurallySingular  # imported when it is used
-    from dirax.program.sparse_equations import NotSparse, SparseEquations
+    from dirax.program.sparse_equations import SparseEquations
     from dirax.program.sparsity import Dense
 
     try:
-        return SparseEquations.of(residual, unknowns, *others)
-    except (Dense, NotSparse, StructurallySingular):
+        found = SparseEquations.of(residual, unknowns, *others)
+    except (Dense, StructurallySingular):
         return None
+    return found if found.slower is None else None
 
 
 def regular_root(

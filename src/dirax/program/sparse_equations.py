@@ -20,10 +20,6 @@ SPARSE_OPERATION, SPARSE_ROW = 1.2, 60.0
 entry; elimination that follows indices for each multiplication, and each equation."""
 
 
-class NotSparse(Exception):
-    """Raised where equations are not sparse enough; says why, in words that go on after "because"."""
-
-
 class SparseEquations(eqx.Module):
     """What is known of the Jacobian of equations without its values: where entries are, and how it is factored.
 
@@ -41,7 +37,7 @@ class SparseEquations(eqx.Module):
 
     @classmethod
     def of(cls, function: Callable, unknowns: Any, *others: Any) -> "SparseEquations":
-        """Those of `function(unknowns, *others)`, arguments as `pattern_of` takes them. Raises `Dense`, `NotSparse` and
+        """Those of `function(unknowns, *others)`, arguments as `pattern_of` takes them. Raises `Dense` and
         `StructurallySingular`."""
         pattern = pattern_of(function, unknowns, *others)
         pattern.sort_indices()
@@ -52,12 +48,7 @@ class SparseEquations(eqx.Module):
         size = pattern.shape[0]
         colours = column_colours(pattern)
         count = int(np.max(colours, initial=-1)) + 1
-        dense = size**2 * (DENSE_OPERATION * size / 3 + DENSE_ENTRY)
-        if (cost := size * (SPARSE_ROW + DENSE_ENTRY * count)) > dense:
-            raise NotSparse(f"the Jacobian of {size} equations is found from {count} products")
         made = elimination(pattern)
-        if cost + SPARSE_OPERATION * made.operations > dense:
-            raise NotSparse(f"elimination takes {made.operations} multiplications, of {size} equations")
         entries = pattern.tocoo()
         numbers = 1 + colours[entries.col].astype(np.int64) * size + entries.row
         places = sp.csr_matrix((numbers, pattern.indices, pattern.indptr), pattern.shape)
@@ -67,6 +58,15 @@ class SparseEquations(eqx.Module):
                 _Static(pattern), made, count, jnp.asarray(colours), arrays(made.tables(places)), arrays(made.solve_tables),
                 jnp.asarray([size], np.int64),
             )  # fmt: skip
+
+    @property
+    def slower(self) -> str | None:
+        """Why elimination as of a dense matrix is quicker, where it is."""
+        made, size = self.elimination, self.elimination.size
+        sparse = size * (SPARSE_ROW + DENSE_ENTRY * self.count) + SPARSE_OPERATION * made.operations
+        if sparse < size**2 * (DENSE_OPERATION * size / 3 + DENSE_ENTRY):
+            return None
+        return f"the Jacobian of {size} equations takes {self.count} products, and {made.operations} multiplications to factor"
 
     @property
     def stats(self) -> dict[str, Any]:

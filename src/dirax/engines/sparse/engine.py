@@ -15,9 +15,10 @@ class Sparse(Xla):
     """Steps of many unknowns each of which depends on few others: a step costs in proportion to their number.
 
     Which unknowns an equation depends on is found in its functions. `stats` say how the matrix is factored, and its bandwidth
-    and fill.
+    and fill. With `only_quicker` steps are left to others that dense elimination is quicker for.
     """
 
+    only_quicker: bool = False
     name = "sparse"
 
     def supports(self, problem: Problem) -> str | None:
@@ -25,7 +26,9 @@ class Sparse(Xla):
         if (platform := jax.default_backend()) != "cpu":
             return f"JAX computes on {platform}"
         plan = sparse_plan(problem.equation, problem.params, problem.batch_params)
-        return plan if isinstance(plan, str) else None
+        if isinstance(plan, str) or not self.only_quicker:
+            return plan if isinstance(plan, str) else None
+        return next(filter(None, (solver.equations.slower for solver in plan)), None)
 
     def _planned(self, p: Problem) -> tuple[Problem, Numerics, dict[str, Any]]:
         plan = sparse_plan(p.equation, p.params, p.batch_params)

@@ -9,7 +9,7 @@ import numpy as np
 from dirax.engines.sparse.solver import SparseSolver
 from dirax.numerics.sparse.elimination import StructurallySingular
 from dirax.program.memo import Memo, Same
-from dirax.program.sparse_equations import NotSparse, SparseEquations
+from dirax.program.sparse_equations import SparseEquations
 from dirax.program.sparsity import Dense
 
 KEPT = 64
@@ -47,7 +47,7 @@ def _planned(equation: Any, params: Any, batch_params: bool) -> tuple[SparseSolv
         shapes = numbers(stage.unknowns), numbers(stage.state_size), scalar, scalar, params
         try:
             found[id(stage)] = SparseSolver(SparseEquations.of(stage.residual, *shapes))
-        except (Dense, NotSparse) as error:
+        except Dense as error:
             return str(error)
         except StructurallySingular as error:
             return f"the equations {', '.join(stage.labels[int(row)] for row in error.rows[:4])} have too few unknowns"
