@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data
+from dirax.schemes.labels import Labels
 from dirax.schemes.lagrangian_step import LagrangianStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.map_lift import Base, Lift, ThetaLift
@@ -35,8 +36,8 @@ class MethodOneStep(LagrangianStep):
         return self.lift.flat and super().canonical
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        balance = tuple(f"momentum balance {i}" for i in range(self.lift.dimension))
+    def labels(self) -> Labels:
+        balance = Labels.numbered("momentum balance {}", self.lift.dimension)
         return balance + tuple(f"constraint {r} at the base point" for r in self.rows.kept)
 
     def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.program.tracing import pulled_back
+from dirax.schemes.labels import Labels
 from dirax.schemes.step import Field, Shape
 from dirax.systems.system import AbstractSystem
 
@@ -77,10 +78,12 @@ class ConstraintRows:
             "constraint": Field(size, "step", ("constraint",), about),
         }
 
-    def labels(self) -> tuple[str, ...]:
+    def labels(self) -> Labels:
         """The names of the constraint equations."""
+        if self.count == self.m + self.c:
+            return Labels.numbered("discrete constraint {}", self.m) + Labels.numbered("holonomic constraint {}", self.c)
         of = lambda i: f"discrete constraint {i}" if i < self.m else f"holonomic constraint {i - self.m}"
-        return tuple(of(i) for i in self.kept)
+        return Labels() + tuple(of(i) for i in self.kept)
 
 
 def step_constraints(rows: ConstraintRows, wd: Callable) -> Callable:

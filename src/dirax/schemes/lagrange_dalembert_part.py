@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
+from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 
@@ -44,9 +45,9 @@ class LagrangeDAlembertPart(AbstractStep):
         return self.inner.fields
 
     @property
-    def labels(self) -> tuple[str, ...]:
+    def labels(self) -> Labels:
         n, count = self.inner.shape.n, self.rows.count
-        return self.inner.labels[: n + count] + tuple(f"projection of the momentum {i}" for i in range(n + count))
+        return self.inner.labels[: n + count] + Labels.numbered("projection of the momentum {}", n + count)
 
     @property
     def canonical(self) -> bool:

@@ -12,6 +12,7 @@ from dirax.program.user_functions import UserFunction
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows, step_constraints
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian, slot_derivatives
+from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field, Shape
 from dirax.schemes.work_of_forces import WorkOfForces
@@ -97,10 +98,10 @@ class LagrangeDAlembertStep(AbstractStep):
         return {"q": Field((n,)), "p": Field((n,)), **self.rows.fields(), **self.work.fields}
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        balance = tuple(f"discrete Lagrange–d'Alembert equation {i}" for i in range(self.shape.n))
+    def labels(self) -> Labels:
+        balance = Labels.numbered("discrete Lagrange–d'Alembert equation {}", self.shape.n)
         projected = self.shape.n + self.rows.holonomic if self.projects else 0
-        return balance + self.rows.labels() + tuple(f"projection of the momentum {i}" for i in range(projected))
+        return balance + self.rows.labels() + Labels.numbered("projection of the momentum {}", projected)
 
     @property
     def canonical(self) -> bool:
