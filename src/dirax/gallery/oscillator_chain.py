@@ -1,0 +1,61 @@
+"""Chains of oscillators between two walls: that of Fermi, Pasta, Ulam and Tsingou, and that of Toda, which is integrable.
+
+    L = Σ q̇_i²/2 − Σ V(q_{i+1} − q_i),   V(d) = d²/2 + α d³/3 + β d⁴/4
+
+E. Fermi, J. Pasta, S. Ulam, Studies of nonlinear problems, Los Alamos report LA-1940 (1955): 32 masses that begin in their first
+mode come back to it. With V(d) = (e^{2αd} − 2αd − 1)/(4α²) the chain, free at its ends, is Toda's (M. Toda, J. Phys. Soc. Japan
+22 (1967) 431), of which α d³/3 is the first term: the eigenvalues of the matrix of H. Flaschka (Phys. Rev. B 9 (1974) 1924)
+do not change. Written in arrays: any number of sites.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.gallery.example import Coordinate, Example
+from dirax.systems.lagrange_dirac import LagrangeDirac
+
+SITES, ALPHA = 12, 0.25
+
+
+def chain(alpha: float = ALPHA, beta: float = 0.0) -> LagrangeDirac:
+    """The chain of Fermi, Pasta, Ulam and Tsingou with fixed ends, of as many sites as the data have."""
+
+    def lagrangian(q, v):
+        d = jnp.diff(jnp.concatenate([jnp.zeros(1), q, jnp.zeros(1)]))
+        return v @ v / 2 - jnp.sum(d**2 / 2 + alpha * d**3 / 3 + beta * d**4 / 4)
+
+    return LagrangeDirac(lagrangian)
+
+
+def toda_chain(alpha: float = ALPHA) -> LagrangeDirac:
+    """Toda's chain with free ends: the same force to third order in d."""
+
+    def lagrangian(q, v):
+        d = jnp.diff(q)
+        return v @ v / 2 - jnp.sum(jnp.exp(2 * alpha * d) - 2 * alpha * d - 1) / (4 * alpha**2)
+
+    return LagrangeDirac(lagrangian)
+
+
+def first_mode(sites: int, amplitude: float = 1.0) -> np.ndarray:
+    """The first mode of the linear chain, of the given amplitude (sites,)."""
+    return amplitude * np.sin(np.pi * np.arange(1, sites + 1) / (sites + 1))
+
+
+def toda_eigenvalues(q: np.ndarray, p: np.ndarray, alpha: float = ALPHA) -> np.ndarray:
+    """The conserved eigenvalues of Flaschka's matrix at (q, p), with b_i = α p_i on its diagonal and e^{α(q_{i+1} − q_i)}/2 beside
+    it."""
+    beside = np.exp(alpha * np.diff(q)) / 2
+    return np.linalg.eigvalsh(np.diag(alpha * np.asarray(p)) + np.diag(beside, 1) + np.diag(beside, -1))
+
+
+EXAMPLE = Example(
+    name="oscillator-chain",
+    title="Chain of Fermi, Pasta, Ulam and Tsingou",
+    source="Fermi, Pasta & Ulam, LA-1940 (1955)",
+    system=chain(),
+    initial={"q": first_mode(SITES), "v": np.zeros(SITES)},
+    step=0.1,
+    steps=2000,
+    coordinates=tuple(Coordinate(f"q{i}") for i in range(1, SITES + 1)),
+)
