@@ -1,9 +1,9 @@
-"""Chains of oscillators between two walls: that of Fermi, Pasta, Ulam and Tsingou, and that of Toda, which is integrable.
+"""Chains of oscillators: that of Fermi, Pasta, Ulam and Tsingou between two walls, and that of Toda in a ring, which is integrable.
 
     L = Σ q̇_i²/2 − Σ V(q_{i+1} − q_i),   V(d) = d²/2 + α d³/3 + β d⁴/4
 
 E. Fermi, J. Pasta, S. Ulam, Studies of nonlinear problems, Los Alamos report LA-1940 (1955): 32 masses that begin in their first
-mode come back to it. With V(d) = (e^{2αd} − 2αd − 1)/(4α²) the chain, free at its ends, is Toda's (M. Toda, J. Phys. Soc. Japan
+mode come back to it. With V(d) = (e^{2αd} − 2αd − 1)/(4α²) a ring of them is Toda's (M. Toda, J. Phys. Soc. Japan
 22 (1967) 431), of which α d³/3 is the first term: the eigenvalues of the matrix of H. Flaschka (Phys. Rev. B 9 (1974) 1924)
 do not change. Written in arrays: any number of sites.
 """
@@ -28,10 +28,10 @@ def chain(alpha: float = ALPHA, beta: float = 0.0) -> LagrangeDirac:
 
 
 def toda_chain(alpha: float = ALPHA) -> LagrangeDirac:
-    """Toda's chain with free ends: the same force to third order in d."""
+    """Toda's chain, closed to a ring: the potential of the other to third order in d."""
 
     def lagrangian(q, v):
-        d = jnp.diff(q)
+        d = jnp.roll(q, -1) - q
         return v @ v / 2 - jnp.sum(jnp.exp(2 * alpha * d) - 2 * alpha * d - 1) / (4 * alpha**2)
 
     return LagrangeDirac(lagrangian)
@@ -45,8 +45,10 @@ def first_mode(sites: int, amplitude: float = 1.0) -> np.ndarray:
 def toda_eigenvalues(q: np.ndarray, p: np.ndarray, alpha: float = ALPHA) -> np.ndarray:
     """The conserved eigenvalues of Flaschka's matrix at (q, p), with b_i = α p_i on its diagonal and e^{α(q_{i+1} − q_i)}/2 beside
     it."""
-    beside = np.exp(alpha * np.diff(q)) / 2
-    return np.linalg.eigvalsh(np.diag(alpha * np.asarray(p)) + np.diag(beside, 1) + np.diag(beside, -1))
+    sites, beside = len(q), np.exp(alpha * (np.roll(q, -1) - q)) / 2
+    upper = np.zeros((sites, sites))
+    upper[np.arange(sites), (np.arange(sites) + 1) % sites] = beside
+    return np.linalg.eigvalsh(np.diag(alpha * np.asarray(p)) + upper + upper.T)
 
 
 EXAMPLE = Example(
