@@ -13,7 +13,9 @@ def test_toda_keeps_its_eigenvalues_and_is_the_limit_of_small_amplitudes():
     changes = []
     for step in (0.1, 0.05):
         finer = {"step": step, "steps": round(2 / step)}
-        sol = dx.simulate(toda, dx.Composition(dx.LagrangeDAlembert(), "yoshida4"), q=oscillator_chain.first_mode(sites, 2.0), **run | finer)
+        sol = dx.simulate(
+            toda, dx.Composition(dx.LagrangeDAlembert(), "yoshida4"), q=oscillator_chain.first_mode(sites, 2.0), **run | finer
+        )
         assert sol.stats["engine"] == "sparse"
         values = np.array([oscillator_chain.toda_eigenvalues(*row) for row in zip(sol.q, sol.p, strict=True)])
         changes.append(np.max(np.abs(values - values[0])))
@@ -29,7 +31,9 @@ def test_ten_thousand_sites_carry_the_kink():
     errors = []
     for sites in (2500, 10_000):
         data = sine_gordon.start(sites, length=60.0, at=-10.0)
-        sol = dx.simulate(sine_gordon.line(60.0), dx.LagrangeDAlembert(), **data, step=0.02 * 2500 / sites, steps=sites // 50, save_every=10)
+        sol = dx.simulate(
+            sine_gordon.line(60.0), dx.LagrangeDAlembert(), **data, step=0.02 * 2500 / sites, steps=sites // 50, save_every=10
+        )
         exact, _ = sine_gordon.kink(sine_gordon.places(sites, 60.0), sol.t[-1], start=-10.0)
         assert sol.ok and sol.stats["engine"] == "sparse"
         errors.append(np.max(np.abs(sol.q[-1] - exact)))
@@ -76,6 +80,8 @@ def test_power_balances_on_a_hundred_thousand_cells():
 def test_waves_go_as_d_alembert_says():
     errors = []
     for cells in (400, 800):
-        sol = dx.simulate(wave_line.line(cells), dx.DiscreteDirac(), x=wave_line.pulse(cells, 0.3), step=1 / cells, steps=cells // 4)
+        sol = dx.simulate(
+            wave_line.line(cells), dx.DiscreteDirac(), x=wave_line.pulse(cells, 0.3), step=1 / cells, steps=cells // 4
+        )
         errors.append(np.max(np.abs(sol.x[-1] - wave_line.pulse(cells, 0.3 + 0.25))))
     assert errors[1] < 1e-3 and 3.5 < errors[0] / errors[1] < 4.5

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from dirax.numerics.loops.compiler import Doubles, Longs
 from dirax.numerics.loops.kernel import Kernel
 from dirax.numerics.sparse.colours import column_colours
 from dirax.numerics.sparse.elimination import BandElimination, FixedElimination, StructurallySingular, elimination
@@ -13,13 +14,13 @@ from dirax.numerics.sparse.elimination import BandElimination, FixedElimination,
 RNG = np.random.default_rng(0)
 
 
-def running(sizes: "i8[]", x: "f8[]", y: "f8[]"):  # pyright: ignore[reportUndefinedVariable]
+def running(sizes: Longs, x: Doubles, y: Doubles):
     """A loop with everything in it."""
     s = 0.0
     for i in range(sizes[0] - 1, -1, -1):
         y[i] = 0.0
-        if i % 2 == 0 and not x[i] > 4.0 or i == 3:
-            s += abs(x[i]) * WEIGHT  # noqa: F821  # pyright: ignore[reportUndefinedVariable]
+        if (i % 2 == 0 and not x[i] > 4.0) or i == 3:
+            s += abs(x[i]) * WEIGHT  # pyright: ignore[reportUndefinedVariable]
         elif i > 8:
             continue
         else:

@@ -1,3 +1,4 @@
+# ruff: noqa: RUF005
 """Labels behave like the tuples of names that they stand for."""
 
 from dirax.schemes.labels import Labels

@@ -1,4 +1,4 @@
-"""Chains of oscillators: that of Fermi, Pasta, Ulam and Tsingou between two walls, and that of Toda in a ring, which is integrable.
+"""Chains of oscillators: that of Fermi, Pasta, Ulam and Tsingou between two walls, and Toda's in a ring, which is integrable.
 
     L = Σ q̇_i²/2 − Σ V(q_{i+1} − q_i),   V(d) = d²/2 + α d³/3 + β d⁴/4
 
@@ -43,8 +43,7 @@ def first_mode(sites: int, amplitude: float = 1.0) -> np.ndarray:
 
 
 def toda_eigenvalues(q: np.ndarray, p: np.ndarray, alpha: float = ALPHA) -> np.ndarray:
-    """The conserved eigenvalues of Flaschka's matrix at (q, p), with b_i = α p_i on its diagonal and e^{α(q_{i+1} − q_i)}/2 beside
-    it."""
+    """The conserved eigenvalues of Flaschka's matrix at (q, p): α p_i on its diagonal, e^{α(q_{i+1} − q_i)}/2 beside it."""
     sites, beside = len(q), np.exp(alpha * (np.roll(q, -1) - q)) / 2
     upper = np.zeros((sites, sites))
     upper[np.arange(sites), (np.arange(sites) + 1) % sites] = beside

@@ -27,7 +27,7 @@ def line(cells: int = CELLS) -> PortHamiltonian:
     size, spacing = 2 * cells, 1.0 / cells
     neighbours = np.ones(size - 1)
     # dH = Δ(T ε, p/ρ) in the coordinates x, so that the flow of each is a difference over Δ²
-    J = sp.diags([neighbours, -neighbours], [1, -1]) / spacing**2
+    J = (sp.csr_matrix(sp.diags(neighbours, 1)) - sp.csr_matrix(sp.diags(neighbours, -1))) / spacing**2
     B = sp.csr_matrix(([-1.0 / spacing, 1.0 / spacing], ([0, size - 1], [0, 1])), (size, 2))
     return PortHamiltonian(lambda x: spacing * jnp.sum(x**2) / 2, sp.csr_matrix(J), B)
 

@@ -1,4 +1,4 @@
-"""SparseEquations: equations r(u, …) = 0 of many unknowns whose Jacobian is sparse; its entries, and solutions with it, in JAX."""
+"""SparseEquations: equations r(u, …) = 0 of many unknowns with a sparse Jacobian: its entries, and solutions with it, in JAX."""
 
 from collections.abc import Callable
 from typing import Any
@@ -39,12 +39,12 @@ class SparseEquations(eqx.Module):
     def of(cls, function: Callable, unknowns: Any, *others: Any) -> "SparseEquations":
         """Those of `function(unknowns, *others)`, arguments as `pattern_of` takes them. Raises `Dense` and
         `StructurallySingular`."""
-        pattern = pattern_of(function, unknowns, *others)
+        pattern: Any = pattern_of(function, unknowns, *others)
         pattern.sort_indices()
         return cls._of_pattern(pattern)
 
     @classmethod
-    def _of_pattern(cls, pattern: sp.csr_matrix) -> "SparseEquations":
+    def _of_pattern(cls, pattern: Any) -> "SparseEquations":
         size = pattern.shape[0]
         colours = column_colours(pattern)
         count = int(np.max(colours, initial=-1)) + 1
@@ -71,7 +71,11 @@ class SparseEquations(eqx.Module):
     @property
     def stats(self) -> dict[str, Any]:
         """What `Solution.stats` says of it."""
-        return {"unknowns": self.elimination.size, "entries": self.pattern.value.nnz, "colours": self.count} | self.elimination.stats
+        return {
+            "unknowns": self.elimination.size,
+            "entries": self.pattern.value.nnz,
+            "colours": self.count,
+        } | self.elimination.stats
 
     def values(self, function: Callable, u: Float[Array, " k"]) -> Float[Array, " colours*k"]:
         """The values of the Jacobian of `function` at u."""
@@ -79,14 +83,14 @@ class SparseEquations(eqx.Module):
         sums = jnp.where(self.colours[None, :] == jnp.arange(self.count, dtype=self.colours.dtype)[:, None], 1.0, 0.0)
         return jax.vmap(linear)(sums).ravel()
 
-    def matrix(self, values: np.ndarray) -> sp.csr_matrix:
+    def matrix(self, values: np.ndarray) -> Any:
         """The Jacobian with these values."""
         pattern = self.pattern.value
         entries, size = pattern.tocoo(), pattern.shape[0]
         data = np.asarray(values)[np.asarray(self.colours)[entries.col].astype(np.int64) * size + entries.row]
         return sp.csr_matrix((data, pattern.indices, pattern.indptr), pattern.shape)
 
-    def values_of(self, matrix: sp.csr_matrix) -> np.ndarray:
+    def values_of(self, matrix: Any) -> np.ndarray:
         """The values of a matrix of this pattern."""
         entries = matrix.tocoo()
         values = np.zeros(self.count * matrix.shape[0])

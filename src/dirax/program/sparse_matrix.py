@@ -16,7 +16,7 @@ class SparseMatrix:
     def __init__(self, matrix: Any):
         from scipy.sparse import csr_matrix  # imported when it is used
 
-        self.matrix = csr_matrix(matrix, dtype=float)
+        self.matrix: Any = csr_matrix(matrix, dtype=float)
         self.matrix.sum_duplicates()
 
     @property

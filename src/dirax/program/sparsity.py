@@ -1,9 +1,9 @@
 """Which results of a function depend on which of its unknowns: index sets through the jaxpr, an array of them at a time.
 
 The set of every entry of an array is a row of one sparse matrix of booleans. What moves entries about takes rows, what computes
-entry by entry unites them, a sum is a product of matrices. Entries that are zero whatever the unknowns are followed too, so that a
-matrix of zeros with some entries is as sparse as it looks. Nothing is found by trying values: a set can be too large and never
-too small.
+entry by entry unites them, a sum is a product of matrices. Entries that are zero whatever the unknowns are followed too, so that
+a matrix of zeros with some entries is as sparse as it looks. Nothing is found by trying values: a set can be too large and
+never too small.
 """
 
 import math
@@ -25,30 +25,36 @@ MOST_PER_UNKNOWN = 256
 """Entries of the sets of one array, for each of its entries and of the unknowns, from which on a function counts as dense."""
 
 MOVES = frozenset(
-    ("reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "concatenate", "stack", "unstack", "tile")
-    + ("split", "slice")
+    (
+        *("reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "concatenate", "stack", "unstack"),
+        *("tile", "split", "slice"),
+    )
 )
 """Primitives whose rules run on arrays of numbers of any kind."""
 
 BY_ENTRY = frozenset(
-    ("add", "add_any", "sub", "mul", "div", "rem", "neg", "sign", "max", "min", "abs", "pow", "integer_pow", "square", "sqrt")
-    + ("rsqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "logistic", "sin", "cos", "tan", "asin", "acos", "atan", "atan2")
-    + ("sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc", "erf_inv", "lgamma", "digamma", "floor", "ceil", "round")
-    + ("nextafter", "clamp", "convert_element_type", "copy", "copy_p", "reduce_precision", "real", "imag", "stop_gradient")
-    + ("optimization_barrier", "bessel_i0e", "bessel_i1e", "igamma", "igammac", "polygamma")
+    (
+        *("add", "add_any", "sub", "mul", "div", "rem", "neg", "sign", "max", "min", "abs", "pow", "integer_pow", "square"),
+        *("sqrt", "rsqrt", "cbrt", "exp", "exp2", "expm1", "log", "log1p", "logistic", "sin", "cos", "tan", "asin", "acos"),
+        *("atan", "atan2", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "erf", "erfc", "erf_inv", "lgamma", "digamma"),
+        *("floor", "ceil", "round", "nextafter", "clamp", "convert_element_type", "copy", "copy_p", "reduce_precision"),
+        *("real", "imag", "bessel_i0e", "bessel_i1e", "igamma", "igammac", "polygamma"),
+    )
 )
+"""Primitives that compute entry by entry."""
+
 CALLS = {
     "jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "remat2": "jaxpr",
     "checkpoint": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "custom_vjp_call_jaxpr": "fun_jaxpr",
 }  # fmt: skip
-BY_MATRIX = frozenset(("lu", "triangular_solve", "cholesky", "eigh", "svd", "qr", "lu_pivots_to_permutation", "householder_product"))
+BY_MATRIX = frozenset(("lu", "triangular_solve", "cholesky", "eigh", "svd", "qr", "householder_product"))
 
 
 class Dense(Exception):
     """Raised where index sets become too large to be of use; says what made them so."""
 
 
-def pattern_of(function: Callable, unknowns: Any, *others: Any) -> sp.csr_matrix:
+def pattern_of(function: Callable, unknowns: Any, *others: Any) -> Any:
     """Where the Jacobian of `function(unknowns, *others)`, an array of floats, can have entries: booleans (results, unknowns).
 
     `unknowns` is a vector; all arguments are values or `jax.ShapeDtypeStruct`s. Other floats than unknowns are not looked at,
@@ -59,8 +65,13 @@ def pattern_of(function: Callable, unknowns: Any, *others: Any) -> sp.csr_matrix
     size = math.prod(unknowns.shape)
     whole = lambda leaf: None if jax.numpy.issubdtype(jax.numpy.result_type(leaf), np.inexact) else _concrete(leaf)
     given = [Value(known=whole(leaf)) for leaf in jax.tree.leaves(others)]
-    (found,) = _Sets(size).run(closed, [Value(sp.identity(size, bool, "csr")), *given])
+    (found,) = _Sets(size).run(closed, [Value(_unit_sets(size)), *given])
     return sp.csr_matrix((closed.out_avals[0].size, size), dtype=bool) if found.sets is None else found.sets
+
+
+def _unit_sets(size: int) -> Any:
+    """Every unknown depends on itself."""
+    return sp.csr_matrix((np.ones(size, bool), np.arange(size), np.arange(size + 1)), (size, size))
 
 
 def _concrete(value: Any) -> np.ndarray | None:
@@ -71,9 +82,9 @@ class Value(NamedTuple):
     """What is known of an array: the index sets of its entries (entries, unknowns), None for empty ones; its numbers, where they
     are known; which entries are zero whatever the unknowns, None for no entries."""
 
-    sets: sp.csr_matrix | None = None
-    known: np.ndarray | None = None
-    zero: np.ndarray | None = None
+    sets: Any = None
+    known: Any = None
+    zero: Any = None
 
     def zeros(self, shape: tuple[int, ...]) -> np.ndarray:
         """Which entries are known to be zero."""
@@ -162,7 +173,7 @@ class _Sets:
 
     def moved(self, equation: Any, operands: list[Value]) -> list[Value]:
         """Numbers of entries are moved, counted from 1; 0 is that of an entry which depends on nothing."""
-        rule = _pad if equation.primitive.name == "pad" else RULES[equation.primitive.name]
+        rule: Any = _pad if equation.primitive.name == "pad" else RULES[equation.primitive.name]
         if all(o.known is not None for o in operands):
             return [Value(known=np.asarray(a)) for a in rule(None, equation, *(o.known for o in operands))]
         shapes = [v.aval.shape for v in equation.invars]
@@ -183,7 +194,7 @@ class _Sets:
             results = [Value(self.rows(sets, moved)) for moved in rule(None, equation, *numbers)]
         return [Value(r.sets, None, zero) for r, zero in zip(results, zeros, strict=True)]
 
-    def rows(self, sets: sp.csr_matrix, numbers: np.ndarray) -> sp.csr_matrix:
+    def rows(self, sets: Any, numbers: np.ndarray) -> Any:
         """The sets of entries with these numbers, counted from 1; 0 for the empty set."""
         flat = numbers.ravel()
         if len(flat) == sets.shape[0] and np.array_equal(flat, np.arange(1, len(flat) + 1)):
@@ -255,7 +266,8 @@ class _Sets:
 
     def united(self, equation: Any, operands: list[Value]) -> Value:
         shape, name = equation.outvars[0].aval.shape, equation.primitive.name
-        found, zero = None, None
+        found: Any = None
+        zero: Any = None
         for operand, variable in zip(operands, equation.invars, strict=True):
             if operand.sets is not None:
                 found = _union(found, self.spread(operand.sets, variable.aval.shape, shape))
@@ -269,7 +281,7 @@ class _Sets:
                 zero = zeros[0]
         return Value(found, None, zero)
 
-    def spread(self, sets: sp.csr_matrix, shape: tuple[int, ...], whole: tuple[int, ...]) -> sp.csr_matrix:
+    def spread(self, sets: Any, shape: tuple[int, ...], whole: tuple[int, ...]) -> Any:
         """The sets of an operand that is repeated along axes of length 1, or is a number."""
         if shape == whole:
             return sets
@@ -299,7 +311,7 @@ class _Sets:
         zero = None if value.zero is None and value.known is None else np.all(value.zeros(shape), axis=tuple(axes))
         return Value(sets, None, zero)
 
-    def folded(self, sets: sp.csr_matrix, shape: tuple[int, ...], axes: Sequence[int]) -> sp.csr_matrix:
+    def folded(self, sets: Any, shape: tuple[int, ...], axes: Sequence[int]) -> Any:
         kept = [n for axis, n in enumerate(shape) if axis not in axes]
         inner = tuple(1 if axis in axes else n for axis, n in enumerate(shape))
         groups = np.broadcast_to(np.arange(math.prod(kept)).reshape(inner), shape).ravel()
@@ -321,7 +333,8 @@ class _Sets:
             ~o.zeros(shape).ravel()[order].reshape(size) if z else None
             for o, shape, order, size, z in zip(operands, shapes, orders, sizes, has_zeros, strict=True)
         ]
-        found, zero = None, None
+        found: Any = None
+        zero: Any = None
         if all(has_zeros) or (any(has_zeros) and not all(np.all(t) for t in there if t is not None)):
             zero = self.zero_products(there, sizes).reshape(equation.outvars[0].aval.shape)
         for k, operand in enumerate(operands):
@@ -340,7 +353,9 @@ class _Sets:
                     raise Dense(f"a product of arrays takes {count} multiplications")
                 out = (group * rows + (mine if k == 0 else other)) * columns + (other if k == 0 else mine)
                 source = (group * own + mine) * length + at
-                taken = sp.csr_matrix((np.ones(out.size, bool), (out.ravel(), source.ravel())), (math.prod(whole), len(orders[k])))
+                taken = sp.csr_matrix(
+                    (np.ones(out.size, bool), (out.ravel(), source.ravel())), (math.prod(whole), len(orders[k]))
+                )
                 part = taken @ sets
             found = _union(found, part)
         return Value(found, None, zero)
@@ -352,7 +367,8 @@ class _Sets:
 
     def by_matrix(self, equation: Any, operands: list[Value]) -> list[Value]:
         """Each matrix of a batch by itself."""
-        batch, found = math.prod(equation.invars[0].aval.shape[:-2]), None
+        batch = math.prod(equation.invars[0].aval.shape[:-2])
+        found: Any = None
         for variable, operand in zip(equation.invars, operands, strict=True):
             if operand.sets is not None:
                 found = _union(found, self.folded(operand.sets, (batch, variable.aval.size // max(batch, 1)), (1,)))
@@ -370,7 +386,7 @@ class _Sets:
 
     def all_of_all(self, equation: Any, operands: list[Value]) -> list[Value]:
         """What is not known: every result depends on everything."""
-        found = None
+        found: Any = None
         for operand in operands:
             if operand.sets is not None:
                 found = _union(found, self.folded(operand.sets, (operand.sets.shape[0],), (0,)))
@@ -396,7 +412,7 @@ INDEXING = frozenset(
 )
 
 
-def _union(a: sp.csr_matrix | None, b: sp.csr_matrix) -> sp.csr_matrix:
+def _union(a: Any, b: Any) -> Any:
     if a is None or a is b:
         return b
     return a if b.nnz == 0 else b if a.nnz == 0 else sp.csr_matrix(a + b)

@@ -89,7 +89,7 @@ def along(function: Callable, point: tuple, direction: tuple) -> Any:
 
 
 def pulled_back(function: Callable, point: Any, covector: Any) -> Any:
-    """(∂f/∂x)ᵀ·covector for a function of one array with an array (c,) for its value: `jax.vjp(function, point)[1](covector)[0]`."""
+    """(∂f/∂x)ᵀ·covector for a function of one array with an array (c,): `jax.vjp(function, point)[1](covector)[0]`."""
     if is_tracing():
         traced = _Traced(function, (point,))
         if traced.is_plain and binds(covector):

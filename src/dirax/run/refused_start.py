@@ -120,7 +120,9 @@ def _refuse_singular_sparse_step(jacobians: SparseJacobians, labels: Sequence[st
         for a, product in ((near, products[1]), (matrix, products[0])):
             missed = np.abs(a @ along - product) / np.maximum(abs(a) @ along, TINY)
             if np.any(missed > PRODUCT):  # never where it is not a number: out of the domain nothing is known
-                raise AssertionError(f"the sparse Jacobian of the step is wrong in {labels[int(np.argmax(missed))]}: report this.")
+                raise AssertionError(
+                    f"the sparse Jacobian of the step is wrong in {labels[int(np.argmax(missed))]}: report this."
+                )
         free = free_direction(jacobians.equations, matrix)
         if free is not None:
             most = np.argsort(-np.abs(free))[:4]

@@ -13,7 +13,6 @@ from dirax.program.roots import FEWEST_SPARSE
 from dirax.program.user_functions import is_traced
 from dirax.run.validate import Case, spread
 
-
 LARGEST_MATRIX = 2**18
 """Entries of a matrix up to which the start of a run makes it whole."""
 
@@ -94,7 +93,8 @@ def _with_sparse_first_step(equation: Any, case: Case, start: Start) -> Start:
 
 
 class SparseJacobians(NamedTuple):
-    """Sparse Jacobians of every trajectory: what is known of them all, `values` (B, …), and the products (B, k) with `direction(k)`."""
+    """Sparse Jacobians of every trajectory at the first guess and near it: what is known of them all, `values` (B, 2, …), and the
+    products (B, 2, k) with `direction(k)`."""
 
     equations: Any
     values: np.ndarray

@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 from typing import overload
 
-
 GIVEN = -1
 """The number of a name that is taken as it is."""
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows
-from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
 from dirax.schemes.labels import Labels
+from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 

@@ -150,7 +150,10 @@ class StepEquation(eqx.Module):
 
     def _repr_html_(self) -> str:
         parts = {"state is": repr(self.state_layout), "unknowns are": repr(self.unknown_layout)}
-        return fields_html("StepEquation", self._summary() | parts | {"equations": ", ".join(self.labels[:SHOWN]) + ", …" * (len(self.labels) > SHOWN)})
+        return fields_html(
+            "StepEquation",
+            self._summary() | parts | {"equations": ", ".join(self.labels[:SHOWN]) + ", …" * (len(self.labels) > SHOWN)},
+        )
 
 
 class StepSequence(eqx.Module):

@@ -153,7 +153,7 @@ class PortHamiltonian(AbstractSystem):
             dh = self.differential(x, params)
             closed = self.closed_matrix(x, params)
             right = self.flow_matrix(x, params) @ dh + self.open_matrix(x, params) @ self.input(t, x, params)
-            matrix = jnp.block([[jnp.eye(n), -closed], [jnp.zeros((m, n + m))]])
+            matrix = jnp.block([[jnp.eye(n), -jnp.asarray(closed)], [jnp.zeros((m, n + m))]])
             return matrix, jnp.concatenate([right, closed.T @ dh])
 
         about = "closed ports: u keeps y = 0" if m else "no closed ports"
@@ -225,7 +225,9 @@ class PortHamiltonian(AbstractSystem):
         if (defect := abs(R - R.T).max()) > STRUCTURE_DEFECT * scale:
             raise ValueError(f"R is not symmetric: max |R − Rᵀ| = {defect:.3g}.")
         if (lowest := R.diagonal().min()) < -STRUCTURE_DEFECT * scale:
-            raise ValueError(f"R is not positive semidefinite: it has {lowest:.3g} on its diagonal; dissipation must not create energy.")
+            raise ValueError(
+                f"R is not positive semidefinite: it has {lowest:.3g} on its diagonal; dissipation must not create energy."
+            )
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         x = data["x"]

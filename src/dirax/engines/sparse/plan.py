@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from dirax.engines.sparse.solver import SparseSolver
 from dirax.numerics.sparse.elimination import StructurallySingular
@@ -22,7 +23,7 @@ def sparse_plan(equation: Any, params: Any, batch_params: bool) -> tuple[SparseS
     """A solver for each stage of the step, the same objects for the same equation and parameters of one kind; or why the step
     is not one for sparse elimination, in words that go on after "because"."""
     leaves, structure = jax.tree.flatten(params)
-    whole = [leaf for leaf in leaves if not _is_float(leaf) and not isinstance(leaf, jax.core.Tracer)]
+    whole = [leaf for leaf in leaves if not _is_float(leaf) and not isinstance(leaf, Tracer)]
     key = Same(equation), structure, batch_params, *map(np.shape, leaves), *(np.asarray(leaf).tobytes() for leaf in whole)
     return _plans.get(key, lambda: _planned(equation, params, batch_params))
 
@@ -33,7 +34,7 @@ def _is_float(leaf: Any) -> bool:
 
 def _planned(equation: Any, params: Any, batch_params: bool) -> tuple[SparseSolver, ...] | str:
     def shaped(leaf: Any) -> Any:
-        if batch_params or _is_float(leaf) or isinstance(leaf, jax.core.Tracer):
+        if batch_params or _is_float(leaf) or isinstance(leaf, Tracer):
             return jax.ShapeDtypeStruct(np.shape(leaf)[batch_params:], jnp.result_type(leaf))
         return leaf
 

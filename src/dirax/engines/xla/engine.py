@@ -145,7 +145,9 @@ class Xla(AbstractEngine):
         return p, Numerics(self.linear_solver, increments, jacobians), notes
 
 
-def _outcome(p: Problem, lanes: Lane, fields: dict[str, Any], closing: dict[str, Any], notes: dict[str, Any], name: str) -> Outcome:
+def _outcome(
+    p: Problem, lanes: Lane, fields: dict[str, Any], closing: dict[str, Any], notes: dict[str, Any], name: str
+) -> Outcome:
     lanes = lanes if p.batch is not None else jax.tree.map(lambda a: a[None], lanes)
     return Outcome(
         fields=fields,

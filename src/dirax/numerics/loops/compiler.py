@@ -1,27 +1,30 @@
 """From a Python function of loops over arrays to LLVM's code: the part of Python that such functions need.
 
 A function may assign numbers and elements of arrays, and has `for … in range(…)`, `while`, `if`, `break`, `continue`, arithmetic,
-comparisons, `abs`, `min` and `max`. Every argument is annotated with its type: "f8[]", "i4[]" or "i8[]" for arrays, which may
-not overlap, "i8" or "f8" for numbers. Called as plain Python it does the same.
+comparisons, `abs`, `min` and `max`. Its arguments are arrays, `Doubles`, `Ints` or `Longs`, which may not overlap. Called as
+plain Python it does the same.
 """
 
 import ast
 import inspect
 import textwrap
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import llvmlite.ir as ir
+import numpy as np
 
 DOUBLE, INDEX, INT, BIT = ir.DoubleType(), ir.IntType(64), ir.IntType(32), ir.IntType(1)
 KINDS = {"f8": DOUBLE, "i8": INDEX, "i4": INT}
-INTEGER = {"<": "<", "<=": "<=", ">": ">", ">=": ">=", "==": "==", "!=": "!="}
+Doubles: TypeAlias = Annotated[np.ndarray, "f8"]
+Ints: TypeAlias = Annotated[np.ndarray, "i4"]
+Longs: TypeAlias = Annotated[np.ndarray, "i8"]
 COMPARED = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 
 
 def argument_kinds(function: Callable) -> dict[str, str]:
-    """The arguments of a function with their types."""
-    return {name: p.annotation for name, p in inspect.signature(function).parameters.items()}
+    """The arguments of a function with the types of their numbers."""
+    return {name: p.annotation.__metadata__[0] for name, p in inspect.signature(function).parameters.items()}
 
 
 def module_of(function: Callable, constants: Mapping[str, int]) -> ir.Module:
@@ -34,12 +37,11 @@ def module_of(function: Callable, constants: Mapping[str, int]) -> ir.Module:
     module, kinds = ir.Module(), argument_kinds(function)
     made = ir.Function(
         module,
-        ir.FunctionType(ir.VoidType(), [KINDS[k[:2]].as_pointer() if k.endswith("[]") else KINDS[k] for k in kinds.values()]),
+        ir.FunctionType(ir.VoidType(), [KINDS[kind].as_pointer() for kind in kinds.values()]),
         tree.name,
     )
-    for argument, kind in zip(made.args, kinds.values(), strict=True):
-        if kind.endswith("[]"):
-            argument.add_attribute("noalias")
+    for argument in made.args:
+        argument.add_attribute("noalias")
     _Body(made, dict(zip(kinds, made.args, strict=True)), constants).write(tree.body)
     return module
 
@@ -49,7 +51,7 @@ class _Body:
 
     def __init__(self, function: ir.Function, arguments: dict[str, Any], constants: Mapping[str, int]):
         self.entry = ir.IRBuilder(function.append_basic_block("entry"))
-        self.b = ir.IRBuilder(function.append_basic_block("body"))
+        self.b: Any = ir.IRBuilder(function.append_basic_block("body"))
         self.arguments, self.constants = arguments, constants
         self.variables: dict[str, Any] = {}
         self.loops: list[tuple[Any, Any]] = []  # where to go on, where to end
@@ -202,7 +204,8 @@ class _Body:
 
     def alike(self, a: Any, b: Any, real: bool = False) -> tuple[Any, Any]:
         real = real or DOUBLE in (a.type, b.type)
-        return tuple(self.b.sitofp(x, DOUBLE) if real and x.type == INDEX else x for x in (a, b))
+        a, b = (self.b.sitofp(x, DOUBLE) if real and x.type == INDEX else x for x in (a, b))
+        return a, b
 
     def _Compare(self, node: ast.Compare) -> Any:
         (operator,), (right,) = node.ops, node.comparators

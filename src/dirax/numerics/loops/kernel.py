@@ -30,7 +30,7 @@ class Kernel:
 
     def __init__(self, function: Callable, results: int, **constants: int):
         self.function, self.results, self.constants = function, results, constants
-        self.kinds = [kind[:2] for kind in argument_kinds(function).values()]
+        self.kinds = list(argument_kinds(function).values())
         self.name = "_".join(["dirax", function.__name__, *(f"{k}{v}" for k, v in sorted(constants.items()))])
 
     def __call__(self, *arrays: np.ndarray) -> None:
@@ -114,4 +114,3 @@ def _write_handler(module: ir.Module, kernel: Any, count: int) -> None:
         values.append(b.bitcast(pointer(buffer, BUFFER_DATA), argument.type))
     b.call(kernel, values)
     b.ret(null)
-

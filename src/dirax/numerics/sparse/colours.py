@@ -1,7 +1,8 @@
 """Colours of the columns of a sparse matrix, so that one product with each colour's sum gives all its entries."""
 
+from typing import Any
+
 import numpy as np
-import scipy.sparse as sp
 
 from dirax.numerics.loops.kernel import Kernel
 from dirax.numerics.sparse import kernels
@@ -9,7 +10,7 @@ from dirax.numerics.sparse import kernels
 _greedy = Kernel(kernels.greedy_colours, 2)
 
 
-def column_colours(pattern: sp.csr_matrix) -> np.ndarray:
+def column_colours(pattern: Any) -> np.ndarray:
     """A colour (columns,) for each column such that no row has two columns of one colour."""
     whole = lambda a: np.ascontiguousarray(a, np.int32)
     by_columns = pattern.tocsc()

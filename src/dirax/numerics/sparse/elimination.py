@@ -25,7 +25,7 @@ class StructurallySingular(ValueError):
         super().__init__(f"the equations {rows[:8].tolist()} have not enough unknowns")
 
 
-def matched_rows(pattern: sp.csr_matrix) -> np.ndarray:
+def matched_rows(pattern: Any) -> np.ndarray:
     """For each unknown an equation that it stands in, every equation once. Raises `StructurallySingular`."""
     matched = csgraph.maximum_bipartite_matching(pattern, perm_type="row")
     if np.any(matched < 0):
@@ -33,7 +33,7 @@ def matched_rows(pattern: sp.csr_matrix) -> np.ndarray:
     return matched.astype(int)
 
 
-def elimination(pattern: sp.csr_matrix) -> "BandElimination | FixedElimination":
+def elimination(pattern: Any) -> "BandElimination | FixedElimination":
     """The way to factor matrices of this pattern. Raises `StructurallySingular`.
 
     Equations stand beside the unknowns of the same numbers, or beside those that they are matched with, where that makes a
@@ -49,7 +49,7 @@ def elimination(pattern: sp.csr_matrix) -> "BandElimination | FixedElimination":
     return FixedElimination(pattern, rows, sp.csr_matrix(turned + turned.T))
 
 
-def _in_band(pattern: sp.csr_matrix, rows: np.ndarray) -> tuple[int, np.ndarray, np.ndarray, int, int]:
+def _in_band(pattern: Any, rows: np.ndarray) -> tuple[int, np.ndarray, np.ndarray, int, int]:
     """(diagonals with those of exchanged rows, order of the unknowns, rows beside them, diagonals below, above)."""
     turned, own = pattern[rows], np.arange(len(rows))
     both = sp.csr_matrix(turned + turned.T)
@@ -59,13 +59,13 @@ def _in_band(pattern: sp.csr_matrix, rows: np.ndarray) -> tuple[int, np.ndarray,
     return 2 * below + above + 1, order, rows, below, above
 
 
-def _has_pivots(pattern: sp.csr_matrix) -> bool:
+def _has_pivots(pattern: Any) -> bool:
     """Whether each unknown stands in the equation of its number, or has neighbours that do, with which it is symmetric."""
     without = np.flatnonzero(~pattern.diagonal())
     return (pattern[without] != pattern.T.tocsr()[without]).nnz == 0
 
 
-def _width(pattern: sp.csr_matrix, order: np.ndarray) -> tuple[int, int]:
+def _width(pattern: Any, order: np.ndarray) -> tuple[int, int]:
     """Diagonals below and above the main one, with rows and columns in this order."""
     place = np.empty(len(order), int)
     place[order] = np.arange(len(order))
@@ -94,13 +94,13 @@ class BandElimination:
     work_of_factor = 0
     """How many of the results of a factorization are no factors."""
 
-    def __init__(self, pattern: sp.csr_matrix, order: np.ndarray, rows: np.ndarray, below: int, above: int):
+    def __init__(self, pattern: Any, order: np.ndarray, rows: np.ndarray, below: int, above: int):
         self.size, self.order, self.rows = pattern.shape[0], _whole(order), _whole(rows)
         self.below, self.above = below, above
         self.width = 2 * below + above + 1 if below else above + 1
         self.kernels = _band_kernels(below, self.width)
 
-    def tables(self, place_of: sp.csr_matrix) -> tuple[np.ndarray, ...]:
+    def tables(self, place_of: Any) -> tuple[np.ndarray, ...]:
         """What the factorization has to know of where values are: `place_of` is the pattern with the numbers of its entries,
         from 1, in the array of values."""
         turned = place_of[self.rows][:, self.order].tocsr()
@@ -152,7 +152,7 @@ class FixedElimination:
 
     work_of_factor = 2
 
-    def __init__(self, pattern: sp.csr_matrix, rows: np.ndarray, both: sp.csr_matrix):
+    def __init__(self, pattern: Any, rows: np.ndarray, both: Any):
         self.size = pattern.shape[0]
         order = _after_neighbours(both, pattern[rows].diagonal(), _minimum_degree(both))
         self.order, self.rows, self.kernels = _whole(order), _whole(rows[order]), _fixed_kernels
@@ -171,7 +171,7 @@ class FixedElimination:
             self.fill_rows, self.left_starts, self.left, self.left_places,
         )  # fmt: skip
 
-    def tables(self, place_of: sp.csr_matrix) -> tuple[np.ndarray, ...]:
+    def tables(self, place_of: Any) -> tuple[np.ndarray, ...]:
         """What the factorization has to know: where values are, of which `place_of` has the numbers from 1, and the fill."""
         entries = place_of[self.rows][:, self.order].tocoo()
         pivot = np.minimum(entries.row, entries.col)
@@ -211,7 +211,7 @@ class FixedElimination:
         return int(np.sum(counts * (counts + 1)))
 
 
-def _minimum_degree(both: sp.csr_matrix) -> np.ndarray:
+def _minimum_degree(both: Any) -> np.ndarray:
     """An order of unknowns in which elimination makes little fill, as SuperLU finds it before it factors anything."""
     size = both.shape[0]
     numbers = sp.csc_matrix((np.ones(both.nnz), both.indices, both.indptr), both.shape)
@@ -223,7 +223,7 @@ def _minimum_degree(both: sp.csr_matrix) -> np.ndarray:
     return order
 
 
-def _after_neighbours(both: sp.csr_matrix, diagonal: np.ndarray, order: np.ndarray) -> np.ndarray:
+def _after_neighbours(both: Any, diagonal: np.ndarray, order: np.ndarray) -> np.ndarray:
     """The order in which an unknown without a diagonal comes after all its neighbours."""
     without = np.flatnonzero(~np.asarray(diagonal, bool))
     if not len(without):

@@ -3,13 +3,13 @@
 Index arrays are those of compressed rows: the entries of row i are `columns[starts[i]:starts[i + 1]]`.
 """
 
-# pyright: reportArgumentType=false
-# the annotations are the types of arrays, for `dirax.numerics.loops`
+# Names in capitals are constants that a kernel is given.
+# pyright: reportUndefinedVariable=false
+
+from dirax.numerics.loops.compiler import Doubles, Ints, Longs
 
 
-def greedy_colours(
-    row_starts: "i4[]", columns: "i4[]", column_starts: "i4[]", rows: "i4[]", sizes: "i8[]", last: "i4[]", colours: "i4[]"
-):
+def greedy_colours(row_starts: Ints, columns: Ints, column_starts: Ints, rows: Ints, sizes: Longs, last: Ints, colours: Ints):
     """Colours of columns such that no row has two of one colour: each column in turn takes the first that is free."""
     for j in range(sizes[0]):
         last[j] = -1
@@ -27,7 +27,7 @@ def greedy_colours(
         colours[j] = free
 
 
-def count_fill(starts: "i4[]", columns: "i4[]", sizes: "i8[]", parent: "i4[]", mark: "i4[]", counts: "i8[]"):
+def count_fill(starts: Ints, columns: Ints, sizes: Longs, parent: Ints, mark: Ints, counts: Longs):
     """The elimination tree of a symmetric pattern, and how many entries each column of L has below its diagonal."""
     for i in range(sizes[0]):
         parent[i] = -1
@@ -45,8 +45,8 @@ def count_fill(starts: "i4[]", columns: "i4[]", sizes: "i8[]", parent: "i4[]", m
 
 
 def list_fill(
-    starts: "i4[]", columns: "i4[]", parent: "i4[]", fill_starts: "i8[]", sizes: "i8[]", mark: "i4[]", there: "i8[]",
-    fill_rows: "i4[]", left_starts: "i8[]", left: "i4[]", left_places: "i8[]",
+    starts: Ints, columns: Ints, parent: Ints, fill_starts: Longs, sizes: Longs, mark: Ints, there: Longs,
+    fill_rows: Ints, left_starts: Longs, left: Ints, left_places: Longs,
 ):  # fmt: skip
     """The rows of the entries of L below the diagonal, column by column, and for every row its columns to the left of the
     diagonal with the places of its entries in them."""
@@ -74,8 +74,8 @@ def list_fill(
 
 
 def band_factor(
-    starts: "i4[]", places: "i4[]", sources: "i4[]", values: "f8[]", sizes: "i8[]",
-    upper: "f8[]", lower: "f8[]", inverse: "f8[]", pivots: "i4[]",
+    starts: Ints, places: Ints, sources: Ints, values: Doubles, sizes: Longs,
+    upper: Doubles, lower: Doubles, inverse: Doubles, pivots: Ints,
 ):  # fmt: skip
     """L and U of a matrix with BELOW diagonals below the main one, WIDTH in all with those of exchanged rows, by elimination
     with partial pivoting. Entry a of row i is `values[sources[a]]`, at `places[a]` from the first column that the row has."""
@@ -113,8 +113,8 @@ def band_factor(
 
 
 def band_solve(
-    order: "i4[]", rows: "i4[]", upper: "f8[]", lower: "f8[]", inverse: "f8[]", pivots: "i4[]", right: "f8[]", sizes: "i8[]",
-    x: "f8[]", found: "f8[]",
+    order: Ints, rows: Ints, upper: Doubles, lower: Doubles, inverse: Doubles, pivots: Ints, right: Doubles, sizes: Longs,
+    x: Doubles, found: Doubles,
 ):  # fmt: skip
     """The solution with those factors, of equations `rows` in turn for unknowns `order` in turn."""
     n = sizes[0]
@@ -141,8 +141,8 @@ def band_solve(
 
 
 def band_solve_transposed(
-    order: "i4[]", rows: "i4[]", upper: "f8[]", lower: "f8[]", inverse: "f8[]", pivots: "i4[]", right: "f8[]", sizes: "i8[]",
-    x: "f8[]", found: "f8[]",
+    order: Ints, rows: Ints, upper: Doubles, lower: Doubles, inverse: Doubles, pivots: Ints, right: Doubles, sizes: Longs,
+    x: Doubles, found: Doubles,
 ):  # fmt: skip
     """The same for the transposed matrix."""
     n = sizes[0]
@@ -172,9 +172,9 @@ def band_solve_transposed(
 
 
 def fixed_factor(
-    starts: "i4[]", places: "i4[]", sources: "i4[]", fill_starts: "i8[]", fill_rows: "i4[]",
-    left_starts: "i8[]", left: "i4[]", left_places: "i8[]", values: "f8[]", sizes: "i8[]",
-    x: "f8[]", y: "f8[]", lower: "f8[]", upper: "f8[]", inverse: "f8[]",
+    starts: Ints, places: Ints, sources: Ints, fill_starts: Longs, fill_rows: Ints,
+    left_starts: Longs, left: Ints, left_places: Longs, values: Doubles, sizes: Longs,
+    x: Doubles, y: Doubles, lower: Doubles, upper: Doubles, inverse: Doubles,
 ):  # fmt: skip
     """L by columns and U by rows of a matrix whose pivots are taken in order, both with the pattern `fill_rows`.
 
@@ -214,8 +214,8 @@ def fixed_factor(
 
 
 def fixed_solve(
-    order: "i4[]", rows: "i4[]", fill_starts: "i8[]", fill_rows: "i4[]", lower: "f8[]", upper: "f8[]", inverse: "f8[]",
-    right: "f8[]", sizes: "i8[]", x: "f8[]", found: "f8[]",
+    order: Ints, rows: Ints, fill_starts: Longs, fill_rows: Ints, lower: Doubles, upper: Doubles, inverse: Doubles,
+    right: Doubles, sizes: Longs, x: Doubles, found: Doubles,
 ):  # fmt: skip
     """The solution with those factors, of equations `rows` in turn for unknowns `order` in turn."""
     n = sizes[0]
@@ -235,8 +235,8 @@ def fixed_solve(
 
 
 def fixed_solve_transposed(
-    order: "i4[]", rows: "i4[]", fill_starts: "i8[]", fill_rows: "i4[]", lower: "f8[]", upper: "f8[]", inverse: "f8[]",
-    right: "f8[]", sizes: "i8[]", x: "f8[]", found: "f8[]",
+    order: Ints, rows: Ints, fill_starts: Longs, fill_rows: Ints, lower: Doubles, upper: Doubles, inverse: Doubles,
+    right: Doubles, sizes: Longs, x: Doubles, found: Doubles,
 ):  # fmt: skip
     """The same for the transposed matrix."""
     n = sizes[0]
