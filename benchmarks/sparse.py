@@ -1,4 +1,4 @@
-"""Chains of many sites: time an unknown and a step beside Newton's method by hand in NumPy and SciPy, first calls, derivatives."""
+"""Chains of many sites: time a step beside Newton's method by hand in NumPy and SciPy, first calls, derivatives."""
 
 import json
 import resource
