@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import batches, first_call, reduction, saving, sweep, xla_vs_c
+from benchmarks import batches, first_call, reduction, saving, sparse, sweep, xla_vs_c
 from benchmarks.harness import RESULTS
 
 BENCHMARKS = {
@@ -11,6 +11,7 @@ BENCHMARKS = {
     "batches": batches,
     "first_call": first_call,
     "reduction": reduction,
+    "sparse": sparse,
     "sweep": sweep,
 }
 

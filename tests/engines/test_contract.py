@@ -12,6 +12,7 @@ import dirax as dx
 from dirax.engines.auto import Auto
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem, cut, saved_steps
 from dirax.engines.native import Native
+from dirax.engines.sparse.engine import Sparse
 from dirax.engines.xla import Xla
 from dirax.schemes.step import Field, StepEquation
 from engines.reference_engine import Reference
@@ -21,6 +22,7 @@ ENGINES: dict[str, dx.AbstractEngine] = {
     "xla": Xla(),
     "plain": Xla(scalars="never"),
     "auto": Auto(),
+    "sparse": Sparse(),
     "reference": Reference(),
 }
 EVERY = pytest.mark.parametrize("engine", ENGINES.values(), ids=ENGINES.keys())

@@ -15,6 +15,9 @@ from dirax.solution.solution import Solution
 SAMPLED_STEPS = 8
 """Steps of a trajectory at which the derivative of the step is taken."""
 
+LARGEST_STATE = 1000
+"""Numbers of a state, or of a row, up to which the derivative of a step and the distribution at a row, matrices, are taken."""
+
 WITHOUT_SYSTEM = "the solution was loaded without its system"
 WORDS = {2: "two", 3: "three"}
 
@@ -31,6 +34,8 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     if isinstance(structure, str):
         return [Line("discrete Dirac structure", None, None, NOT_CHECKED, structure)]
     name, points = structure.claims[0].quantity, structure.points
+    if (size := sum(int(np.prod(sol.field_info[key].shape)) for key in structure.reads)) > LARGEST_STATE:
+        return [Line(name, None, None, NOT_CHECKED, f"its distribution is a matrix, and a row has {size} numbers")]
     if sol.save_every != 1:
         return [Line(name, None, None, NOT_CHECKED, f"needs every step, but save_every = {sol.save_every}")]
     if sol.rows < points:
@@ -63,6 +68,8 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     name = "structural relation φ*Ω = Ω + dβ" if constrained else "symplecticity of one step"
     if sol.equation is None or sol.system is None:
         return Line(name, None, None, NOT_CHECKED, WITHOUT_SYSTEM)
+    if (size := max(stage.state_size for stage, _ in sol.equation.stages)) > LARGEST_STATE:
+        return Line(name, None, None, NOT_CHECKED, f"the derivative of a step is a matrix of {size} × {size} numbers")
     if "work" in sol.fields and not keeps_books(sol):
         return Line(name, None, None, NOT_CHECKED, "the forces change the two-form")
     form = sol.scheme.step_form(sol.system, shape_of(sol), sol.step)

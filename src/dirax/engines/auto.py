@@ -1,4 +1,4 @@
-"""The engine "auto": native for small systems on a CPU, xla for everything else; `policy.py` says how large is small."""
+"""The engine "auto": native for small systems on a CPU, sparse for large ones that are sparse, xla for everything else."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,8 @@ from dirax.program.interpreter import UnsupportedPrimitive
 
 
 class Auto(AbstractEngine):
-    """Takes the native engine where that is quicker, by the numbers in `policy.py`; `stats["not_native"]` says why where not."""
+    """Takes the native engine where that is quicker, by the numbers in `policy.py`; `stats["not_native"]` says why where not, and
+    `stats["not_sparse"]` why a large system is not taken as a sparse one."""
 
     name = "auto"
 
@@ -34,13 +35,14 @@ class Auto(AbstractEngine):
             else:
                 if reason is None:
                     return native.prepared(problem)
+        engine, notes = self._by_arrays(problem)
 
-        def by_xla(problem: Problem, progress: Progress | None = None) -> Outcome:
-            outcome = Xla().run(problem, progress)
-            outcome.notes["not_native"] = reason
+        def by_arrays(problem: Problem, progress: Progress | None = None) -> Outcome:
+            outcome = engine.run(problem, progress)
+            outcome.notes |= {"not_native": reason, **notes}
             return outcome
 
-        return by_xla
+        return by_arrays
 
     def run_traced(self, problem: Problem) -> Outcome:
         """The same, for smaller systems: their derivatives are compiled, too."""
@@ -50,6 +52,21 @@ class Auto(AbstractEngine):
                 return policy.engine_of("native").run_traced(problem)
             except (ImportError, UnsupportedPrimitive) as error:
                 reason = str(error)
-        outcome = Xla().run_traced(problem)
-        outcome.notes["not_native"] = reason
+        engine, notes = self._by_arrays(problem)
+        outcome = engine.run_traced(problem)
+        outcome.notes |= {"not_native": reason, **notes}
         return outcome
+
+    def _by_arrays(self, problem: Problem) -> tuple[AbstractEngine, dict[str, str]]:
+        """The sparse engine or the xla engine, and why not the former."""
+        if problem.size < policy.FEWEST_SPARSE:
+            return Xla(), {}
+        try:
+            sparse = policy.engine_of("sparse", only_quicker=True)
+            reason = sparse.supports(problem)
+        except ImportError as error:
+            reason = str(error)
+        else:
+            if reason is None:
+                return sparse, {}
+        return Xla(), {"not_sparse": reason}

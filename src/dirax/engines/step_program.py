@@ -103,7 +103,7 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
     )  # fmt: skip
 
 
-DERIVATIVES = ("dirax_derivative", "dirax_directional")
+DERIVATIVES = ("dirax_derivative", "dirax_directional", "dirax_pullback")
 
 
 def nesting(jaxpr: Any) -> int:

@@ -44,6 +44,10 @@ _MODULES = {
     "knife-edge": "knife_edge",
     "contact-particle": "contact_particle",
     "transmission": "transmission",
+    "oscillator-chain": "oscillator_chain",
+    "sine-gordon": "sine_gordon",
+    "hanging-chain": "hanging_chain",
+    "wave-line": "wave_line",
 }
 """Name → the module here that defines `EXAMPLE`; a new system is a file and a line."""
 

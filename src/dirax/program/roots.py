@@ -2,6 +2,7 @@
 pseudo-inverse, and that of a regular system."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,9 @@ from dirax.program.given_tangents import implicit, implicit_tangent
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.primitives import binds, plain_primitive
 from dirax.program.tracing import closed_over, jacobian
+
+FEWEST_SPARSE = 128
+"""Unknowns from which on equations around a run are solved by sparse elimination, where they are sparse and regular."""
 
 
 def nearest_root(residual: Callable, guess: Float[Array, " k"], max_steps: int = 100) -> Float[Array, " k"]:
@@ -38,20 +42,60 @@ def _root(residual: Callable, max_steps: int, guess, *captured):
     fixed = lax.stop_gradient(captured)
     of_unknowns = lambda u: residual(u, *fixed)
 
+    sparse = sparse_equations(residual, guess, *captured)
+    inverse_at = _least_changes(of_unknowns) if sparse is None else _by_elimination(of_unknowns, sparse)
+
     def step(carry):
         u, _, count = carry
-        inverse, units = scaled_pseudo_inverse(jacobian(of_unknowns)(u))
-        u, going = damped_step(lambda u: inverse @ of_unknowns(u), u, units, jnp)
+        inverse, units = inverse_at(u)
+        u, going = damped_step(lambda u: inverse(of_unknowns(u)), u, units, jnp)
         return u, going, count + 1
 
     unfinished = lambda carry: carry[1] & (carry[2] < max_steps)
     root = lax.while_loop(unfinished, step, (lax.stop_gradient(guess), jnp.array(True), 0))[0]
+    if sparse is not None:
+        return sparse.root(lambda u: residual(u, *captured), root)
     return implicit(lambda u, captured: residual(u, *captured), root, captured, _least_change)
 
 
 def _least_change(matrix, right):
     """The solution of a linear system, regular or not, in the units of its equations and unknowns."""
     return scaled_pseudo_inverse(matrix)[0] @ right
+
+
+def _least_changes(equations: Callable) -> Callable:
+    """u ↦ (right-hand side ↦ solution of least size with the Jacobian of `equations` at u, units of the unknowns)."""
+
+    def at(u):
+        inverse, units = scaled_pseudo_inverse(jacobian(equations)(u))
+        return (lambda right: inverse @ right), units
+
+    return at
+
+
+def _by_elimination(equations: Callable, sparse: Any) -> Callable:
+    """The same of many unknowns, by sparse elimination."""
+
+    def at(u):
+        factors = sparse.factorise(sparse.values(equations, u))
+        return (lambda right: sparse.solve(factors, right)), jnp.ones(u.shape)
+
+    return at
+
+
+def sparse_equations(residual: Callable, unknowns: Any, *others: Any) -> Any:
+    """What is known of the sparse Jacobian of residual(unknowns, *others); None for few unknowns, or where it is not sparse."""
+    if unknowns.shape[0] < FEWEST_SPARSE or jax.default_backend() != "cpu":
+        return None
+    from dirax.numerics.sparse.elimination import StructurallySingular  # imported when it is used
+    from dirax.program.sparse_equations import SparseEquations
+    from dirax.program.sparsity import Dense
+
+    try:
+        found = SparseEquations.of(residual, unknowns, *others)
+    except (Dense, StructurallySingular):
+        return None
+    return found if found.slower is None else None
 
 
 def regular_root(
@@ -94,6 +138,8 @@ def _by_jax(*operands, residual: ClosedJaxpr, max_steps: int):
 
 
 def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, max_steps: int):
+    if primals[-1].shape[0] >= FEWEST_SPARSE:
+        return _as_plain(primals, tangents, residual=residual, max_steps=max_steps)
     u = root_p.bind(*primals, residual=residual, max_steps=max_steps)[0]
     along = [None if isinstance(t, ad.Zero) else t for t in tangents[:-1]]
     return [u], [implicit_tangent(_unknowns_first(residual), u, primals[:-1], along, _least_change)]
@@ -101,4 +147,5 @@ def _root_p_tangents(primals, tangents, *, residual: ClosedJaxpr, max_steps: int
 
 root_p = plain_primitive("dirax_root", _by_jax, lambda *operands, **_: [operands[-1]])
 """The root of a jaxpr of (*captured, unknowns) from the last operand on, the others being what it captured."""
+_as_plain = ad.primitive_jvps[root_p]
 ad.primitive_jvps[root_p] = _root_p_tangents

@@ -23,7 +23,7 @@ PLAIN = frozenset(
         *("squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "concatenate", "stack", "unstack", "tile", "split"),
         *("slice", "pad", "iota", "gather", "dynamic_slice", "dynamic_update_slice", "scatter", "scatter-add", "reduce_sum"),
         *("dot_general", "add_any", "jit", "pjit", "closed_call"),
-        *("dirax_derivative", "dirax_directional", "dirax_formula", "dirax_program"),
+        *("dirax_derivative", "dirax_directional", "dirax_pullback", "dirax_formula", "dirax_program"),
     )
 )
 """Primitives whose derivative is the same for JAX and for the graph, and as accurate: no corners (of an absolute value, a
@@ -86,6 +86,15 @@ def along(function: Callable, point: tuple, direction: tuple) -> Any:
             operands = (*traced.captured, *traced.leaves, *map(operand, direction))
             return directional_p.bind(*operands, jaxpr=traced.jaxpr, count=len(direction))[0]
     return jax.jvp(function, point, direction)[1]
+
+
+def pulled_back(function: Callable, point: Any, covector: Any) -> Any:
+    """(∂f/∂x)ᵀ·covector for a function of one array with an array (c,): `jax.vjp(function, point)[1](covector)[0]`."""
+    if is_tracing():
+        traced = _Traced(function, (point,))
+        if traced.is_plain and binds(covector):
+            return pullback_p.bind(*traced.captured, *traced.leaves, operand(covector), jaxpr=traced.jaxpr)[0]
+    return _pullback(function, point, covector)
 
 
 def value_along(function: Callable, point: tuple, direction: tuple) -> tuple[Any, Any]:
@@ -178,6 +187,26 @@ def _derivative_shapes(*operands, jaxpr: ClosedJaxpr, wanted: tuple[int, ...], r
 
 derivative_p = plain_primitive("dirax_derivative", _derivatives_by_jax, _derivative_shapes)
 """The derivatives of a jaxpr of floats with one result by the operands numbered `wanted`, one result each."""
+
+
+LARGEST_MATRIX = 4096
+"""Entries of a derivative up to which a covector is multiplied by it, and not pulled back without it."""
+
+
+def _pullback(function: Callable, point: Any, covector: Any) -> Any:
+    if covector.size * point.size <= LARGEST_MATRIX:
+        return jax.jacrev(function)(point).T @ covector
+    return jax.vjp(function, point)[1](covector)[0]
+
+
+def _pullback_by_jax(*operands, jaxpr: ClosedJaxpr):
+    """Its operands are captured values, the point and the covector."""
+    *captured, point, covector = operands
+    return [_pullback(lambda point: of_one_result(jaxpr)(*captured, point), point, covector)]
+
+
+pullback_p = plain_primitive("dirax_pullback", _pullback_by_jax, lambda *operands, jaxpr: [operands[-2]])
+"""The product of a covector with the derivative of a jaxpr of floats by its last operand."""
 
 
 def _directional_by_jax(*operands, jaxpr: ClosedJaxpr, count: int):

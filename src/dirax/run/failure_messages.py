@@ -1,5 +1,6 @@
 """Why a trajectory ended early, in words: which step, which equation, how near to singular."""
 
+from collections.abc import Callable
 from contextvars import ContextVar
 
 import jax
@@ -10,6 +11,7 @@ from dirax.engines.contract import NOT_FINITE, OK, Outcome, Problem
 from dirax.engines.stage_in_numbers import InJax, InNumbers, in_numbers
 from dirax.engines.stopping import STALLED
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
+from dirax.program.roots import FEWEST_SPARSE, sparse_equations
 
 SMALLER = "a smaller step may help"
 
@@ -56,7 +58,7 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
             known[id(stage)] = in_numbers(stage, params)
         numbers, h = known[id(stage)], fraction * p.h
         guess = numbers.guess(state, last if len(last) == stage.unknowns else np.zeros(stage.unknowns), h)
-        reason, u = _replay_newton(stage, numbers, guess, (state, t, h), p.max_iterations)
+        reason, u = _replay_newton(stage, numbers, guess, (state, t, h), params, p.max_iterations)
         if reason:
             return reason
         solved.append((stage, numbers, guess, (state, t, h)))
@@ -67,22 +69,22 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     return f"Newton did not converge from the values extrapolated from the steps before: {advice}"
 
 
-def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, max_iterations: int):
+def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, max_iterations: int):
     """(what went wrong or nothing, unknowns) of one stage."""
     u = guess
     if not stage.unknowns:
         return "", u
+    linearized = _sparse(stage, (*args, params)) or _dense(numbers, args)
     size, worst, condition = np.inf, 0, np.nan
     for iteration in range(max_iterations):
-        residual, jacobian = numbers.linearized(u, *args)
-        broken = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
+        residual, broken, solve, condition = linearized(u)
         if np.any(broken):
             label = stage.labels[int(np.argmax(broken))]
             return f"{label} is not finite (outside the domain of the system's functions) in Newton iteration {iteration + 1}", u
-        worst, condition = int(np.argmax(np.abs(residual))), np.linalg.cond(jacobian)
+        worst = int(np.argmax(np.abs(residual)))
         if not condition < LARGEST_CONDITION:
             return f"the Jacobian of the step is singular (condition number {condition:.2g})", u
-        change = np.linalg.solve(jacobian, residual)
+        change = solve(residual)
         u, size = u - change, np.max(np.abs(change) / (np.abs(u) + 1.0))
     if size < STALLED:
         return "", u
@@ -92,10 +94,47 @@ def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, max_iteration
     ), u
 
 
+def _dense(numbers: InNumbers | InJax, args) -> Callable:
+    """u ↦ (residual, which rows of it or of its Jacobian are not finite, solution with the Jacobian, its condition number)."""
+
+    def linearized(u):
+        residual, jacobian = numbers.linearized(u, *args)
+        broken = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
+        condition = np.inf if np.any(broken) else np.linalg.cond(jacobian)
+        return residual, broken, lambda right: np.linalg.solve(jacobian, right), condition
+
+    return linearized
+
+
+def _sparse(stage, args) -> Callable | None:
+    """The same of many unknowns with a sparse Jacobian; None of others."""
+    equations = sparse_equations(stage.residual, jax.ShapeDtypeStruct((stage.unknowns,), float), *args)
+    if equations is None:
+        return None
+    from dirax.numerics.sparse.ranks import smallest_singular_value  # imported when it is used
+
+    def both(u):
+        residual = lambda u: stage.residual(u, *args)
+        return residual(u), equations.values(residual, u)
+
+    evaluate = jax.jit(both)
+
+    def linearized(u):
+        residual, values = (np.asarray(a) for a in evaluate(u))
+        matrix = equations.matrix(values)
+        broken = ~np.isfinite(residual) | ~np.isfinite(matrix @ np.ones(len(residual)))
+        if np.any(broken):
+            return residual, broken, None, np.inf
+        smallest, _ = smallest_singular_value(equations, matrix)
+        return residual, broken, equations.in_numpy(values), np.max(np.abs(matrix.data)) / smallest
+
+    return linearized
+
+
 def _advice(stage, numbers: InNumbers | InJax, u, args) -> str:
     """What to do about a stage without a root: a larger step where roundoff hides it, and hides less of it in a larger one."""
     state, t, h = args
-    if not stage.unknowns:
+    if not 0 < stage.unknowns < FEWEST_SPARSE:
         return SMALLER
     here, there = (_roundoff(numbers, u, (state, t, step)) for step in (h, 10 * h))
     if not (here > STALLED and there < here / 2):

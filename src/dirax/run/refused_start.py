@@ -1,12 +1,13 @@
 """Initial data that a premise of the system or of the scheme excludes: refused before the first step, with the premise."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from dirax.numerics.ranks import rank_of_equations
-from dirax.numerics.tolerances import CONSTRAINT_DEFECT
-from dirax.run.start import Initial, Start
+from dirax.numerics.tolerances import CONSTRAINT_DEFECT, TINY
+from dirax.run.start import Initial, SparseJacobians, Start, direction
 from dirax.schemes.lagrangian_step import METHOD_2
 from dirax.systems.system import AbstractSystem
 
@@ -17,7 +18,7 @@ FINAL_MANIFOLD = (
 
 
 def refuse_bad_start(
-    system: AbstractSystem, initial: Initial, start: Start, labels: tuple[str, ...], check_constraint: bool, singular: bool
+    system: AbstractSystem, initial: Initial, start: Start, labels: Sequence[str], check_constraint: bool, singular: bool
 ) -> None:
     """Raise `ValueError` for functions that are not finite at the data, data off the constraints (with the residual), and a
     first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
@@ -80,8 +81,9 @@ def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Star
         )
 
 
-def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool) -> None:
-    residual, jacobian = _lanes(start.residual, 1), _lanes(start.jacobian, 2)
+def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool) -> None:
+    residual, sparse = _lanes(start.residual, 1), isinstance(start.jacobian, SparseJacobians)
+    jacobian = start.jacobian.product[:, 0, :, None] if sparse else _lanes(start.jacobian, 2)
     rows = np.isfinite(residual) & np.all(np.isfinite(jacobian), axis=2)
     finite = np.all(rows, axis=1)
     if not np.all(finite):
@@ -95,6 +97,8 @@ def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool)
             f"the first step is not finite at the initial data{_which(~finite)} (in {labels[row]}): the data lie outside the "
             "domain of the system's functions, or on its edge."
         )
+    if sparse:
+        return _refuse_singular_sparse_step(start.jacobian, labels)
     ranks, directions = rank_of_equations(jacobian)
     unknowns = jacobian.shape[1]
     if np.any(ranks < unknowns):
@@ -116,6 +120,39 @@ def _refuse_singular_step(start: Start, labels: tuple[str, ...], singular: bool)
             f"initial data{_which(ranks < unknowns)}, and leaves the direction "
             f"{direction} of the unknowns free. {way}."
         )
+
+
+def _refuse_singular_sparse_step(jacobians: SparseJacobians, labels: Sequence[str]) -> None:
+    """The same of many unknowns, of which only some are named: those that move most in the direction that is left free.
+
+    That the pattern has all entries is checked by a product with a vector that was not found with it."""
+    from dirax.numerics.sparse.ranks import free_direction  # imported when it is used
+
+    for lane, (values, products) in enumerate(zip(jacobians.values, jacobians.product, strict=True)):
+        which = f" of trajectory {lane}" if len(jacobians.values) > 1 else ""
+        matrix, near = map(jacobians.equations.matrix, values)
+        along = direction(matrix.shape[1])
+        for a, product in ((near, products[1]), (matrix, products[0])):
+            missed = np.abs(a @ along - product) / np.maximum(abs(a) @ along, TINY)
+            if np.any(missed > PRODUCT):  # never where it is not a number: out of the domain nothing is known
+                raise AssertionError(
+                    f"the sparse Jacobian of the step is wrong in {labels[int(np.argmax(missed))]}: report this."
+                )
+        free = free_direction(jacobians.equations, matrix)
+        if free is not None:
+            most = np.argsort(-np.abs(free))[:4]
+            rows = np.unique(matrix.tocsc()[:, most].indices)
+            raise ValueError(
+                f"the first step has no unique solution: its matrix ([PY] (21)) is singular at the initial data{which}, and "
+                f"leaves a direction free in which the unknowns {', '.join(map(str, np.sort(most)))} move most, which stand in "
+                f"{', '.join(labels[int(row)] for row in rows[:4])}. The Lagrangian is singular together with its constraints: "
+                "remove the coordinates that it does not determine, constraints that follow from others, or choose another "
+                "discrete Lagrangian."
+            )
+
+
+PRODUCT = 1e-10
+"""Difference of two ways to a product of the Jacobian with a vector, relative to its terms, that roundoff makes."""
 
 
 def _lanes(values: Any, ndim: int) -> np.ndarray:

@@ -11,15 +11,22 @@ from dirax.program.compiled import compiled
 from dirax.program.evaluation.in_floats import Floats
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
+from dirax.program.roots import FEWEST_SPARSE
 from dirax.program.user_functions import is_traced
 from dirax.run.validate import Case, spread
+
+LARGEST_MATRIX = 2**18
+"""Entries of a matrix up to which the start of a run makes it whole."""
+
+FEWEST_ARRAYS = 97
+"""Numbers of a state from which on a start is not found by scalars."""
 
 
 class Initial(NamedTuple):
     """Initial data as the system completes them, each entry with a leading batch axis in a batch.
 
     All that a scheme may start from, by name; how far the data are off the constraints, and the size of the velocity; the
-    Lagrangian and the matrix [W; ∂g/∂q] of the constraints at the data, if the system has them.
+    Lagrangian and the matrix [W; ∂g/∂q] of the constraints at the data, if the system has them and it is not too large.
     """
 
     data: dict[str, Any]
@@ -33,7 +40,7 @@ class Start(NamedTuple):
     """Where an equation begins, each entry with a leading batch axis in a batch.
 
     First state and the first guess of every stage; the given row 0 of a two-point start; the residual and the Jacobian of the
-    first step, None for an explicit one.
+    first step, None for an explicit one: an array, or of many unknowns the `SparseJacobians`.
     """
 
     state: Any
@@ -62,12 +69,47 @@ def begun(equation: Any, case: Case, initial: Initial, by_jax: bool = False) -> 
     start = _of_every(_Beginning(equation, case.two_points), (equation,), case, initial.data, by_jax)
     if not equation.stages[0][0].unknowns:
         return start
+    if equation.stages[0][0].unknowns >= FEWEST_SPARSE and not case.traced and not is_traced(start):
+        return _with_sparse_first_step(equation, case, start)
     first = None
     if not by_jax and not case.traced and not is_traced(start):
         first = _first_step_in_numbers(equation, case, start)
     if first is None:
         first = _of_every(_FirstStep(equation, case.two_points), (equation,), case, start._replace(row0=None), True)
     return start._replace(residual=first[0], jacobian=first[1])
+
+
+def _with_sparse_first_step(equation: Any, case: Case, start: Start) -> Start:
+    """The start with the first step's Jacobian as a sparse one, or a dense one where it is not too large."""
+    from dirax.engines.sparse.plan import sparse_plan  # imported when it is used
+
+    plan = sparse_plan(equation, case.params, case.batch_params)
+    known = None if isinstance(plan, str) or plan[0].equations.slower else plan[0].equations
+    if known is None and equation.stages[0][0].unknowns ** 2 > LARGEST_MATRIX:
+        return start
+    first = _of_every(_FirstStep(equation, case.two_points, known), (equation,), case, start._replace(row0=None), True)
+    if known is None:
+        return start._replace(residual=first[0], jacobian=first[1])
+    residual, values, product = (np.asarray(a) if case.batch is not None else np.asarray(a)[None] for a in first)
+    return start._replace(residual=residual[:, 0], jacobian=SparseJacobians(known, values, product))
+
+
+class SparseJacobians(NamedTuple):
+    """Sparse Jacobians of every trajectory at the first guess and near it: what is known of them all, `values` (B, 2, …), and the
+    products (B, 2, k) with `direction(k)`."""
+
+    equations: Any
+    values: np.ndarray
+    product: np.ndarray
+
+
+AWAY = 1e-3
+"""How far from the first guess, relative to it, Jacobians are compared: an entry may be zero at it by symmetry."""
+
+
+def direction(size: int) -> np.ndarray:
+    """A vector without zeros in which no entries of a row cancel but by chance."""
+    return np.random.default_rng(size).uniform(0.5, 1.5, size)
 
 
 class _Completion(eqx.Module):
@@ -86,7 +128,9 @@ class _Completion(eqx.Module):
             size = jnp.max(jnp.abs(complete["v"]))
         q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if self.two_points else (complete.get("q"), complete.get("v"))
         lagrangian = None if q is None or v is None else system.lagrangian_value(t0, q, v, params)
-        constraints = system.constraints.matrix(t0, system.point(complete), params) if system.constraints.any else None
+        constraints = None
+        if system.constraints.any and defect.size * system.point(complete).size <= LARGEST_MATRIX:
+            constraints = system.constraints.matrix(t0, system.point(complete), params)
         return Initial(complete, defect, size, lagrangian, constraints)
 
 
@@ -111,16 +155,26 @@ class _FirstStep(eqx.Module):
 
     equation: Any
     two_points: bool
+    sparse: Any = None
 
     def __call__(self, start: Start, params, h, t0):
         stage, fraction = self.equation.stages[0]
         t = t0 + int(self.two_points) * h
         solved = lambda u: stage.residual(u, start.state, t, fraction * h, params)
+        if self.sparse is not None:
+            u, along = start.guess[0], jnp.asarray(direction(start.guess[0].shape[0]))
+
+            def at(u):
+                residual, product = jax.jvp(solved, (u,), (along,))
+                return residual, self.sparse.values(solved, u), product
+
+            return jax.lax.map(at, jnp.stack([u, u + AWAY * (1.0 + jnp.max(jnp.abs(u))) * along]))
         return solved(start.guess[0]), jax.jacfwd(solved)(start.guess[0])
 
 
 def _of_every(one: Any, kept: tuple, case: Case, given: Any, by_jax: bool) -> Any:
     """`one(given, params, h, t0)` of every trajectory; what is traced for NumPy is remembered by the objects `kept`."""
+    by_jax = by_jax or max(np.shape(leaf)[-1] for leaf in case.data.values()) >= FEWEST_ARRAYS
     if not by_jax and not is_traced(given, case.params, case.h, case.t0):
         found = _in_numpy(one, kept, case, given)
         if found is not None:

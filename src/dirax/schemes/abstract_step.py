@@ -1,6 +1,7 @@
 """AbstractStep: one step of a scheme as a class, whose methods are the functions of its StepEquation."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 from jaxtyping import Array, Float
@@ -39,7 +40,7 @@ class AbstractStep(ABC):
 
     @property
     @abstractmethod
-    def labels(self) -> tuple[str, ...]:
+    def labels(self) -> Sequence[str]:
         """The name of each row of the residual, for messages."""
 
     @property

@@ -30,7 +30,7 @@ class AdjointStep(AbstractStep):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        return tuple(f"adjoint: component {i} of the state" for i in range(self.inner.state_size)) + self.inner.labels
+        return (*(f"adjoint: component {i} of the state" for i in range(self.inner.state_size)), *self.inner.labels)
 
     @property
     def canonical(self) -> bool:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data
+from dirax.schemes.labels import Labels
 from dirax.schemes.lagrangian_step import LagrangianStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.map_lift import Base, Lift, ThetaLift
@@ -35,8 +36,8 @@ class MethodOneStep(LagrangianStep):
         return self.lift.flat and super().canonical
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        balance = tuple(f"momentum balance {i}" for i in range(self.lift.dimension))
+    def labels(self) -> Labels:
+        balance = Labels.numbered("momentum balance {}", self.lift.dimension)
         return balance + tuple(f"constraint {r} at the base point" for r in self.rows.kept)
 
     def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
@@ -72,5 +73,5 @@ class MethodOneStep(LagrangianStep):
         at = self.lift.step(q0, velocity, t, h)
         rate, momentum = self.rates(at.t, at.q, at.v, params)
         if self.rows.count:
-            rate = rate + self.rows.matrix(at.t, at.q, params).T @ multipliers
+            rate = rate + self.rows.force(at.t, at.q, multipliers, params)
         return at, rate, momentum

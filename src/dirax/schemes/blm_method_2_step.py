@@ -110,8 +110,8 @@ class ProjectedThetaStep(ThetaStep):
         (q0, p0, _), parts, rows = self.state.split(state), self.unknowns.split(u), self.rows
         at, q, q1 = self._base(u, state, t, h)
         p, rate, along_flow = self._flow(at, q, parts.v, parts.a, parts.multipliers, params)
-        begun = p0 + rows.matrix(t, q0, params).T @ parts.sigma - (p - (1.0 - self.theta) * h * rate)
-        ended = self.system.legendre(q1, parts.end_v, params, t + h) + rows.matrix(t + h, q1, params).T @ parts.end_sigma
+        begun = p0 + rows.force(t, q0, parts.sigma, params) - (p - (1.0 - self.theta) * h * rate)
+        ended = self.system.legendre(q1, parts.end_v, params, t + h) + rows.force(t + h, q1, parts.end_sigma, params)
         ends = [
             begun,
             rows.velocity_defect(at, q, parts.v, params),
@@ -140,7 +140,7 @@ class ProjectedThetaStep(ThetaStep):
     def _at_point(self, t: Any, q: Array, v: Array, a: Array, multipliers: Array, params: Any) -> tuple[Array, Array, Array]:
         """(p, ṗ, what is zero where a and λ are those of the flow) at a point of M_f."""
         rate, p = self.rates(t, q, v, params, self._forces(multipliers))
-        rate = rate + self.rows.matrix(t, q, params).T @ multipliers
+        rate = rate + self.rows.force(t, q, multipliers, params)
         turning = self._along(lambda t, q, v: self.system.legendre(q, v, params, t), t, q, v, a)
         drift = self._along(lambda t, q, v: self.rows.velocity_defect(t, q, v, params), t, q, v, a)
         return p, rate, jnp.concatenate([turning - rate, drift])
@@ -154,7 +154,7 @@ class ProjectedThetaStep(ThetaStep):
     def _pushed(self, t: Any, q: Array, v: Array, w: Array, s: Array, params: Any) -> Float[Array, " n"]:
         """M(w − v) − G(q)ᵀs, zero where w is the direction of the projection onto g = 0 at q."""
         change = along(lambda v: self.system.legendre(q, v, params, t), (v,), (w - v,))
-        return change - self.rows.holonomic_matrix(t, q, params).T @ s
+        return change - self.rows.holonomic_force(t, q, s, params)
 
     def _base(self, u: Array, state: Array, t: Any, h: Any) -> tuple[Any, Array, Array]:
         """The time of the base point, the base point, and where the second half ends."""

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from dirax.program.tracing import gradient
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.collocation_tables import Tableau
+from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.stage_relation import StageRelation
 from dirax.schemes.step import Field, StepEquation
@@ -38,8 +39,8 @@ class CollocationStep(AbstractStep):
         return Layout(**{f"rate_{i + 1}": self.n for i in range(self.tableau.stages)})
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(f"equation {i} at node {j + 1}" for j in range(self.tableau.stages) for i in range(self.n))
+    def labels(self) -> Labels:
+        return sum((Labels.numbered(f"equation {{}} at node {j + 1}", self.n) for j in range(self.tableau.stages)), Labels())
 
     def nodes(self, u, state, t, h, params) -> tuple[list, list, list, list]:
         """(time, y, a, ḃ) at every node."""

@@ -6,6 +6,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.program.tracing import pulled_back
+from dirax.schemes.labels import Labels
 from dirax.schemes.step import Field, Shape
 from dirax.systems.system import AbstractSystem
 
@@ -28,6 +30,20 @@ class ConstraintRows:
     def holonomic_matrix(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, "r n"]:
         """The kept rows of G."""
         return self.pick(self.constraints.holonomic_matrix(t, q, params), self.m)
+
+    def force(self, t: Any, q: Float[Array, " n"], multipliers: Float[Array, " k"], params: Any) -> Float[Array, " n"]:
+        """[W; G]ᵀ·multipliers of the kept rows."""
+        return self._pulled(t, q, multipliers, params) if self.m == 0 else self.matrix(t, q, params).T @ multipliers
+
+    def holonomic_force(self, t: Any, q: Float[Array, " n"], multipliers: Float[Array, " r"], params: Any) -> Float[Array, " n"]:
+        """Gᵀ·multipliers of the kept rows."""
+        return self._pulled(t, q, multipliers, params)
+
+    def _pulled(self, t, q, multipliers, params):
+        """Without the matrix G, which has c·n entries."""
+        if self.holonomic < self.c or not self.c:
+            return self.holonomic_matrix(t, q, params).T @ multipliers
+        return pulled_back(lambda q: self.constraints.position_defect(t, q, params), q, multipliers)
 
     def position(self, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, " r"]:
         """The kept entries of g."""
@@ -62,10 +78,12 @@ class ConstraintRows:
             "constraint": Field(size, "step", ("constraint",), about),
         }
 
-    def labels(self) -> tuple[str, ...]:
+    def labels(self) -> Labels:
         """The names of the constraint equations."""
+        if self.count == self.m + self.c:
+            return Labels.numbered("discrete constraint {}", self.m) + Labels.numbered("holonomic constraint {}", self.c)
         of = lambda i: f"discrete constraint {i}" if i < self.m else f"holonomic constraint {i - self.m}"
-        return tuple(of(i) for i in self.kept)
+        return Labels() + tuple(of(i) for i in self.kept)
 
 
 def step_constraints(rows: ConstraintRows, wd: Callable) -> Callable:

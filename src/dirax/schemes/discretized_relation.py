@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from dirax.geometry.cotangent_lift import CotangentLift
 from dirax.geometry.maps import AbstractDiscretizationMap, Theta
 from dirax.geometry.spaces import Euclidean
+from dirax.schemes.labels import Labels
 from dirax.schemes.step import Field, StepEquation
 from dirax.systems.forms import RelationForm
 
@@ -112,6 +113,6 @@ def discretized_relation(form: RelationForm, size: int, map: AbstractDiscretizat
         state_size=size,
         unknowns=d + m,
         fields=fields,
-        labels=tuple(f"component {i} of the Dirac condition" for i in range(d)) + form.labels,
+        labels=Labels.numbered("component {} of the Dirac condition", d) + form.labels,
         canonical=form.canonical,
     )

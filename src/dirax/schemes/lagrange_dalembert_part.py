@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows
+from dirax.schemes.labels import Labels
 from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
@@ -45,9 +46,9 @@ class LagrangeDAlembertPart(AbstractStep):
         return self.inner.fields
 
     @property
-    def labels(self) -> tuple[str, ...]:
+    def labels(self) -> Labels:
         n, count = self.inner.shape.n, self.rows.count
-        return self.inner.labels[: n + count] + tuple(f"projection of the momentum {i}" for i in range(n + count))
+        return self.inner.labels[: n + count] + Labels.numbered("projection of the momentum {}", n + count)
 
     @property
     def canonical(self) -> bool:
@@ -58,7 +59,7 @@ class LagrangeDAlembertPart(AbstractStep):
         v, sigma = self.unknowns.split(u).v, self.unknowns.split(u).sigma
         q = self.state.split(state).q
         q1, p1 = q + h * v, self.inner.slots(t, q, v, h, params, self.of_constraints(u))[1]
-        return q1, p1 - self.rows.matrix(t + h, q1, params).T @ sigma
+        return q1, p1 - self.rows.force(t + h, q1, sigma, params)
 
     def residual(self, u, state, t, h, params):
         v, multipliers, end_v, _ = self.unknowns.split(u)

@@ -12,6 +12,7 @@ from dirax.program.user_functions import UserFunction
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows, step_constraints
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian, slot_derivatives
+from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field, Shape
 from dirax.schemes.work_of_forces import WorkOfForces
@@ -99,10 +100,10 @@ class LagrangeDAlembertStep(AbstractStep):
         return {"q": Field((n,)), "p": Field((n,)), **self.rows.fields(), **self.work.fields}
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        balance = tuple(f"discrete Lagrange–d'Alembert equation {i}" for i in range(self.shape.n))
+    def labels(self) -> Labels:
+        balance = Labels.numbered("discrete Lagrange–d'Alembert equation {}", self.shape.n)
         projected = self.shape.n + self.rows.holonomic if self.projects else 0
-        return balance + self.rows.labels() + tuple(f"projection of the momentum {i}" for i in range(projected))
+        return balance + self.rows.labels() + Labels.numbered("projection of the momentum {}", projected)
 
     @property
     def canonical(self) -> bool:
@@ -129,14 +130,14 @@ class LagrangeDAlembertStep(AbstractStep):
         if not self.rows.count:
             return balance
         imposed = self.rows.pick(self.step_constraint(t, q, v, h, params, unit=h))
-        return jnp.concatenate([balance - self.rows.matrix(t, q, params).T @ multipliers, imposed])
+        return jnp.concatenate([balance - self.rows.force(t, q, multipliers, params), imposed])
 
     def saved_momentum(self, multipliers, sigma, q, p, t, params):
         """p_k − share·Wᵀμ − Gᵀσ."""
         if self.share:
             count = self.rows.nonholonomic
             p = p - self.share * (self.rows.matrix(t, q, params)[:count].T @ multipliers[:count])
-        return p - self.rows.holonomic_matrix(t, q, params).T @ sigma if self.projects else p
+        return p - self.rows.holonomic_force(t, q, sigma, params) if self.projects else p
 
     def projection(self, saved_v, sigma, multipliers, q, p, t, params):
         """∂L/∂v(q, v̂) is the saved momentum, and G v̂ + ∂g/∂t = 0."""
@@ -223,16 +224,16 @@ class LagrangeDAlembertStep(AbstractStep):
         mu = leaving.multipliers[: rows.nonholonomic]
         jump = share / (1.0 - share) * mu if share < 1.0 else 0.0 * mu
         if not self.projects:
-            return p + rows.matrix(t, q, params).T @ jump, self.unknowns.join(v=leaving.v, multipliers=mu + jump)
+            return p + rows.force(t, q, jump, params), self.unknowns.join(v=leaving.v, multipliers=mu + jump)
         sigma = step.split(found.arriving).multipliers[rows.nonholonomic :]
         jump = jnp.concatenate([jump, sigma])
         u = self.unknowns.join(v=leaving.v, multipliers=leaving.multipliers + jump, saved_v=v, sigma=sigma)
-        return p + rows.matrix(t, q, params).T @ jump, u
+        return p + rows.force(t, q, jump, params), u
 
     def _arriving(self, v, multipliers, q, p, t, h, params):
         """The equations of (v, μ, σ) for a step from q − h v on the constraints to (q, p)."""
         rows, before = self.rows, q - h * v
-        missed = p - self.slots(t - h, before, v, h, params)[1] + rows.matrix(t, q, params).T @ multipliers
+        missed = p - self.slots(t - h, before, v, h, params)[1] + rows.force(t, q, multipliers, params)
         g = rows.constraints.position_defect(t - h, before, params) / h
         imposed = rows.pick(jnp.concatenate([self.discrete_constraint(t - h, before, v, h, params), g]))
         return jnp.concatenate([missed, imposed])

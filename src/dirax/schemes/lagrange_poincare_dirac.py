@@ -1,5 +1,6 @@
 """One step of the (±)-Lagrange–Poincaré–Dirac equations: a step on Q seen on the quotient by its symmetry ([RL] (4.6), (4.8))."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -49,7 +50,7 @@ class LagrangePoincareDiracStep(AbstractStep):
         return self.quotient.fields() | {name: field for name, field in of_q.items() if name not in ("q", "p")}
 
     @property
-    def labels(self) -> tuple[str, ...]:
+    def labels(self) -> Sequence[str]:
         horizontal = tuple(f"horizontal equation {i}" for i in range(self.quotient.s))
         vertical = tuple(f"vertical equation {a}" for a in range(self.quotient.k))
         return horizontal + vertical + self.unreduced.labels[self.unreduced.shape.n :]

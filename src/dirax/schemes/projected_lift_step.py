@@ -54,9 +54,9 @@ class ProjectedLiftStep(LagrangianStep):
         q1 = self._end(u, state, at, h)
         p, rate, _ = self._flow(q0, at.t, at.q, at.v, params)
         minus_p0, p1 = lift.lifted(at, h * rate, p)
-        begun = p0 + rows.matrix(t, q0, params).T @ parts.sigma + minus_p0
+        begun = p0 + rows.force(t, q0, parts.sigma, params) + minus_p0
         v1 = lift.tangents(q0, q1) @ parts.end_v
-        momentum = self.rates(t + h, q1, v1, params)[1] + rows.matrix(t + h, q1, params).T @ parts.end_sigma
+        momentum = self.rates(t + h, q1, v1, params)[1] + rows.force(t + h, q1, parts.end_sigma, params)
         equations = [
             lift.paired(q0, begun),
             rows.velocity_defect(at.t, at.q, at.v, params),
@@ -102,7 +102,7 @@ class ProjectedLiftStep(LagrangianStep):
 
     def _pushed(self, t: Any, q: Array, v: Array, s: Array, h: Any, params: Any) -> Float[Array, " N"]:
         """q + h M⁻¹G(q)ᵀs; on submanifolds of R^N there are no holonomic constraints."""
-        return q + h * solve(self._mass(t, q, v, params), self.rows.holonomic_matrix(t, q, params).T @ s)
+        return q + h * solve(self._mass(t, q, v, params), self.rows.holonomic_force(t, q, s, params))
 
     def _base(self, u: Array, state: Array, t: Any, h: Any, params: Any) -> Base:
         """The base point of the step from q̃0 to q̃1."""

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from dirax.program.memo import Memo
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
+from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.stage_relation import MeanRelation, StageRelation
 from dirax.schemes.step_forms import form_of_steps
@@ -18,6 +19,10 @@ from dirax.text.representation import counted, fields_html, module_html, module_
 
 COMPOSED = ("first", "sum", "mean", "each")
 """How the row of a composed step is made of those of its parts."""
+
+
+SHOWN = 200
+"""Equations that are named where a step is shown."""
 
 
 class Field(eqx.Module):
@@ -86,7 +91,7 @@ class StepEquation(eqx.Module):
     state_size: int = eqx.field(static=True)
     unknowns: int = eqx.field(static=True)
     fields: dict[str, Field]
-    labels: tuple[str, ...] = eqx.field(static=True)
+    labels: Sequence[str] = eqx.field(static=True)
     canonical: bool = eqx.field(static=True)
     check: Callable = eqx.field(static=True)
     remark: Callable = eqx.field(static=True)
@@ -109,7 +114,7 @@ class StepEquation(eqx.Module):
         unknowns: int | None = None,
         state_layout: Layout | None = None,
         unknown_layout: Layout | None = None,
-        labels: tuple[str, ...] | None = None,
+        labels: Sequence[str] | None = None,
         canonical: bool = False,
         check: Callable | None = None,
         remark: Callable | None = None,
@@ -122,7 +127,7 @@ class StepEquation(eqx.Module):
         self.fields, self.canonical = dict(fields), canonical
         self.state_layout, self.state_size = _layout("state", state_layout, "state_size", state_size)
         self.unknown_layout, self.unknowns = _layout("u", unknown_layout, "unknowns", unknowns)
-        self.labels = labels or tuple(f"equation {i}" for i in range(self.unknowns))
+        self.labels = labels or Labels.numbered("equation {}", self.unknowns)
         self.check = check or nothing_to_check
         self.remark = remark or nothing_to_say
         self.review = review or nothing_to_report
@@ -150,7 +155,10 @@ class StepEquation(eqx.Module):
 
     def _repr_html_(self) -> str:
         parts = {"state is": repr(self.state_layout), "unknowns are": repr(self.unknown_layout)}
-        return fields_html("StepEquation", self._summary() | parts | {"equations": ", ".join(self.labels)})
+        return fields_html(
+            "StepEquation",
+            self._summary() | parts | {"equations": ", ".join(self.labels[:SHOWN]) + ", …" * (len(self.labels) > SHOWN)},
+        )
 
 
 class StepSequence(eqx.Module):

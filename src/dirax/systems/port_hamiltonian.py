@@ -3,12 +3,14 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import STRUCTURE_DEFECT, TINY
+from dirax.program.sparse_matrix import SparseMatrix
 from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.systems.constraints import no_constraint
@@ -22,7 +24,8 @@ class PortHamiltonian(AbstractSystem):
     """ẋ = (J(x) − R(x)) dH(x) + B(x) u, y = B(x)ᵀ dH(x) ([BLM] (20)).
 
     `hamiltonian(x[, params])` a scalar; `J(x[, params])` (N, N) skew; `B(x[, params])` (N, m), no ports by default;
-    `R(x[, params])` (N, N) symmetric, positive semidefinite, no dissipation by default. J, B and R may be constant arrays.
+    `R(x[, params])` (N, N) symmetric, positive semidefinite, no dissipation by default. J, B and R may be constant arrays, or
+    sparse matrices of SciPy, with which a step of the discretized system costs in proportion to their entries.
     Open (default): u = `inputs(t, x[, params])` (m,), zero without it. Closed: u is the multiplier that keeps y = 0
     ([BLM] (23), a Dirac system); `closed` may also name the columns of B that are closed, the others stay open. A closed
     port imposes y = 0 alone: for constraints g(x) = 0 on positions, not on their rates only, see `DiracSystem`.
@@ -59,23 +62,23 @@ class PortHamiltonian(AbstractSystem):
 
     def with_inputs(self, inputs: Callable) -> "PortHamiltonian":
         """The same open system driven by u = inputs(t, x[, params])."""
-        matrices = (self.J.function, _function(self.B), _function(self.R))
+        matrices = (_function(self.J), _function(self.B), _function(self.R))
         return PortHamiltonian(self.hamiltonian.function, *matrices, self.closed, inputs)
 
     def differential(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
         """dH(x)."""
         return gradient(lambda x: self.hamiltonian(x, params))(x)
 
-    def input_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N m"]:
+    def input_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N m"] | SparseMatrix:
         """B(x); (N, 0) without ports."""
         return jnp.zeros((x.shape[0], 0)) if self.B is None else self.B(x, params)
 
-    def closed_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N k"]:
+    def closed_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N k"] | SparseMatrix:
         """The columns of B(x) whose ports are closed."""
         b = self.input_matrix(x, params)
         return b[:, list(self._split(b.shape[1])[0])]
 
-    def open_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N k"]:
+    def open_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N k"] | SparseMatrix:
         """The columns of B(x) whose ports are open."""
         b = self.input_matrix(x, params)
         return b[:, list(self._split(b.shape[1])[1])]
@@ -84,7 +87,7 @@ class PortHamiltonian(AbstractSystem):
         closed = (tuple(range(ports)) if self.closed else ()) if isinstance(self.closed, bool) else self.closed
         return closed, tuple(port for port in range(ports) if port not in closed)
 
-    def flow_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N N"]:
+    def flow_matrix(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N N"] | SparseMatrix:
         """J(x) − R(x)."""
         return self.J(x, params) if self.R is None else self.J(x, params) - self.R(x, params)
 
@@ -119,7 +122,7 @@ class PortHamiltonian(AbstractSystem):
         """(⟨dH, ẋ⟩, ⟨y, u⟩ of the open ports, ⟨dH, R dH⟩); the first is the second less the third ([BLM] §7.1)."""
         dh = self.differential(x, params)
         supplied = self.input(t, x, params) @ (self.open_matrix(x, params).T @ dh)
-        dissipated = jnp.zeros(()) if self.R is None else dh @ self.R(x, params) @ dh
+        dissipated = jnp.zeros(()) if self.R is None else _squared(self.R(x, params), dh)
         return jnp.stack([dh @ velocity, supplied, dissipated])
 
     def relation_form(self, shape: Shape) -> RelationForm:
@@ -136,7 +139,7 @@ class PortHamiltonian(AbstractSystem):
         in place of dH."""
         driven = self.input(t, x, params)
         outputs = self.open_matrix(x, params).T @ gradient
-        return driven, outputs, jnp.zeros(()) if self.R is None else gradient @ self.R(x, params) @ gradient
+        return driven, outputs, jnp.zeros(()) if self.R is None else _squared(self.R(x, params), gradient)
 
     def energy_form(self, shape: Shape) -> EnergyForm:
         return EnergyForm(self.hamiltonian, self.differential, self.relation, self.ports)
@@ -150,7 +153,7 @@ class PortHamiltonian(AbstractSystem):
             dh = self.differential(x, params)
             closed = self.closed_matrix(x, params)
             right = self.flow_matrix(x, params) @ dh + self.open_matrix(x, params) @ self.input(t, x, params)
-            matrix = jnp.block([[jnp.eye(n), -closed], [jnp.zeros((m, n + m))]])
+            matrix = jnp.block([[jnp.eye(n), -jnp.asarray(closed)], [jnp.zeros((m, n + m))]])
             return matrix, jnp.concatenate([right, closed.T @ dh])
 
         about = "closed ports: u keeps y = 0" if m else "no closed ports"
@@ -191,6 +194,8 @@ class PortHamiltonian(AbstractSystem):
         return size, len(closed)
 
     def _check_structure(self, x, params) -> None:
+        if isinstance(self.J, ConstantFunction):
+            return self._check_sparse_structure()
         J = np.asarray(evaluated(self.J, x, params))
         skewness = np.max(np.abs(J + J.T), initial=0.0)
         if skewness > STRUCTURE_DEFECT * max(np.max(np.abs(J), initial=0.0), TINY):
@@ -206,6 +211,22 @@ class PortHamiltonian(AbstractSystem):
             raise ValueError(
                 f"R is not positive semidefinite at the initial point: its lowest eigenvalue is {lowest:.3g}; dissipation "
                 "must not create energy."
+            )
+
+    def _check_sparse_structure(self) -> None:
+        """The same of sparse matrices; of R what follows from its symmetry and its diagonal, row by row."""
+        J = self.J(None).matrix
+        if (skewness := abs(J + J.T).max()) > STRUCTURE_DEFECT * max(abs(J).max(), TINY):
+            raise ValueError(f"J is not skew: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
+        if not isinstance(self.R, ConstantFunction):
+            return
+        R = self.R(None).matrix
+        scale = max(abs(R).max(), TINY)
+        if (defect := abs(R - R.T).max()) > STRUCTURE_DEFECT * scale:
+            raise ValueError(f"R is not symmetric: max |R − Rᵀ| = {defect:.3g}.")
+        if (lowest := R.diagonal().min()) < -STRUCTURE_DEFECT * scale:
+            raise ValueError(
+                f"R is not positive semidefinite: it has {lowest:.3g} on its diagonal; dissipation must not create energy."
             )
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
@@ -235,7 +256,7 @@ class PortHamiltonian(AbstractSystem):
     def flow_size(self, x: Float[Numbers, " N"], params: Any) -> Float[Numbers, ""]:
         """|dH|ᵀ (|J − R| |dH| + 1), where 1 is the unit in which ẋ is solved."""
         dh = jnp.abs(self.differential(x, params))
-        return dh @ (jnp.abs(self.flow_matrix(x, params)) @ dh + 1.0)
+        return dh @ (abs(self.flow_matrix(x, params)) @ dh + 1.0)
 
 
 def _matrix_function(value: Any, name: str) -> UserFunction:
@@ -244,9 +265,38 @@ def _matrix_function(value: Any, name: str) -> UserFunction:
         return value
     if callable(value):
         return UserFunction(value, name, ("x",))
+    if is_sparse(value):
+        return ConstantFunction(value, name)
     constant = np.asarray(value, dtype=float)
     return UserFunction(lambda x: jnp.asarray(constant), name, ("x",))
 
 
+def _squared(R: Any, covector: Float[Numbers, " N"]) -> Float[Numbers, ""]:
+    """⟨α, Rα⟩."""
+    return covector @ (R @ covector) if isinstance(R, SparseMatrix) else covector @ R @ covector
+
+
+class ConstantFunction(UserFunction):
+    """The function of x that is a sparse matrix everywhere."""
+
+    def __init__(self, matrix: Any, name: str):
+        constant = matrix if isinstance(matrix, SparseMatrix) else SparseMatrix(matrix)
+        super().__init__(lambda x: constant, name, ("x",))
+
+    def __call__(self, *values: Any):
+        return self.function(None)
+
+    def shape(self, *values: Any) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(self.function(None).shape, jnp.float64)
+
+
+def is_sparse(value: Any) -> bool:
+    """Whether a value is a sparse matrix, of SciPy or of dirax."""
+    return isinstance(value, SparseMatrix) or hasattr(value, "tocsr")
+
+
 def _function(function: UserFunction | None):
+    """What a system is made of again."""
+    if isinstance(function, ConstantFunction):
+        return function.function(None)
     return None if function is None else function.function

@@ -87,7 +87,7 @@ class Xla(AbstractEngine):
             interrupted = True
         _, rows = call(lanes, 0, 1, closing=True)
         outcome = _outcome(
-            p, jax.tree.map(np.asarray, lanes), fields, {name: values[:, 0] for name, values in rows.items()}, notes
+            p, jax.tree.map(np.asarray, lanes), fields, {name: values[:, 0] for name, values in rows.items()}, notes, self.name
         )
         outcome.interrupted, outcome.compile_seconds = interrupted, compile_seconds
         outcome.record = None if interrupted else lanes
@@ -128,7 +128,7 @@ class Xla(AbstractEngine):
             packed = jnp.concatenate([packed, step(lanes, p.steps)[1][None]])
         rows = {name: by_lane(a, p.batch, jnp) for name, a in unpack_rows(p.equation, axes, packed, p.params, clock).items()}
         fields = {name: values if p.is_node(name) else values[:, :-1] for name, values in rows.items()}
-        return finished(p, _outcome(p, lanes, fields, {name: values[:, -1] for name, values in rows.items()}, notes))
+        return finished(p, _outcome(p, lanes, fields, {name: values[:, -1] for name, values in rows.items()}, notes, self.name))
 
     def _planned(self, p: Problem) -> tuple[Problem, Numerics, dict[str, Any]]:
         """The run with its equations in scalars where the policy has them so, how its steps are computed, and what `stats` say
@@ -148,7 +148,9 @@ class Xla(AbstractEngine):
         return p, Numerics(self.linear_solver, increments, jacobians), notes
 
 
-def _outcome(p: Problem, lanes: Lane, fields: dict[str, Any], closing: dict[str, Any], notes: dict[str, Any]) -> Outcome:
+def _outcome(
+    p: Problem, lanes: Lane, fields: dict[str, Any], closing: dict[str, Any], notes: dict[str, Any], name: str
+) -> Outcome:
     lanes = lanes if p.batch is not None else jax.tree.map(lambda a: a[None], lanes)
     return Outcome(
         fields=fields,
@@ -159,7 +161,7 @@ def _outcome(p: Problem, lanes: Lane, fields: dict[str, Any], closing: dict[str,
         max_residual=lanes.max_residual,
         last_state=lanes.state,
         last_unknowns=lanes.unknowns[0],
-        engine="xla",
+        engine=name,
         notes=notes,
     )
 

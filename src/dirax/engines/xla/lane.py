@@ -18,11 +18,22 @@ class Numerics(NamedTuple):
 
     `linear_solver` solves the equations of Newton's method. Where they are known, each stage has a function of
     (u, state, t, h, params) for what the step adds to the state (NaN: unknown), and for the Jacobian (k, k) of the residual.
+    With `sparse` each stage has a solver and a Jacobian of its own that belong together.
     """
 
     linear_solver: AbstractLinearSolver | None = None
     increments: tuple[Callable, ...] | None = None
     jacobians: tuple[Callable, ...] | None = None
+    sparse: tuple[Any, ...] | None = None
+
+    def of_stages(self, equation) -> list[tuple]:
+        """(linear solver, increment, Jacobian) of every stage."""
+        none = (None,) * len(equation.stages)
+        increments = self.increments or none
+        if self.sparse is None:
+            return [(self.linear_solver, *own) for own in zip(increments, self.jacobians or none, strict=True)]
+        jacobians = (own.jacobian_of(stage.residual) for own, (stage, _) in zip(self.sparse, equation.stages, strict=True))
+        return list(zip(self.sparse, increments, jacobians, strict=True))
 
 
 class Lane(eqx.Module):
@@ -76,11 +87,12 @@ def take_step(
     unknowns and the state that it left.
 
     With `differentiable` it can be differentiated in reverse mode too, and no derivative passes through a step that failed."""
-    linear_solver, *known = numerics or Numerics()
-    increments, jacobians = (functions or (None,) * len(equation.stages) for functions in known)
+    numerics = numerics or Numerics()
+    known = numerics.of_stages(equation)
     stages, fractions = zip(*equation.stages, strict=True)
 
-    def solved(carry, fraction, before, stage, increment, jacobian):
+    def solved(carry, fraction, before, stage, known):
+        linear_solver, increment, jacobian = known
         state, lost, t, status, updates, worst = carry
         left_state = state
         running = status == OK
@@ -98,7 +110,7 @@ def take_step(
         worst = jnp.where(status == OK, jnp.maximum(worst, jnp.max(jnp.abs(left), initial=0.0)), worst)
         if differentiable:
             args = passing(args, status == OK)
-            u = as_function(stage.residual, u, args, linear_solver)
+            u = as_function(stage.residual, u, args, linear_solver, jacobian if numerics.sparse else None)
             new = stage.advance(u, *args)
         if increment is not None:
             new, left_out = compensated_sum(state, lost, increment(u, *args), new)
@@ -109,13 +121,13 @@ def take_step(
 
     carry = (lane.state, lane.lost, jnp.asarray(t, float), lane.status, jnp.zeros_like(lane.iterations), lane.max_residual)
     if len(stages) > 1 and len({(stage.residual, stage.advance, stage.guess) for stage in stages}) == 1:
-        one = lambda carry, given: solved(carry, given[0], given[1], stages[0], increments[0], jacobians[0])
+        one = lambda carry, given: solved(carry, given[0], given[1], stages[0], known[0])
         carry, (histories, solutions, left) = jax.lax.scan(one, carry, (jnp.array(fractions), jnp.stack(lane.history)))
         history, unknowns, states = tuple(histories), tuple(solutions), tuple(left)
     else:
         history, unknowns, states = (), (), ()
         for i, before in enumerate(lane.history):
-            carry, (remembered, u, left) = solved(carry, fractions[i], before, stages[i], increments[i], jacobians[i])
+            carry, (remembered, u, left) = solved(carry, fractions[i], before, stages[i], known[i])
             history, unknowns, states = (*history, remembered), (*unknowns, u), (*states, left)
     state, lost, _, status, updates, worst = carry
     good = status == OK

@@ -42,13 +42,13 @@ def solve(
     args: tuple[Any, ...],
     max_iterations: int,
     running: Any = True,
-    jacobian: Callable[..., Float[Array, "k k"]] | None = None,
+    jacobian: Callable[..., Any] | None = None,
     linear_solver: AbstractLinearSolver | None = None,
 ) -> tuple[Float[Array, " k"], Int[Array, ""], Bool[Array, ""]]:
     """(u, number of updates, converged) of residual(u, *args) = 0; not for reverse mode, see `as_function`.
 
     The guess comes back where `running` is false. `jacobian(u, *args)` is that of the residual, derived here where it is not
-    given; `linear_solver` is `Dense()` where none is.
+    given, or what `linear_solver` takes for it; that is `Dense()` where none is.
     """
     if guess.shape[0] == 0:
         return guess, jnp.zeros((), jnp.int64), jnp.array(True)
@@ -63,12 +63,23 @@ def as_function(
     root: Float[Array, " k"],
     args: tuple[Any, ...],
     linear_solver: AbstractLinearSolver | None = None,
+    jacobian: Callable[..., Any] | None = None,
 ) -> Float[Array, " k"]:
-    """`root`, with its derivatives as the function of args that residual(root, *args) = 0 makes of it."""
+    """`root`, with its derivatives as the function of args that residual(root, *args) = 0 makes of it; `jacobian` where the
+    solver takes another matrix than a dense one."""
     if root.shape[0] == 0:
         return root
 
     solver = linear_solver or Dense()
+
+    if jacobian is not None:
+
+        def by_jacobian(linear, right):
+            factors = solver.factorise(jax.lax.stop_gradient(jacobian(root, *args)))
+            solve, transposed = (lambda _, b, by=by: by(factors, b) for by in (solver.solve, solver.solve_transposed))
+            return jax.lax.custom_linear_solve(linear, right, solve, transposed)
+
+        return jax.lax.custom_root(lambda u: residual(u, *args), root, lambda _, u: u, by_jacobian)
 
     def solved(matrix, right):
         factors = solver.factorise(jax.lax.stop_gradient(matrix))

@@ -1,6 +1,7 @@
 """Functions of a few numbers by their scalar programs: in NumPy, where nothing is compiled, which is quicker where they run
 once; and written in scalars for JAX. Every function here is traced once for arguments of one kind."""
 
+import math
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -19,6 +20,9 @@ from dirax.program.scalar_program import ScalarProgram, program_p
 
 KEPT = 128
 """Functions kept in memory."""
+
+MOST_NUMBERS = 512
+"""Numbers that a function takes from which on it is not taken apart into operations on scalars: compiling is quicker."""
 
 _programs: Memo[tuple[ScalarProgram, Any] | None] = Memo(KEPT)
 _jaxprs: Memo[tuple[ClosedJaxpr, Any]] = Memo(KEPT)
@@ -87,7 +91,9 @@ def _flat(function: Callable, structure: Any) -> Callable:
 
 
 def _traced(function: Callable, shapes: list[jax.ShapeDtypeStruct], by_numpy: bool) -> tuple[ScalarProgram, Any] | None:
-    """The program of a function, and the structure of its result; None where it has none."""
+    """The program of a function, and the structure of its result; None where it has none, or one of too many numbers."""
+    if sum(math.prod(shape.shape) for shape in shapes) > MOST_NUMBERS:
+        return None
     closed, result = jax.make_jaxpr(function, return_shape=True)(*shapes)
     if any(isinstance(c, Tracer) for c in closed.consts):
         return None

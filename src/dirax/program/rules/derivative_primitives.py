@@ -13,6 +13,7 @@ from dirax.program.graph_derivatives import gradient, jacobian
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, Unsupported, elementwise, rule
 from dirax.program.memo import Memo, Same
 from dirax.program.rules import formulas
+from dirax.program.rules.reductions import fold
 from dirax.program.tracing import of_one_result
 
 KEPT = 256
@@ -37,6 +38,16 @@ def directional(interpreter: Interpreter, equation: Any, *operands: Nodes):
     jaxpr, count, limit = equation.params["jaxpr"], equation.params["count"], interpreter.graph.limit
     own = _derived.get((Same(jaxpr), count, limit), lambda: Derived.along(jaxpr, count, limit))
     return own.results_in(interpreter.graph, [*operands, np.array(interpreter.graph.zero)])
+
+
+@rule("dirax_pullback")
+def pullback(interpreter: Interpreter, equation: Any, *operands: Nodes):
+    """The sum over rows of the derivative, each times an entry of the covector."""
+    jaxpr, limit, g = equation.params["jaxpr"], interpreter.graph.limit, interpreter.graph
+    wanted = (len(operands) - 2,)
+    own = _derived.get((Same(jaxpr), wanted, limit), lambda: Derived.by_operands(jaxpr, wanted, limit))
+    (matrix,), covector = own.results_in(g, operands[:-1]), operands[-1].tolist()
+    return [np.array([fold(interpreter, "add", map(g.mul, column, covector)) for column in matrix.T.tolist()], np.int64)]
 
 
 def pushed_forward(equation: Any, k: int) -> ClosedJaxpr:

@@ -1,0 +1,109 @@
+"""Chains of many sites: time a step beside Newton's method by hand in NumPy and SciPy, first calls, derivatives."""
+
+import json
+import resource
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.linalg import solve_banded
+
+import dirax as dx
+from benchmarks.harness import in_new_process, interleaved, store, summary, table
+from dirax.gallery import hanging_chain, oscillator_chain
+
+STEP, BETA = 0.05, 0.8
+CHAIN = oscillator_chain.chain(alpha=0.0, beta=BETA)
+LINKS = 128
+
+
+def run(sites: int, steps: int) -> dx.Solution:
+    q = oscillator_chain.first_mode(sites)
+    return dx.simulate(CHAIN, dx.LagrangeDAlembert(), q=q, v=0 * q, step=STEP, steps=steps, save_every=steps)
+
+
+def by_hand(sites: int, steps: int) -> float:
+    """µs a step of the midpoint rule on the same chain: Newton's method with SciPy's banded solver, two updates a step."""
+    q, p, v = oscillator_chain.first_mode(sites), np.zeros(sites), np.zeros(sites)
+    band = np.zeros((3, sites))
+    started = time.perf_counter()
+    for _ in range(steps):
+        for _ in range(2):
+            middle = q + STEP / 2 * v
+            d = np.diff(middle, prepend=0.0, append=0.0)
+            force, slope = d + BETA * d**3, 1 + 3 * BETA * d**2
+            left = v - p + STEP / 2 * (force[:-1] - force[1:])
+            band[1] = 1 + STEP**2 / 4 * (slope[:-1] + slope[1:])
+            band[0, 1:] = band[2, :-1] = -(STEP**2) / 4 * slope[1:-1]
+            v = v - solve_banded((1, 1), band, left, check_finite=False)
+        q, p = q + STEP * v, 2 * v - p
+    return (time.perf_counter() - started) / steps * 1e6
+
+
+def first(sites: int) -> dict:
+    """Seconds to the first result in a new process, and the growth of its memory in bytes an unknown."""
+    before, started = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
+    run(sites, 2)
+    scale = 1 if sys.platform == "darwin" else 1024
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * scale
+    return {"seconds": time.perf_counter() - started, "bytes_per_unknown": grown / sites}
+
+
+def links(steps: int) -> float:
+    """µs a step of a chain of LINKS links that begins level."""
+    q = hanging_chain.straight(LINKS)
+    found = dx.simulate(hanging_chain.SYSTEM, dx.LagrangeDAlembert(), q=q, v=0 * q, step=1e-3, steps=steps, save_every=steps)
+    return found.stats["run_seconds"] / steps * 1e6
+
+
+def derivative(sites: int, steps: int) -> dict:
+    """Seconds of a run and of the gradient of its end in all initial velocities."""
+    q = jnp.asarray(oscillator_chain.first_mode(sites))
+
+    def end(v):
+        sol = dx.simulate(CHAIN, dx.LagrangeDAlembert(), q=q, v=v, step=STEP, steps=steps, save_every=steps)
+        return jnp.sum(sol.p[-1] ** 2)
+
+    value, both = jax.jit(end), jax.jit(jax.grad(end))
+    times = {}
+    for name, function in (("run", value), ("gradient", both)):
+        jax.block_until_ready(function(0 * q))
+        started = time.process_time()
+        jax.block_until_ready(function(0 * q))
+        times[name] = time.process_time() - started
+    return times
+
+
+def main(short: bool = False) -> None:
+    results, rows = {"system": "FPUT chain with quartic forces, midpoint L_d"}, []
+    for sites in (64, 1000, 10_000, 100_000):
+        steps = max(20, (200_000 if short else 2_000_000) // sites)
+        programs = {
+            "dirax": lambda sites=sites, steps=steps: run(sites, steps).stats["run_seconds"] / steps * 1e6,
+            "by hand": lambda sites=sites, steps=steps: by_hand(sites, min(steps, 200)),
+        }
+        run(sites, 2)
+        found = {name: summary(values) for name, values in interleaved(programs, 3 if short else 9).items()}
+        begun = in_new_process("benchmarks.sparse", {"what": "first", "sites": sites})
+        results[str(sites)] = {"microseconds_per_step": found, "first_call": begun}
+        ours, theirs = found["dirax"]["median"], found["by hand"]["median"]
+        cells = (ours / sites, theirs / ours, begun["seconds"], begun["bytes_per_unknown"])
+        rows.append((str(sites), *(f"{number:.3g}" for number in cells)))
+    links(10)
+    results["links"] = links(2000)
+    results["derivative"] = derivative(10_000, 100)
+    header = ("sites", "µs an unknown and step", "by hand / dirax", "first call s", "bytes an unknown")
+    print(table(header, rows, results["system"]))
+    times = results["derivative"]
+    print(f"{LINKS} links: {results['links']:.3g} µs a step; a gradient takes {times['gradient'] / times['run']:.3g} runs")
+    store("sparse", results)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1 and sys.argv[1].startswith("{"):
+        arguments = json.loads(sys.argv[1])
+        print(json.dumps({"first": first}[arguments.pop("what")](**arguments)))
+    else:
+        main("--short" in sys.argv)

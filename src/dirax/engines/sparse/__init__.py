@@ -1,0 +1,1 @@
+"""The engine of sparse steps: arrays by XLA, linear equations by sparse elimination."""

@@ -1,0 +1,40 @@
+"""The engine "sparse": steps on arrays by XLA, their linear equations by sparse elimination."""
+
+from typing import Any
+
+import jax
+
+from dirax.engines.contract import Problem
+from dirax.engines.sparse.plan import sparse_plan
+from dirax.engines.xla.engine import Xla
+from dirax.engines.xla.lane import Numerics
+from dirax.program.interpreter import UnsupportedPrimitive
+
+
+class Sparse(Xla):
+    """Steps of many unknowns each of which depends on few others: a step costs in proportion to their number.
+
+    Which unknowns an equation depends on is found in its functions. `stats` say how the matrix is factored, and its bandwidth
+    and fill. With `only_quicker` steps are left to others that dense elimination is quicker for.
+    """
+
+    only_quicker: bool = False
+    name = "sparse"
+
+    def supports(self, problem: Problem) -> str | None:
+        """A CPU, and sparse equations."""
+        if (platform := jax.default_backend()) != "cpu":
+            return f"JAX computes on {platform}"
+        plan = sparse_plan(problem.equation, problem.params, problem.batch_params)
+        if isinstance(plan, str) or not self.only_quicker:
+            return plan if isinstance(plan, str) else None
+        return next(filter(None, (solver.equations.slower for solver in plan)), None)
+
+    def _planned(self, p: Problem) -> tuple[Problem, Numerics, dict[str, Any]]:
+        plan = sparse_plan(p.equation, p.params, p.batch_params)
+        if isinstance(plan, str):
+            raise UnsupportedPrimitive("the step as a whole", f"is not sparse: {plan}", "engine='sparse'")
+        notes: dict[str, Any] = dict(plan[0].equations.stats)
+        if p.compensated:
+            notes["not_compensated"] = "the engine 'sparse' does not know the increments of the step"
+        return p, Numerics(sparse=plan), notes

@@ -1,0 +1,1 @@
+"""Sparse matrices: orders of elimination, colours of columns, and elimination itself."""

@@ -1,0 +1,141 @@
+"""SparseEquations: equations r(u, …) = 0 of many unknowns with a sparse Jacobian: its entries, and solutions with it, in JAX."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Float
+
+from dirax.numerics.sparse.colours import column_colours
+from dirax.numerics.sparse.elimination import elimination
+from dirax.program.sparsity import pattern_of
+
+DENSE_OPERATION, DENSE_ENTRY = 0.05, 4.0
+SPARSE_OPERATION, SPARSE_ROW = 1.2, 60.0
+"""Nanoseconds that elimination takes: LAPACK for each of its k³/3 multiplications, and the columns of a dense Jacobian for each
+entry; elimination that follows indices for each multiplication, and each equation."""
+
+
+class SparseEquations(eqx.Module):
+    """What is known of the Jacobian of equations without its values: where entries are, and how it is factored.
+
+    Values are those of one product with the sum of each colour's columns, (colours·k,). On a CPU.
+    """
+
+    pattern: Any = eqx.field(static=True)
+    elimination: Any = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+    """How many colours there are."""
+    colours: Array
+    tables: tuple[Array, ...]
+    solve_tables: tuple[Array, ...]
+    size: Array
+
+    @classmethod
+    def of(cls, function: Callable, unknowns: Any, *others: Any) -> "SparseEquations":
+        """Those of `function(unknowns, *others)`, arguments as `pattern_of` takes them. Raises `Dense` and
+        `StructurallySingular`."""
+        pattern: Any = pattern_of(function, unknowns, *others)
+        pattern.sort_indices()
+        return cls._of_pattern(pattern)
+
+    @classmethod
+    def _of_pattern(cls, pattern: Any) -> "SparseEquations":
+        size = pattern.shape[0]
+        colours = column_colours(pattern)
+        count = int(np.max(colours, initial=-1)) + 1
+        made = elimination(pattern)
+        entries = pattern.tocoo()
+        numbers = 1 + colours[entries.col].astype(np.int64) * size + entries.row
+        places = sp.csr_matrix((numbers, pattern.indices, pattern.indptr), pattern.shape)
+        with jax.ensure_compile_time_eval():
+            arrays = lambda given: tuple(map(jnp.asarray, given))
+            return cls(
+                _Static(pattern), made, count, jnp.asarray(colours), arrays(made.tables(places)), arrays(made.solve_tables),
+                jnp.asarray([size], np.int64),
+            )  # fmt: skip
+
+    @property
+    def slower(self) -> str | None:
+        """Why elimination as of a dense matrix is quicker, where it is."""
+        made, size = self.elimination, self.elimination.size
+        sparse = size * (SPARSE_ROW + DENSE_ENTRY * self.count) + SPARSE_OPERATION * made.operations
+        if sparse < size**2 * (DENSE_OPERATION * size / 3 + DENSE_ENTRY):
+            return None
+        return f"the Jacobian of {size} equations takes {self.count} products, and {made.operations} multiplications to factor"
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """What `Solution.stats` says of it."""
+        return {
+            "unknowns": self.elimination.size,
+            "entries": self.pattern.value.nnz,
+            "colours": self.count,
+        } | self.elimination.stats
+
+    def values(self, function: Callable, u: Float[Array, " k"]) -> Float[Array, " colours*k"]:
+        """The values of the Jacobian of `function` at u."""
+        _, linear = jax.linearize(function, u)
+        sums = jnp.where(self.colours[None, :] == jnp.arange(self.count, dtype=self.colours.dtype)[:, None], 1.0, 0.0)
+        return jax.vmap(linear)(sums).ravel()
+
+    def matrix(self, values: np.ndarray) -> Any:
+        """The Jacobian with these values."""
+        pattern = self.pattern.value
+        entries, size = pattern.tocoo(), pattern.shape[0]
+        data = np.asarray(values)[np.asarray(self.colours)[entries.col].astype(np.int64) * size + entries.row]
+        return sp.csr_matrix((data, pattern.indices, pattern.indptr), pattern.shape)
+
+    def values_of(self, matrix: Any) -> np.ndarray:
+        """The values of a matrix of this pattern."""
+        entries = matrix.tocoo()
+        values = np.zeros(self.count * matrix.shape[0])
+        values[np.asarray(self.colours)[entries.col].astype(np.int64) * matrix.shape[0] + entries.row] = entries.data
+        return values
+
+    def factorise(self, values: Float[Array, " colours*k"]) -> Any:
+        """The factors of the Jacobian with these values."""
+        made = self.elimination
+        shapes = [jax.ShapeDtypeStruct(shape, kind) for shape, kind in made.factor_shapes]
+        return tuple(made.kernels[0].in_jax(shapes, *self.tables, values, self.size))[made.work_of_factor :]
+
+    def solve(self, factors: Any, right: Float[Array, " k"], transposed: bool = False) -> Float[Array, " k"]:
+        """x with J x = right, or Jᵀ x = right."""
+        made = self.elimination
+        shapes = [jax.ShapeDtypeStruct((n,), np.float64) for n in (*made.work, made.size)]
+        return made.kernels[1 + transposed].in_jax(shapes, *self.solve_tables, *factors, right, self.size)[-1]
+
+    def root(self, function: Callable, root: Float[Array, " k"]) -> Float[Array, " k"]:
+        """`root`, with its derivatives as the function of what `function` captures that function(root) = 0 makes of it."""
+
+        def solved(linear, right):
+            factors = self.factorise(jax.lax.stop_gradient(self.values(function, root)))
+            of_factors = lambda transposed: lambda _, b: self.solve(factors, b, transposed)
+            return jax.lax.custom_linear_solve(linear, right, of_factors(False), of_factors(True))
+
+        return jax.lax.custom_root(function, root, lambda _, u: u, solved)
+
+    def in_numpy(self, values: np.ndarray) -> Callable[..., np.ndarray]:
+        """(right, transposed=False) ↦ the solution with the Jacobian of these values, in NumPy."""
+        made, size = self.elimination, np.asarray(self.size)
+        factors = [np.zeros(shape, kind) for shape, kind in made.factor_shapes]
+        made.kernels[0](*map(np.asarray, self.tables), np.ascontiguousarray(values, float), size, *factors)
+
+        def solve(right: np.ndarray, transposed: bool = False) -> np.ndarray:
+            *work, found = (np.zeros(n) for n in (*made.work, made.size))
+            given = map(np.asarray, self.solve_tables), factors[made.work_of_factor :]
+            made.kernels[1 + transposed](*(a for part in given for a in part), np.ascontiguousarray(right), size, *work, found)
+            return found
+
+        return solve
+
+
+class _Static:
+    """Holds a value that is compared by identity."""
+
+    def __init__(self, value: Any):
+        self.value = value

@@ -1,0 +1,160 @@
+"""The sparse engine beside the dense one: rows, multipliers, derivatives, batches; what is said of large systems that fail."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.engines.auto import Auto
+from dirax.engines.contract import Problem
+from dirax.engines.sparse.engine import Sparse
+from dirax.schemes.step import Shape, make_step_equation
+
+N = 64
+
+
+def chain(q, v, k=1.0):
+    d = jnp.diff(jnp.concatenate([jnp.zeros(1), q, jnp.zeros(1)]))
+    return v @ v / 2 - k * jnp.sum(d**2 / 2 + d**4 / 5)
+
+
+def links(q):
+    d = jnp.diff(jnp.concatenate([jnp.zeros((1, 2)), q.reshape(-1, 2)]), axis=0)
+    return (jnp.sum(d * d, axis=1) - (2 / N) ** 2) / 2
+
+
+FPUT = dx.LagrangeDirac(chain)
+STIFF = dx.LagrangeDirac(lambda q, v, params: chain(q, v, params))
+LINKS = dx.LagrangeDirac(lambda q, v: v @ v / N - 9.81 * jnp.sum(q[1::2]) * 2 / N, holonomic=links)
+DRIVEN = dx.LagrangeDirac(chain, forces=lambda t, q, v: jnp.sin(t) - v / 10)
+SKEW = np.eye(N, k=1) - np.eye(N, k=-1)
+PORTS = dx.PortHamiltonian(lambda x: x @ x / 2 + jnp.sum(x**4) / 10, SKEW, None, np.eye(N) / 10)
+WAVE = np.sin(np.pi * np.arange(1, N + 1) / (N + 1))
+STRAIGHT = np.stack([np.arange(1, N // 2 + 1) * 2 / N, np.zeros(N // 2)], axis=1).ravel()
+
+RUNS = {
+    "midpoint": (FPUT, dx.LagrangeDAlembert(), {"q": WAVE, "v": 0 * WAVE}),
+    "start from p": (DRIVEN, dx.PlusLagrangeDirac(), {"q": WAVE, "p": WAVE}),
+    "two points": (FPUT, dx.LagrangeDAlembert(), {"q0": WAVE, "q1": 0.99 * WAVE}),
+    "composition": (FPUT, dx.Composition(dx.LagrangeDAlembert(), "yoshida4"), {"q": WAVE, "v": 0 * WAVE}),
+    "collocation": (FPUT, dx.Collocation(stages=2), {"q": WAVE, "v": 0 * WAVE}),
+    "Method 2": (FPUT, dx.DiscreteDirac(constraints="resolve"), {"q": WAVE, "v": 0 * WAVE}),
+    "port-Hamiltonian": (PORTS, dx.DiscreteDirac(), {"x": WAVE}),
+    "links": (LINKS, dx.LagrangeDAlembert(), {"q": STRAIGHT, "v": 0 * STRAIGHT}),
+    "links, Method 1": (LINKS, dx.DiscreteDirac(), {"q": STRAIGHT, "v": 0 * STRAIGHT}),
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_equals_the_dense_engine(name):
+    system, scheme, initial = RUNS[name]
+    step = 1e-3 if system is LINKS else 0.05
+    ours, theirs = (dx.simulate(system, scheme, **initial, step=step, steps=12, engine=e) for e in ("sparse", "xla"))
+    assert ours.ok and theirs.ok and ours.stats["engine"] == "sparse" and theirs.stats["engine"] == "xla"
+    for field in theirs.fields:
+        size = 1 + np.max(np.abs(theirs.fields[field]))
+        np.testing.assert_allclose(ours.fields[field], theirs.fields[field], rtol=0, atol=1e-12 * size, err_msg=field)
+    assert ours.stats["solver"] in ("tridiagonal", "band")
+
+
+def test_auto_takes_it_where_it_is_quicker():
+    run = {"step": 0.05, "steps": 3}
+    sol = dx.simulate(FPUT, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, **run)
+    assert sol.stats["engine"] == "sparse" and sol.stats["bandwidth"] == [1, 1] and sol.stats["colours"] == 3
+    coupled = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(jnp.cos(q[:, None] - q[None, :])))
+    sol = dx.simulate(coupled, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, **run)
+    assert sol.stats["engine"] == "xla" and "64 equations" in sol.stats["not_sparse"]
+
+
+def test_a_batch_keeps_its_bits():
+    run = {"step": 0.05, "steps": 5, "engine": "sparse"}
+    q = np.stack([WAVE, 0.5 * WAVE, -WAVE])
+    k = np.array([1.0, 2.0, 0.5])
+    both = dx.simulate(STIFF, dx.LagrangeDAlembert(), q=q, v=0 * q, params=k, batch_params=True, **run)
+    alone = dx.simulate(STIFF, dx.LagrangeDAlembert(), q=q[1], v=0 * WAVE, params=k[1], **run)
+    assert both.q[1].tobytes() == alone.q.tobytes()
+
+
+@pytest.mark.parametrize("system", [STIFF, LINKS], ids=["chain", "links"])
+def test_derivatives_are_those_of_the_dense_engine(system):
+    start = WAVE if system is STIFF else STRAIGHT
+
+    def end(z, engine):
+        params = {"params": z[-1]} if system is STIFF else {}
+        sol = dx.simulate(system, dx.LagrangeDAlembert(), q=start, v=z[:-1], **params, step=1e-3, steps=4, engine=engine)
+        return jnp.sum(sol.q[-1] ** 2) + jnp.sum(sol.p[-1] ** 3)
+
+    z = np.append(0.0 * start, 1.3)
+    ours, theirs = (jax.grad(end)(z, engine) for engine in ("sparse", "xla"))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-11)
+
+
+def test_a_thousand_links_start_and_conserve_their_energy():
+    count = 1000
+
+    def lengths(q):
+        d = jnp.diff(jnp.concatenate([jnp.zeros((1, 2)), q.reshape(-1, 2)]), axis=0)
+        return (jnp.sum(d * d, axis=1) - 1 / count**2) / 2
+
+    system = dx.LagrangeDirac(lambda q, v: (v @ v / 2 - 9.81 * jnp.sum(q[1::2])) / count, holonomic=lengths)
+    q = np.stack([np.arange(1.0, count + 1) / count, np.zeros(count)], axis=1).ravel()
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), q=q, v=0 * q, step=1e-4, steps=10, save_every=5)
+    assert sol.ok and sol.stats["engine"] == "sparse" and sol.stats["unknowns"] == 6 * count
+    assert np.max(np.abs(sol.constraint_residual())) < 1e-12
+    assert np.ptp(sol.energy()) < 1e-9
+
+
+def test_failures_name_the_equation():
+    def well(q, v):  # the root of a negative number at the site 100
+        return v @ v / 2 - jnp.sum(jnp.diff(q) ** 2) / 2 + jnp.sqrt(q[100])
+
+    q = np.ones(200)
+    v = np.zeros(200)
+    v[100] = -50.0
+    sol = dx.simulate(dx.LagrangeDirac(well), dx.LagrangeDAlembert(), q=q, v=v, step=0.01, steps=10, engine="sparse")
+    assert not sol.ok and "equation 100" in sol.message and "not finite" in sol.message
+
+
+def test_singular_first_steps_are_named():
+    def missing(q, v):  # nothing is said of the coordinate 77
+        return jnp.sum(v[:77] ** 2) / 2 + jnp.sum(v[78:] ** 2) / 2 - jnp.sum(q[:77] ** 2) - jnp.sum(q[78:] ** 2)
+
+    def tied(q, v):  # one equation for the coordinates 76 and 77 together
+        w = v.at[76].add(v[77]).at[77].set(0.0)
+        return w @ w / 2
+
+    run = {"q": np.ones(300), "v": np.zeros(300), "step": 0.1, "steps": 2}
+    with pytest.raises(ValueError, match=r"unknowns.*76, 77|no unique solution"):
+        dx.simulate(dx.LagrangeDirac(tied), dx.LagrangeDAlembert(), **run)
+    with pytest.raises(ValueError, match=r"equation 77 has too few unknowns|no unique solution"):
+        dx.simulate(dx.LagrangeDirac(missing), dx.LagrangeDAlembert(), **run)
+
+
+def test_a_wrong_pattern_is_refused(monkeypatch):
+    from dirax.engines.sparse import plan
+    from dirax.program import sparse_equations
+    from dirax.program.sparsity import pattern_of
+
+    def without_one(*given):
+        pattern = pattern_of(*given).tolil()
+        pattern[150, 151] = False
+        return pattern.tocsr()
+
+    monkeypatch.setattr(sparse_equations, "pattern_of", without_one)
+    plan._plans.clear()
+    q = np.sin(np.arange(200.0))
+    with pytest.raises(AssertionError, match="equation 150"):
+        dx.simulate(dx.LagrangeDirac(chain), dx.LagrangeDAlembert(), q=q, v=0 * q, step=0.1, steps=2, engine="sparse")
+
+
+def test_it_says_why_it_does_not_take_a_step():
+    size = 3000
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(q) ** 2)
+    equation = make_step_equation(dx.LagrangeDAlembert(), system, Shape(size))
+    state = np.zeros(2 * size)
+    problem = Problem(equation, state, (state[:size],), 0.1, 0.0, 2)
+    assert "depend on too many unknowns" in (Sparse().supports(problem) or "")
+    assert isinstance(Auto()._by_arrays(dataclasses.replace(problem))[1]["not_sparse"], str)

@@ -1,0 +1,87 @@
+"""Large systems of the gallery beside what is known of them; each runs on the sparse engine."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import dirax as dx
+from dirax.gallery import hanging_chain, oscillator_chain, sine_gordon, wave_line
+
+
+def test_toda_keeps_its_eigenvalues_and_is_the_limit_of_small_amplitudes():
+    sites, toda = 400, oscillator_chain.toda_chain()
+    run = {"v": np.zeros(sites), "step": 0.05, "steps": 40, "save_every": 10}
+    changes = []
+    for step in (0.1, 0.05):
+        finer = {"step": step, "steps": round(2 / step)}
+        sol = dx.simulate(
+            toda, dx.Composition(dx.LagrangeDAlembert(), "yoshida4"), q=oscillator_chain.first_mode(sites, 2.0), **run | finer
+        )
+        assert sol.stats["engine"] == "sparse"
+        values = np.array([oscillator_chain.toda_eigenvalues(*row) for row in zip(sol.q, sol.p, strict=True)])
+        changes.append(np.max(np.abs(values - values[0])))
+    assert changes[1] < 1e-4 and 12 < changes[0] / changes[1] < 20  # of fourth order
+    linear = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum((jnp.roll(q, -1) - q) ** 2) / 2)
+    for amplitude, most in ((1e-2, 1e-3), (1e-3, 1e-4)):
+        of = {"q": amplitude * np.cos(np.arange(sites)), **run}
+        near, other = (dx.simulate(s, dx.LagrangeDAlembert(), **of).q for s in (toda, linear))
+        assert np.max(np.abs(near - other)) < most * amplitude * 20
+
+
+def test_ten_thousand_sites_carry_the_kink():
+    errors = []
+    for sites in (2500, 10_000):
+        data = sine_gordon.start(sites, length=60.0, at=-10.0)
+        sol = dx.simulate(
+            sine_gordon.line(60.0), dx.LagrangeDAlembert(), **data, step=0.02 * 2500 / sites, steps=sites // 50, save_every=10
+        )
+        exact, _ = sine_gordon.kink(sine_gordon.places(sites, 60.0), sol.t[-1], start=-10.0)
+        assert sol.ok and sol.stats["engine"] == "sparse"
+        errors.append(np.max(np.abs(sol.q[-1] - exact)))
+    assert errors[1] < 1e-5 and 12 < errors[0] / errors[1] < 20  # of second order in space and time
+
+
+def test_two_links_are_a_double_pendulum():
+    def lagrangian(a, w):  # angles to the vertical of links of length ½ with masses ½
+        speed = (w[0] ** 2 + (w[0] ** 2 + w[1] ** 2 + 2 * w[0] * w[1] * jnp.cos(a[0] - a[1]))) / 16
+        return speed + hanging_chain.GRAVITY * (2 * jnp.cos(a[0]) + jnp.cos(a[1])) / 4
+
+    errors = []
+    for step in (2e-3, 1e-3):
+        run = {"step": step, "steps": round(0.3 / step)}
+        chain = dx.simulate(hanging_chain.SYSTEM, dx.LagrangeDAlembert(), q=hanging_chain.straight(2, 1.0), v=np.zeros(4), **run)
+        angles = dx.simulate(dx.LagrangeDirac(lagrangian), dx.LagrangeDAlembert(), q=[1.0, 1.0], v=[0.0, 0.0], **run).q[-1]
+        first = np.array([np.sin(angles[0]), -np.cos(angles[0])]) / 2
+        second = first + np.array([np.sin(angles[1]), -np.cos(angles[1])]) / 2
+        errors.append(np.max(np.abs(chain.q[-1] - np.concatenate([first, second]))))
+    assert errors[1] < 1e-5 and 3.5 < errors[0] / errors[1] < 4.5
+
+
+def test_a_straight_chain_hangs_still_and_keeps_its_energy():
+    still = hanging_chain.straight(500, 0.0)
+    sol = dx.simulate(hanging_chain.SYSTEM, dx.LagrangeDAlembert(), q=still, v=0 * still, step=1e-3, steps=5)
+    assert sol.stats["engine"] == "sparse" and np.max(np.abs(sol.q - still)) < 1e-11
+    tension = -sol.multipliers[1:] / 1e-3 / 500  # of the links: the weight of what is below, (1 − s) g
+    below = hanging_chain.GRAVITY * np.arange(500, 0, -1) / 500
+    np.testing.assert_allclose(np.abs(tension), np.broadcast_to(below, tension.shape), rtol=1e-6)
+
+
+def test_power_balances_on_a_hundred_thousand_cells():
+    cells = 50_000
+    drive = lambda t, x: jnp.stack([jnp.cos(3e3 * t), 1.0 + 0.0 * t])
+    sol = dx.simulate(
+        wave_line.line(cells), dx.DiscreteDirac(), x=wave_line.pulse(cells), inputs=drive, step=1 / cells, steps=6, save_every=3
+    )
+    stored, supplied, dissipated = np.moveaxis(sol.fields["power"], -1, 0)
+    assert sol.ok and sol.stats["solver"] == "tridiagonal" and np.all(dissipated == 0)
+    assert np.max(np.abs(stored - supplied)) <= 1e-12 * cells  # of |dH||ẋ|, which is of the size of the cells' number
+    assert np.max(np.abs(supplied)) > 0.1
+
+
+def test_waves_go_as_d_alembert_says():
+    errors = []
+    for cells in (400, 800):
+        sol = dx.simulate(
+            wave_line.line(cells), dx.DiscreteDirac(), x=wave_line.pulse(cells, 0.3), step=1 / cells, steps=cells // 4
+        )
+        errors.append(np.max(np.abs(sol.x[-1] - wave_line.pulse(cells, 0.3 + 0.25))))
+    assert errors[1] < 1e-3 and 3.5 < errors[0] / errors[1] < 4.5
