@@ -114,11 +114,11 @@ def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool) -
                 "The Lagrangian is singular (∂²L/∂v²), and a part of a composition ends at the momentum of a velocity on the "
                 "constraints, which such a Lagrangian does not determine: take the scheme by itself, with smaller steps"
             )
-        direction = np.array2string(directions[lane], precision=2, suppress_small=True, max_line_width=1000)
+        free = np.array2string(directions[lane], precision=2, suppress_small=True, max_line_width=1000)
         raise ValueError(
             f"the first step has no unique solution: its matrix ([PY] (21)) has rank {ranks[lane]} of {unknowns} at the "
             f"initial data{_which(ranks < unknowns)}, and leaves the direction "
-            f"{direction} of the unknowns free. {way}."
+            f"{free} of the unknowns free. {way}."
         )
 
 
