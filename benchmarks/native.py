@@ -28,9 +28,9 @@ SUBJECT = subject(gallery.get("double-spherical-pendulum"), STEPS)
 
 def problems() -> tuple[Problem, Problem]:
     """One trajectory with every row saved, and a batch from points along it with every tenth."""
-    one = Problem(**{**vars(SUBJECT.one), "save_every": 1})
+    one = SUBJECT.one.with_numbers(save_every=1)
     batch = SUBJECT.batch(Native().run(one), BATCH, BATCH_STEPS)
-    return one, Problem(**{**vars(batch), "save_every": 10})
+    return one, batch.with_numbers(save_every=10)
 
 
 def timed(run, threads: int, clock):

@@ -17,7 +17,7 @@ def test_trajectories_are_stationary_and_their_neighbours_are_not(scheme):
     sol = gallery.get("rolling-disk").simulate(scheme, steps=50)
     rng = np.random.default_rng(1)
     for _ in range(3):
-        beside = dx.action_variation(sol, rng.normal(size=sol.q.shape))
+        found = dx.action_variation(sol, rng.normal(size=sol.q.shape))
         assert abs(found.value) < 1e-13 * found.size
     q = sol.q.copy()
     q[20] += [0.0, 0.0, 1e-3, 0.0]

@@ -211,7 +211,7 @@ def test_what_is_no_engine_is_refused():
     run = {"q": [1.0], "v": [0.0], "step": 0.1, "steps": 1}
     system = dx.LagrangeDirac(lambda q, v: (v @ v - q @ q) / 2)
     for wrong, error, words in (
-        ("gpu", ValueError, "'auto', 'xla', 'native', or a dx.AbstractEngine, but 'gpu'"),
+        ("gpu", ValueError, "'auto', 'xla', 'native', 'sparse', or a dx.AbstractEngine, but 'gpu'"),
         (Native, TypeError, "the class Native itself was given: add parentheses"),
         (3, ValueError, "but 3 was given"),
     ):

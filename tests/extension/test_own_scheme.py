@@ -116,7 +116,7 @@ def test_its_premise_and_its_labels_are_in_messages():
     with pytest.raises(ValueError, match="SymplecticEuler begins with a step of length 1 at most"):
         run(v=[30.0, 0.0])
     valley = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sqrt(1.0 - q @ q))  # no derivative outside the unit circle
-    sol = dx.simulate(valley, SymplecticEuler("right"), q=[0.9, 0.0], v=[3.0, 0.0], step=0.1, steps=10)
+    sol = dx.simulate(valley, SymplecticEuler("left"), q=[0.9, 0.0], v=[3.0, 0.0], step=0.1, steps=10)
     assert not sol.ok and "momentum 0 of symplectic Euler is not finite" in sol.message
 
 

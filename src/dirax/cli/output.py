@@ -34,7 +34,7 @@ def with_messages(command: Callable) -> Callable:
             typer.echo(f"dirax: {error}", err=True)
             raise typer.Exit(1) from error
         except KeyboardInterrupt as end:
-            typer.echo(f"dirax: {end or 'interrupted.'}", err=True)
+            typer.echo(f"dirax: {str(end) or 'interrupted.'}", err=True)
             raise typer.Exit(130) from None
 
     return run

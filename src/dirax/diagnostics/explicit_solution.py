@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.bench.ode import ExplicitODE, explicit_ode
-from dirax.diagnostics.bench.ode_solvers import compiled_field
 from dirax.diagnostics.bench.subject import Skipped
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.memo import Same
@@ -45,6 +44,10 @@ class ExplicitSolution:
 
     def __call__(self, t: np.ndarray) -> dict[str, np.ndarray]:
         """Raises `Skipped` where the equations cannot be solved in reasonable time."""
+        try:
+            from dirax.diagnostics.bench.ode_solvers import compiled_field  # imported when it is used
+        except ImportError:
+            raise Skipped("needs llvmlite") from None
         y = extrapolated(compiled_field(self.ode), self.t0, self.ode.start, t)
         n, params = self.ode.shown, self.params
         if len(self.ode.start) == 2 * n:

@@ -64,6 +64,8 @@ class Begun:
     traced: bool
     rows: dict[str, np.ndarray] | None = field(default=None, kw_only=True)
     """Rows that were saved by the run that this one goes on with."""
+    save_every: int = field(default=1, kw_only=True)
+    """What was asked for, which may be more steps than there are."""
     plan: Callable[[], Plan | None]
     """Makes the plan for others of its kind."""
 
@@ -73,15 +75,17 @@ def carried_out(
 ) -> Solution:
     """The Solution of a run. Raises `ValueError` for data that a premise excludes."""
     began = time.perf_counter()
-    save_every = _checked_times(case, steps, save_every)
+    every = _checked_times(case, steps, save_every)
     kind = kind or kind_for(settings, case)
     if kind is not None and kind.plan is not None:
-        problem = kind.plan.problem(case, steps, save_every)
+        problem = kind.plan.problem(case, steps, every)
         if problem is not None:
             if problem.rows * kind.plan.row_bytes > MANY_BYTES:
                 refuse_more_than_memory(problem)
-            return _run(settings, kind, Begun(case, problem, (), None, False, _no_plan), steps, progress, entered, began)
-    found = _begun(settings, case, steps, save_every)
+            found = Begun(case, problem, (), None, False, _no_plan, save_every=save_every)
+            return _run(settings, kind, found, steps, progress, entered, began)
+    found = _begun(settings, case, steps, every)
+    found.save_every = save_every
     if kind is not None and not found.traced:
         if kind.plan is not None and not found.redundant:
             kind.plan.learn(bytes_of(case.params))
@@ -105,7 +109,7 @@ def prepared(settings: Settings, case: Case, steps: int, save_every: int) -> Kin
 
 
 def _checked_times(case: Case, steps: int, save_every: int) -> int:
-    """How often rows are saved, at the last step at the latest. Raises `ValueError` for times that floats do not tell apart."""
+    """How often rows are saved, no later than at the last step. Raises `ValueError` for times that floats do not tell apart."""
     refuse_clock_that_stands(case.t0, case.h, steps)
     return min(save_every, max(1, steps - int(case.two_points)))
 
@@ -218,7 +222,8 @@ class Continuation:
         """The solution of the whole run of so many more steps, bit by bit."""
         began, old = time.perf_counter(), self.begun.problem
         after = old.steps if self.record is not None else 0
-        problem = old.with_numbers(steps=old.steps + more, after=after, record=self.record)
+        every = min(self.begun.save_every, old.steps + more)
+        problem = old.with_numbers(steps=old.steps + more, save_every=every, after=after, record=self.record)
         refuse_more_than_memory(problem)
         before = _rows_before(sol, problem)
         found = replace(self.begun, problem=problem, rows=before)

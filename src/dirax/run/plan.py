@@ -148,7 +148,7 @@ def planned(settings: Settings, case: Case, shape: Shape, initial: Initial, star
     whose functions have no program or a large one, and compositions that might leave a final manifold."""
     equation, system = problem.equation, settings.system
     stages = equation.stages
-    if case.batch is not None or case.two_points or (stages[0][0].unknowns and start.jacobian is None):
+    if case.batch is not None or case.two_points or (stages[0][0].unknowns and not isinstance(start.jacobian, np.ndarray)):
         return None
     fields = stages[0][0].fields
     if len(stages) > 1 and not system.constraints.any and "p" in fields and system.final_relation(shape) is not None:

@@ -183,6 +183,8 @@ class LagrangeDAlembertStep(AbstractStep):
 
     def resume(self, data, h, params):
         """With the saved momentum, which is p_k modulo the forces of the constraints: the step takes no notice of these."""
+        if self.share == 1.0:
+            raise ValueError("outgoing momenta do not say by which one the run began.")
         u = self.unknowns.join(v=data["v"], saved_v=data["v"] if self.projects else jnp.zeros(0))
         return self.state.join(q=data["q"], p=data["p"]), u
 

@@ -8,8 +8,6 @@ import jax
 import numpy as np
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
-from dirax.engines.native import compile as llvm
-from dirax.engines.native.ir.compiled_function import compiled
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.interpreter import Interpreter, Nodes, Unsupported, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
@@ -82,6 +80,9 @@ def _function(one: Callable, given: list[Any]) -> Callable | None:
     except (UnsupportedPrimitive, GraphTooLarge):
         return None
     inputs = [node for nodes in made.inputs for node in nodes.ravel().tolist()]
+    from dirax.engines.native import compile as llvm  # imported when they are used
+    from dirax.engines.native.ir.compiled_function import compiled
+
     return compiled(made.graph, inputs, made.results[0].ravel().tolist(), llvm.vector_width())
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from dirax.engines.native.lanes import thread_count
+from dirax.engines.threads import thread_count
 from dirax.sweeps.processes import Processes, packed, run_packed
 from dirax.sweeps.task import Done, Plan, Task, run_task
 

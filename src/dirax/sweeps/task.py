@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dirax.engines.native.lanes import at_most
+from dirax.engines.threads import at_most
 from dirax.run.failure_messages import brief
 from dirax.run.simulate import simulate
 from dirax.solution.solution import Solution

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dirax.engines.native.lanes import at_most
+from dirax.engines.threads import at_most
 from dirax.run.simulate import simulate
 from dirax.solution.solution import Solution
 from dirax.sweeps import fingerprint

@@ -67,7 +67,7 @@ def _batch(subject: Subject, engine: AbstractEngine) -> Program:
 
 def _many(subject: Subject) -> tuple[Problem, float]:
     """A batch from points along the trajectory, and the share of its time that is that of one run of the subject."""
-    rows = Native().run(Problem(**{**vars(subject.one), "save_every": max(1, subject.steps // BATCH)}))
+    rows = Native().run(subject.one.with_numbers(save_every=max(1, subject.steps // BATCH)))
     return subject.batch(rows, BATCH, BATCH_STEPS), subject.steps / (BATCH * BATCH_STEPS)
 
 

@@ -2,9 +2,7 @@
 
 import itertools
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
-from contextvars import ContextVar
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -14,6 +12,7 @@ from dirax.engines.contract import NOT_CONVERGED, OK, Problem
 from dirax.engines.native import compile as llvm
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
+from dirax.engines.threads import thread_count
 
 SHARES = 4
 """Parts of a batch per thread, so that a thread that is held up holds up little."""
@@ -26,20 +25,6 @@ def width_for(batch: int) -> int:
     """Lanes side by side for a batch."""
     widest = llvm.vector_width()
     return 1 if batch == 1 else next((w for w in (2, 4) if batch <= w <= widest), widest)
-
-
-at_most: ContextVar[int | None] = ContextVar("at_most", default=None)
-"""Threads for batches in this context, where several batches run side by side."""
-
-
-def thread_count() -> int:
-    """Threads for batches: as many as the context has, else DIRAX_THREADS, else the processors this process may use."""
-    if (most := at_most.get()) is not None:
-        return most
-    chosen = os.environ.get("DIRAX_THREADS", "")
-    if chosen.isdigit() and int(chosen) > 0:
-        return int(chosen)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Saved(NamedTuple):
