@@ -12,12 +12,12 @@ import dirax as dx
 from dirax.engines.stopping import EPSILON
 from dirax.engines.xla import Xla
 from dirax.engines.xla.dense import Dense
-from dirax.engines.xla.newton import as_function, solve
+from dirax.engines.xla.newton import as_function, newton_root
 
 
 def root(equation, guess, args=(), **keywords):
     guess = jnp.asarray(guess)
-    u, updates, converged = solve(equation, guess, args, 50, **keywords)
+    u, updates, converged = newton_root(equation, guess, args, 50, **keywords)
     return np.asarray(u), int(updates), bool(converged)
 
 
@@ -72,7 +72,7 @@ def test_where_it_does_not_run_the_guess_comes_back():
 
 def test_lanes_of_a_batch_do_not_depend_on_each_other():
     """Each lane has the bits and the number of updates that it has among others that need more."""
-    one = lambda guess: solve(lambda u: u - jnp.cos(u) * u, guess, (), 50)[:2]
+    one = lambda guess: newton_root(lambda u: u - jnp.cos(u) * u, guess, (), 50)[:2]
     guesses = jnp.array([[0.5], [2.0], [7.0], [0.3]])
     together, counts = jax.jit(jax.vmap(one))(guesses)
     for order in ([3, 1, 0, 2], [0, 0, 0, 0]):
@@ -85,7 +85,7 @@ def test_lanes_of_a_batch_do_not_depend_on_each_other():
 def test_derivatives_of_the_root_to_second_order():
     """u³ = a: u' = 1/(3u²), u'' = −2/(9u⁵), forwards and backwards."""
     equation = lambda u, a: u**3 - a
-    found = lambda a: solve(equation, jnp.array([1.3]), (jax.lax.stop_gradient(a),), 50)[0]
+    found = lambda a: newton_root(equation, jnp.array([1.3]), (jax.lax.stop_gradient(a),), 50)[0]
     cube_root = lambda a: as_function(equation, found(a), (a,))[0]
     u = 2.0 ** (1 / 3)
     assert jax.grad(cube_root)(2.0) == pytest.approx(1 / (3 * u**2), rel=1e-14)

@@ -5,7 +5,7 @@ loops/                scalar program → the loop over rows, steps, stages and N
 ir/                   the writer of LLVM IR, and nodes written with it
 functions/            the elementary functions in LLVM IR
 compile.py            IR → machine code, and its cache
-engine.py, lanes.py   the run: memory, chunks, threads
+engine.py             what the engine supports; run.py its chunks and threads, lanes.py its memory
 gradients/            derivatives of a run: the loops of tangents and cotangents, and the run as JAX's primitives
 """
 

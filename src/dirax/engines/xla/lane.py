@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
 from dirax.engines.linear_solver import AbstractLinearSolver
-from dirax.engines.xla.newton import as_function, solve
+from dirax.engines.xla.newton import as_function, newton_root
 from dirax.schemes.step import composed_row, needs_every_part
 
 
@@ -100,7 +100,7 @@ def take_step(
         fixed = passing(args, False) if differentiable else args
         guess = stage.guess(fixed[0], jnp.sum(before, axis=0), *fixed[2:])
         guess = jax.lax.stop_gradient(guess) if differentiable else guess
-        u, count, converged = solve(stage.residual, guess, fixed, max_iterations, running, jacobian, linear_solver)
+        u, count, converged = newton_root(stage.residual, guess, fixed, max_iterations, running, jacobian, linear_solver)
         new, left = stage.advance(u, *fixed), stage.residual(u, *fixed)
         # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
         finite = jnp.isfinite(jnp.sum(0.0 * jnp.concatenate([new, left])))

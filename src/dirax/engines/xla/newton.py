@@ -36,7 +36,7 @@ class Search(NamedTuple):
         return self.measures[2]
 
 
-def solve(
+def newton_root(
     residual: Callable[..., Float[Array, " k"]],
     guess: Float[Array, " k"],
     args: tuple[Any, ...],

@@ -92,7 +92,7 @@ def while_(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operan
 
 
 @numpy_rule("dirax_solve")
-def solve(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes, right: Nodes) -> list[Nodes]:
+def solved_by_numpy(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes, right: Nodes) -> list[Nodes]:
     return made.between([matrix, right], [right.shape], lambda operands: [_solved(*operands)])
 
 

@@ -24,7 +24,7 @@ def solve_triangular(g: Graph, matrix: np.ndarray, b: np.ndarray, lower: bool, u
     return x
 
 
-def solve(g: Graph, matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
+def eliminated(g: Graph, matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
     """x with matrix x = b, (n, r), by elimination with partial pivoting of [matrix | b]."""
     n = len(matrix)
     if n > SOLVE_LIMIT:
@@ -90,7 +90,7 @@ def solve_blocks(g: Graph, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """x with matrix x = right, (n, r), for every group of equations by itself."""
     x = np.empty_like(right)
     for block in _independent(matrix != g.zero):
-        x[block] = solve(g, matrix[np.ix_(block, block)], right[block])
+        x[block] = eliminated(g, matrix[np.ix_(block, block)], right[block])
     return x
 
 

@@ -16,10 +16,10 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from dirax.engines.contract import Outcome, Problem, finished, saved_steps
-from dirax.engines.native.engine import run
 from dirax.engines.native.gradients.recording import INPUTS, Recorded
 from dirax.engines.native.gradients.tangents_on_host import jvp, vjp
 from dirax.engines.native.kernels import kernels
+from dirax.engines.native.run import run
 from dirax.engines.parameters import parameters
 from dirax.engines.xla import Xla
 from dirax.engines.xla.loop import unpacked_rows

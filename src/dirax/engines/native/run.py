@@ -1,0 +1,109 @@
+"""The run of a kernel, chunk by chunk."""
+
+import time
+
+import numpy as np
+
+from dirax.engines.contract import Outcome, Problem, Progress, finished
+from dirax.engines.native.collocation_kernels import collocation_kernels
+from dirax.engines.native.kernels import kernels
+from dirax.engines.native.lanes import Lanes, width_for
+from dirax.engines.native.one_lane import OneLane, places_of
+from dirax.program.interpreter import UnsupportedPrimitive
+
+CHUNK_SECONDS = 0.1
+WORTH_THREADS = 2e-3
+"""Seconds of work from which on it is shared among threads."""
+
+FIRST_CHUNK = 20_000
+"""Lane-steps of the first call, from which the speed is estimated."""
+
+
+def run(p: Problem, progress: Progress | None = None) -> Outcome:
+    """The run of a problem, as `Native.run` has it."""
+    return Ready(p)(p, progress)
+
+
+class Ready:
+    """The kernel of a problem and of those that differ from it in numbers alone; called with one of them, it runs it.
+
+    Raises `UnsupportedPrimitive` for a step that cannot be compiled.
+    """
+
+    def __init__(self, p: Problem):
+        started = time.perf_counter()
+        nodes = collocation_kernels(p.equation, p.params, p.batch_params)
+        made = nodes or kernels(p.equation, p.params, p.batch_params, p.compensated)
+        self.made, self.is_collocation = made, nodes is not None
+        self.width = 1 if self.is_collocation else width_for(p.batch or 1)
+        self.kernel, cached = made.kernel(self.width)
+        self.first_unknowns = made.record.unknowns(0, p.equation.stages[0][0].unknowns)
+        self.notes = {
+            "unknowns": sum(len(made.step.equations[i].unknowns) for i, _ in made.step.stages),
+            "operations": made.operations,
+            "lanes": self.width,
+            "threads": 1,
+            "kernel_cached": cached,
+            **({} if nodes is None else nodes.notes),
+        }
+        self.compile_seconds = time.perf_counter() - started
+
+    def __call__(self, p: Problem, progress: Progress | None = None) -> Outcome:
+        """Run `p`, as `Native.run` has it."""
+        places = places_of(p, self.made)
+        lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
+        fields = lanes.fields
+        compile_seconds, cached, started = self.compile_seconds, self.notes["kernel_cached"], time.perf_counter()
+        done, interrupted, threads = p.after, False, 1
+        count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
+        try:
+            while done < p.steps and (done == p.after or lanes.going):
+                count = min(count, p.steps - done)
+                tick = time.perf_counter()
+                lanes.advance(self.kernel, done, done + count, threads)
+                done += count
+                rate = count / max(time.perf_counter() - tick, 1e-9)
+                count = max(1, int(rate * CHUNK_SECONDS))
+                threads = lanes.threads if threads > 1 or p.steps - done > rate * WORTH_THREADS else 1
+                if progress:
+                    progress(done, p.steps)
+        except KeyboardInterrupt:
+            interrupted = True
+        by_newton = self.is_collocation and not interrupted and _by_newton(lanes)
+        run_seconds = time.perf_counter() - started
+        closing = lanes.close(self.kernel)
+        self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
+        table, record = lanes.table(), lanes.record
+        counts = table[:, record.completed : record.iterations + 1].astype(np.int64)
+        outcome = Outcome(
+            fields=fields,
+            closing=closing,
+            completed=counts[:, 0],
+            status=counts[:, 1],
+            iterations=counts[:, 2],
+            max_residual=table[:, record.max_residual],
+            last_state=table[:, record.state],
+            last_unknowns=table[:, self.first_unknowns],
+            interrupted=interrupted,
+            compile_seconds=compile_seconds,
+            run_seconds=run_seconds,
+            record=None if interrupted or by_newton else table,
+            engine="native",
+            notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
+        )
+        whole = places is not None and outcome.completed[0] == p.steps  # then the closing row stands where it belongs
+        return outcome if whole else finished(p, outcome)
+
+
+def _by_newton(lanes: Lanes | OneLane) -> bool:
+    """Go on with trajectories whose fixed-point iteration has not converged, by Newton's method for all nodes together; whether
+    there are any."""
+    if left := lanes.left():
+        p = lanes.problem
+        try:
+            newton, _ = kernels(p.equation, p.params, p.batch_params, True).kernel(1)
+        except UnsupportedPrimitive:  # too large to be written out: they end where they are
+            return False
+        for lane in left:
+            lanes.again(newton, lane)
+    return bool(left)
