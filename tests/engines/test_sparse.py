@@ -78,7 +78,7 @@ def test_a_batch_keeps_its_bits():
     assert both.q[1].tobytes() == alone.q.tobytes()
 
 
-@pytest.mark.parametrize("system", [STIFF, LINKS], ids=["chain", "links"])
+@pytest.mark.parametrize("system", [STIFF, pytest.param(LINKS, marks=pytest.mark.soak)], ids=["chain", "links"])
 def test_derivatives_are_those_of_the_dense_engine(system):
     start = WAVE if system is STIFF else STRAIGHT
 

@@ -124,7 +124,10 @@ def lift_report_of(name):
     return quick_jit(jax.vmap(report, (0, 0, None)))
 
 
-@pytest.mark.parametrize("name", sorted(set(MAPS) - {"projected midpoint", "SE2"}))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.soak) if n == "SE3" else n for n in sorted(set(MAPS) - {"projected midpoint", "SE2"})],
+)
 @examples
 @given(seed=seeds, scale=st.floats(1e-8, 0.8))
 def test_lifts_are_symplectic_discretization_maps(name, seed, scale):

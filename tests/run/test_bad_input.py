@@ -203,7 +203,7 @@ def test_counts_beyond_what_is_counted(name, most):
         complaint(ValueError, f"{name} must be at most", **{name: value})
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_largest_counts(engine):
     """Rows 0 and 3 alone are saved; the derivative takes as long as the run does."""
     run = lambda q, **more: dx.simulate(OSCILLATOR, PLUS, **(GOOD | {"q": q, "engine": engine, "save_every": 2**63 - 1} | more))

@@ -88,7 +88,7 @@ def reference():
     return {"q": y[:, :3], "p": y[:, 3:6] * inertia, "work": y[:, 6], "impulse": y[:, 7]}
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 @pytest.mark.parametrize(
     ("scheme", "order"),
     [
@@ -151,6 +151,7 @@ def rows_of(engine, save_every=1, **changed):
     return run
 
 
+@pytest.mark.soak
 def test_gradients_of_composed_rows():
     """The same by both engines, forward and backward, and by differences."""
     save_every = 2

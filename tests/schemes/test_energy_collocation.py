@@ -176,7 +176,7 @@ SYSTEMS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.soak) if n == "heavy top" else n for n in SYSTEMS])
 def test_every_system_with_a_bracket(name):
     system, data, step = SYSTEMS[name]
     run = lambda scheme, h, n, **more: dx.simulate(system, scheme, step=h, steps=n, **data, **more)
@@ -221,7 +221,7 @@ def test_where_the_fixed_point_does_not_converge_newton_goes_on():
     assert sol.ok and np.max(np.abs(energy - energy[0])) < 1e-13
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_gradients_are_those_of_differences(engine):
     system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["k"] * q @ q / 2, lambda q: jnp.array([[q[1], 0.0, -1.0]]))
 

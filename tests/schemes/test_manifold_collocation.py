@@ -39,6 +39,7 @@ def test_a_pendulum_on_the_sphere():
     assert line.verdict == "bounded", line
 
 
+@pytest.mark.soak
 def test_a_free_body_on_so3_has_its_order_and_keeps_its_spatial_momentum():
     stages = 2
     group, inertia = dx.SO3(), jnp.array([1.0, 2.0, 3.0])

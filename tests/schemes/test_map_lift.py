@@ -177,6 +177,7 @@ def test_suslovs_problem_on_the_group_against_eulers_equations(map, constraints)
     assert np.log2(np.array(errors)[:-1] / np.array(errors)[1:]) == pytest.approx(2.0, abs=0.25)
 
 
+@pytest.mark.soak
 def test_engines_and_batches_agree_on_a_sphere():
     edge = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - q[2], dx.Sphere(3), lambda q: jnp.stack([q[2], 0.3 * q[0], q[1]])[None])
     q, v = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8]]), np.array([[0.8, 0.3, -0.6], [0.5, 0.8, -0.6]])

@@ -104,6 +104,7 @@ FLAT = dx.NonholonomicMechanics(  # on an ellipse, so that g keeps no sum of squ
 FLAT_START = {"q": np.array([1.0, 0.0]), "v": np.array([0.0, 0.7])}
 
 
+@pytest.mark.soak
 def test_engines_and_batches_agree():
     run = {"step": 0.1, "steps": 10}
     batch = {"q": np.stack([FLAT_START["q"]] * 2), "v": np.stack([FLAT_START["v"], -0.5 * FLAT_START["v"]])}

@@ -96,6 +96,7 @@ def test_a_worker_is_killed(tmp_path, uninterrupted):
     kill_workers(tmp_path, uninterrupted, (1, 4, 8))
 
 
+@pytest.mark.soak
 def test_a_scheduler_and_its_workers_are_killed(tmp_path, uninterrupted):
     kill_schedulers(tmp_path, uninterrupted, (1, 4, 8))
 

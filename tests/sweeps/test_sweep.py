@@ -117,6 +117,7 @@ print(len(jax.local_devices()), len(used), bool((data.status == 1).all()))
 """
 
 
+@pytest.mark.soak
 def test_on_two_devices_a_task_runs_on_one_of_them(tmp_path):
     environment = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"}
     program = TWO_DEVICES.format(folder=str(Path(__file__).parents[1]), path=str(tmp_path / "two.zarr"))

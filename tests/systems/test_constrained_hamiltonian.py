@@ -106,6 +106,7 @@ FLAT = dx.DiracSystem(
 FLAT_START = np.array([1.0, 0.0, 0.0, 0.7])
 
 
+@pytest.mark.soak
 def test_engines_and_batches_agree():
     run = {"step": 0.1, "steps": 10}
     batch = np.stack([FLAT_START, FLAT_START * np.array([1.0, 1.0, 1.0, -0.5])])
