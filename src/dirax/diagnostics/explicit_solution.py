@@ -1,8 +1,7 @@
 """The motion by explicit equations, solved by extrapolation: a reference that shares nothing with schemes but the system.
 
 The equations of motion are those of `diagnostics/bench/ode.py`, solved for the derivatives with the multipliers eliminated, and
-integrated by Gragg's midpoint rule with extrapolation in h² (Hairer, Nørsett, Wanner I, §II.9), of its own here: SciPy is no
-dependency of dirax.
+integrated by Gragg's midpoint rule with extrapolation in h² (Hairer, Nørsett, Wanner I, §II.9).
 """
 
 from collections.abc import Callable, Mapping

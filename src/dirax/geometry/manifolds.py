@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dirax.geometry.squared_angles import Scalar, norm
+from dirax.numerics.tolerances import POINT_DEFECT
 from dirax.program.tracing import value_along
 from dirax.program.user_functions import evaluated, is_traced
 
@@ -65,7 +66,7 @@ class AbstractManifold(eqx.Module):
         """Whether x is on the manifold: `defect(x) <= tolerance`."""
         return self.defect(x) <= tolerance
 
-    def check_point(self, x: Vector, name: str = "x", tolerance: float = 1e-8) -> None:
+    def check_point(self, x: Vector, name: str = "x", tolerance: float = POINT_DEFECT) -> None:
         """Raise `ValueError` for a wrong shape, and for a concrete x off the manifold, with the defect."""
         self._check_shape(x, name)
         if is_traced(x):
@@ -74,7 +75,9 @@ class AbstractManifold(eqx.Module):
         if not is_traced(defect):  # a constant inside a traced function
             self._refuse_off(float(defect), name, tolerance)
 
-    def check_tangent(self, x: Vector, v: Vector, name: str = "v", tolerance: float = 1e-8, point: str | None = None) -> None:
+    def check_tangent(
+        self, x: Vector, v: Vector, name: str = "v", tolerance: float = POINT_DEFECT, point: str | None = None
+    ) -> None:
         """Raise `ValueError` for a wrong shape, and for a concrete v that is not tangent at x, with the defect; and, where it
         has a name, for a `point` x off the manifold."""
         if point is not None:

@@ -84,8 +84,7 @@ def carried_out(
                 refuse_more_than_memory(problem)
             found = Begun(case, problem, (), None, False, _no_plan, save_every=save_every)
             return _run(settings, kind, found, steps, progress, entered, began)
-    found = _begun(settings, case, steps, every)
-    found.save_every = save_every
+    found = _begun(settings, case, steps, every, save_every)
     if kind is not None and not found.traced:
         if kind.plan is not None and not found.redundant:
             kind.plan.learn(bytes_of(case.params))
@@ -101,7 +100,7 @@ def prepared(settings: Settings, case: Case, steps: int, save_every: int) -> Kin
     kind = kind_for(settings, case)
     if kind is None or (kind.plan is not None and kind.engine is not None and kind.plan.problem(case, steps, save_every)):
         return kind
-    found = _begun(settings, case, steps, save_every)
+    found = _begun(settings, case, steps, save_every, save_every)
     if not found.traced and not found.redundant:
         kind.plan = kind.plan or found.plan()
         kind.engine = kind.engine or settings.engine.prepared(found.problem)
@@ -118,8 +117,8 @@ def _no_plan() -> None:
     return None
 
 
-def _begun(settings: Settings, case: Case, steps: int, save_every: int) -> Begun:
-    """The general way from a case to its problem."""
+def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: int) -> Begun:
+    """The general way from a case to its problem; `asked`: the `save_every` that was asked for."""
     system, scheme, by_jax = settings.system, settings.scheme, settings.engine.compiles_start
     given, check_initial = case, settings.check_initial
     data, own = case.first
@@ -169,7 +168,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int) -> Begun
     def plan() -> Plan | None:
         return None if special else planned(settings, given, shape, initial, start, problem)
 
-    return Begun(case, problem, redundant, start.row0, traced, plan)
+    return Begun(case, problem, redundant, start.row0, traced, plan, save_every=asked)
 
 
 def _run(

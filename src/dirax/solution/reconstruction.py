@@ -30,13 +30,14 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
 
     Raises `TypeError` for a solution of another system, `ValueError` for a g0 that is no element of the group.
     """
-    on_algebra, system = (None, None) if solution.system is None else _reduced_forms(solution.system)
-    if on_algebra is not None:
+    stated = solution.system
+    if stated is not None and (on_algebra := stated.lie_algebra_form()) is not None:
         return _on_group(solution, on_algebra.space.group, on_algebra.space.dimension, g0)
+    system = None if stated is None else stated.quotient_form()
     if system is None:
         raise TypeError(
             "dx.reconstruct takes a solution of a dx.EulerPoincare, dx.LiePoisson or dx.reduce system, but this one is of "
-            f"{solution.system!r}."
+            f"{stated!r}."
         )
     if g0 is not None:
         raise ValueError("g0 is for systems on a Lie group: here the initial data name the group coordinate already.")
@@ -51,10 +52,6 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     whole = _lifted(solution, system.system, lifted, about)
     whole.scheme = jax.tree.map(_on_q, solution.scheme, is_leaf=lambda part: isinstance(part, DiscreteRouth))
     return whole if is_traced(lifted) or solution.equation is None else with_code(whole, whole.system, whole.scheme)
-
-
-def _reduced_forms(system: Any) -> tuple[Any, Any]:
-    return system.lie_algebra_form(), system.quotient_form()
 
 
 def _on_q(part: Any) -> Any:

@@ -18,7 +18,7 @@ from dirax.sweeps.case import Case, Values
 from dirax.sweeps.commit import commit
 from dirax.sweeps.grid import Index
 from dirax.sweeps.keep import Keep
-from dirax.sweeps.layout import FAILED, MESSAGE, OK, OPEN, REFUSED, STATUS, Layout
+from dirax.sweeps.layout import FAILED, MESSAGE, OK, REFUSED, STATUS, Layout
 
 
 class Stopped(Exception):
@@ -179,8 +179,3 @@ def _in_context(plan: Plan) -> Iterator[None]:
     finally:
         at_most.reset(tokens[0])
         brief.reset(tokens[1])
-
-
-def is_open(status: np.ndarray) -> bool:
-    """Whether a point of a block has not been run."""
-    return bool(np.any(status == OPEN))

@@ -217,12 +217,6 @@ class Emitter:
     def int_equal(self, a: str, b: str) -> str:
         return self.body.put(f"icmp eq {self.int} {a}, {b}")
 
-    def int_select(self, condition: str, yes: str, no: str) -> str:
-        return self.body.put(f"select {self.bool} {condition}, {self.int} {yes}, {self.int} {no}")
-
-    def flag_to_int(self, condition: str) -> str:
-        return self.body.put(f"zext {self.bool} {condition} to {self.int}")
-
     # ------------------------------------------------------------------ sums and products without error
 
     def two_sum(self, a: str, b: str) -> tuple[str, str]:
