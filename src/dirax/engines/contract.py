@@ -38,7 +38,9 @@ class Problem:
 
     `state` (s,) or (B, s) and `guess` (k,) or (B, k), one guess per stage; `params` a pytree, with a leading batch axis
     when `batch_params`. Rows are saved every `save_every` steps, and the last one always. Steps are numbered from
-    `first_step` (1 after a two-point start), so the first state is at time t0 + first_step·h.
+    `first_step` (1 after a two-point start), so the first state is at time t0 + first_step·h. `sizes` are those of the
+    unknowns and of the equations of each stage, (2, k) or (B, 2, k): `engines/sizes.py`, which an engine asks where they
+    are not given.
     """
 
     equation: Any
@@ -54,6 +56,7 @@ class Problem:
     batch_params: bool = False
     max_iterations: int = 50
     compensated: bool = False
+    sizes: tuple | None = None
 
     @property
     def size(self) -> int:

@@ -12,6 +12,7 @@ from dirax.engines.contract import OK, Problem
 from dirax.engines.native import compile as llvm
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
+from dirax.engines.sizes import sizes_of
 
 SHARES = 4
 """Parts of a batch per thread, so that a thread that is held up holds up little."""
@@ -60,6 +61,9 @@ class Lanes:
         for stage, guess in enumerate(p.guess):
             values = np.asarray(guess).reshape(self.lanes, -1)
             table[:, self.record.unknowns(stage, values.shape[1])] = values
+        for stage, sizes in enumerate(sizes_of(p)):
+            for part, numbers in zip(self.record.sizes(stage, sizes.shape[-1]), np.moveaxis(sizes, -2, 0), strict=True):
+                table[:, part] = numbers
         self.records = self._blocked(table)
         leaves = made.step.parameters.flatten(p.params, p.batch if p.batch_params else None)
         self.params = self._blocked(np.broadcast_to(leaves, (self.lanes, leaves.shape[-1])))

@@ -12,6 +12,7 @@ from dirax.engines import policy
 from dirax.engines.contract import OK, Outcome, Problem, Progress, finished
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.linear_solver import AbstractLinearSolver
+from dirax.engines.sizes import sizes_by_jax, sizes_of
 from dirax.engines.xla.lane import Lane, Numerics, first_lane
 from dirax.engines.xla.loop import Clock, axes_of, by_lane, compiled_chunk, make_step, next_row, row_capacity, unpack_rows
 
@@ -54,12 +55,13 @@ class Xla(AbstractEngine):
         chunk = compiled_chunk(jax.default_backend())
         axes, capacity, params = axes_of(p), row_capacity(p), jax.device_put(p.params)
         lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, numerics.increments is not None)
+        sizes = sizes_of(problem)
 
         def call(lanes, start, stop, closing=False):
             t0, h, first_step = map(np.float64, (p.t0, p.h, p.first_step))
             every, start, stop = map(np.int64, (p.save_every, start, stop))
             clock = Clock(t0, h, first_step, every, start, stop, np.bool_(closing))
-            after, rows = chunk(p.equation, lanes, params, clock, capacity, axes, p.max_iterations, numerics)
+            after, rows = chunk(p.equation, lanes, params, sizes, clock, capacity, axes, p.max_iterations, numerics)
             return after, {name: by_lane(np.asarray(values), p.batch, np) for name, values in rows.items()}
 
         _, empty = call(lanes, 0, 0)  # compile
@@ -96,12 +98,12 @@ class Xla(AbstractEngine):
         p, numerics, notes = self._planned(problem)
         axes = axes_of(p)
         lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), compensated=numerics.increments is not None)
-        clock = Clock.of(p)
+        clock, sizes = Clock.of(p), sizes_by_jax(problem)
         one = make_step(p.equation, axes, p.max_iterations, True, numerics)
 
         def step(lanes, k):
             """The lanes after step k and the row that they left; a step past the last is undone."""
-            after, row = one(lanes, p.params, clock)
+            after, row = one(lanes, p.params, sizes, clock)
             return jax.tree.map(lambda a, b: jnp.where(k < p.steps, a, b), after, lanes), row
 
         def to_next_row(lanes, start):

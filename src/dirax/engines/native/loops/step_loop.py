@@ -8,7 +8,7 @@ from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.dense import add_dense_solve
 from dirax.engines.native.loops.plan import RUN, Plan, frontier
 from dirax.engines.native.loops.record import Frame
-from dirax.engines.native.loops.stage import Block, emit_stage
+from dirax.engines.native.loops.stage import Block, bind_sizes, emit_stage
 
 WRITTEN_OUT = 64
 """Unknowns of all stages up to which there is no loop over them."""
@@ -54,6 +54,7 @@ def _define_block(plan: Plan, module: Module, width: int) -> None:
         known.bind(node, b.load(e.real, b.at(e.real, "%params", i)))
     if len(plan.stages) == 1:
         known.bind(plan.shared.h, e.mul(e.splat("%h"), e.const(plan.stages[0][1])))
+        bind_sizes(known, frame, plan.corrections[0])
     known.require(frontier(plan.graph, level, plan.outputs, RUN))
 
     def give_back() -> None:
