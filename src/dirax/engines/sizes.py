@@ -1,13 +1,17 @@
 """How large the unknowns and the equations of a step are: the units in which an engine measures them.
 
-The residual r of a step is a sum of terms of the size |r| + |r_u||u| + |r_x||x|, at the first guess u and the first state x; a
-last place of each changes the solution by
+At the first guess u and the first state x of a step with the residual r, the terms of its equations have the sizes
+|r| + |r_u||u| + |r_x||x|, and a last place of each changes the unknowns by
 
-    ε |r_u⁻¹| (|r| + |r_u||u| + |r_x||x|)        (Skeel 1979),
+    ε |r_u⁻¹| (|r| + |r_u||u| + |r_x||x|)        (Skeel 1979).
 
-the roundoff of the unknowns. Without the ε this is the size of an unknown, and |r_u| times these sizes that of an equation.
-Both are rounded to powers of two, by which one multiplies without rounding, and scale with the units of lengths, masses and
-times: nothing in an engine is compared with 1.
+Without the ε this is the size of an unknown, and |r_u| times these sizes that of an equation. Data may be special, such as a
+link that hangs straight: what the derivatives are near them counts as well. All sizes are rounded to powers of two, by which one
+multiplies without rounding, and they scale with the units of lengths, masses and times: nothing in an engine is compared with 1.
+
+A velocity under constraints, whose size is |q|/h in short steps, is known to ε|q|/h. Where that is more than STALLED of what it
+comes to, v, or √(a|q|) where motion begins with the acceleration a, and where nothing that it is coupled to is known better, the
+step is too short for double precision, and the unknowns have that size instead: Newton's method will not converge.
 """
 
 from types import ModuleType
@@ -18,7 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Problem
+from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import inverse_sizes, power_of_two
+from dirax.numerics.tolerances import EPSILON
 from dirax.program.compiled import compiled
 
 
@@ -58,21 +64,48 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
         linear = linearized(p.equation, p.params, p.batch_params, u, state, t, h, number, True)
         if linear is None:
             return None
-        found.append(_sizes(*linear, u, state, np))
+        near = linearized(p.equation, p.params, p.batch_params, u, state * _nearby(state.shape[1]), t, h, number, True)
+        assert near is not None
+        found.append(_sizes(*linear, near[1], u, state, h[:, None], np))
     return tuple(found if p.batch is not None else [a[0] for a in found])
 
 
-def _sizes(residual: Any, slopes: Any, u: Any, state: Any, xp: ModuleType) -> Any:
-    """(…, 2, k) from r (…, k) and its derivatives by (u, x), (…, k, k + s)."""
-    k = u.shape[-1]
+NEAR = 1.0 / 16.0
+"""How much, relative, the data are changed to see what derivatives are near them."""
+
+
+COUPLED = 1e-8
+"""Unknowns that change each other by less than this of their sizes are not coupled."""
+
+ROUNDINGS = 64.0
+"""Roundings up to which an unknown is zero."""
+
+
+def _nearby(count: int) -> np.ndarray:
+    """A factor near 1 for each of so many numbers, all of them different."""
+    return 1.0 + NEAR * (np.modf(np.arange(1, count + 1) * (np.sqrt(5.0) - 1.0) / 2.0)[0] - 0.5)
+
+
+def _sizes(residual: Any, slopes: Any, near: Any, u: Any, state: Any, h: Any, xp: ModuleType) -> Any:
+    """(…, 2, k) from r (…, k) and its derivatives by (u, x, h) at the data and near them, (…, k, k + s + 1)."""
+    k, applied = u.shape[-1], lambda matrix, vector: (matrix @ vector[..., None])[..., 0]
+    finite = lambda sizes: xp.where(xp.isfinite(sizes), sizes, 0.0)
     with np.errstate(all="ignore"):
-        signed, slopes, numbers = slopes, xp.abs(slopes), xp.abs(xp.concatenate([u, state], axis=-1))
-        terms = xp.abs(residual) + (slopes @ numbers[..., None])[..., 0]
-        change = (inverse_sizes(signed[..., :k], xp) @ terms[..., None])[..., 0]
-        change = xp.where(xp.isfinite(change), change, xp.abs(u))  # of a singular equation
-        unknowns = power_of_two(change, xp)
-        equations = power_of_two((slopes[..., :k] @ unknowns[..., None])[..., 0], xp)
-    return xp.stack([unknowns, equations], axis=-2)
+        numbers, both = xp.abs(xp.concatenate([u, state], axis=-1)), (slopes, near)
+        inverses = [inverse_sizes(derivatives[..., :k], xp) for derivatives in both]
+        sizes = [
+            finite(applied(inverse, xp.abs(residual) + applied(xp.abs(derivatives[..., :-1]), numbers)))
+            for inverse, derivatives in zip(inverses, both, strict=True)
+        ]
+        reached = xp.abs(u) + xp.sqrt(finite(applied(inverses[0], xp.abs(h * slopes[..., -1]))) * sizes[0])
+        known = EPSILON * sizes[0] <= STALLED * reached
+        coupling = (finite(i @ xp.abs(d[..., :k])) for i, d in zip(inverses, both, strict=True))
+        coupled = xp.maximum(*coupling) * sizes[0][..., None, :] > COUPLED * sizes[0][..., None]
+        hidden = ~known & (xp.abs(u) > ROUNDINGS * EPSILON * sizes[0]) & ~xp.any(coupled & known[..., None, :], axis=-1)
+        too_short = xp.any(hidden, axis=-1, keepdims=True)
+        unknowns = power_of_two(xp.maximum(xp.where(too_short, reached, xp.maximum(*sizes)), xp.abs(u)), xp)
+        equations = (finite(applied(xp.abs(derivatives[..., :k]), unknowns)) for derivatives in both)
+        return xp.stack([unknowns, power_of_two(xp.maximum(*equations), xp)], axis=-2)
 
 
 def _arguments(p: Problem) -> tuple:
@@ -88,9 +121,15 @@ def _by_jax(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: Any
             if not stage.unknowns:
                 found.append(jnp.ones((2, 0)))
                 continue
-            residual = lambda u, x, stage=stage, fraction=fraction: stage.residual(u, x, t, fraction * h, params)
-            slopes = jnp.concatenate(jax.jacfwd(residual, argnums=(0, 1))(u, state), axis=1)
-            found.append(_sizes(residual(u, state), slopes, u, state, jnp))
+            residual = lambda u, x, h, stage=stage: stage.residual(u, x, t, h, params)
+            part = fraction * h
+
+            def slopes(x, u=u, residual=residual, part=part):
+                by_u, by_x, by_h = jax.jacfwd(residual, argnums=(0, 1, 2))(u, x, part)
+                return jnp.concatenate([by_u, by_x, by_h[:, None]], axis=1)
+
+            near = slopes(state * _nearby(len(state)))
+            found.append(_sizes(residual(u, state, part), slopes(state), near, u, state, part, jnp))
         return tuple(found)
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params

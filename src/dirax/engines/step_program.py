@@ -172,20 +172,20 @@ class StepProgram:
 
     @cached_property
     def slopes(self) -> tuple[Graph, list[list[int]]]:
-        """A graph of the step with the derivatives of every residual by its unknowns and its state, row by row."""
+        """A graph of the step with the derivatives of every residual by its unknowns, its state and h, row by row."""
         g = self.graph.copy()
-        inputs = [[*e.unknowns, *e.state] for e in self.equations]
+        inputs = [[*e.unknowns, *e.state, self.shared.h] for e in self.equations]
         rows = [jacobian(g, e.residual, i) for e, i in zip(self.equations, inputs, strict=True)]
         return g, [[row.get(j, g.zero) for row in r for j in range(len(i))] for r, i in zip(rows, inputs, strict=True)]
 
     def linearized(
         self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_state: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(residual, Jacobian) of a stage in numbers, (entries, k) and (entries, k, k), or (entries, k, k + s) with the columns
-        of the state; arguments have an axis of entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
+        """(residual, Jacobian) of a stage in numbers, (entries, k) and (entries, k, k), or (entries, k, k + s + 1) with the columns
+        of the state and of h; arguments have an axis of entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
         index = self.stages[stage][0]
         first, shared, graph = self.equations[index], self.shared, self.graph
-        inputs = [*first.unknowns, *first.state] if by_state else first.unknowns
+        inputs = [*first.unknowns, *first.state, shared.h] if by_state else first.unknowns
         k, few = len(first.unknowns), len(u) * len(inputs) * len(graph) <= IN_NUMBERS
         entries: list[int] = []
         if few:

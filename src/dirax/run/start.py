@@ -16,7 +16,8 @@ from dirax.run.validate import Case, spread
 class Initial(NamedTuple):
     """Initial data as the system completes them, each entry with a leading batch axis in a batch.
 
-    All that a scheme may start from, by name; how far the data are off the constraints, and the size of the velocity; the
+    All that a scheme may start from, by name; how far the data are off the constraints, and the sizes of their terms (of two
+    points, followed by those of the constraints of their step); the
     Lagrangian and the matrix [W; ∂g/∂q] of the constraints at the data, if the system has them.
     """
 
@@ -77,12 +78,11 @@ class _Completion(eqx.Module):
 
     def __call__(self, data, params, h, t0) -> Initial:
         system, complete = self.system, self.system.complete({**data, "t": t0}, params, self.project)
-        defect, size = system.initial_defect({**complete, "t": t0}, params), jnp.array(1.0)
-        if self.two_points:
-            size = jnp.max(jnp.abs(data["q1"] - data["q0"])) / h
-        elif "v" in complete:
-            size = jnp.max(jnp.abs(complete["v"]))
+        defect = system.initial_defect({**complete, "t": t0}, params)
         q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if self.two_points else (complete.get("q"), complete.get("v"))
+        size, form = jnp.ones(defect.shape), system.lagrangian_form()
+        if form is not None and v is not None and form.constraints.any:
+            size = form.initial_terms({**complete, "v": v, "t": t0}, params)
         lagrangian = None if q is None or v is None else system.lagrangian_value(t0, q, v, params)
         constraints = system.constraints.matrix(t0, system.point(complete), params) if system.constraints.any else None
         return Initial(complete, defect, size, lagrangian, constraints)
