@@ -6,7 +6,7 @@ At the first guess u and the first state x of a step with the residual r, the te
     ε |r_u⁻¹| (|r| + |r_u||u| + |r_x||x|)        (Skeel 1979).
 
 Without the ε this is the size of an unknown, and |r_u| times these sizes that of an equation. Data may be special, such as a
-link that hangs straight: what the derivatives are near them counts as well. All sizes are rounded to powers of two, by which one
+link that hangs straight: what the derivatives are near the end of the step counts as well. All sizes are rounded to powers of two, by which one
 multiplies without rounding, and they scale with the units of lengths, masses and times: nothing in an engine is compared with 1.
 
 A velocity under constraints, whose size is |q|/h in short steps, is known to ε|q|/h. Where that is more than STALLED of what it
@@ -23,7 +23,7 @@ import numpy as np
 
 from dirax.engines.contract import Problem
 from dirax.engines.stopping import STALLED
-from dirax.numerics.equilibration import inverse_sizes, power_of_two
+from dirax.numerics.equilibration import balanced_inverse, power_of_two
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.compiled import compiled
 
@@ -40,34 +40,55 @@ def sizes_by_jax(problem: Problem) -> tuple[jax.Array, ...]:
     """The same of a problem that JAX traces, without derivatives."""
     if problem.sizes is not None:
         return tuple(map(jnp.asarray, problem.sizes))
-    return jax.lax.stop_gradient(_by_jax(*_arguments(problem)))
+    return jax.lax.stop_gradient(sizes_at(*_arguments(problem)))
 
 
 def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
-    """By the scalar program of the step, equal stages side by side; None where it has none."""
-    from dirax.engines.step_program import linearized  # imported when it is used
+    """By the scalar program of the step, once for stages that are equal; None where it has none."""
+    from dirax.engines.step_program import step_program  # imported when it is used
+    from dirax.program.graph import GraphTooLarge
+    from dirax.program.interpreter import UnsupportedPrimitive
 
-    batch, stages = p.batch or 1, p.equation.stages
-    state = np.asarray(p.state, float).reshape(batch, -1)
-    t = np.full(batch, p.t0 + p.first_step * p.h)
-    found: list[np.ndarray] = []
-    for number, (stage, fraction) in enumerate(stages):
-        u = np.asarray(p.guess[number], float).reshape(batch, -1)
-        same = [i for i in range(number) if stages[i] == (stage, fraction) and np.array_equal(p.guess[i], p.guess[number])]
-        if same:
-            found.append(found[same[0]])
-            continue
-        if not stage.unknowns:
-            found.append(np.ones((batch, 2, 0)))
-            continue
-        h = np.full(batch, fraction * p.h)
-        linear = linearized(p.equation, p.params, p.batch_params, u, state, t, h, number, True)
-        if linear is None:
-            return None
-        near = linearized(p.equation, p.params, p.batch_params, u, state * _nearby(state.shape[1]), t, h, number, True)
-        assert near is not None
-        found.append(_sizes(*linear, near[1], u, state, h[:, None], np))
+    batch, stages, key = p.batch or 1, p.equation.stages, (p.params, p.batch_params)
+    t, state = np.full(batch, p.t0 + p.first_step * p.h), np.asarray(p.state, float).reshape(batch, -1)
+    guesses, h = [np.asarray(g, float).reshape(batch, -1) for g in p.guess], [np.full(batch, a * p.h) for _, a in stages]
+    firsts = _first_of_each(stages)
+    try:
+        program = step_program(p.equation, *key)
+        none = np.zeros((batch, 0)), np.zeros((batch, 0, state.shape[1] + 1))
+        linear = lambda i, u, x: program.linearized(*key, u, x, t, h[i], i, True) if u.shape[1] else none
+        here = {i: linear(i, guesses[i], state) for i in firsts}
+        end = state
+        for i in firsts:
+            u = _updated(*(here[i] if end is state else linear(i, guesses[i], end)), guesses[i], np)
+            end = program.advanced(*key, u, end, t, h[i], i)
+        end = end * _nearby(end.shape[1])
+        found: list[np.ndarray] = []
+        for i, (stage, u) in enumerate(zip(stages, guesses, strict=True)):
+            same = next((j for j in range(i) if stages[j] == stage and np.array_equal(guesses[j], u)), None)
+            if same is None:
+                residual, slopes = here[i] if i in here else linear(i, u, state)
+                found.append(_sizes(residual, slopes, linear(i, u, end)[1], u, state, end, h[i][:, None], np))
+            else:
+                found.append(found[same])
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return None
     return tuple(found if p.batch is not None else [a[0] for a in found])
+
+
+def _first_of_each(stages: tuple) -> list[int]:
+    """The number of the first stage with each of the equations."""
+    return [i for i, (stage, _) in enumerate(stages) if all(stage is not other for other, _ in stages[:i])]
+
+
+def _updated(residual: Any, slopes: Any, u: Any, xp: ModuleType) -> Any:
+    """The unknowns (…, k) after one update of Newton's method; as they were where that is not finite."""
+    k = u.shape[-1]
+    if not k:
+        return u
+    with np.errstate(all="ignore"):
+        change = (balanced_inverse(slopes[..., :k], xp) @ residual[..., None])[..., 0]
+    return u - xp.where(xp.all(xp.isfinite(change), axis=-1, keepdims=True), change, 0.0)
 
 
 NEAR = 1.0 / 16.0
@@ -75,7 +96,7 @@ NEAR = 1.0 / 16.0
 
 
 COUPLED = 1e-8
-"""Unknowns that change each other by less than this of their sizes are not coupled."""
+"""Unknowns that change others by less than this of their sizes are not coupled."""
 
 ROUNDINGS = 64.0
 """Roundings up to which an unknown is zero."""
@@ -86,22 +107,26 @@ def _nearby(count: int) -> np.ndarray:
     return 1.0 + NEAR * (np.modf(np.arange(1, count + 1) * (np.sqrt(5.0) - 1.0) / 2.0)[0] - 0.5)
 
 
-def _sizes(residual: Any, slopes: Any, near: Any, u: Any, state: Any, h: Any, xp: ModuleType) -> Any:
-    """(…, 2, k) from r (…, k) and its derivatives by (u, x, h) at the data and near them, (…, k, k + s + 1)."""
+def _sizes(residual: Any, slopes: Any, near: Any, u: Any, state: Any, end: Any, h: Any, xp: ModuleType) -> Any:
+    """(…, 2, k) from r (…, k) and its derivatives by (u, x, h) at the state and near the `end` of the step, (…, k, k + s + 1)."""
+    if not u.shape[-1]:
+        return xp.ones((*u.shape[:-1], 2, 0))
     k, applied = u.shape[-1], lambda matrix, vector: (matrix @ vector[..., None])[..., 0]
     finite = lambda sizes: xp.where(xp.isfinite(sizes), sizes, 0.0)
     with np.errstate(all="ignore"):
-        numbers, both = xp.abs(xp.concatenate([u, state], axis=-1)), (slopes, near)
-        inverses = [inverse_sizes(derivatives[..., :k], xp) for derivatives in both]
+        both, numbers = (slopes, near), [xp.abs(xp.concatenate([u, x], axis=-1)) for x in (state, end)]
+        solving = [balanced_inverse(derivatives[..., :k], xp) for derivatives in both]
+        inverses, solution = list(map(xp.abs, solving)), xp.abs(u - finite(applied(solving[0], residual)))
         sizes = [
-            finite(applied(inverse, xp.abs(residual) + applied(xp.abs(derivatives[..., :-1]), numbers)))
-            for inverse, derivatives in zip(inverses, both, strict=True)
+            finite(applied(inverse, xp.abs(residual) + applied(xp.abs(derivatives[..., :-1]), there)))
+            for inverse, derivatives, there in zip(inverses, both, numbers, strict=True)
         ]
-        reached = xp.abs(u) + xp.sqrt(finite(applied(inverses[0], xp.abs(h * slopes[..., -1]))) * sizes[0])
+        reached = solution + xp.sqrt(finite(applied(inverses[0], xp.abs(h * slopes[..., -1]))) * sizes[0])
         known = EPSILON * sizes[0] <= STALLED * reached
         coupling = (finite(i @ xp.abs(d[..., :k])) for i, d in zip(inverses, both, strict=True))
         coupled = xp.maximum(*coupling) * sizes[0][..., None, :] > COUPLED * sizes[0][..., None]
-        hidden = ~known & (xp.abs(u) > ROUNDINGS * EPSILON * sizes[0]) & ~xp.any(coupled & known[..., None, :], axis=-1)
+        coupled = coupled & xp.swapaxes(coupled, -1, -2)
+        hidden = ~known & (solution > ROUNDINGS * EPSILON * sizes[0]) & ~xp.any(coupled & known[..., None, :], axis=-1)
         too_short = xp.any(hidden, axis=-1, keepdims=True)
         unknowns = power_of_two(xp.maximum(xp.where(too_short, reached, xp.maximum(*sizes)), xp.abs(u)), xp)
         equations = (finite(applied(xp.abs(derivatives[..., :k]), unknowns)) for derivatives in both)
@@ -114,26 +139,27 @@ def _arguments(p: Problem) -> tuple:
     return p.equation, jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), jax.tree.map(jnp.asarray, p.params), t, h, axes
 
 
-def _by_jax(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: Any, axes: tuple | None) -> tuple:
+def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: Any, axes: tuple | None = None) -> tuple:
+    """The sizes of each stage of a step from a state, over a batch with the `axes` of (state, guess, params), by JAX."""
     def one(state, guess, params):
-        found = []
-        for (stage, fraction), u in zip(equation.stages, guess, strict=True):
-            if not stage.unknowns:
-                found.append(jnp.ones((2, 0)))
-                continue
-            residual = lambda u, x, h, stage=stage: stage.residual(u, x, t, h, params)
-            part = fraction * h
+        def linear(i, u, x):
+            stage, fraction = equation.stages[i]
+            residual = lambda u, x, h: stage.residual(u, x, t, h, params)
+            by_u, by_x, by_h = jax.jacfwd(residual, argnums=(0, 1, 2))(u, x, fraction * h)
+            return residual(u, x, fraction * h), jnp.concatenate([by_u, by_x, by_h[:, None]], axis=1)
 
-            def slopes(x, u=u, residual=residual, part=part):
-                by_u, by_x, by_h = jax.jacfwd(residual, argnums=(0, 1, 2))(u, x, part)
-                return jnp.concatenate([by_u, by_x, by_h[:, None]], axis=1)
-
-            near = slopes(state * _nearby(len(state)))
-            found.append(_sizes(residual(u, state, part), slopes(state), near, u, state, part, jnp))
+        end, found = state, []
+        for i in _first_of_each(equation.stages):
+            stage, fraction = equation.stages[i]
+            end = stage.advance(_updated(*linear(i, guess[i], end), guess[i], jnp), end, t, fraction * h, params)
+        end = end * _nearby(len(state))
+        for i, u in enumerate(guess):
+            near = linear(i, u, end)[1]
+            found.append(_sizes(*linear(i, u, state), near, u, state, end, equation.stages[i][1] * h, jnp))
         return tuple(found)
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params
     return one(*given) if axes is None else jax.vmap(one, in_axes=axes)(*given)
 
 
-_compiled = compiled(_by_jax)
+_compiled = compiled(sizes_at)

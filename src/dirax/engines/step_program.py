@@ -208,6 +208,18 @@ class StepProgram:
         return residual, slopes
 
 
+    def advanced(self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0) -> np.ndarray:
+        """The state after a stage in numbers, (entries, s); arguments as above."""
+        shared, count, e = self.shared, len(u), self.equations[self.stages[stage][0]]
+        leaves = self.parameters.flatten(params, count if batch_params else None)
+        known, leaves = Values(self.graph, count), np.broadcast_to(leaves, (count, self.parameters.size))
+        node = lambda nodes: np.asarray(nodes, dtype=np.int64)
+        bound = (e.unknowns, u), (e.state, state), (shared.t, t), (shared.h, h), (shared.params, leaves)
+        for nodes, array in bound:
+            known.bind(node(nodes), array)
+        return known.read(node(e.advance))
+
+
 _programs: Memo[StepProgram | UnsupportedPrimitive] = Memo(KEPT)
 
 

@@ -73,13 +73,13 @@ def power_of_two(sizes: Any, xp: ModuleType = np) -> Any:
     return xp.ldexp(xp.ones_like(sizes), exponents - 1)
 
 
-def inverse_sizes(matrix: Any, xp: ModuleType = np) -> Any:
-    """|A⁻¹| of matrices (…, k, k), NaN of a singular one."""
+def balanced_inverse(matrix: Any, xp: ModuleType = np) -> Any:
+    """A⁻¹ of matrices (…, k, k), whatever the units of rows and columns; NaN of a singular one."""
     rows, columns = geometric_scales(xp.abs(matrix), xp)
     scaled = matrix / rows / columns
     found = _inverted(scaled) if xp is np else xp.linalg.inv(scaled)
     turned = lambda a: xp.swapaxes(a, -1, -2)
-    return xp.abs(found) / turned(columns) / turned(rows)
+    return found / turned(columns) / turned(rows)
 
 
 def _inverted(matrices: np.ndarray) -> np.ndarray:
