@@ -196,18 +196,21 @@ class LagrangeDirac(AbstractSystem):
         """The sizes of the terms of `initial_defect`; for two points, of it and of the constraints of their step."""
         t = data.get("t", 0.0)
         if "q0" not in data:
-            return self._terms(t, data["q"], data["v"], params)
-        first, step = (self._terms(t, data[q], data["v"], params) for q in ("q0", "q1"))
+            return self.constraint_terms(t, data["q"], data["v"], params)
+        first, step = (self.constraint_terms(t, data[q], data["v"], params) for q in ("q0", "q1"))
         m = self.constraints.one_forms_at(t, data["q0"], params).shape[0]
         c = (first.shape[0] - m) // 2
         return jnp.concatenate([first[m : m + c], step[: m + c]])
 
-    def _terms(self, t, q, v, params):
-        """With the speed that each coordinate would have alone at this kinetic energy."""
+    def speeds(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " n"]:
+        """How fast each coordinate would be that had the kinetic energy alone; 0 where L is degenerate in it."""
         metric = jnp.abs(jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v))
         along, own = jnp.abs(v) @ metric @ jnp.abs(v), jnp.diagonal(metric)
-        speed = jnp.sqrt(jnp.where(own > 0.0, along / jnp.where(own > 0.0, own, 1.0), 0.0))
-        return self.constraints.terms(t, q, v, speed, params)
+        return jnp.sqrt(jnp.where(own > 0.0, along / jnp.where(own > 0.0, own, 1.0), 0.0))
+
+    def constraint_terms(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
+        """The sizes of the terms of (W v + b, g, G v + ∂g/∂t), for each coordinate as fast as the kinetic energy makes it."""
+        return self.constraints.terms(t, q, v, self.speeds(t, q, v, params), params)
 
     def _velocity(self, row: Data, params: Any) -> Float[Numbers, " n"]:
         """The velocity that belongs to the saved momentum."""
