@@ -14,6 +14,7 @@ comes to, v, or √(a|q|) where motion begins with the acceleration a, and where
 step is too short for double precision, and the unknowns have that size instead: Newton's method will not converge.
 """
 
+import dataclasses
 from types import ModuleType
 from typing import Any
 
@@ -41,6 +42,24 @@ def sizes_by_jax(problem: Problem) -> tuple[jax.Array, ...]:
     if problem.sizes is not None:
         return tuple(map(jnp.asarray, problem.sizes))
     return jax.lax.stop_gradient(sizes_at(*_arguments(problem)))
+
+
+def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple, sizes: tuple) -> tuple:
+    """The sizes of trajectories at which Newton's method stopped too early or not at all, and which of them grew: the largest of
+    those where they began and of those where they stand, after `completed` steps at `state` (lanes, s) with the unknowns `guess`.
+
+    Data may be so special where a run begins that an unknown has no size there. Everything has an axis of the `lanes`."""
+    p = problem
+    moved = lambda a: np.asarray(a)[lanes] if p.batch is not None else np.asarray(a)[None][lanes]
+    params = jax.tree.map(moved, p.params) if p.batch_params else p.params
+    here = dataclasses.replace(
+        p, state=state, guess=guess, params=params, batch=len(lanes), first_step=p.first_step + completed, sizes=None
+    )
+    found = _in_numbers(here)
+    if found is None:
+        return sizes, np.zeros(len(lanes), bool)
+    more = np.any([np.any(new[:, 0] > old[:, 0], axis=1) for new, old in zip(found, sizes, strict=True)], axis=0)
+    return tuple(np.maximum(new, old) for new, old in zip(found, sizes, strict=True)), more
 
 
 def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
@@ -114,9 +133,11 @@ def _sizes(residual: Any, slopes: Any, near: Any, u: Any, state: Any, end: Any, 
     k, applied = u.shape[-1], lambda matrix, vector: (matrix @ vector[..., None])[..., 0]
     finite = lambda sizes: xp.where(xp.isfinite(sizes), sizes, 0.0)
     with np.errstate(all="ignore"):
-        both, numbers = (slopes, near), [xp.abs(xp.concatenate([u, x], axis=-1)) for x in (state, end)]
+        both = slopes, near
         solving = [balanced_inverse(derivatives[..., :k], xp) for derivatives in both]
         inverses, solution = list(map(xp.abs, solving)), xp.abs(u - finite(applied(solving[0], residual)))
+        largest = xp.maximum(xp.abs(u), solution)
+        numbers = [xp.concatenate([largest, xp.abs(x)], axis=-1) for x in (state, end)]
         sizes = [
             finite(applied(inverse, xp.abs(residual) + applied(xp.abs(derivatives[..., :-1]), there)))
             for inverse, derivatives, there in zip(inverses, both, numbers, strict=True)

@@ -7,8 +7,9 @@ import numpy as np
 from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem, Progress, finished
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.native.collocation_kernels import collocation_kernels
-from dirax.engines.native.kernels import kernels
+from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
+from dirax.engines.sizes import grown
 from dirax.program.interpreter import UnsupportedPrimitive
 
 CHUNK_SECONDS = 0.1
@@ -83,8 +84,10 @@ def run(p: Problem, progress: Progress | None = None) -> Outcome:
                 progress(done, p.steps)
     except KeyboardInterrupt:
         interrupted = True
-    if nodes is not None and not interrupted:
-        _by_newton(lanes, outs)
+    if not interrupted:
+        if nodes is not None:
+            _by_newton(lanes, outs)
+        _with_present_sizes(lanes, kernels(p.equation, p.params, p.batch_params, p.compensated) if nodes is None else None, outs)
     run_seconds = time.perf_counter() - started
     closing, outs = lanes.arrays(2)
     lanes.call(kernel, lanes.records.copy(), outs, 0, 1, 1, threads)
@@ -130,3 +133,41 @@ def _by_newton(lanes: Lanes, outs: np.ndarray) -> None:
         one[:, record.status] = OK
         one[:, record.differences] = 0.0
         lanes.call(newton, one, outs[lane : lane + 1], int(one[0, record.completed, 0]), p.steps, p.save_every, 1, lane)
+
+
+RESUMED = 16
+"""How often trajectories go on with other sizes."""
+
+
+def _with_present_sizes(lanes: Lanes, made: Kernels | None, outs: np.ndarray) -> None:
+    """Go on with trajectories whose unknowns have become larger than where they began: one by one, since each is at another
+    step, and with the bits that it has alone. An attempt that does not come to another step leaves no trace."""
+    p, record = lanes.problem, lanes.record
+    failed = np.flatnonzero(lanes.table()[:, record.status] == NOT_CONVERGED)
+    for _ in range(RESUMED if made is not None else 0):
+        if not len(failed):
+            return
+        table = lanes.table().copy()
+        assert made is not None
+        own, stages = table[failed], [stage.unknowns for stage, _ in p.equation.stages]
+        places = [record.sizes(i, k) for i, k in enumerate(stages)]
+        before = tuple(np.stack([own[:, part] for part in pair], axis=1) for pair in places)
+        guess = tuple(own[:, record.unknowns(i, k)] for i, k in enumerate(stages))
+        sizes, more = grown(p, failed, own[:, record.completed], own[:, record.state], guess, before)
+        if not np.any(more):
+            return
+        for pair, values in zip(places, sizes, strict=True):
+            for part, numbers in zip(pair, np.moveaxis(values, 1, 0), strict=True):
+                own[:, part] = numbers
+        own[more, record.status] = OK
+        chosen, kernel = failed[more], made.kernel(1)[0]
+        alone = lanes.alone(chosen, made, tuple(a[more] for a in sizes))
+        alone.records[:] = own[more][:, :, None]
+        blocks, places_in = np.divmod(chosen, lanes.width)
+        addresses = np.ascontiguousarray(outs[blocks, :, places_in][:, :, None])
+        for i, done in enumerate(own[more, record.completed].astype(int).tolist()):
+            one = slice(i, i + 1)
+            alone.call(kernel, alone.records[one], addresses[one], done, p.steps, p.save_every, 1, i)
+        further = alone.records[:, record.completed, 0] > own[more, record.completed]
+        lanes.records[blocks[further], :, places_in[further]] = alone.records[further, :, 0]
+        failed = chosen[further & (alone.records[:, record.status, 0] == NOT_CONVERGED)]

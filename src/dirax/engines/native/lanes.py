@@ -1,11 +1,13 @@
 """The trajectories of a run in memory: records in blocks of lanes, saved arrays, and calls of a kernel on several threads."""
 
+import dataclasses
 import itertools
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 
+import jax
 import numpy as np
 
 from dirax.engines.contract import OK, Problem
@@ -74,6 +76,15 @@ class Lanes:
         self.ends_before = [not p.is_node(name) for name in self.shapes]
         self.sizes = [math.prod(shape) for shape in self.shapes.values()]
         self._at = self.params.ctypes.data, self.params.strides[0]
+
+    def alone(self, numbers: np.ndarray, made: Kernels, sizes: tuple) -> "Lanes":
+        """Some of the trajectories, each in a block of its own, of these sizes."""
+        p, count = self.problem, len(numbers)
+        of = lambda a: np.asarray(a).reshape(self.lanes, *np.shape(a)[int(p.batch is not None) :])[numbers]
+        params = jax.tree.map(of, p.params) if p.batch_params else p.params
+        guess = tuple(map(of, p.guess))
+        chosen = dataclasses.replace(p, state=of(p.state), guess=guess, params=params, batch=count, sizes=sizes)
+        return Lanes(chosen, made, 1)
 
     def _blocked(self, table: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(table[self.source].reshape(self.blocks, self.width, -1).swapaxes(1, 2))
