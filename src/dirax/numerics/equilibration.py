@@ -82,6 +82,12 @@ def balanced_inverse(matrix: Any, xp: ModuleType = np) -> Any:
     return found / turned(columns) / turned(rows)
 
 
+def balanced_condition(matrix: np.ndarray) -> float:
+    """The condition number of a matrix whose rows and columns have units of their own."""
+    rows, columns = geometric_scales(np.abs(matrix))
+    return float(np.linalg.cond(matrix / rows / columns))
+
+
 def _inverted(matrices: np.ndarray) -> np.ndarray:
     try:
         return np.linalg.inv(matrices)

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import NOT_FINITE, OK, Outcome, Problem
+from dirax.engines.sizes import sizes_of
 from dirax.engines.stopping import STALLED
+from dirax.numerics.equilibration import balanced_condition, balanced_inverse
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
 
 SMALLER = "a smaller step may help"
@@ -49,14 +51,14 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     """The stages of the failing step are replayed one by one, to see where it breaks."""
     params = jax.tree.map(lambda a: jnp.asarray(a[lane] if p.batch_params else a), p.params)
     state, last = jnp.asarray(outcome.last_state[lane]), jnp.asarray(outcome.last_unknowns[lane])
-    solved = []
-    for stage, fraction in p.equation.stages:
+    solved, sizes = [], [np.asarray(a)[lane if p.batch is not None else ...][0] for a in sizes_of(p)]
+    for (stage, fraction), size in zip(p.equation.stages, sizes, strict=True):
         args = (state, jnp.asarray(t), fraction * p.h, params)
         guess = jnp.asarray(stage.guess(state, last if len(last) == stage.unknowns else jnp.zeros(stage.unknowns), *args[2:]))
-        reason, u = _replay_newton(stage, guess, args, p.max_iterations)
+        reason, u = _replay_newton(stage, guess, args, size, p.max_iterations)
         if reason:
             return reason
-        solved.append((stage, guess, args))
+        solved.append((stage, guess, args, size))
         state, t = stage.advance(u, *args), t + fraction * p.h
         if not np.all(np.isfinite(state)):
             return "the new state is not finite: it has left the domain of the system's functions, or overflowed"
@@ -64,38 +66,39 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     return f"Newton did not converge from the values extrapolated from the steps before: {advice}"
 
 
-def _replay_newton(stage, guess, args, max_iterations: int):
-    """(what went wrong or nothing, unknowns) of one stage."""
+def _replay_newton(stage, guess, args, sizes, max_iterations: int):
+    """(what went wrong or nothing, unknowns) of one stage, whose unknowns have these sizes."""
     u = guess
     if not stage.unknowns:
         return "", u
     evaluate = jax.jit(lambda u: (stage.residual(u, *args), jax.jacfwd(stage.residual)(u, *args)))
-    size, worst, condition = np.inf, 0, np.nan
+    update, worst, condition = np.inf, 0, np.nan
     for iteration in range(max_iterations):
         residual, jacobian = (np.asarray(a) for a in evaluate(u))
         broken = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
         if np.any(broken):
             label = stage.labels[int(np.argmax(broken))]
             return f"{label} is not finite (outside the domain of the system's functions) in Newton iteration {iteration + 1}", u
-        worst, condition = int(np.argmax(np.abs(residual))), np.linalg.cond(jacobian)
+        worst, condition = int(np.argmax(np.abs(residual))), balanced_condition(jacobian)
         if not condition < LARGEST_CONDITION:
             return f"the Jacobian of the step is singular (condition number {condition:.2g})", u
         change = np.linalg.solve(jacobian, residual)
-        u, size = u - change, np.max(np.abs(change) / (np.abs(u) + 1.0))
-    if size < STALLED:
+        u = u - change
+        update = np.max(np.abs(change) / (np.abs(u) + sizes))
+    if update < STALLED:
         return "", u
     return (
         f"Newton did not converge in {max_iterations} iterations (largest residual in {stage.labels[worst]}, "
-        f"condition number {condition:.2g}): {_advice(stage, guess, args)}"
+        f"condition number {condition:.2g}): {_advice(stage, guess, args, sizes)}"
     ), u
 
 
-def _advice(stage, u, args) -> str:
+def _advice(stage, u, args, sizes) -> str:
     """What to do about a stage without a root: a larger step where roundoff hides it, and hides less of it in a larger one."""
     state, t, h, params = args
     if not stage.unknowns:
         return SMALLER
-    here, there = (_roundoff(stage, u, (state, t, step, params)) for step in (h, 10 * h))
+    here, there = (_roundoff(stage, u, (state, t, step, params), sizes) for step in (h, 10 * h))
     if not (here > STALLED and there < here / 2):
         return SMALLER
     return (
@@ -104,12 +107,12 @@ def _advice(stage, u, args) -> str:
     )
 
 
-def _roundoff(stage, u, args) -> float:
+def _roundoff(stage, u, args, sizes) -> float:
     """The change of the unknowns, relative to their size, that follows from a last place of every number that the residual
     is a function of."""
     by_u, by_state = map(np.asarray, jax.jacfwd(stage.residual, argnums=(0, 1))(u, *args))
     left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
-    if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and np.linalg.cond(by_u) < LARGEST_CONDITION):
+    if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and balanced_condition(by_u) < LARGEST_CONDITION):
         return np.inf
-    change = EPSILON * np.abs(np.linalg.inv(by_u)) @ left
-    return float(np.max(change / (np.abs(u) + 1.0)))
+    change = EPSILON * np.abs(balanced_inverse(by_u)) @ left
+    return float(np.max(change / (np.abs(u) + sizes)))

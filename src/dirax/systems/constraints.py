@@ -127,8 +127,8 @@ class Constraints(eqx.Module):
         return jnp.concatenate([first, self.position_defect(t, q, params), self.hidden_defect(t, q, v, params)])
 
     def terms(
-        self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], speed: Float[Array, " n"], params: Any
-    ) -> Float[Array, " k"]:
+        self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], speed: Float[Numbers, " n"], params: Any
+    ) -> Float[Numbers, " k"]:
         """The sizes of the terms of `defect` at velocities as large as |v| + `speed`: a coordinate that does not move, of a system
         that does, misses its constraint by a rounding of how fast it could."""
         at = jnp.asarray(t, float)

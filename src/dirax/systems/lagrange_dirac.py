@@ -202,13 +202,13 @@ class LagrangeDirac(AbstractSystem):
         c = (first.shape[0] - m) // 2
         return jnp.concatenate([first[m : m + c], step[: m + c]])
 
-    def speeds(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " n"]:
+    def speeds(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " n"]:
         """How fast each coordinate would be that had the kinetic energy alone; 0 where L is degenerate in it."""
         metric = jnp.abs(jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v))
         along, own = jnp.abs(v) @ metric @ jnp.abs(v), jnp.diagonal(metric)
         return jnp.sqrt(jnp.where(own > 0.0, along / jnp.where(own > 0.0, own, 1.0), 0.0))
 
-    def constraint_terms(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, " k"]:
+    def constraint_terms(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " k"]:
         """The sizes of the terms of (W v + b, g, G v + ∂g/∂t), for each coordinate as fast as the kinetic energy makes it."""
         return self.constraints.terms(t, q, v, self.speeds(t, q, v, params), params)
 
