@@ -75,19 +75,18 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
     try:
         program = step_program(p.equation, *key)
         none = np.zeros((batch, 0)), np.zeros((batch, 0, state.shape[1] + 1))
-        linear = lambda i, u, x: program.linearized(*key, u, x, t, h[i], i, True) if u.shape[1] else none
-        here = {i: linear(i, guesses[i], state) for i in firsts}
+        linear = lambda i, u, x, part: program.linearized(*key, u, x, t, part * h[i], i, True) if u.shape[1] else none
         end = state
         for i in firsts:
-            u = _updated(*(here[i] if end is state else linear(i, guesses[i], end)), guesses[i], np)
-            end = program.advanced(*key, u, end, t, h[i], i)
+            u = _updated(*linear(i, guesses[i], end, SHORT), guesses[i], np)
+            end = program.advanced(*key, u, end, t, SHORT * h[i], i)
         end = end * _nearby(end.shape[1])
         found: list[np.ndarray] = []
         for i, (stage, u) in enumerate(zip(stages, guesses, strict=True)):
             same = next((j for j in range(i) if stages[j] == stage and np.array_equal(guesses[j], u)), None)
             if same is None:
-                residual, slopes = here[i] if i in here else linear(i, u, state)
-                found.append(_sizes(residual, slopes, linear(i, u, end)[1], u, state, end, h[i][:, None], np))
+                short, near = linear(i, u, state, SHORT)[1], linear(i, u, end, SHORT)[1]
+                found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, state, end, h[i][:, None], np))
             else:
                 found.append(found[same])
     except (UnsupportedPrimitive, GraphTooLarge):
@@ -110,11 +109,14 @@ def _updated(residual: Any, slopes: Any, u: Any, xp: ModuleType) -> Any:
     return u - xp.where(xp.all(xp.isfinite(change), axis=-1, keepdims=True), change, 0.0)
 
 
+SHORT = 0.25
+"""The part of a step whose equations are inverted: those of a step that is too long may be singular anywhere."""
+
 NEAR = 1.0 / 16.0
 """How much, relative, the data are changed to see what derivatives are near them."""
 
 
-COUPLED = 1e-8
+COUPLED = 1e-3
 """Unknowns that change others by less than this of their sizes are not coupled."""
 
 ROUNDINGS = 64.0
@@ -126,28 +128,33 @@ def _nearby(count: int) -> np.ndarray:
     return 1.0 + NEAR * (np.modf(np.arange(1, count + 1) * (np.sqrt(5.0) - 1.0) / 2.0)[0] - 0.5)
 
 
-def _sizes(residual: Any, slopes: Any, near: Any, u: Any, state: Any, end: Any, h: Any, xp: ModuleType) -> Any:
-    """(…, 2, k) from r (…, k) and its derivatives by (u, x, h) at the state and near the `end` of the step, (…, k, k + s + 1)."""
+def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, state: Any, end: Any, h: Any, xp: ModuleType) -> Any:
+    """(…, 2, k) from r (…, k) and its derivatives by (u, x, h) at the state, and those of a short step there and near its `end`,
+    (…, k, k + s + 1)."""
     if not u.shape[-1]:
         return xp.ones((*u.shape[:-1], 2, 0))
     k, applied = u.shape[-1], lambda matrix, vector: (matrix @ vector[..., None])[..., 0]
     finite = lambda sizes: xp.where(xp.isfinite(sizes), sizes, 0.0)
     with np.errstate(all="ignore"):
         both = slopes, near
-        solving = [balanced_inverse(derivatives[..., :k], xp) for derivatives in both]
-        inverses, solution = list(map(xp.abs, solving)), xp.abs(u - finite(applied(solving[0], residual)))
+        inverse = balanced_inverse(slopes[..., :k], xp)
+        solution = xp.abs(u - finite(applied(inverse, residual)))
         largest = xp.maximum(xp.abs(u), solution)
-        numbers = [xp.concatenate([largest, xp.abs(x)], axis=-1) for x in (state, end)]
-        sizes = [
-            finite(applied(inverse, xp.abs(residual) + applied(xp.abs(derivatives[..., :-1]), there)))
-            for inverse, derivatives, there in zip(inverses, both, numbers, strict=True)
+        terms = [
+            xp.abs(residual) + applied(xp.abs(derivatives[..., :-1]), xp.concatenate([largest, xp.abs(x)], axis=-1))
+            for derivatives, x in zip(both, (state, end), strict=True)
         ]
-        reached = solution + xp.sqrt(finite(applied(inverses[0], xp.abs(h * slopes[..., -1]))) * sizes[0])
-        known = EPSILON * sizes[0] <= STALLED * reached
-        coupling = (finite(i @ xp.abs(d[..., :k])) for i, d in zip(inverses, both, strict=True))
-        coupled = xp.maximum(*coupling) * sizes[0][..., None, :] > COUPLED * sizes[0][..., None]
+        inverses = [xp.abs(balanced_inverse(derivatives[..., :k], xp)) for derivatives in (short, near)]
+        sizes = [finite(applied(inverse, of)) for inverse, of in zip(inverses, terms, strict=True)]
+
+        blurred = EPSILON * finite(applied(xp.abs(inverse), terms[0]))
+        moved = finite(applied(xp.abs(inverse), xp.abs(h * slopes[..., -1])))
+        reached = solution + xp.sqrt(moved * blurred / EPSILON)
+        known = blurred <= STALLED * reached
+        coupling = (finite(i @ xp.abs(d[..., :k])) for i, d in zip((xp.abs(inverse), inverses[1]), both, strict=True))
+        coupled = xp.maximum(*coupling) * blurred[..., None, :] > COUPLED * blurred[..., None]
         coupled = coupled & xp.swapaxes(coupled, -1, -2)
-        hidden = ~known & (solution > ROUNDINGS * EPSILON * sizes[0]) & ~xp.any(coupled & known[..., None, :], axis=-1)
+        hidden = ~known & (solution > ROUNDINGS * blurred) & ~xp.any(coupled & known[..., None, :], axis=-1)
         too_short = xp.any(hidden, axis=-1, keepdims=True)
         unknowns = power_of_two(xp.maximum(xp.where(too_short, reached, xp.maximum(*sizes)), xp.abs(u)), xp)
         equations = (finite(applied(xp.abs(derivatives[..., :k]), unknowns)) for derivatives in both)
@@ -163,20 +170,21 @@ def _arguments(p: Problem) -> tuple:
 def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: Any, axes: tuple | None = None) -> tuple:
     """The sizes of each stage of a step from a state, over a batch with the `axes` of (state, guess, params), by JAX."""
     def one(state, guess, params):
-        def linear(i, u, x):
+        def linear(i, u, x, part):
             stage, fraction = equation.stages[i]
             residual = lambda u, x, h: stage.residual(u, x, t, h, params)
-            by_u, by_x, by_h = jax.jacfwd(residual, argnums=(0, 1, 2))(u, x, fraction * h)
-            return residual(u, x, fraction * h), jnp.concatenate([by_u, by_x, by_h[:, None]], axis=1)
+            by_u, by_x, by_h = jax.jacfwd(residual, argnums=(0, 1, 2))(u, x, part * fraction * h)
+            return residual(u, x, part * fraction * h), jnp.concatenate([by_u, by_x, by_h[:, None]], axis=1)
 
         end, found = state, []
         for i in _first_of_each(equation.stages):
             stage, fraction = equation.stages[i]
-            end = stage.advance(_updated(*linear(i, guess[i], end), guess[i], jnp), end, t, fraction * h, params)
+            u = _updated(*linear(i, guess[i], end, SHORT), guess[i], jnp)
+            end = stage.advance(u, end, t, SHORT * fraction * h, params)
         end = end * _nearby(len(state))
         for i, u in enumerate(guess):
-            near = linear(i, u, end)[1]
-            found.append(_sizes(*linear(i, u, state), near, u, state, end, equation.stages[i][1] * h, jnp))
+            short, near = linear(i, u, state, SHORT)[1], linear(i, u, end, SHORT)[1]
+            found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, state, end, equation.stages[i][1] * h, jnp))
         return tuple(found)
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params

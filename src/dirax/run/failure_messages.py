@@ -99,20 +99,22 @@ def _advice(stage, u, args, sizes) -> str:
     if not stage.unknowns:
         return SMALLER
     here, there = (_roundoff(stage, u, (state, t, step, params), sizes) for step in (h, 10 * h))
-    if not (here > STALLED and there < here / 2):
+    hidden = (here > STALLED) & (there < here / 2)
+    if not np.any(hidden):
         return SMALLER
+    here = np.max(here[hidden])
     return (
         f"the step h = {float(h):.3g} is too small for double precision, in which the rounding of the state and of the unknowns "
         f"changes these by {here:.1g} of their size: take a larger step"
     )
 
 
-def _roundoff(stage, u, args, sizes) -> float:
-    """The change of the unknowns, relative to their size, that follows from a last place of every number that the residual
+def _roundoff(stage, u, args, sizes) -> np.ndarray:
+    """The change of each unknown, relative to their size, that follows from a last place of every number that the residual
     is a function of."""
     by_u, by_state = map(np.asarray, jax.jacfwd(stage.residual, argnums=(0, 1))(u, *args))
     left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
     if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and balanced_condition(by_u) < LARGEST_CONDITION):
-        return np.inf
+        return np.full(len(u), np.inf)
     change = EPSILON * np.abs(balanced_inverse(by_u)) @ left
-    return float(np.max(change / (np.abs(u) + sizes)))
+    return change / (np.abs(u) + sizes)

@@ -41,18 +41,19 @@ def solve(
     guess: Float[Array, " k"],
     args: tuple[Any, ...],
     max_iterations: int,
-    sizes: Float[Array, "2 k"],
+    sizes: Float[Array, "2 k"] | None = None,
     running: Any = True,
     jacobian: Callable[..., Float[Array, "k k"]] | None = None,
     linear_solver: AbstractLinearSolver | None = None,
 ) -> tuple[Float[Array, " k"], Int[Array, ""], Bool[Array, ""]]:
     """(u, number of updates, converged) of residual(u, *args) = 0; not for reverse mode, see `as_function`.
 
-    `sizes` are those of the unknowns and of the equations (`dirax/engines/sizes.py`). The guess comes back where `running` is false. `jacobian(u, *args)` is that of the residual, derived here where it is not
+    `sizes` are those of the unknowns and of the equations (`dirax/engines/sizes.py`), 1 where they are not given. The guess comes back where `running` is false. `jacobian(u, *args)` is that of the residual, derived here where it is not
     given; `linear_solver` is `Dense()` where none is.
     """
     if guess.shape[0] == 0:
         return guess, jnp.zeros((), jnp.int64), jnp.array(True)
+    sizes = jnp.ones((2, guess.shape[0])) if sizes is None else sizes
     equation = lambda u: residual(u, *args)
     slopes = (lambda u: jacobian(u, *args)) if jacobian else jax.jacfwd(equation)
     found = newton(equation, slopes, linear_solver or Dense(), guess, max_iterations, sizes, running)
