@@ -163,3 +163,47 @@ def test_verdicts_in_other_units():
         for units in (Units(), UNITS[0], UNITS[2]):
             report = dx.verify(case.run(units, scheme, "native"))
             assert "VIOLATED" not in [line.verdict for line in report.lines]
+
+
+def test_a_bicycle_that_goes_nearly_straight():
+    """The rate of a constraint whose terms all vanish at upright is judged by how fast they could be, not by roundoff."""
+
+    def forms(q):
+        x, _, turn, steer, *_ = q
+        rear = jnp.stack([-jnp.sin(turn), jnp.cos(turn), 0 * x, 0 * x, 0 * x])
+        return jnp.stack([rear, jnp.stack([-jnp.sin(turn + steer), jnp.cos(turn + steer), 1.2 * jnp.cos(steer), 0 * x, 0 * x])])
+
+    inertia = jnp.array([10.0, 10.0, 2.0, 0.1, 10.0])
+    bicycle = dx.LagrangeDirac(
+        lambda q, v: v @ (inertia * v) / 2 - 98.1 * q[4],
+        forms,
+        holonomic=lambda q: jnp.stack([q[4] + 0.3 * jnp.cos(q[3]) - 0.3]),
+    )
+    for steer, rate in ((1e-5, -1e-4), (0.0, 0.0)):
+        data = {"q": [0.0, 0.0, 0.0, steer, 0.0], "v": [4.0, 0.0, 0.0, rate, 0.0]}
+        sol = dx.simulate(bicycle, dx.LagrangeDAlembert(), **data, step=0.01, steps=60, project=True)
+        assert sol.ok and "VIOLATED" not in [line.verdict for line in dx.verify(sol).lines]
+
+
+def chain():
+    """Three links of a machine, of centimetres and grams, one of them hanging straight."""
+
+    def lagrangian(q, v):
+        masses = jnp.repeat(jnp.array([0.05, 0.007, 0.003]), 2)
+        return v @ (masses * v) / 2 - 9.81 * (masses * q)[1::2].sum()
+
+    def links(q):
+        a, b, c = q[:2], q[2:4], q[4:]
+        return jnp.stack([a @ a - 0.03**2, (b - a) @ (b - a) - 0.02**2, (c - b) @ (c - b) - 0.04**2])
+
+    return dx.LagrangeDirac(lagrangian, holonomic=links)
+
+
+@pytest.mark.parametrize("step", [1e-3, 1e-5, 1e-6])
+def test_short_steps_of_a_composition_go_on_at_their_floor(step):
+    q = np.array([0.018, -0.024, 0.038, -0.024, 0.038, -0.064])
+    scheme = dx.Composition(dx.LagrangeDAlembert(), "kahan-li6")
+    sol = dx.simulate(chain(), scheme, q=q, v=np.zeros(6), step=step, steps=60)
+    assert sol.ok
+    energy = np.asarray(sol.energy())
+    assert np.max(np.abs(energy - energy[0])) < 1e-12

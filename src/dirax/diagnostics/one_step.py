@@ -40,7 +40,7 @@ def differentiated_step(equation: Any, h: Any, state, guess, t, params) -> Diffe
 
 
 def _sizes(stage: Any, u, state, t, h, params):
-    """The sizes of the unknowns of a step near u, as `dirax.engines.sizes` has them but for their rounding; 1 for its equations."""
+    """The sizes of the unknowns near u, as `dirax.engines.sizes` has them but for their rounding; 1 for the equations."""
     if not stage.unknowns:
         return jnp.ones((2, 0))
     by_u, by_state = jax.jacfwd(lambda u, x: stage.residual(u, x, t, h, params), argnums=(0, 1))(u, state)

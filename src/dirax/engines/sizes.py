@@ -6,10 +6,11 @@ At the first guess u and the first state x of a step with the residual r, the te
     ε |r_u⁻¹| (|r| + |r_u||u| + |r_x||x|)        (Skeel 1979).
 
 Without the ε this is the size of an unknown, and |r_u| times these sizes that of an equation. Data may be special, such as a
-link that hangs straight: what the derivatives are near the end of the step counts as well. All sizes are rounded to powers of two, by which one
-multiplies without rounding, and they scale with the units of lengths, masses and times: nothing in an engine is compared with 1.
+link that hangs straight: what the derivatives are near the end of a short step counts as well. All sizes are rounded to powers
+of two, by which one multiplies without rounding, and they scale with the units of lengths, masses and times: nothing in an
+engine is compared with 1.
 
-A velocity under constraints, whose size is |q|/h in short steps, is known to ε|q|/h. Where that is more than STALLED of what it
+A velocity under constraints, whose size is |q|/h in short steps, is known to ε|q|/h. Where that is more than 4·STALLED of what it
 comes to, v, or √(a|q|) where motion begins with the acceleration a, and where nothing that it is coupled to is known better, the
 step is too short for double precision, and the unknowns have that size instead: Newton's method will not converge.
 """
@@ -150,7 +151,7 @@ def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, state: Any
         blurred = EPSILON * finite(applied(xp.abs(inverse), terms[0]))
         moved = finite(applied(xp.abs(inverse), xp.abs(h * slopes[..., -1])))
         reached = solution + xp.sqrt(moved * blurred / EPSILON)
-        known = blurred <= STALLED * reached
+        known = blurred <= 4.0 * STALLED * reached
         coupling = (finite(i @ xp.abs(d[..., :k])) for i, d in zip((xp.abs(inverse), inverses[1]), both, strict=True))
         coupled = xp.maximum(*coupling) * blurred[..., None, :] > COUPLED * blurred[..., None]
         coupled = coupled & xp.swapaxes(coupled, -1, -2)
@@ -169,6 +170,7 @@ def _arguments(p: Problem) -> tuple:
 
 def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: Any, axes: tuple | None = None) -> tuple:
     """The sizes of each stage of a step from a state, over a batch with the `axes` of (state, guess, params), by JAX."""
+
     def one(state, guess, params):
         def linear(i, u, x, part):
             stage, fraction = equation.stages[i]

@@ -181,8 +181,8 @@ class StepProgram:
     def linearized(
         self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_state: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(residual, Jacobian) of a stage in numbers, (entries, k) and (entries, k, k), or (entries, k, k + s + 1) with the columns
-        of the state and of h; arguments have an axis of entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
+        """(residual, Jacobian) of a stage in numbers, (entries, k) and (entries, k, k), or (entries, k, k + s + 1) with columns of
+        the state and of h; arguments have an axis of entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
         index = self.stages[stage][0]
         first, shared, graph = self.equations[index], self.shared, self.graph
         inputs = [*first.unknowns, *first.state, shared.h] if by_state else first.unknowns
@@ -206,7 +206,6 @@ class StepProgram:
 
         residual, slopes = in_parts(part, [u, state, t, h, np.broadcast_to(leaves, (len(u), self.parameters.size))])
         return residual, slopes
-
 
     def advanced(self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0) -> np.ndarray:
         """The state after a stage in numbers, (entries, s); arguments as above."""

@@ -50,8 +50,9 @@ def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     It does for a saddle point [M, Wᵀ; W, 0] what largest entries cannot: M and W come out of one size, however small M is."""
     there = sizes > 0.0
     logs = xp.where(there, xp.log2(xp.where(there, sizes, 1.0)), 0.0)
-    mean = lambda a, axis: xp.sum(xp.where(there, a, 0.0), axis=axis, keepdims=True) / xp.maximum(
-        xp.sum(there.astype(float), axis=axis, keepdims=True), 1.0
+    mean = lambda a, axis: (
+        xp.sum(xp.where(there, a, 0.0), axis=axis, keepdims=True)
+        / xp.maximum(xp.sum(there.astype(float), axis=axis, keepdims=True), 1.0)
     )
     columns = xp.zeros((*sizes.shape[:-2], 1, sizes.shape[-1]))
     rows = mean(logs, -1)

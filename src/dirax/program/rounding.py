@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
-from dirax.program.graph_derivatives import partials
 from dirax.program.graph import Graph, GraphTooLarge
+from dirax.program.graph_derivatives import partials
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive, elementwise, rule
 from dirax.program.memo import Memo, Same
 from dirax.program.primitives import plain_primitive

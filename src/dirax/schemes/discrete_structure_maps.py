@@ -163,9 +163,9 @@ class LiftedPairs(AbstractDiscreteStructure):
         if not self.constrained:
             return jnp.stack([jnp.stack([first, whole]), jnp.stack([of_momentum, of_force])])
         outside = force - annihilator_projector(constraints.matrix(t, base(z)[0], params)) @ force
-        missed = jnp.concatenate([jnp.stack([first, jnp.max(jnp.abs(outside))]), jnp.abs(constraint), whole[None]])
+        numbers = jnp.concatenate([jnp.stack([first, jnp.max(jnp.abs(outside))]), jnp.abs(constraint), whole[None]])
         sizes = jnp.concatenate([jnp.stack([of_momentum, of_force]), scales[2], of_force[None]])
-        return jnp.stack([missed, sizes])
+        return jnp.stack([numbers, sizes])
 
 
 def structure_on_cotangent_bundle(

@@ -129,8 +129,8 @@ class Constraints(eqx.Module):
     def terms(
         self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], speed: Float[Numbers, " n"], params: Any
     ) -> Float[Numbers, " k"]:
-        """The sizes of the terms of `defect` at velocities as large as |v| + `speed`: a coordinate that does not move, of a system
-        that does, misses its constraint by a rounding of how fast it could."""
+        """The sizes of the terms of `defect` at velocities as large as |v| + `speed`: a coordinate that does not move, of a
+        system that does, misses its constraint by a rounding of how fast it could."""
         at = jnp.asarray(t, float)
         fastest, w = jnp.abs(v) + speed, self.one_forms_at(t, q, params)
         first = jnp.abs(w) @ fastest

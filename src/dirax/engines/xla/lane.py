@@ -72,8 +72,8 @@ def first_lane(state, guess: tuple, xp=jnp, compensated: bool = False) -> Lane:
 def take_step(
     equation, lane: Lane, t, h, params, sizes, max_iterations: int, differentiable: bool = True, numerics: Numerics | None = None
 ) -> tuple[Lane, tuple, tuple]:
-    """One step of every stage, of unknowns and equations of these `sizes`; the lane after it (unchanged where it had failed or the step fails), and of each stage the
-    unknowns and the state that it left.
+    """One step of every stage, of unknowns and equations of these `sizes`; the lane after it (unchanged where it had failed or
+    the step fails), and of each stage the unknowns and the state that it left.
 
     With `differentiable` it can be differentiated in reverse mode too, and no derivative passes through a step that failed."""
     linear_solver, *known = numerics or Numerics()
@@ -109,7 +109,7 @@ def take_step(
 
     carry = (lane.state, lane.lost, jnp.asarray(t, float), lane.status, jnp.zeros_like(lane.iterations), lane.max_residual)
     if len(stages) > 1 and len({(stage.residual, stage.advance, stage.guess) for stage in stages}) == 1:
-        one = lambda carry, given: solved(carry, *given, stages[0], increments[0], jacobians[0])
+        one = lambda carry, given: solved(carry, given[0], given[1], given[2], stages[0], increments[0], jacobians[0])
         given = jnp.array(fractions), jnp.stack(lane.history), jnp.stack(sizes)
         carry, (histories, solutions, left) = jax.lax.scan(one, carry, given)
         history, unknowns, states = tuple(histories), tuple(solutions), tuple(left)

@@ -48,8 +48,9 @@ def solve(
 ) -> tuple[Float[Array, " k"], Int[Array, ""], Bool[Array, ""]]:
     """(u, number of updates, converged) of residual(u, *args) = 0; not for reverse mode, see `as_function`.
 
-    `sizes` are those of the unknowns and of the equations (`dirax/engines/sizes.py`), 1 where they are not given. The guess comes back where `running` is false. `jacobian(u, *args)` is that of the residual, derived here where it is not
-    given; `linear_solver` is `Dense()` where none is.
+    `sizes` are those of the unknowns and of the equations (`dirax/engines/sizes.py`), 1 where they are not given. The guess comes
+    back where `running` is false. `jacobian(u, *args)` is that of the residual, derived here where it is not given;
+    `linear_solver` is `Dense()` where none is.
     """
     if guess.shape[0] == 0:
         return guess, jnp.zeros((), jnp.int64), jnp.array(True)

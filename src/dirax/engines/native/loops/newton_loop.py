@@ -21,9 +21,7 @@ class NewtonLoop:
     After `emit`, `converged` and `count` are, by lane, whether the floor was reached and the number of updates.
     """
 
-    def __init__(
-        self, equation: TracedEquation, correction: Correction, around: Region, unknowns: list[str], sizes: list[str]
-    ):
+    def __init__(self, equation: TracedEquation, correction: Correction, around: Region, unknowns: list[str], sizes: list[str]):
         self.equation, self.correction, self.around = equation, correction, around
         self.unknowns, self.sizes = unknowns, sizes
         self.e: Emitter = around.emitter

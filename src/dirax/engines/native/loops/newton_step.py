@@ -45,7 +45,9 @@ def newton_correction(g: Graph, equation: TracedEquation, rows: list[dict[int, i
     factors = Factors(g, matrix, order, sizes)
     right = [g.input(f"right{i}") for i in range(k)]
     again = factors.solve(g, right)
-    return Correction(matrix, factors.solve(g, equation.residual), factors.stable, order, right, again, sorted(factors.nodes), sizes)
+    return Correction(
+        matrix, factors.solve(g, equation.residual), factors.stable, order, right, again, sorted(factors.nodes), sizes
+    )
 
 
 def pivot_order(g: Graph, matrix: list[list[int]]) -> list[tuple[int, int]]:

@@ -11,7 +11,8 @@ class Record:
     """The layout of a lane's record. Every quantity is a double, counters too, and stands `width` times, once a lane.
 
     state · for each stage the unknowns of the step before, their first differences, their second, the sizes of unknowns, those
-    of equations · what rounding took from the state (with compensated summation) · good steps · outcome of the last · updates of Newton's method · largest residual.
+    of equations · what rounding took from the state (with compensated summation) · good steps · outcome of the last · updates of
+    Newton's method · largest residual.
     """
 
     state_size: int
