@@ -181,8 +181,8 @@ class StepProgram:
     def linearized(
         self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_state: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(residual, Jacobian) of a stage in numbers, (entries, k) and (entries, k, k), or (entries, k, k + s + 1) with columns of
-        the state and of h; arguments have an axis of entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
+        """(residual, Jacobian) of a stage in numbers, (entries, k) and (entries, k, k), or (entries, k, k + s + 1) with those
+        of the state and of h; arguments have an axis of entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
         index = self.stages[stage][0]
         first, shared, graph = self.equations[index], self.shared, self.graph
         inputs = [*first.unknowns, *first.state, shared.h] if by_state else first.unknowns
