@@ -77,16 +77,17 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
         program = step_program(p.equation, *key)
         none = np.zeros((batch, 0)), np.zeros((batch, 0, state.shape[1] + 1))
         linear = lambda i, u, x, part: program.linearized(*key, u, x, t, part * h[i], i, True) if u.shape[1] else none
-        end = state
+        end, first = state, linear(0, guesses[0], state, SHORT)
         for i in firsts:
-            u = _updated(*linear(i, guesses[i], end, SHORT), guesses[i], np)
+            u = _updated(*(linear(i, guesses[i], end, SHORT) if i else first), guesses[i], np)
             end = program.advanced(*key, u, end, t, SHORT * h[i], i)
         end = end * _nearby(end.shape[1])
         found: list[np.ndarray] = []
         for i, (stage, u) in enumerate(zip(stages, guesses, strict=True)):
             same = next((j for j in range(i) if stages[j] == stage and np.array_equal(guesses[j], u)), None)
             if same is None:
-                short, near = linear(i, u, state, SHORT)[1], linear(i, u, end, SHORT)[1]
+                short = linear(i, u, state, SHORT)[1] if i else first[1]
+                near = linear(i, u, end, SHORT)[1]
                 found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, state, end, h[i][:, None], np))
             else:
                 found.append(found[same])
