@@ -7,6 +7,7 @@ import pytest
 
 import dirax as dx
 from dirax.engines import policy
+from dirax.engines.sizes import sizes_at
 from dirax.engines.xla.lane import first_lane, take_step
 from dirax.schemes.step import Shape, make_step_equation
 
@@ -69,6 +70,7 @@ def test_equal_stages_are_compiled_once():
     for made in (dx.Composition(scheme, [1.0]), dx.Composition(scheme, "suzuki4")):
         equation = make_step_equation(made, SYSTEM, shape)
         lane = first_lane(jnp.ones(8), tuple(jnp.ones(stage.unknowns) for stage, _ in equation.stages))
-        step = lambda lane, h, c, equation=equation: take_step(equation, lane, 0.0, h, c, 50, False)
+        units = sizes_at(equation, lane.state, lane.unknowns, {"g": 9.81}, 0.0, 0.1)
+        step = lambda lane, h, c, equation=equation, units=units: take_step(equation, lane, 0.0, h, c, units, 50, False)
         sizes.append(len(jax.jit(step).lower(lane, 0.1, {"g": 9.81}).as_text()))
     assert sizes[1] < 1.5 * sizes[0]

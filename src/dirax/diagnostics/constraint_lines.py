@@ -11,6 +11,7 @@ from dirax.diagnostics.energy_lines import energy_terms
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import constraint_of, over_rows, times_at
 from dirax.diagnostics.verdicts import SAMPLED_ROWS, judged, of_lane, roundoff_limit, sampled_terms, spread, worst_place
+from dirax.numerics.tolerances import TINY
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.solution.solution import Solution
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -57,21 +58,23 @@ def hidden_constraint(sol: Solution, tolerance: float | None) -> Line | None:
         return None
     items = (times_at(sol, np.arange(sol.rows)), np.asarray(sol.q), np.asarray(sol.p))
     values = over_rows(eqx.Partial(_hidden_terms, system), sol, items)
-    scale = float(np.nanmax(values[..., 1])) or 1.0
-    lane, row = worst_place(values[..., 0])
+    scale = np.nanmax(values[:, :, 1], axis=(0, 1))
+    missed = np.max(values[:, :, 0] / np.where(scale > 0, scale, TINY), axis=2)
+    lane, row = worst_place(missed)
     text = f"∂g/∂q v + ∂g/∂t at each row, relative to its terms, worst at t = {float(sol.t[row]):.6g}{of_lane(sol, lane)}"
-    return judged(sol, "hidden constraint", np.nanmax(values[..., 0], axis=1) / scale, roundoff_limit(tolerance, 1), text)
+    return judged(sol, "hidden constraint", np.nanmax(missed, axis=1), roundoff_limit(tolerance, 1), text)
 
 
 def _hidden_terms(system: LagrangeDirac, t, q, p, params: Any):
-    """The largest |G v + ∂g/∂t|, and the largest of |∂(G v + ∂g/∂t)/∂(q, p)||(q, p)|."""
+    """|G v + ∂g/∂t|, and the sizes of the terms of these and of |∂(G v + ∂g/∂t)/∂(q, p)||(q, p)|."""
 
     def defect(q, p):
         return system.constraints.hidden_defect(t, q, system.inverse_legendre(q, p, params, t=t), params)
 
     of_q, of_p = jax.jacfwd(defect, argnums=(0, 1))(q, p)
-    size = jnp.abs(of_q) @ jnp.abs(q) + jnp.abs(of_p) @ jnp.abs(p)
-    return jnp.stack([jnp.max(jnp.abs(defect(q, p))), jnp.max(size)])
+    size, missed = jnp.abs(of_q) @ jnp.abs(q) + jnp.abs(of_p) @ jnp.abs(p), jnp.abs(defect(q, p))
+    terms = system.constraint_terms(t, q, system.inverse_legendre(q, p, params, t=t), params)
+    return jnp.stack([missed, size + terms[-len(missed) :]])
 
 
 def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str) -> Any:
@@ -80,16 +83,18 @@ def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str)
     if isinstance(structure, AbstractDiscreteStructure) and structure.own_constraints:
         q = np.asarray(sol.q)
         speed = np.abs(np.diff(q, axis=-2)) / (sol.step * sol.save_every)
-        speed = np.nanmax(speed, axis=tuple(range(speed.ndim - 1)), initial=0.0) + 1.0
+        speed = np.nanmax(speed, axis=tuple(range(speed.ndim - 1)), initial=0.0)
         rows = spread(sol.rows, SAMPLED_ROWS)
         items = {"t": times_at(sol, rows), "q": q[..., rows, :]}
         scale = np.nanmax(over_rows(eqx.Partial(_own_size, structure, speed), sol, (items,)), axis=(0, 1))
-        return np.where(scale > 0, scale, 1.0)
+        return np.where(scale > 0, scale, TINY)
     if sol.system is None:
         nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
-        return float(max(1.0, *(np.nanmax(np.abs(a)) for a in nodes)))
-    terms = energy_terms if sol.system.constrains_differential else _constraint_terms
-    return float(np.nanmax(sampled_terms(sol, terms))) or 1.0
+        return float(max(np.nanmax(np.abs(a)) for a in nodes)) or TINY
+    if sol.system.constrains_differential:
+        return float(np.nanmax(sampled_terms(sol, energy_terms))) or TINY
+    scale = np.nanmax(sampled_terms(sol, _constraint_terms), axis=(0, 1))
+    return np.where(scale > 0, scale, TINY)
 
 
 def _own_size(structure: AbstractDiscreteStructure, speed, row: dict, params: Any):
@@ -97,7 +102,11 @@ def _own_size(structure: AbstractDiscreteStructure, speed, row: dict, params: An
 
 
 def _constraint_terms(system: Any, t, row: dict, params: Any):
-    """Σ |∂c/∂row_i| |row_i|, the largest over the constraints c."""
+    """The sizes of the terms of the constraints: of a Lagrangian system, those of each; else Σ |∂c/∂row_i| |row_i|, the largest
+    over the constraints c."""
+    form = system.lagrangian_form()
+    if form is not None and "p" in row:
+        return form.constraint_terms(t, row["q"], form.inverse_legendre(row["q"], row["p"], params, t=t), params)
     derivative = jax.jacfwd(lambda row: system.constraint_at({**row, "t": t}, params))(row)
     terms = (jnp.abs(derivative[name]).reshape(derivative[name].shape[0], -1) @ jnp.abs(row[name]).ravel() for name in row)
-    return jnp.max(sum(terms), initial=0.0)
+    return jnp.max(sum(terms), initial=0.0)[None]

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from dirax.engines.xla.lane import first_lane, take_step
 from dirax.numerics.equilibration import condition_number
+from dirax.numerics.tolerances import TINY
 from dirax.program.linear_solves import solve
 from dirax.schemes.discrete_structure import DifferentiatedStep
 
@@ -19,7 +20,8 @@ def differentiated_step(equation: Any, h: Any, state, guess, t, params) -> Diffe
     With r(u, x) = 0 and x' = a(u, x) of each stage, ∂x'/∂x = ∂_x a − ∂_u a (∂_u r)⁻¹ ∂_x r.
     """
     lane = first_lane(state, (guess,) * len(equation.stages))
-    after, unknowns, _ = take_step(equation, lane, t, h, params, MAX_ITERATIONS, differentiable=False)
+    sizes = tuple(_sizes(stage, guess, state, t, fraction * h, params) for stage, fraction in equation.stages)
+    after, unknowns, _ = take_step(equation, lane, t, h, params, sizes, MAX_ITERATIONS, differentiable=False)
     jacobian, condition = jnp.eye(state.shape[0]), jnp.ones(())
     for (stage, fraction), u in zip(equation.stages, unknowns, strict=True):
 
@@ -35,3 +37,13 @@ def differentiated_step(equation: Any, h: Any, state, guess, t, params) -> Diffe
         t = t + fraction * h
     good = after.completed > 0
     return DifferentiatedStep(jnp.where(good, state, jnp.nan), jnp.where(good, jacobian, jnp.nan), condition)
+
+
+def _sizes(stage: Any, u, state, t, h, params):
+    """The sizes of the unknowns near u, as `dirax.engines.sizes` has them but for their rounding; 1 for the equations."""
+    if not stage.unknowns:
+        return jnp.ones((2, 0))
+    by_u, by_state = jax.jacfwd(lambda u, x: stage.residual(u, x, t, h, params), argnums=(0, 1))(u, state)
+    terms = jnp.abs(by_u) @ jnp.abs(u) + jnp.abs(by_state) @ jnp.abs(state)
+    size = jnp.abs(solve(by_u, jnp.eye(len(u)))) @ terms
+    return jnp.stack([jnp.where(size > TINY, size, TINY), jnp.ones(len(u))])

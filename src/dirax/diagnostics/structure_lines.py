@@ -41,8 +41,7 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     if sol.rows < points:
         return [Line(name, None, None, NOT_CHECKED, f"needs {WORDS[points]} points, but only {sol.rows} were saved")]
     items = consecutive(sol, structure.reads, points, np.arange(sol.rows - points + 1))
-    values = over_rows(eqx.Partial(_missed, structure), sol, (items,))
-    values = where_reached(values, items)
+    values = _relative(where_reached(over_rows(eqx.Partial(_terms, structure), sol, (items,)), items), structure.counts)
     parts, middle, lines, first = [part for claim in structure.claims for part in claim.parts], (points - 1) // 2, [], 0
     if "q0" in sol.initial:
         values[:, 0, [parts.index(part) for part in structure.given]] = 0.0  # the first pair was given, not computed
@@ -58,8 +57,18 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     return lines
 
 
-def _missed(structure: AbstractDiscreteStructure, rows, params):
-    return structure.membership_defect(rows, params)
+def _terms(structure: AbstractDiscreteStructure, rows, params):
+    return structure.membership_terms(rows, params)
+
+
+def _relative(values: np.ndarray, counts: tuple[int, ...]) -> np.ndarray:
+    """By how much each part is missed, (B, rows, parts), of (B, rows, 2, numbers): each number relative to the largest size of
+    its terms over the trajectory."""
+    missed, sizes = values[:, :, 0], values[:, :, 1]
+    largest = np.max(np.where(np.isfinite(sizes), sizes, 0.0), axis=1, keepdims=True)
+    relative = np.divide(missed, largest, out=np.where(missed > 0.0, np.inf, 0.0), where=largest > 0.0)
+    ends = np.cumsum(counts)[:-1]
+    return np.stack([np.max(part, axis=2, initial=0.0) for part in np.split(relative, ends, axis=2)], axis=2)
 
 
 def symplecticity(sol: Solution, tolerance: float | None) -> Line:

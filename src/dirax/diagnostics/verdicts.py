@@ -21,7 +21,7 @@ def where_reached(values: np.ndarray, items: dict[str, np.ndarray]) -> np.ndarra
     """The values (B, rows, …), 0 at rows whose items (…, rows, …) were not reached, and infinite where finite ones give no
     finite value."""
     finite = [np.all(np.isfinite(a).reshape(*values.shape[:2], -1), axis=-1) for a in items.values()]
-    reached = np.logical_and.reduce(finite)[..., None]
+    reached = np.logical_and.reduce(finite).reshape(*values.shape[:2], *(1,) * (values.ndim - 2))
     return np.where(reached, np.where(np.isfinite(values), values, np.inf), 0.0)
 
 

@@ -190,14 +190,30 @@ class StepProgram:
 
         return jax.jit(function)  # so that JAX traces it once for all the places that a loop has it in
 
-    def linearized(self, params: Any, batch_params: bool, u, state, t, h) -> tuple[np.ndarray, np.ndarray]:
-        """(residual, Jacobian) of the first stage in numbers, (entries, k) and (entries, k, k); arguments have an axis of
-        entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
-        first, shared, graph = self.equations[self.stages[0][0]], self.shared, self.graph
-        k, few = len(first.unknowns), len(u) * len(first.unknowns) * len(graph) <= IN_NUMBERS
-        rows = [] if few else self.jacobians[self.stages[0][0]]
-        entries = [row.get(j, graph.zero) for row in rows for j in range(k)]
-        graph = graph.copy() if few else graph
+    @cached_property
+    def slopes(self) -> tuple[Graph, list[list[int]]]:
+        """A graph of the step with the derivatives of every residual by its unknowns, its state and h, row by row."""
+        g = self.graph.copy()
+        inputs = [[*e.unknowns, *e.state, self.shared.h] for e in self.equations]
+        rows = [jacobian(g, e.residual, i) for e, i in zip(self.equations, inputs, strict=True)]
+        return g, [[row.get(j, g.zero) for row in r for j in range(len(i))] for r, i in zip(rows, inputs, strict=True)]
+
+    def linearized(
+        self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_state: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(residual, Jacobian) of a stage in numbers, (entries, k) and (entries, k, k), or (entries, k, k + s + 1) with those
+        of the state and of h; arguments have an axis of entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
+        index = self.stages[stage][0]
+        first, shared, graph = self.equations[index], self.shared, self.graph
+        inputs = [*first.unknowns, *first.state, shared.h] if by_state else first.unknowns
+        k, few = len(first.unknowns), len(u) * len(inputs) * len(graph) <= IN_NUMBERS
+        entries: list[int] = []
+        if few:
+            graph = graph.copy()
+        elif by_state:
+            graph, entries = self.slopes[0], self.slopes[1][index]
+        else:
+            entries = [row.get(j, graph.zero) for row in self.jacobians[index] for j in range(k)]
         node = lambda nodes: np.asarray(nodes, dtype=np.int64)
         leaves = self.parameters.flatten(params, len(u) if batch_params else None)
 
@@ -205,11 +221,22 @@ class StepProgram:
             known = Values(graph, len(arguments[0]))
             for nodes, array in zip((first.unknowns, first.state, shared.t, shared.h, shared.params), arguments, strict=True):
                 known.bind(node(nodes), array)
-            slopes = known.slopes(first.residual, first.unknowns) if few else known.read(node(entries).reshape(k, k))
+            slopes = known.slopes(first.residual, inputs) if few else known.read(node(entries).reshape(k, -1))
             return [known.read(node(first.residual)), slopes]
 
         residual, slopes = in_parts(part, [u, state, t, h, np.broadcast_to(leaves, (len(u), self.parameters.size))])
         return residual, slopes
+
+    def advanced(self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0) -> np.ndarray:
+        """The state after a stage in numbers, (entries, s); arguments as above."""
+        shared, count, e = self.shared, len(u), self.equations[self.stages[stage][0]]
+        leaves = self.parameters.flatten(params, count if batch_params else None)
+        known, leaves = Values(self.graph, count), np.broadcast_to(leaves, (count, self.parameters.size))
+        node = lambda nodes: np.asarray(nodes, dtype=np.int64)
+        bound = (e.unknowns, u), (e.state, state), (shared.t, t), (shared.h, h), (shared.params, leaves)
+        for nodes, array in bound:
+            known.bind(node(nodes), array)
+        return known.read(node(e.advance))
 
 
 _programs: Memo[StepProgram | UnsupportedPrimitive] = Memo(KEPT)
@@ -231,9 +258,11 @@ def step_program(equation: Any, params: Any, batch_params: bool) -> StepProgram:
     return found
 
 
-def linearized(equation: Any, params: Any, batch_params: bool, u, state, t, h) -> tuple[np.ndarray, np.ndarray] | None:
+def linearized(
+    equation: Any, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_state: bool = False
+) -> tuple[np.ndarray, np.ndarray] | None:
     """`StepProgram.linearized`; None for a step that is no scalar program."""
     try:
-        return step_program(equation, params, batch_params).linearized(params, batch_params, u, state, t, h)
+        return step_program(equation, params, batch_params).linearized(params, batch_params, u, state, t, h, stage, by_state)
     except (UnsupportedPrimitive, GraphTooLarge):
         return None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from dirax.numerics.equilibration import equilibrated
+from dirax.numerics.equilibration import equilibrated, geometric_scales
 from dirax.numerics.tolerances import EQUATION_RANK, RANK_GAP, RANK_ROUNDOFF, STRUCTURE_RANK, TINY
 
 
@@ -30,11 +30,16 @@ def numerical_rank(values: np.ndarray, tolerance: float, least: float = TINY) ->
 def rank_of_equations(matrices: np.ndarray, tolerance: float = EQUATION_RANK) -> tuple[np.ndarray, np.ndarray]:
     """The ranks (B,) of matrices (B, k, l) whose rows and columns have units of their own, and the directions (B, l) nearest
     to their kernels, with a largest entry of 1, in the units of the unknowns."""
-    scaled, units = equilibrated(np.array(matrices, dtype=float))
+    matrices = np.array(matrices, dtype=float)
+    scaled, units = equilibrated(matrices)
     _, values, vt = np.linalg.svd(scaled)
+    ranks = numerical_rank(values, tolerance)
     directions = vt[:, -1] * units[:, 0]
+    if np.any(low := ranks < matrices.shape[2]):  # largest entries cannot balance a saddle point with small masses
+        rows, columns = geometric_scales(np.abs(matrices[low]))
+        ranks[low] = np.maximum(ranks[low], numerical_rank(np.linalg.svd(matrices[low] / rows / columns)[1], tolerance))
     directions /= np.max(np.abs(directions), axis=1, keepdims=True)
-    return numerical_rank(values, tolerance), directions
+    return ranks, directions
 
 
 SURE = 1e8

@@ -86,7 +86,7 @@ POINT_DEFECT = 1e-8
 leaves after a long run, less than any mistake."""
 
 CONSTRAINT_DEFECT = 1e-9
-"""Of constraints at initial data and at nodes, relative to 1 and to the size of the point or of the velocity."""
+"""Of constraints at initial data and at nodes, relative to the sizes of their terms."""
 
 ON_MANIFOLD = 1e-10
 """Of conditions at a point that Gauss–Newton has put on their zeros, relative to their derivative and to the point."""

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import NOT_FINITE, OK, Outcome, Problem
+from dirax.engines.sizes import sizes_of
 from dirax.engines.stage_in_numbers import InJax, InNumbers, in_numbers
 from dirax.engines.stopping import STALLED
+from dirax.numerics.equilibration import balanced_condition, balanced_inverse
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
 from dirax.program.roots import FEWEST_SPARSE, sparse_equations
 
@@ -52,16 +54,16 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     """The stages of the failing step are replayed one by one, to see where it breaks."""
     params = jax.tree.map(lambda a: np.asarray(a[lane] if p.batch_params else a), p.params)
     state, last = np.asarray(outcome.last_state[lane]), np.asarray(outcome.last_unknowns[lane])
-    solved, known = [], {}
-    for stage, fraction in p.equation.stages:
+    solved, known, sizes = [], {}, [a[lane if p.batch is not None else ...][0] for a in sizes_of(p)]
+    for (stage, fraction), size in zip(p.equation.stages, sizes, strict=True):
         if id(stage) not in known:
             known[id(stage)] = in_numbers(stage, params)
         numbers, h = known[id(stage)], fraction * p.h
         guess = numbers.guess(state, last if len(last) == stage.unknowns else np.zeros(stage.unknowns), h)
-        reason, u = _replay_newton(stage, numbers, guess, (state, t, h), params, p.max_iterations)
+        reason, u = _replay_newton(stage, numbers, guess, (state, t, h), params, size, p.max_iterations)
         if reason:
             return reason
-        solved.append((stage, numbers, guess, (state, t, h)))
+        solved.append((stage, numbers, guess, (state, t, h), size))
         state, t = numbers.advance(u, state, t, h), t + h
         if not np.all(np.isfinite(state)):
             return "the new state is not finite: it has left the domain of the system's functions, or overflowed"
@@ -69,13 +71,13 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     return f"Newton did not converge from the values extrapolated from the steps before: {advice}"
 
 
-def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, max_iterations: int):
-    """(what went wrong or nothing, unknowns) of one stage."""
+def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, sizes, max_iterations: int):
+    """(what went wrong or nothing, unknowns) of one stage, whose unknowns have these sizes."""
     u = guess
     if not stage.unknowns:
         return "", u
     linearized = _sparse(stage, (*args, params)) or _dense(numbers, args)
-    size, worst, condition = np.inf, 0, np.nan
+    update, worst, condition = np.inf, 0, np.nan
     for iteration in range(max_iterations):
         residual, broken, solve, condition = linearized(u)
         if np.any(broken):
@@ -85,12 +87,13 @@ def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, max_i
         if not condition < LARGEST_CONDITION:
             return f"the Jacobian of the step is singular (condition number {condition:.2g})", u
         change = solve(residual)
-        u, size = u - change, np.max(np.abs(change) / (np.abs(u) + 1.0))
-    if size < STALLED:
+        u = u - change
+        update = np.max(np.abs(change) / (np.abs(u) + sizes))
+    if update < STALLED:
         return "", u
     return (
         f"Newton did not converge in {max_iterations} iterations (largest residual in {stage.labels[worst]}, "
-        f"condition number {condition:.2g}): {_advice(stage, numbers, guess, args)}"
+        f"condition number {condition:.2g}): {_advice(stage, numbers, guess, args, sizes)}"
     ), u
 
 
@@ -100,7 +103,7 @@ def _dense(numbers: InNumbers | InJax, args) -> Callable:
     def linearized(u):
         residual, jacobian = numbers.linearized(u, *args)
         broken = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
-        condition = np.inf if np.any(broken) else np.linalg.cond(jacobian)
+        condition = np.inf if np.any(broken) else balanced_condition(jacobian)
         return residual, broken, lambda right: np.linalg.solve(jacobian, right), condition
 
     return linearized
@@ -131,26 +134,28 @@ def _sparse(stage, args) -> Callable | None:
     return linearized
 
 
-def _advice(stage, numbers: InNumbers | InJax, u, args) -> str:
+def _advice(stage, numbers: InNumbers | InJax, u, args, sizes) -> str:
     """What to do about a stage without a root: a larger step where roundoff hides it, and hides less of it in a larger one."""
     state, t, h = args
     if not 0 < stage.unknowns < FEWEST_SPARSE:
         return SMALLER
-    here, there = (_roundoff(numbers, u, (state, t, step)) for step in (h, 10 * h))
-    if not (here > STALLED and there < here / 2):
+    here, there = (_roundoff(numbers, u, (state, t, step), sizes) for step in (h, 10 * h))
+    hidden = (here > STALLED) & (there < here / 2)
+    if not np.any(hidden):
         return SMALLER
+    here = np.max(here[hidden])
     return (
         f"the step h = {float(h):.3g} is too small for double precision, in which the rounding of the state and of the unknowns "
         f"changes these by {here:.1g} of their size: take a larger step"
     )
 
 
-def _roundoff(numbers: InNumbers | InJax, u, args) -> float:
-    """The change of the unknowns, relative to their size, that follows from a last place of every number that the residual
+def _roundoff(numbers: InNumbers | InJax, u, args, sizes) -> np.ndarray:
+    """The change of each unknown, relative to their size, that follows from a last place of every number that the residual
     is a function of."""
     by_u, by_state = numbers.slopes(u, *args)
     left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
-    if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and np.linalg.cond(by_u) < LARGEST_CONDITION):
-        return np.inf
-    change = EPSILON * np.abs(np.linalg.inv(by_u)) @ left
-    return float(np.max(change / (np.abs(u) + 1.0)))
+    if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and balanced_condition(by_u) < LARGEST_CONDITION):
+        return np.full(len(u), np.inf)
+    change = EPSILON * np.abs(balanced_inverse(by_u)) @ left
+    return change / (np.abs(u) + sizes)

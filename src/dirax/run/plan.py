@@ -94,16 +94,16 @@ class Plan:
 
     def _holds(self, initial: Sequence[float]) -> bool:
         """Whether the data are on the constraints, and inside the domain of the functions, and no constraint is redundant."""
-        at = self.data_size + self.defects
-        defects, size = initial[self.data_size : at], initial[at]
-        allowed = CONSTRAINT_DEFECT * max(size, 1.0) if self.settings.check_initial else math.inf
-        if not all([abs(defect) <= allowed and defect - defect == 0.0 for defect in defects]):
-            return False
-        if self.has_lagrangian and not math.isfinite(initial[at + 1]):
+        first, at = self.data_size + self.defects, self.data_size + 2 * self.defects
+        allowed = CONSTRAINT_DEFECT if self.settings.check_initial else math.inf
+        for defect, size in zip(initial[self.data_size : first], initial[first:at], strict=True):
+            if not (abs(defect) <= allowed * size and defect - defect == 0.0):
+                return False
+        if self.has_lagrangian and not math.isfinite(initial[at]):
             return False
         if self.matrix is None:
             return True
-        return surely_independent(_scaled(initial[at + 1 + self.has_lagrangian :], self.matrix), SURELY_REGULAR)
+        return surely_independent(_scaled(initial[at + self.has_lagrangian :], self.matrix), SURELY_REGULAR)
 
     def _steps(self, start: Sequence[float], case: Case, leaves: list[Any]) -> bool:
         """Whether the first step has a unique solution."""

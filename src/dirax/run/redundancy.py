@@ -58,9 +58,10 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
             f"initial data{where}: its row of [W; ∂g/∂q] is zero there. Leave it out, or start elsewhere."
         )
     q = jnp.asarray(system.point(data))
-    near, positions, velocities = map(np.asarray, _nearby(system, q, params, jnp.asarray(t0, float)))
-    worst = max((positions, velocities), key=lambda residual: np.max(np.abs(residual), initial=0.0))
-    if np.max(np.abs(worst), initial=0.0) > CONSTRAINT_DEFECT * (1 + np.max(np.abs(q))):
+    near, left, terms = map(np.asarray, _nearby(system, q, params, jnp.asarray(t0, float)))
+    bad = np.abs(left) > CONSTRAINT_DEFECT * terms
+    if np.any(bad):
+        worst = np.where(bad, left, 0.0)
         raise ValueError(
             f"the constraints ({constraints.names}) contradict each other at the initial data: their rank is {np.min(ranks)} "
             f"of {total}, and the nearest point and velocity leave the residual {np.array2string(worst, precision=4)}. Take "
@@ -77,13 +78,14 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
 
 @compiled
 def _nearby(system, q, params, t):
-    """[W; G] at an admissible point near q, and the residuals of g and of the velocities' constraints that no point and no
-    velocity nearest to q makes zero."""
+    """[W; G] at an admissible point near q, and the residual (W v + b, g, G v + ∂g/∂t) that no point and no velocity nearest to
+    q makes zero, with the sizes of its terms."""
     constraints: Constraints = system.constraints
     still = jnp.zeros_like(q)
     nearest = system.project_position(q, still, params, t)
     v = system.project_velocity(nearest, still, params, t)
-    residuals = constraints.position_defect(t, nearest, params), constraints.velocity_defect(t, nearest, v, params)
+    residual, terms = constraints.defect(t, nearest, v, params), constraints.terms(t, nearest, v, still, params)
     direction = jax.random.uniform(jax.random.key(0), q.shape, minval=0.5)
-    away = nearest + AWAY * (1.0 + jnp.max(jnp.abs(q))) * direction
-    return constraints.matrix(t, system.project_position(away, still, params, t), params), *residuals
+    size = jnp.max(jnp.abs(q))
+    away = nearest + AWAY * jnp.where(size > 0.0, size, 1.0) * direction
+    return constraints.matrix(t, system.project_position(away, still, params, t), params), residual, terms

@@ -65,8 +65,9 @@ def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Star
     defect = _lanes(initial.defect, 1)
     if not defect.size:
         return
+    size = _lanes(initial.size, 1)[:, : defect.shape[1]]
     worst = np.max(np.abs(defect), axis=-1)
-    bad = ~(worst <= CONSTRAINT_DEFECT * np.maximum(_lanes(initial.size, 0), 1.0))
+    bad = ~np.all(np.abs(defect) <= CONSTRAINT_DEFECT * size, axis=-1)
     if np.any(bad):
         lane = int(np.argmax(bad))
         way = (

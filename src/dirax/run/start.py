@@ -25,7 +25,8 @@ FEWEST_ARRAYS = 97
 class Initial(NamedTuple):
     """Initial data as the system completes them, each entry with a leading batch axis in a batch.
 
-    All that a scheme may start from, by name; how far the data are off the constraints, and the size of the velocity; the
+    All that a scheme may start from, by name; how far the data are off the constraints, and the sizes of their terms (of two
+    points, followed by those of the constraints of their step); the
     Lagrangian and the matrix [W; ∂g/∂q] of the constraints at the data, if the system has them and it is not too large.
     """
 
@@ -121,15 +122,17 @@ class _Completion(eqx.Module):
 
     def __call__(self, data, params, h, t0) -> Initial:
         system, complete = self.system, self.system.complete({**data, "t": t0}, params, self.project)
-        defect, size = system.initial_defect({**complete, "t": t0}, params), jnp.array(1.0)
-        if self.two_points:
-            size = jnp.max(jnp.abs(data["q1"] - data["q0"])) / h
-        elif "v" in complete:
-            size = jnp.max(jnp.abs(complete["v"]))
+        defect = system.initial_defect({**complete, "t": t0}, params)
         q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if self.two_points else (complete.get("q"), complete.get("v"))
+        size, form = jnp.ones(defect.shape), system.lagrangian_form()
+        small = system.constraints.any and defect.size * system.point(complete).size <= LARGEST_MATRIX
+        if small and form is not None and v is not None:
+            size = form.initial_terms({**complete, "v": v, "t": t0}, params)
+        elif v is not None:
+            size = jnp.maximum(size, jnp.max(jnp.abs(v), initial=0.0))
         lagrangian = None if q is None or v is None else system.lagrangian_value(t0, q, v, params)
         constraints = None
-        if system.constraints.any and defect.size * system.point(complete).size <= LARGEST_MATRIX:
+        if small:
             constraints = system.constraints.matrix(t0, system.point(complete), params)
         return Initial(complete, defect, size, lagrangian, constraints)
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data
@@ -46,13 +47,24 @@ class AbstractDiscreteStructure(eqx.Module):
         """What it says; the first claim has the structure's name."""
 
     @abstractmethod
-    def membership_defect(self, rows: dict[str, Array], params: Any) -> Float[Array, " parts"]:
-        """By how much rows miss it, one number for each part of the claims, in roundings: relative to the size of what
-        cancels, and to what it changes when every coordinate is changed by itself.
+    def membership_terms(self, rows: dict[str, Array], params: Any) -> Float[Array, "2 numbers"]:
+        """By how much rows miss it, and the sizes of the terms of that: of what cancels, and of what it changes when every
+        coordinate is changed by itself. `counts` says how many numbers each part of the claims has.
 
         `rows`: the arrays that it reads, those of nodes (points, …) and those of the steps between (points − 1, …), and the
-        times "t" (points,).
+        times "t" (points,). A size may vanish at a point: over a trajectory, the largest one is that of the terms.
         """
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """How many numbers each part of the claims has: equations with units of their own are judged apart."""
+        return tuple(1 for claim in self.claims for _ in claim.parts)
+
+    def membership_defect(self, rows: dict[str, Array], params: Any) -> Float[Array, " parts"]:
+        """By how much rows miss it, one number for each part of the claims, relative to the sizes of the terms at these rows."""
+        missed, sizes = self.membership_terms(rows, params)
+        relative, ends = missed / nonzero(sizes), np.cumsum(self.counts)[:-1].tolist()
+        return jnp.stack([jnp.max(part, initial=0.0) for part in jnp.split(relative, ends)])
 
     @property
     def given(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from dirax.geometry.cotangent_lift import CotangentLift, cotangent_lift
 from dirax.geometry.finite_difference import annihilator_projector
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.program.tracing import gradient
-from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Claim, nonzero
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Claim
 from dirax.systems.forms import RelationForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
@@ -21,9 +21,9 @@ NAME = "discretization-map Dirac structure"
 PROJECTED = "Method 2 projects the step of D onto the final manifold"
 
 
-def moved(first: Array, last: Array, h: Any) -> Array:
-    """What both points change when every coordinate is changed by itself: |x| + |Δx| + h."""
-    return jnp.abs(jnp.concatenate([first, last])) + jnp.tile(jnp.abs(last - first) + h, 2)
+def moved(first: Array, last: Array) -> Array:
+    """What both points change when every coordinate is changed by itself: |x| + |Δx|."""
+    return jnp.abs(jnp.concatenate([first, last])) + jnp.tile(jnp.abs(last - first), 2)
 
 
 class RelationPairs(AbstractDiscreteStructure):
@@ -57,7 +57,7 @@ class RelationPairs(AbstractDiscreteStructure):
         quantity = NAME if self.relation.dirac else "discretized implicit system"
         return (Claim(quantity, ("relation",), f"{statement} at every step, from {x} alone"),)
 
-    def membership_defect(self, rows: dict[str, Array], params: Any) -> Float[Array, "1"]:
+    def membership_terms(self, rows: dict[str, Array], params: Any) -> Float[Array, "2 1"]:
         """Relative to the terms of the relation that are linear in v and in the multipliers, and the rest."""
         (x0, x1), at = rows[self._name], rows["t"][0] + self.map.base_fraction * self.step
         multipliers = jnp.zeros(self.relation.multipliers)
@@ -81,8 +81,8 @@ class RelationPairs(AbstractDiscreteStructure):
         rest = relation(jnp.zeros_like(v), jnp.zeros_like(multipliers))
         terms = jnp.abs(of_velocity) @ jnp.abs(v) + jnp.abs(of_multipliers) @ jnp.abs(multipliers) + jnp.abs(rest)
         z = jnp.concatenate([x0, x1])
-        scale = jnp.max(terms) + jnp.max(jnp.abs(jax.jacfwd(defect)(z)) @ moved(x0, x1, self.step))
-        return jnp.max(jnp.abs(defect(z)))[None] / nonzero(scale)
+        scale = jnp.max(terms) + jnp.max(jnp.abs(jax.jacfwd(defect)(z)) @ moved(x0, x1))
+        return jnp.stack([jnp.max(jnp.abs(defect(z))), scale])[:, None]
 
 
 class LiftedPairs(AbstractDiscreteStructure):
@@ -96,7 +96,12 @@ class LiftedPairs(AbstractDiscreteStructure):
     system: LagrangeDirac | ManifoldLagrangian
     map: CotangentLift
     step: Any
-    constrained: bool = eqx.field(static=True)
+    constraint_count: int = eqx.field(static=True)
+
+    @property
+    def constrained(self) -> bool:
+        """Whether there are constraints."""
+        return self.constraint_count > 0
 
     @property
     def points(self) -> int:
@@ -107,6 +112,10 @@ class LiftedPairs(AbstractDiscreteStructure):
         return ("q", "p", "multipliers") if self.constrained else ("q", "p")
 
     @property
+    def counts(self) -> tuple[int, ...]:
+        return (1, 1, self.constraint_count, 1) if self.constrained else (1, 1)
+
+    @property
     def claims(self) -> tuple[Claim, ...]:
         parts = "p = ∂L/∂q̇, q̇ ∈ Δ, ṗ − ∂L/∂q ∈ Δ°" if self.constrained else "p = ∂L/∂q̇, ṗ = ∂L/∂q"
         names = ("momentum", "force", "constraint") if self.constrained else ("momentum", "force")
@@ -115,7 +124,7 @@ class LiftedPairs(AbstractDiscreteStructure):
             return (own,)
         return own, Claim("saved multipliers", ("multipliers",), "against the forces at the base points")
 
-    def membership_defect(self, rows: dict[str, Array], params: Any) -> Float[Array, " parts"]:
+    def membership_terms(self, rows: dict[str, Array], params: Any) -> Float[Array, "2 numbers"]:
         (q0, q1), (p0, p1), h = rows["q"], rows["p"], self.step
         n, t = q0.shape[0], rows["t"][0] + self.map.base_fraction * h
         multipliers = rows["multipliers"][0] if self.constrained else jnp.zeros(0)
@@ -144,18 +153,19 @@ class LiftedPairs(AbstractDiscreteStructure):
             return jnp.sum(legendre, axis=0), jnp.sum(balance, axis=0), constraints.velocity_defect(t, q, v, params)
 
         z = jnp.concatenate([q0, p0, q1, p1])
-        size = moved(jnp.concatenate([q0, p0]), jnp.concatenate([q1, p1]), h)
+        size = moved(jnp.concatenate([q0, p0]), jnp.concatenate([q1, p1]))
         (momentum, force, constraint), slope = missed(z), jax.jacfwd(missed)(z)
         legendre, balance = terms_of(z)
         scales = [jnp.abs(part) @ size for part in slope]
-        of_momentum = nonzero(jnp.max(jnp.sum(jnp.abs(legendre), axis=0) + scales[0]))
-        of_force = nonzero(jnp.max(jnp.sum(jnp.abs(balance), axis=0) + scales[1]))
-        first = jnp.max(jnp.abs(momentum)) / of_momentum
+        of_momentum = jnp.max(jnp.sum(jnp.abs(legendre), axis=0) + scales[0])
+        of_force = jnp.max(jnp.sum(jnp.abs(balance), axis=0) + scales[1])
+        first, whole = jnp.max(jnp.abs(momentum)), jnp.max(jnp.abs(force))
         if not self.constrained:
-            return jnp.stack([first, jnp.max(jnp.abs(force)) / of_force])
+            return jnp.stack([jnp.stack([first, whole]), jnp.stack([of_momentum, of_force])])
         outside = force - annihilator_projector(constraints.matrix(t, base(z)[0], params)) @ force
-        of_constraint = jnp.max(jnp.abs(constraint) / nonzero(scales[2]), initial=0.0)
-        return jnp.stack([first, jnp.max(jnp.abs(outside)) / of_force, of_constraint, jnp.max(jnp.abs(force)) / of_force])
+        numbers = jnp.concatenate([jnp.stack([first, jnp.max(jnp.abs(outside))]), jnp.abs(constraint), whole[None]])
+        sizes = jnp.concatenate([jnp.stack([of_momentum, of_force]), scales[2], of_force[None]])
+        return jnp.stack([numbers, sizes])
 
 
 def structure_on_cotangent_bundle(
@@ -163,4 +173,4 @@ def structure_on_cotangent_bundle(
 ) -> LiftedPairs:
     """The structure of a Lagrangian by a map on Q, or by its lift."""
     lift = map if isinstance(map, CotangentLift) else cotangent_lift(map)
-    return LiftedPairs(system, lift, step, shape.m + shape.c > 0)
+    return LiftedPairs(system, lift, step, shape.m + shape.c)

@@ -12,7 +12,7 @@ from dirax.geometry.tulczyjew import FiniteDifferenceTriple, slot_derivatives
 from dirax.numerics.arrays import Data
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian
-from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Claim, nonzero
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Claim
 from dirax.schemes.two_form_on_pairs import FormOnPairs
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.shape import Shape
@@ -116,19 +116,17 @@ class LagrangianPairs(AbstractDiscreteStructure):
         return True
 
     def constraint_size(self, row: Data, speed: Array, params: Any) -> Float[Array, " k"]:
-        """|W||v| + |b|, the largest of all, and |∂g/∂q||q|."""
-        t, constraints = row["t"], self.system.constraints
-        matrix = jnp.abs(self.matrix(t, row["q"], params))
-        along = matrix @ speed
-        if constraints.affine is not None:
-            b = jnp.abs(constraints.affine.at(t, row["q"], params))
-            along = along.at[: b.shape[0]].add(b)
-        m = self.shape.m
-        largest = jnp.full(m, jnp.max(along[:m], initial=0.0))
-        return jnp.concatenate([largest, (matrix @ jnp.abs(row["q"]))[m:]])
+        """|W||v| + |b|, and the terms of g."""
+        speeds = self.system.speeds(row["t"], row["q"], speed, params)
+        terms = self.system.constraints.terms(row["t"], row["q"], speed, speeds, params)
+        return terms[: self.shape.m + self.shape.c]
 
-    def membership_defect(self, rows: dict[str, Array], params: Any) -> Float[Array, "3"]:
-        """(constraint, force, saved): the third is by how much the p and the multipliers saved at the middle point miss the
+    @property
+    def counts(self) -> tuple[int, ...]:
+        return self.shape.m + self.shape.c, 1, 1
+
+    def membership_terms(self, rows: Data, params: Any) -> Float[Array, "2 numbers"]:
+        """(constraints, force, saved): the third is by how much the p and the multipliers saved at the middle point miss the
         Legendre momenta and the force of the three points."""
         h, t, (q0, q1, q2), p = self.step, rows["t"][0], rows["q"], rows["p"][1]
         n, here = q0.shape[0], t + h
@@ -165,16 +163,17 @@ class LagrangianPairs(AbstractDiscreteStructure):
             return self.constraint(first, *((a, b) if self.sign == "+" else (b, c)), params)
 
         z = jnp.concatenate([q0, q1, q2])
-        moved = jnp.maximum(jnp.abs(q1 - q0), jnp.abs(q2 - q1)) + h
-        size = jnp.abs(z) + jnp.tile(moved, 3)
+        moved = jnp.maximum(jnp.abs(q1 - q0), jnp.abs(q2 - q1))
+        size = jnp.abs(z) + jnp.tile(moved + h * self.system.speeds(here, q1, moved / h, params), 3)
         terms = jnp.abs(p1) + jnp.abs(p2) + jnp.abs(before0) + jnp.abs(before1)
         of_reaction = jnp.abs(jax.jacfwd(reaction_of)(q1)) @ size[n : 2 * n]
-        largest = nonzero(jnp.max(terms + jnp.abs(jax.jacfwd(force_of)(z)) @ size + of_reaction))
-        relative_force, relative_saved = jnp.max(jnp.abs(force)) * h / largest, jnp.max(jnp.abs(saved)) / largest
+        largest = jnp.max(terms + jnp.abs(jax.jacfwd(force_of)(z)) @ size + of_reaction)
+        missed = jnp.stack([jnp.max(jnp.abs(force)) * h, jnp.max(jnp.abs(saved))])
         if constraint.shape[0] == 0:
-            return jnp.stack([jnp.zeros(()), relative_force, relative_saved])
-        constraint_scale = jnp.abs(jax.jacfwd(constraint_of)(z)) @ size
-        return jnp.stack([jnp.max(jnp.abs(constraint) / nonzero(constraint_scale)), relative_force, relative_saved])
+            return jnp.stack([missed, jnp.stack([largest, largest])])
+        of_constraint = jnp.abs(jax.jacfwd(constraint_of)(z)) @ size
+        missed = jnp.concatenate([jnp.abs(constraint), missed])
+        return jnp.stack([missed, jnp.concatenate([of_constraint, jnp.stack([largest, largest])])])
 
     def _of_induced_structure(
         self,

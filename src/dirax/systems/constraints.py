@@ -11,6 +11,7 @@ from jaxtyping import Float
 from dirax.numerics.arrays import Numbers
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.roots import nearest_root
+from dirax.program.rounding import rounding
 from dirax.program.tracing import along, jacobian
 from dirax.program.user_functions import UserFunction
 
@@ -124,6 +125,22 @@ class Constraints(eqx.Module):
         if self.holonomic is None:
             return first
         return jnp.concatenate([first, self.position_defect(t, q, params), self.hidden_defect(t, q, v, params)])
+
+    def terms(
+        self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], speed: Float[Numbers, " n"], params: Any
+    ) -> Float[Numbers, " k"]:
+        """The sizes of the terms of `defect` at velocities as large as |v| + `speed`: a coordinate that does not move, of a
+        system that does, misses its constraint by a rounding of how fast it could."""
+        at = jnp.asarray(t, float)
+        fastest, w = jnp.abs(v) + speed, self.one_forms_at(t, q, params)
+        first = jnp.abs(w) @ fastest
+        if self.affine is not None:
+            first = first + jnp.abs(self.affine.at(t, q, params))
+        if self.holonomic is None:
+            return first
+        position = rounding(lambda t, q: self.position_defect(t, q, params), at, q)
+        moved = jnp.abs(self.hidden_defect(t, q, jnp.zeros_like(v), params))
+        return jnp.concatenate([first, position, jnp.abs(self.holonomic_matrix(t, q, params)) @ fastest + moved])
 
     def nearest_velocity(
         self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], lifted: Float[Numbers, "n k"], params: Any

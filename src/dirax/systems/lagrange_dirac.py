@@ -221,6 +221,26 @@ class LagrangeDirac(AbstractSystem):
             return no_constraint() if self.holonomic is None else self.constraints.position_defect(t, data["q0"], params)
         return self.constraints.defect(t, data["q"], data["v"], params)
 
+    def initial_terms(self, data: Data, params: Any) -> Float[Numbers, " k"]:
+        """The sizes of the terms of `initial_defect`; for two points, of it and of the constraints of their step."""
+        t = data.get("t", 0.0)
+        if "q0" not in data:
+            return self.constraint_terms(t, data["q"], data["v"], params)
+        first, step = (self.constraint_terms(t, data[q], data["v"], params) for q in ("q0", "q1"))
+        m = self.constraints.one_forms_at(t, data["q0"], params).shape[0]
+        c = (first.shape[0] - m) // 2
+        return jnp.concatenate([first[m : m + c], step[: m + c]])
+
+    def speeds(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " n"]:
+        """How fast each coordinate would be that had the kinetic energy alone; 0 where L is degenerate in it."""
+        metric = jnp.abs(jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v))
+        along, own = jnp.abs(v) @ metric @ jnp.abs(v), jnp.diagonal(metric)
+        return jnp.sqrt(jnp.where(own > 0.0, along / jnp.where(own > 0.0, own, 1.0), 0.0))
+
+    def constraint_terms(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " k"]:
+        """The sizes of the terms of (W v + b, g, G v + ∂g/∂t), for each coordinate as fast as the kinetic energy makes it."""
+        return self.constraints.terms(t, q, v, self.speeds(t, q, v, params), params)
+
     def _velocity(self, row: Data, params: Any) -> Float[Numbers, " n"]:
         """The velocity that belongs to the saved momentum."""
         return self.inverse_legendre(row["q"], row["p"], params, t=row.get("t", 0.0))

@@ -6,12 +6,14 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from dirax.engines.contract import NOT_CONVERGED, OK, Problem
 from dirax.engines.native import compile as llvm
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
+from dirax.engines.sizes import sizes_of
 from dirax.engines.threads import thread_count
 
 SHARES = 4
@@ -66,8 +68,11 @@ class Lanes:
         if p.record is None:
             table = np.zeros((self.lanes, self.record.size))
             table[:, self.record.state] = p.state
-            for stage, guess in enumerate(p.guess):
-                table[:, self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+            for stage, (guess, sizes) in enumerate(zip(p.guess, sizes_of(p), strict=True)):
+                count = np.shape(guess)[-1]
+                table[:, self.record.unknowns(stage, count)] = guess
+                for number, part in enumerate(self.record.sizes(stage, count)):
+                    table[:, part] = sizes[..., number, :]
         else:
             table = np.array(p.record)
         self.records = self._blocked(table)
@@ -111,6 +116,24 @@ class Lanes:
         closing, outs = self.arrays(2)
         self.call(kernel, self.records.copy(), outs, 0, 1, 1, self.threads)
         return {name: rows[:, 0] for name, rows in closing.items()}
+
+    def attempt(self, numbers: np.ndarray, made: Kernels, table: np.ndarray) -> np.ndarray:
+        """The records (n, quantities) after some of the trajectories went on from others, which are not kept: one by one, since
+        each is at another step, and with the bits that it has alone."""
+        p, kernel = self.problem, made.kernel(1)[0]
+        params = jax.tree.map(lambda a: np.asarray(a)[numbers], p.params) if p.batch_params else p.params
+        alone = Lanes(p.with_numbers(params=params, batch=len(numbers), record=table), made, 1)
+        blocks, places = np.divmod(numbers, self.width)
+        outs = np.ascontiguousarray(self.outs[blocks, :, places][:, :, None])
+        for i, done in enumerate(table[:, self.record.completed].astype(int).tolist()):
+            one = slice(i, i + 1)
+            alone.call(kernel, alone.records[one], outs[one], done, p.steps, p.save_every, 1, i)
+        return alone.table()
+
+    def put(self, numbers: np.ndarray, table: np.ndarray) -> None:
+        """Have some of the trajectories go on from these records."""
+        blocks, places = np.divmod(numbers, self.width)
+        self.records[blocks, :, places] = table
 
     def _blocked(self, table: np.ndarray) -> np.ndarray:
         if self.lanes == self.width == 1:

@@ -9,6 +9,7 @@ from dirax.engines.contract import NOT_CONVERGED, OK, Problem
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.lanes import TOGETHER, arrays_saved
+from dirax.engines.sizes import sizes_of
 
 
 class Places:
@@ -50,8 +51,11 @@ class OneLane:
         if p.record is None:
             memory[: places.record] = 0.0
             memory[self.record.state] = p.state
-            for stage, guess in enumerate(p.guess):
-                memory[self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+            for stage, (guess, sizes) in enumerate(zip(p.guess, sizes_of(p), strict=True)):
+                count = np.shape(guess)[-1]
+                memory[self.record.unknowns(stage, count)] = guess
+                for part, numbers in zip(self.record.sizes(stage, count), sizes, strict=True):
+                    memory[part] = numbers
         else:
             memory[: places.record] = p.record[0]
         if places.outs > places.params:
@@ -85,6 +89,18 @@ class OneLane:
         memory, record = self.memory, self.record
         memory[record.status], memory[record.differences] = OK, 0.0
         self.advance(kernel, int(memory[record.completed]), self.problem.steps)
+
+    def attempt(self, numbers: np.ndarray, made: Kernels, table: np.ndarray) -> np.ndarray:
+        """The record after going on from one, which is not kept."""
+        kept, self.memory[: self.places.record] = self.memory[: self.places.record].copy(), table[0]
+        self.advance(made.kernel(1)[0], int(table[0, self.record.completed]), self.problem.steps)
+        after = self.memory[: self.places.record].copy()
+        self.memory[: self.places.record] = kept
+        return after[None]
+
+    def put(self, numbers: np.ndarray, table: np.ndarray) -> None:
+        """Have it go on from a record."""
+        self.memory[: self.places.record] = table[0]
 
     @cached_property
     def fields(self) -> dict[str, np.ndarray]:

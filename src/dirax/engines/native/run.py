@@ -4,11 +4,12 @@ import time
 
 import numpy as np
 
-from dirax.engines.contract import Outcome, Problem, Progress, finished
+from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem, Progress, finished
 from dirax.engines.native.collocation_kernels import collocation_kernels
-from dirax.engines.native.kernels import kernels
+from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
 from dirax.engines.native.one_lane import OneLane, places_of
+from dirax.engines.sizes import grown
 from dirax.program.interpreter import UnsupportedPrimitive
 
 CHUNK_SECONDS = 0.1
@@ -69,7 +70,11 @@ class Ready:
                     progress(done, p.steps)
         except KeyboardInterrupt:
             interrupted = True
-        by_newton = self.is_collocation and not interrupted and _by_newton(lanes)
+        by_newton = False
+        if not interrupted:
+            by_newton = self.is_collocation and _by_newton(lanes)
+            if not self.is_collocation:
+                _with_present_sizes(lanes, self.made)
         run_seconds = time.perf_counter() - started
         closing = lanes.close(self.kernel)
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
@@ -107,3 +112,32 @@ def _by_newton(lanes: Lanes | OneLane) -> bool:
         for lane in left:
             lanes.again(newton, lane)
     return bool(left)
+
+
+RESUMED = 16
+"""How often trajectories go on with other sizes."""
+
+
+def _with_present_sizes(lanes: Lanes | OneLane, made: Kernels) -> None:
+    """Go on with trajectories whose unknowns have become larger than where they began. An attempt that does not come to another
+    step leaves no trace."""
+    p, record = lanes.problem, lanes.record
+    table = lanes.table()
+    failed, tried = np.flatnonzero(table[:, record.status] == NOT_CONVERGED), 0
+    while len(failed) and tried < RESUMED:
+        tried, own, stages = tried + 1, table[failed], [stage.unknowns for stage, _ in p.equation.stages]
+        places = [record.sizes(i, k) for i, k in enumerate(stages)]
+        before = tuple(np.stack([own[:, part] for part in pair], axis=1) for pair in places)
+        guess = tuple(own[:, record.unknowns(i, k)] for i, k in enumerate(stages))
+        sizes, more = grown(p, failed, own[:, record.completed], own[:, record.state], guess, before)
+        if not np.any(more):
+            return
+        for pair, values in zip(places, sizes, strict=True):
+            for number, part in enumerate(pair):
+                own[:, part] = values[:, number]
+        own[:, record.status] = OK
+        before, chosen = table[failed[more]], failed[more]
+        after = lanes.attempt(chosen, made, own[more])
+        further = after[:, record.completed] > own[more, record.completed]
+        lanes.put(chosen, np.where(further[:, None], after, before))
+        table, failed = lanes.table(), chosen[further & (after[:, record.status] == NOT_CONVERGED)]

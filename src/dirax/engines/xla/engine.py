@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
@@ -12,6 +13,7 @@ from dirax.engines import policy
 from dirax.engines.contract import OK, Outcome, Problem, Progress, finished
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.linear_solver import AbstractLinearSolver
+from dirax.engines.sizes import sizes_by_jax, sizes_of
 from dirax.engines.xla.lane import Lane, Numerics, first_lane
 from dirax.engines.xla.loop import Clock, axes_of, by_lane, compiled_chunk, make_step, next_row, row_capacity, unpack_rows
 
@@ -53,7 +55,7 @@ class Xla(AbstractEngine):
         p, numerics, notes = self._planned(problem)
         chunk = compiled_chunk(jax.default_backend())
         axes, capacity, params = axes_of(p), row_capacity(p), jax.device_put(p.params)
-        lanes = p.record
+        lanes, sizes = p.record, _sizes(p, numerics, sizes_of)
         if lanes is None:
             lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, numerics.increments is not None)
 
@@ -61,7 +63,7 @@ class Xla(AbstractEngine):
             t0, h, first_step = map(np.float64, (p.t0, p.h, p.first_step))
             every, start, stop = map(np.int64, (p.save_every, start, stop))
             clock = Clock(t0, h, first_step, every, start, stop, np.bool_(closing))
-            after, rows = chunk(p.equation, lanes, params, clock, capacity, axes, p.max_iterations, numerics)
+            after, rows = chunk(p.equation, lanes, params, sizes, clock, capacity, axes, p.max_iterations, numerics)
             return after, {name: by_lane(np.asarray(values), p.batch, np) for name, values in rows.items()}
 
         _, empty = call(lanes, 0, 0)  # compile
@@ -99,12 +101,12 @@ class Xla(AbstractEngine):
         p, numerics, notes = self._planned(problem)
         axes = axes_of(p)
         lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), compensated=numerics.increments is not None)
-        clock = Clock.of(p)
+        clock, sizes = Clock.of(p), _sizes(p, numerics, sizes_by_jax)
         one = make_step(p.equation, axes, p.max_iterations, True, numerics)
 
         def step(lanes, k):
             """The lanes after step k and the row that they left; a step past the last is undone."""
-            after, row = one(lanes, p.params, clock)
+            after, row = one(lanes, p.params, sizes, clock)
             return jax.tree.map(lambda a, b: jnp.where(k < p.steps, a, b), after, lanes), row
 
         def to_next_row(lanes, start):
@@ -146,6 +148,11 @@ class Xla(AbstractEngine):
             equation, jacobians = in_jax.in_scalars(*key)
             p = dataclasses.replace(p, equation=equation)
         return p, Numerics(self.linear_solver, increments, jacobians), notes
+
+
+def _sizes(p: Problem, numerics: Numerics, found: Callable) -> tuple | None:
+    """Those of the unknowns and of the equations of every stage; None for sparse ones, which are measured by 1."""
+    return None if numerics.sparse is not None else found(p)
 
 
 def _outcome(

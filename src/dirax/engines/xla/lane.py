@@ -81,17 +81,17 @@ def first_lane(state, guess: tuple, xp=jnp, compensated: bool = False) -> Lane:
 
 
 def take_step(
-    equation, lane: Lane, t, h, params, max_iterations: int, differentiable: bool = True, numerics: Numerics | None = None
+    equation, lane: Lane, t, h, params, sizes, max_iterations: int, differentiable: bool = True, numerics: Numerics | None = None
 ) -> tuple[Lane, tuple, tuple]:
-    """One step of every stage; the lane after it (unchanged where it had failed or the step fails), and of each stage the
-    unknowns and the state that it left.
+    """One step of every stage, of unknowns and equations of these `sizes`; the lane after it (unchanged where it had failed or
+    the step fails), and of each stage the unknowns and the state that it left.
 
     With `differentiable` it can be differentiated in reverse mode too, and no derivative passes through a step that failed."""
     numerics = numerics or Numerics()
     known = numerics.of_stages(equation)
     stages, fractions = zip(*equation.stages, strict=True)
 
-    def solved(carry, fraction, before, stage, known):
+    def solved(carry, fraction, before, sizes, stage, known):
         linear_solver, increment, jacobian = known
         state, lost, t, status, updates, worst = carry
         left_state = state
@@ -100,7 +100,7 @@ def take_step(
         fixed = passing(args, False) if differentiable else args
         guess = stage.guess(fixed[0], jnp.sum(before, axis=0), *fixed[2:])
         guess = jax.lax.stop_gradient(guess) if differentiable else guess
-        u, count, converged = newton_root(stage.residual, guess, fixed, max_iterations, running, jacobian, linear_solver)
+        u, count, converged = newton_root(stage.residual, guess, fixed, max_iterations, sizes, running, jacobian, linear_solver)
         new, left = stage.advance(u, *fixed), stage.residual(u, *fixed)
         # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
         finite = jnp.isfinite(jnp.sum(0.0 * jnp.concatenate([new, left])))
@@ -121,13 +121,15 @@ def take_step(
 
     carry = (lane.state, lane.lost, jnp.asarray(t, float), lane.status, jnp.zeros_like(lane.iterations), lane.max_residual)
     if len(stages) > 1 and len({(stage.residual, stage.advance, stage.guess) for stage in stages}) == 1:
-        one = lambda carry, given: solved(carry, given[0], given[1], stages[0], known[0])
-        carry, (histories, solutions, left) = jax.lax.scan(one, carry, (jnp.array(fractions), jnp.stack(lane.history)))
+        one = lambda carry, given: solved(carry, *given, stages[0], known[0])
+        given = jnp.array(fractions), jnp.stack(lane.history), None if sizes is None else jnp.stack(sizes)
+        carry, (histories, solutions, left) = jax.lax.scan(one, carry, given)
         history, unknowns, states = tuple(histories), tuple(solutions), tuple(left)
     else:
         history, unknowns, states = (), (), ()
         for i, before in enumerate(lane.history):
-            carry, (remembered, u, left) = solved(carry, fractions[i], before, stages[i], known[i])
+            own = None if sizes is None else sizes[i]
+            carry, (remembered, u, left) = solved(carry, fractions[i], before, own, stages[i], known[i])
             history, unknowns, states = (*history, remembered), (*unknowns, u), (*states, left)
     state, lost, _, status, updates, worst = carry
     good = status == OK

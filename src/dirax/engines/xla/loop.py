@@ -43,14 +43,14 @@ class Clock(eqx.Module):
 
 
 def make_step(equation, axes, max_iterations: int, differentiable: bool, numerics: Numerics):
-    """(lanes, params, clock) ↦ (lanes after a step, packed rows that they left), over the batch if there is one."""
+    """(lanes, params, sizes, clock) ↦ (lanes after a step, packed rows that they left), over the batch if there is one."""
 
-    def one(lane, params, clock):
+    def one(lane, params, sizes, clock):
         t = time_of(lane, clock.t0, clock.h, clock.first_step)
-        after, unknowns, states = take_step(equation, lane, t, clock.h, params, max_iterations, differentiable, numerics)
+        after, unknowns, states = take_step(equation, lane, t, clock.h, params, sizes, max_iterations, differentiable, numerics)
         return after, packed_row(equation, lane, unknowns, states)
 
-    return one if axes is None else jax.vmap(one, in_axes=(*axes, None))
+    return one if axes is None else jax.vmap(one, in_axes=(*axes, 0, None))
 
 
 def unpack_rows(equation, axes, packed, params, clock: Clock) -> dict:
@@ -73,11 +73,11 @@ def compiled_chunk(platform: str) -> Any:
 
 
 def _chunk(
-    equation, lanes: Lane, params, clock: Clock, capacity: int, axes, max_iterations: int, numerics: Numerics
+    equation, lanes: Lane, params, sizes: tuple, clock: Clock, capacity: int, axes, max_iterations: int, numerics: Numerics
 ) -> tuple[Lane, dict]:
     """The steps from clock.start to clock.stop: the lanes after them, and the at most `capacity` rows saved on the way."""
     step = make_step(equation, axes, max_iterations, False, numerics)
-    row = jax.eval_shape(step, lanes, params, clock)[1]
+    row = jax.eval_shape(step, lanes, params, sizes, clock)[1]
     first_row = next_row(clock.start, clock.every)
 
     def going(carry):
@@ -86,7 +86,7 @@ def _chunk(
 
     def body(carry):
         k, lanes, rows = carry
-        lanes, row = step(lanes, params, clock)
+        lanes, row = step(lanes, params, sizes, clock)
         # the last slot is for the rows that are not saved
         slot = jnp.where(jax.lax.rem(k, clock.every) == 0, jax.lax.div(k, clock.every) - first_row, capacity)
         return k + 1, lanes, jax.lax.dynamic_update_index_in_dim(rows, row, slot, 0)

@@ -14,7 +14,7 @@ from dirax.program.given_tangents import implicit
 
 
 class Search(NamedTuple):
-    """Where the iteration stands: the unknowns, and (the size of the last update relative to |u_i| + 1, its ratio to the
+    """Where the iteration stands: the unknowns, and (the last update relative to |u_i| + size_i, its ratio to the
     update before, the number of updates) as one array, which costs XLA one kernel and not three."""
 
     u: Float[Array, " k"]
@@ -41,20 +41,22 @@ def newton_root(
     guess: Float[Array, " k"],
     args: tuple[Any, ...],
     max_iterations: int,
+    sizes: Float[Array, "2 k"] | None = None,
     running: Any = True,
     jacobian: Callable[..., Any] | None = None,
     linear_solver: AbstractLinearSolver | None = None,
 ) -> tuple[Float[Array, " k"], Int[Array, ""], Bool[Array, ""]]:
     """(u, number of updates, converged) of residual(u, *args) = 0; not for reverse mode, see `as_function`.
 
-    The guess comes back where `running` is false. `jacobian(u, *args)` is that of the residual, derived here where it is not
-    given, or what `linear_solver` takes for it; that is `Dense()` where none is.
+    `sizes` are those of the unknowns and of the equations (`dirax/engines/sizes.py`), 1 where they are not given. The guess comes
+    back where `running` is false. `jacobian(u, *args)` is that of the residual, derived here where it is not given, or what
+    `linear_solver` takes for it, without sizes; that is `Dense()` where none is.
     """
     if guess.shape[0] == 0:
         return guess, jnp.zeros((), jnp.int64), jnp.array(True)
     equation = lambda u: residual(u, *args)
     slopes = (lambda u: jacobian(u, *args)) if jacobian else jax.jacfwd(equation)
-    found = newton(equation, slopes, linear_solver or Dense(), guess, max_iterations, running)
+    found = newton(equation, slopes, linear_solver or Dense(), guess, max_iterations, sizes, running)
     return found.u, found.updates.astype(int), at_floor(found)
 
 
@@ -95,14 +97,16 @@ def newton(
     linear_solver: AbstractLinearSolver,
     guess: Float[Array, " k"],
     max_iterations: int,
+    sizes: Float[Array, "2 k"] | None,
     running: Any,
 ) -> Search:
     """Newton's method in which a Jacobian serves several updates while they contract quickly, and is renewed otherwise."""
+    size, unit = (1.0, None) if sizes is None else (sizes[0], 1.0 / sizes[1])
 
     def updated(s: Search, factors: Any) -> Search:
-        change = linear_solver.solve(factors, equation(s.u))
+        change = linear_solver.solve(factors, equation(s.u) if unit is None else unit * equation(s.u))
         u = s.u - change
-        update = jnp.max(jnp.abs(change) / (jnp.abs(u) + 1.0))
+        update = jnp.max(jnp.abs(change) / (jnp.abs(u) + size))
         ratio = jnp.where(s.updates > 0, update / s.update, jnp.nan)
         return Search(u, jnp.stack([update, ratio, s.updates + 1]))
 
@@ -113,7 +117,7 @@ def newton(
         return unfinished(s) & ((s.ratio < CONTRACTING) | (jnp.isnan(s.ratio) & (s.update < NEAR)))
 
     def with_new_jacobian(s: Search) -> Search:
-        factors = linear_solver.factorise(jacobian(s.u))
+        factors = linear_solver.factorise(jacobian(s.u) if unit is None else unit[:, None] * jacobian(s.u))
         return jax.lax.while_loop(contracting, lambda s: updated(s, factors), updated(s, factors))
 
     start = Search(guess, jnp.array([jnp.inf, jnp.nan, 0.0]))

@@ -46,6 +46,7 @@ class _Kernel:
         first = record.state_size if plan.gain is None else record.state_size + record.kept
         before = places[first : first + record.kept]
         self._read_iterates(before)
+        self.sizes = self._sizes(places)
 
         def give_back() -> None:
             for value, place in zip(scalars, spots, strict=True):
@@ -63,6 +64,15 @@ class _Kernel:
         give_back()
         pointers = "ptr noalias %lanes, ptr noalias %params, ptr noalias %outs"
         b.module.define(f"define internal void @block({pointers}, {NUMBERS}) noinline", b)
+
+    def _sizes(self, places: list[str]) -> list[str]:
+        """How large iterates are, those of all nodes of a kind alike: as the unknowns, rates; accelerations as rates by h."""
+        b, one, found = self.body, self.one, []
+        first = self.plan.record.sizes(0, len(self.iterates))[0].start
+        for place in places[first : first + len(self.iterates)]:
+            size = b.load("double", place)
+            found.append(self.all.splat(size if self.plan.gain is None else one.div(size, one.abs("%h"))))
+        return found
 
     def _read_iterates(self, places: list[str]) -> None:
         b, n = self.body, len(self.iterates)
@@ -171,7 +181,7 @@ class _Kernel:
         old = [b.load(e.real, pointer, 64) for pointer in self.iterates]
         new, stable = sweep.sweep(old)
         going, worst, missed = e.false, e.const(0.0), e.const(0.0)
-        for pointer, before, a, least_of in zip(self.iterates, old, new, least, strict=True):
+        for pointer, before, a, least_of, unit in zip(self.iterates, old, new, least, self.sizes, strict=True):
             b.store(e.real, a, pointer, 64)
             moved, size, smallest = e.abs(e.sub(a, before)), e.abs(a), b.load(e.real, least_of, 64)
             shrinks = e.both(e.compare("olt", moved, smallest), e.compare("ogt", moved, e.mul(size, e.const(EPSILON))))
@@ -182,7 +192,7 @@ class _Kernel:
             going = e.either(going, e.both(shrinks, e.invert(enough)))
             b.store(e.real, e.select(e.compare("olt", moved, smallest), moved, smallest), least_of, 64)
             worst = e.max(moved, worst)
-            missed = e.max(e.sub(moved, e.mul(e.add(size, e.const(1.0)), e.const(STALLED))), missed)
+            missed = e.max(e.sub(moved, e.mul(e.add(size, unit), e.const(STALLED))), missed)
         b.store(e.real, worst, change, 64)
         b.store("i64", b.put(f"add i64 {b.load('i64', sweeps)}, 1"), sweeps)
         count = b.put(f"add i64 {b.load('i64', count_here)}, 1")

@@ -5,6 +5,8 @@ factors together, a second kind the residual alone. Where a pivot was too small 
 pivoting, and the factors are not used again.
 """
 
+from collections.abc import Sequence
+
 from dirax.engines.native.ir.emitter import Body, Emitter
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.newton_step import Correction
@@ -13,13 +15,15 @@ from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, STALLED
 
 
 class NewtonLoop:
-    """The iteration of one equation, from the guess in `unknowns` to its root there.
+    """The iteration of one equation, from the guess in `unknowns` to its root there; `sizes` are pointers to those of the
+    unknowns.
 
     After `emit`, `converged` and `count` are, by lane, whether the floor was reached and the number of updates.
     """
 
-    def __init__(self, equation: TracedEquation, correction: Correction, around: Region, unknowns: list[str]):
-        self.equation, self.correction, self.around, self.unknowns = equation, correction, around, unknowns
+    def __init__(self, equation: TracedEquation, correction: Correction, around: Region, unknowns: list[str], sizes: list[str]):
+        self.equation, self.correction, self.around = equation, correction, around
+        self.unknowns, self.sizes = unknowns, sizes
         self.e: Emitter = around.emitter
         self.body: Body = self.e.body
         self.converged = self.count = ""
@@ -58,7 +62,9 @@ class NewtonLoop:
         change = [inner.value(n) for n in correction.change]
         stable = inner.value(correction.stable)
         if correction.stable != g.true:
-            change = by_partial_pivoting(inner, correction.jacobian, self.equation.residual, change, stable, now)
+            change = by_partial_pivoting(
+                inner, correction.jacobian, self.equation.residual, change, stable, now, correction.sizes
+            )
         self._apply(old, change, stable, now)
         return inner
 
@@ -79,8 +85,8 @@ class NewtonLoop:
         b, e = self.body, self.e
         new = [e.sub(a, d) for a, d in zip(old, change, strict=True)]
         update, total = e.const(0.0), e.const(0.0)
-        for a, d in zip(new, change, strict=True):
-            update = e.max(e.div(e.abs(d), e.add(e.abs(a), e.const(1.0))), update)
+        for a, d, size in zip(new, change, self.sizes, strict=True):
+            update = e.max(e.div(e.abs(d), e.add(e.abs(a), b.load(e.real, size))), update)
             total = e.add(total, d)
         update = e.select(e.compare("uno", total, total), e.const(float("nan")), update)
         count = b.load(e.real, self._number)
@@ -114,9 +120,17 @@ class NewtonLoop:
 
 
 def by_partial_pivoting(
-    region: Region, matrix: list[list[int]], right: list[int], change: list[str], stable: str, now: str
+    region: Region,
+    matrix: list[list[int]],
+    right: list[int],
+    change: list[str],
+    stable: str,
+    now: str,
+    sizes: Sequence[int] = (),
 ) -> list[str]:
-    """The solution `change` of matrix·x = right, in lanes with a pivot that was too small solved for anew, one at a time."""
+    """The solution `change` of matrix·x = right, in lanes with a pivot that was too small solved for anew, one at a time.
+
+    Rows are divided by the `sizes` of their equations, powers of two, so that pivots are chosen whatever their units."""
     e, k = region.emitter, len(change)
     b = e.body
     slots = lambda base, count: [b.at(e.real, base, i) for i in range(count)]
@@ -129,8 +143,13 @@ def by_partial_pivoting(
         nodes = [node for row in matrix for node in row]
         cold = Region(e, region.graph, region)
         cold.require([*nodes, *right])
-        store([cold.value(n) for n in nodes], entries)
-        store([cold.value(n) for n in right], side)
+        values, sides = [cold.value(n) for n in nodes], [cold.value(n) for n in right]
+        if sizes:
+            units = [e.div(e.const(1.0), region.value(n)) for n in sizes]
+            values = [e.mul(value, units[i // k]) for i, value in enumerate(values)]
+            sides = [e.mul(value, unit) for value, unit in zip(sides, units, strict=True)]
+        store(values, entries)
+        store(sides, side)
         for lane in range(e.width):
             with b.when(e.extract(weak, lane, e.bool)):
                 pointers = ", ".join(f"ptr {b.at('double', m, lane)}" for m in (entries, side, memory))

@@ -30,19 +30,24 @@ class Correction:
     right: list[int]
     again: list[int]
     factors: list[int]
+    sizes: list[int]
+    """The inputs that say how large the terms of each equation are."""
 
 
 def newton_correction(g: Graph, equation: TracedEquation, rows: list[dict[int, int]]) -> Correction:
     """The correction of one Newton iteration of an equation whose Jacobian has these rows {column: node}."""
     k = len(equation.unknowns)
     if k == 0:
-        return Correction([], [], g.true, [], [], [], [])
+        return Correction([], [], g.true, [], [], [], [], [])
     matrix = [[row.get(j, g.zero) for j in range(k)] for row in rows]
     order = pivot_order(g, matrix)
-    factors = Factors(g, matrix, order)
+    sizes = [g.input(f"size{i}") for i in range(k)]
+    factors = Factors(g, matrix, order, sizes)
     right = [g.input(f"right{i}") for i in range(k)]
     again = factors.solve(g, right)
-    return Correction(matrix, factors.solve(g, equation.residual), factors.stable, order, right, again, sorted(factors.nodes))
+    return Correction(
+        matrix, factors.solve(g, equation.residual), factors.stable, order, right, again, sorted(factors.nodes), sizes
+    )
 
 
 def pivot_order(g: Graph, matrix: list[list[int]]) -> list[tuple[int, int]]:
@@ -102,14 +107,15 @@ def _samples(g: Graph, matrix: list[list[int]]) -> np.ndarray:
 
 
 class Factors:
-    """Elimination of a matrix in a given pivot order: multipliers, upper rows, reciprocal pivots and the guard."""
+    """Elimination of a matrix in a given pivot order: multipliers, upper rows, reciprocal pivots and the guard, for which rows
+    are divided by their `sizes` if these are given."""
 
-    def __init__(self, g: Graph, matrix: list[list[int]], order: list[tuple[int, int]]):
+    def __init__(self, g: Graph, matrix: list[list[int]], order: list[tuple[int, int]], sizes: list[int] | None = None):
         self.order = order
         self.upper = [{j: entry for j, entry in enumerate(row) if entry != g.zero} for row in matrix]
         self.multipliers: list[tuple[int, int, int]] = []
         self.inverses: dict[int, int] = {}
-        self.stable, guard = g.true, g.constant(GUARD)
+        self.stable, least = g.true, g.constant(GUARD)
         a, remaining = self.upper, set(range(len(matrix)))
         for i, j in order:
             remaining.discard(i)
@@ -119,6 +125,7 @@ class Factors:
                 entry = a[other].pop(j, None)
                 if entry is None:
                     continue
+                guard = least if sizes is None else g.mul(least, g.div(sizes[i], sizes[other]))
                 small = g.make("le", g.mul(guard, g.make("abs", entry)), g.make("abs", pivot))
                 self.stable = g.make("and", self.stable, small)
                 factor = g.mul(entry, self.inverses[i])

@@ -73,8 +73,10 @@ class Plan:
         of_input = {node: STEP for e in self.equations for node in (*e.state, *e.previous)}
         of_input |= {node: NEWTON for e in self.equations for node in e.unknowns}
         of_input |= {node: NEWTON for c in self.corrections for node in c.right}
+        of_stage = STEP if len(self.stages) > 1 else RUN
+        of_input |= {node: of_stage for c in self.corrections for node in c.sizes}
         of_input |= dict.fromkeys(self.shared.params, RUN)
-        of_input |= {self.shared.t: STEP, self.shared.h: STEP if len(self.stages) > 1 else RUN}
+        of_input |= {self.shared.t: STEP, self.shared.h: of_stage}
         level = {}
         for node in range(len(g)):
             inside = max((level[a] for a in g.args[node]), default=0)

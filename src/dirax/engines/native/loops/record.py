@@ -11,8 +11,9 @@ from dirax.engines.native.ir.emitter import Emitter
 class Record:
     """The layout of a lane's record. Every quantity is a double, counters too, and stands `width` times, once a lane.
 
-    state · for each stage the unknowns of the step before, their first differences, their second · what rounding took from the
-    state (with compensated summation) · good steps · outcome of the last · updates of Newton's method · largest residual.
+    state · for each stage the unknowns of the step before, their first differences, their second, the sizes of unknowns, those
+    of equations · what rounding took from the state (with compensated summation) · good steps · outcome of the last · updates of
+    Newton's method · largest residual.
     """
 
     state_size: int
@@ -33,7 +34,7 @@ class Record:
 
     @cached_property
     def size(self) -> int:
-        return self.state_size + 3 * self.kept + self.lost + 4
+        return self.state_size + 5 * self.kept + self.lost + 4
 
     @cached_property
     def state(self) -> slice:
@@ -48,6 +49,11 @@ class Record:
     def differences(self) -> slice:
         """First and second differences of the unknowns of all stages."""
         return slice(self.state_size + self.kept, self.state_size + 3 * self.kept)
+
+    def sizes(self, stage: int, count: int) -> tuple[slice, slice]:
+        """Those of the first `count` unknowns of a stage, and of its equations."""
+        first = self.state_size + 3 * self.kept + stage * self.history
+        return slice(first, first + count), slice(first + self.kept, first + self.kept + count)
 
     @cached_property
     def completed(self) -> int:
@@ -70,7 +76,8 @@ class Record:
 class Frame:
     """Pointers to the quantities of a record in the frame of the kernel's function, and to those that a step needs besides.
 
-    `kept` holds state and lost as they were before the step, `fresh` the unknowns found in it.
+    `kept` holds state and lost as they were before the step, `fresh` the unknowns found in it; `sizes` are those of the
+    unknowns and `rows` those of the equations.
     """
 
     emitter: Emitter
@@ -80,6 +87,8 @@ class Frame:
     unknowns: str
     slopes: str
     bends: str
+    sizes: str
+    rows: str
     fresh: str
     completed: str
     status: str
@@ -93,14 +102,19 @@ class Frame:
         state = [b.alloca(e.real) for _ in range(record.state_size)]
         lost = [b.alloca(e.real) for _ in range(record.lost)]
         kept = [b.alloca(e.real) for _ in range(record.state_size + record.lost)]
-        unknowns, slopes, bends, fresh = (b.alloca(e.real, max(1, record.kept)) for _ in range(4))
+        arrays = [b.alloca(e.real, max(1, record.kept)) for _ in range(6)]
         numbers = [b.alloca(e.real) for _ in range(4)]
-        return cls(e, state, lost, kept, unknowns, slopes, bends, fresh, *numbers)
+        return cls(e, state, lost, kept, *arrays, *numbers)
 
     def in_order(self, record: Record) -> list[str]:
         """One pointer for each quantity of the record."""
-        arrays = [pointer for base in (self.unknowns, self.slopes, self.bends) for pointer in self.slots(base, record.kept)]
+        arrays = [pointer for base in self.of_stages for pointer in self.slots(base, record.kept)]
         return [*self.state, *arrays, *self.lost, self.completed, self.status, self.iterations, self.max_residual]
+
+    @property
+    def of_stages(self) -> tuple[str, ...]:
+        """The arrays that hold something of every stage, in the order of the record."""
+        return self.unknowns, self.slopes, self.bends, self.sizes, self.rows
 
     @property
     def carried(self) -> list[str]:

@@ -6,6 +6,7 @@ from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
 from dirax.engines.native.ir.emitter import Emitter
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.newton_loop import NewtonLoop
+from dirax.engines.native.loops.newton_step import Correction
 from dirax.engines.native.loops.plan import STEP, Plan, frontier
 from dirax.engines.native.loops.record import Frame
 
@@ -51,6 +52,8 @@ def emit_stage(
     active = e.both(running, block.running())
     region = Region(e, plan.graph, around)
     region.bind(plan.shared.t, time)
+    if len(plan.stages) > 1:
+        bind_sizes(region, frame, correction, offset)
     for node, value in zip(equation.state, frame.loads(frame.state), strict=True):
         region.bind(node, value)
     last, slopes, bends = (frame.loads(frame.slots(base, k, offset)) for base in (frame.unknowns, frame.slopes, frame.bends))
@@ -62,7 +65,7 @@ def emit_stage(
     frame.stores([region.value(n) for n in equation.guess], unknowns)
     converged = e.true
     if k:
-        newton = NewtonLoop(equation, correction, region, unknowns)
+        newton = NewtonLoop(equation, correction, region, unknowns, frame.slots(frame.sizes, k, offset))
         newton.emit(active)
         converged = newton.converged
         b.store(e.real, e.add(b.load(e.real, frame.iterations), newton.count), frame.iterations)
@@ -87,6 +90,13 @@ def emit_stage(
     state = frame.loads(frame.carried)
     frame.stores([e.select(good, a, c) for a, c in zip([*new, *lost], state, strict=True)], frame.carried)
     frame.stores(solution, frame.slots(frame.fresh, k, offset))
+
+
+def bind_sizes(region: Region, frame: Frame, correction: Correction, offset: int | str = 0) -> None:
+    """The sizes of the equations of a stage, known in a region."""
+    pointers = frame.slots(frame.rows, len(correction.sizes), offset)
+    for node, value in zip(correction.sizes, frame.loads(pointers), strict=True):
+        region.bind(node, value)
 
 
 def _compensated(block: Block, increments: list[int | None], after: Region, new: list[str]) -> tuple[list[str], list[str]]:

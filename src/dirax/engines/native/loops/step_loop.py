@@ -8,7 +8,7 @@ from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.dense import add_dense_solve
 from dirax.engines.native.loops.plan import RUN, Plan, frontier
 from dirax.engines.native.loops.record import Frame, Record
-from dirax.engines.native.loops.stage import Block, emit_stage
+from dirax.engines.native.loops.stage import Block, bind_sizes, emit_stage
 
 WRITTEN_OUT = 64
 """Unknowns of all stages up to which there is no loop over them."""
@@ -53,6 +53,7 @@ def _define_block(plan: Plan, module: Module, width: int) -> None:
         known.bind(node, b.load(e.real, b.at(e.real, "%params", i)))
     if len(plan.stages) == 1:
         known.bind(plan.shared.h, e.mul(e.splat("%h"), e.const(plan.stages[0][1])))
+        bind_sizes(known, frame, plan.corrections[0])
     known.require(frontier(plan.graph, level, plan.outputs, RUN))
 
     def give_back() -> None:
@@ -72,10 +73,10 @@ def _transfers(frame: Frame, record: Record) -> tuple[Callable[[], None], Callab
     if kept <= WRITTEN_OUT:
         places, memory = frame.slots("%lanes", record.size), frame.in_order(record)
         return lambda: frame.stores(frame.loads(places), memory), lambda: frame.stores(frame.loads(memory), places)
-    after = first + 3 * kept
+    after = first + 5 * kept
     singles = [*frame.state, *frame.lost, frame.completed, frame.status, frame.iterations, frame.max_residual]
     places = [e.body.at(e.real, "%lanes", i) for i in (*range(first), *range(after, record.size))]
-    arrays = [(base, first + number * kept) for number, base in enumerate((frame.unknowns, frame.slopes, frame.bends))]
+    arrays = [(base, first + number * kept) for number, base in enumerate(frame.of_stages)]
 
     def transfer(into_frame: bool) -> None:
         b = e.body

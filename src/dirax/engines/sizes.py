@@ -1,0 +1,202 @@
+"""How large the unknowns and the equations of a step are: the units in which an engine measures them.
+
+At the first guess u and the first state x of a step with the residual r, the terms of its equations have the sizes
+|r| + |r_u||u| + |r_x||x|, and a last place of each changes the unknowns by
+
+    ε |r_u⁻¹| (|r| + |r_u||u| + |r_x||x|)        (Skeel 1979).
+
+Without the ε this is the size of an unknown, and |r_u| times these sizes that of an equation. Data may be special, such as a
+link that hangs straight: what the derivatives are near the end of a short step counts as well. All sizes are rounded to powers
+of two, by which one multiplies without rounding, and they scale with the units of lengths, masses and times: nothing in an
+engine is compared with 1.
+
+A velocity under constraints, whose size is |q|/h in short steps, is known to ε|q|/h. Where that is more than 4·STALLED of what it
+comes to, v, or √(a|q|) where motion begins with the acceleration a, and where nothing that it is coupled to is known better, the
+step is too short for double precision, and the unknowns have that size instead: Newton's method will not converge.
+"""
+
+import dataclasses
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.engines.contract import Problem
+from dirax.engines.stopping import STALLED
+from dirax.numerics.equilibration import balanced_inverse, power_of_two
+from dirax.numerics.tolerances import EPSILON
+from dirax.program.compiled import compiled
+from dirax.program.roots import FEWEST_SPARSE
+
+
+def sizes_of(problem: Problem) -> tuple[np.ndarray, ...]:
+    """The sizes of the unknowns and of the equations of each stage, (2, k) or (B, 2, k), of a problem in numbers."""
+    if problem.sizes is not None:
+        return tuple(map(np.asarray, problem.sizes))
+    if problem.size >= FEWEST_SPARSE:
+        return tuple(np.ones((*np.shape(guess)[:-1], 2, np.shape(guess)[-1])) for guess in problem.guess)
+    found = _in_numbers(problem)
+    return tuple(map(np.asarray, _compiled(*_arguments(problem)))) if found is None else found
+
+
+def sizes_by_jax(problem: Problem) -> tuple[jax.Array, ...]:
+    """The same of a problem that JAX traces, without derivatives."""
+    if problem.sizes is not None or problem.size >= FEWEST_SPARSE:
+        return tuple(map(jnp.asarray, sizes_of(problem)))
+    return jax.lax.stop_gradient(sizes_at(*_arguments(problem)))
+
+
+def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple, sizes: tuple) -> tuple:
+    """The sizes of trajectories at which Newton's method stopped too early or not at all, and which of them grew: the largest of
+    those where they began and of those where they stand, after `completed` steps at `state` (lanes, s) with the unknowns `guess`.
+
+    Data may be so special where a run begins that an unknown has no size there. Everything has an axis of the `lanes`."""
+    p = problem
+    if p.size >= FEWEST_SPARSE:
+        return sizes, np.zeros(len(lanes), bool)
+    moved = lambda a: np.asarray(a)[lanes] if p.batch is not None else np.asarray(a)[None][lanes]
+    params = jax.tree.map(moved, p.params) if p.batch_params else p.params
+    here = dataclasses.replace(
+        p, state=state, guess=guess, params=params, batch=len(lanes), first_step=p.first_step + completed, sizes=None
+    )
+    found = _in_numbers(here)
+    if found is None:
+        return sizes, np.zeros(len(lanes), bool)
+    more = np.any([np.any(new[:, 0] > old[:, 0], axis=1) for new, old in zip(found, sizes, strict=True)], axis=0)
+    return tuple(np.maximum(new, old) for new, old in zip(found, sizes, strict=True)), more
+
+
+def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
+    """By the scalar program of the step, once for stages that are equal; None where it has none."""
+    from dirax.engines.step_program import step_program  # imported when it is used
+    from dirax.program.graph import GraphTooLarge
+    from dirax.program.interpreter import UnsupportedPrimitive
+
+    batch, stages, key = p.batch or 1, p.equation.stages, (p.params, p.batch_params)
+    t, state = np.full(batch, p.t0 + p.first_step * p.h), np.asarray(p.state, float).reshape(batch, -1)
+    guesses, h = [np.asarray(g, float).reshape(batch, -1) for g in p.guess], [np.full(batch, a * p.h) for _, a in stages]
+    firsts = _first_of_each(stages)
+    try:
+        program = step_program(p.equation, *key)
+        none = np.zeros((batch, 0)), np.zeros((batch, 0, state.shape[1] + 1))
+        linear = lambda i, u, x, part: program.linearized(*key, u, x, t, part * h[i], i, True) if u.shape[1] else none
+        end, first = state, linear(0, guesses[0], state, SHORT)
+        for i in firsts:
+            u = _updated(*(linear(i, guesses[i], end, SHORT) if i else first), guesses[i], np)
+            end = program.advanced(*key, u, end, t, SHORT * h[i], i)
+        end = end * _nearby(end.shape[1])
+        found: list[np.ndarray] = []
+        for i, (stage, u) in enumerate(zip(stages, guesses, strict=True)):
+            same = next((j for j in range(i) if stages[j] == stage and np.array_equal(guesses[j], u)), None)
+            if same is None:
+                short = linear(i, u, state, SHORT)[1] if i else first[1]
+                near = linear(i, u, end, SHORT)[1]
+                found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, state, end, h[i][:, None], np))
+            else:
+                found.append(found[same])
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return None
+    return tuple(found if p.batch is not None else [a[0] for a in found])
+
+
+def _first_of_each(stages: tuple) -> list[int]:
+    """The number of the first stage with each of the equations."""
+    return [i for i, (stage, _) in enumerate(stages) if all(stage is not other for other, _ in stages[:i])]
+
+
+def _updated(residual: Any, slopes: Any, u: Any, xp: ModuleType) -> Any:
+    """The unknowns (…, k) after one update of Newton's method; as they were where that is not finite."""
+    k = u.shape[-1]
+    if not k:
+        return u
+    with np.errstate(all="ignore"):
+        change = (balanced_inverse(slopes[..., :k], xp) @ residual[..., None])[..., 0]
+    return u - xp.where(xp.all(xp.isfinite(change), axis=-1, keepdims=True), change, 0.0)
+
+
+SHORT = 0.25
+"""The part of a step whose equations are inverted: those of a step that is too long may be singular anywhere."""
+
+NEAR = 1.0 / 16.0
+"""How much, relative, the data are changed to see what derivatives are near them."""
+
+
+COUPLED = 1e-3
+"""Unknowns that change others by less than this of their sizes are not coupled."""
+
+ROUNDINGS = 64.0
+"""Roundings up to which an unknown is zero."""
+
+
+def _nearby(count: int) -> np.ndarray:
+    """A factor near 1 for each of so many numbers, all of them different."""
+    return 1.0 + NEAR * (np.modf(np.arange(1, count + 1) * (np.sqrt(5.0) - 1.0) / 2.0)[0] - 0.5)
+
+
+def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, state: Any, end: Any, h: Any, xp: ModuleType) -> Any:
+    """(…, 2, k) from r (…, k) and its derivatives by (u, x, h) at the state, and those of a short step there and near its `end`,
+    (…, k, k + s + 1)."""
+    if not u.shape[-1]:
+        return xp.ones((*u.shape[:-1], 2, 0))
+    k, applied = u.shape[-1], lambda matrix, vector: (matrix @ vector[..., None])[..., 0]
+    finite = lambda sizes: xp.where(xp.isfinite(sizes), sizes, 0.0)
+    with np.errstate(all="ignore"):
+        both = slopes, near
+        inverse = balanced_inverse(slopes[..., :k], xp)
+        solution = xp.abs(u - finite(applied(inverse, residual)))
+        largest = xp.maximum(xp.abs(u), solution)
+        terms = [
+            xp.abs(residual) + applied(xp.abs(derivatives[..., :-1]), xp.concatenate([largest, xp.abs(x)], axis=-1))
+            for derivatives, x in zip(both, (state, end), strict=True)
+        ]
+        inverses = [xp.abs(balanced_inverse(derivatives[..., :k], xp)) for derivatives in (short, near)]
+        sizes = [finite(applied(inverse, of)) for inverse, of in zip(inverses, terms, strict=True)]
+
+        blurred = EPSILON * finite(applied(xp.abs(inverse), terms[0]))
+        moved = finite(applied(xp.abs(inverse), xp.abs(h * slopes[..., -1])))
+        reached = solution + xp.sqrt(moved * blurred / EPSILON)
+        known = blurred <= 4.0 * STALLED * reached
+        coupling = (finite(i @ xp.abs(d[..., :k])) for i, d in zip((xp.abs(inverse), inverses[1]), both, strict=True))
+        coupled = xp.maximum(*coupling) * blurred[..., None, :] > COUPLED * blurred[..., None]
+        coupled = coupled & xp.swapaxes(coupled, -1, -2)
+        hidden = ~known & (solution > ROUNDINGS * blurred) & ~xp.any(coupled & known[..., None, :], axis=-1)
+        too_short = xp.any(hidden, axis=-1, keepdims=True)
+        unknowns = power_of_two(xp.maximum(xp.where(too_short, reached, xp.maximum(*sizes)), xp.abs(u)), xp)
+        equations = (finite(applied(xp.abs(derivatives[..., :k]), unknowns)) for derivatives in both)
+        return xp.stack([unknowns, power_of_two(xp.maximum(*equations), xp)], axis=-2)
+
+
+def _arguments(p: Problem) -> tuple:
+    axes = None if p.batch is None else (0, 0, 0 if p.batch_params else None)
+    t, h = jnp.asarray(p.t0 + p.first_step * p.h, float), jnp.asarray(p.h, float)
+    return p.equation, jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), jax.tree.map(jnp.asarray, p.params), t, h, axes
+
+
+def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: Any, axes: tuple | None = None) -> tuple:
+    """The sizes of each stage of a step from a state, over a batch with the `axes` of (state, guess, params), by JAX."""
+
+    def one(state, guess, params):
+        def linear(i, u, x, part):
+            stage, fraction = equation.stages[i]
+            residual = lambda u, x, h: stage.residual(u, x, t, h, params)
+            by_u, by_x, by_h = jax.jacfwd(residual, argnums=(0, 1, 2))(u, x, part * fraction * h)
+            return residual(u, x, part * fraction * h), jnp.concatenate([by_u, by_x, by_h[:, None]], axis=1)
+
+        end, found = state, []
+        for i in _first_of_each(equation.stages):
+            stage, fraction = equation.stages[i]
+            u = _updated(*linear(i, guess[i], end, SHORT), guess[i], jnp)
+            end = stage.advance(u, end, t, SHORT * fraction * h, params)
+        end = end * _nearby(len(state))
+        for i, u in enumerate(guess):
+            short, near = linear(i, u, state, SHORT)[1], linear(i, u, end, SHORT)[1]
+            found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, state, end, equation.stages[i][1] * h, jnp))
+        return tuple(found)
+
+    given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params
+    return one(*given) if axes is None else jax.vmap(one, in_axes=axes)(*given)
+
+
+_compiled = compiled(sizes_at)
