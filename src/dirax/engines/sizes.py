@@ -37,8 +37,16 @@ def sizes_of(problem: Problem) -> tuple[np.ndarray, ...]:
         return tuple(map(np.asarray, problem.sizes))
     if problem.size >= FEWEST_SPARSE:
         return tuple(np.ones((*np.shape(guess)[:-1], 2, np.shape(guess)[-1])) for guess in problem.guess)
-    found = _in_numbers(problem)
-    return tuple(map(np.asarray, _compiled(*_arguments(problem)))) if found is None else found
+    found, sure = _first_in_numbers(problem) or (None, np.zeros(problem.batch or 1, bool))
+    if found is not None and np.all(sure):
+        return found
+    closer = _in_numbers(problem)
+    if closer is None:
+        closer = tuple(map(np.asarray, _compiled(*_arguments(problem))))
+    if found is None:
+        return closer
+    chosen = sure[:, None, None] if problem.batch is not None else sure[0]
+    return tuple(np.where(chosen, a, b) for a, b in zip(found, closer, strict=True))
 
 
 def sizes_by_jax(problem: Problem) -> tuple[jax.Array, ...]:
@@ -99,6 +107,34 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
     except (UnsupportedPrimitive, GraphTooLarge):
         return None
     return tuple(found if p.batch is not None else [a[0] for a in found])
+
+
+def _first_in_numbers(p: Problem) -> tuple[tuple[np.ndarray, ...], np.ndarray] | None:
+    """The sizes by one linearization, and of which trajectories there is no doubt; None for a step that has no small program."""
+    from dirax.engines.step_program import step_program  # imported when it is used
+    from dirax.program.graph import GraphTooLarge
+    from dirax.program.interpreter import UnsupportedPrimitive
+
+    batch = p.batch or 1
+    t, state = np.full(batch, p.t0 + p.first_step * p.h), np.asarray(p.state, float).reshape(batch, -1)
+    found, sure = [], np.ones(batch, bool)
+    try:
+        program = step_program(p.equation, p.params, p.batch_params)
+        leaves = program.parameters.flatten(p.params, p.batch if p.batch_params else None)
+        leaves = np.broadcast_to(leaves, (batch, program.parameters.size))
+        for (index, fraction), guess in zip(program.stages, p.guess, strict=True):
+            u = np.asarray(guess, float).reshape(batch, -1)
+            if not u.shape[1]:
+                found.append(np.ones((batch, 2, 0)))
+                continue
+            if program.first_sizes(index) is None:
+                return None
+            values = program.sizes_in_numbers(index, u, state, t, np.full(batch, fraction * p.h), leaves)
+            found.append(values[:, :-1].reshape(batch, 2, -1))
+            sure &= values[:, -1] > 0.0
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return None
+    return tuple(a if p.batch is not None else a[0] for a in found), sure
 
 
 def _first_of_each(stages: tuple) -> list[int]:

@@ -133,6 +133,8 @@ class StepProgram:
     parameters: Parameters
     size: int = field(init=False)
     """Nodes of the step without its Jacobians."""
+    _sizes: dict[int, Any] = field(init=False, default_factory=dict)
+    _in_floats: dict[int, Floats | None] = field(init=False, default_factory=dict)
 
     def __post_init__(self):
         self.size = len(self.graph)
@@ -159,6 +161,37 @@ class StepProgram:
     def jacobians(self) -> list[list[dict[int, int]]]:
         """The rows {column: node} of the Jacobian of every equation's residual. Raises `GraphTooLarge`."""
         return [jacobian(self.graph, e.residual, e.unknowns) for e in self.equations]
+
+    def first_sizes(self, index: int) -> Any:
+        """The `FirstSizes` of an equation; None for a large step."""
+        from dirax.engines.first_sizes import FirstSizes  # which reads this module
+
+        e = self.equations[index]
+        if index not in self._sizes:
+            small = 0 < len(e.unknowns) * self.size <= WRITTEN
+            self._sizes[index] = FirstSizes(self.graph, e.unknowns, e.state, self.shared.h, e.residual) if small else None
+        return self._sizes[index]
+
+    def sizes_in_numbers(self, index: int, *arguments: np.ndarray) -> np.ndarray:
+        """The sizes of `first_sizes`, (entries, 2k + 1); (u, state, t, h, parameters) have an axis of entries."""
+        e, shared, made = self.equations[index], self.shared, self.first_sizes(index)
+        node = lambda nodes: np.asarray(nodes, dtype=np.int64)
+
+        def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
+            known = Values(made.graph, len(arguments[0]))
+            for nodes, array in zip((e.unknowns, e.state, shared.t, shared.h, shared.params), arguments, strict=True):
+                known.bind(node(nodes), array)
+            return [known.read(node(made.sizes))]
+
+        return in_parts(part, list(arguments))[0]
+
+    def sizes_in_floats(self, index: int) -> Floats | None:
+        """(unknowns, state, t, h, params) ↦ the outputs of `first_sizes`, for one entry; None for a large step."""
+        if index not in self._in_floats:
+            e, made = self.equations[index], self.first_sizes(index)
+            inputs = [*e.unknowns, *e.state, self.shared.t, self.shared.h, *self.shared.params]
+            self._in_floats[index] = made and in_floats(made.graph, inputs, made.outputs)
+        return self._in_floats[index]
 
     @cached_property
     def first_in_floats(self) -> Floats | None:

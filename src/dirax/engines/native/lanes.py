@@ -100,6 +100,11 @@ class Lanes:
         assert self.fields
         self.call(kernel, self.records, self.outs, first, stop, self.problem.save_every, threads)
 
+    @property
+    def stuck(self) -> bool:
+        """Whether there is a trajectory for which Newton's method has not converged."""
+        return bool((self.records[:, self.record.status] == NOT_CONVERGED).any())
+
     def left(self) -> list[int]:
         """The trajectories that have not converged; of blocks of one lane."""
         return np.flatnonzero(self.records[:, self.record.status, 0] == NOT_CONVERGED).tolist()

@@ -80,9 +80,14 @@ class OneLane:
         """Whether the trajectory has neither failed nor ended before its time."""
         return self.memory[self.record.status] == OK
 
+    @property
+    def stuck(self) -> bool:
+        """Whether Newton's method has not converged."""
+        return self.memory[self.record.status] == NOT_CONVERGED
+
     def left(self) -> list[int]:
         """The trajectories that have not converged."""
-        return [0] if self.memory[self.record.status] == NOT_CONVERGED else []
+        return [0] if self.stuck else []
 
     def again(self, kernel, lane: int) -> None:
         """Go on with a trajectory by another kernel."""

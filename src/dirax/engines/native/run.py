@@ -122,6 +122,8 @@ def _with_present_sizes(lanes: Lanes | OneLane, made: Kernels) -> None:
     """Go on with trajectories whose unknowns have become larger than where they began. An attempt that does not come to another
     step leaves no trace."""
     p, record = lanes.problem, lanes.record
+    if not lanes.stuck:
+        return
     table = lanes.table()
     failed, tried = np.flatnonzero(table[:, record.status] == NOT_CONVERGED), 0
     while len(failed) and tried < RESUMED:

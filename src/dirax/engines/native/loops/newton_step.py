@@ -153,3 +153,17 @@ class Factors:
                     total = g.sub(total, g.mul(upper, x[c]))
             x[j] = g.mul(total, self.inverses[i])
         return [x[j] for j in range(len(right))]
+
+    def bounds(self, g: Graph, right: list[int]) -> list[int]:
+        """Bounds of the solution for right-hand sides of these sizes, from the sizes of the factors."""
+        size = lambda node: g.make("abs", node)
+        b, x = list(right), {}
+        for row, pivot_row, factor in self.multipliers:
+            b[row] = g.add(b[row], g.mul(size(factor), b[pivot_row]))
+        for i, j in reversed(self.order):
+            total = b[i]
+            for c, upper in sorted(self.upper[i].items()):
+                if c != j:
+                    total = g.add(total, g.mul(size(upper), x[c]))
+            x[j] = g.mul(total, size(self.inverses[i]))
+        return [x[j] for j in range(len(right))]

@@ -1,0 +1,59 @@
+"""How large unknowns and equations are, by one linearization of the step in scalars: where that leaves no doubt, it is all that
+has to be found.
+
+The inverse of the Jacobian is bounded by the sizes of its triangular factors, whose pivots are those of a kernel. There is doubt
+where these are too small, and where an unknown is not known to 4·STALLED of what it comes to: `sizes.py` looks closer then, as it
+does for trajectories at which Newton's method stops too early.
+"""
+
+from functools import cached_property, reduce
+
+from dirax.engines.native.loops.newton_step import Factors, pivot_order
+from dirax.engines.stopping import STALLED
+from dirax.numerics.equilibration import LEAST_SIZE
+from dirax.numerics.tolerances import EPSILON
+from dirax.program.graph import Graph
+from dirax.program.graph_derivatives import jacobian
+
+SOLVED = 1e-10
+"""What a solution with good pivots leaves of a right-hand side, relative to its terms."""
+
+
+class FirstSizes:
+    """The sizes of one equation as nodes: `outputs` are residual · Jacobian · sizes of the unknowns · those of the equations ·
+    1 where there is no doubt and 0 where there is."""
+
+    def __init__(self, graph: Graph, unknowns: list[int], state: list[int], h: int, residual: list[int]):
+        g = self.graph = graph.copy()
+        self.count = k = len(unknowns)
+        size = lambda node: g.make("abs", node)
+        total = lambda nodes: reduce(g.add, nodes, g.zero)
+        rows = jacobian(g, residual, [*unknowns, *state, h])
+        matrix = [[row.get(j, g.zero) for j in range(k)] for row in rows]
+        factors = Factors(g, matrix, pivot_order(g, matrix))
+        change = factors.solve(g, residual)
+        solution = [size(g.sub(u, d)) for u, d in zip(unknowns, change, strict=True)]
+        operands = [*(g.add(size(u), a) for u, a in zip(unknowns, solution, strict=True)), *map(size, state)]
+        products = lambda row, values: [g.mul(size(row[j]), value) for j, value in enumerate(values) if j in row]
+        terms = [total([size(r), *products(row, operands)]) for r, row in zip(residual, rows, strict=True)]
+        known = factors.bounds(g, terms)
+        moved = factors.bounds(g, [size(g.mul(h, row.get(k + len(state), g.zero))) for row in rows])
+        least = g.constant(LEAST_SIZE)
+        own = [total([a, size(u), least]) for a, u in zip(known, unknowns, strict=True)]
+        equations = [g.add(total(products(row, own)), least) for row in rows]
+
+        sure = g.make("finite", total([*own, *equations]))
+        below = lambda a, b: g.make("and", sure, g.make("le", a, b))
+        for a, m, u in zip(known, moved, solution, strict=True):
+            reached = g.add(u, g.make("sqrt", g.mul(m, a)))
+            sure = below(g.mul(g.constant(EPSILON), a), g.mul(g.constant(4.0 * STALLED), reached))
+        for r, row in zip(residual, matrix, strict=True):
+            of_row = [g.mul(a, d) for a, d in zip(row, change, strict=True)]
+            sure = below(size(g.sub(total(of_row), r)), g.mul(g.constant(SOLVED), total([size(r), *map(size, of_row)])))
+        entries = [entry for row in matrix for entry in row]
+        self.outputs = [*residual, *entries, *own, *equations, g.select(sure, g.one, g.zero)]
+
+    @cached_property
+    def sizes(self) -> list[int]:
+        """The outputs without residual and Jacobian."""
+        return self.outputs[self.count * (self.count + 1) :]
