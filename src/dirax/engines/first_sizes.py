@@ -6,9 +6,10 @@ where these are too small, and where an unknown is not known to 4·STALLED of wh
 does for trajectories at which Newton's method stops too early.
 """
 
-from functools import cached_property, reduce
+from functools import reduce
 
 from dirax.engines.native.loops.newton_step import Factors, pivot_order
+from dirax.engines.step_program import TracedEquation
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import LEAST_SIZE
 from dirax.numerics.tolerances import EPSILON
@@ -20,17 +21,16 @@ SOLVED = 1e-10
 
 
 class FirstSizes:
-    """The sizes of one equation as nodes: `outputs` are residual · Jacobian · sizes of the unknowns · those of the equations ·
-    1 where there is no doubt and 0 where there is."""
+    """The sizes of one equation as nodes of a graph, which gains them: of the `unknowns`, of the `equations`, and `sure`, 1 where
+    there is no doubt and 0 where there is. `order` is that of the pivots, found here where it is not given."""
 
-    def __init__(self, graph: Graph, unknowns: list[int], state: list[int], h: int, residual: list[int]):
-        g = self.graph = graph.copy()
-        self.count = k = len(unknowns)
-        size = lambda node: g.make("abs", node)
+    def __init__(self, graph: Graph, equation: TracedEquation, h: int, order: list[tuple[int, int]] | None = None):
+        g, unknowns, state, residual = graph, equation.unknowns, equation.state, equation.residual
+        k, size = len(unknowns), lambda node: g.make("abs", node)
         total = lambda nodes: reduce(g.add, nodes, g.zero)
         rows = jacobian(g, residual, [*unknowns, *state, h])
         matrix = [[row.get(j, g.zero) for j in range(k)] for row in rows]
-        factors = Factors(g, matrix, pivot_order(g, matrix))
+        factors = Factors(g, matrix, order or pivot_order(g, matrix))
         change = factors.solve(g, residual)
         solution = [size(g.sub(u, d)) for u, d in zip(unknowns, change, strict=True)]
         operands = [*(g.add(size(u), a) for u, a in zip(unknowns, solution, strict=True)), *map(size, state)]
@@ -50,10 +50,9 @@ class FirstSizes:
         for r, row in zip(residual, matrix, strict=True):
             of_row = [g.mul(a, d) for a, d in zip(row, change, strict=True)]
             sure = below(size(g.sub(total(of_row), r)), g.mul(g.constant(SOLVED), total([size(r), *map(size, of_row)])))
-        entries = [entry for row in matrix for entry in row]
-        self.outputs = [*residual, *entries, *own, *equations, g.select(sure, g.one, g.zero)]
+        self.graph, self.unknowns, self.equations, self.sure = g, own, equations, g.select(sure, g.one, g.zero)
 
-    @cached_property
-    def sizes(self) -> list[int]:
-        """The outputs without residual and Jacobian."""
-        return self.outputs[self.count * (self.count + 1) :]
+    @property
+    def outputs(self) -> list[int]:
+        """All of them."""
+        return [*self.unknowns, *self.equations, self.sure]

@@ -61,19 +61,23 @@ def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.
     those where they began and of those where they stand, after `completed` steps at `state` (lanes, s) with the unknowns `guess`.
 
     Data may be so special where a run begins that an unknown has no size there. Everything has an axis of the `lanes`."""
+    found = sizes_there(problem, lanes, completed, state, guess)
+    more = np.any([np.any(new[:, 0] > old[:, 0], axis=1) for new, old in zip(found, sizes, strict=True)], axis=0)
+    return tuple(np.maximum(new, old) for new, old in zip(found, sizes, strict=True)), more
+
+
+def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> tuple:
+    """The sizes of some trajectories where they stand, looked at closely; arguments as above."""
     p = problem
     if p.size >= FEWEST_SPARSE:
-        return sizes, np.zeros(len(lanes), bool)
+        return tuple(np.ones((len(lanes), 2, np.shape(u)[-1])) for u in guess)
     moved = lambda a: np.asarray(a)[lanes] if p.batch is not None else np.asarray(a)[None][lanes]
     params = jax.tree.map(moved, p.params) if p.batch_params else p.params
     here = dataclasses.replace(
         p, state=state, guess=guess, params=params, batch=len(lanes), first_step=p.first_step + completed, sizes=None
     )
     found = _in_numbers(here)
-    if found is None:
-        return sizes, np.zeros(len(lanes), bool)
-    more = np.any([np.any(new[:, 0] > old[:, 0], axis=1) for new, old in zip(found, sizes, strict=True)], axis=0)
-    return tuple(np.maximum(new, old) for new, old in zip(found, sizes, strict=True)), more
+    return tuple(map(np.asarray, _compiled(*_arguments(here)))) if found is None else found
 
 
 def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:

@@ -134,7 +134,6 @@ class StepProgram:
     size: int = field(init=False)
     """Nodes of the step without its Jacobians."""
     _sizes: dict[int, Any] = field(init=False, default_factory=dict)
-    _in_floats: dict[int, Floats | None] = field(init=False, default_factory=dict)
 
     def __post_init__(self):
         self.size = len(self.graph)
@@ -166,11 +165,15 @@ class StepProgram:
         """The `FirstSizes` of an equation; None for a large step."""
         from dirax.engines.first_sizes import FirstSizes  # which reads this module
 
-        e = self.equations[index]
         if index not in self._sizes:
-            small = 0 < len(e.unknowns) * self.size <= WRITTEN
-            self._sizes[index] = FirstSizes(self.graph, e.unknowns, e.state, self.shared.h, e.residual) if small else None
+            made = FirstSizes(self.graph.copy(), self.equations[index], self.shared.h) if self.sizes_are_written else None
+            self._sizes[index] = made
         return self._sizes[index]
+
+    @property
+    def sizes_are_written(self) -> bool:
+        """Whether the step is small enough for its sizes to be written as nodes."""
+        return max(len(e.unknowns) for e in self.equations) * self.size <= WRITTEN
 
     def sizes_in_numbers(self, index: int, *arguments: np.ndarray) -> np.ndarray:
         """The sizes of `first_sizes`, (entries, 2k + 1); (u, state, t, h, parameters) have an axis of entries."""
@@ -181,17 +184,9 @@ class StepProgram:
             known = Values(made.graph, len(arguments[0]))
             for nodes, array in zip((e.unknowns, e.state, shared.t, shared.h, shared.params), arguments, strict=True):
                 known.bind(node(nodes), array)
-            return [known.read(node(made.sizes))]
+            return [known.read(node(made.outputs))]
 
         return in_parts(part, list(arguments))[0]
-
-    def sizes_in_floats(self, index: int) -> Floats | None:
-        """(unknowns, state, t, h, params) ↦ the outputs of `first_sizes`, for one entry; None for a large step."""
-        if index not in self._in_floats:
-            e, made = self.equations[index], self.first_sizes(index)
-            inputs = [*e.unknowns, *e.state, self.shared.t, self.shared.h, *self.shared.params]
-            self._in_floats[index] = made and in_floats(made.graph, inputs, made.outputs)
-        return self._in_floats[index]
 
     @cached_property
     def first_in_floats(self) -> Floats | None:

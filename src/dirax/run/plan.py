@@ -15,14 +15,7 @@ from dirax.program.evaluation.functions import program_at
 from dirax.program.evaluation.in_floats import Floats
 from dirax.run.final_manifold import MOST
 from dirax.run.settings import Settings
-from dirax.run.start import (
-    Initial,
-    Start,
-    program_of_beginning,
-    program_of_completion,
-    program_of_first_step,
-    programs_of_sizes,
-)
+from dirax.run.start import Initial, Start, program_of_beginning, program_of_completion, program_of_first_step
 from dirax.run.validate import Case
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.step import Shape, nothing_to_check
@@ -45,7 +38,6 @@ class Plan:
         self.complete: Any = program_of_completion(settings.system, case, settings.project)
         self.begun: Any = program_of_beginning(equation, case, initial.data)
         self.first_step: Any = None
-        self.sizes: list[tuple[Floats | None, float]] = []
         self.data_size = sum(np.size(a) for a in jax.tree.leaves(initial.data))
         self.defects, self.has_lagrangian = np.size(initial.defect), initial.lagrangian is not None
         self.matrix = None
@@ -55,7 +47,6 @@ class Plan:
         self.fraction, self.unknowns = equation.stages[0][1], equation.stages[0][0].unknowns
         if self.unknowns:
             self.first_step, self.moving = program_of_first_step(equation, case)
-            self.sizes = programs_of_sizes(equation, case)
             self.jacobian = _scales(np.asarray(start.jacobian))
         system = settings.system
         never = system.metric_form() is not None or system.lagrangian_form() is None or system.final_relation(shape) is not None
@@ -79,10 +70,9 @@ class Plan:
             initial = self.complete((*data, *last))
             complete = initial[: self.data_size]
             start = self.begun((*complete, *last))
-            if not (self._holds(initial) and self._has_regular_hessian(complete, case, last)):
-                return None
-            steps_on, sizes = self._steps(start, case, leaves)
-            if not steps_on:
+            if not (
+                self._holds(initial) and self._steps(start, case, leaves) and self._has_regular_hessian(complete, case, last)
+            ):
                 return None
         except (ArithmeticError, ValueError):  # what Python's floats do not have
             return None
@@ -100,7 +90,6 @@ class Plan:
             steps=steps,
             save_every=save_every,
             params=case.params,
-            sizes=sizes,
         )
 
     def _holds(self, initial: Sequence[float]) -> bool:
@@ -116,27 +105,14 @@ class Plan:
             return True
         return surely_independent(_scaled(initial[at + self.has_lagrangian :], self.matrix), SURELY_REGULAR)
 
-    def _steps(self, start: Sequence[float], case: Case, leaves: list[Any]) -> tuple[bool, tuple[np.ndarray, ...] | None]:
-        """Whether the first step has a unique solution; and the sizes of its unknowns and equations, None where in doubt."""
+    def _steps(self, start: Sequence[float], case: Case, leaves: list[Any]) -> bool:
+        """Whether the first step has a unique solution."""
         k, s = self.unknowns, self.state_size
         if not k:
-            return True, None
+            return True
         params = [x for leaf, moves in zip(leaves, self.moving, strict=True) if moves for x in leaf.ravel().tolist()]
-        at, sizes, known = s, [], {}
-        for (program, fraction), count in zip(self.sizes, self.guesses, strict=True):
-            given = (*start[at : at + count], *start[:s], case.t0, fraction * case.h, *params)
-            at += count
-            if (key := (program, given)) not in known:
-                known[key] = _tried(program, given)
-            numbers = known[key]
-            if not sizes:
-                first = numbers or self.first_step(given)
-                if not (math.isfinite(sum(first[:k])) and surely_independent(_scaled(first[k : k + k * k], self.jacobian))):
-                    return False, None
-            if numbers is None or not numbers[-1]:
-                return True, None
-            sizes.append(np.array(numbers[count * (count + 1) : -1]).reshape(2, count))
-        return True, tuple(sizes)
+        found = self.first_step((*start[s : s + k], *start[:s], case.t0, self.fraction * case.h, *params))
+        return math.isfinite(sum(found[:k])) and surely_independent(_scaled(found[k:], self.jacobian))
 
     def _has_regular_hessian(self, complete: Sequence[float], case: Case, last: Sequence[float]) -> bool:
         """Whether ∂²L/∂v² is regular; what is so once is not asked again for the same params."""
@@ -160,14 +136,6 @@ class Plan:
         if len(self.regular) > 256:
             self.regular.clear()
         self.regular.add(given)
-
-
-def _tried(program: Floats | None, given: tuple[float, ...]) -> tuple[float, ...] | None:
-    """What a program gives; None where Python's floats do not have it."""
-    try:
-        return program and program(given)
-    except (ArithmeticError, ValueError):
-        return None
 
 
 def bytes_of(params: Any) -> tuple:

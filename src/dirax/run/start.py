@@ -239,15 +239,6 @@ def program_of_first_step(equation: Any, case: Case) -> tuple[Floats | None, tup
     return step.first_in_floats, step.parameters.dynamic
 
 
-def programs_of_sizes(equation: Any, case: Case) -> list[tuple[Floats | None, float]]:
-    """For each stage (unknowns, state, t, fraction of h, params that move) ↦ the numbers of the residual, of the Jacobian, and
-    the sizes of unknowns and equations, None as above; and its fraction of h."""
-    from dirax.engines.step_program import step_program  # imported when it is used
-
-    step = step_program(equation, case.params, case.batch_params)
-    return [(step.sizes_in_floats(index), fraction) for index, fraction in step.stages]
-
-
 def _first_step_in_numbers(equation: Any, case: Case, start: Start) -> tuple[np.ndarray, np.ndarray] | None:
     """The residual and the Jacobian of the first step from the scalar program of the step; None where it has none."""
     from dirax.engines.step_program import linearized  # imported when it is used

@@ -37,6 +37,8 @@ class CollocationKernels:
         self.places: Any = None
         self._run: tuple[Any, Any] | None = None
 
+    finds_sizes = False
+
     @functools.cached_property
     def record(self) -> Record:
         """What is kept of a trajectory."""

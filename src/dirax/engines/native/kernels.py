@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dirax.engines.compensation import increments
+from dirax.engines.first_sizes import FirstSizes
 from dirax.engines.native import compile as llvm
 from dirax.engines.native import kernel_cache
 from dirax.engines.native.gradients.linearized_loop import LinearizedLoop, backward, forward
@@ -52,6 +53,11 @@ class Kernels:
         """What is kept of a lane."""
         return self.bare.record
 
+    @property
+    def finds_sizes(self) -> bool:
+        """Whether a kernel finds the sizes of unknowns and equations where a record has none."""
+        return self.step.sizes_are_written
+
     def kernel(self, width: int) -> tuple[Any, bool]:
         """The compiled `run` for a width, and whether it came from a cache."""
         if width in self._runs:
@@ -93,6 +99,9 @@ class Kernels:
                 g = self._graph()
                 plan = self._plan(g)
                 plan.corrections = [newton_correction(g, e, rows) for e, rows in zip(step.equations, step.jacobians, strict=True)]
+                if self.finds_sizes:
+                    pairs = zip(step.equations, plan.corrections, strict=True)
+                    plan.sizes = [FirstSizes(g, e, step.shared.h, c.order) if e.unknowns else None for e, c in pairs]
                 if self.compensated:
                     plan.increments = [increments(g, e) for e in step.equations]
             except GraphTooLarge as error:

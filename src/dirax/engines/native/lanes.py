@@ -13,6 +13,7 @@ from dirax.engines.contract import NOT_CONVERGED, OK, Problem
 from dirax.engines.native import compile as llvm
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
+from dirax.engines.native.loops.record import DOUBTFUL
 from dirax.engines.sizes import sizes_of
 from dirax.engines.threads import thread_count
 
@@ -68,11 +69,10 @@ class Lanes:
         if p.record is None:
             table = np.zeros((self.lanes, self.record.size))
             table[:, self.record.state] = p.state
-            for stage, (guess, sizes) in enumerate(zip(p.guess, sizes_of(p), strict=True)):
-                count = np.shape(guess)[-1]
-                table[:, self.record.unknowns(stage, count)] = guess
-                for number, part in enumerate(self.record.sizes(stage, count)):
-                    table[:, part] = sizes[..., number, :]
+            for stage, guess in enumerate(p.guess):
+                table[:, self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+            if p.sizes is not None or not made.finds_sizes:
+                self.record.put_sizes(table, sizes_of(p))
         else:
             table = np.array(p.record)
         self.records = self._blocked(table)
@@ -99,6 +99,11 @@ class Lanes:
         """Steps `first` to `stop` − 1 of all trajectories."""
         assert self.fields
         self.call(kernel, self.records, self.outs, first, stop, self.problem.save_every, threads)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether there is a trajectory with sizes in doubt."""
+        return bool((self.records[:, self.record.status] == DOUBTFUL).any())
 
     @property
     def stuck(self) -> bool:
@@ -137,8 +142,9 @@ class Lanes:
 
     def put(self, numbers: np.ndarray, table: np.ndarray) -> None:
         """Have some of the trajectories go on from these records."""
-        blocks, places = np.divmod(numbers, self.width)
-        self.records[blocks, :, places] = table
+        slots = np.flatnonzero(np.isin(self.source, numbers))  # a lane that fills up a block is a copy of another one
+        blocks, places = np.divmod(slots, self.width)
+        self.records[blocks, :, places] = table[np.searchsorted(numbers, self.source[slots])]
 
     def _blocked(self, table: np.ndarray) -> np.ndarray:
         if self.lanes == self.width == 1:

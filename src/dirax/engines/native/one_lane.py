@@ -9,6 +9,7 @@ from dirax.engines.contract import NOT_CONVERGED, OK, Problem
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.lanes import TOGETHER, arrays_saved
+from dirax.engines.native.loops.record import DOUBTFUL
 from dirax.engines.sizes import sizes_of
 
 
@@ -51,11 +52,10 @@ class OneLane:
         if p.record is None:
             memory[: places.record] = 0.0
             memory[self.record.state] = p.state
-            for stage, (guess, sizes) in enumerate(zip(p.guess, sizes_of(p), strict=True)):
-                count = np.shape(guess)[-1]
-                memory[self.record.unknowns(stage, count)] = guess
-                for part, numbers in zip(self.record.sizes(stage, count), sizes, strict=True):
-                    memory[part] = numbers
+            for stage, guess in enumerate(p.guess):
+                memory[self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+            if p.sizes is not None or not made.finds_sizes:
+                self.record.put_sizes(memory, sizes_of(p))
         else:
             memory[: places.record] = p.record[0]
         if places.outs > places.params:
@@ -79,6 +79,11 @@ class OneLane:
     def going(self) -> bool:
         """Whether the trajectory has neither failed nor ended before its time."""
         return self.memory[self.record.status] == OK
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the sizes are in doubt."""
+        return self.memory[self.record.status] == DOUBTFUL
 
     @property
     def stuck(self) -> bool:

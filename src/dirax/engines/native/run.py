@@ -8,8 +8,9 @@ from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem, Progress
 from dirax.engines.native.collocation_kernels import collocation_kernels
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
+from dirax.engines.native.loops.record import DOUBTFUL
 from dirax.engines.native.one_lane import OneLane, places_of
-from dirax.engines.sizes import grown
+from dirax.engines.sizes import grown, sizes_there
 from dirax.program.interpreter import UnsupportedPrimitive
 
 CHUNK_SECONDS = 0.1
@@ -54,6 +55,9 @@ class Ready:
         places = places_of(p, self.made)
         lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
         fields = lanes.fields
+        if places is None and self.made.finds_sizes:
+            lanes.advance(self.kernel, p.after, p.after)
+            look_closer(lanes)
         compile_seconds, cached, started = self.compile_seconds, self.notes["kernel_cached"], time.perf_counter()
         done, interrupted, threads = p.after, False, 1
         count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
@@ -62,6 +66,9 @@ class Ready:
                 count = min(count, p.steps - done)
                 tick = time.perf_counter()
                 lanes.advance(self.kernel, done, done + count, threads)
+                if done == p.after and lanes.doubtful:
+                    look_closer(lanes)
+                    lanes.advance(self.kernel, done, done + count, threads)
                 done += count
                 rate = count / max(time.perf_counter() - tick, 1e-9)
                 count = max(1, int(rate * CHUNK_SECONDS))
@@ -114,6 +121,18 @@ def _by_newton(lanes: Lanes | OneLane) -> bool:
     return bool(left)
 
 
+def look_closer(lanes: Lanes | OneLane) -> None:
+    """Find the sizes that are in doubt."""
+    p, record, table = lanes.problem, lanes.record, lanes.table()
+    doubtful = np.flatnonzero(table[:, record.status] == DOUBTFUL)
+    if len(doubtful):
+        own = table[doubtful]
+        guess = tuple(own[:, record.unknowns(i, stage.unknowns)] for i, (stage, _) in enumerate(p.equation.stages))
+        record.put_sizes(own, sizes_there(p, doubtful, own[:, record.completed], own[:, record.state], guess))
+        own[:, record.status] = OK
+        lanes.put(doubtful, own)
+
+
 RESUMED = 16
 """How often trajectories go on with other sizes."""
 
@@ -134,9 +153,7 @@ def _with_present_sizes(lanes: Lanes | OneLane, made: Kernels) -> None:
         sizes, more = grown(p, failed, own[:, record.completed], own[:, record.state], guess, before)
         if not np.any(more):
             return
-        for pair, values in zip(places, sizes, strict=True):
-            for number, part in enumerate(pair):
-                own[:, part] = values[:, number]
+        record.put_sizes(own, sizes)
         own[:, record.status] = OK
         before, chosen = table[failed[more]], failed[more]
         after = lanes.attempt(chosen, made, own[more])

@@ -1,10 +1,15 @@
 """What a kernel keeps of a trajectory from call to call, and where it stands while the kernel works on it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from dirax.engines.native.ir.emitter import Emitter
+
+DOUBTFUL = 3
+"""The outcome of a trajectory that has not begun, for the sizes of its unknowns are in doubt."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,12 @@ class Record:
         """Those of the first `count` unknowns of a stage, and of its equations."""
         first = self.state_size + 3 * self.kept + stage * self.history
         return slice(first, first + count), slice(first + self.kept, first + self.kept + count)
+
+    def put_sizes(self, table: np.ndarray, sizes: Sequence[np.ndarray]) -> None:
+        """Write those of every stage, (…, 2, k), into records (…, quantities)."""
+        for stage, values in enumerate(sizes):
+            for number, part in enumerate(self.sizes(stage, values.shape[-1])):
+                table[..., part] = values[..., number, :]
 
     @cached_property
     def completed(self) -> int:
