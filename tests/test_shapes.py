@@ -8,7 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-CHECKED = ("dirax.numerics", "dirax.geometry", "dirax.systems")
+ROOMS = "numerics program geometry systems reduction schemes engines solution run diagnostics"
+CHECKED = tuple(f"dirax.{room}" for room in ROOMS.split())
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:

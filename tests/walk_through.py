@@ -7,8 +7,8 @@ import sys
 
 from jaxtyping import install_import_hook
 
-if __name__ == "__main__":
-    install_import_hook(sys.argv[1:], "beartype.beartype")
+if __name__ == "__main__":  # an int is a float, as type checkers have it
+    install_import_hook(sys.argv[1:], "beartype.beartype(conf=__import__('beartype').BeartypeConf(is_pep484_tower=True))")
 
 import jax
 import jax.numpy as jnp
@@ -113,6 +113,23 @@ def structures_and_systems() -> None:
     assert dx.simulate(vortex, dx.DiscreteDirac(), q=rng, step=0.01, steps=3).ok
 
 
+def runs_and_what_reads_them() -> None:
+    """Every kind of scheme, verified, reduced, batched, stored and loaded."""
+    ball = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2, lambda q: jnp.array([[-q[1], 0.0, 1.0]]))
+    start = {"q": jnp.array([0.3, 0.2, 0.1]), "v": jnp.array([0.5, 0.1, 0.1])}
+    for scheme in (dx.PlusLagrangeDirac(), dx.MinusLagrangeDirac(), dx.DiscreteDirac(constraints="discretize")):
+        sol = dx.simulate(ball, scheme, **start, step=0.01, steps=4)
+        assert sol.ok and dx.verify(sol).ok and np.all(np.isfinite(sol.energy())), scheme
+    free = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.cos(q[0]))
+    several = {"q": np.array([[0.1, 0.0], [0.2, 0.3]]), "v": np.ones((2, 2))}
+    for scheme in (dx.Collocation(2), dx.Composition(dx.PlusLagrangeDirac(), "suzuki4"), dx.EnergyCollocation(1)):
+        sol = dx.simulate(free, scheme, **several, step=0.1, steps=3)
+        assert np.all(sol.ok) and sol[0].q.shape == (4, 2) and sol[:2].batch == 2, scheme
+    fibre = dx.reduce(free, dx.LinearConnection(fibre=[1]))
+    reduced = dx.simulate(fibre, dx.PlusLagrangeDirac(), q=several["q"][0], v=several["v"][0], step=0.1, steps=3)
+    assert reduced.ok and dx.reconstruct(reduced).q.shape == (4, 2)
+
+
 if __name__ == "__main__":
-    for walk in (linear_structures, manifolds_and_maps, structures_and_systems):
+    for walk in (linear_structures, manifolds_and_maps, structures_and_systems, runs_and_what_reads_them):
         walk()

@@ -197,9 +197,13 @@ def disk_map(z, h):
 def structural_defect(structure, equation, q0, q1):
     """The numbers of the relation φ*Ω = Ω + dβ at a pair, q1 at time 0."""
     h = structure.step
-    step = lambda state, guess, t, params: differentiated_step(equation, h, state, guess, t, params)
-    rows = {"q": jnp.stack([q0, q1]), "t": jnp.array([-h, 0.0])}
-    return eqx.filter_jit(lambda rows: structure.step_form.defect(step, equation, rows, None))(rows)
+    form, rows = structure.step_form, {"q": jnp.stack([q0, q1]), "t": jnp.array([-h, 0.0])}
+
+    def defect(rows):
+        step = differentiated_step(equation, h, *form.begins(equation, rows, None), rows["t"][-1], None)
+        return form.defect(step, equation, rows, None)
+
+    return eqx.filter_jit(defect)(rows)
 
 
 def complex_step(function, z):

@@ -1,17 +1,52 @@
-"""The derivative of one step, at the engine's solution of it."""
+"""The derivative of single steps, each at the solution of its equations."""
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from dirax.diagnostics.rows import over_rows
+from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.xla.lane import first_lane, take_step
 from dirax.numerics.equilibration import condition_number
 from dirax.numerics.tolerances import TINY
+from dirax.program.graph import GraphTooLarge
+from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.linear_solves import solve
+from dirax.program.memo import Same
 from dirax.schemes.discrete_structure import DifferentiatedStep
+from dirax.solution.solution import Solution
 
 MAX_ITERATIONS = 50
+
+
+def differentiated_steps(sol: Solution, states: np.ndarray, guesses: np.ndarray, t: np.ndarray) -> DifferentiatedStep:
+    """The steps from states (B, rows, s) at times (B, rows), from first guesses (B, rows, k): arrays (B, rows, …), NaN where a
+    step has no solution. By their scalar program, where there is one; nothing is compiled then."""
+    lanes, rows, size = states.shape
+    try:
+        steps = StepsInNumbers.of(sol.equation, jax.tree.map(np.asarray, sol.params), sol.batch_params)
+    except (UnsupportedPrimitive, GraphTooLarge):
+        items = (states, guesses, t) if sol.batch is not None else (states[0], guesses[0], t[0])
+        flat = over_rows(eqx.Partial(_by_jax, Same(sol.equation), sol.step), sol, items)
+        jacobians = flat[..., size:-1].reshape(lanes, rows, size, size)
+        return DifferentiatedStep(flat[..., :size], jacobians, flat[..., -1])
+    params = np.atleast_2d(steps.parameters(sol.params, sol.batch if sol.batch_params else None))
+    params = np.repeat(np.broadcast_to(params, (lanes, params.shape[1])), rows, axis=0)
+    joined = lambda a: a.reshape(lanes * rows, *a.shape[2:])
+    given = joined(states), [joined(guesses)] * len(sol.equation.stages), joined(t)
+    made = steps.step(*given, sol.step, params)
+    jacobians, conditions = steps.differentiated(made, joined(t), sol.step, params)
+    good = np.where(made.good, 1.0, np.nan)
+    apart = lambda a: a.reshape(lanes, rows, *a.shape[1:])
+    return DifferentiatedStep(apart(made.after * good[:, None]), apart(jacobians * good[:, None, None]), apart(conditions))
+
+
+def _by_jax(same: Same, h: Any, state, guess, t, params):
+    step = differentiated_step(same.object, h, state, guess, t, params)
+    return jnp.concatenate([step.state, step.jacobian.ravel(), step.condition[None]])
 
 
 def differentiated_step(equation: Any, h: Any, state, guess, t, params) -> DifferentiatedStep:

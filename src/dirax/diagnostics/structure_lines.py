@@ -1,9 +1,11 @@
 """Lines of `dx.verify` on the discrete Dirac structure of every step, and on the derivative of single steps."""
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.one_step import differentiated_step
+from dirax.diagnostics.one_step import differentiated_steps
 from dirax.diagnostics.power_balance import keeps_books
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import consecutive, over_rows, shape_of
@@ -93,7 +95,12 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     one = {key: values[(0,) * (1 + (sol.batch is not None))] for key, values in items.items()}
     if reason := form.refusal(sol.equation, one, sol.params_of_one):
         return Line(name, None, None, NOT_CHECKED, reason)
-    values = over_rows(eqx.Partial(_changed, form, Same(sol.equation), sol.step), sol, (items,))
+    same = Same(sol.equation)
+    begun = over_rows(eqx.Partial(_begun, form, same), sol, (items,))
+    size, t = sol.equation.stages[0][0].state_size, np.atleast_2d(items["t"][..., -1])
+    step = differentiated_steps(sol, begun[..., :size], begun[..., size:], t)
+    taken = step if sol.batch is not None else jax.tree.map(lambda a: a[0], step)
+    values = over_rows(eqx.Partial(_changed, form, same), sol, (items, taken))
     defect, condition = values[..., 0], float(np.max(values[..., -1], where=np.isfinite(values[..., -1]), initial=1.0))
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")
@@ -105,10 +112,12 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     return line
 
 
-def _changed(form: AbstractStepForm, same: Same, h, rows, params):
-    equation = same.object
-    step = lambda state, guess, t, params: differentiated_step(equation, h, state, guess, t, params)
-    return form.defect(step, equation, rows, params)
+def _begun(form: AbstractStepForm, same: Same, rows, params):
+    return jnp.concatenate(form.begins(same.object, rows, params))
+
+
+def _changed(form: AbstractStepForm, same: Same, rows, step, params):
+    return form.defect(step, same.object, rows, params)
 
 
 def _sampled(sol: Solution) -> np.ndarray:

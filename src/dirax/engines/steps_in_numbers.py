@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from dirax.engines.step_program import StepProgram, step_program
+from dirax.numerics.equilibration import condition_number
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Values
 from dirax.program.operations import BOOLEAN, NUMPY
@@ -111,6 +112,24 @@ class StepsInNumbers:
         known = self._values(self.program.stages[0][0], u, state, (t, np.full(len(t), h), params))
         after = self._read(known, self.program.equations[self.program.stages[0][0]].advance)
         return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
+
+    def differentiated(self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The derivatives (states, s, s) of the states after steps by those before, and the largest condition number of the
+        equations of each. With r(u, x) = 0 and x' = a(u, x), ∂x'/∂x = ∂_x a − ∂_u a (∂_u r)⁻¹ ∂_x r."""
+        count, size = made.states[0].shape
+        jacobians, conditions = np.broadcast_to(np.eye(size), (count, size, size)), np.ones(count)
+        for (index, fraction), u, states in zip(self.program.stages, made.unknowns, made.states, strict=True):
+            e, k = self.program.equations[index], u.shape[1]
+            known = self._values(index, u, states, (t, np.full(count, fraction * h), params))
+            slopes = known.slopes([*e.residual, *e.advance], [*e.unknowns, *e.state])
+            by_u, by_state = slopes[:, :, :k], slopes[:, :, k:]
+            step = by_state[:, k:]
+            if k:
+                step = step - by_u[:, k:] @ (_inverses(by_u[:, :k]) @ by_state[:, :k])
+                regular = np.all(np.isfinite(by_u), axis=(1, 2))
+                conditions[regular] = np.maximum(conditions[regular], condition_number(by_u[regular, :k]))
+            jacobians, t = step @ jacobians, t + fraction * h
+        return jacobians, conditions
 
     def rows(
         self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: "Noise | None" = None

@@ -6,6 +6,6 @@ interpreter.py        a jaxpr read as scalars, by rules/: one rule a JAX primiti
 graph.py              the scalars: expressions built once; operations/ what each operation means, and its derivative
 graph_derivatives.py  derivatives of expressions
 scalar_program.py     a traced function as one object; evaluation/ its values in NumPy and in JAX
-sparsity.py           which results depend on which unknowns; sparse_equations.py Jacobians and solutions by it
+sparsity/             which results depend on which unknowns; sparse_equations.py Jacobians and solutions by it
 memo.py               what is kept of all this, and let go by dx.clear_caches()
 """

@@ -20,7 +20,7 @@ class AbstractConnection(eqx.Module):
     """A discrete principal connection ω_d(q0, q1) = g1 − g0 − h⁰_d(x0, x1) on Q = Σ × G ([RL] Definition 2.1).
 
     `fibre`: the indices of q that are the group G = R^k (or a torus, by addition of angles); the others, in order, are
-    the shape x ∈ Σ. Any h⁰_d with h⁰_d(x, x) = 0 gives one.
+    the shape x ∈ Σ = R^r, r = n − k. Any h⁰_d with h⁰_d(x, x) = 0 gives one.
     """
 
     fibre: eqx.AbstractVar[tuple[int, ...]]
@@ -30,26 +30,26 @@ class AbstractConnection(eqx.Module):
         """Raise `ValueError` where the connection does not fit n coordinates, or is none."""
 
     @abstractmethod
-    def lift_of_shapes(self, x0: Float[Array, " n-k"], x1: Float[Array, " n-k"]) -> Float[Array, " k"]:
+    def lift_of_shapes(self, x0: Float[Array, " r"], x1: Float[Array, " r"]) -> Float[Array, " k"]:
         """h⁰_d(x0, x1) = h_d((x0, 0), x1)."""
 
     @abstractmethod
-    def matrix_at(self, x: Float[Array, " n-k"]) -> Float[Array, "k n-k"]:
+    def matrix_at(self, x: Float[Array, " r"]) -> Float[Array, "k r"]:
         """A(x) = D2 h⁰_d(x, x): the horizontal subspace at x is ġ = A(x) ẋ."""
 
     @abstractmethod
-    def momentum_shift(self, x: Float[Array, " n-k"], mu: Float[Array, " k"]) -> Float[Array, " n-k"]:
+    def momentum_shift(self, x: Float[Array, " r"], mu: Float[Array, " k"]) -> Float[Array, " r"]:
         """h*_{d,Σ}(μ) = A(x)ᵀ μ."""
 
     def shape_indices(self, n: int) -> np.ndarray:
         """The indices of q that are the shape coordinates x."""
         return np.setdiff1d(np.arange(n), self.fibre)
 
-    def split(self, q: Float[Array, " n"]) -> tuple[Float[Array, " n-k"], Float[Array, " k"]]:
+    def split(self, q: Float[Array, " n"]) -> tuple[Float[Array, " r"], Float[Array, " k"]]:
         """q (or p, or v) as its (x, g) parts."""
         return picked(q, self.shape_indices(q.shape[-1])), picked(q, np.array(self.fibre))
 
-    def join(self, x: Float[Array, " n-k"], g: Float[Array, " k"]) -> Float[Array, " n"]:
+    def join(self, x: Float[Array, " r"], g: Float[Array, " k"]) -> Float[Array, " n"]:
         """The inverse of `split`."""
         n = x.shape[-1] + g.shape[-1]
         order = np.argsort(np.concatenate([self.shape_indices(n), self.fibre]))
@@ -60,7 +60,7 @@ class AbstractConnection(eqx.Module):
         (x0, g0), (x1, g1) = self.split(q0), self.split(q1)
         return g1 - g0 - self.lift_of_shapes(x0, x1)
 
-    def horizontal_lift(self, q0: Float[Array, " n"], x1: Float[Array, " n-k"]) -> Float[Array, " k"]:
+    def horizontal_lift(self, q0: Float[Array, " n"], x1: Float[Array, " r"]) -> Float[Array, " k"]:
         """h_d(q0, x1) = g0 + h⁰_d(x0, x1): the group coordinate of the point over x1 that is horizontal from q0."""
         x0, g0 = self.split(q0)
         return g0 + self.lift_of_shapes(x0, x1)
@@ -69,7 +69,7 @@ class AbstractConnection(eqx.Module):
         """λ_d(q0, q1) = (q0, x1, g1 − h_d(q0, x1)), the vertical part being ω_d(q0, q1) ([RL] (3.2))."""
         return q0, self.split(q1)[0], self.one_form(q0, q1)
 
-    def untrivialize_pair(self, q0: Float[Array, " n"], x1: Float[Array, " n-k"], g1: Float[Array, " k"]) -> Float[Array, " n"]:
+    def untrivialize_pair(self, q0: Float[Array, " n"], x1: Float[Array, " r"], g1: Float[Array, " k"]) -> Float[Array, " n"]:
         """q1 = (x1, g1 + h_d(q0, x1)): the inverse of `trivialize_pair` ([RL] (3.3))."""
         return self.join(x1, g1 + self.horizontal_lift(q0, x1))
 
@@ -78,7 +78,7 @@ class AbstractConnection(eqx.Module):
         return self.split(q0)[0], self.one_form(q1, q0), q1
 
     def untrivialize_pair_backward(
-        self, x0: Float[Array, " n-k"], g0: Float[Array, " k"], q1: Float[Array, " n"]
+        self, x0: Float[Array, " r"], g0: Float[Array, " k"], q1: Float[Array, " n"]
     ) -> Float[Array, " n"]:
         """q0 = (x0, g0 + h_d(q1, x0)): the inverse of `trivialize_pair_backward`."""
         return self.join(x0, g0 + self.horizontal_lift(q1, x0))
@@ -88,9 +88,7 @@ class AbstractConnection(eqx.Module):
         w0, r0 = self.split(p0)
         return q0, w0 + self.momentum_shift(self.split(q0)[0], r0), r0
 
-    def untrivialize_covector(
-        self, x: Float[Array, " n-k"], w: Float[Array, " n-k"], mu: Float[Array, " k"]
-    ) -> Float[Array, " n"]:
+    def untrivialize_covector(self, x: Float[Array, " r"], w: Float[Array, " r"], mu: Float[Array, " k"]) -> Float[Array, " n"]:
         """p0 = (w − h*_{d,Σ}(μ), μ): the inverse of `trivialize_covector` at a point over x ([RL] (3.7))."""
         return self.join(w - self.momentum_shift(x, mu), mu)
 
@@ -131,20 +129,20 @@ class LinearConnection(AbstractConnection):
                 f"{list(self.fibre)}, but it has {len(self.horizontal[0])} columns."
             )
 
-    def matrix(self, n: int) -> Float[Array, "k n-k"]:
+    def matrix(self, n: int) -> Float[Array, "k r"]:
         """A."""
         k = len(self.fibre)
         return jnp.zeros((k, n - k)) if self.horizontal is None else jnp.asarray(self.horizontal)
 
-    def matrix_at(self, x: Float[Array, " n-k"]) -> Float[Array, "k n-k"]:
+    def matrix_at(self, x: Float[Array, " r"]) -> Float[Array, "k r"]:
         """A, at every x."""
         return self.matrix(x.shape[-1] + len(self.fibre))
 
-    def momentum_shift(self, x: Float[Array, " n-k"], mu: Float[Array, " k"]) -> Float[Array, " n-k"]:
+    def momentum_shift(self, x: Float[Array, " r"], mu: Float[Array, " k"]) -> Float[Array, " r"]:
         """Aᵀ μ."""
         return jnp.zeros_like(x) if self.horizontal is None else self.matrix_at(x).T @ mu
 
-    def lift_of_shapes(self, x0: Float[Array, " n-k"], x1: Float[Array, " n-k"]) -> Float[Array, " k"]:
+    def lift_of_shapes(self, x0: Float[Array, " r"], x1: Float[Array, " r"]) -> Float[Array, " k"]:
         """h⁰_d(x0, x1) = A(x1 − x0)."""
         return self.matrix_at(x1) @ (x1 - x0)
 
@@ -153,11 +151,11 @@ class LinearConnection(AbstractConnection):
         x0, g0 = self.split(q0)
         return g0 - self.matrix_at(x0) @ x0
 
-    def lift_of_shape(self, x1: Float[Array, " n-k"]) -> Float[Array, " k"]:
+    def lift_of_shape(self, x1: Float[Array, " r"]) -> Float[Array, " k"]:
         """h_{d,Σ}(x1) = A x1."""
         return self.matrix_at(x1) @ x1
 
-    def adjoint_of_point(self, x: Float[Array, " n-k"], mu: Float[Array, " k"]) -> Float[Array, " n"]:
+    def adjoint_of_point(self, x: Float[Array, " r"], mu: Float[Array, " k"]) -> Float[Array, " n"]:
         """h*_{d,Q}(μ) = (−Aᵀμ, μ), with ⟨h*_{d,Q}(μ), q⟩ = ⟨μ, h_{d,Q}(q)⟩; h*_{d,Σ} is `momentum_shift` ([RL] (2.4))."""
         return self.join(-self.momentum_shift(x, mu), mu)
 
@@ -206,16 +204,16 @@ class DiscreteConnection(AbstractConnection):
                     if not defect <= STRUCTURE_DEFECT * (1 + float(np.max(np.abs(np.asarray(wanted))))):
                         raise ValueError(f"one_form is no discrete connection: {axiom} fails by {defect:.3g} at {where}.")
 
-    def lift_of_shapes(self, x0: Float[Array, " n-k"], x1: Float[Array, " n-k"]) -> Float[Array, " k"]:
+    def lift_of_shapes(self, x0: Float[Array, " r"], x1: Float[Array, " r"]) -> Float[Array, " k"]:
         """h⁰_d(x0, x1) = −ω_d((x0, 0), (x1, 0))."""
         nothing = jnp.zeros(len(self.fibre))
         return -self.function(self.join(x0, nothing), self.join(x1, nothing), None)
 
-    def matrix_at(self, x: Float[Array, " n-k"]) -> Float[Array, "k n-k"]:
+    def matrix_at(self, x: Float[Array, " r"]) -> Float[Array, "k r"]:
         """D2 h⁰_d(x, x)."""
         return jax.jacfwd(self.lift_of_shapes, argnums=1)(x, x)
 
-    def momentum_shift(self, x: Float[Array, " n-k"], mu: Float[Array, " k"]) -> Float[Array, " n-k"]:
+    def momentum_shift(self, x: Float[Array, " r"], mu: Float[Array, " k"]) -> Float[Array, " r"]:
         """A(x)ᵀ μ."""
         return jax.vjp(lambda x1: self.lift_of_shapes(x, x1), x)[1](mu)[0]
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.numerics.arrays import Data
+from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import INERTIA_RANK, SYMMETRY_DEFECT
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.actions import Translations
@@ -158,7 +158,7 @@ def sampled(data: Data) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return times(1 + SAMPLES), nearby(q), nearby(v)
 
 
-def group_inertia_ranks(system: LagrangeDirac, connection: AbstractConnection, q: Array, params: Any) -> tuple[int, int]:
+def group_inertia_ranks(system: LagrangeDirac, connection: AbstractConnection, q: Numbers, params: Any) -> tuple[int, int]:
     """Ranks of ∂²L/∂ġ² at rest at q and at a point near it: a generator that vanishes at q has no inertia there only."""
     fibre = list(connection.fibre)
     whole = jax.jit(jax.hessian(lambda v, q: system.lagrangian.at(0.0, q, v, params)))

@@ -72,7 +72,7 @@ class AbstractStep(ABC):
         """What there is to say of a place from which a step fails."""
         return ""
 
-    def review(self, fields: dict[str, Array]) -> dict[str, Any]:
+    def review(self, fields: Data) -> dict[str, Any]:
         """What the saved arrays of a run say for its `stats`; warns of what is wrong with them."""
         return {}
 

@@ -61,7 +61,7 @@ class ConstraintRows:
         """The kept ones of all constraints from number `first` on."""
         return self.shape.pick(values, first)
 
-    def all(self, multipliers: Float[Array, " k"]) -> Float[Array, " m+c"]:
+    def all(self, multipliers: Float[Array, " k"]) -> Float[Array, " multipliers"]:
         """The multipliers of all constraints: zero for the redundant ones."""
         return self.shape.spread(multipliers)
 

@@ -5,7 +5,6 @@ states whose change in one step is known.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -88,11 +87,12 @@ class AbstractDiscreteStructure(eqx.Module):
 
 
 class DifferentiatedStep(NamedTuple):
-    """A step with its derivative ∂(new state)/∂(state), and how well its equations are conditioned (≥ 1)."""
+    """A step with its derivative: the new state (s,), ∂(new state)/∂(state) (s, s), and the condition number of its equations,
+    at least 1; or many steps, in arrays with more axes in front."""
 
-    state: Float[Array, " s"]
-    jacobian: Float[Array, "s s"]
-    condition: Float[Array, ""]
+    state: Any
+    jacobian: Any
+    condition: Any
 
 
 class AbstractStepForm(eqx.Module):
@@ -114,13 +114,16 @@ class AbstractStepForm(eqx.Module):
         """The names of the saved arrays that it reads, those of nodes."""
 
     @abstractmethod
-    def defect(self, step: Callable, equation: Any, rows: dict[str, Array], params: Any) -> Float[Array, " numbers"]:
-        """(by how much the change differs from what it is to be, …, the condition of the step), the first relative to the
-        size of the form after the step; numbers in between are for `told`.
+    def begins(self, equation: Any, rows: Data, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+        """(state, first guess) of the step that begins at the last of the rows, for the first part of `equation`.
 
-        `step(state, guess, t, params)` gives a DifferentiatedStep of `equation`; `rows`: the arrays that it reads (points, …)
-        and the times "t" (points,).
+        `rows`: the arrays that it reads (points, …) and the times "t" (points,).
         """
+
+    @abstractmethod
+    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, " numbers"]:
+        """(by how much the change in that step differs from what it is to be, …, the condition of the step), the first
+        relative to the size of the form after the step; numbers in between are for `told`."""
 
     def refusal(self, equation: Any, row: Data, params: Any) -> str:
         """Why the step does not start from a saved row; empty if it does."""

@@ -1,6 +1,5 @@
 """The forms on the states of schemes: the canonical two-form of T*Q, in charts too, and Lie–Poisson bivectors."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,10 +8,10 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.structures import canonical_two_form
 from dirax.numerics.arrays import Data
-from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm, nonzero
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm, DifferentiatedStep, nonzero
 
 
-def started(system: Any, step: Any, equation: Any, rows: dict[str, Array], params: Any) -> tuple[Array, Array]:
+def started(system: Any, step: Any, equation: Any, rows: Data, params: Any) -> tuple[Array, Array]:
     """(state, first guess) of the first part of a step that starts from a saved row, the only one of `rows`."""
     row = {name: values[0] for name, values in rows.items()}
     stage, fraction = equation.stages[0]
@@ -33,9 +32,12 @@ class RowForm(AbstractStepForm):
     def points(self) -> int:
         return 1
 
+    def begins(self, equation: Any, rows: Data, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+        return started(self.system, self.step, equation, rows, params)
+
     def refusal(self, equation: Any, row: Data, params: Any) -> str:
         try:
-            jax.eval_shape(lambda row: started(self.system, self.step, equation, row, params), row)
+            jax.eval_shape(lambda row: self.begins(equation, row, params), row)
         except (KeyError, TypeError, ValueError) as error:
             return f"the scheme does not start from a saved row: {error}"
         return ""
@@ -54,11 +56,10 @@ class CanonicalForm(RowForm):
     def told(self, numbers: Any, place: str) -> str:
         return f"‖JᵀΩJ − Ω‖/‖JᵀΩJ‖, {place}"
 
-    def defect(self, step: Callable, equation: Any, rows: dict[str, Array], params: Any) -> Float[Array, "2"]:
+    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2"]:
         """(‖JᵀΩJ − Ω‖/‖JᵀΩJ‖, condition number)."""
-        state, guess = started(self.system, self.step, equation, rows, params)
-        _, jacobian, condition = step(state, guess, rows["t"][0], params)
-        n = state.shape[0] // 2
+        _, jacobian, condition = step
+        n = jacobian.shape[0] // 2
         form = canonical_two_form(n)
         by_momentum, by_position = jnp.max(jnp.abs(jacobian[:n, n:])), jnp.max(jnp.abs(jacobian[n:, :n]))
         both = (by_momentum > 0) & (by_position > 0)
@@ -91,10 +92,9 @@ class LiePoissonForm(RowForm):
     def told(self, numbers: Any, place: str) -> str:
         return f"‖JΛJᵀ − Λ‖/‖JΛJᵀ‖ of the Lie–Poisson bivector, {place}"
 
-    def defect(self, step: Callable, equation: Any, rows: dict[str, Array], params: Any) -> Float[Array, "2"]:
+    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2"]:
         """(‖JΛJᵀ − Λ∘Φ‖/‖JΛJᵀ‖, condition number)."""
-        state, guess = started(self.system, self.step, equation, rows, params)
-        after, jacobian, condition = step(state, guess, rows["t"][0], params)
+        (state, _), (after, jacobian, condition) = self.begins(equation, rows, params), step
         bivector = self.system.dual.bivector
         n = self.system.dual.size
         jacobian, before = jacobian[:n, :n], bivector(state[:n])
@@ -117,11 +117,10 @@ class ChartedForm(RowForm):
     def told(self, numbers: Any, place: str) -> str:
         return f"‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖ of (q, p) by the coordinates of a chart, {place}"
 
-    def defect(self, step: Callable, equation: Any, rows: dict[str, Array], params: Any) -> Float[Array, "2"]:
+    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2"]:
         """(‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖, condition number)."""
-        state, guess = started(self.system, self.step, equation, rows, params)
+        (state, guess), (after, jacobian, condition) = self.begins(equation, rows, params), step
         t, size = rows["t"][0], rows["q"].shape[1]
-        after, jacobian, condition = step(state, guess, t, params)
         stage, fraction = equation.stages[0]
 
         def saved(state):

@@ -1,15 +1,15 @@
 """The two-form of a discrete Lagrangian on Q × Q, and what constraint forces change in it in one step ([PY] §3.2)."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.numerics.arrays import Data
 from dirax.numerics.ranks import significant
 from dirax.numerics.tolerances import PAIR_RANK
-from dirax.schemes.discrete_structure import AbstractStepForm, nonzero
+from dirax.schemes.discrete_structure import AbstractStepForm, DifferentiatedStep, nonzero
 
 
 class FormOnPairs(AbstractStepForm):
@@ -40,14 +40,18 @@ class FormOnPairs(AbstractStepForm):
     def reads(self) -> tuple[str, ...]:
         return ("q",)
 
-    def defect(self, step: Callable, equation: Any, rows: dict[str, Array], params: Any) -> Float[Array, "3"]:
+    def begins(self, equation: Any, rows: Data, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+        q0, q1 = rows["q"]
+        multipliers = jnp.zeros(equation.stages[0][0].unknowns - q0.shape[0])
+        guess = jnp.concatenate([(q1 - q0) / self.pairs.step, multipliers])
+        return jnp.concatenate([q1, self.pairs.slots(rows["t"][0], q0, q1, params)[1]]), guess
+
+    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "3"]:
         """(defect of φ*Ω = Ω + dβ, ‖φ*Ω − Ω‖, both relative; condition number)."""
         pairs, (q0, q1), (before, t) = self.pairs, rows["q"], rows["t"]
-        n, h = q0.shape[0], pairs.step
+        n = q0.shape[0]
         d1 = lambda t, a, b: pairs.slots(t, a, b, params)[0]
         d2 = lambda t, a, b: pairs.slots(t, a, b, params)[1]
-        m = equation.stages[0][0].unknowns - n
-        guess = jnp.concatenate([(q1 - q0) / h, jnp.zeros(m)])
 
         def state_of(z):
             return jnp.concatenate([z[n:], d2(before, z[:n], z[n:])])
@@ -62,8 +66,7 @@ class FormOnPairs(AbstractStepForm):
             return jnp.block([[zero, mixed], [-mixed.T, zero]])
 
         z = jnp.concatenate([q0, q1])
-        state, of_pair = state_of(z), jax.jacfwd(state_of)(z)
-        after, of_state, condition = step(state, guess, t, params)
+        of_pair, (after, of_state, condition) = jax.jacfwd(state_of)(z), step
         q2, q2_of_pair = after[:n], of_state[:n] @ of_pair
         jacobian = jnp.concatenate([jnp.eye(2 * n)[n:], q2_of_pair])  # of φ
         force_z, force_q2 = jax.jacfwd(force, argnums=(0, 1))(z, q2)

@@ -1,19 +1,17 @@
 """Parts of a Solution: trajectories of a batch, rows, stretches of time."""
 
 from collections.abc import Iterator
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
 
 from dirax.program.user_functions import is_traced
-from dirax.solution.trajectory import Trajectory
+from dirax.solution.trajectory import Some, Trajectory
 from dirax.text.representation import shortened
 
 SLACK = 1e-6
 """Part of a step by which a saved time may lie outside of a stretch of time and still belong to it."""
-
-Some = TypeVar("Some", bound=Trajectory)
 
 
 def select(sol: Some, which: Any) -> Some:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from dirax.solution import export, plotting, saving, selection
 from dirax.solution.trajectory import Trajectory
@@ -30,7 +30,7 @@ class Solution(Trajectory):
     report: Callable[..., Path]
     """`sol.report(path)`: a page for a browser; `dirax.show`, which stands above this room, puts the method here."""
 
-    def extend(self, steps: int, progress: Any = False) -> Self:
+    def extend(self, steps: int, progress: Any = False) -> "Solution":
         """The solution of the run with `steps` more steps, with the bits of one run: the steps that are done are not repeated,
         except where Ctrl-C has interrupted them. Rows are saved as before; the last row of this solution is one of the longer
         run's if its number is a multiple of `save_every`. A trajectory that has failed stays as it is.

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,8 @@ GIVEN = (
     *("batch_params", "initial", "derived", "metadata"),
 )
 """What a Trajectory is made of, besides the params."""
+
+Some = TypeVar("Some", bound="Trajectory")
 
 
 class Trajectory:
@@ -74,7 +76,7 @@ class Trajectory:
             raise AttributeError(f"this solution has no {name!r}; it holds {', '.join(fields)}.")
         raise AttributeError(f"'Solution' object has no attribute {name!r}")
 
-    def replace(self, **changes: Any) -> Self:
+    def replace(self: Some, **changes: Any) -> Some:
         """A copy with other values for some of the constructor's arguments."""
         given = {name: getattr(self, name) for name in GIVEN} | {"params": self._params}
         copy = type(self)(**(given | changes))

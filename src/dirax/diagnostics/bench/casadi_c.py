@@ -32,7 +32,6 @@ DRIVER = r"""
 #include <math.h>
 #include <string.h>
 #include "step.c"
-static const double scale[] = {%(scale)s};
 static int at_floor(double update, double before, int updates) {
   if (update <= 8 * 2.220446049250313e-16) return 1;
   if (updates < 2) return 0;
@@ -81,7 +80,7 @@ long run(double *state, double *unknowns, double t0, double h, long first, long 
       double update = 0;
       for (int j = 0; j < K; j++) {
         u[j] -= r[j];
-        double share = fabs(r[j]) / (fabs(u[j]) + scale[j]);
+        double share = fabs(r[j]) / (fabs(u[j]) + 1);
         if (!(share <= update)) update = share;
       }
       updates++;
@@ -182,7 +181,7 @@ def _write(casadi: Any, p: Problem, folder: Path) -> None:
         generator.add(casadi.Function(name, arguments, casadi.cse([casadi.densify(r) for r in results])))
     generator.generate(f"{folder}/")
     sizes = f"#define K {e.unknowns}\n#define S {e.state_size}\n"
-    (folder / "driver.c").write_text(sizes + DRIVER % {"scale": ", ".join(["1.0"] * len(e.unknowns))})
+    (folder / "driver.c").write_text(sizes + DRIVER)
 
 
 def operations(casadi: Any) -> dict[str, Callable]:
