@@ -39,9 +39,7 @@ class Problem:
 
     `state` (s,) or (B, s) and `guess` (k,) or (B, k), one guess per stage; `params` a pytree, with a leading batch axis
     when `batch_params`. Rows are saved every `save_every` steps, and the last one always. Steps are numbered from
-    `first_step` (1 after a two-point start), so the first state is at time t0 + first_step·h. `sizes` are those of the
-    unknowns and of the equations of each stage, (2, k) or (B, 2, k): `engines/sizes.py`, which an engine asks where they
-    are not given.
+    `first_step` (1 after a two-point start), so the first state is at time t0 + first_step·h.
 
     A run that goes on has the `record` that the engine gave after its first `after` steps: rows of these need not be computed
     again, and whatever stands in them is written over. An engine may run all of it instead, since the bits are the same.
@@ -62,7 +60,6 @@ class Problem:
     compensated: bool = False
     after: int = 0
     record: Any = None
-    sizes: tuple | None = None
 
     @property
     def size(self) -> int:

@@ -13,6 +13,10 @@ engine is compared with 1.
 A velocity under constraints, whose size is |q|/h in short steps, is known to ε|q|/h. Where that is more than 4·STALLED of what it
 comes to, v, or √(a|q|) where motion begins with the acceleration a, and where nothing that it is coupled to is known better, the
 step is too short for double precision, and the unknowns have that size instead: Newton's method will not converge.
+
+All this is for data that are special, and takes milliseconds. `first_sizes.py` has the sizes from one linearization alone, and
+says where they leave no doubt: they are those of most runs, and a kernel of the native engine finds them itself in no time. Steps
+of very many unknowns are measured by 1.
 """
 
 import dataclasses
@@ -33,8 +37,6 @@ from dirax.program.roots import FEWEST_SPARSE
 
 def sizes_of(problem: Problem) -> tuple[np.ndarray, ...]:
     """The sizes of the unknowns and of the equations of each stage, (2, k) or (B, 2, k), of a problem in numbers."""
-    if problem.sizes is not None:
-        return tuple(map(np.asarray, problem.sizes))
     if problem.size >= FEWEST_SPARSE:
         return tuple(np.ones((*np.shape(guess)[:-1], 2, np.shape(guess)[-1])) for guess in problem.guess)
     found, sure = _first_in_numbers(problem) or (None, np.zeros(problem.batch or 1, bool))
@@ -51,7 +53,7 @@ def sizes_of(problem: Problem) -> tuple[np.ndarray, ...]:
 
 def sizes_by_jax(problem: Problem) -> tuple[jax.Array, ...]:
     """The same of a problem that JAX traces, without derivatives."""
-    if problem.sizes is not None or problem.size >= FEWEST_SPARSE:
+    if problem.size >= FEWEST_SPARSE:
         return tuple(map(jnp.asarray, sizes_of(problem)))
     return jax.lax.stop_gradient(sizes_at(*_arguments(problem)))
 
@@ -73,9 +75,7 @@ def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, stat
         return tuple(np.ones((len(lanes), 2, np.shape(u)[-1])) for u in guess)
     moved = lambda a: np.asarray(a)[lanes] if p.batch is not None else np.asarray(a)[None][lanes]
     params = jax.tree.map(moved, p.params) if p.batch_params else p.params
-    here = dataclasses.replace(
-        p, state=state, guess=guess, params=params, batch=len(lanes), first_step=p.first_step + completed, sizes=None
-    )
+    here = dataclasses.replace(p, state=state, guess=guess, params=params, batch=len(lanes), first_step=p.first_step + completed)
     found = _in_numbers(here)
     return tuple(map(np.asarray, _compiled(*_arguments(here)))) if found is None else found
 

@@ -71,7 +71,7 @@ class Lanes:
             table[:, self.record.state] = p.state
             for stage, guess in enumerate(p.guess):
                 table[:, self.record.unknowns(stage, np.shape(guess)[-1])] = guess
-            if p.sizes is not None or not made.finds_sizes:
+            if not made.finds_sizes:
                 self.record.put_sizes(table, sizes_of(p))
         else:
             table = np.array(p.record)

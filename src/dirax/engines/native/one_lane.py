@@ -54,7 +54,7 @@ class OneLane:
             memory[self.record.state] = p.state
             for stage, guess in enumerate(p.guess):
                 memory[self.record.unknowns(stage, np.shape(guess)[-1])] = guess
-            if p.sizes is not None or not made.finds_sizes:
+            if not made.finds_sizes:
                 self.record.put_sizes(memory, sizes_of(p))
         else:
             memory[: places.record] = p.record[0]
