@@ -105,7 +105,7 @@ def _constraint_terms(system: Any, t, row: dict, params: Any):
     """The sizes of the terms of the constraints: of a Lagrangian system, those of each; else Σ |∂c/∂row_i| |row_i|, the largest
     over the constraints c."""
     form = system.lagrangian_form()
-    if form is not None and "p" in row:
+    if form is not None and form.constraints.any and "p" in row:
         return form.constraint_terms(t, row["q"], form.inverse_legendre(row["q"], row["p"], params, t=t), params)
     derivative = jax.jacfwd(lambda row: system.constraint_at({**row, "t": t}, params))(row)
     terms = (jnp.abs(derivative[name]).reshape(derivative[name].shape[0], -1) @ jnp.abs(row[name]).ravel() for name in row)

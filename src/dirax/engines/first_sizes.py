@@ -8,13 +8,17 @@ does for trajectories at which Newton's method stops too early.
 
 from functools import reduce
 
-from dirax.engines.native.loops.newton_step import Factors, pivot_order
-from dirax.engines.step_program import TracedEquation
+import numpy as np
+
+from dirax.engines.newton_step import Factors, pivot_order
+from dirax.engines.step_program import KEPT, StepProgram, TracedEquation
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import LEAST_SIZE
 from dirax.numerics.tolerances import EPSILON
+from dirax.program.evaluation.in_numpy import Values, in_parts
 from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import jacobian
+from dirax.program.memo import Memo, Same
 
 SOLVED = 1e-10
 """What a solution with good pivots leaves of a right-hand side, relative to its terms."""
@@ -56,3 +60,21 @@ class FirstSizes:
     def outputs(self) -> list[int]:
         """All of them."""
         return [*self.unknowns, *self.equations, self.sure]
+
+
+_known: Memo[FirstSizes] = Memo(KEPT)
+
+
+def first_sizes(program: StepProgram, index: int, *arguments: np.ndarray) -> np.ndarray:
+    """The outputs of an equation of a step, (entries, 2k + 1); (u, state, t, h, parameters) have an axis of entries."""
+    e, shared = program.equations[index], program.shared
+    made = _known.get((Same(program), index), lambda: FirstSizes(program.graph.copy(), e, shared.h))
+    node = lambda nodes: np.asarray(nodes, dtype=np.int64)
+
+    def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
+        known = Values(made.graph, len(arguments[0]))
+        for nodes, array in zip((e.unknowns, e.state, shared.t, shared.h, shared.params), arguments, strict=True):
+            known.bind(node(nodes), array)
+        return [known.read(node(made.outputs))]
+
+    return in_parts(part, list(arguments))[0]

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Problem
+from dirax.engines.first_sizes import first_sizes
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import balanced_inverse, power_of_two
 from dirax.numerics.tolerances import EPSILON
@@ -124,6 +125,8 @@ def _first_in_numbers(p: Problem) -> tuple[tuple[np.ndarray, ...], np.ndarray] |
     found, sure = [], np.ones(batch, bool)
     try:
         program = step_program(p.equation, p.params, p.batch_params)
+        if not program.sizes_are_written:
+            return None
         leaves = program.parameters.flatten(p.params, p.batch if p.batch_params else None)
         leaves = np.broadcast_to(leaves, (batch, program.parameters.size))
         for (index, fraction), guess in zip(program.stages, p.guess, strict=True):
@@ -131,9 +134,7 @@ def _first_in_numbers(p: Problem) -> tuple[tuple[np.ndarray, ...], np.ndarray] |
             if not u.shape[1]:
                 found.append(np.ones((batch, 2, 0)))
                 continue
-            if program.first_sizes(index) is None:
-                return None
-            values = program.sizes_in_numbers(index, u, state, t, np.full(batch, fraction * p.h), leaves)
+            values = first_sizes(program, index, u, state, t, np.full(batch, fraction * p.h), leaves)
             found.append(values[:, :-1].reshape(batch, 2, -1))
             sure &= values[:, -1] > 0.0
     except (UnsupportedPrimitive, GraphTooLarge):

@@ -133,7 +133,6 @@ class StepProgram:
     parameters: Parameters
     size: int = field(init=False)
     """Nodes of the step without its Jacobians."""
-    _sizes: dict[int, Any] = field(init=False, default_factory=dict)
 
     def __post_init__(self):
         self.size = len(self.graph)
@@ -161,32 +160,10 @@ class StepProgram:
         """The rows {column: node} of the Jacobian of every equation's residual. Raises `GraphTooLarge`."""
         return [jacobian(self.graph, e.residual, e.unknowns) for e in self.equations]
 
-    def first_sizes(self, index: int) -> Any:
-        """The `FirstSizes` of an equation; None for a large step."""
-        from dirax.engines.first_sizes import FirstSizes  # which reads this module
-
-        if index not in self._sizes:
-            made = FirstSizes(self.graph.copy(), self.equations[index], self.shared.h) if self.sizes_are_written else None
-            self._sizes[index] = made
-        return self._sizes[index]
-
     @property
     def sizes_are_written(self) -> bool:
         """Whether the step is small enough for its sizes to be written as nodes."""
         return max(len(e.unknowns) for e in self.equations) * self.size <= WRITTEN
-
-    def sizes_in_numbers(self, index: int, *arguments: np.ndarray) -> np.ndarray:
-        """The sizes of `first_sizes`, (entries, 2k + 1); (u, state, t, h, parameters) have an axis of entries."""
-        e, shared, made = self.equations[index], self.shared, self.first_sizes(index)
-        node = lambda nodes: np.asarray(nodes, dtype=np.int64)
-
-        def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
-            known = Values(made.graph, len(arguments[0]))
-            for nodes, array in zip((e.unknowns, e.state, shared.t, shared.h, shared.params), arguments, strict=True):
-                known.bind(node(nodes), array)
-            return [known.read(node(made.outputs))]
-
-        return in_parts(part, list(arguments))[0]
 
     @cached_property
     def first_in_floats(self) -> Floats | None:

@@ -13,10 +13,10 @@ from dirax.engines.first_sizes import FirstSizes
 from dirax.engines.native import compile as llvm
 from dirax.engines.native import kernel_cache
 from dirax.engines.native.gradients.linearized_loop import LinearizedLoop, backward, forward
-from dirax.engines.native.loops.newton_step import newton_correction
 from dirax.engines.native.loops.plan import Plan
 from dirax.engines.native.loops.record import Record
 from dirax.engines.native.loops.step_loop import kernel_module
+from dirax.engines.newton_step import newton_correction
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program import graph as graph_module
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge

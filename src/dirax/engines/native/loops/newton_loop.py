@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from dirax.engines.native.ir.emitter import Body, Emitter
 from dirax.engines.native.ir.lower import Region
-from dirax.engines.native.loops.newton_step import Correction
+from dirax.engines.newton_step import Correction
 from dirax.engines.step_program import TracedEquation
 from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, STALLED
 

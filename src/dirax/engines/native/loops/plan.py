@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from dirax.engines.first_sizes import FirstSizes
-from dirax.engines.native.loops.newton_step import Correction
 from dirax.engines.native.loops.record import Record
+from dirax.engines.newton_step import Correction
 from dirax.engines.step_program import Inputs, TracedEquation
 from dirax.program.graph import Graph
 

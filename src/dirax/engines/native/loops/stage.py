@@ -6,9 +6,9 @@ from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
 from dirax.engines.native.ir.emitter import Emitter
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.newton_loop import NewtonLoop
-from dirax.engines.native.loops.newton_step import Correction
 from dirax.engines.native.loops.plan import STEP, Plan, frontier
 from dirax.engines.native.loops.record import Frame
+from dirax.engines.newton_step import Correction
 
 
 @dataclass(frozen=True)
