@@ -5,7 +5,6 @@ from functools import cached_property
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -85,7 +84,7 @@ class Replay:
         if sol.system is None or sol.equation is None:
             raise CannotReplay("the solution was loaded without its system")
         try:
-            made = cls(sol, StepsInNumbers.of(sol.equation, jax.tree.map(np.asarray, sol.params), sol.batch_params))
+            made = cls(sol, StepsInNumbers.of(sol.equation, sol.given_params, sol.batch_params))
         except (UnsupportedPrimitive, GraphTooLarge) as error:
             raise CannotReplay(f"the step is no scalar program: {error}") from None
         if not np.any(made.ends >= 1):
@@ -278,7 +277,7 @@ class Replay:
     def params_of(self, lanes: np.ndarray) -> np.ndarray:
         """The numbers of the parameters of these trajectories, (entries, numbers)."""
         sol = self.sol
-        numbers = self.steps.parameters(jax.tree.map(np.asarray, sol.params), sol.batch if sol.batch_params else None)
+        numbers = self.steps.parameters(sol.given_params, sol.batch if sol.batch_params else None)
         return numbers[lanes] if sol.batch_params else np.broadcast_to(numbers, (len(lanes), len(numbers)))
 
 

@@ -97,8 +97,13 @@ class Trajectory:
 
     @property
     def params_of_one(self) -> Any:
-        """The params of a run, of the first trajectory where they have a batch axis."""
-        return jax.tree.map(lambda leaf: leaf[0], self.params) if self.batch_params else self.params
+        """`given_params`, of the first trajectory where they have a batch axis."""
+        return jax.tree.map(lambda leaf: leaf[0], self._params) if self.batch_params else self._params
+
+    @property
+    def given_params(self) -> Any:
+        """The params of a run, NumPy's arrays where they were not traced: nothing is handed to a device."""
+        return self._params
 
     @property
     def rows(self) -> int:
