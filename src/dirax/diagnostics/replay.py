@@ -14,6 +14,7 @@ from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
 from dirax.solution.solution import Solution
+from dirax.solution.trajectory import SavedRow
 
 MOST_OPERATIONS = 4e9
 """Scalar operations of the steps that are taken again, some ten seconds: of longer runs as many rows, evenly spread."""
@@ -284,7 +285,7 @@ class Replay:
 def _begun(system: Any, step: Any, same: Same, anew: bool, row: dict, params: Any):
     """State and first guesses of all stages of the step that leaves a saved row, or of a run that starts `anew` from it."""
     equation = same.object
-    data = {**row, **system.complete(row, params, False), "t": row["t"]}
+    data = SavedRow({**row, **system.complete(SavedRow(row), params, False), "t": row["t"]})
     (first, fraction), *others = equation.stages
     state, u = (first.start if anew else first.resume)(data, fraction * step, params)
     return jnp.concatenate([state, u, *((s.start if anew else s.resume)(data, part * step, params)[1] for s, part in others)])

@@ -12,6 +12,7 @@ from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.schemes.step import Shape
 from dirax.solution.solution import Solution
+from dirax.solution.trajectory import SavedRow
 from dirax.systems.system import AbstractSystem
 
 CHUNK = 4096
@@ -94,11 +95,11 @@ def _of_nodes(sol: Solution, name: str, function: Callable) -> np.ndarray:
 
 
 def _energy(system: AbstractSystem, row: dict, params: Any):
-    return system.energy_at(row, params)
+    return system.energy_at(SavedRow(row), params)
 
 
 def _constraint(system: AbstractSystem, row: dict, params: Any):
-    return system.constraint_at(row, params)
+    return system.constraint_at(SavedRow(row), params)
 
 
 def times_at(sol: Solution, rows: np.ndarray) -> np.ndarray:
