@@ -1,5 +1,7 @@
 """A scheme is one class outside the package: engines, batches, gradients, compositions and verdicts take it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -123,3 +125,24 @@ def test_its_premise_and_its_labels_are_in_messages():
 def test_equal_schemes_share_their_equation():
     assert run().equation is run(SymplecticEuler("left")).equation
     assert jnp.all(run().q == run(SymplecticEuler("left")).q)
+
+
+class OfPositions(SymplecticEuler):
+    """The same scheme, which saves q alone."""
+
+    def step_equation(self, system, shape):
+        whole = super().step_equation(system, shape)
+        alone = lambda x, u, t, h, params: {"q": whole.state_layout.split(x).q}
+        return dataclasses.replace(whole, fields={"q": whole.fields["q"]}, unpack=alone)
+
+
+def test_what_was_not_saved_is_named():
+    sol = run(OfPositions())
+    np.testing.assert_array_equal(sol.q, run().q)
+    with pytest.raises(ValueError, match="needs p, but the rows hold q alone"):
+        sol.energy()
+    report = dx.verify(sol)
+    for line in ("energy", "symplecticity of one step", "steps replayed"):
+        assert report[line].verdict == "not checked" and "needs p, but the rows hold q alone" in report[line].explanation
+    order = dx.convergence(SYSTEM, OfPositions(), **START, step_sizes=[0.02, 0.01, 0.005], time=1.0)
+    assert order.order == pytest.approx(1.0, abs=0.05)

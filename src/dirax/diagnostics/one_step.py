@@ -27,13 +27,13 @@ def differentiated_steps(sol: Solution, states: np.ndarray, guesses: np.ndarray,
     step has no solution. By their scalar program, where there is one; nothing is compiled then."""
     lanes, rows, size = states.shape
     try:
-        steps = StepsInNumbers.of(sol.equation, jax.tree.map(np.asarray, sol.params), sol.batch_params)
+        steps = StepsInNumbers.of(sol.equation, sol.given_params, sol.batch_params)
     except (UnsupportedPrimitive, GraphTooLarge):
         items = (states, guesses, t) if sol.batch is not None else (states[0], guesses[0], t[0])
         flat = over_rows(eqx.Partial(_by_jax, Same(sol.equation), sol.step), sol, items)
         jacobians = flat[..., size:-1].reshape(lanes, rows, size, size)
         return DifferentiatedStep(flat[..., :size], jacobians, flat[..., -1])
-    params = np.atleast_2d(steps.parameters(sol.params, sol.batch if sol.batch_params else None))
+    params = np.atleast_2d(steps.parameters(sol.given_params, sol.batch if sol.batch_params else None))
     params = np.repeat(np.broadcast_to(params, (lanes, params.shape[1])), rows, axis=0)
     joined = lambda a: a.reshape(lanes * rows, *a.shape[2:])
     given = joined(states), [joined(guesses)] * len(sol.equation.stages), joined(t)

@@ -5,7 +5,6 @@ from functools import cached_property
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,6 +14,7 @@ from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
 from dirax.solution.solution import Solution
+from dirax.solution.trajectory import SavedRow
 
 MOST_OPERATIONS = 4e9
 """Scalar operations of the steps that are taken again, some ten seconds: of longer runs as many rows, evenly spread."""
@@ -85,7 +85,7 @@ class Replay:
         if sol.system is None or sol.equation is None:
             raise CannotReplay("the solution was loaded without its system")
         try:
-            made = cls(sol, StepsInNumbers.of(sol.equation, jax.tree.map(np.asarray, sol.params), sol.batch_params))
+            made = cls(sol, StepsInNumbers.of(sol.equation, sol.given_params, sol.batch_params))
         except (UnsupportedPrimitive, GraphTooLarge) as error:
             raise CannotReplay(f"the step is no scalar program: {error}") from None
         if not np.any(made.ends >= 1):
@@ -278,14 +278,14 @@ class Replay:
     def params_of(self, lanes: np.ndarray) -> np.ndarray:
         """The numbers of the parameters of these trajectories, (entries, numbers)."""
         sol = self.sol
-        numbers = self.steps.parameters(jax.tree.map(np.asarray, sol.params), sol.batch if sol.batch_params else None)
+        numbers = self.steps.parameters(sol.given_params, sol.batch if sol.batch_params else None)
         return numbers[lanes] if sol.batch_params else np.broadcast_to(numbers, (len(lanes), len(numbers)))
 
 
 def _begun(system: Any, step: Any, same: Same, anew: bool, row: dict, params: Any):
     """State and first guesses of all stages of the step that leaves a saved row, or of a run that starts `anew` from it."""
     equation = same.object
-    data = {**row, **system.complete(row, params, False), "t": row["t"]}
+    data = SavedRow({**row, **system.complete(SavedRow(row), params, False), "t": row["t"]})
     (first, fraction), *others = equation.stages
     state, u = (first.start if anew else first.resume)(data, fraction * step, params)
     return jnp.concatenate([state, u, *((s.start if anew else s.resume)(data, part * step, params)[1] for s, part in others)])

@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -32,7 +31,7 @@ def residual_size(sol: Solution) -> float | None:
         begun = over_rows(eqx.Partial(_started, sol.system, sol.step, sol.equation), sol, (at,))[0]
     except (KeyError, TypeError, ValueError):  # the scheme does not start from a saved row
         return None
-    sizes, params = [], jax.tree.map(np.asarray, sol.params_of_one)
+    sizes, params = [], sol.params_of_one
     for begin, t in zip(begun[np.all(np.isfinite(begun), axis=1)], times, strict=False):
         state, u = begin[None, : stage.state_size], begin[None, stage.state_size :]
         found = linearized(stage, params, False, u, state, np.array([t]), np.full(1, fraction * sol.step))

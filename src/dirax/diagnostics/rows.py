@@ -12,6 +12,7 @@ from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.schemes.step import Shape
 from dirax.solution.solution import Solution
+from dirax.solution.trajectory import SavedRow
 from dirax.systems.system import AbstractSystem
 
 CHUNK = 4096
@@ -34,7 +35,7 @@ def _by_graph(function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray 
     """The values by the scalar graph, without a compiler; None where it cannot say them."""
     leaves, structure = jax.tree.flatten(items)
     lanes, rows = np.shape(leaves[0])[:2]
-    of_params, params_structure = jax.tree.flatten(sol.params)
+    of_params, params_structure = jax.tree.flatten(sol.given_params)
     if not all(isinstance(leaf, bool | int | float | np.ndarray | np.generic | jax.Array) for leaf in of_params):
         return None
 
@@ -57,12 +58,12 @@ def _by_graph(function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray 
 def _compiled(function: Callable, sol: Solution, items: tuple) -> np.ndarray:
     rows = jax.tree.leaves(items)[0].shape[1]
     size = max(1, CHUNK // (sol.batch or 1)) if rows * (sol.batch or 1) > CHUNK else rows
-    axis = 0 if sol.batch_params and sol.params is not None else None
+    axis = 0 if sol.batch_params and sol.given_params is not None else None
     found = []
     for start in range(0, rows, size):
         numbers = np.minimum(np.arange(start, start + size), rows - 1)  # the last piece repeats its last row
         piece = jax.tree.map(lambda a, numbers=numbers: jnp.asarray(a[:, numbers]), items)
-        found.append(np.asarray(_piece(function, piece, sol.params, axis))[:, : rows - start])
+        found.append(np.asarray(_piece(function, piece, sol.given_params, axis))[:, : rows - start])
     return np.concatenate(found, axis=1)
 
 
@@ -94,11 +95,11 @@ def _of_nodes(sol: Solution, name: str, function: Callable) -> np.ndarray:
 
 
 def _energy(system: AbstractSystem, row: dict, params: Any):
-    return system.energy_at(row, params)
+    return system.energy_at(SavedRow(row), params)
 
 
 def _constraint(system: AbstractSystem, row: dict, params: Any):
-    return system.constraint_at(row, params)
+    return system.constraint_at(SavedRow(row), params)
 
 
 def times_at(sol: Solution, rows: np.ndarray) -> np.ndarray:

@@ -36,6 +36,8 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     if isinstance(structure, str):
         return [Line("discrete Dirac structure", None, None, NOT_CHECKED, structure)]
     name, points = structure.claims[0].quantity, structure.points
+    if unsaved := _unsaved(structure.reads, sol):
+        return [Line(name, None, None, NOT_CHECKED, unsaved)]
     if (size := sum(int(np.prod(sol.field_info[key].shape)) for key in structure.reads)) > LARGEST_STATE:
         return [Line(name, None, None, NOT_CHECKED, f"its distribution is a matrix, and a row has {size} numbers")]
     if sol.save_every != 1:
@@ -86,6 +88,8 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     form = sol.scheme.step_form(sol.system, shape_of(sol), sol.step)
     if isinstance(form, str):
         return Line(name, None, None, NOT_CHECKED, form)
+    if unsaved := _unsaved(form.reads, sol):
+        return Line(name, None, None, NOT_CHECKED, unsaved)
     if form.points > 1 and sol.save_every != 1:
         return Line(name, None, None, NOT_CHECKED, f"needs every step, but save_every = {sol.save_every}")
     rows = _sampled(sol)
@@ -118,6 +122,12 @@ def _begun(form: AbstractStepForm, same: Same, rows, params):
 
 def _changed(form: AbstractStepForm, same: Same, rows, step, params):
     return form.defect(step, same.object, rows, params)
+
+
+def _unsaved(reads: tuple[str, ...], sol: Solution) -> str:
+    """What is read and was not saved, in words; empty where all was."""
+    unsaved = [name for name in reads if name not in sol.fields]
+    return f"needs {', '.join(unsaved)}, but the rows hold {', '.join(sol.fields)} alone" if unsaved else ""
 
 
 def _sampled(sol: Solution) -> np.ndarray:

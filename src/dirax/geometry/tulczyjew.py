@@ -12,13 +12,13 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac
 from dirax.geometry.generating_functions import GeneratingFunctionDirac
 from dirax.program.roots import regular_root
+from dirax.program.tracing import gradient
 
 Vector = Float[Array, " n"]
 Four = tuple[Vector, Vector, Vector, Vector]
@@ -27,7 +27,7 @@ Function = Callable[[Vector, Vector], Any]
 
 def slot_derivatives(function: Function, q0: Vector, q1: Vector) -> tuple[Vector, Vector]:
     """(D1 f, D2 f) at (q0, q1), each (n,): the components of df on TQ or on Q × Q."""
-    return jax.grad(function, argnums=(0, 1))(q0, q1)
+    return gradient(function, (0, 1))(q0, q1)
 
 
 def plus_legendre(discrete_lagrangian: Function, q0: Vector, q1: Vector) -> tuple[Vector, Vector]:

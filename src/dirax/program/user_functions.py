@@ -88,7 +88,7 @@ class UserFunction(eqx.Module):
         if len(args) != len(self.arguments):
             raise TypeError(
                 f"{self._call} is not called with its {len(self.arguments)} arguments here, but with {len(args)}"
-                + (f": {NO_MULTIPLIERS}." if "multipliers" in self.arguments else ".")
+                + (f": {NO_MULTIPLIERS}." if "multipliers" in self.arguments else "; params, which may be None, come last.")
             )
         return once(self.function)(*args, *((params,) if self.takes_params else ()))
 

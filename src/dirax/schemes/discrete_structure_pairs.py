@@ -3,13 +3,13 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector
 from dirax.geometry.tulczyjew import FiniteDifferenceTriple, slot_derivatives
 from dirax.numerics.arrays import Data
+from dirax.program.tracing import jacobian, once
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Claim
@@ -58,6 +58,7 @@ class LagrangianPairs(AbstractDiscreteStructure):
             return jnp.zeros_like(q0), jnp.zeros_like(q0)
         return discrete_forces(self.system.forces, self.rule)(t, q0, (q1 - q0) / self.step, self.step, params)
 
+    @once
     def slots(self, t: Any, q0: Vector, q1: Vector, params: Any) -> tuple[Vector, Vector]:
         """(D1 L_d + f_d^−, D2 L_d + f_d^+)."""
         d1, d2 = slot_derivatives(lambda a, b: self.lagrangian(t, a, b, params), q0, q1)
@@ -166,12 +167,12 @@ class LagrangianPairs(AbstractDiscreteStructure):
         moved = jnp.maximum(jnp.abs(q1 - q0), jnp.abs(q2 - q1))
         size = jnp.abs(z) + jnp.tile(moved + h * self.system.speeds(here, q1, moved / h, params), 3)
         terms = jnp.abs(p1) + jnp.abs(p2) + jnp.abs(before0) + jnp.abs(before1)
-        of_reaction = jnp.abs(jax.jacfwd(reaction_of)(q1)) @ size[n : 2 * n]
-        largest = jnp.max(terms + jnp.abs(jax.jacfwd(force_of)(z)) @ size + of_reaction)
+        of_reaction = jnp.abs(jacobian(reaction_of)(q1)) @ size[n : 2 * n]
+        largest = jnp.max(terms + jnp.abs(jacobian(force_of)(z)) @ size + of_reaction)
         missed = jnp.stack([jnp.max(jnp.abs(force)) * h, jnp.max(jnp.abs(saved))])
         if constraint.shape[0] == 0:
             return jnp.stack([missed, jnp.stack([largest, largest])])
-        of_constraint = jnp.abs(jax.jacfwd(constraint_of)(z)) @ size
+        of_constraint = jnp.abs(jacobian(constraint_of)(z)) @ size
         missed = jnp.concatenate([jnp.abs(constraint), missed])
         return jnp.stack([missed, jnp.concatenate([of_constraint, jnp.stack([largest, largest])])])
 

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data
 from dirax.numerics.ranks import significant
 from dirax.numerics.tolerances import PAIR_RANK
+from dirax.program.tracing import jacobian as jacobian_of
 from dirax.schemes.discrete_structure import AbstractStepForm, DifferentiatedStep, nonzero
 
 
@@ -61,15 +61,15 @@ class FormOnPairs(AbstractStepForm):
 
         def lagrangian_two_form(t, z):
             """−dΘ of Θ = −D1 L_d dq0: dq0 ∧ dq1 with the coefficients −D1 D2 L_d, and nothing else (D1 D1 L_d is symmetric)."""
-            mixed = -jax.jacfwd(lambda b: d1(t, z[:n], b))(z[n:])  # ∂p0_i/∂q1_j
+            mixed = -jacobian_of(lambda b: d1(t, z[:n], b))(z[n:])  # ∂p0_i/∂q1_j
             zero = jnp.zeros((n, n))
             return jnp.block([[zero, mixed], [-mixed.T, zero]])
 
         z = jnp.concatenate([q0, q1])
-        of_pair, (after, of_state, condition) = jax.jacfwd(state_of)(z), step
+        of_pair, (after, of_state, condition) = jacobian_of(state_of)(z), step
         q2, q2_of_pair = after[:n], of_state[:n] @ of_pair
         jacobian = jnp.concatenate([jnp.eye(2 * n)[n:], q2_of_pair])  # of φ
-        force_z, force_q2 = jax.jacfwd(force, argnums=(0, 1))(z, q2)
+        force_z, force_q2 = jacobian_of(force, argnums=(0, 1))(z, q2)
         beta = jnp.concatenate([jnp.zeros((n, 2 * n)), force_z + force_q2 @ q2_of_pair])  # ∂_j β_i
         two_form, two_form_after = lagrangian_two_form(before, z), lagrangian_two_form(t, jnp.concatenate([q1, q2]))
         change = jacobian.T @ two_form_after @ jacobian - two_form
@@ -79,7 +79,7 @@ class FormOnPairs(AbstractStepForm):
             first = pairs.system.constraints.position_defect(before, z[:n], params)
             return jnp.concatenate([pairs.constraint(before, z[:n], z[n:], params), first])
 
-        constraint_matrix = jax.jacfwd(constraints_of_pair)(z)
+        constraint_matrix = jacobian_of(constraints_of_pair)(z)
         constraint_matrix = constraint_matrix / nonzero(jnp.max(jnp.abs(constraint_matrix), axis=1, keepdims=True))
         _, values, right = jnp.linalg.svd(constraint_matrix, full_matrices=True)
         kept = jnp.concatenate([significant(values, PAIR_RANK, xp=jnp), jnp.zeros(right.shape[0] - values.shape[0], bool)])

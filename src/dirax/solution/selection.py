@@ -98,7 +98,7 @@ def _trajectories(sol: Some, lanes: Any) -> Some:
         derived={k: a[lanes] for k, a in sol.derived.items()},
         ok=np.asarray(sol.ok)[lanes] if not is_traced(sol.ok) else sol.ok[lanes],
         message=[sol.message[lane] for lane in np.atleast_1d(lanes)] if sol.message else sol.message,
-        params=jax.tree.map(lambda leaf: leaf[lanes], sol.params) if sol.batch_params else sol.params,
+        params=jax.tree.map(lambda leaf: leaf[lanes], sol.given_params) if sol.batch_params else sol.given_params,
         initial={k: of_batch(a) for k, a in sol.initial.items()},
     )
 

@@ -30,6 +30,14 @@ GIVEN = (
 Some = TypeVar("Some", bound="Trajectory")
 
 
+class SavedRow(dict):
+    """The node fields of one row and its time "t", which say so where something is asked of them that was not saved."""
+
+    def __missing__(self, name: str):
+        held = ", ".join(key for key in self if key != "t")
+        raise ValueError(f"needs {name}, but the rows hold {held} alone (a scheme saves what its `fields` name)")
+
+
 class Trajectory:
     """The arrays of a run and what was run: `Solution` says what each is."""
 
@@ -97,8 +105,13 @@ class Trajectory:
 
     @property
     def params_of_one(self) -> Any:
-        """The params of a run, of the first trajectory where they have a batch axis."""
-        return jax.tree.map(lambda leaf: leaf[0], self.params) if self.batch_params else self.params
+        """`given_params`, of the first trajectory where they have a batch axis."""
+        return jax.tree.map(lambda leaf: leaf[0], self._params) if self.batch_params else self._params
+
+    @property
+    def given_params(self) -> Any:
+        """The params of a run, NumPy's arrays where they were not traced: nothing is handed to a device."""
+        return self._params
 
     @property
     def rows(self) -> int:
@@ -175,7 +188,7 @@ class Trajectory:
         along = [(repeated if self.batch_params else constant)(np.asarray(leaf)) for leaf in leaves]
         function = getattr(self.system, method)
         program = lambda *values: function(
-            dict(zip(rows, values, strict=False)), jax.tree.unflatten(structure, values[len(rows) :])
+            SavedRow(zip(rows, values, strict=False)), jax.tree.unflatten(structure, values[len(rows) :])
         )
         values = in_numpy(program, [*rows.values(), *along], (Same(self.system), method, tuple(rows), structure))
         return None if values is None else values.reshape(*lead, *values.shape[1:])
@@ -223,5 +236,5 @@ def _is_numeric(leaf: Any) -> bool:
 @compiled
 def _along(function, nodes, params, axes):
     """`function` of every row, compiled once per function and shape: a system's bound method is compared by its system."""
-    along = jax.vmap(function, in_axes=(0, None))
+    along = jax.vmap(lambda row, params: function(SavedRow(row), params), in_axes=(0, None))
     return (along if axes is None else jax.vmap(along, in_axes=axes))(nodes, params)

@@ -49,7 +49,7 @@ _functions: Memo[Callable | None] = Memo(16)
 def _compiled(sol: Solution) -> Callable[[Solution], np.ndarray] | None:
     """The energies (B, rows) of a batch of solutions like this one; None where their system has no scalar program."""
     names = tuple(k for k in sol.fields if sol.field_info[k].place == "node")
-    leaves, structure = jax.tree.flatten(sol.params)
+    leaves, structure = jax.tree.flatten(sol.given_params)
     shapes = tuple(np.shape(leaf)[1:] if sol.batch_params else np.shape(leaf) for leaf in leaves)
     kinds = tuple(np.asarray(leaf).dtype for leaf in leaves)
     if any(kind.kind not in "fiub" for kind in kinds):
@@ -108,7 +108,7 @@ def _run(run: Callable, sol: Solution, names: tuple[str, ...]) -> np.ndarray:
     lanes, rows = sol.batch or 0, sol.rows
     columns = [np.asarray(sol.fields[name]).reshape(lanes * rows, -1).T for name in names]
     columns.append(np.tile(np.asarray(sol.t), lanes)[None])
-    for leaf in jax.tree.leaves(sol.params):
+    for leaf in jax.tree.leaves(sol.given_params):
         values = np.asarray(leaf, dtype=np.float64)
         if sol.batch_params:
             columns.append(np.repeat(values.reshape(lanes, -1), rows, axis=0).T)

@@ -103,7 +103,7 @@ class Keep:
         """Compiled for one number of trajectories, up to which the last repeats itself, so that no result depends on it."""
         size, most = sol.batch or 0, lanes_together(sol.rows)
         at = np.minimum(np.arange(most), size - 1)
-        params = jax.tree.map(lambda leaf: np.asarray(leaf)[at], sol.params) if sol.batch_params else sol.params
+        params = jax.tree.map(lambda leaf: np.asarray(leaf)[at], sol.given_params) if sol.batch_params else sol.given_params
         arrays = {name: np.asarray(a)[at] for name, a in sol.fields.items()}
         derived = {name: np.asarray(getattr(sol, name)())[at] for name in self.derived}
         bare = sol.replace(t=jnp.asarray(sol.t), fields={}, derived={}, params=None, message="", initial={}, ok=True)
@@ -183,7 +183,7 @@ class _Together(Solution):
 
 def _as_columns(sol: Solution) -> Solution:
     given = {name: getattr(sol, name) for name in ("field_info", "step", "save_every", "stats", "system", "scheme", "equation")}
-    params = jax.tree.map(lambda leaf: Column(np.asarray(leaf)), sol.params) if sol.batch_params else sol.params
+    params = jax.tree.map(lambda leaf: Column(np.asarray(leaf)), sol.given_params) if sol.batch_params else sol.given_params
     shown = _Together(
         **given,
         t=Column(np.broadcast_to(sol.t, (sol.batch or 0, len(sol.t)))),
