@@ -96,6 +96,11 @@ class AbstractSystem(eqx.Module):
         none."""
         return None
 
+    def phase_space_form(self) -> Any:
+        """The same system in x = (q, p) as a `dx.HamiltonDirac`, whose one-forms need not be counted among the constraints of
+        this one; its `hamiltonian_form` by default."""
+        return self.hamiltonian_form()
+
     def quotient_form(self) -> Any:
         """The same system as one on the quotient by its symmetry, a `dx.ReducedLagrangeDirac`; None where it is none."""
         return None
