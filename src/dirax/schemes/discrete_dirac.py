@@ -38,9 +38,9 @@ class DiscreteDirac(AbstractScheme):
     order of q. With a base point off the middle of the step (θ ≠ ½) what is off a constraint is multiplied by −θ/(1 − θ) or
     −(1 − θ)/θ in a step, whatever its size, and in the adjoint by the inverse: where that grows the run is refused. Method 2 of
     a DiracSystem with `holonomic` is stated here for graphs of two-forms and bivectors with {g_i, g_j} = 0, and by its resolved
-    chain for others. On T*Q the lift of dx.Theta(1.0) has the constraint W(q_1)Δq = 0 at the base point (q_1, p_0), which restricts
-    the state alone: its force leads to a state with a step ahead (`LookAheadStep`). Multipliers are forces at the base point, ṗ = … + Wᵀλ; those of
-    `dx.LagrangeDAlembert` are impulses of the opposite sign.
+    chain for others. On T*Q the lift of dx.Theta(1.0) has the constraint W(q_1)Δq = 0 at the base point (q_1, p_0), which
+    restricts the state alone: its force leads to a state with a step ahead (`LookAheadStep`). Multipliers are forces at the
+    base point, ṗ = … + Wᵀλ; those of `dx.LagrangeDAlembert` are impulses of the opposite sign.
 
     Takes systems with a relation form or a Lagrangian form: DiracSystem, PortHamiltonian, ImplicitSystem, LiePoisson,
     LagrangeDirac, NonholonomicMechanics, PhaseSpaceLagrangian, ManifoldLagrangian and systems of one's own; and what
@@ -91,7 +91,7 @@ class DiscreteDirac(AbstractScheme):
         return None
 
     def _looks_ahead(self, system: AbstractSystem) -> bool:
-        """Whether the constraint at the base point (q_1, p_0) restricts the state alone, and its force is that of the step ahead."""
+        """Whether the constraint at the base point (q_1, p_0) restricts the state alone: its force is one of the step ahead."""
         form = system.phase_space_form() if isinstance(self.map, CotangentLift) and _theta_of(self.map) == 1.0 else None
         return form is not None and form.constraints.any
 

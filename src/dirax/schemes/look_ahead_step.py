@@ -94,8 +94,12 @@ class LookAheadStep(AbstractStep):
 
     def start(self, data, h, params):
         t, (q, p), both = data.get("t", 0.0), self.state.split(data["x"]), Layout(v=self.n, p=self.n)
-        equations = lambda u: self.outgoing(*both.split(u), p, t, q, h, params)
+
+        def equations(u):
+            v, outgoing = both.split(u)
+            return self.outgoing(v, outgoing, p, t, q, h, params)
+
         guess = both.join(v=data["velocity"][: self.n], p=p)
         found = nearest_root(equations, guess)
-        v, p = both.split(jnp.where(jnp.all(jnp.isfinite(found)), found, guess))
-        return self.state.join(q=q, p=p), self.unknowns.join(v=v, p=p, ahead=v)
+        v, outgoing = both.split(jnp.where(jnp.all(jnp.isfinite(found)), found, guess))
+        return self.state.join(q=q, p=outgoing), self.unknowns.join(v=v, p=outgoing, ahead=v)
