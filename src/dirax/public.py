@@ -48,12 +48,14 @@ from dirax.program.memo import clear_caches
 from dirax.reduction.actions import GroupAction, Translations
 from dirax.reduction.connection import DiscreteConnection, LinearConnection
 from dirax.reduction.coordinates import adapted_basis, in_coordinates
+from dirax.reduction.dirac import ReducedGeneratingFunctionDirac
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.left_translation import LeftTranslation
 from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
+from dirax.reduction.trivializations import CovectorTrivialization, PairTrivialization, PontryaginTrivialization
 from dirax.run.prepare import PreparedRun, prepare
 from dirax.run.simulate import simulate
 from dirax.schemes.collocation import Collocation
@@ -112,12 +114,16 @@ __all__ = [
 ]
 # Symmetries, and systems reduced by them
 __all__ += [
+    "CovectorTrivialization",
     "DiscreteConnection",
     "EulerPoincare",
     "GroupAction",
     "LeftTranslation",
     "LiePoisson",
     "LinearConnection",
+    "PairTrivialization",
+    "PontryaginTrivialization",
+    "ReducedGeneratingFunctionDirac",
     "ReducedLagrangeDirac",
     "Translations",
     "adapted_basis",
