@@ -35,6 +35,7 @@ from dirax.geometry.projected_map import ProjectedMap, Submanifold
 from dirax.geometry.semidirect import SemidirectProduct
 from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
+from dirax.geometry.subspaces import PontryaginSubspace
 from dirax.geometry.tulczyjew import (
     DiscreteEvolution,
     FiniteDifferenceTriple,
@@ -155,6 +156,7 @@ __all__ += [
     "LieGroupExp",
     "LinearDirac",
     "Midpoint",
+    "PontryaginSubspace",
     "Product",
     "ProductMap",
     "ProjectedMap",

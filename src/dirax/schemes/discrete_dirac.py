@@ -4,9 +4,11 @@ from typing import Any
 
 from dirax.geometry.cotangent_lift import CotangentLift, cotangent_lift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
+from dirax.geometry.projected_map import ProjectedMap
 from dirax.geometry.spaces import Euclidean
 from dirax.schemes.blm_method_1_step import MethodOneStep
 from dirax.schemes.blm_method_2_step import NonholonomicStep, ProjectedThetaStep
+from dirax.schemes.constraint_manifold_premise import where_the_constraints_hold
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.schemes.discrete_structure_maps import PROJECTED, RelationPairs, structure_on_cotangent_bundle
 from dirax.schemes.discretized_relation import discretized_relation
@@ -41,6 +43,9 @@ class DiscreteDirac(AbstractScheme):
     chain for others. On T*Q the lift of dx.Theta(1.0) has the constraint W(q_1)Δq = 0 at the base point (q_1, p_0), which
     restricts the state alone: its force leads to a state with a step ahead (`LookAheadStep`). Multipliers are forces at the
     base point, ṗ = … + Wᵀλ; those of `dx.LagrangeDAlembert` are impulses of the opposite sign.
+
+    Method 2 of a relation with multipliers, closed ports say, also takes a `dx.ProjectedMap` whose projector has the constraint
+    manifold M_0 as its image ([BLM] §7.2): (ẋ, u) with ẋ tangent to M_0 satisfy the relation at its base point on M_0.
 
     Takes systems with a relation form or a Lagrangian form: DiracSystem, PortHamiltonian, ImplicitSystem, LiePoisson,
     LagrangeDirac, NonholonomicMechanics, PhaseSpaceLagrangian, ManifoldLagrangian and systems of one's own; and what
@@ -109,6 +114,10 @@ class DiscreteDirac(AbstractScheme):
 
     def _resolved(self, system: AbstractSystem, shape: Shape) -> StepEquation | None:
         """Method 2."""
+        relation = system.relation_form(shape)
+        if isinstance(self.map, ProjectedMap) and relation is not None and relation.multipliers:
+            make = lambda: discretized_relation(relation, shape.n, self.map, on_constraints=True)
+            return where_the_constraints_hold(system, relation.multipliers, self.map.manifold(shape.n), make)
         if (manifold := system.final_manifold(shape)) is not None:
             return projected_field(manifold, shape.n, _theta_of_points(self.map))
         if (relation := system.final_relation(shape)) is not None:
@@ -140,7 +149,7 @@ class DiscreteDirac(AbstractScheme):
     def discrete_structure(self, system: AbstractSystem, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
         if self.constraints == "discretize":
             relation = system.relation_form(shape)
-        elif system.final_manifold(shape) is None:
+        elif system.final_manifold(shape) is None or isinstance(self.map, ProjectedMap):
             relation = system.final_relation(shape) or system.relation_form(shape)
         else:
             return PROJECTED
