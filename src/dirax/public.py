@@ -19,6 +19,7 @@ from dirax.geometry.discrete import (
     GeneratingFunctionDirac,
     InducedFiniteDifferenceDirac,
 )
+from dirax.geometry.lagrangian_submanifolds import LagrangianSubmanifold
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.map_report import check_discretization_map
@@ -83,6 +84,7 @@ from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.forms import FinalManifold, Observed, RelationForm
+from dirax.systems.generalized_dirac import GeneralizedDiracSystem
 from dirax.systems.hamilton_dirac import HamiltonDirac
 from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.interconnection import interconnect
@@ -100,6 +102,7 @@ __all__ = [
     "ConstraintChain",
     "DiracSystem",
     "FinalManifold",
+    "GeneralizedDiracSystem",
     "HamiltonDirac",
     "ImplicitSystem",
     "LagrangeDirac",
@@ -153,6 +156,7 @@ __all__ += [
     "GeneratingFunctionDirac",
     "GeneratingFunctionTriple",
     "InducedFiniteDifferenceDirac",
+    "LagrangianSubmanifold",
     "LieGroupExp",
     "LinearDirac",
     "Midpoint",

@@ -105,7 +105,7 @@ def discretized_relation(
     def start(data, h, params):
         if "x" not in data:
             raise ValueError("this scheme is a one-step method in x: start it from one point, not from two.")
-        return data["x"], jnp.concatenate([step.initial(data["x"], data["velocity"]), jnp.zeros(m)])
+        return data["x"], jnp.concatenate([step.initial(data["x"], data["velocity"]), data.get("guess", jnp.zeros(m))])
 
     labels = () if on_constraints else form.labels
     fields = {name: Field((size,)) for name in form.names}

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from dirax.geometry.lagrangian_submanifolds import LagrangianSubmanifold
 from dirax.geometry.structures import DiracStructure, Induced
 from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import BRACKET_DEFECT, RATE_RANK
@@ -49,6 +50,11 @@ class DiracSystem(AbstractSystem):
             raise TypeError(
                 f"structure must be a dx.DiracStructure, but a {type(structure).__name__} was given: "
                 "use one of its constructors, e.g. dx.DiracStructure.from_bivector(lambda x: …)."
+            )
+        if isinstance(hamiltonian, LagrangianSubmanifold):
+            raise TypeError(
+                "a dx.DiracSystem has a Hamiltonian; with a Lagrangian submanifold in the place of dH it is "
+                "dx.GeneralizedDiracSystem(structure, submanifold)."
             )
         self.structure = structure
         self.hamiltonian = UserFunction(hamiltonian, "hamiltonian", ("x",))
