@@ -162,6 +162,7 @@ def reproduce(
 
     from dirax.gallery.reproduction import HEADER, tables_as_json
     from dirax.gallery.reproduction import reproduce as reproductions
+    from dirax.gallery.theorems import HEADER as THEOREMS
 
     with progress_bar("starting") as tell:
         results = reproductions(paper, out, tell)
@@ -172,9 +173,14 @@ def reproduce(
             marks, notes = result.notes()
             cells = [(r.quantity, r.paper, r.computed, r.verdict, mark) for r, mark in zip(result.rows, marks, strict=True)]
             show_table(f"[{result.paper}] {result.title}", (*HEADER, "note"), cells, f"{result}\n", notes)
+            if result.theorems:
+                proved = [theorem.cells for theorem in result.theorems]
+                show_table(f"[{result.paper}] theorems", THEOREMS, proved, "")
         typer.echo(f"figures and tables are in {out}")
     if not all(result.ok for result in results):
-        typer.echo("dirax: a quantity differs from what it should be, see DIFFERS in the table.", err=True)
+        typer.echo(
+            "dirax: a quantity differs from what it should be, see DIFFERS in the table, or a theorem does not hold.", err=True
+        )
         raise typer.Exit(1)
 
 
