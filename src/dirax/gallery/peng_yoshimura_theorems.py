@@ -1,6 +1,7 @@
 """The theorems of [PY], measured on a skate with a potential and a mass matrix, by formulas in NumPy."""
 
 import itertools
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,12 +35,13 @@ def theorems() -> list[Theorem]:
 
     forms = lambda q: row(q, jnp)[None]
     system = LagrangeDirac(lambda q, v: lagrangian(q, v, jnp), forms)
-    start = {"q": [0.1, 0.2, 0.3], "v": [0.4, 0.1, 0.6], "step": STEP, "steps": STEPS, "project": True}
+    start: dict[str, Any] = {"q": [0.1, 0.2, 0.3], "v": [0.4, 0.1, 0.6], "step": STEP, "steps": STEPS, "project": True}
     found = _structures()
     for sign, scheme in (("+", PlusLagrangeDirac()), ("−", MinusLagrangeDirac())):
         q = np.asarray(simulate(system, scheme, **start).q)
         found += [_equations(sign, q), _principle(sign, q)]
-    free = simulate(LagrangeDirac(lambda q, v: lagrangian(q, v, jnp)), PlusLagrangeDirac(), **(start | {"project": False}))
+    unconstrained: dict[str, Any] = {**start, "project": False}
+    free = simulate(LagrangeDirac(lambda q, v: lagrangian(q, v, jnp)), PlusLagrangeDirac(), **unconstrained)
     return [*found, _symplectic(np.asarray(free.q), np.asarray(free.p))]
 
 

@@ -114,7 +114,7 @@ def _reduced(sign: str, rows: dict[str, np.ndarray]) -> list[Theorem]:
             d1, d2 = slots(q[k], q[k + 1])
             for own, at, p in ((w[k], mu[k], -d1), (w[k + 1], mu[k + 1], d2)):
                 worst = max(worst, largest(own - (p[:2] + A.T @ p[2:])), largest(at - p[2:]))
-        return worst / largest(d2)
+        return worst / largest(slots(q[0], q[1])[1])
 
     numbers = ("3.8, 4.3", "5.5") if plus else ("3.10, 4.4", "5.9")
     off = structure(rows["w"] + 1e-6, rows["mu"])

@@ -63,10 +63,10 @@ class GeneralizedDiracSystem(AbstractSystem):
 
     def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
         """On (x, s): F ẋ = −E ∂F/∂x, 0 = ∂F/∂s, with ṡ free of them."""
-        given = near if isinstance(near, dict) else {"x": near}
-        given = {name: np.asarray(value, dtype=float) for name, value in given.items()}
+        named = near if isinstance(near, dict) else {"x": near}
+        given: Data = {name: jnp.asarray(value, dtype=float) for name, value in named.items()}
         N, k = self.sizes(given, params)
-        found = self.complete({name: jnp.asarray(value) for name, value in given.items()}, params, False)
+        found = self.complete(given, params, False)
 
         def equations(z, params):
             x, s = z[:N], z[N:]
