@@ -32,6 +32,7 @@ from dirax.geometry.maps import (
     SphereProjection,
     Theta,
 )
+from dirax.geometry.pairs import DiscreteLagrangianSystem
 from dirax.geometry.projected_map import ProjectedMap, Submanifold
 from dirax.geometry.semidirect import SemidirectProduct
 from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
@@ -149,6 +150,7 @@ __all__ += [
     "CotangentBundle",
     "DiracStructure",
     "DiscreteEvolution",
+    "DiscreteLagrangianSystem",
     "DiscretizationMapDirac",
     "Euclidean",
     "FiniteDifferenceDirac",
