@@ -3,6 +3,7 @@
 A name is added by its import and its line in the list of its room.
 """
 
+from dirax import bodies
 from dirax.diagnostics.action import action_sum, action_variation, discrete_energy
 from dirax.diagnostics.compare import compare
 from dirax.diagnostics.convergence import convergence
@@ -106,6 +107,7 @@ __all__ = [
     "PhaseSpaceLagrangian",
     "PortHamiltonian",
     "RelationForm",
+    "bodies",
     "circuit",
     "constraint_algorithm",
     "interconnect",
