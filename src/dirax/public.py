@@ -7,6 +7,7 @@ from dirax import bodies
 from dirax.diagnostics.action import action_sum, action_variation, discrete_energy
 from dirax.diagnostics.compare import compare
 from dirax.diagnostics.convergence import convergence
+from dirax.diagnostics.linearize import Linearization, linearize
 from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
 from dirax.engines.configure import configure
@@ -217,12 +218,14 @@ __all__ += [
 ]
 # Measuring
 __all__ += [
+    "Linearization",
     "Report",
     "action_sum",
     "action_variation",
     "compare",
     "convergence",
     "discrete_energy",
+    "linearize",
     "verify",
 ]
 # Looked at

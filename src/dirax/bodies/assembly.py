@@ -43,13 +43,6 @@ def assembled(model: Any, q: Any, v: Any, params: Any) -> dict[str, np.ndarray]:
         positions = lambda q: tuple(map(np.asarray, evaluated(model.assembly.position, q, params)))
         place = _solved(positions, start, ~fixed)
         _refuse_unmet(model, positions(place)[0], place, fixed)
-    names = dependent(model, place, params)
-    if names:
-        listed = ", ".join(map(repr, names))
-        raise ValueError(
-            f"these constraints follow from the others, so that their forces are not determined: {listed}. Leave them out: "
-            f"model.without({listed})."
-        )
     speed, kept = _given(model, v, "v", np.zeros(len(start)))
     if system.constraints.any:
         speed = _moving(model, place, speed, kept, params)

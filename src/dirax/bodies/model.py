@@ -306,13 +306,12 @@ class Model:
 
         `q` and `v` are numbers by coordinate, which stay as they are while the others are found (from 0, and quaternions from
         1, as near as can be); or arrays (n,), which are moved onto the constraints. Raises `ValueError` where the machine cannot
-        be assembled, with the residual of every joint and contact that is not met, and where constraints are redundant, with
-        their names.
+        be assembled, with the residual of every joint and contact that is not met.
         """
         return assembled(self, q, v, self.params if params is None else params)
 
     def redundant(self, q: Any, params: Any = None) -> tuple[str, ...]:
-        """The names of constraints that follow from those before them at q (n,)."""
+        """The names of constraints that follow from those before them at q (n,): a run leaves their forces out."""
         return dependent(self, np.asarray(q, float), self.params if params is None else params)
 
     def without(self, *names: str) -> "Model":
