@@ -18,6 +18,7 @@ from dirax.bodies.frames import Frame, Vector, unit, vector
 from dirax.bodies.joints import Joint, norm_defect, stacked
 from dirax.bodies.motion import Glide, Quaternion
 from dirax.bodies.parts import Body
+from dirax.diagnostics.linearized_field import accelerations
 from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import evaluated
 from dirax.show.scene import Scene
@@ -309,6 +310,11 @@ class Model:
         be assembled, with the residual of every joint and contact that is not met.
         """
         return assembled(self, q, v, self.params if params is None else params)
+
+    def accelerations(self, q: Any, v: Any, params: Any = None) -> dict[str, float]:
+        """The acceleration of every coordinate at data on the constraints."""
+        found, _ = accelerations(self.system, q, v, self.params if params is None else params)
+        return dict(zip(self.coordinates, found.tolist(), strict=True))
 
     def redundant(self, q: Any, params: Any = None) -> tuple[str, ...]:
         """The names of constraints that follow from those before them at q (n,): a run leaves their forces out."""

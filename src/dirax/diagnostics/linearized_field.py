@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.program.memo import Memo
 from dirax.program.tracing import along, gradient, jacobian
 from dirax.program.user_functions import evaluated
 from dirax.systems.constraint_algorithm import constraint_algorithm
@@ -53,10 +54,38 @@ class Equations:
         at = lambda z, w: self(z[:n], z[n:], w[:n], w[n:], params)
         return at(z, w), jacobian(lambda z: at(z, w))(z), jacobian(lambda w: at(z, w))(w)
 
+    def momentum(self, q: Any, v: Any, params: Any) -> tuple[Any, Any]:
+        """The derivatives of ∂L/∂v by q and by v."""
+        return jacobian(lambda q, v: self.system.legendre(q, v, params, self.t), (0, 1))(q, v)
+
     def tangent(self, z: Any, params: Any) -> Any:
         """The derivative of all constraints on (q, v)."""
         n = z.shape[0] // 2
         return jacobian(lambda z: self.system.constraints.defect(self.t, z[:n], z[n:], params))(z)
+
+
+_equations: Memo[Equations] = Memo(64)
+
+
+def equations_of(system: LagrangeDirac, t: float) -> Equations:
+    """The equations of a system at a time, the same object for equal systems, so that they are traced once."""
+    return _equations.get((system, t), lambda: Equations(system, t))
+
+
+def accelerations(system: LagrangeDirac, q: Any, v: Any, params: Any = None, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """The accelerations q̈ (n,) at data on the constraints, and the multipliers (k,), whose forces are −[W; G]ᵀu."""
+    q, v = np.asarray(q, float), np.asarray(v, float)
+    w = _solved(equations_of(system, t), np.concatenate([q, v]), sum(system.constraints.sizes(q, params)), params)
+    return w[: q.size], w[q.size :]
+
+
+def _solved(equations: Equations, z: np.ndarray, count: int, params: Any) -> np.ndarray:
+    """w = (a, u) at z = (q, v)."""
+    w = np.zeros(z.size // 2 + count)
+    for _ in range(3):  # affine in (a, u), but for forces that see the multipliers
+        missed, _, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
+        w = w - np.linalg.lstsq(by_w, missed, rcond=RANK)[0]
+    return w
 
 
 def linearized_lagrangian(
@@ -64,32 +93,27 @@ def linearized_lagrangian(
 ) -> FieldAt:
     """Of a Lagrangian with constraints, in z = (q, v)."""
     q, v = (np.asarray(at[name], float) for name in ("q", "v"))
-    n, z, equations = q.size, np.concatenate([q, v]), Equations(system, float(at.get("t", 0.0)))
-    count = sum(system.constraints.sizes(q, params))
-    w = np.zeros(n + count)
-    for _ in range(3):  # affine in (a, u), but for forces that see the multipliers
-        missed, by_z, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
-        w = w - np.linalg.lstsq(by_w, missed, rcond=RANK)[0]
+    n, z, equations = q.size, np.concatenate([q, v]), equations_of(system, float(at.get("t", 0.0)))
+    w = _solved(equations, z, sum(system.constraints.sizes(q, params)), params)
     _, by_z, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
     derivative = np.zeros((2 * n, 2 * n))
     derivative[:n, n:] = np.eye(n)
     derivative[n:] = -np.linalg.lstsq(by_w, by_z, rcond=RANK)[0][:n]
     lifted, slopes = [], []
     for generator in generators:
-        value, slope = (np.asarray(x) for x in evaluated(_Lift(generator), q))
+        value, slope, bend = (np.asarray(x) for x in evaluated(_lifts.get(generator, lambda g=generator: Lift(g)).at, q, v))
         lifted.append(np.concatenate([value, slope @ v]))
-        slopes.append(slope)
+        slopes.append((slope, bend))
     symmetric = np.stack(lifted, axis=1) if lifted else np.zeros((2 * n, 0))
     field = np.concatenate([v, w[:n]])
     terms = 1.0 + np.abs(v).max(initial=0.0)
     if lifted:
         shares = np.linalg.lstsq(symmetric, field, rcond=RANK)[0]
         residual = np.abs(field - symmetric @ shares).max() / (terms + np.abs(field).max())
-        slope = sum((c * s for c, s in zip(shares, slopes, strict=True)), np.zeros((n, n)))
-        # the lift of ξ is (ξ(q), Dξ v), whose derivative by q has D²ξ too: none of a linear ξ, and of others by differences
-        derivative[:n, :n] -= slope
-        derivative[n:, n:] -= slope
-        derivative[n:, :n] -= sum((c * _bent(g, q, v) for c, g in zip(shares, generators, strict=True)), np.zeros((n, n)))
+        for share, (slope, bend) in zip(shares, slopes, strict=True):
+            derivative[:n, :n] -= share * slope
+            derivative[n:, n:] -= share * slope
+            derivative[n:, :n] -= share * bend
     else:
         changed = derivative @ np.concatenate([v, np.zeros(n)])
         changed = changed / (terms * (1.0 + np.abs(derivative).max()))
@@ -100,19 +124,19 @@ def linearized_lagrangian(
     return FieldAt(derivative, tangent, symmetric, residual)
 
 
-class _Lift:
-    """q ↦ (ξ(q), Dξ(q)) of a generator."""
+class Lift:
+    """An infinitesimal generator ξ, lifted to velocities: (ξ(q), Dξ(q) v)."""
 
     def __init__(self, generator: Callable):
         self.generator = generator
 
-    def __call__(self, q: Any) -> tuple[Any, Any]:
-        return self.generator(q), jacobian(self.generator)(q)
+    def at(self, q: Any, v: Any) -> tuple[Any, Any, Any]:
+        """ξ(q), Dξ(q), and the derivative of Dξ(q) v by q."""
+        bend = jacobian(lambda q: along(self.generator, (q,), (v,)))
+        return self.generator(q), jacobian(self.generator)(q), bend(q)
 
 
-def _bent(generator: Callable, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The derivative of Dξ(q) v by q."""
-    return np.asarray(evaluated(lambda q, v: jacobian(lambda q: along(generator, (q,), (v,)))(q), q, v))
+_lifts: Memo[Lift] = Memo(256)
 
 
 def kernel(rows: np.ndarray) -> np.ndarray:

@@ -3,12 +3,15 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.linearized_field import FieldAt
+from dirax.diagnostics.linearized_field import FieldAt, equations_of
+from dirax.program.memo import Memo
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
+from dirax.run.start import begun, completed
+from dirax.run.validate import Case, validated_case
+from dirax.schemes.layout import Layout
 from dirax.schemes.step import AbstractScheme, make_step_equation
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
@@ -61,6 +64,9 @@ class _Stage:
         return following, along_state + along_u @ by_state
 
 
+_stages: Memo[_Stage] = Memo(64)
+
+
 def linearized_step(
     system: AbstractSystem, scheme: AbstractScheme, h: Any, at: Mapping[str, Any], field: FieldAt, params: Any
 ) -> StepAt:
@@ -68,40 +74,44 @@ def linearized_step(
 
     Raises `ValueError` where the scheme's own relative equilibrium is another one.
     """
-    q, v = (np.asarray(at[name], float) for name in ("q", "v"))
-    t, n = float(at.get("t", 0.0)), q.size
-    equation = make_step_equation(scheme, system, Shape(*system.sizes({"q": q, "v": v}, params)))
-
-    def start(z, params):
-        complete = system.complete({"q": z[:n], "v": z[n:], "t": jnp.asarray(t)}, params, False)
-        return equation.stages[0][0].start({**complete, "t": jnp.asarray(t)}, h * equation.stages[0][1], params)[0]
-
-    z = np.concatenate([q, v])
-    begun = lambda z, params: (start(z, params), jacobian(lambda z: start(z, params))(z))
-    first, lift = (np.asarray(x) for x in evaluated(begun, z, params))
-    state, matrix, time = first, np.eye(first.size), t
-    for stage, fraction in equation.stages:
-        data = {name: np.asarray(x) for name, x in _completed(system, stage, state, q, v, time, params).items()}
-        guess = np.asarray(stage.start(data, fraction * h, params)[1])
-        state, slope = _Stage(stage, time, fraction * h).step(state, guess, params)
+    case = validated_case({"q": at["q"], "v": at["v"]}, params, False, h, at.get("t", 0.0))
+    equation = make_step_equation(scheme, system, Shape(*system.sizes(dict(case.data), case.params)))
+    began = begun(equation, case, completed(system, case, False))
+    first = np.asarray(began.state)
+    lift = _lift(system, equation.stages[0][0].state_layout, case)
+    state, matrix, time = first, np.eye(first.size), case.t0
+    for (stage, fraction), guess in zip(equation.stages, began.guess, strict=True):
+        state, slope = _stage(stage, time, fraction * h).step(state, np.asarray(guess), case.params)
         matrix, time = slope @ matrix, time + fraction * h
-    moved = lift @ np.concatenate([v, np.zeros(n)]) * h
-    change = state - first
-    if field.symmetric.size:
-        moved = lift @ field.symmetric
-        moved = moved @ np.linalg.lstsq(moved, change, rcond=1e-12)[0]
-    residual = np.abs(change - moved).max() / (1.0 + np.abs(first).max() + np.abs(change).max())
-    tangent = np.linalg.qr(lift @ field.tangent)[0]
+    # lifts are tangent to the discrete constraints up to the forces of constraints, of which a step takes no notice
+    symmetric, tangent = matrix @ lift @ field.symmetric, matrix @ lift @ field.tangent
+    change, v = state - first, case.data["v"]
+    moved = symmetric if symmetric.size else matrix @ lift @ np.concatenate([v, np.zeros(v.size)])[:, None]
+    shares = np.linalg.lstsq(moved, change, rcond=1e-12)[0]
+    residual = np.abs(change - moved @ shares).max() / (1.0 + np.abs(first).max() + np.abs(change).max())
     for _ in range(TRIES):
+        tangent = np.linalg.qr(tangent)[0]
         image = matrix @ tangent
-        outside = np.abs(image - tangent @ (tangent.T @ image)).max(initial=0.0)
-        if outside <= INVARIANT * np.abs(matrix).max():
+        if np.abs(image - tangent @ (tangent.T @ image)).max(initial=0.0) <= INVARIANT * np.abs(matrix).max():
             break
-        tangent = np.linalg.qr(image)[0]
-    return StepAt(matrix, tangent, lift @ field.symmetric, residual)
+        tangent = image
+    return StepAt(matrix, tangent, symmetric, residual)
 
 
-def _completed(system: Any, stage: Any, state: np.ndarray, q: np.ndarray, v: np.ndarray, t: float, params: Any) -> dict:
-    """Initial data near the state, for a first guess of the unknowns: those of the motion at that time."""
-    complete = system.complete({"q": q, "v": v, "t": t}, params, False)
-    return {**complete, "t": t}
+def _stage(equation: Any, t: float, h: float) -> _Stage:
+    """The same object for equal equations, so that they are traced once."""
+    return _stages.get((equation, t, h), lambda: _Stage(equation, t, h))
+
+
+def _lift(system: AbstractSystem, layout: Layout, case: Case) -> np.ndarray:
+    """The derivative of the scheme's state by (q, v): q, and p = ∂L/∂v. Raises `TypeError` for a state without them."""
+    q, v = case.data["q"], case.data["v"]
+    parts = dict(zip(layout, layout.split(np.arange(layout.size)), strict=True))
+    if not {"q", "p"} <= parts.keys():
+        raise TypeError(f"the state of this scheme is {layout!r}, but a linearization needs one of q and p.")
+    equations = equations_of(system.lagrangian_form(), case.t0)
+    by_q, by_v = (np.asarray(x) for x in evaluated(equations.momentum, q, v, case.params))
+    lift = np.zeros((layout.size, 2 * q.size))
+    lift[np.ix_(parts["q"], np.arange(q.size))] = np.eye(q.size)
+    lift[parts["p"]] = np.concatenate([by_q, by_v], axis=1)
+    return lift

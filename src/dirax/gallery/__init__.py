@@ -48,6 +48,7 @@ _MODULES = {
     "sine-gordon": "sine_gordon",
     "hanging-chain": "hanging_chain",
     "wave-line": "wave_line",
+    "bicycle": "bicycle",
 }
 """Name → the module here that defines `EXAMPLE`; a new system is a file and a line."""
 
