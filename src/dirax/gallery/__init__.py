@@ -49,6 +49,13 @@ _MODULES = {
     "hanging-chain": "hanging_chain",
     "wave-line": "wave_line",
     "bicycle": "bicycle",
+    "andrews-squeezer": "andrews_squeezer",
+    "four-bar": "four_bar",
+    "bricard": "bricard",
+    "tippe-top": "tippe_top",
+    "chaplygin-sphere": "chaplygin_sphere",
+    "rattleback": "rattleback",
+    "euler-disk": "euler_disk",
 }
 """Name → the module here that defines `EXAMPLE`; a new system is a file and a line."""
 
