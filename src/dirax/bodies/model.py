@@ -155,15 +155,17 @@ class Model:
         frames, about = self.frames(q, v, params), jnp.asarray(about, float)
         return sum(body.angular_momentum(frames[body.name], about, params) for body in self.bodies)
 
-    def observables(self, solution: Any) -> dict[str, np.ndarray]:
-        """"energy" (rows,), "momentum" and "angular momentum" (rows, 3) of a run, from its q and p."""
+    def observables(self, solution: Any, **more: Callable) -> dict[str, np.ndarray]:
+        """"energy" (rows,), "momentum" and "angular_momentum" (rows, 3) of one trajectory, from its q and p; and `more`
+        functions (q, v) by name."""
 
         def at(q, p, params):
             v = self.system.inverse_legendre(q, p, params)
-            return self.energy(q, v, params), self.momentum(q, v, params), self.angular_momentum(q, v, params)
+            known = self.energy(q, v, params), self.momentum(q, v, params), self.angular_momentum(q, v, params)
+            return (*known, *(function(q, v) for function in more.values()))
 
         rows = [evaluated(at, q, p, solution.params) for q, p in zip(solution.q, solution.p, strict=True)]
-        names = ("energy", "momentum", "angular momentum")
+        names = ("energy", "momentum", "angular_momentum", *more)
         return {name: np.array(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
 
     # ------------------------------------------------------------------ constraints

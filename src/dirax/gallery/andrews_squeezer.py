@@ -7,7 +7,7 @@ import numpy as np
 
 from dirax.bodies import Body, Model, Motor, Spring, revolute
 from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.collocation import Collocation
+from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 
 A, B, C = (-0.06934, -0.00227, 0.0), (-0.03635, 0.03273, 0.0), (0.014, 0.072, 0.0)
 MASSES = (0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498)
@@ -40,6 +40,12 @@ MODEL = Model(
 )
 
 
+START = np.array(
+    [-0.0617138900142764496, 0.0, 0.455279819163070380, 0.222668390165885885, 0.487364979543842550]
+    + [-0.222668390165885885, 1.230547444549821192]
+)
+"""The angles at rest, where the loops close."""
+
 REFERENCE = np.array(
     [15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948]
     + [0.5244099658805304, 0.5347301163226948, 1.048080741042263]
@@ -51,11 +57,10 @@ EXAMPLE = Example(
     title="Andrews' squeezing mechanism",
     source="IVP test set, problem Andrews; Hairer & Wanner II, VII.7",
     system=MODEL.system,
-    initial=MODEL.state(np.array([-0.0617138900142764, 0.0, 0.455279819163070, 0.222668390165886, 0.487364979543843,
-                                  -0.222668390165886, 1.230547444549821])),
-    scheme=Collocation(4, nodes="lobatto"),
-    step=1.25e-5,
-    steps=2400,
+    initial=MODEL.state(START),
+    scheme=LagrangeDAlembert(),
+    step=1e-5,
+    steps=3000,
     coordinates=tuple(Coordinate(name, "rad") for name in MODEL.coordinates),
     plane=(2, 4),
     time_unit="s",

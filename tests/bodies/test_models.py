@@ -1,0 +1,142 @@
+"""Machines from bodies and joints against equations written by hand, and their mistakes."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+
+b = dx.bodies
+ROD = {"mass": 2.0, "inertia": (0.3, 0.2, 0.1)}
+
+
+def value(found):
+    return float(np.asarray(found))
+
+
+def test_a_double_pendulum_is_the_one_written_by_hand():
+    m1, m2, l1, g = 1.3, 0.7, 0.9, 9.81
+    model = b.Model(
+        [b.Body("upper", m1, centre=(0, 0, -l1)), b.Body("lower", m2, centre=(0, 0, -0.6))],
+        [b.revolute("ground", "upper", (0, -1, 0)), b.revolute("upper", "lower", (0, -1, 0), at=(0, 0, -l1))],
+    )
+    q, v = np.array([0.4, 0.9]), np.array([-1.1, 0.6])
+    first = l1 * v[0] * np.array([np.cos(q[0]), np.sin(q[0])])
+    second = first + 0.6 * (v[0] + v[1]) * np.array([np.cos(q[0] + q[1]), np.sin(q[0] + q[1])])
+    height = -m1 * l1 * np.cos(q[0]) - m2 * (l1 * np.cos(q[0]) + 0.6 * np.cos(q[0] + q[1]))
+    lagrangian = m1 * first @ first / 2 + m2 * second @ second / 2 - g * height
+    assert value(model.system.lagrangian(jnp.array(q), jnp.array(v), None)) == pytest.approx(lagrangian, abs=1e-13)
+    assert value(model.energy(q, v)) == pytest.approx(lagrangian + 2 * g * height, abs=1e-12)
+
+
+@pytest.mark.parametrize("rotation", ["zxz", "zxy", "quaternion"])
+def test_a_free_body_keeps_momentum_and_angular_momentum_in_every_description(rotation):
+    model = b.Model([b.Body("stone", **ROD, centre=(0.1, 0.2, 0.0))], [b.free("ground", "stone", rotation)], gravity=(0, 0, 0))
+    n = len(model.coordinates)
+    start = np.linspace(0.4, 0.9, n)
+    data = model.state(start if rotation != "quaternion" else start / np.linalg.norm(start), np.linspace(-0.5, 0.8, n))
+    sol = dx.simulate(model.system, dx.LagrangeDAlembert(), **data, step=0.002, steps=200, save_every=100)
+    seen = model.observables(sol)
+    assert np.ptp(seen["momentum"], axis=0).max() < 1e-5 and np.ptp(seen["angular_momentum"], axis=0).max() < 1e-5
+    assert np.ptp(seen["energy"]) < 1e-5 and seen["energy"] == pytest.approx(sol.energy(), abs=1e-12)
+
+
+def test_euler_angles_and_quaternions_have_the_same_motion():
+    ends = []
+    for rotation, start in (("zxz", {"top.nutation": 0.5}), ("quaternion", {"top.qx": np.sin(0.25)})):
+        model = b.Model([b.Body("top", **ROD, centre=(0, 0, 0.4))], [b.ball("ground", "top", rotation)])
+        spin = {"top.spin": 9.0, "top.precession": 0.0} if rotation == "zxz" else {"top.qz": 4.5 * np.cos(0.25)}
+        data = model.state(start, spin if rotation == "zxz" else {**spin, "top.qy": -4.5 * np.sin(0.25), "top.qx": 0.0})
+        sol = dx.simulate(model.system, dx.LagrangeDAlembert(), **data, step=5e-4, steps=1000, save_every=1000)
+        ends.append(np.asarray(model.frames(sol.q[-1], np.zeros(len(sol.q[-1])))["top"].turn))
+    assert ends[0] == pytest.approx(ends[1], abs=2e-5)
+
+
+def test_parameters_springs_dampers_and_motors():
+    model = b.Model(
+        [b.Body("cart", "m")],
+        [b.prismatic("ground", "cart")],
+        forces=[
+            b.Spring("k", (("ground", (0.0, 0.0, 0.0)), ("cart", (0.0, 0.0, 0.0)))),
+            b.Damper("c", coordinate="cart"),
+            b.Motor("cart", lambda t, q, v, params: params["push"] * jnp.cos(t)),
+        ],
+        parameters={"m": 2.0, "k": 8.0, "c": 0.4, "push": 0.5},
+    )
+    found = model.accelerations([0.3], [0.7])["cart"]
+    assert found == pytest.approx((0.5 - 8.0 * 0.3 - 0.4 * 0.7) / 2.0)
+    assert model.accelerations([0.3], [0.7], {**model.params, "k": 0.0})["cart"] == pytest.approx((0.5 - 0.28) / 2)
+    sol = dx.simulate(
+        model.system, dx.LagrangeDAlembert(), **model.state({"cart": 0.3}), params=model.params, step=0.01, steps=10
+    )
+    assert sol.ok and sol.params["k"] == 8.0
+
+
+def test_a_ball_rolls_in_a_bowl():
+    """On z = (x² + y²)/2 · k the contact stays on the surface, and the energy of a ball that starts at rest stays."""
+    model = b.Model(
+        [b.Body("ball", 1.0, (0.004, 0.004, 0.004))],
+        [b.gliding("ground", "ball", lambda x, y: 0.5 * (x * x + y * y), 0.1)],
+        contacts=[b.ball_contact("ball", 0.1)],
+    )
+    sol = dx.simulate(model.system, dx.LagrangeDAlembert(), **model.state({"ball.x": 0.3}), step=0.005, steps=400)
+    assert sol.ok and np.ptp(sol.energy()) < 2e-3 * 0.5 and np.abs(sol.q[:, 1]).max() < 1e-12
+    assert sol.q[:, 0].min() == pytest.approx(-0.3, abs=1e-3)
+
+
+def test_a_loop_is_assembled_and_one_that_cannot_close_says_which_joint():
+    def crank(rod):
+        return b.Model(
+            [b.Body("crank", **ROD), b.Body("rod", **ROD), b.Body("piston", 1.0)],
+            [
+                b.revolute("ground", "crank"),
+                b.revolute("crank", "rod", at=(1.0, 0, 0)),
+                b.prismatic("ground", "piston"),
+                b.revolute("rod", "piston", name="pin", at=(rod, 0, 0), closes=True),
+            ],
+        )
+
+    model = crank(2.5)
+    data = model.state({"crank": 0.7}, {"crank": 1.0})
+    q, v = dict(zip(model.coordinates, data["q"], strict=True)), dict(zip(model.coordinates, data["v"], strict=True))
+    apart = q["piston"] - np.cos(0.7)
+    assert apart**2 + np.sin(0.7) ** 2 == pytest.approx(2.5**2, abs=1e-12) and q["crank"] == 0.7
+    assert apart * (v["piston"] + np.sin(0.7)) + np.sin(0.7) * np.cos(0.7) == pytest.approx(0.0, abs=1e-12)
+    assert v["crank"] == 1.0
+    with pytest.raises(ValueError, match=r"cannot be assembled.*pin: y by .*crank.*open"):
+        crank(0.5).state({"crank": 1.2})
+
+
+def rods(*names):
+    return [b.Body(name, **ROD) for name in names]
+
+
+@pytest.mark.parametrize(
+    "bodies, joints, message",
+    [
+        ([b.Body("a", 0.0, (1, 1, 1))], [b.revolute("ground", "a")], "'a' has no mass, but moments of inertia"),
+        (rods("a"), [b.revolute("ground", "a"), b.ball("ground", "a", name="b")], "'a' has two parents.*closes=True"),
+        (rods("a", "c"), [b.revolute("ground", "a", name="j"), b.ball("a", "c", name="j")], "two joints are called 'j'"),
+        (rods("a", "a"), [b.revolute("ground", "a")], "two bodies are called 'a'"),
+        (rods("a", "c"), [b.revolute("ground", "a")], "'c' has no joint"),
+        (rods("a", "c"), [b.revolute("a", "c"), b.revolute("c", "a", name="k")], "go round in a circle"),
+        (rods("a"), [b.revolute("ground", "arm")], "joint 'arm' is at body 'arm', but the bodies are a, ground"),
+        (rods("a"), [b.fixed("ground", "a")], "nothing can move"),
+        ([b.Body("a", -1.0)], [b.revolute("ground", "a")], "negative mass"),
+    ],
+)
+def test_mistakes_get_one_error_each(bodies, joints, message):
+    with pytest.raises(ValueError, match=message):
+        b.Model(bodies, joints)
+
+
+def test_mistakes_in_data_name_the_coordinates():
+    model = b.Model(rods("a"), [b.ball("ground", "a")])
+    with pytest.raises(ValueError, match=r"q has 'angle', but the coordinates are a\.qw"):
+        model.state({"angle": 1.0})
+    with pytest.raises(ValueError, match=r"shape \(4,\)"):
+        model.state(np.zeros(3))
+    with pytest.raises(ValueError, match="no velocity has the given ones"):
+        model.state({"a.qw": 1.0}, {"a.qw": 1.0})
+    with pytest.raises(ValueError, match="rotation must be"):
+        b.ball("ground", "a", "zzq")
