@@ -121,7 +121,7 @@ def c_program(p: Problem, name: str, title: str) -> str:
         title=title,
         name=name,
         fma="-mfma " * llvm.has_fma(),
-        code=c_code(kernel_module(made.plan, 1, llvm.has_fma())),
+        code=c_code(kernel_module(made.plan, 1, llvm.has_fma(), groups=False)),
         last_state=record.state_size - 1,
         state_size=record.state_size,
         state=", ".join(f"{part} {shape}" for part, shape in layout.items()),
