@@ -56,6 +56,7 @@ from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
+from dirax.run.export_c import export_c
 from dirax.run.prepare import PreparedRun, prepare
 from dirax.run.simulate import simulate
 from dirax.schemes.collocation import Collocation
@@ -210,6 +211,7 @@ __all__ += [
     "Solution",
     "clear_caches",
     "configure",
+    "export_c",
     "load",
     "prepare",
     "reconstruct",
