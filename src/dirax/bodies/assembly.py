@@ -144,5 +144,3 @@ def dependent(model: Any, q: np.ndarray, params: Any) -> tuple[str, ...]:
         else:
             basis = np.vstack([basis, rest / np.linalg.norm(rest)])
     return tuple(found)
-
-

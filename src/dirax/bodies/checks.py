@@ -80,9 +80,7 @@ def check_coordinates(model: Any) -> None:
         raise ValueError("the model has no coordinates: nothing can move. Give a body a joint that is not fixed.")
     for force in model.forces:
         if getattr(force, "between", None) is None and force.coordinate not in names:
-            raise ValueError(
-                f"{force.name!r} is at coordinate {force.coordinate!r}, but the coordinates are {', '.join(names)}."
-            )
+            raise ValueError(f"{force.name!r} is at coordinate {force.coordinate!r}, but the coordinates are {', '.join(names)}.")
 
 
 def check_masses(model: Any) -> None:

@@ -32,7 +32,8 @@ def scene_of(model: Any, view: str = "oblique", trail: str = "") -> Scene:
             parts.append(rod(_place(model, joint.body, (0.0, 0.0, 0.0)), _place(model, joint.body, joint.on)))
     for force in model.forces:
         if isinstance(force, Spring) and force.between is not None:
-            parts.append(spring(*(_place(model, *end) for end in force.between)))
+            first, second = force.between
+            parts.append(spring(_place(model, *first), _place(model, *second)))
     return Scene(tuple(parts), view=view)
 
 

@@ -50,7 +50,8 @@ class Damper:
             return -scalar(self.rate, params) * v[self.coordinate] * w[self.coordinate]
         apart = apart_of(self.between, frames, params)
         along = apart / jnp.sqrt(apart @ apart)
-        speed = lambda of: along @ (velocity_of(self.between[1], of, params) - velocity_of(self.between[0], of, params))
+        first, second = self.between
+        speed = lambda of: along @ (velocity_of(second, of, params) - velocity_of(first, of, params))
         return -scalar(self.rate, params) * speed(frames) * speed(moved)
 
 

@@ -156,7 +156,7 @@ class Model:
         return sum(body.angular_momentum(frames[body.name], about, params) for body in self.bodies)
 
     def observables(self, solution: Any, **more: Callable) -> dict[str, np.ndarray]:
-        """"energy" (rows,), "momentum" and "angular_momentum" (rows, 3) of one trajectory, from its q and p; and `more`
+        """Of one trajectory, from its q and p: "energy" (rows,), "momentum" and "angular_momentum" (rows, 3), and `more`
         functions (q, v) by name."""
 
         def at(q, p, params):
@@ -216,7 +216,7 @@ class Model:
 
     @cached_property
     def _kept(self) -> tuple[list[int], list[int]]:
-        """Which of all holonomic constraints and one-forms are those of the system: not dropped, and not met by the tree alone."""
+        """Which holonomic constraints and one-forms are those of the system: not dropped, and not met by the tree alone."""
         params, rng = self.params, np.random.default_rng(0)
         points = [rng.uniform(-0.9, 0.9, len(self.coordinates)) for _ in range(3)]
         sizes = np.zeros(len(self._all_holonomic)), np.zeros(len(self._all_rows))
@@ -272,9 +272,7 @@ class Model:
 
         def forces(t, q, v, multipliers, params):
             frames, named = self.frames(q, v, params), (self._named(q), self._named(v))
-            pressures = [
-                -multipliers[places[f"{contact.name}: touches"]] if contact.rubs else 0.0 for contact in resisting
-            ]
+            pressures = [-multipliers[places[f"{contact.name}: touches"]] if contact.rubs else 0.0 for contact in resisting]
             felt = [
                 contact.force(frames[contact.body], self._normal(contact, q), jnp.maximum(pressure, 0.0), params)
                 for contact, pressure in zip(resisting, pressures, strict=True)

@@ -1,4 +1,4 @@
-"""linearize(): the linear equations of small motions about an equilibrium or a relative equilibrium, of a system or of a scheme."""
+"""linearize(): the linear equations of small motions about a relative equilibrium, of a system or of a scheme."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -60,7 +60,7 @@ class Linearization:
         return bool(self.eigenvalues[0].real <= 1e-6 * (1.0 + np.abs(self.eigenvalues).max())) if len(self.matrix) else True
 
 
-def _order(values: np.ndarray) -> np.ndarray:
+def _order(values: Any) -> np.ndarray:
     return np.lexsort((-values.imag, -np.round(values.real, 9)))
 
 
@@ -98,7 +98,9 @@ def linearize(
         raise ValueError("a scheme is linearized with its step: give scheme= and step= together, or neither.")
     if system.lagrangian_form() is None:
         if scheme is not None or generators:
-            raise TypeError(f"schemes and symmetries are linearized of systems with a Lagrangian, but this is a {type(system).__name__}.")
+            raise TypeError(
+                f"schemes and symmetries are linearized of systems with a Lagrangian, but this is a {type(system).__name__}."
+            )
         return _reduced(linearized_chain(system, at, params), None)
     found = linearized_lagrangian(system.lagrangian_form(), at, generators, params)
     if scheme is None:
@@ -137,5 +139,3 @@ def _orthonormal(vectors: np.ndarray) -> np.ndarray:
         return vectors.reshape(len(vectors), -1)[:, :0]
     u, values, _ = np.linalg.svd(vectors, full_matrices=False)
     return u[:, values > RANK * max(values[0], 1.0 if values[0] < RANK else values[0])]
-
-

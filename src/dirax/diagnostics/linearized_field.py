@@ -74,27 +74,26 @@ def equations_of(system: LagrangeDirac, t: float) -> Equations:
 
 def accelerations(system: LagrangeDirac, q: Any, v: Any, params: Any = None, t: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """The accelerations q̈ (n,) at data on the constraints, and the multipliers (k,), whose forces are −[W; G]ᵀu."""
-    q, v = np.asarray(q, float), np.asarray(v, float)
-    w = _solved(equations_of(system, t), np.concatenate([q, v]), sum(system.constraints.sizes(q, params)), params)
+    q, v = (np.asarray(values, float) for values in (q, v))
+    w = _solved(equations_of(system, t), np.concatenate([q, v]), params)
     return w[: q.size], w[q.size :]
 
 
-def _solved(equations: Equations, z: np.ndarray, count: int, params: Any) -> np.ndarray:
+def _solved(equations: Equations, z: Any, params: Any) -> np.ndarray:
     """w = (a, u) at z = (q, v)."""
-    w = np.zeros(z.size // 2 + count)
+    n = z.size // 2
+    w = np.zeros(n + sum(equations.system.constraints.sizes(z[:n], params)))
     for _ in range(3):  # affine in (a, u), but for forces that see the multipliers
         missed, _, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
         w = w - np.linalg.lstsq(by_w, missed, rcond=RANK)[0]
     return w
 
 
-def linearized_lagrangian(
-    system: LagrangeDirac, at: Mapping[str, Any], generators: Sequence[Callable], params: Any
-) -> FieldAt:
+def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generators: Sequence[Callable], params: Any) -> FieldAt:
     """Of a Lagrangian with constraints, in z = (q, v)."""
     q, v = (np.asarray(at[name], float) for name in ("q", "v"))
     n, z, equations = q.size, np.concatenate([q, v]), equations_of(system, float(at.get("t", 0.0)))
-    w = _solved(equations, z, sum(system.constraints.sizes(q, params)), params)
+    w = _solved(equations, z, params)
     _, by_z, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
     derivative = np.zeros((2 * n, 2 * n))
     derivative[:n, n:] = np.eye(n)

@@ -106,12 +106,11 @@ def _stage(equation: Any, t: float, h: float) -> _Stage:
 def _lift(system: AbstractSystem, layout: Layout, case: Case) -> np.ndarray:
     """The derivative of the scheme's state by (q, v): q, and p = ∂L/∂v. Raises `TypeError` for a state without them."""
     q, v = case.data["q"], case.data["v"]
-    parts = dict(zip(layout, layout.split(np.arange(layout.size)), strict=True))
-    if not {"q", "p"} <= parts.keys():
+    if not {"q", "p"} <= layout.keys():
         raise TypeError(f"the state of this scheme is {layout!r}, but a linearization needs one of q and p.")
     equations = equations_of(system.lagrangian_form(), case.t0)
     by_q, by_v = (np.asarray(x) for x in evaluated(equations.momentum, q, v, case.params))
     lift = np.zeros((layout.size, 2 * q.size))
-    lift[np.ix_(parts["q"], np.arange(q.size))] = np.eye(q.size)
-    lift[parts["p"]] = np.concatenate([by_q, by_v], axis=1)
+    lift[layout.place("q"), : q.size] = np.eye(q.size)
+    lift[layout.place("p")] = np.concatenate([by_q, by_v], axis=1)
     return lift

@@ -15,9 +15,7 @@ AXES = ((0, 1, 0), (0, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1))
 RODS = [f"rod {k}" for k in range(1, 6)]
 
 MODEL = Model(
-    bodies=[
-        Body(rod, 1.0, (1.0 - np.abs(edge)) / 12, centre=edge / 2) for rod, edge in zip(RODS, EDGES, strict=True)
-    ],
+    bodies=[Body(rod, 1.0, (1.0 - np.abs(edge)) / 12, centre=edge / 2) for rod, edge in zip(RODS, EDGES, strict=True)],
     joints=[
         revolute("ground", "rod 1", AXES[0]),
         *(revolute(RODS[k - 1], RODS[k], AXES[k], at=EDGES[k - 1]) for k in range(1, 5)),

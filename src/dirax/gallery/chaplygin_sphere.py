@@ -28,9 +28,7 @@ EXAMPLE = Example(
     title="Chaplygin's sphere",
     source="Chaplygin 1903; Borisov & Mamaev, Nelin. Dinam. 2001: its integrals",
     system=MODEL.system,
-    initial=MODEL.state(
-        {"ball.z": 1.0, "ball.qx": 0.3, "ball.qy": 0.1}, {"ball.x": 0.5, "ball.y": 0.2, "ball.qz": 0.6}
-    ),
+    initial=MODEL.state({"ball.z": 1.0, "ball.qx": 0.3, "ball.qy": 0.1}, {"ball.x": 0.5, "ball.y": 0.2, "ball.qz": 0.6}),
     scheme=LagrangeDAlembert(),
     step=0.01,
     steps=2000,

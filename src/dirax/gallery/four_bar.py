@@ -4,8 +4,6 @@ The coupler stays level, so that the angle is that of a pendulum: (5/3) l θ̈ =
 space, where the hinge that closes the loop demands three things too many: they are met by the other hinges. SI units.
 """
 
-import numpy as np
-
 from dirax.bodies import Body, Model, revolute
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert

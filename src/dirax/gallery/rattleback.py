@@ -3,8 +3,6 @@
 Spun one way it begins to rattle and turns round. Data: Kane and Levinson, Int. J. Non-Linear Mech. 17 (1982). SI units.
 """
 
-
-
 from dirax.bodies import Body, Model, ellipsoid, free
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert

@@ -35,9 +35,7 @@ EXAMPLE = Example(
     scheme=LagrangeDAlembert(),
     step=2e-4,
     steps=20_000,
-    coordinates=tuple(
-        Coordinate(name.removeprefix("top."), "m" if k < 3 else "") for k, name in enumerate(MODEL.coordinates)
-    ),
+    coordinates=tuple(Coordinate(name.removeprefix("top."), "m" if k < 3 else "") for k, name in enumerate(MODEL.coordinates)),
     plane=(4, 5),
     time_unit="s",
     energy_unit="J",

@@ -1,6 +1,7 @@
 """A kernel's LLVM IR as C: one statement an instruction, so that the C does what the kernel does, rounding for rounding."""
 
 import re
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -74,6 +75,7 @@ static void {name}(void *px, void *phigh, void *plow, void *pquadrant, int64_t c
 }}
 """
 
+TABLE = re.compile(r"@(\w+) = internal constant \[(\d+) x (\w+)\] \[(.*)\]")
 HEAD = re.compile(r"define (?:internal )?(\w+) @(\w+)\((.*?)\)[^{]*\{")
 PHI = re.compile(r"\[ (\S+), %(\S+) \]")
 
@@ -106,8 +108,12 @@ class _Function:
 def c_code(module: str) -> str:
     """The functions of a module as C, static all of them. Raises `UnsupportedPrimitive` for vectors of lanes."""
     parts, function, block = [HELPERS], None, ""
+    phis: dict[str, list[tuple[str, str, str]]] = {}
     for line in _lines(module):
-        if found := HEAD.match(line):
+        if (table := TABLE.match(line)) and table[1] != "two_over_pi":
+            values = ", ".join(_value(entry.split()[1], table[3]) for entry in table[4].split(","))
+            parts.append(f"static {_type(table[3])} v_{table[1]}[{table[2]}] = {{{values}}};")
+        elif found := HEAD.match(line):
             name = found[2]
             if name == FAR_NAME:
                 function = None
@@ -128,6 +134,10 @@ def c_code(module: str) -> str:
         else:
             _statement(function, line, block, phis)
     return "\n".join(parts)
+
+
+def _no_c(what: str) -> UnsupportedPrimitive:
+    return UnsupportedPrimitive(what, "is in the kernel and has no translation to C", "dirax/engines/native/c_code.py")
 
 
 def _lines(module: str) -> Iterator[str]:
@@ -158,7 +168,7 @@ def _far_reduction() -> str:
 
 
 def _name(value: str) -> str:
-    return "v_" + value.lstrip("%").replace(".", "_")
+    return "v_" + value.lstrip("%@").replace(".", "_")
 
 
 def _label(block: str) -> str:
@@ -180,8 +190,6 @@ def _value(text: str, kind: str) -> str:
 
 
 def _literal(bits: int) -> str:
-    import struct
-
     x = struct.unpack("<d", bits.to_bytes(8, "little"))[0]
     if x != x:
         return "NAN"
@@ -213,7 +221,7 @@ def _statement(f: _Function, line: str, block: str, phis: dict[str, list[tuple[s
         elif word == "call":
             put(f"    {_call(line)};")
         else:
-            raise UnsupportedPrimitive(f"no C for the instruction {line!r}")
+            raise _no_c(line)
         return
     name, word = _name(target), rest.split(" ")[0]
     if word == "alloca":
@@ -230,7 +238,7 @@ def _statement(f: _Function, line: str, block: str, phis: dict[str, list[tuple[s
 
 def _type(kind: str) -> str:
     if kind not in TYPES:
-        raise UnsupportedPrimitive(f"a kernel with values of type {kind}, nodes or trajectories side by side, is not written in C")
+        raise _no_c(f"values of type {kind}")
     return TYPES[kind]
 
 
@@ -241,7 +249,7 @@ def _call(rest: str) -> str:
     if name.startswith("llvm."):
         function = name.split(".")[1]
         if function not in INTRINSICS or kind != "double":
-            raise UnsupportedPrimitive(f"no C for {name}")
+            raise _no_c(name)
         name = INTRINSICS[function]
     return f"{name}({values})"
 
@@ -286,7 +294,7 @@ def _binary(tokens: list[str], word: str) -> tuple[str, str]:
             return "i1", f"!({a} {UNORDERED[predicate]} {b})"
         table = ORDERED if word == "fcmp" else COMPARED
         if predicate not in table:
-            raise UnsupportedPrimitive(f"no C for the comparison {predicate}")
+            raise _no_c(f"the comparison {predicate}")
         return "i1", f"({a} {table[predicate]} {b})"
     kind = tokens[1]
     a, b = _value(tokens[2], kind), _value(tokens[3], kind)
@@ -300,4 +308,4 @@ def _binary(tokens: list[str], word: str) -> tuple[str, str]:
         return kind, f"(int64_t)((uint64_t){a} {WHOLE[word]} (uint64_t){b})"
     if word in SIGNED:
         return kind, f"{a} {SIGNED[word]} {b}"
-    raise UnsupportedPrimitive(f"no C for the instruction {word}")
+    raise _no_c(f"the instruction {word}")

@@ -94,14 +94,14 @@ class WritesC(AbstractEngine):
     def run(self, problem: Problem, progress: Progress | None = None) -> Outcome:
         """Write the file, then run the problem. Raises `UnsupportedPrimitive`."""
         if reason := self.supports(problem):
-            raise UnsupportedPrimitive(reason)
+            raise UnsupportedPrimitive("the run", f"is not written in C: {reason}", "dx.export_c")
         path = Path(self.path)
         path.write_text(c_program(problem, path.name, self.title), encoding="utf-8")
         return Native().run(problem, progress)
 
     def run_traced(self, problem: Problem) -> Outcome:
         """None: values that JAX traces are no numbers."""
-        raise UnsupportedPrimitive("a C file needs numbers, and these are traced by JAX")
+        raise UnsupportedPrimitive("the run", "is not written in C: its numbers are traced by JAX", "dx.export_c")
 
 
 def c_program(p: Problem, name: str, title: str) -> str:

@@ -18,7 +18,7 @@ NUMBERS = "double %t0, double %h, i64 %offset, i64 %first, i64 %stop, i64 %every
 
 
 def kernel_module(plan: Plan, width: int, fma: bool, groups: bool = True) -> str:
-    """IR of `run(lanes, params, outs, blocks, …)`: the kernel for consecutive blocks of `width` lanes; `groups` as of `Module`."""
+    """IR of `run(lanes, params, outs, blocks, …)`: the kernel for blocks of `width` lanes; `groups` as of `Module`."""
     module = Module(fma, groups)
     add_far_reduction(module)
     add_dense_solve(module)
