@@ -45,9 +45,7 @@ def test_a_circular_orbit_is_a_relative_equilibrium_of_turns():
 
 def test_a_symmetry_that_is_not_linear_in_q():
     """The orbit in log-polar coordinates (log r, φ) turned by a generator that bends: (0, 1) pushed by φ ↦ sinh φ."""
-    lagrangian = lambda q, v: (
-        jnp.exp(2 * q[0]) * (v[0] ** 2 + v[1] ** 2 / jnp.sqrt(1 + q[1] ** 2) ** 2) / 2 + jnp.exp(-q[0])
-    )
+    lagrangian = lambda q, v: jnp.exp(2 * q[0]) * (v[0] ** 2 + v[1] ** 2 / jnp.sqrt(1 + q[1] ** 2) ** 2) / 2 + jnp.exp(-q[0])
     system = dx.LagrangeDirac(lagrangian)
     turns = lambda q: jnp.stack([jnp.zeros(()), jnp.sqrt(1 + q[1] ** 2)])
     place = {"q": [np.log(2.0), 0.7], "v": [0.0, np.sqrt(1 / 8) * np.sqrt(1 + 0.49)]}
