@@ -140,3 +140,83 @@ def test_mistakes_in_data_name_the_coordinates():
         model.state({"a.qw": 1.0}, {"a.qw": 1.0})
     with pytest.raises(ValueError, match="rotation must be"):
         b.ball("ground", "a", "zzq")
+
+
+WHERE = {"at": (0.3, -0.2, 0.5), "on": (0.1, 0.4, -0.3), "turned": ((1.0, 2.0, -1.0), 0.7)}
+
+
+@pytest.mark.parametrize(
+    "joint",
+    [
+        lambda **more: b.fixed("a", "c", name="j", **more),
+        lambda **more: b.revolute("a", "c", (1, 2, 3), name="j", **more),
+        lambda **more: b.prismatic("a", "c", (1, 2, 3), name="j", **more),
+        lambda **more: b.universal("a", "c", (1, 2, 0), (-2, 1, 0), name="j", **more),
+        lambda **more: b.ball("a", "c", name="j", **more),
+        lambda **more: b.planar("a", "c", (1, 2, 3), name="j", **more),
+    ],
+)
+def test_what_a_joint_of_the_tree_does_its_conditions_allow_and_nothing_else(joint):
+    """Moved by its coordinates, a body meets the conditions of the joint that closes a loop, as many as take the rest of six."""
+    model = b.Model(rods("a", "c"), [b.free("ground", "a", "zxz"), joint(**WHERE)])
+    closing = joint(**WHERE, closes=True)
+    q = np.random.default_rng(1).uniform(-1.0, 1.0, len(model.coordinates))
+    frames = model.frames(q, np.zeros(q.size))
+    defect = [float(x) for x in closing.defect(frames["a"], frames["c"], None)]
+    assert defect == pytest.approx(np.zeros(len(closing.conditions)), abs=1e-14)
+    coordinates = len(joint().coordinates) - (joint().kind == "ball")  # of a quaternion three are free
+    assert len(defect) == 6 - coordinates
+
+
+def test_velocities_are_the_derivatives_of_places():
+    model = b.Model(
+        rods("a", "c", "d", "e"),
+        [
+            b.free("ground", "a"),
+            b.universal("a", "c", **WHERE),
+            b.gliding("ground", "d", lambda x, y: 0.3 * jnp.sin(x) + 0.2 * x * y, 0.4, "zxz"),
+            b.rolling_wheel("ground", "e", 0.5, 0.1),
+        ],
+    )
+    rng = np.random.default_rng(2)
+    q, v = rng.uniform(0.2, 0.9, (2, len(model.coordinates)))
+    frames = model.frames(q, v)
+    ahead, behind = (model.frames(q + s * 1e-6 * v, v) for s in (1, -1))
+    for name in "acde":
+        x = rng.uniform(-1.0, 1.0, 3)
+        rate = (ahead[name].point(x) - behind[name].point(x)) / 2e-6
+        assert frames[name].velocity_of(x) == pytest.approx(np.asarray(rate), abs=1e-8)
+
+
+def test_chaplygins_sleigh():
+    """u̇ = a ω², ω̇ = −m a u ω/(J + m a²) for the blade at the origin and the mass centre a ahead of it."""
+    m, j, a, angle, u, omega = 1.5, 0.4, 0.3, 0.8, 1.2, 0.7
+    model = b.Model(
+        [b.Body("sleigh", m, (0, 0, j), centre=(a, 0, 0))], [b.planar("ground", "sleigh")], contacts=[b.blade("sleigh")]
+    )
+    assert model.constraints == ("sleigh: skates",)
+    data = model.state({"sleigh.angle": angle}, {"sleigh.angle": omega, "sleigh.x": u * np.cos(angle)})
+    assert data["v"][1] == pytest.approx(u * np.sin(angle))
+    found = model.accelerations(**data)
+    assert found["sleigh.angle"] == pytest.approx(-m * a * u * omega / (j + m * a**2))
+    along = np.array([np.cos(angle), np.sin(angle)])
+    assert along @ [found["sleigh.x"], found["sleigh.y"]] == pytest.approx(a * omega**2)
+
+
+def test_friction_is_of_the_normal_force_and_dampers_take_energy():
+    model = b.Model(
+        [b.Body("ball", 2.0, (0.1, 0.1, 0.1))],
+        [b.free("ground", "ball")],
+        contacts=[b.ball_contact("ball", 0.5, motion="slides", friction=0.2)],
+    )
+    data = model.state({"ball.z": 0.5}, {"ball.x": 3.0, "ball.qx": 0.0, "ball.qy": 0.0})
+    found = model.accelerations(**data)
+    assert found["ball.x"] == pytest.approx(-0.2 * 9.81, rel=1e-6) and found["ball.z"] == pytest.approx(0.0, abs=1e-12)
+    ends = (("ground", (1.0, 0.0, 1.0)), ("ball", (0.1, 0.2, 0.0)))
+    damped = b.Model(model.bodies, model.joints, forces=[b.Damper(0.7, ends)])
+    q, v = np.array([0.3, 0.2, 0.1, 0.8, 0.2, -0.4, 0.4]), np.array([0.5, -0.2, 0.3, 0.0, 0.4, 0.0, -0.2])
+    frame = model.frames(q, v)["ball"]
+    apart = np.asarray(frame.point(np.array([0.1, 0.2, 0.0]))) - [1.0, 0.0, 1.0]
+    speed = apart @ np.asarray(frame.velocity_of(np.array([0.1, 0.2, 0.0]))) / np.linalg.norm(apart)
+    force = damped.system.forces(0.0, q, v, None)
+    assert v @ np.asarray(force) == pytest.approx(-0.7 * speed**2)

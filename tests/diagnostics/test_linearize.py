@@ -39,7 +39,7 @@ def test_a_circular_orbit_is_a_relative_equilibrium_of_turns():
     assert found.eigenvalues == pytest.approx([1j * rate, 0.0, -1j * rate], abs=1e-12)
     with pytest.raises(ValueError, match="no relative equilibrium"):
         dx.linearize(system, place)
-    with pytest.raises(ValueError, match="symmetries by .*must be symmetries"):
+    with pytest.raises(ValueError, match=r"symmetries by .*must be symmetries"):
         dx.linearize(system, {"q": [2.0, 0.0], "v": [0.0, 0.0]} | place, symmetries=[turns, lambda q: jnp.ones(2)])
 
 
