@@ -8,7 +8,16 @@ from scipy.integrate import solve_ivp
 
 import dirax as dx
 from dirax import gallery
-from dirax.gallery import andrews_squeezer, bricard, chaplygin_sphere, euler_disk, four_bar, rattleback, tippe_top
+from dirax.gallery import (
+    andrews_squeezer,
+    bricard,
+    chaplygin_sphere,
+    euler_disk,
+    flyball_governor,
+    four_bar,
+    rattleback,
+    tippe_top,
+)
 
 
 def test_andrews_squeezer_ends_where_the_test_set_says():
@@ -74,6 +83,16 @@ def test_the_tippe_top_turns_over_and_keeps_jelletts_integral():
     seen = tippe_top.MODEL.observables(sol, jellett=tippe_top.jellett, upright=upright)
     assert seen["upright"][0] > 0.99 and seen["upright"].min() < 0.0
     assert np.ptp(seen["jellett"]) < 1e-3 * seen["jellett"][0] and np.all(np.diff(sol.energy()) < 1e-9)
+
+
+def test_the_governor_turns_freely_and_its_damper_takes_energy():
+    sol = flyball_governor.EXAMPLE.simulate(steps=1000, save_every=20)
+    seen = flyball_governor.MODEL.observables(sol)
+    about = seen["angular_momentum"][:, 2]
+    assert np.ptp(about) < 1e-12 * about[0] and np.abs(sol.q[:, 2] + sol.q[:, 4]).max() < 1e-10
+    assert np.abs(sol.constraint_residual()).max() < 1e-12 and np.ptp(sol.q[:, 1]) > 0.01
+    assert seen["energy"][-1] < seen["energy"][0] - 0.1
+    assert seen["energy"] - sol.work == pytest.approx(seen["energy"][0], rel=1e-4)
 
 
 @pytest.mark.parametrize("name", ["bicycle", "andrews-squeezer", "euler-disk"])

@@ -80,8 +80,8 @@ CASES: list[Any] = [  # name, fibre, discrete Lagrangian, step, coordinates, ini
 ON_GROUPS = ("free-top", "heavy-top-so3", "suslov", "chaplygin-sleigh-se2", "underwater-vehicle")
 """Reduced by a whole group, over one point: the only connection is the trivial one."""
 
-MACHINES = ("bicycle", "tippe-top", "chaplygin-sphere", "rattleback", "euler-disk")
-"""They have translations, which rolling or friction sees: `dx.linearize` divides by them, and no run is made on the quotient."""
+MACHINES = ("bicycle", "tippe-top", "chaplygin-sphere", "rattleback", "euler-disk", "flyball-governor")
+"""They have translations, and rolling, friction or closed loops: no run is made on the quotient."""
 
 WITHOUT = {
     "double-pendulum": "gravity singles out the vertical, and time is not a coordinate",

@@ -56,6 +56,7 @@ _MODULES = {
     "chaplygin-sphere": "chaplygin_sphere",
     "rattleback": "rattleback",
     "euler-disk": "euler_disk",
+    "flyball-governor": "flyball_governor",
 }
 """Name → the module here that defines `EXAMPLE`; a new system is a file and a line."""
 
