@@ -220,3 +220,21 @@ def test_friction_is_of_the_normal_force_and_dampers_take_energy():
     speed = apart @ np.asarray(frame.velocity_of(np.array([0.1, 0.2, 0.0]))) / np.linalg.norm(apart)
     force = damped.system.forces(0.0, q, v, None)
     assert v @ np.asarray(force) == pytest.approx(-0.7 * speed**2)
+
+
+def test_a_machine_with_parameters_is_drawn():
+    import jax
+
+    model = b.Model(
+        [b.Body("wheel", "m", (0.1, 0.2, 0.1))],
+        [b.rolling_wheel("ground", "wheel", 0.5)],
+        contacts=[b.wheel("wheel", "r")],
+        forces=[b.Spring(1.0, (("ground", (0.0, 0.0, 1.0)), ("wheel", (0.0, 0.0, 0.0))))],
+        parameters={"m": 1.0, "r": 0.5},
+    )
+    parts = {part.kind: part for part in model.scene().parts}
+    assert set(parts) == {"plane", "disk", "spring"} and parts["disk"].settings["radius"] == 0.5
+    for params in (None, model.params):
+        turn = jax.eval_shape(lambda q: parts["disk"].places["turn"](q, params), np.zeros(5))
+        assert turn.shape == (3, 3)
+    assert np.asarray(parts["spring"].places["end"](np.zeros(5), None)) == pytest.approx([0.0, 0.0, 0.5])

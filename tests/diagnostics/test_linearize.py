@@ -23,6 +23,17 @@ def test_a_rod_with_its_length_as_a_constraint_swings_as_fast():
     assert found.matrix.shape == (2, 2) and found.eigenvalues == pytest.approx([3j, -3j], abs=1e-14)
 
 
+def test_a_constraint_said_twice_changes_nothing():
+    once = lambda q: jnp.array([q @ q - 1.0])
+    twice = lambda q: jnp.array([q @ q - 1.0, 2.0 * q @ q - 2.0])
+    place, found = {"q": [0.0, -1.0], "v": [0.0, 0.0]}, []
+    for holonomic in (once, twice):
+        system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.0 * q[1], holonomic=holonomic)
+        found.append(dx.linearize(system, place, dx.LagrangeDAlembert(), step=0.1).eigenvalues)
+        assert dx.linearize(system, place).eigenvalues == pytest.approx([3j, -3j], abs=1e-13)
+    assert found[0] == pytest.approx(found[1], abs=1e-12) and found[0] == pytest.approx([3j, -3j], abs=0.05)
+
+
 def test_forces_and_parameters():
     system = dx.LagrangeDirac(lambda q, v, p: v @ v / 2 - p["k"] * q @ q / 2, forces=lambda t, q, v, p: -p["c"] * v)
     found = dx.linearize(system, {"q": [0.0], "v": [0.0]}, params={"k": 4.0, "c": 5.0})

@@ -57,7 +57,7 @@ def _contact(model: Any, contact: Any) -> list[Part]:
 
 
 def _frame(model: Any, body: str, q: Any, params: Any) -> Any:
-    return model.frames(q, jnp.zeros_like(q), params or {})[body]
+    return model.frames(q, jnp.zeros_like(q), params or None)[body]
 
 
 def _place(model: Any, body: str, x: Any) -> Callable:

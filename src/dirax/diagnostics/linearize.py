@@ -134,8 +134,8 @@ def _project(space: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def _orthonormal(vectors: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of the span of the columns."""
+    """An orthonormal basis of the span of the columns, without any where all of them are roundoff of unit vectors."""
     if not vectors.size:
         return vectors.reshape(len(vectors), -1)[:, :0]
     u, values, _ = np.linalg.svd(vectors, full_matrices=False)
-    return u[:, values > RANK * max(values[0], 1.0 if values[0] < RANK else values[0])]
+    return u[:, values > RANK * (values[0] if values[0] > RANK else 1.0)]

@@ -9,6 +9,7 @@ from dirax.diagnostics.linearized_field import FieldAt, equations_of
 from dirax.program.memo import Memo
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
+from dirax.run.redundancy import redundant_constraints
 from dirax.run.start import begun, completed
 from dirax.run.validate import Case, validated_case
 from dirax.schemes.layout import Layout
@@ -75,8 +76,11 @@ def linearized_step(
     Raises `ValueError` where the scheme's own relative equilibrium is another one.
     """
     case = validated_case({"q": at["q"], "v": at["v"]}, params, False, h, at.get("t", 0.0))
-    equation = make_step_equation(scheme, system, Shape(*system.sizes(dict(case.data), case.params)))
-    began = begun(equation, case, completed(system, case, False))
+    initial = completed(system, case, False)
+    shape = Shape(*system.sizes(dict(case.data), case.params))
+    redundant = redundant_constraints(system, initial.constraints, dict(case.data), case.params, case.t0)
+    equation = make_step_equation(scheme, system, Shape(shape.n, shape.m, shape.c, redundant=redundant))
+    began = begun(equation, case, initial)
     first = np.asarray(began.state)
     lift = _lift(system, equation.stages[0][0].state_layout, case)
     state, matrix, time = first, np.eye(first.size), case.t0
