@@ -235,6 +235,6 @@ def test_a_machine_with_parameters_is_drawn():
     parts = {part.kind: part for part in model.scene().parts}
     assert set(parts) == {"plane", "disk", "spring"} and parts["disk"].settings["radius"] == 0.5
     for params in (None, model.params):
-        turn = jax.eval_shape(lambda q: parts["disk"].places["turn"](q, params), np.zeros(5))
+        turn = jax.eval_shape(lambda q, params=params: parts["disk"].places["turn"](q, params), np.zeros(5))
         assert turn.shape == (3, 3)
     assert np.asarray(parts["spring"].places["end"](np.zeros(5), None)) == pytest.approx([0.0, 0.0, 0.5])
