@@ -74,6 +74,14 @@ def test_the_manoeuvres_of_the_iftomm_library_are_within_its_score(speed, roll, 
     assert np.abs(sol.constraint_residual()).max() < 1e-13
 
 
+@pytest.mark.soak
+def test_an_hour_of_riding_keeps_both_contacts():
+    start = bicycle.MODEL.state({}, {"frame.x": 5.0, "frame.roll": 0.5, "frame.yaw": 0.0, "steer": 0.0})
+    sol = bicycle.EXAMPLE.simulate(**start, step=0.02, steps=180_000, save_every=200)
+    energy = sol.energy()
+    assert sol.ok and np.abs(sol.constraint_residual()).max() < 1e-13 and 100 * np.ptp(energy) / energy[0] < 1e-3
+
+
 def test_it_rides_with_both_wheels_on_the_ground():
     sol = bicycle.EXAMPLE.simulate(steps=400)
     assert sol.ok and np.abs(sol.constraint_residual()).max() < 1e-13
