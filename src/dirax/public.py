@@ -3,9 +3,11 @@
 A name is added by its import and its line in the list of its room.
 """
 
+from dirax import bodies
 from dirax.diagnostics.action import action_sum, action_variation, discrete_energy
 from dirax.diagnostics.compare import compare
 from dirax.diagnostics.convergence import convergence
+from dirax.diagnostics.linearize import Linearization, linearize
 from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
 from dirax.engines.configure import configure
@@ -59,6 +61,7 @@ from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.reduction.trivializations import CovectorTrivialization, PairTrivialization, PontryaginTrivialization
+from dirax.run.export_c import export_c
 from dirax.run.prepare import PreparedRun, prepare
 from dirax.run.simulate import simulate
 from dirax.schemes.collocation import Collocation
@@ -113,6 +116,7 @@ __all__ = [
     "PhaseSpaceLagrangian",
     "PortHamiltonian",
     "RelationForm",
+    "bodies",
     "circuit",
     "constraint_algorithm",
     "interconnect",
@@ -221,6 +225,7 @@ __all__ += [
     "Solution",
     "clear_caches",
     "configure",
+    "export_c",
     "load",
     "prepare",
     "reconstruct",
@@ -229,12 +234,14 @@ __all__ += [
 ]
 # Measuring
 __all__ += [
+    "Linearization",
     "Report",
     "action_sum",
     "action_variation",
     "compare",
     "convergence",
     "discrete_energy",
+    "linearize",
     "verify",
 ]
 # Looked at

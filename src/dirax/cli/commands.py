@@ -118,6 +118,26 @@ def report(
 
 @app.command()
 @with_messages
+def export(
+    kind: Annotated[str, typer.Argument(help="what to write: c", show_default=False)],
+    system: System,
+    settings: Settings = None,
+    scheme: Annotated[str | None, typer.Option(help=SCHEME_HELP, show_default=False)] = None,
+    out: Annotated[Path | None, typer.Option(help="the file [default: NAME.c]", show_default=False)] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file that exists")] = False,
+) -> None:
+    """Write the run of a system as one C file that depends on nothing, and prints the rows of the run with their bits."""
+    from dirax.cli.export import write_c
+
+    if kind != "c":
+        raise ValueError(f"export writes c, but {kind!r} was asked for.")
+    with progress_bar("writing"):
+        path = write_c(system, settings or (), scheme, out, overwrite)
+    typer.echo(f"the program is in {path}; its first lines say how it is compiled")
+
+
+@app.command()
+@with_messages
 def compare(
     system: System,
     settings: Settings = None,
