@@ -40,8 +40,9 @@ def text(
     source: str,
     data: dict[str, Any],
     arrays: Arrays,
+    small: bool = False,
 ) -> str:
-    """The whole page."""
+    """The whole page; of a `small` one only the motion and two plots are seen."""
     first = solutions[0]
     units = first.metadata.get("units", {})
     data = {
@@ -49,10 +50,11 @@ def text(
         "title": title,
         "names": list(names),
         "unit": str(units.get("t", "")),
-        "charts": charts(runs, plane, units),
+        "charts": _two(charts(runs, plane, units)) if small else charts(runs, plane, units),
         "bytes": arrays.size,
     }
     return Template(asset("page.html")).substitute(
+        kind="small" if small else "whole",
         title=html.escape(title),
         subtitle=html.escape(_subtitle(solutions)),
         verdict=_chip(reports),
@@ -98,6 +100,11 @@ def charts(runs: Sequence[Run], plane: tuple[int, ...], units: dict[str, Any]) -
             title = TITLES.get(name, name.replace("_", " ").capitalize())
             found.append(_over_time(title, name, range(len(table.columns)), ["value", "log"]))
     return found
+
+
+def _two(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The first plot over time, which is of the energy where there is one, and the phase plane."""
+    return [*[chart for chart in found if chart["kind"] == "time"][:1], *[chart for chart in found if chart["kind"] == "phase"]]
 
 
 def _over_time(title: str, table: str, columns: Any, modes: list[str], unit: str = "") -> dict[str, Any]:
