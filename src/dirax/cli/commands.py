@@ -156,6 +156,7 @@ def reproduce(
 ) -> None:
     """Reproduce a paper: print a table of its quantities, theirs against computed, and draw its figures again.
 
+    With `all`, index.html in the folder shows everything, and the systems of the gallery in motion.
     The exit status is 1 when a quantity differs from what it should be.
     """
     import json
@@ -172,7 +173,8 @@ def reproduce(
             marks, notes = result.notes()
             cells = [(r.quantity, r.paper, r.computed, r.verdict, mark) for r, mark in zip(result.rows, marks, strict=True)]
             show_table(f"[{result.paper}] {result.title}", (*HEADER, "note"), cells, f"{result}\n", notes)
-        typer.echo(f"figures and tables are in {out}")
+        index = f", {out / 'index.html'} shows them" if (out / "index.html").exists() else ""
+        typer.echo(f"figures and tables are in {out}{index}")
     if not all(result.ok for result in results):
         typer.echo("dirax: a quantity differs from what it should be, see DIFFERS in the table.", err=True)
         raise typer.Exit(1)

@@ -58,7 +58,7 @@ def text(
         title=html.escape(title),
         subtitle=html.escape(_subtitle(solutions)),
         verdict=_chip(reports),
-        statement=_statement(first),
+        statement=equations_html(first),
         runs=_runs(solutions, names, runs),
         verdicts="".join(_verdicts(report, names[k], k, runs, len(solutions)) for k, report in enumerate(reports)),
         details=_details(first, source),
@@ -161,7 +161,8 @@ def math(parts: Sequence[Written]) -> str:
     return " ".join(map(piece, parts))
 
 
-def _statement(sol: Solution) -> str:
+def equations_html(sol: Solution) -> str:
+    """The system in formulas, empty where there are no short ones."""
     equal = Written("=", "<mo>=</mo>")
     rows = [
         f'<div class="equation">{math([equation.left])} {math([equal, *equation.right])}</div>'
