@@ -7,12 +7,12 @@ import logging
 import multiprocessing
 import os
 import sys
-import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
+HERE = str(Path(__file__).parent)
+sys.path.insert(0, HERE)
 import pages
 
 log = logging.getLogger("mkdocs.hooks.execute")
@@ -25,24 +25,6 @@ cards: list[str] = []
 WORKERS = min(4, os.cpu_count() or 1)
 
 
-def page(text: str, name: str) -> list[pages.Outcome]:
-    """The outcomes of a page, in a process of its own."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    with tempfile.TemporaryDirectory() as folder:
-        return pages.run(text, name, Path(folder), tables=True)
-
-
-def card(name: str) -> tuple[str, str, bytes]:
-    """(name, HTML, moving picture) of a system of the gallery."""
-    from dirax.gallery.cards import card
-
-    with tempfile.TemporaryDirectory() as folder:
-        made = card(name, Path(folder))
-        return name, made.html(f"{FOLDER}/gallery"), made.picture.read_bytes()
-
-
 def on_files(files: Any, config: Any) -> Any:
     from mkdocs.structure.files import File
 
@@ -51,11 +33,13 @@ def on_files(files: Any, config: Any) -> Any:
     sources = {f.src_uri: Path(f.abs_src_path).read_text("utf-8") for f in files.documentation_pages()}
     programs = {uri: text for uri, text in sources.items() if pages.blocks(text)}
     names = gallery.names() if any(CARDS in text for text in sources.values()) else ()
+    if HERE not in sys.path:  # MkDocs takes it back; the processes need it
+        sys.path.insert(0, HERE)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(WORKERS, mp_context=context) as pool:
         longest_first = sorted(programs, key=lambda uri: -len(programs[uri]))
-        ran = {uri: pool.submit(page, programs[uri], f"docs/{uri}") for uri in longest_first}
-        made = [pool.submit(card, name) for name in names]
+        ran = {uri: pool.submit(pages.outcomes, programs[uri], f"docs/{uri}") for uri in longest_first}
+        made = [pool.submit(pages.card, name, f"{FOLDER}/gallery") for name in names]
         for uri, future in ran.items():
             try:
                 outcomes[uri] = future.result()

@@ -1,4 +1,4 @@
-"""MkDocs hook: every link and every picture of the built pages leads to something that is there, and nothing is loaded from elsewhere."""
+"""MkDocs hook: every link and picture of the built pages leads to something that is there; nothing is loaded from elsewhere."""
 
 import logging
 from functools import cache

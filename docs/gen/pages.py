@@ -8,6 +8,7 @@ import io
 import os
 import re
 import sys
+import tempfile
 import textwrap
 import types
 from collections.abc import Iterator
@@ -88,6 +89,24 @@ def run(text: str, name: str, folder: Path, tables: bool = False) -> list[Outcom
                     outcome.pictures.append((path.name, path.read_bytes()))
             outcomes.append(outcome)
     return outcomes
+
+
+def outcomes(text: str, name: str) -> list[Outcome]:
+    """A page run in a process of its own."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    with tempfile.TemporaryDirectory() as folder:
+        return run(text, name, Path(folder), tables=True)
+
+
+def card(name: str, url: str) -> tuple[str, str, bytes]:
+    """(name, HTML, moving picture) of a system of the gallery; the picture will be under `url`."""
+    from dirax.gallery.cards import card
+
+    with tempfile.TemporaryDirectory() as folder:
+        made = card(name, Path(folder))
+        return name, made.html(url), made.picture.read_bytes()
 
 
 def _printer(outcome: Outcome) -> Any:
