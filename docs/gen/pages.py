@@ -133,7 +133,8 @@ def shown(outcome: Outcome, url: str) -> str:
     lines = []
     for kind, piece in outcome.pieces:
         if kind == "html":
-            lines.append(f'<div class="output">{" ".join(piece.split(chr(10)))}</div>')
+            table = " ".join(piece.splitlines()).replace("<table>", '<table class="outcome">', 1)
+            lines.append(f'<div class="output">{table}</div>')
         else:
             wide = max(map(len, piece.splitlines()), default=0)
             size = " wide" if wide > 88 else ""

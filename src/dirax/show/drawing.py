@@ -1,5 +1,6 @@
 """A scene at one time as a matplotlib picture: faces, shaded by a sun, drawn from the farthest to the nearest."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -117,7 +118,8 @@ class Drawing:
         self.still.set(segments=lines, color=colours, linewidths=widths)
 
     def at(self, frame: int) -> None:
-        """Put everything where it is at a frame of the first motion, the others at theirs."""
+        """Put everything where it is at a frame of the first motion, the others at theirs. A disk whose centre rests is a
+        table: it lies beneath what moves."""
         faces: list[tuple[float, np.ndarray, tuple[float, ...]]] = []
         trails, colours, widths = [], [], []
         for k, motion in enumerate(self.motions):
@@ -134,7 +136,9 @@ class Drawing:
                         trails.append(points)
                         colours.append((*self.rgb(colour), opacity * self.opacity[k]))
                         widths.append(width)
-                faces += self._rigid(rigid, at, colour, self.opacity[k])
+                table = part.kind == "disk" and len(places["at"]) == 1
+                found = self._rigid(rigid, at, colour, self.opacity[k])
+                faces += [(math.inf, *rest) for _, *rest in found] if table else found
                 faces += self._bent(part, at, colour, self.opacity[k])
         faces.sort(key=lambda face: -face[0])
         self.trails.set(segments=trails, color=colours, linewidths=widths)
