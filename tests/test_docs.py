@@ -8,6 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "docs" / "gen"))
+import links
 import pages
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -61,3 +62,13 @@ def test_a_page_that_fails_says_its_own_line(tmp_path):
     with pytest.raises(ZeroDivisionError) as error:
         pages.run("text\n\n```python\n1 / 0\n```\n", "page.md", tmp_path)
     assert error.traceback[-1].lineno == 3 and str(error.traceback[-1].path).endswith("page.md")
+
+
+def test_links_that_lead_nowhere_are_named(tmp_path):
+    (tmp_path / "a.html").write_text('<a href="b.html#there">1</a><a href="b.html#not">2</a><a href="c.html">3</a>')
+    (tmp_path / "b.html").write_text('<h1 id="there"></h1><img src="https://x.org/y.png"><a href="https://x.org">4</a>')
+    assert links.broken(tmp_path) == [
+        "a.html points to b.html#not, a place that the page has not",
+        "a.html points to c.html, which is not there",
+        "b.html loads https://x.org/y.png",
+    ]

@@ -153,7 +153,7 @@ class Drawing:
             depth = float(self.camera(turned(np.array(piece.centre)) + at["at"])[1])
             for layer, (polygons, name) in enumerate(piece.mesh):
                 corners = turned(polygons) + at["at"]
-                normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
+                normals = np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)  # Newell's, for corners that coincide too
                 normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
                 facing = np.einsum("ki,ki->k", normals, self.camera.eye - corners[:, 0]) > 0
                 seen, _ = self.camera(corners[facing])
