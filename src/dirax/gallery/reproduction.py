@@ -121,10 +121,10 @@ def reproduce(paper: str = "all", out: Any = None, progress: Progress | None = N
             results[-1].save_figures(Path(out) / name)
     if out is not None:
         write_tables(results, Path(out))
-    if shows:
-        from dirax.gallery.exhibition import write_index
+        if shows:
+            from dirax.gallery.exhibition import write_index
 
-        write_index(results, Path(out), lambda fraction, text: tell_all(PAPERS_PART + (1 - PAPERS_PART) * fraction, text))
+            write_index(results, Path(out), lambda fraction, text: tell_all(PAPERS_PART + (1 - PAPERS_PART) * fraction, text))
     tell_all(1.0, "done")
     return results
 
