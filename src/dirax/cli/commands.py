@@ -161,11 +161,15 @@ def reproduce(
     """
     import json
 
+    from dirax.gallery.exhibition import write_index
     from dirax.gallery.reproduction import HEADER, tables_as_json
     from dirax.gallery.reproduction import reproduce as reproductions
 
+    shown = f"figures and tables are in {out}"
     with progress_bar("starting") as tell:
         results = reproductions(paper, out, tell)
+        if paper.lower() == "all":
+            shown += f", {write_index(results, out, tell)} shows them"
     if as_json:
         show_json(json.loads(tables_as_json(results)))
     else:
@@ -173,8 +177,7 @@ def reproduce(
             marks, notes = result.notes()
             cells = [(r.quantity, r.paper, r.computed, r.verdict, mark) for r, mark in zip(result.rows, marks, strict=True)]
             show_table(f"[{result.paper}] {result.title}", (*HEADER, "note"), cells, f"{result}\n", notes)
-        index = f", {out / 'index.html'} shows them" if (out / "index.html").exists() else ""
-        typer.echo(f"figures and tables are in {out}{index}")
+        typer.echo(shown)
     if not all(result.ok for result in results):
         typer.echo("dirax: a quantity differs from what it should be, see DIFFERS in the table.", err=True)
         raise typer.Exit(1)

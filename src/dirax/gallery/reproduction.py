@@ -21,9 +21,6 @@ HEADER = ("quantity", "paper", "computed", "verdict")
 _PAPERS = {"PY": "peng_yoshimura", "RL": "rodriguez_leok", "BLM": "barbero_linan"}
 """Short name → the module here with `reproduction(progress) -> Reproduction`; a new paper is a module and a line."""
 
-PAPERS_PART = 0.6
-"""Of the time in which everything is made, the rest goes to the systems in motion."""
-
 Progress = Callable[[float, str], None]
 """Called with (fraction done, what is being done)."""
 
@@ -99,8 +96,7 @@ def papers() -> tuple[str, ...]:
 def reproduce(paper: str = "all", out: Any = None, progress: Progress | None = None) -> list[Reproduction]:
     """Reproduce a paper, or all of them: its runs, its table, its figures.
 
-    With `out`, a folder, the figures go to `out/<paper>/*.png` and the tables to `out/table.json` and `out/table.txt`; for all
-    papers `out/index.html` shows them, and the systems of the gallery in motion.
+    With `out`, a folder, the figures go to `out/<paper>/*.png` and the tables to `out/table.json` and `out/table.txt`.
     `progress` is called with (fraction, text). Raises `ValueError` for an unknown paper.
     """
     known = {name.lower(): name for name in _PAPERS}
@@ -108,9 +104,7 @@ def reproduce(paper: str = "all", out: Any = None, progress: Progress | None = N
     if wanted != "all" and wanted not in known:
         raise ValueError(f"no reproduction of {paper!r}: choose one of {', '.join(_PAPERS)} or all.")
     chosen = list(_PAPERS) if wanted == "all" else [known[wanted]]
-    tell_all = progress or (lambda fraction, text: None)
-    shows = out is not None and wanted == "all"
-    tell = (lambda fraction, text: tell_all(PAPERS_PART * fraction, text)) if shows else tell_all
+    tell = progress or (lambda fraction, text: None)
     results = []
     for number, name in enumerate(chosen):
         module = import_module(f"dirax.gallery.{_PAPERS[name]}")
@@ -121,11 +115,7 @@ def reproduce(paper: str = "all", out: Any = None, progress: Progress | None = N
             results[-1].save_figures(Path(out) / name)
     if out is not None:
         write_tables(results, Path(out))
-        if shows:
-            from dirax.gallery.exhibition import write_index
-
-            write_index(results, Path(out), lambda fraction, text: tell_all(PAPERS_PART + (1 - PAPERS_PART) * fraction, text))
-    tell_all(1.0, "done")
+    tell(1.0, "done")
     return results
 
 
