@@ -135,9 +135,9 @@ def test_a_section_has_the_states_at_the_value():
     found = crossings(t, states, 0, 0.5, 1)
     assert found == pytest.approx(np.tile([0.5, np.sqrt(0.75)], (len(found), 1)), abs=3e-6) and len(found) == 4
     assert len(crossings(t, states, 0, 0.5, 0)) == 7 and np.all(crossings(t, states, 0, 0.5, -1)[:, 1] < 0)
-    ax = plotting.plot_section(BATCH, "y", "p_y", through="x")
+    ax = plotting.plot_section(BATCH, "y", "p_y", through="x", value=0.1)
     shown = sum(len(line.get_xdata()) for line in ax.lines)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$y$", "$p_{y}$") and shown > 0
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$y$", "$p_{y}$") and shown == 14
     points = np.arange(8.0).reshape(2, 4)
     ax = plotting.plot_section(BATCH, "y", "p_x", points=points)
     assert np.array_equal(lines(ax)[0], points[:, [1, 2]].T)
