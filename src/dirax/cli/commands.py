@@ -176,16 +176,21 @@ def reproduce(
 ) -> None:
     """Reproduce a paper: print a table of its quantities, theirs against computed, and draw its figures again.
 
+    With `all`, index.html in the folder shows everything, and the systems of the gallery in motion.
     The exit status is 1 when a quantity differs from what it should be.
     """
     import json
 
+    from dirax.gallery.exhibition import write_index
     from dirax.gallery.reproduction import HEADER, tables_as_json
     from dirax.gallery.reproduction import reproduce as reproductions
     from dirax.gallery.theorems import HEADER as THEOREMS
 
+    shown = f"figures and tables are in {out}"
     with progress_bar("starting") as tell:
         results = reproductions(paper, out, tell)
+        if paper.lower() == "all":
+            shown += f", {write_index(results, out, tell)} shows them"
     if as_json:
         show_json(json.loads(tables_as_json(results)))
     else:
@@ -196,7 +201,7 @@ def reproduce(
             if result.theorems:
                 proved = [theorem.cells for theorem in result.theorems]
                 show_table(f"[{result.paper}] theorems", THEOREMS, proved, "")
-        typer.echo(f"figures and tables are in {out}")
+        typer.echo(shown)
     if not all(result.ok for result in results):
         typer.echo(
             "dirax: a quantity differs from what it should be, see DIFFERS in the table, or a theorem does not hold.", err=True

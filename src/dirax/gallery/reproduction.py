@@ -87,7 +87,7 @@ class Reproduction:
 
     def save_figures(self, folder: Path) -> list[Path]:
         """Write every figure as PNG into `folder`, which is made if it is missing; returns the files."""
-        from dirax.solution.plotting import save_figure
+        from dirax.solution.style import save_figure
 
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / f"{name}.png" for name in self.figures]

@@ -30,6 +30,9 @@ class Solution(Trajectory):
     report: Callable[..., Path]
     """`sol.report(path)`: a page for a browser; `dirax.show`, which stands above this room, puts the method here."""
 
+    animate: Callable[..., Path]
+    """`sol.animate(path)`: the motion as .gif, .webp, .mp4 or .html, from `dirax.show` too."""
+
     def extend(self, steps: int, progress: Any = False) -> "Solution":
         """The solution of the run with `steps` more steps, with the bits of one run: the steps that are done are not repeated,
         except where Ctrl-C has interrupted them. Rows are saved as before; the last row of this solution is one of the longer
@@ -61,3 +64,5 @@ class Solution(Trajectory):
     plot_energy = plotting.plot_energy
     plot_phase = plotting.plot_phase
     plot_constraint = plotting.plot_constraint
+    plot_momenta = plotting.plot_momenta
+    plot_section = plotting.plot_section
