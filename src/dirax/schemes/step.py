@@ -78,11 +78,10 @@ class StepEquation(eqx.Module):
       warns of what is wrong with them;
     - `resume(data, h, params) -> (state, u)`: where the step that leaves a saved row begins, of which `data` has the fields too,
       and which need not be the first: `start` sets sums since the start to zero, and may choose another chart, or take longer;
-    - `interpolate(theta, u, state, t, h, params) -> dict`, the fields of nodes at t + θh inside the step, 0 ≤ θ ≤ 1, by the polynomial
-      of the method, which joins both ends;
-    - `between(theta, row, after, h, params) -> dict`, the same of the rows at both ends, which hold the time `t` and the velocity `v`
-      too: for methods of second order, of which more is not to be had. Where neither is said, the fields at t + θh are those of
-      a step of the length θh;
+    - `interpolate(theta, u, state, t, h, params) -> dict`, the fields of nodes at t + θh inside the step, 0 ≤ θ ≤ 1, by the
+      polynomial of the method, which joins both ends;
+    - `between(theta, row, after, h, params) -> dict`, the same of the rows at both ends, which hold the time `t` and the velocity
+      `v` too: for methods of second order. Where neither is said, the fields at t + θh are those of a step of length θh;
     - `collocation`, the stage relation or mean relation of which the unknowns are copies: a fact that engines may use or ignore.
 
     Equations are compared by the identity of their functions. One with other functions is made by `dataclasses.replace`.
