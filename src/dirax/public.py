@@ -54,6 +54,7 @@ from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
+from dirax.run.event import Event
 from dirax.run.prepare import PreparedRun, prepare
 from dirax.run.simulate import simulate
 from dirax.schemes.collocation import Collocation
@@ -203,6 +204,7 @@ __all__ += [
 __all__ += [
     "AbstractEngine",
     "AbstractLinearSolver",
+    "Event",
     "PreparedRun",
     "Solution",
     "clear_caches",

@@ -9,6 +9,7 @@ from dirax.systems.lagrange_dirac import LagrangeDirac
 def hermite(system: LagrangeDirac) -> Callable:
     """`between` of a StepEquation: q(θ) of degree 3 with q and v of both rows, v = q̇ and p = ∂L/∂v(q, q̇).
 
+    The rows have their own p, from which ∂L/∂v may differ at them, where L is degenerate for instance: that is blended in.
     The interpolation alone is off by O(h⁴) in q and O(h³) in v and p, less than a method of second order is.
     """
 
@@ -18,7 +19,9 @@ def hermite(system: LagrangeDirac) -> Callable:
         q = row["q"] + theta * (change + rest * bend)
         slope = (change - h * after["v"]) - (h * row["v"] - change)
         v = (change + (rest - theta) * bend + theta * rest * slope) / h
-        found = {"q": q, "v": v, "p": system.legendre(q, v, params, row["t"] + theta * h)}
+        missed = [end["p"] - system.legendre(end["q"], end["v"], params, end["t"]) for end in (row, after)]
+        p = system.legendre(q, v, params, row["t"] + theta * h) + rest * missed[0] + theta * missed[1]
+        found = {"q": q, "v": v, "p": p}
         if "work" in row:
             found["work"] = row["work"] + theta * (after["work"] - row["work"])
         return found

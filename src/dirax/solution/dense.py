@@ -202,22 +202,23 @@ class Dense:
         lanes, flat = np.repeat(np.arange(batch), times.shape[1]), times.ravel()
         numbers, theta = self.place(lanes, flat)
         found = self.inside(lanes, numbers, theta)
-        fields = {name: found.get(name, self._of_rows(name, lanes, numbers)) for name in self.nodes}
+        fields = {name: found.get(name, self.of_rows(name, lanes, numbers)) for name in self.nodes}
         if sol.save_every == 1:
             steps = {name: a for name, a in self.saved.items() if name not in fields}
             fields |= {name: a[lanes, np.minimum(numbers, a.shape[1] - 1)] for name, a in steps.items()}
         if sol.batch is not None:
-            beyond = flat > self._time(self.ends[lanes]) + SLACK * float(sol.step)
+            beyond = flat > self.time_at(self.ends[lanes], 0.0) + SLACK * float(sol.step)
             for a in fields.values():
                 a[beyond] = np.nan
         return {name: a.reshape(batch, times.shape[1], *a.shape[1:]) for name, a in fields.items()}
 
-    def _of_rows(self, name: str, lanes: np.ndarray, numbers: np.ndarray) -> Any:
+    def of_rows(self, name: str, lanes: np.ndarray, numbers: np.ndarray) -> Any:
         """A field of which a polynomial says nothing: that of the row before."""
         return self.saved[name][lanes, np.searchsorted(self.counts, numbers, side="right") - 1]
 
-    def _time(self, numbers: np.ndarray) -> np.ndarray:
-        return float(self.sol.t[0]) + numbers * float(self.sol.step)
+    def time_at(self, numbers: np.ndarray, theta: Any) -> np.ndarray:
+        """The times of places inside steps."""
+        return float(self.sol.t[0]) + (numbers + theta) * float(self.sol.step)
 
     def _refuse_outside(self, times: np.ndarray) -> None:
         first, last = float(self.sol.t[0]), float(self.sol.t[-1])

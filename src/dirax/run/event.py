@@ -1,0 +1,102 @@
+"""Event: a function of the motion whose zeros are looked for along a run."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.text.representation import value_text
+
+KNOWN = ("t", "q", "v", "p", "x", "params")
+"""What a function of an event may be given, by the names of its arguments."""
+
+TRACED = (
+    "events= are not looked for under jax.grad, jit and vmap, where how many there are cannot depend on values: run without "
+    "them, and use sol.at(t)."
+)
+
+
+class Event:
+    """Where a function of the motion goes through zero: `dx.simulate(…, events=[dx.Event(function)])`.
+
+    `function` returns one number of what the names of its arguments say: the time `t`, `q`, `v`, `p` or `x` at that time, and
+    `params`. `direction`: +1 for zeros through which it rises, −1 for those through which it falls, 0 for both. With `terminal`
+    the trajectory ends at the first of them.
+
+        section = dx.Event(lambda q, v: q[0], direction=+1)
+
+    Zeros are found inside the steps, on what `sol.at` is there, to a float's precision of the step. The function is looked at in
+    rows, at points between them, and at more where it comes near to zero. What is found is each change of sign: a function that
+    touches zero and goes back, and one that dips below it for less than 10⁻⁴ of a step, may count as two zeros or as none. At the
+    first row nothing is found, if the function is zero there.
+    Raises `TypeError` for something that is no function of such arguments, `ValueError` for another direction.
+    """
+
+    def __init__(self, function: Callable, direction: int = 0, terminal: bool = False):
+        if isinstance(direction, bool) or direction not in (-1, 0, 1):
+            raise ValueError(f"direction must be +1 (rising), −1 (falling) or 0 (both), but {direction!r} was given.")
+        self.function, self.direction, self.terminal = function, int(direction), bool(terminal)
+        self.arguments = names_of(function, "the function of an event")
+
+    def __call__(self, known: dict[str, Any]) -> Any:
+        """The function of what is known of one moment, by name."""
+        return self.function(**{name: known[name] for name in self.arguments})
+
+    def __repr__(self) -> str:
+        own = getattr(self.function, "__name__", type(self.function).__name__).replace("<lambda>", "lambda")
+        settings = f", direction={self.direction:+d}" * bool(self.direction) + ", terminal=True" * self.terminal
+        return f"Event({own}({', '.join(self.arguments)}){settings})"
+
+
+def names_of(function: Any, what: str) -> tuple[str, ...]:
+    """The arguments of a user's function that is given things by their names. Raises `TypeError`."""
+    expected = f"{what} takes some of {', '.join(KNOWN)} by their names, like lambda t, q: q[0]"
+    if not callable(function):
+        raise TypeError(f"{expected}, but {value_text(function)} was given.")
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        raise TypeError(f"{expected}, but the signature of {value_text(function)} is not known: wrap it in a lambda.") from None
+    needed = [p for p in parameters if p.name in KNOWN or p.default is p.empty]
+    wrong = [p.name for p in needed if p.name not in KNOWN or p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD, p.POSITIONAL_ONLY)]
+    if wrong or not needed:
+        raise TypeError(f"{expected}, but it takes {', '.join(wrong) or 'no argument'}.")
+    return tuple(p.name for p in needed)
+
+
+def checked_events(events: Any) -> tuple[Any, ...]:
+    """The events of a run, each an `Event`. Raises `TypeError`."""
+    if isinstance(events, Event):
+        events = [events]
+    if not isinstance(events, Sequence) or isinstance(events, str):
+        raise TypeError(f"events must be a list of dx.Event(function, …), but {value_text(events)} was given.")
+    for event in events:
+        if not isinstance(event, Event):
+            hint = ": write dx.Event(function)" if callable(event) else ""
+            raise TypeError(f"events must be a list of dx.Event(function, …), but it holds {value_text(event)}{hint}.")
+    return tuple(events)
+
+
+def check_result(event: Event, number: int, known: dict[str, np.ndarray], params: Any) -> None:
+    """Raise `TypeError` and `ValueError` for a function that has no such arguments, or that returns no number; `known` at one
+    moment."""
+    missing = [name for name in event.arguments if name not in known and name != "params"]
+    if missing:
+        raise TypeError(
+            f"events[{number}] asks for {', '.join(missing)}, but a run of this system and scheme knows "
+            f"{', '.join([*known, 'params'])}."
+        )
+    try:
+        found = jax.eval_shape(lambda known, params: event({**known, "params": params}), known, params)
+    except Exception as error:
+        raise TypeError(
+            f"events[{number}] could not be traced by JAX: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+        ) from error
+    if not hasattr(found, "shape") or found.shape != ():
+        came = f"shape {found.shape}: index or sum its result" if hasattr(found, "shape") else type(found).__name__
+        raise ValueError(f"the function of events[{number}] must return one number, but it returned {came}.")
+    if not jnp.issubdtype(found.dtype, jnp.floating):
+        raise TypeError(f"the function of events[{number}] must return a real number (float64), but its dtype is {found.dtype}.")
