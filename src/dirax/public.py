@@ -55,6 +55,7 @@ from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.run.event import Event
+from dirax.run.impact import Impact
 from dirax.run.prepare import PreparedRun, prepare
 from dirax.run.simulate import simulate
 from dirax.schemes.collocation import Collocation
@@ -205,6 +206,7 @@ __all__ += [
     "AbstractEngine",
     "AbstractLinearSolver",
     "Event",
+    "Impact",
     "PreparedRun",
     "Solution",
     "clear_caches",

@@ -76,7 +76,7 @@ def carried_out(
 ) -> Solution:
     """The Solution of a run. Raises `ValueError` for data that a premise excludes."""
     if settings.events:
-        return run_with_events(carried_out, settings, case, steps, save_every, progress, kind, entered)
+        return run_with_events(carried_out, _begun, settings, case, steps, save_every, progress, kind, entered)
     began = time.perf_counter()
     every = _checked_times(case, steps, save_every)
     kind = kind or kind_for(settings, case)

@@ -51,32 +51,34 @@ class Event:
         return f"Event({own}({', '.join(self.arguments)}){settings})"
 
 
-def names_of(function: Any, what: str) -> tuple[str, ...]:
+def names_of(function: Any, what: str, known: tuple[str, ...] = KNOWN) -> tuple[str, ...]:
     """The arguments of a user's function that is given things by their names. Raises `TypeError`."""
-    expected = f"{what} takes some of {', '.join(KNOWN)} by their names, like lambda t, q: q[0]"
+    expected = f"{what} takes some of {', '.join(known)} by their names, like lambda q: q[0]"
     if not callable(function):
         raise TypeError(f"{expected}, but {value_text(function)} was given.")
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):
         raise TypeError(f"{expected}, but the signature of {value_text(function)} is not known: wrap it in a lambda.") from None
-    needed = [p for p in parameters if p.name in KNOWN or p.default is p.empty]
-    wrong = [p.name for p in needed if p.name not in KNOWN or p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD, p.POSITIONAL_ONLY)]
+    needed = [p for p in parameters if p.name in known or p.default is p.empty]
+    wrong = [p.name for p in needed if p.name not in known or p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD, p.POSITIONAL_ONLY)]
     if wrong or not needed:
         raise TypeError(f"{expected}, but it takes {', '.join(wrong) or 'no argument'}.")
     return tuple(p.name for p in needed)
 
 
-def checked_events(events: Any) -> tuple[Any, ...]:
-    """The events of a run, each an `Event`. Raises `TypeError`."""
-    if isinstance(events, Event):
+def checked_events(events: Any, kinds: tuple[type, ...]) -> tuple[Any, ...]:
+    """The events of a run, each of one of these kinds. Raises `TypeError`."""
+    if isinstance(events, kinds):
         events = [events]
     if not isinstance(events, Sequence) or isinstance(events, str):
-        raise TypeError(f"events must be a list of dx.Event(function, …), but {value_text(events)} was given.")
+        raise TypeError(f"events must be a list of dx.Event(function, …) and dx.Impact(gap), but {value_text(events)} was given.")
     for event in events:
-        if not isinstance(event, Event):
+        if not isinstance(event, kinds):
             hint = ": write dx.Event(function)" if callable(event) else ""
-            raise TypeError(f"events must be a list of dx.Event(function, …), but it holds {value_text(event)}{hint}.")
+            raise TypeError(
+                f"events must be a list of dx.Event(function, …) and dx.Impact(gap), but it holds {value_text(event)}{hint}."
+            )
     return tuple(events)
 
 

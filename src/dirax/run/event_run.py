@@ -11,6 +11,8 @@ import numpy as np
 from dirax.program.user_functions import is_traced
 from dirax.run.event import TRACED, Event, check_result
 from dirax.run.event_search import EventSearch
+from dirax.run.impact import Impact
+from dirax.run.impact_run import fly_all
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
 from dirax.solution.solution import Solution
@@ -19,18 +21,18 @@ FIRST_STRETCH = 256
 """Steps of the first stretch of a run that may end at an event; every other one is as long as all before it."""
 
 
-def with_events(run: Any, events: tuple[Event, ...], steps: int, save_every: int, progress: Any, traced: bool) -> Solution:
-    """The Solution of a run with its events; `run(steps)` is that of so many steps with every row. Raises `ValueError` under
-    JAX's transformations and for functions that are not finite, `TypeError` for those that return no number."""
+def with_events(run: Any, events: tuple[Any, ...], steps: int, save_every: int, progress: Any, traced: bool) -> Solution:
+    """The Solution of a run with its events; `run(steps)` is that of so many steps with every row, with its impacts. Raises
+    `ValueError` under JAX's transformations and for functions that are not finite, `TypeError` for those that return no number."""
     if traced:
         raise ValueError(TRACED)
-    watch = any(event.terminal for event in events)
+    watch = any(event.terminal for event in events) and not any(isinstance(event, Impact) for event in events)
     sol = run(min(steps, FIRST_STRETCH) if watch else steps)
     if is_traced(sol.t, sol.fields):
         raise ValueError(TRACED)
     searched = Searched(sol, events)
     searched.go_on(sol)
-    while not searched.over and int(sol.stats["steps"]) < steps:
+    while watch and not searched.over and int(sol.stats["steps"]) < steps:
         done = int(sol.stats["steps"])
         sol = sol.extend(min(done, steps - done), progress)
         searched.go_on(sol)
@@ -40,7 +42,7 @@ def with_events(run: Any, events: tuple[Event, ...], steps: int, save_every: int
 class Searched:
     """A run as far as it has been looked through."""
 
-    def __init__(self, sol: Solution, events: tuple[Event, ...]):
+    def __init__(self, sol: Solution, events: tuple[Any, ...]):
         self.events, self.sol, self.done, self.seconds = events, sol, 0, 0.0
         self.found: Events | None = None
         self.endings = np.full(sol.batch or 1, np.inf)
@@ -54,15 +56,21 @@ class Searched:
     def go_on(self, sol: Solution) -> None:
         """Look through the steps that a longer run has more."""
         began, self.sol = time.perf_counter(), sol
-        if sol.rows > 1:
+        own = [(i, event) for i, event in enumerate(self.events) if isinstance(event, Event)]
+        parts = [self.found] if self.found is not None else []
+        if sol.impacts is not None:
+            parts = [sol.impacts]
+        if sol.rows > 1 and own:
             dense = Dense(sol)
-            self._check(dense)
+            if self.done == 0:
+                self._check(dense)
             last = int(dense.ends.max())
-            parts = [EventSearch(dense, event, i).found(self.done, last) for i, event in enumerate(self.events)]
+            parts += [EventSearch(dense, event, i).found(self.done, last) for i, event in own]
             sol.__dict__["_dense"] = dense
             self.done = last
-            self.found = joined([*([self.found] if self.found is not None else []), *parts])
-            for i, event in enumerate(self.events):
+        if parts:
+            self.found = joined(parts)
+            for i, event in own:
                 if event.terminal:
                     ends = self.found.of(i)
                     np.minimum.at(self.endings, ends.lane, ends.t)
@@ -70,14 +78,14 @@ class Searched:
         self.seconds += time.perf_counter() - began
 
     def _check(self, dense: Dense) -> None:
-        if self.found is not None:
-            return
         known: dict[str, Any] = {"t": np.asarray(dense.sol.t[0], float)}
         known |= {name: dense.saved[name][0, 0] for name in ("q", "p", "x") if name in dense.nodes}
         if {"q", "p"} <= known.keys() and any("v" in event.arguments for event in self.events):
             with contextlib.suppress(KeyError):
                 known["v"] = dense.velocities[0, 0]
         for i, event in enumerate(self.events):
+            if isinstance(event, Impact):
+                continue
             check_result(event, i, known, jax.tree.map(np.asarray, dense.sol.params_of_one))
 
     def solution(self, save_every: int, steps: int) -> Solution:
@@ -154,10 +162,19 @@ def thinned(sol: Solution, every: int) -> Solution:
 
 
 def run_with_events(
-    carry_out: Any, settings: Any, case: Any, steps: int, save_every: int, progress: Any, kind: Any, entered: float
+    carry_out: Any, begin: Any, settings: Any, case: Any, steps: int, save_every: int, progress: Any, kind: Any, entered: float
 ) -> Solution:
     """A run whose settings have events."""
     plain = replace(settings, events=())
-    run = lambda count: carry_out(plain, case, count, 1, progress, kind, entered)
+    walls = [i for i, event in enumerate(settings.events) if isinstance(event, Impact)]
+
+    def run(count: int) -> Solution:
+        if not walls:
+            return carry_out(plain, case, count, 1, progress, kind, entered)
+        begun = begin(plain, case, count, 1, 1)
+        if begun.traced:
+            raise ValueError(TRACED)
+        return fly_all(plain, begun, tuple(settings.events[i] for i in walls), tuple(walls))
+
     every = min(save_every, max(1, steps - int(case.two_points)))
     return with_events(run, settings.events, steps, every, progress, case.traced or is_traced(case.data, case.params))

@@ -92,16 +92,16 @@ class EventSearch:
         some, at = np.nonzero(_changes(values[:, :-1], values[:, 1:]))
         found = [Brackets(lanes[some], numbers[some], x[at], x[at + 1], values[some, at], values[some, at + 1])]
         # dips between points: inside the step, and around its beginning with the last point of the step before
-        some, at = np.nonzero(_dips(values[:, :-2], values[:, 1:-1], values[:, 2:]))
+        some, at = np.nonzero(dips(values[:, :-2], values[:, 1:-1], values[:, 2:]))
         found.append(self._dipped(lanes[some], numbers[some], x[at], x[at + 2]))
         follows = np.flatnonzero((numbers[1:] == numbers[:-1] + 1) & (lanes[1:] == lanes[:-1])) + 1
-        around = follows[_dips(values[follows - 1, -2], values[follows, 0], values[follows, 1])]
+        around = follows[dips(values[follows - 1, -2], values[follows, 0], values[follows, 1])]
         step = np.full(len(around), 1 / self.points)
         found.append(self._dipped(lanes[around], numbers[around], -step, step))
         if first > 0:  # around the first row of the block
             starts = np.flatnonzero(numbers == first)
             before = self.value(lanes[starts], numbers[starts] - 1, np.full(len(starts), x[-2]))
-            starts = starts[_dips(before, values[starts, 0], values[starts, 1])]
+            starts = starts[dips(before, values[starts, 0], values[starts, 1])]
             step = np.full(len(starts), 1 / self.points)
             found.append(self._dipped(lanes[starts], numbers[starts], -step, step))
         return Brackets(*map(np.concatenate, zip(*found, strict=True)))
@@ -120,7 +120,7 @@ class EventSearch:
             found.append(Brackets(lanes[some], base[some], x[some, at], x[some, at + 1], values[some, at], values[some, at + 1]))
             left = np.flatnonzero(~change.any(axis=1))
             lowest = np.clip(np.argmin(np.abs(values[left]), axis=1), 1, count - 2)
-            near = _dips(*(values[left, lowest + i] for i in (-1, 0, 1)))
+            near = dips(*(values[left, lowest + i] for i in (-1, 0, 1)))
             left, lowest = left[near], lowest[near]
             lanes, base, low, high = lanes[left], base[left], x[left, lowest - 1], x[left, lowest + 1]
         return Brackets(*map(np.concatenate, zip(*found, strict=True))) if found else _none()
@@ -156,7 +156,7 @@ def _changes(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return ((before < 0.0) & (after >= 0.0)) | ((before > 0.0) & (after <= 0.0))
 
 
-def _dips(before: np.ndarray, middle: np.ndarray, after: np.ndarray) -> np.ndarray:
+def dips(before: np.ndarray, middle: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Where a function of one sign is nearest to zero in the middle, and bends so much that it may reach zero beside it, four
     times as much as a parabola has to."""
     sign = np.sign(middle)

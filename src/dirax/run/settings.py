@@ -7,7 +7,8 @@ from typing import Any
 import jax
 
 from dirax.engines.engine import AbstractEngine
-from dirax.run.event import checked_events
+from dirax.run.event import Event, checked_events
+from dirax.run.impact import Impact
 from dirax.run.validate import (
     MOST_ITERATIONS,
     Case,
@@ -50,7 +51,7 @@ def stated(
     check_kinds(system, scheme)
     on, steps, save_every = engine_from(engine), count(steps, "steps"), count(save_every, "save_every")
     max_iterations = count(max_iterations, "max_iterations", MOST_ITERATIONS)
-    events = checked_events(events)
+    events = checked_events(events, (Event, Impact))
     case = validated_case(data, params, batch_params, step, t0)
     system = system if inputs is None else system.with_inputs(inputs)
     settings = Settings(system, scheme, on, project, check_initial, max_iterations, bool(compensated), events)

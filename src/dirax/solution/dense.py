@@ -52,6 +52,8 @@ class Dense:
             raise ValueError(
                 "this solution does not know by which equations it was made: load it with dx.load(path, system=…, scheme=…)."
             )
+        if sol.impacts is not None and sol.save_every != 1:
+            raise ValueError("between the rows of a run with impacts sol.at needs every row: leave save_every= out.")
         if sol.rows < 2:
             raise ValueError("there is no step between the rows of this solution, which has only one.")
         self.sol, self.equation = sol, sol.equation
@@ -165,6 +167,8 @@ class Dense:
         sol, again = self.sol, self.again
         h = np.full(len(theta), float(sol.step))
         t = float(sol.t[0]) + numbers * h
+        if sol.impacts is not None and np.any(hit := self._is_divided(lanes, numbers)):
+            return self._with_impacts(lanes, numbers, theta, hit)
         if self.interpolate is not None:
             states, u = again.at(lanes, numbers)
             interpolate = self.interpolate
@@ -177,6 +181,47 @@ class Dense:
             function = lambda values, params: between(*values, params)
             return self.entries(function, lanes, (theta, *rows, h), "between", *again.key)
         return self._by_steps(lanes, numbers, theta, t, h)
+
+    @cached_property
+    def _divided(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of every impact: trajectory, number of the step, and where in it."""
+        hits = self.sol.impacts
+        at = (hits.t - float(self.sol.t[0])) / float(self.sol.step)
+        return hits.lane, np.floor(at).astype(np.int64), at - np.floor(at)
+
+    def _is_divided(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """Which of these steps have an impact in them."""
+        of_lanes, of_steps, _ = self._divided
+        size = int(self.counts[-1]) + 1
+        return np.isin(lanes * size + numbers, of_lanes * size + of_steps)
+
+    def _with_impacts(self, lanes: np.ndarray, numbers: np.ndarray, theta: np.ndarray, hit: np.ndarray) -> dict[str, np.ndarray]:
+        """The fields inside steps, some of which walls divide: by the scheme's own step from the last impact before."""
+        sol, layout = self.sol, self.equation.stages[0][0].state_layout
+        found = {name: a[lanes, numbers].astype(float) for name, a in self.saved.items() if name in self.nodes}
+        if not np.all(hit):
+            for name, values in self.inside(lanes[~hit], numbers[~hit], theta[~hit]).items():
+                if name in found:
+                    found[name][~hit] = values
+        some = np.flatnonzero(hit)
+        of_lanes, of_steps, places = self._divided
+        row, begins = {name: a[some] for name, a in found.items()}, np.zeros(len(some))
+        for i, at in enumerate(some):
+            before = np.flatnonzero((of_lanes == lanes[at]) & (of_steps == numbers[at]) & (places <= theta[at]))
+            if len(before):
+                begins[i] = places[before[-1]]
+                for name in ("q", "p"):
+                    row[name][i] = sol.impacts.fields[name][before[-1]]
+        t, part = self.time_at(numbers[some], begins), theta[some] - begins
+        states, u = self.again.begin(lanes[some], row, t)
+        moved = part > AT_ROW
+        if np.any(moved):
+            h = part[moved] * float(sol.step)
+            states[moved] = self.again.step(lanes[some][moved], states[moved], u[moved], t[moved], h)[0]
+        for name in ("q", "p", "work"):
+            if name in found:
+                found[name][some] = states[:, layout.place(name)].reshape(found[name][some].shape)
+        return found
 
     def _by_steps(self, lanes, numbers, theta, t, h) -> dict[str, np.ndarray]:
         nearest = numbers + (theta > 0.5)

@@ -102,6 +102,7 @@ def _trajectories(sol: Some, lanes: Any) -> Some:
         initial={k: of_batch(a) for k, a in sol.initial.items()},
     )
     part.events = None if sol.events is None else sol.events.of_lanes(lanes)
+    part.impacts = None if sol.impacts is None else sol.impacts.of_lanes(lanes)
     return part
 
 

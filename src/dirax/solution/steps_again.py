@@ -151,12 +151,17 @@ class StepsAgain:
             lanes, left, number, state, u = lanes[on], left[on] - 1, number[on] + 1, after[on], u[on]
 
     def _begun(self, lanes: np.ndarray, rows: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        sol, equation = self.sol, self.equation
+        sol = self.sol
         take = lambda a, at: np.asarray(a)[at] if sol.batch is None else np.asarray(a)[lanes, at]
         row = {name: take(a, rows) for name, a in sol.fields.items() if sol.field_info[name].place == "node"}
         if sol.rows > 1:
             of_steps = {name: a for name, a in sol.fields.items() if sol.field_info[name].place == "step"}
             row |= {name: take(a, np.minimum(rows, sol.rows - 2)) for name, a in of_steps.items()}
+        return self.begin(lanes, row, t)
+
+    def begin(self, lanes: np.ndarray, row: dict[str, np.ndarray], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States and first guesses of steps that leave rows."""
+        sol, equation = self.sol, self.equation
         h = np.full(len(lanes), float(sol.step))
 
         def function(values, params):

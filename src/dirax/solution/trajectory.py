@@ -50,6 +50,9 @@ class Trajectory:
     events: Any = None
     """What `events=` found, the `Events` of the run; None for a run without."""
 
+    impacts: Any = None
+    """Those of the events that are impacts, which divide steps; None for a run without walls."""
+
     def __init__(
         self,
         *,
@@ -91,7 +94,7 @@ class Trajectory:
         """A copy with other values for some of the constructor's arguments."""
         given = {name: getattr(self, name) for name in GIVEN} | {"params": self._params}
         copy = type(self)(**(given | changes))
-        copy.example, copy.events = self.example, self.events
+        copy.example, copy.events, copy.impacts = self.example, self.events, self.impacts
         return copy
 
     @property
