@@ -22,8 +22,11 @@ FIRST_STRETCH = 256
 
 
 def with_events(run: Any, events: tuple[Any, ...], steps: int, save_every: int, progress: Any, traced: bool) -> Solution:
-    """The Solution of a run with its events; `run(steps)` is that of so many steps with every row, with its impacts. Raises
-    `ValueError` under JAX's transformations and for functions that are not finite, `TypeError` for those that return no number."""
+    """The Solution of a run with its events; `run(steps)` is that of so many steps with every row, with its impacts.
+
+    Raises `ValueError` under JAX's transformations and for functions that are not finite, `TypeError` for those that return no
+    number.
+    """
     if traced:
         raise ValueError(TRACED)
     watch = any(event.terminal for event in events) and not any(isinstance(event, Impact) for event in events)

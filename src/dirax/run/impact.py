@@ -13,12 +13,13 @@ from dirax.program.tracing import gradient
 from dirax.run.event import names_of
 
 KNOWN = ("t", "q", "params")
+"""What the gap may be given, by the names of its arguments."""
 
 
 class Impact:
     """A wall: the motion bounces where `gap` becomes zero, `dx.simulate(…, events=[dx.Impact(gap, restitution=1.0)])`.
 
-    `gap` returns one number of `q`, the time `t` and `params`, by the names of its arguments: positive off the wall, negative behind it.
+    `gap` returns one number of `q`, the time `t` and `params`, by the names of its arguments: positive off the wall.
     `restitution` is e in [0, 1] of v⁺·n = −e v⁻·n, relative to a wall that moves.
 
     The step in which a wall is hit is divided (Fetecau, Marsden, Ortiz, West 2003): a step of the scheme of length αh that ends

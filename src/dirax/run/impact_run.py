@@ -32,6 +32,9 @@ ON_WALL = 1e-13
 SHORTEST = 1e-12
 """The shortest flight, in steps."""
 
+SHORT, BEYOND = 0.25, 0.5
+"""Parts of a step below the first may be too short to be solved; then a step is taken that is longer by the second."""
+
 ACCUMULATED = 1e-9
 """Part of a step: when impacts follow each other faster, again and again, they are called accumulating."""
 
@@ -155,33 +158,47 @@ class Flight:
         """The state and the unknowns after a step in which walls may be hit; None where it does not end."""
         at, first = 0.0, True
         while True:
-            rest = 1.0 - at
-            found = self._next(state, u, step + at, rest)
-            part, wall = found if found is not None else (rest, -1)
-            if part > 0.0 or first:
-                length = part if part > 0.0 else 1.0
-                out = self._steps(state, u, self._time(step + at), length * self.problem.h, 1)
-                if first:
-                    self._keep(out, step, 1)
-                    first = False
-                if not int(out.completed[0]):
-                    self.status = int(out.status[0])
-                    return None
-                if part > 0.0:
-                    state, u = out.last_state[0], out.last_unknowns[0]
+            found = self._next(state, u, step + at, 1.0 - at)
+            part = 1.0 - at if found is None else found[0]
+            out, moved = self._part(state, u, step + at, part)
+            if first:
+                self._keep(out, step, 1)
+            if moved is None:
+                self.status = int(out.status[0])
+                return None
+            state, u = moved
             if found is None:
                 return state, u
-            at += part
-            hit = self._bounced(state, wall, step + at)
+            at, first = at + part, False
+            hit = self._bounced(state, found[1], step + at)
             if hit is None:
                 return None
-            state = hit
+            state, u = hit
 
-    def _bounced(self, state: np.ndarray, wall: int, at: float) -> np.ndarray | None:
-        """The state after an impact; None where the run ends there."""
+    def _part(self, state: np.ndarray, u: np.ndarray, at: float, part: float) -> tuple[Outcome, tuple | None]:
+        """A step of a part of the length; state and unknowns after it, None where it has no solution.
+
+        The forces of constraints are lost in rounding in a very short step: one that is longer is solved then, and one back.
+        """
+        h = self.problem.h
+        out = self._steps(state, u, self._time(at), (part or 1.0) * h, 1)
+        if part == 0.0:
+            return out, (state, u)
+        if int(out.completed[0]):
+            return out, (out.last_state[0], out.last_unknowns[0])
+        if part < SHORT:
+            there = self._steps(state, u, self._time(at), (part + BEYOND) * h, 1)
+            if int(there.completed[0]):
+                back = self._steps(there.last_state[0], there.last_unknowns[0], self._time(at + part + BEYOND), -BEYOND * h, 1)
+                if int(back.completed[0]):
+                    return there, (back.last_state[0], back.last_unknowns[0])
+        return out, None
+
+    def _bounced(self, state: np.ndarray, wall: int, at: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """The state after an impact, and a guess of the unknowns of the step that leaves it; None where the run ends there."""
         t, n = self._time(at), self.q.stop - self.q.start
-        found = np.asarray(self.jumps[wall].one(t, state[self.q], state[self.p]))
-        after, (speed, share) = found[:n], found[-2:]
+        found = np.asarray(self.jumps[wall].one(t, state[self.q], state[self.p], self.problem.h))
+        after, u, (speed, share) = found[:n], found[n:-2], found[-2:]
         number = self.numbers[wall]
         if not np.all(np.isfinite(found)) or share < 1e-12:
             why = "constraints hold it back" if share < 1e-12 else "its jump is not finite: L must be regular there"
@@ -190,13 +207,13 @@ class Flight:
         self.last = at
         if self.close >= AGAIN or speed >= 0.0:
             return self._end(
-                f"impacts on events[{number}] accumulate at t = {t:.6g} (Zeno), after {len(self.hits)} of them: what comes after is a "
-                "motion on the wall, which can be run with a holonomic constraint"
+                f"impacts on events[{number}] accumulate at t = {t:.6g} (Zeno), after {len(self.hits)} of them: what comes after "
+                "is a motion on the wall, which can be run with a holonomic constraint"
             )
         state = state.copy()
         state[self.p] = after
         self.hits.append((t, number, state[self.q].copy(), after))
-        return state
+        return state, u
 
     def _end(self, message: str) -> None:
         self.message, self.status = message, NOT_CONVERGED
@@ -209,10 +226,8 @@ class Flight:
 
         def gap(part: float) -> np.ndarray:
             if part not in values:
-                out = self._steps(state, u, self._time(at), part * self.problem.h, 1)
-                values[part] = (
-                    self._gaps(out.last_state[0], at + part) if int(out.completed[0]) else np.full(len(self.walls), np.nan)
-                )
+                _, moved = self._part(state, u, at, part)
+                values[part] = np.full(len(self.walls), np.nan) if moved is None else self._gaps(moved[0], at + part)
             return values[part]
 
         for k in range(1, PARTS + 1):
@@ -254,7 +269,7 @@ class Flight:
 
 
 def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> Solution:
-    """The Solution of a problem with impacts, of which every row is saved, and its `Events`. Raises `TypeError` and `ValueError`."""
+    """The Solution of a problem with impacts, of which every row is saved. Raises `TypeError` and `ValueError`."""
     p, system, started = begun.problem, settings.system, time.perf_counter()
     _check(system, p, walls, numbers)
     lanes = p.batch or 1
@@ -307,12 +322,18 @@ def _functions(system: Any, p: Problem, walls: tuple[Impact, ...]) -> tuple[Numb
     t, q = np.zeros(()), np.zeros(n)
     gaps = lambda t, q, params: jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in walls])
     own = tuple(map(Same, walls))
-    jumps = [
-        Numbers(
-            lambda t, q, p, params, wall=wall: jump(system, wall, q, p, t, params), [t, q, q], p.params, "jump", Same(system), key
-        )
-        for wall, key in zip(walls, own, strict=True)
-    ]
+    stage = p.equation.stages[0][0]
+
+    def jumped(wall: Impact) -> Any:
+        def function(t, q, p, h, params):
+            after, v, speed, share = jump(system, wall, q, p, t, params)
+            _, u = stage.resume({"q": q, "p": after, "v": v, "t": t}, h, params)
+            return after, u, speed, share
+
+        return function
+
+    key = "jump", Same(system), Same(p.equation)
+    jumps = [Numbers(jumped(wall), [t, q, q, t], p.params, *key, own[i]) for i, wall in enumerate(walls)]
     return Numbers(gaps, [t, q], p.params, "gaps", *own), jumps
 
 
@@ -349,8 +370,8 @@ def _refuse_behind(flight: Flight, lane: int | None) -> None:
     for number, gap in zip(flight.numbers, gaps, strict=True):
         if not gap >= -1e-12 * (1.0 + np.max(np.abs(state[flight.q]))):
             raise ValueError(
-                f"the gap of events[{number}] must not be negative at the start{whose}, but it is {gap:.6g}: begin in front of the "
-                "wall, or change the sign of the gap."
+                f"the gap of events[{number}] must not be negative at the start{whose}, but it is {gap:.6g}: begin in front "
+                "of the wall, or change the sign of the gap."
             )
 
 

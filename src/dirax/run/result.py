@@ -23,7 +23,7 @@ def solution_of(
     traced: bool,
     said: list[str] | None = None,
 ) -> Solution:
-    """The Solution of a run; `row0` is the given row 0 of a two-point start, `said` why trajectories ended, where that is known."""
+    """The Solution of a run; `row0` is the given row 0 of a two-point start, `said` why trajectories ended, where it is known."""
     p, fields, numbers = problem, outcome.fields, saved_steps(problem)
     ok, message = outcome.completed == p.steps, ""
     if not traced and p.batch is None and ok[0]:

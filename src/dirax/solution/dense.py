@@ -15,6 +15,9 @@ from dirax.solution.trajectory import Trajectory
 AT_ROW = 1e-12
 """Part of a step by which a time may lie off a saved row and still be at it, where steps of a part are taken."""
 
+SHORT = 1e-3
+"""Part of a step from which on there is no doubt that it can be solved."""
+
 SLACK = 1e-9
 """Part of a step by which a time may lie outside of the run: what rounding does to t0 + k·h."""
 
@@ -230,13 +233,26 @@ class Dense:
         found = {name: self.saved[name][lanes, row].astype(float) for name in self.nodes}
         if not np.all(at_row):
             off = ~at_row
-            lanes, t, part = lanes[off], t[off], np.maximum(theta[off], AT_ROW) * h[off]
+            lanes_all, lanes, t, part = lanes, lanes[off], t[off], np.maximum(theta[off], AT_ROW) * h[off]
             states, u = self.again.at(lanes, numbers[off])
             states, u = self.again.step(lanes, states, u, t, part)
             made = self.again.row(lanes, states, u, t + part)
             for name, values in found.items():
                 values[off] = made[name]
+            fails = np.flatnonzero(off)[~np.isfinite(states).all(axis=1) & (theta[off] < SHORT)]
+            if len(fails):
+                for name, values in self._near_row(lanes_all[fails], numbers[fails], theta[fails]).items():
+                    found[name][fails] = values
         return found
+
+    def _near_row(self, lanes: np.ndarray, numbers: np.ndarray, theta: np.ndarray) -> dict[str, np.ndarray]:
+        """The same so near to a row that the equations of a step of this length are not solved in floats: by the cubic through
+        the row and longer steps."""
+        places = np.arange(4) * 2 * SHORT
+        points = [self.inside(lanes, numbers, np.full(len(theta), place)) for place in places]
+        weights = [np.prod([(theta - b) / (a - b) for b in places if b != a], axis=0) for a in places]
+        column = lambda w, a: w.reshape(-1, *(1,) * (a.ndim - 1)) * a
+        return {name: sum(column(w, p[name]) for w, p in zip(weights, points, strict=True)) for name in self.nodes}
 
     def at(self, times: np.ndarray) -> dict[str, np.ndarray]:
         """The fields at times (T,) or (B, T): (B, T, …). Raises `ValueError` for times outside of the run."""
