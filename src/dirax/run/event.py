@@ -4,9 +4,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 
 from dirax.text.representation import value_text
 
@@ -82,17 +80,17 @@ def checked_events(events: Any, kinds: tuple[type, ...]) -> tuple[Any, ...]:
     return tuple(events)
 
 
-def check_result(event: Event, number: int, known: dict[str, np.ndarray], params: Any) -> None:
-    """Raise `TypeError` and `ValueError` for a function that has no such arguments, or that returns no number; `known` at one
-    moment."""
+def evaluated(event: Event, number: int, known: dict[str, Any], params: Any) -> Any:
+    """The function of an event of what is known of one moment. Raises `TypeError` and `ValueError` for one that has no such
+    arguments, or that returns no number."""
     missing = [name for name in event.arguments if name not in known and name != "params"]
     if missing:
+        names = [name for name in KNOWN if name in known or name == "params"]
         raise TypeError(
-            f"events[{number}] asks for {', '.join(missing)}, but a run of this system and scheme knows "
-            f"{', '.join([*known, 'params'])}."
+            f"events[{number}] asks for {', '.join(missing)}, but a run of this system and scheme knows {', '.join(names)}."
         )
     try:
-        found = jax.eval_shape(lambda known, params: event({**known, "params": params}), known, params)
+        found = event({**known, "params": params})
     except Exception as error:
         raise TypeError(
             f"events[{number}] could not be traced by JAX: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
@@ -102,3 +100,4 @@ def check_result(event: Event, number: int, known: dict[str, np.ndarray], params
         raise ValueError(f"the function of events[{number}] must return one number, but it returned {came}.")
     if not jnp.issubdtype(found.dtype, jnp.floating):
         raise TypeError(f"the function of events[{number}] must return a real number (float64), but its dtype is {found.dtype}.")
+    return found

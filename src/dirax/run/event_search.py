@@ -6,14 +6,12 @@ import numpy as np
 
 from dirax.numerics.brackets import bracketed_roots
 from dirax.program.memo import Same
-from dirax.run.event import Event
+from dirax.run.event import Event, evaluated
+from dirax.run.watched import points_of
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
 
-FEWEST_POINTS = 4
-"""Points of a step at which a function is looked at, its beginning among them."""
-
-BLOCK = 2**15
+BLOCK = 2**16
 """Points that are looked at together."""
 
 FINER, LEVELS = 8, 4
@@ -34,10 +32,10 @@ class Brackets(NamedTuple):
 class EventSearch:
     """Looks for one event in the steps of a run, of which every row was saved."""
 
-    def __init__(self, dense: Dense, event: Event, number: int):
-        self.dense, self.event, self.number = dense, event, number
-        stages = getattr(getattr(dense.equation.stages[0][0], "collocation", None), "tableau", None)
-        self.points = max(FEWEST_POINTS, stages.stages + 1 if stages is not None else 0)
+    def __init__(self, dense: Dense, event: Event, number: int, values: np.ndarray | None = None):
+        """`values` (B, steps, points) are those that the engine found, at the points of each step."""
+        self.dense, self.event, self.number, self.values = dense, event, number, values
+        self.points = points_of(dense.equation)
 
     def value(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> np.ndarray:
         """The function at base + x, in steps. Raises `ValueError` where it is not finite."""
@@ -56,11 +54,15 @@ class EventSearch:
         return self._of(lanes, fields, self.dense.time_at(numbers, np.zeros(len(numbers))))
 
     def _of(self, lanes: np.ndarray, fields: dict[str, np.ndarray], t: np.ndarray) -> np.ndarray:
-        event, dense = self.event, self.dense
+        event, dense, number = self.event, self.dense, self.number
         if "v" in event.arguments and "v" not in fields:
             fields = fields | {"v": dense.velocity(lanes, fields, t)}
         known = {name: fields[name] for name in event.arguments if name in fields} | {"t": t}
-        values = dense.entries(lambda known, params: event({**known, "params": params}), lanes, known, "event", Same(event))
+        one = lambda known, params: evaluated(event, number, known, params)
+        return self._finite(dense.entries(one, lanes, known, "event", Same(event)), t)
+
+    def _finite(self, values: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """The values. Raises `ValueError` where one is not finite."""
         bad = ~np.isfinite(values)
         if np.any(bad):
             raise ValueError(
@@ -82,12 +84,7 @@ class EventSearch:
         if not len(lanes):
             return _none()
         numbers = numbers + first
-        inner = np.arange(1, self.points) / self.points
-        repeated = lambda a: np.repeat(a, len(inner))
-        values = np.empty((len(lanes), self.points + 1))
-        values[:, 0] = self.at_rows(lanes, numbers)
-        values[:, -1] = self.at_rows(lanes, numbers + 1)
-        values[:, 1:-1] = self.value(repeated(lanes), repeated(numbers), np.tile(inner, len(lanes))).reshape(len(lanes), -1)
+        values = self._at_points(lanes, numbers)
         x = np.arange(self.points + 1) / self.points
         some, at = np.nonzero(_changes(values[:, :-1], values[:, 1:]))
         found = [Brackets(lanes[some], numbers[some], x[at], x[at + 1], values[some, at], values[some, at + 1])]
@@ -100,11 +97,27 @@ class EventSearch:
         found.append(self._dipped(lanes[around], numbers[around], -step, step))
         if first > 0:  # around the first row of the block
             starts = np.flatnonzero(numbers == first)
-            before = self.value(lanes[starts], numbers[starts] - 1, np.full(len(starts), x[-2]))
+            before = self._at_points(lanes[starts], numbers[starts] - 1)[:, -2]
             starts = starts[dips(before, values[starts, 0], values[starts, 1])]
             step = np.full(len(starts), 1 / self.points)
             found.append(self._dipped(lanes[starts], numbers[starts], -step, step))
         return Brackets(*map(np.concatenate, zip(*found, strict=True)))
+
+    def _at_points(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """The function at the points of these steps, both ends among them, (entries, points + 1)."""
+        values, inner = np.empty((len(lanes), self.points + 1)), np.arange(1, self.points) / self.points
+        if self.values is None:
+            repeated = lambda a: np.repeat(a, len(inner))
+            values[:, 0] = self.at_rows(lanes, numbers)
+            values[:, 1:-1] = self.value(repeated(lanes), repeated(numbers), np.tile(inner, len(lanes))).reshape(len(lanes), -1)
+            values[:, -1] = self.at_rows(lanes, numbers + 1)
+            return values
+        values[:, :-1] = self.values[lanes, numbers]
+        last = numbers + 1 >= self.dense.ends[lanes]
+        values[~last, -1] = self.values[lanes[~last], numbers[~last] + 1, 0]
+        values[last, -1] = self.at_rows(lanes[last], numbers[last] + 1)
+        self._finite(values.ravel(), np.repeat(self.dense.time_at(numbers, 0.0), self.points + 1))
+        return values
 
     def _dipped(self, lanes: np.ndarray, base: np.ndarray, low: np.ndarray, high: np.ndarray) -> Brackets:
         """The changes of sign between two places around the one where the function is nearest to zero."""

@@ -66,6 +66,10 @@ class Entries:
     def __call__(self, function: Callable, lanes: np.ndarray, values: Any, *key: Any) -> Any:
         """`function(values, params)` of every entry, a pytree of arrays; `key` is equal for functions that are."""
         leaves, structure = jax.tree.flatten(values)
+        if not len(lanes):  # one entry, for the shapes of what there is none of
+            one = [np.zeros((1, *np.shape(leaf)[1:])) for leaf in leaves]
+            found = self(function, np.zeros(1, int), jax.tree.unflatten(structure, one), *key)
+            return jax.tree.map(lambda a: a[:0], found)
         arrays = [np.asarray(leaf, float) for leaf in leaves] + self.params(lanes)
         count, size = len(leaves), len(lanes)
 
