@@ -9,7 +9,7 @@ import numpy as np
 
 from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
-from dirax.solution.steps_again import Entries, StepsAgain, begun, row_of, stepped
+from dirax.solution.steps_again import Entries, Keyed, StepsAgain, begun, compiled_call, row_of, stepped
 from dirax.solution.trajectory import Trajectory
 
 AT_ROW = 1e-12
@@ -83,17 +83,20 @@ class Dense:
         rows = {name: jnp.asarray(a) for name, a in self.nodes.items()}
         steps = {name: jnp.asarray(a) for name, a in sol.fields.items() if name not in rows}
 
-        def lane(rows, steps, params):
+        def lane(rows, steps, params, times, numbers, t0, h):
             def one(time, number):
                 row, after = ({name: a[number + i] for name, a in rows.items()} for i in (0, 1))
                 of_step = {name: a[number] for name, a in steps.items()}
-                return self._at_one(row, after, of_step, time, t0 + number * h, h, params) | of_step
+                return self._at_one(row, after, of_step, time, t0 + number.astype(float) * h, h, params) | of_step
 
             return jax.vmap(one)(times, numbers)
 
-        if sol.batch is None:
-            return lane(rows, steps, sol.params)
-        return jax.vmap(lane, in_axes=(0, 0, 0 if sol.batch_params else None))(rows, steps, sol.params)
+        own = (
+            lane if sol.batch is None else jax.vmap(lane, in_axes=(0, 0, 0 if sol.batch_params else None, None, None, None, None))
+        )
+        structure = jax.tree.structure((rows, steps, sol.params))
+        whole = Keyed(own, Same(self.equation), Same(sol.system), sol.batch is None, sol.batch_params, structure)
+        return compiled_call(whole, rows, steps, jax.tree.map(jnp.asarray, sol.params), times, numbers, t0, h)
 
     def _at_one(self, row, after, of_step, time, t, h, params) -> dict[str, Any]:
         theta, system = (time - t) / h, self.sol.system

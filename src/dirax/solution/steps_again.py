@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.engines.in_jax import in_scalars
 from dirax.engines.steps_in_numbers import StepsInNumbers
-from dirax.engines.xla.lane import first_lane, take_step
+from dirax.engines.xla.lane import Numerics, first_lane, take_step
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import GraphTooLarge
@@ -35,7 +36,9 @@ def begun(equation: Any, system: Any, row: dict[str, Any], t: Any, h: Any, param
 
 def stepped(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> tuple[Any, tuple, tuple]:
     """The state after a step, and of each stage the unknowns and the state that it left, by JAX."""
-    lane, unknowns, states = take_step(equation, first_lane(state, guess), t, h, params, UPDATES)
+    written, jacobians = in_scalars(equation, params, False)
+    numerics = Numerics(jacobians=jacobians)
+    lane, unknowns, states = take_step(written, first_lane(state, guess), t, h, params, UPDATES, numerics=numerics)
     return jnp.where(lane.completed > 0, lane.state, jnp.nan), unknowns, states
 
 
@@ -81,26 +84,33 @@ class Entries:
         if found is None:  # no scalar program: by JAX, in sizes that are powers of two
             more = np.minimum(np.arange(1 << max(size - 1, 0).bit_length()), max(size - 1, 0))
             given = [jnp.asarray(a[more]) for a in arrays]
-            found = jax.tree.map(lambda a: np.asarray(a)[:size], _compiled(_Flat(flat, key, structure, self.structure), given))
+            found = jax.tree.map(
+                lambda a: np.asarray(a)[:size], compiled_call(Keyed(_each(flat), key, structure, self.structure), *given)
+            )
         return found
 
 
-class _Flat:
+class Keyed:
     """A function that is compared by its key."""
 
     def __init__(self, function: Callable, *key: Any):
         self.function, self.key = function, key
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Flat) and self.key == other.key
+        return isinstance(other, Keyed) and self.key == other.key
 
     def __hash__(self) -> int:
         return hash(self.key)
 
 
 @compiled
-def _compiled(one: _Flat, arrays: list) -> Any:
-    return jax.vmap(one.function)(*arrays)
+def compiled_call(function: Keyed, *values: Any) -> Any:
+    """The function of these values, compiled once for its key."""
+    return function.function(*values)
+
+
+def _each(function: Callable) -> Callable:
+    return lambda *arrays: jax.vmap(function)(*arrays)
 
 
 class StepsAgain:
