@@ -90,9 +90,9 @@ def test_the_picture_of_a_section(tmp_path):
         ([position], TypeError, "write dx.Event"),
         (3, TypeError, "list of dx.Event"),
         ([dx.Event(lambda q: q)], ValueError, r"one number, but it returned shape \(1,\)"),
-        ([dx.Event(lambda x: x[0])], TypeError, r"asks for x, but a run .* knows t, q, p, params"),
+        ([dx.Event(lambda x: x[0])], TypeError, r"asks for x, but a run .* knows t, q, p, v, params"),
         ([dx.Event(lambda q: np.log(q))], TypeError, r"events\[0\] could not be traced"),
-        ([dx.Event(lambda q: jax.numpy.log(q[0]))], ValueError, "must be finite along the run, but it is nan at t = 1.6"),
+        ([dx.Event(lambda q: jax.numpy.log(q[0]))], ValueError, "must be finite along the run, but it is nan at t = 1."),
     ],
 )
 def test_bad_events_are_refused(events, error, text):

@@ -1,7 +1,7 @@
 """Event: a function of the motion whose zeros are looked for along a run."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -80,15 +80,19 @@ def checked_events(events: Any, kinds: tuple[type, ...]) -> tuple[Any, ...]:
     return tuple(events)
 
 
-def evaluated(event: Event, number: int, known: dict[str, Any], params: Any) -> Any:
-    """The function of an event of what is known of one moment. Raises `TypeError` and `ValueError` for one that has no such
-    arguments, or that returns no number."""
-    missing = [name for name in event.arguments if name not in known and name != "params"]
+def refuse_unknown(event: Event, number: int, fields: Collection[str]) -> None:
+    """Raise `TypeError` for an event that asks for what no row says, of which the fields are these."""
+    names = ["t", *(name for name in ("q", "p", "x") if name in fields), *["v"] * ({"q", "p"} <= set(fields)), "params"]
+    missing = [name for name in event.arguments if name not in names]
     if missing:
-        names = [name for name in KNOWN if name in known or name == "params"]
         raise TypeError(
             f"events[{number}] asks for {', '.join(missing)}, but a run of this system and scheme knows {', '.join(names)}."
         )
+
+
+def evaluated(event: Event, number: int, known: dict[str, Any], params: Any) -> Any:
+    """The function of an event of what is known of one moment. Raises `TypeError` and `ValueError` for one that cannot be traced,
+    or that returns no number."""
     try:
         found = event({**known, "params": params})
     except Exception as error:

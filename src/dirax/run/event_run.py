@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.user_functions import is_traced
 from dirax.run.event import TRACED, Event
 from dirax.run.event_search import EventSearch
 from dirax.run.impact import Impact
 from dirax.run.impact_run import fly_all
-from dirax.run.watched import VALUES, Watched, without_values
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
 from dirax.solution.solution import Solution
@@ -21,9 +19,7 @@ FIRST_STRETCH = 256
 """Steps of the first stretch of a run that may end at an event; every other one is as long as all before it."""
 
 
-def with_events(
-    run: Any, scheme: Any, events: tuple[Any, ...], steps: int, save_every: int, progress: Any, traced: bool
-) -> Solution:
+def with_events(run: Any, events: tuple[Any, ...], steps: int, save_every: int, progress: Any, traced: bool) -> Solution:
     """The Solution of a run with its events; `run(steps)` is that of so many steps with every row, with its impacts.
 
     Raises `ValueError` under JAX's transformations and for functions that are not finite, `TypeError` for those that return no
@@ -35,7 +31,7 @@ def with_events(
     sol = run(min(steps, FIRST_STRETCH) if watch else steps)
     if is_traced(sol.t, sol.fields):
         raise ValueError(TRACED)
-    searched = Searched(sol, events, scheme)
+    searched = Searched(sol, events)
     searched.go_on(sol)
     while watch and not searched.over and int(sol.stats["steps"]) < steps:
         done = int(sol.stats["steps"])
@@ -47,8 +43,7 @@ def with_events(
 class Searched:
     """A run as far as it has been looked through."""
 
-    def __init__(self, sol: Solution, events: tuple[Any, ...], scheme: Any):
-        self.scheme = scheme
+    def __init__(self, sol: Solution, events: tuple[Any, ...]):
         self.events, self.sol, self.done, self.seconds = events, sol, 0, 0.0
         self.found: Events | None = None
         self.endings = np.full(sol.batch or 1, np.inf)
@@ -67,13 +62,10 @@ class Searched:
         if sol.impacts is not None:
             parts = [sol.impacts]
         if sol.rows > 1 and own:
-            dense = Dense(without_values(sol, self.scheme))
+            dense = Dense(sol)
             last = int(dense.ends.max())
-            watched = getattr(sol.scheme, "events", ()) if VALUES in sol.fields else ()
-            values = np.asarray(sol.fields[VALUES]) if watched else np.zeros(0)
-            values = values[None] if sol.batch is None else values
-            known = {number: values[:, :, i] for i, (number, _) in enumerate(watched)}
-            parts += [EventSearch(dense, event, i, known.get(i)).found(self.done, last) for i, event in own]
+            parts += [EventSearch(dense, event, i).found(self.done, last) for i, event in own]
+            sol.__dict__["_dense"] = dense
             self.done = last
         if parts:
             self.found = joined(parts)
@@ -87,7 +79,7 @@ class Searched:
     def solution(self, save_every: int, steps: int) -> Solution:
         """The Solution of the run with the rows that are to be kept, and its events."""
         sol, ended = self.sol, np.isfinite(self.endings)
-        kept = thinned(ended_at(without_values(sol, self.scheme), self.endings), save_every)
+        kept = thinned(ended_at(sol, self.endings), save_every)
         kept.stats = sol.stats | {"events_seconds": self.seconds}
         kept.events = self.found
         if np.any(ended):
@@ -122,7 +114,7 @@ class LongerWithEvents:
         before = self.searched
         if before.over:
             return sol
-        after = Searched(before.sol, before.events, before.scheme)
+        after = Searched(before.sol, before.events)
         after.done, after.found, after.endings = before.done, before.found, before.endings.copy()
         after.go_on(before.sol.extend(self.steps - int(before.sol.stats["steps"]) + more, progress))
         longer = after.solution(self.save_every, self.steps + more)
@@ -162,22 +154,15 @@ def run_with_events(
 ) -> Solution:
     """A run whose settings have events."""
     plain = replace(settings, events=())
-    own = tuple((i, event) for i, event in enumerate(settings.events) if isinstance(event, Event) and "v" not in event.arguments)
-    watched = replace(plain, scheme=Watched(settings.scheme, own))
     walls = [i for i, event in enumerate(settings.events) if isinstance(event, Impact)]
 
     def run(count: int) -> Solution:
         if not walls:
-            try:
-                return carry_out(watched, case, count, 1, progress, None, entered)
-            except UnsupportedPrimitive:  # a function that the engine does not take, at least
-                return carry_out(plain, case, count, 1, progress, kind, entered)
+            return carry_out(plain, case, count, 1, progress, kind, entered)
         begun = begin(plain, case, count, 1, 1)
         if begun.traced:
             raise ValueError(TRACED)
         return fly_all(plain, begun, tuple(settings.events[i] for i in walls), tuple(walls))
 
     every = min(save_every, max(1, steps - int(case.two_points)))
-    return with_events(
-        run, settings.scheme, settings.events, steps, every, progress, case.traced or is_traced(case.data, case.params)
-    )
+    return with_events(run, settings.events, steps, every, progress, case.traced or is_traced(case.data, case.params))

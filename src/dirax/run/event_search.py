@@ -6,10 +6,12 @@ import numpy as np
 
 from dirax.numerics.brackets import bracketed_roots
 from dirax.program.memo import Same
-from dirax.run.event import Event, evaluated
-from dirax.run.watched import points_of
+from dirax.run.event import Event, evaluated, refuse_unknown
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
+
+FEWEST_POINTS = 4
+"""Points of a step at which a function is looked at, its beginning among them."""
 
 BLOCK = 2**16
 """Points that are looked at together."""
@@ -32,10 +34,11 @@ class Brackets(NamedTuple):
 class EventSearch:
     """Looks for one event in the steps of a run, of which every row was saved."""
 
-    def __init__(self, dense: Dense, event: Event, number: int, values: np.ndarray | None = None):
-        """`values` (B, steps, points) are those that the engine found, at the points of each step."""
-        self.dense, self.event, self.number, self.values = dense, event, number, values
-        self.points = points_of(dense.equation)
+    def __init__(self, dense: Dense, event: Event, number: int):
+        self.dense, self.event, self.number = dense, event, number
+        refuse_unknown(event, number, dense.nodes)
+        tableau = getattr(getattr(dense.equation.stages[0][0], "collocation", None), "tableau", None)
+        self.points = max(FEWEST_POINTS, 0 if tableau is None else tableau.stages + 1)
 
     def value(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> np.ndarray:
         """The function at base + x, in steps. Raises `ValueError` where it is not finite."""
@@ -106,17 +109,10 @@ class EventSearch:
     def _at_points(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """The function at the points of these steps, both ends among them, (entries, points + 1)."""
         values, inner = np.empty((len(lanes), self.points + 1)), np.arange(1, self.points) / self.points
-        if self.values is None:
-            repeated = lambda a: np.repeat(a, len(inner))
-            values[:, 0] = self.at_rows(lanes, numbers)
-            values[:, 1:-1] = self.value(repeated(lanes), repeated(numbers), np.tile(inner, len(lanes))).reshape(len(lanes), -1)
-            values[:, -1] = self.at_rows(lanes, numbers + 1)
-            return values
-        values[:, :-1] = self.values[lanes, numbers]
-        last = numbers + 1 >= self.dense.ends[lanes]
-        values[~last, -1] = self.values[lanes[~last], numbers[~last] + 1, 0]
-        values[last, -1] = self.at_rows(lanes[last], numbers[last] + 1)
-        self._finite(values.ravel(), np.repeat(self.dense.time_at(numbers, 0.0), self.points + 1))
+        repeated = lambda a: np.repeat(a, len(inner))
+        values[:, 0] = self.at_rows(lanes, numbers)
+        values[:, 1:-1] = self.value(repeated(lanes), repeated(numbers), np.tile(inner, len(lanes))).reshape(len(lanes), -1)
+        values[:, -1] = self.at_rows(lanes, numbers + 1)
         return values
 
     def _dipped(self, lanes: np.ndarray, base: np.ndarray, low: np.ndarray, high: np.ndarray) -> Brackets:

@@ -1,6 +1,8 @@
 """The steps of a run once more, where they are asked for: the state that each leaves and its unknowns, kept once found."""
 
+import contextlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -8,16 +10,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.engines.contract import Problem
 from dirax.engines.in_jax import in_scalars
+from dirax.engines.native.engine import Native
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.xla.lane import Numerics, first_lane, take_step
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
-from dirax.program.memo import Same
-from dirax.schemes.step import composed_row, needs_every_part
+from dirax.program.memo import Memo, Same
+from dirax.schemes.step import Field, StepEquation, composed_row, needs_every_part
 from dirax.solution.trajectory import Trajectory
+
+MANY = 2000
+"""Steps from which on it pays to compile them."""
 
 UPDATES = 50
 """Newton's updates a step, where it is solved by JAX."""
@@ -113,6 +120,14 @@ def _each(function: Callable) -> Callable:
     return lambda *arrays: jax.vmap(function)(*arrays)
 
 
+_solved_equations: Memo[StepEquation] = Memo(64)
+
+
+def _solved(equation: StepEquation) -> StepEquation:
+    about = {"unknowns": Field((equation.unknowns,), "step", ("unknown",))}
+    return replace(equation, unpack=lambda state, u, t, h, params: {"unknowns": u}, fields=about)
+
+
 class StepsAgain:
     """The steps of a run by number: `states` (B, steps, s) that they leave, `unknowns` (B, steps, k) of all stages in order."""
 
@@ -158,7 +173,7 @@ class StepsAgain:
         left, number = left[lanes, rows], self.counts[rows]
         state, u = self._begun(lanes, rows, self.time(number))
         while len(lanes):
-            after, u = self.step(lanes, state, u, self.time(number), float(self.sol.step))
+            after, u = self._whole(lanes, state, u, self.time(number))
             self.states[lanes, number], self.unknowns[lanes, number] = state, u
             self.known[lanes, number] = True
             on = left > 0
@@ -194,6 +209,33 @@ class StepsAgain:
         bad = ~made.good
         made.after[bad] = np.nan
         return made.after, np.concatenate([np.where(bad[:, None], np.nan, part) for part in made.unknowns], axis=1)
+
+    def _whole(self, lanes, state, u, t) -> tuple[np.ndarray, np.ndarray]:
+        """`step` with the length of the run's: by machine code where there are many, and they do not depend on the time."""
+        if len(lanes) >= MANY and self.solved is not None:
+            sol = self.sol
+            params = jax.tree.map(lambda a: np.asarray(a)[lanes] if sol.batch_params else np.asarray(a), sol.params)
+            problem = Problem(
+                equation=self.solved, state=state, guess=(u,), h=float(sol.step), t0=float(sol.t[0]), steps=1, params=params,
+                batch=len(lanes), batch_params=sol.batch_params,
+            )  # fmt: skip
+            with contextlib.suppress(UnsupportedPrimitive):
+                out = Native().run(problem)
+                good = (out.completed == 1)[:, None]
+                return np.where(good, out.last_state, np.nan), np.where(good, out.fields["unknowns"][:, 0], np.nan)
+        return self.step(lanes, state, u, t, float(self.sol.step))
+
+    @cached_property
+    def solved(self) -> StepEquation | None:
+        """The equation with its unknowns for rows; None for a step that depends on the time, of several parts, or that is no
+        scalar program."""
+        numbers = self.in_numbers
+        if numbers is None or len(self.equation.stages) > 1 or not self.ends[-1] or self.sol.stats.get("engine") == "xla":
+            return None
+        traced, graph = numbers.program.equations[0], numbers.program.graph
+        if numbers.program.shared.t in graph.reachable([*traced.residual, *traced.advance]):
+            return None
+        return _solved_equations.get(Same(self.equation), lambda: _solved(self.equation))
 
     def row(self, lanes, state, u, t) -> dict[str, np.ndarray]:
         """The rows that are at these states, by the steps of the run's length that leave them."""
