@@ -96,7 +96,8 @@ class Searched:
         return kept
 
     def _ending(self, lane: int) -> str:
-        own = self.found[self.found.lane == lane]  # pyright: ignore[reportOptionalSubscript]
+        assert self.found is not None
+        own = self.found[self.found.lane == lane]
         number = int(own.index[own.t == self.endings[lane]][-1])
         return f"ended at t = {self.endings[lane]:.6g} by events[{number}], {self.events[number]!r}"
 

@@ -147,12 +147,11 @@ class EventSearch:
         end = numbers >= dense.ends[lanes]
         numbers, theta = np.where(end, dense.ends[lanes] - 1, numbers), np.where(end, 1.0, theta)
         inside = dense.inside(lanes, numbers, theta)
-        fields = {name: inside.get(name, dense.of_rows(name, lanes, numbers)) for name in dense.nodes}
+        fields: dict[str, Any] = {name: inside.get(name, dense.of_rows(name, lanes, numbers)) for name in dense.nodes}
         t = dense.time_at(numbers, theta)
         order = np.lexsort((t, lanes))
-        index = np.full(len(t), self.number)
-        own = (array[order] for array in (t, index, direction[asked], lanes))
-        return Events(*own, {name: array[order] for name, array in fields.items()})
+        index, found = np.full(len(t), self.number), {name: array[order] for name, array in fields.items()}
+        return Events(t[order], index, direction[asked][order], lanes[order], found)
 
 
 def _none() -> Brackets:

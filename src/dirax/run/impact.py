@@ -92,26 +92,23 @@ class Numbers:
         found = program_of(flat, shapes, (*key, structure))
         self.program = found[0] if found else None
         self.fixed = [x for leaf in self.leaves for x in leaf.ravel().tolist()]
-        self.compiled = None if found else jax.jit(flat)
-        self.structure = found[1] if found else None
-        self.of_many = None if found else jax.jit(jax.vmap(flat, in_axes=(0,) * count + (None,) * len(self.leaves)))
+        self.of_many = jax.jit(jax.vmap(flat, in_axes=(0,) * count + (None,) * len(self.leaves)))
 
-    def one(self, *values: Any) -> list[float]:
+    def one(self, *values: Any) -> np.ndarray:
         """The numbers of the results at one place."""
-        if self.program is None or self.program.in_floats is None:
-            return np.concatenate(
-                [np.ravel(a)[None] if np.ndim(a) == 0 else np.ravel(a) for a in self.many(*([a] for a in values))]
-            )
+        floats = self.program and self.program.in_floats
+        if self.program is None or floats is None:
+            return np.concatenate([np.ravel(a) for a in self.many(*(np.asarray(value)[None] for value in values))])
         flat = [x for value in values for x in np.ravel(value).tolist()]
         try:
-            return self.program.in_floats((*flat, *self.fixed))
+            return np.array(floats((*flat, *self.fixed)))
         except (ArithmeticError, ValueError):
-            return [np.nan] * sum(nodes.size for nodes in self.program.results)
+            return np.full(sum(nodes.size for nodes in self.program.results), np.nan)
 
     def many(self, *values: Any) -> list[np.ndarray]:
         """The results at many places, arrays with an axis of them in front."""
-        values = [np.asarray(a, float) for a in values]
+        arrays = [np.asarray(a, float) for a in values]
         if self.program is None:
-            return [np.asarray(a) for a in jax.tree.leaves(self.of_many(*values, *self.leaves))]
-        count = len(values[0])
-        return self.program.in_numpy([*values, *(np.broadcast_to(leaf, (count, *leaf.shape)) for leaf in self.leaves)])
+            return [np.asarray(a) for a in jax.tree.leaves(self.of_many(*arrays, *self.leaves))]
+        count = len(arrays[0])
+        return self.program.in_numpy([*arrays, *(np.broadcast_to(leaf, (count, *leaf.shape)) for leaf in self.leaves)])

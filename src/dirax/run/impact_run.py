@@ -103,7 +103,7 @@ class Flight:
         self._close(state, u, done)
         return done, state, u
 
-    def _time(self, step: float) -> float:
+    def _time(self, step: Any) -> Any:
         return self.problem.t0 + step * self.problem.h
 
     def _steps(self, state: np.ndarray, u: np.ndarray, t: float, h: float, count: int) -> Outcome:
@@ -197,7 +197,7 @@ class Flight:
     def _bounced(self, state: np.ndarray, wall: int, at: float) -> tuple[np.ndarray, np.ndarray] | None:
         """The state after an impact, and a guess of the unknowns of the step that leaves it; None where the run ends there."""
         t, n = self._time(at), self.q.stop - self.q.start
-        found = np.asarray(self.jumps[wall].one(t, state[self.q], state[self.p], self.problem.h))
+        found = self.jumps[wall].one(t, state[self.q], state[self.p], self.problem.h)
         after, u, (speed, share) = found[:n], found[n:-2], found[-2:]
         number = self.numbers[wall]
         if not np.all(np.isfinite(found)) or share < 1e-12:
@@ -236,7 +236,7 @@ class Flight:
         return min(hits) if hits else None
 
     def _gaps(self, state: np.ndarray, at: float) -> np.ndarray:
-        return np.asarray(self.gaps.one(self._time(at), state[self.q]))
+        return self.gaps.one(self._time(at), state[self.q])
 
     def _hit(self, wall: int, gap: Any, values: dict[float, np.ndarray]) -> tuple[float, int] | None:
         """When a wall is hit, and the wall."""
@@ -366,7 +366,7 @@ def _check(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[in
 def _refuse_behind(flight: Flight, lane: int | None) -> None:
     """Raise `ValueError` for a trajectory that begins behind a wall, by more than rounding."""
     state, whose = np.asarray(flight.problem.state), "" if lane is None else f" of trajectory {lane}"
-    gaps = np.asarray(flight.gaps.one(flight.problem.t0, state[flight.q]))
+    gaps = flight.gaps.one(flight.problem.t0, state[flight.q])
     for number, gap in zip(flight.numbers, gaps, strict=True):
         if not gap >= -1e-12 * (1.0 + np.max(np.abs(state[flight.q]))):
             raise ValueError(

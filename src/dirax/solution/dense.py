@@ -255,7 +255,8 @@ class Dense:
         points = [self.inside(lanes, numbers, np.full(len(theta), place)) for place in places]
         weights = [np.prod([(theta - b) / (a - b) for b in places if b != a], axis=0) for a in places]
         column = lambda w, a: w.reshape(-1, *(1,) * (a.ndim - 1)) * a
-        return {name: sum(column(w, p[name]) for w, p in zip(weights, points, strict=True)) for name in self.nodes}
+        whole = lambda name: np.sum([column(w, p[name]) for w, p in zip(weights, points, strict=True)], axis=0)
+        return {name: whole(name) for name in self.nodes}
 
     def at(self, times: np.ndarray) -> dict[str, np.ndarray]:
         """The fields at times (T,) or (B, T): (B, T, …). Raises `ValueError` for times outside of the run."""
@@ -266,7 +267,7 @@ class Dense:
         lanes, flat = np.repeat(np.arange(batch), times.shape[1]), times.ravel()
         numbers, theta = self.place(lanes, flat)
         found = self.inside(lanes, numbers, theta)
-        fields = {name: found.get(name, self.of_rows(name, lanes, numbers)) for name in self.nodes}
+        fields: dict[str, Any] = {name: found.get(name, self.of_rows(name, lanes, numbers)) for name in self.nodes}
         if sol.save_every == 1:
             steps = {name: a for name, a in self.saved.items() if name not in fields}
             fields |= {name: a[lanes, np.minimum(numbers, a.shape[1] - 1)] for name, a in steps.items()}

@@ -29,8 +29,8 @@ class Events:
 
     def __getitem__(self, which: Any) -> Self:
         which = np.atleast_1d(np.arange(len(self))[which])
-        own = (a[which] for a in (self.t, self.index, self.direction, self.lane))
-        return type(self)(*own, {name: a[which] for name, a in self.fields.items()})
+        fields = {name: a[which] for name, a in self.fields.items()}
+        return type(self)(self.t[which], self.index[which], self.direction[which], self.lane[which], fields)
 
     def of(self, index: int) -> Self:
         """Those of one of the `events=`."""
@@ -52,7 +52,9 @@ def joined(parts: list[Events]) -> Events:
     """All of them, sorted by trajectory and time."""
     if len(parts) == 1:
         return parts[0]
-    arrays = [np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "index", "direction", "lane")]
+    t, index, direction, lane = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "index", "direction", "lane")
+    )
     fields = {name: np.concatenate([part.fields[name] for part in parts]) for name in parts[0].fields}
-    order = np.lexsort((arrays[0], arrays[3]))
-    return Events(*(a[order] for a in arrays), {name: a[order] for name, a in fields.items()})
+    whole = Events(t, index, direction, lane, fields)
+    return whole[np.lexsort((t, lane))]
