@@ -1,6 +1,6 @@
 """Where the functions of events change their sign along a run, inside the steps."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
