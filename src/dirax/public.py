@@ -61,7 +61,9 @@ from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.reduction.trivializations import CovectorTrivialization, PairTrivialization, PontryaginTrivialization
+from dirax.run.event import Event
 from dirax.run.export_c import export_c
+from dirax.run.impact import Impact
 from dirax.run.prepare import PreparedRun, prepare
 from dirax.run.simulate import simulate
 from dirax.schemes.collocation import Collocation
@@ -221,6 +223,8 @@ __all__ += [
 __all__ += [
     "AbstractEngine",
     "AbstractLinearSolver",
+    "Event",
+    "Impact",
     "PreparedRun",
     "Solution",
     "clear_caches",

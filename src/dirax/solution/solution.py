@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dirax.solution import export, plotting, saving, selection
+from dirax.solution import dense, export, plotting, saving, selection
 from dirax.solution.trajectory import Trajectory
 
 
@@ -53,6 +53,8 @@ class Solution(Trajectory):
     __getitem__ = selection.select
     __len__ = selection.count
     __iter__ = selection.each
+
+    at = dense.at
 
     save = saving.save
     to_xarray = export.to_xarray
