@@ -12,8 +12,8 @@ from dirax.run.event import Event
 from dirax.run.simulate import simulate
 from dirax.schemes.collocation import Collocation
 from dirax.show.section import draw_section
-from dirax.solution.plotting import save_figure
 from dirax.solution.solution import Solution
+from dirax.solution.style import save_figure
 
 
 def crosses(q):

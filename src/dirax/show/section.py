@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from dirax.solution.events import Events
-from dirax.solution.plotting import COLOURS, new_figure, style
+from dirax.solution.style import COLOURS, new_figure, style
 
 
 @style()
