@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dirax.gallery.reproduction import Reproduction
-from dirax.gallery.theorems import FAILS, HOLDS, Theorem, derivative, kernel
+from dirax.gallery.theorem_numbers import derivative, kernel
+from dirax.gallery.theorems import FAILS, HOLDS, Theorem
 
 
 @pytest.mark.parametrize(("paper", "rows"), [("peng_yoshimura", 8), ("rodriguez_leok", 13), ("barbero_linan", 11)])

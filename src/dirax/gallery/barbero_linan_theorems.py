@@ -5,7 +5,8 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.gallery.theorems import Theorem, gradient, kernel, largest, projector
+from dirax.gallery.theorem_numbers import gradient, kernel, largest, projector
+from dirax.gallery.theorems import Theorem
 
 STEP = 0.05
 

@@ -6,7 +6,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.gallery.theorems import Theorem, derivative, gradient, kernel, largest, projector
+from dirax.gallery.theorem_numbers import derivative, gradient, kernel, largest, projector
+from dirax.gallery.theorems import Theorem
 
 STEP, STEPS = 0.05, 40
 MASS = np.array([[2.0, 0.3, 0.0], [0.3, 1.5, 0.1], [0.0, 0.1, 1.0]])

@@ -5,7 +5,8 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.gallery.theorems import Theorem, derivative, gradient, largest
+from dirax.gallery.theorem_numbers import derivative, gradient, largest
+from dirax.gallery.theorems import Theorem
 
 STEP, STEPS = 0.05, 40
 A = np.array([[0.3, -0.2], [0.5, 0.4]])

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-from dirax.engines.native.c_program import WritesC
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
@@ -22,6 +21,8 @@ def export_c(path: Any, system: AbstractSystem, scheme: AbstractScheme, title: s
 
         dx.export_c("disk.c", system, dx.LagrangeDAlembert(), q=q, v=v, step=0.01, steps=1000)
     """
+    from dirax.engines.native.c_program import WritesC  # the compiler is there where its engine is used
+
     file = Path(path)
     if file.suffix != ".c":
         raise ValueError(f"path must end in .c, but it is {str(path)!r}.")

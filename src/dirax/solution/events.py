@@ -1,6 +1,6 @@
 """Events of a run: where a function of its motion was zero, or where it hit a wall."""
 
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -27,16 +27,16 @@ class Events:
     def __len__(self) -> int:
         return len(self.t)
 
-    def __getitem__(self, which: Any) -> Self:
+    def __getitem__(self, which: Any) -> "Events":
         which = np.atleast_1d(np.arange(len(self))[which])
         fields = {name: a[which] for name, a in self.fields.items()}
         return type(self)(self.t[which], self.index[which], self.direction[which], self.lane[which], fields)
 
-    def of(self, index: int) -> Self:
+    def of(self, index: int) -> "Events":
         """Those of one of the `events=`."""
         return self[self.index == index]
 
-    def of_lanes(self, lanes: Any) -> Self:
+    def of_lanes(self, lanes: Any) -> "Events":
         """Those of some trajectories of a batch, numbered anew."""
         parts = [np.flatnonzero(self.lane == lane) for lane in np.atleast_1d(lanes)]
         found = self[np.concatenate([*parts, np.zeros(0, int)]).astype(int)]

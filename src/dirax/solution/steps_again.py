@@ -12,7 +12,7 @@ import numpy as np
 
 from dirax.engines.contract import Problem
 from dirax.engines.in_jax import in_scalars
-from dirax.engines.native.engine import Native
+from dirax.engines.policy import engine_of
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.xla.lane import Numerics, first_lane, take_step
 from dirax.program.compiled import compiled
@@ -220,8 +220,8 @@ class StepsAgain:
                 equation=self.solved, state=state, guess=(u,), h=float(sol.step), t0=float(sol.t[0]), steps=1, params=params,
                 batch=len(lanes), batch_params=sol.batch_params,
             )  # fmt: skip
-            with contextlib.suppress(UnsupportedPrimitive):
-                out = Native().run(problem)
+            with contextlib.suppress(UnsupportedPrimitive, ImportError):
+                out = engine_of("native").run(problem)
                 good = (out.completed == 1)[:, None]
                 return np.where(good, out.last_state, np.nan), np.where(good, out.fields["unknowns"][:, 0], np.nan)
         return self.step(lanes, state, u, t, float(self.sol.step))
