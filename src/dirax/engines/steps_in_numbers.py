@@ -70,9 +70,10 @@ class StepsInNumbers:
         """About how many scalar operations a step takes."""
         return 4 * len(self.program.graph) * len(self.program.stages)
 
-    def parameters(self, params: Any, batch: int | None) -> np.ndarray:
-        """The numbers of `params`, (numbers,) or with a batch axis (B, numbers)."""
-        return self.program.parameters.flatten(params, batch)
+    def parameters(self, params: Any, batch: int | None, lanes: np.ndarray) -> np.ndarray:
+        """The numbers of `params` of these trajectories, (states, numbers); `batch` is None for params that all of them share."""
+        numbers = self.program.parameters.flatten(params, batch)
+        return np.broadcast_to(numbers, (len(lanes), len(numbers))) if batch is None else numbers[lanes]
 
     def step(
         self,

@@ -11,9 +11,8 @@ from dirax.gallery.henon_heiles import ENERGY, EXAMPLE
 from dirax.run.event import Event
 from dirax.run.simulate import simulate
 from dirax.schemes.collocation import Collocation
-from dirax.show.section import draw_section
 from dirax.solution.solution import Solution
-from dirax.solution.style import save_figure
+from dirax.solution.style import COLOURS, new_figure, save_figure
 
 
 def crosses(q):
@@ -37,7 +36,11 @@ def section(energy: float = ENERGY, orbits: int = 24, steps: int = 2000, step: f
 
 def picture(path: Any, energy: float = ENERGY, orbits: int = 24, steps: int = 4000) -> None:
     """Draw the section into a file of any format that matplotlib writes."""
-    events = section(energy, orbits, steps).events
-    ax = draw_section(events, "q[1]", "p[1]", title=f"Hénon–Heiles, x = 0, E = {energy:.4g}")
-    ax.set(xlabel="$y$", ylabel=r"$\dot{y}$")
-    save_figure(ax.figure, path)
+    sol = section(energy, orbits, steps)
+    passages = np.concatenate([sol.events.q, sol.events.p], axis=1)
+    figure, ax = new_figure(size=(5.2, 4.8))
+    for lane in np.unique(sol.events.lane):
+        colour = COLOURS[int(lane) % len(COLOURS)]
+        sol.plot_section(1, 3, points=passages[sol.events.lane == lane], ax=ax, color=colour, ms=1.3, rasterized=True)
+    ax.set(xlabel="$y$", ylabel=r"$\dot{y}$", title=f"Hénon–Heiles, x = 0, E = {energy:.4g}")
+    save_figure(figure, path)

@@ -65,7 +65,6 @@ class Searched:
             dense = Dense(sol)
             last = int(dense.ends.max())
             parts += [EventSearch(dense, event, i).found(self.done, last) for i, event in own]
-            sol.__dict__["_dense"] = dense
             self.done = last
         if parts:
             self.found = joined(parts)

@@ -42,12 +42,14 @@ class EventSearch:
 
     def value(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> np.ndarray:
         """The function at base + x, in steps. Raises `ValueError` where it is not finite."""
-        dense = self.dense
-        whole = np.floor(x)
-        numbers, theta = base + whole.astype(np.int64), x - whole
-        end = numbers >= dense.ends[lanes]
-        numbers, theta = np.where(end, dense.ends[lanes] - 1, numbers), np.where(end, 1.0, theta)
-        return self._of(lanes, dense.inside(lanes, numbers, theta), dense.time_at(numbers, theta))
+        numbers, theta = self._place(lanes, base, x)
+        return self._of(lanes, self.dense.inside(lanes, numbers, theta), self.dense.time_at(numbers, theta))
+
+    def _place(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The number of the step in which base + x lies, and where in it; the end of the last step belongs to that step."""
+        whole, last = np.floor(x), self.dense.ends[lanes] - 1
+        numbers = base + whole.astype(np.int64)
+        return np.minimum(numbers, last), np.where(numbers > last, 1.0, x - whole)
 
     def at_rows(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """The function at saved rows."""
@@ -142,10 +144,7 @@ class EventSearch:
         lanes, base, a, b, fa, fb = (array[asked] for array in brackets)
         x = bracketed_roots(lambda x, which: self.value(lanes[which], base[which], x), a, b, fa, fb)
         dense = self.dense
-        whole = np.floor(x)
-        numbers, theta = base + whole.astype(np.int64), x - whole
-        end = numbers >= dense.ends[lanes]
-        numbers, theta = np.where(end, dense.ends[lanes] - 1, numbers), np.where(end, 1.0, theta)
+        numbers, theta = self._place(lanes, base, x)
         inside = dense.inside(lanes, numbers, theta)
         fields: dict[str, Any] = {name: inside.get(name, dense.of_rows(name, lanes, numbers)) for name in dense.nodes}
         t = dense.time_at(numbers, theta)

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-BISECTIONS = 60
+from dirax.numerics.brackets import bracketed_roots
 
 
 def crossings(t: np.ndarray, states: np.ndarray, column: int, value: float, direction: int) -> np.ndarray:
@@ -17,13 +17,11 @@ def crossings(t: np.ndarray, states: np.ndarray, column: int, value: float, dire
         raise ValueError(f"a section needs four saved rows or more, but there are {len(states)}: run longer, or save more often.")
     first = np.clip(at - 1, 0, len(states) - 4)
     near = first[:, None] + np.arange(4)
-    low, high = t[at], t[at + 1]
-    sign = np.where(g[at + 1] > g[at], 1.0, -1.0)
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        before = sign * np.einsum("kj,kj->k", _weights(t[near], middle), g[near]) < 0
-        low, high = np.where(before, middle, low), np.where(before, high, middle)
-    return np.einsum("kj,kjn->kn", _weights(t[near], high), states[near])
+    time = lambda part, which: t[at[which]] + part * (t[at[which] + 1] - t[at[which]])
+    through = lambda part, which: np.einsum("kj,kj->k", _weights(t[near[which]], time(part, which)), g[near[which]])
+    part = bracketed_roots(through, np.zeros(len(at)), np.ones(len(at)), g[at], g[at + 1])
+    x = time(part, np.arange(len(at)))
+    return np.einsum("kj,kjn->kn", _weights(t[near], x), states[near])
 
 
 def _weights(nodes: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -64,7 +64,7 @@ class Entries:
 
     def __init__(self, sol: Trajectory):
         self.sol = sol
-        self.leaves, self.structure = jax.tree.flatten(sol.params)
+        self.leaves, self.structure = jax.tree.flatten(sol.given_params)
         self.leaves = [np.asarray(leaf) for leaf in self.leaves]
 
     def params(self, lanes: np.ndarray) -> list[np.ndarray]:
@@ -145,7 +145,7 @@ class StepsAgain:
     def in_numbers(self) -> StepsInNumbers | None:
         """The steps in NumPy; None where they are no scalar program."""
         try:
-            return StepsInNumbers.of(self.equation, jax.tree.map(np.asarray, self.sol.params), self.sol.batch_params)
+            return StepsInNumbers.of(self.equation, self.sol.given_params, self.sol.batch_params)
         except (UnsupportedPrimitive, GraphTooLarge):
             return None
 
@@ -215,7 +215,7 @@ class StepsAgain:
         """`step` with the length of the run's: by machine code where there are many, and they do not depend on the time."""
         if len(lanes) >= MANY and self.solved is not None:
             sol = self.sol
-            params = jax.tree.map(lambda a: np.asarray(a)[lanes] if sol.batch_params else np.asarray(a), sol.params)
+            params = jax.tree.map(lambda a: np.asarray(a)[lanes] if sol.batch_params else np.asarray(a), sol.given_params)
             problem = Problem(
                 equation=self.solved, state=state, guess=(u,), h=float(sol.step), t0=float(sol.t[0]), steps=1, params=params,
                 batch=len(lanes), batch_params=sol.batch_params,
@@ -265,5 +265,4 @@ class StepsAgain:
     def _numbers(self, lanes: np.ndarray) -> np.ndarray:
         steps, sol = self.in_numbers, self.sol
         assert steps is not None
-        numbers = steps.parameters(jax.tree.map(np.asarray, sol.params), sol.batch if sol.batch_params else None)
-        return numbers[lanes] if numbers.ndim == 2 else np.broadcast_to(numbers, (len(lanes), len(numbers)))
+        return steps.parameters(sol.given_params, sol.batch if sol.batch_params else None, lanes)
