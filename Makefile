@@ -26,7 +26,7 @@ help:  ## List the targets
 
 install: $(READY)  ## Make the virtual environment .venv and install the locked packages and dirax in it
 
-demo: $(READY)  ## Reproduce the papers: figures and a table in out/
+demo: $(READY)  ## Reproduce the papers: out/index.html shows figures, tables and the systems in motion
 	$(BIN)/dirax reproduce all --out $(OUT)
 
 test: lint types  ## The whole test suite: style, types, import order, tests
@@ -55,8 +55,9 @@ fuzz: $(READY)  ## Examine SYSTEMS=10000 random systems by every scheme against 
 bench: $(READY)  ## Measure speed
 	$(RUN) benchmarks
 
-vendor:  ## Bundle the script of reports anew, with three.js and uPlot at the versions of its package.json (needs node and npm)
+vendor:  ## Fetch anew what reports and pages are made with: three.js, uPlot, KaTeX at locked versions (needs node and npm)
 	cd $(REPORT) && npm ci --no-audit --no-fund --ignore-scripts && node build.mjs && rm -rf node_modules
+	cd docs/gen && npm ci --no-audit --no-fund --ignore-scripts && node vendor.mjs && rm -rf node_modules
 
 lock:  ## Write requirements.lock anew from pyproject.toml (UPGRADE=--upgrade takes the newest versions)
 	$(PYTHON) -m venv --clear $(VENV)-lock

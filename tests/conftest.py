@@ -1,5 +1,6 @@
 """Shared test configuration: a compilation cache, reproducible examples, strict promotion, figures without a screen."""
 
+import gc
 import os
 import tempfile
 
@@ -9,6 +10,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MPLBACKEND", "Agg")
 # most of a test's time is compilation: less optimization halves it, and changes last digits at most
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+
+gc.set_threshold(50_000, 20, 100)  # tracing makes many objects that live
 
 import hypothesis
 import jax

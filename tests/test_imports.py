@@ -25,6 +25,7 @@ ROOMS = (
     "diagnostics",
     "sweeps",
     "show",
+    "bodies",
     "gallery",
     "public",
     "__init__",

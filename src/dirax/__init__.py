@@ -3,8 +3,8 @@
 Importing dirax turns on 64-bit floats in JAX (`jax_enable_x64`): structure is preserved to roundoff, and roundoff is float64's.
 Papers are cited as [PY] Peng and Yoshimura, [RL] Rodríguez Abella and Leok, [BLM] Barbero-Liñán and Martín de Diego. The folders
 are rooms, each of which imports only from those below it: text, numerics, program, geometry, systems, reduction, schemes,
-engines, solution, run, diagnostics, sweeps, show, gallery, cli. The public names are those of `dirax.public`. They, and JAX
-with them, are imported where the first of them is used.
+engines, solution, run, diagnostics, sweeps, show, bodies, gallery, cli. The public names are those of `dirax.public`. They, and
+JAX with them, are imported where the first of them is used.
 """
 
 from importlib import import_module

@@ -3,9 +3,11 @@
 A name is added by its import and its line in the list of its room.
 """
 
+from dirax import bodies
 from dirax.diagnostics.action import action_sum, action_variation, discrete_energy
 from dirax.diagnostics.compare import compare
 from dirax.diagnostics.convergence import convergence
+from dirax.diagnostics.linearize import Linearization, linearize
 from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
 from dirax.engines.configure import configure
@@ -19,6 +21,7 @@ from dirax.geometry.discrete import (
     GeneratingFunctionDirac,
     InducedFiniteDifferenceDirac,
 )
+from dirax.geometry.lagrangian_submanifolds import LagrangianSubmanifold
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.map_report import check_discretization_map
@@ -31,10 +34,12 @@ from dirax.geometry.maps import (
     SphereProjection,
     Theta,
 )
+from dirax.geometry.pairs import DiscreteLagrangianSystem
 from dirax.geometry.projected_map import ProjectedMap, Submanifold
 from dirax.geometry.semidirect import SemidirectProduct
 from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
+from dirax.geometry.subspaces import PontryaginSubspace
 from dirax.geometry.tulczyjew import (
     DiscreteEvolution,
     FiniteDifferenceTriple,
@@ -48,12 +53,17 @@ from dirax.program.memo import clear_caches
 from dirax.reduction.actions import GroupAction, Translations
 from dirax.reduction.connection import DiscreteConnection, LinearConnection
 from dirax.reduction.coordinates import adapted_basis, in_coordinates
+from dirax.reduction.dirac import ReducedGeneratingFunctionDirac
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.left_translation import LeftTranslation
 from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
+from dirax.reduction.trivializations import CovectorTrivialization, PairTrivialization, PontryaginTrivialization
+from dirax.run.event import Event
+from dirax.run.export_c import export_c
+from dirax.run.impact import Impact
 from dirax.run.prepare import PreparedRun, prepare
 from dirax.run.simulate import simulate
 from dirax.schemes.collocation import Collocation
@@ -80,6 +90,7 @@ from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.forms import FinalManifold, Observed, RelationForm
+from dirax.systems.generalized_dirac import GeneralizedDiracSystem
 from dirax.systems.hamilton_dirac import HamiltonDirac
 from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.interconnection import interconnect
@@ -97,6 +108,7 @@ __all__ = [
     "ConstraintChain",
     "DiracSystem",
     "FinalManifold",
+    "GeneralizedDiracSystem",
     "HamiltonDirac",
     "ImplicitSystem",
     "LagrangeDirac",
@@ -106,18 +118,23 @@ __all__ = [
     "PhaseSpaceLagrangian",
     "PortHamiltonian",
     "RelationForm",
+    "bodies",
     "circuit",
     "constraint_algorithm",
     "interconnect",
 ]
 # Symmetries, and systems reduced by them
 __all__ += [
+    "CovectorTrivialization",
     "DiscreteConnection",
     "EulerPoincare",
     "GroupAction",
     "LeftTranslation",
     "LiePoisson",
     "LinearConnection",
+    "PairTrivialization",
+    "PontryaginTrivialization",
+    "ReducedGeneratingFunctionDirac",
     "ReducedLagrangeDirac",
     "Translations",
     "adapted_basis",
@@ -139,6 +156,7 @@ __all__ += [
     "CotangentBundle",
     "DiracStructure",
     "DiscreteEvolution",
+    "DiscreteLagrangianSystem",
     "DiscretizationMapDirac",
     "Euclidean",
     "FiniteDifferenceDirac",
@@ -146,9 +164,11 @@ __all__ += [
     "GeneratingFunctionDirac",
     "GeneratingFunctionTriple",
     "InducedFiniteDifferenceDirac",
+    "LagrangianSubmanifold",
     "LieGroupExp",
     "LinearDirac",
     "Midpoint",
+    "PontryaginSubspace",
     "Product",
     "ProductMap",
     "ProjectedMap",
@@ -203,10 +223,13 @@ __all__ += [
 __all__ += [
     "AbstractEngine",
     "AbstractLinearSolver",
+    "Event",
+    "Impact",
     "PreparedRun",
     "Solution",
     "clear_caches",
     "configure",
+    "export_c",
     "load",
     "prepare",
     "reconstruct",
@@ -215,12 +238,14 @@ __all__ += [
 ]
 # Measuring
 __all__ += [
+    "Linearization",
     "Report",
     "action_sum",
     "action_variation",
     "compare",
     "convergence",
     "discrete_energy",
+    "linearize",
     "verify",
 ]
 # Looked at

@@ -18,7 +18,7 @@ from dirax.cli.schemes import scheme_from_text
 from dirax.cli.subject import changed
 from dirax.gallery import peng_yoshimura, reproduction
 from dirax.gallery.listing import listing
-from dirax.solution.plotting import new_figure
+from dirax.solution.style import new_figure
 
 SPRING = """
 import dirax as dx

@@ -7,6 +7,18 @@ import dirax as dx
 from dirax import gallery
 
 
+def check_work_and_precision(found):
+    """A curve a scheme, of the errors over the time of their runs, the compared step marked."""
+    ax = found.plot()
+    assert (ax.get_xscale(), ax.get_yscale(), ax.get_xlabel()) == ("log", "log", "time of the run (µs)")
+    for k, entry in enumerate(found.entries):
+        curve, mark = ax.lines[2 * k : 2 * k + 2]
+        work, errors = curve.get_data()
+        assert curve.get_label() == entry.scheme and list(errors) == [error for _, error in entry.precision]
+        assert work == pytest.approx([64 * 2**i * entry.microseconds_per_step for i in range(4)])
+        assert mark.get_data()[1] == [entry.error] == [errors[0]]
+
+
 def test_the_disk_by_three_schemes():
     disk = gallery.get("rolling-disk")
     schemes = {"plus": dx.PlusLagrangeDirac(), "minus": dx.MinusLagrangeDirac(), "midpoint": dx.LagrangeDAlembert()}
@@ -19,6 +31,7 @@ def test_the_disk_by_three_schemes():
     text = str(found)
     assert "midpoint" in text and "µs/step" in text and "<table" in found._repr_html_()
     assert found.to_dict()["schemes"][2]["scheme"] == "midpoint"
+    check_work_and_precision(found)
 
 
 def test_a_list_is_named_by_class_and_failures_have_a_row():

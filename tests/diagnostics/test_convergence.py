@@ -25,6 +25,11 @@ def test_orders_on_the_rolling_disk_in_q_p_and_multipliers(scheme, order):
     )
     assert set(found.orders) == {"q", "p", "multipliers"}
     assert list(found.orders.values()) == pytest.approx([order] * 3, abs=0.03)
+    ax = found.plot()
+    line, used, unused = ax.lines[:3]
+    assert ax.get_xscale() == ax.get_yscale() == "log" and line.get_label() == f"$q$: order {found.order:.2f}"
+    assert slope_by_hand(*line.get_data()) == pytest.approx(found.order)
+    assert np.array_equal(used.get_ydata(), found.slopes["q"].errors) and len(unused.get_ydata()) == 0
 
 
 @pytest.mark.parametrize("rule", ["midpoint", "trapezoidal"])

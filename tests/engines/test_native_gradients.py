@@ -117,7 +117,10 @@ def test_second_derivatives():
     np.testing.assert_allclose(curvature(mine), curvature(theirs), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(("engine", "holonomic"), [("xla", False), pytest.param("native", True, marks=pytest.mark.soak)])
+@pytest.mark.parametrize(
+    ("engine", "holonomic"),
+    [("native", False), *(pytest.param(*both, marks=pytest.mark.soak) for both in (("xla", False), ("native", True)))],
+)
 def test_second_derivatives_of_a_nonlinear_run(engine, holonomic):
     """Forward and reverse, and for a batch: beside differences of the first."""
     more = {"holonomic": lambda q: jnp.array([(q @ q - 1) / 2])} if holonomic else {}

@@ -301,6 +301,8 @@ def test_pull_back_and_push_forward_against_null_spaces(shape, near, data):
         assert near or result is not None
         if result is not None:
             assert result.is_dirac(1e-12)
+            if near and span(expected)[1] != result.n:
+                continue  # a singular value at its fixed tolerance: what the null spaces span is no Dirac structure
             assert gap(result, expected) < (1e-5 if near else 1e-10)
 
 

@@ -6,17 +6,10 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.reduction.dirac import (
-    minus_differential,
-    minus_energy,
-    minus_structure,
-    plus_differential,
-    plus_energy,
-    plus_structure,
-)
 
 H, STEPS = 0.1, 4
 CONNECTION = dx.LinearConnection([0, 3], [[0.3, -0.2], [0.1, 0.4]])
+PLUS, MINUS = (dx.ReducedGeneratingFunctionDirac(CONNECTION, sign) for sign in "+-")
 
 
 def lagrangian(q, v):
@@ -45,20 +38,20 @@ def test_every_step_lies_in_the_plus_structure(rows):
     for k in range(STEPS):
         x, w, mu, g = (rows[name][k] for name in ("x", "w", "mu", "g"))
         x1, w1, mu1, g1 = (rows[name][k + 1] for name in ("x", "w", "mu", "g"))
-        differential = plus_differential(CONNECTION, ld, x, x1, rows["vertical"][k])
+        differential = PLUS.dirac_differential(ld, x, x1, rows["vertical"][k])
         pair = (x, w, mu, CONNECTION.join(jnp.asarray(x1), jnp.asarray(g1 - g)), w1, mu1)
-        assert close(plus_structure(CONNECTION, pair), differential)
-        assert not close(plus_structure(CONNECTION, (x, w + 1e-6, *pair[2:])), differential)
+        assert close(PLUS.flat(pair), differential)
+        assert not close(PLUS.flat((x, w + 1e-6, *pair[2:])), differential)
 
 
 def test_every_step_lies_in_the_minus_structure(rows):
     for k in range(STEPS):
         x, w, mu, g = (rows[name][k] for name in ("x", "w", "mu", "g"))
         x1, w1, mu1, g1 = (rows[name][k + 1] for name in ("x", "w", "mu", "g"))
-        differential = minus_differential(CONNECTION, ld, x, -rows["vertical"][k], x1)
+        differential = MINUS.dirac_differential(ld, x, -rows["vertical"][k], x1)
         pair = (CONNECTION.join(jnp.asarray(x), jnp.asarray(g - g1)), w, mu, x1, w1, mu1)
-        assert close(minus_structure(CONNECTION, pair), differential)
-        assert not close(minus_structure(CONNECTION, (*pair[:4], w1, mu1 + 1e-6)), differential)
+        assert close(MINUS.flat(pair), differential)
+        assert not close(MINUS.flat((*pair[:4], w1, mu1 + 1e-6)), differential)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -73,10 +66,10 @@ def test_trajectories_make_the_reduced_action_stationary(rows, sign):
         for k in range(STEPS):
             if sign > 0:
                 point = CONNECTION.join(nodes[k + 1], group[k + 1] - group[k])
-                total += plus_energy(CONNECTION, ld, nodes[k], moved_x[k], moved_g[k], point, w[k + 1], mu[k + 1])
+                total += PLUS.energy(ld, nodes[k], moved_x[k], moved_g[k], point, w[k + 1], mu[k + 1])
             else:
                 point = CONNECTION.join(nodes[k], group[k] - group[k + 1])
-                total += minus_energy(CONNECTION, ld, moved_x[k], moved_g[k], nodes[k + 1], w[k], mu[k], point)
+                total += MINUS.energy(ld, moved_x[k], moved_g[k], nodes[k + 1], w[k], mu[k], point)
         return total
 
     moved = (x[1:], vertical) if sign > 0 else (x[:-1], -vertical)

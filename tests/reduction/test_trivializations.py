@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.reduction import dirac
 
 S, K = 3, 2
 CONNECTION = dx.LinearConnection([1, 3], np.random.default_rng(5).normal(size=(K, S)))
+PLUS, MINUS = (dx.ReducedGeneratingFunctionDirac(CONNECTION, sign) for sign in "+-")
 RNG = np.random.default_rng(7)
 Q0, Q1, P0, P1 = RNG.normal(size=(4, S + K))
 X0, X1 = RNG.normal(size=(2, S))
@@ -98,9 +98,9 @@ def test_reduced_structures_are_the_images_of_the_unreduced():
     (_, w0, mu0), (_, w1, mu1) = CONNECTION.trivialize_covector(Q0, P0), CONNECTION.trivialize_covector(Q1, P1)
     (x0, g0), (x1, g1) = CONNECTION.split(Q0), CONNECTION.split(Q1)
     pair = (x0, w0, mu0, moved(Q1, -g0), w1, mu1)
-    assert close(dirac.plus_structure(CONNECTION, pair), plus_covector(Q0, P1, P0, Q1))
+    assert close(PLUS.flat(pair), plus_covector(Q0, P1, P0, Q1))
     pair = (moved(Q0, -g1), w0, mu0, x1, w1, mu1)
-    assert close(dirac.minus_structure(CONNECTION, pair), minus_covector(P0, Q1, -Q0, -P1))
+    assert close(MINUS.flat(pair), minus_covector(P0, Q1, -Q0, -P1))
 
 
 def test_reduced_differentials_are_the_images_of_the_unreduced():
@@ -108,9 +108,9 @@ def test_reduced_differentials_are_the_images_of_the_unreduced():
     d0, d1 = jax.grad(ld, argnums=(0, 1))(Q0, Q1)
     assert close([CONNECTION.split(d0)[1]], [-CONNECTION.split(d1)[1]])  # invariance
     x0, x1, vertical = CONNECTION.split(Q0)[0], CONNECTION.split(Q1)[0], CONNECTION.one_form(Q0, Q1)
-    assert close(dirac.plus_differential(CONNECTION, ld, x0, x1, vertical), plus_covector(Q0, d1, -d0, Q1))
+    assert close(PLUS.dirac_differential(ld, x0, x1, vertical), plus_covector(Q0, d1, -d0, Q1))
     vertical = CONNECTION.one_form(Q1, Q0)
-    assert close(dirac.minus_differential(CONNECTION, ld, x0, vertical, x1), minus_covector(-d0, Q1, -Q0, -d1))
+    assert close(MINUS.dirac_differential(ld, x0, vertical, x1), minus_covector(-d0, Q1, -Q0, -d1))
 
 
 def test_reduced_lagrangians_and_the_derivatives_of_lemmas_4_5_and_4_7():
@@ -118,8 +118,8 @@ def test_reduced_lagrangians_and_the_derivatives_of_lemmas_4_5_and_4_7():
     d0, d1 = jax.grad(ld, argnums=(0, 1))(Q0, Q1)
     _, x1, g1 = CONNECTION.trivialize_pair(Q0, Q1)
     x0 = CONNECTION.split(Q0)[0]
-    plus = lambda x0, x1, g1: dirac.plus_lagrangian(CONNECTION, ld, x0, x1, g1)
-    minus = lambda x0, g0, x1: dirac.minus_lagrangian(CONNECTION, ld, x0, g0, x1)
+    plus = lambda x0, x1, g1: PLUS.lagrangian(ld, x0, x1, g1)
+    minus = lambda x0, g0, x1: MINUS.lagrangian(ld, x0, g0, x1)
     assert float(plus(x0, x1, g1)) == pytest.approx(float(ld(Q0, Q1)), abs=1e-13)
     g0 = CONNECTION.one_form(Q1, Q0)
     assert float(minus(x0, g0, x1)) == pytest.approx(float(ld(Q0, Q1)), abs=1e-13)
@@ -161,8 +161,8 @@ def test_printed_lagrange_poincare_dirac_equations(sign):
 
     def reduced(far, near, vertical):
         if sign > 0:
-            return dirac.plus_lagrangian(CONNECTION, ld, far, near, vertical)
-        return dirac.minus_lagrangian(CONNECTION, ld, near, vertical, far)
+            return PLUS.lagrangian(ld, far, near, vertical)
+        return MINUS.lagrangian(ld, near, vertical, far)
 
     @jax.jit
     def missed(near, far, vertical):

@@ -165,6 +165,7 @@ def test_gradients_of_composed_rows():
     np.testing.assert_allclose((run(9.81 + e, at[1]) - run(9.81 - e, at[1])) / (2 * e), native[0], rtol=1e-6)
 
 
+@pytest.mark.soak
 def test_the_engines_agree_in_batches_and_where_a_run_fails():
     batch = {name: jnp.stack([a, a]) for name, a in START.items()}
     batch["q"] = batch["q"].at[1].set(jnp.array([np.sin(0.9), -np.cos(0.9)]))

@@ -103,6 +103,7 @@ def test_two_stages_are_rattle():
     np.testing.assert_allclose(ours.p, theirs.p, atol=1e-13)
 
 
+@pytest.mark.soak
 def test_symplectic_on_the_constraint_manifold():
     system = dx.LagrangeDirac(two_bobs, holonomic=rods)
 

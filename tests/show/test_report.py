@@ -135,3 +135,11 @@ def test_the_bundle_belongs_to_the_sources():
     assert said["packages"] == {name: wanted[name] for name in said["packages"]}
     licences = (ASSETS / "LICENSES.txt").read_text()
     assert all(f"{name} {number}" in licences for name, number in said["packages"].items())
+
+
+def test_in_a_notebook_it_is_a_small_page_in_a_frame_of_its_own(sol):
+    shown = sol._repr_html_()
+    frame = re.match(r'<iframe srcdoc="([^"]*)" title="The motion of Kepler problem" sandbox="allow-scripts"', shown)
+    assert frame is not None and "&lt;html lang=&quot;en&quot; class=&quot;small&quot;&gt;" in frame[1]
+    assert "<table>" in shown[frame.end() :]
+    assert sol[0:1]._repr_html_().startswith("<table>")

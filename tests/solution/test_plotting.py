@@ -7,6 +7,8 @@ from matplotlib.figure import Figure
 
 from dirax import gallery
 from dirax.solution import plotting
+from dirax.solution.section import crossings
+from dirax.solution.style import new_figure, save_figure
 
 DISK = gallery.get("rolling-disk").simulate(step=0.01, steps=300)
 BATCH_Q = np.array([[0.0, 0.1 + 0.01 * k] for k in range(14)])
@@ -44,12 +46,12 @@ def test_energy_with_its_error_on_a_logarithmic_scale():
 
 
 def test_constraint_and_the_envelope_of_long_series():
-    ax = plotting.plot_constraint(DISK, ax=plotting.new_figure()[1])
+    ax = plotting.plot_constraint(DISK, ax=new_figure()[1])
     residual = np.abs(DISK.constraint_residual()).max(axis=1)
     shown = lines(ax)[0][1]
     assert np.array_equal(shown[residual > 0], residual[residual > 0]) and np.all(np.isnan(shown[residual == 0]))
     values = np.concatenate([[1.0], 1.0 + np.random.default_rng(0).random(12_345)])
-    _, ax = plotting.new_figure()
+    _, ax = new_figure()
     plotting.plot_error(ax, np.arange(values.size), values)
     t, error = lines(ax)[0]
     assert t.size == plotting.ENVELOPE and np.nanmax(error) == np.max(values - 1)
@@ -86,7 +88,7 @@ def test_no_global_state_is_touched(tmp_path):
     before = dict(matplotlib.rcParams)
     figure = plotting.plot_energy(DISK, label="disk")
     figure.axes[0].legend()
-    plotting.save_figure(figure, tmp_path / "energy.png")
+    save_figure(figure, tmp_path / "energy.png")
     assert isinstance(figure, Figure) and dict(matplotlib.rcParams) == before
     assert (tmp_path / "energy.png").read_bytes().startswith(b"\x89PNG")
     again = plotting.plot_energy(DISK, figure=figure)
@@ -106,3 +108,40 @@ def test_picture_of_the_readme(tmp_path):
     left, right = draw(0.02, 2.0).axes
     assert [line.get_label() for line in left.lines][-1] == "exact" and len(lines(left)) == 4
     assert np.nanmax(lines(right)[2][1]) < 1e-3 < 1e-2 < min(np.nanmax(lines(right)[k][1]) for k in (0, 1))
+
+
+def test_a_path_in_space_and_axes_that_cannot_hold_it():
+    particle = gallery.get("charged-particle").simulate(steps=40)
+    ax = plotting.plot_trajectory(particle, "x", "y", "z")
+    assert np.allclose(np.array(ax.lines[0].get_data_3d()), particle.q[:, :3].T)
+    assert (ax.get_xlabel(), ax.get_zlabel()) == ("$x$", "$z$")
+    with pytest.raises(ValueError, match='projection "3d"'):
+        plotting.plot_trajectory(particle, 0, 1, 2, ax=new_figure()[1])
+
+
+def test_momenta_of_symmetries_move_from_zero_and_without_them_p_is_drawn():
+    ax = plotting.plot_momenta(DISK)
+    assert np.array_equal(lines(ax)[0], [DISK.t, DISK.p[:, 3] - DISK.p[0, 3]]) and ax.get_ylabel() == "$J - J(0)$"
+    assert ax.get_legend_handles_labels()[1] == ["$p_{φ}$"]
+    ax = plotting.plot_momenta(gallery.get("double-pendulum").simulate(steps=5))
+    assert len(lines(ax)) == 2 and ax.get_ylabel() == "momentum $p$"
+    with pytest.raises(ValueError, match="momenta need p"):
+        plotting.plot_momenta(gallery.get("rigid-body").simulate(steps=5))
+
+
+def test_a_section_has_the_states_at_the_value():
+    t = np.linspace(0, 20, 201)
+    states = np.stack([np.sin(t), np.cos(t)], axis=1)
+    found = crossings(t, states, 0, 0.5, 1)
+    assert found == pytest.approx(np.tile([0.5, np.sqrt(0.75)], (len(found), 1)), abs=3e-6) and len(found) == 4
+    assert len(crossings(t, states, 0, 0.5, 0)) == 7 and np.all(crossings(t, states, 0, 0.5, -1)[:, 1] < 0)
+    ax = plotting.plot_section(BATCH, "y", "p_y", through="x", value=0.1)
+    shown = sum(len(line.get_xdata()) for line in ax.lines)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$y$", "$p_{y}$") and shown == 14
+    points = np.arange(8.0).reshape(2, 4)
+    ax = plotting.plot_section(BATCH, "y", "p_x", points=points)
+    assert np.array_equal(lines(ax)[0], points[:, [1, 2]].T)
+    with pytest.raises(ValueError, match="give through="):
+        plotting.plot_section(BATCH)
+    with pytest.raises(ValueError, match="4 numbers"):
+        plotting.plot_section(BATCH, points=np.zeros((3, 2)))

@@ -9,7 +9,7 @@ from dirax.cli.subject import INITIAL
 from dirax.diagnostics.bench.measure import Bench, bench
 from dirax.diagnostics.bench.subject import Subject
 from dirax.gallery.example import Example
-from dirax.solution.plotting import save_figure
+from dirax.solution.style import save_figure
 
 LONGEST = 2000
 """Most steps of a timed trajectory, unless others are asked for."""

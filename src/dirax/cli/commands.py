@@ -118,6 +118,26 @@ def report(
 
 @app.command()
 @with_messages
+def export(
+    kind: Annotated[str, typer.Argument(help="what to write: c", show_default=False)],
+    system: System,
+    settings: Settings = None,
+    scheme: Annotated[str | None, typer.Option(help=SCHEME_HELP, show_default=False)] = None,
+    out: Annotated[Path | None, typer.Option(help="the file [default: NAME.c]", show_default=False)] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the file that exists")] = False,
+) -> None:
+    """Write the run of a system as one C file that depends on nothing, and prints the rows of the run with their bits."""
+    from dirax.cli.export import write_c
+
+    if kind != "c":
+        raise ValueError(f"export writes c, but {kind!r} was asked for.")
+    with progress_bar("writing"):
+        path = write_c(system, settings or (), scheme, out, overwrite)
+    typer.echo(f"the program is in {path}; its first lines say how it is compiled")
+
+
+@app.command()
+@with_messages
 def compare(
     system: System,
     settings: Settings = None,
@@ -156,15 +176,21 @@ def reproduce(
 ) -> None:
     """Reproduce a paper: print a table of its quantities, theirs against computed, and draw its figures again.
 
+    With `all`, index.html in the folder shows everything, and the systems of the gallery in motion.
     The exit status is 1 when a quantity differs from what it should be.
     """
     import json
 
+    from dirax.gallery.exhibition import write_index
     from dirax.gallery.reproduction import HEADER, tables_as_json
     from dirax.gallery.reproduction import reproduce as reproductions
+    from dirax.gallery.theorems import HEADER as THEOREMS
 
+    shown = f"figures and tables are in {out}"
     with progress_bar("starting") as tell:
         results = reproductions(paper, out, tell)
+        if paper.lower() == "all":
+            shown += f", {write_index(results, out, tell)} shows them"
     if as_json:
         show_json(json.loads(tables_as_json(results)))
     else:
@@ -172,9 +198,14 @@ def reproduce(
             marks, notes = result.notes()
             cells = [(r.quantity, r.paper, r.computed, r.verdict, mark) for r, mark in zip(result.rows, marks, strict=True)]
             show_table(f"[{result.paper}] {result.title}", (*HEADER, "note"), cells, f"{result}\n", notes)
-        typer.echo(f"figures and tables are in {out}")
+            if result.theorems:
+                proved = [theorem.cells for theorem in result.theorems]
+                show_table(f"[{result.paper}] theorems", THEOREMS, proved, "")
+        typer.echo(shown)
     if not all(result.ok for result in results):
-        typer.echo("dirax: a quantity differs from what it should be, see DIFFERS in the table.", err=True)
+        typer.echo(
+            "dirax: a quantity differs from what it should be, see DIFFERS in the table, or a theorem does not hold.", err=True
+        )
         raise typer.Exit(1)
 
 

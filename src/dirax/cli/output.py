@@ -15,11 +15,13 @@ REPORTED = (ValueError, TypeError, OSError)
 COLOURS = {
     "ok": "green",
     "agrees": "green",
+    "holds": "green",
     "bounded": "green",
     "drifts": "yellow",
     "paper is wrong": "yellow",
     "VIOLATED": "bold red",
     "DIFFERS": "bold red",
+    "DOES NOT HOLD": "bold red",
 }
 
 

@@ -3,7 +3,7 @@
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,8 +15,12 @@ from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solut
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
+from dirax.solution.style import COLOURS, MARKERS, given_or_new, style
 from dirax.systems.system import AbstractSystem
 from dirax.text.tables import html_table, number, plain, text_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 HEADER = ("scheme", "order", "error", "energy band", "energy", "slope", "constraint", "µs/step", "Newton/step", "ended")
 ORDER_STEPS = 64
@@ -42,6 +46,8 @@ class Entry:
     newton_per_step: float
     ended: str
     note: str = ""
+    precision: tuple[tuple[float, float], ...] = ()
+    """(steps, error) of the runs from which the order was measured, the longest step first."""
 
     def cells(self) -> tuple[str, ...]:
         """The row as text."""
@@ -76,6 +82,27 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         return html_table(HEADER, [entry.cells() for entry in self.entries], self.title)
+
+    @style()
+    def plot(self, ax: "Axes | None" = None) -> "Axes":
+        """Work and precision, both logarithmic: the error over the time of the run that has it, one curve a scheme, over the
+        step that was compared (the large mark), and its half, quarter and eighth. Further left and down is better; a scheme
+        whose order could not be measured is left out."""
+        ax = given_or_new(ax)
+        for k, entry in enumerate(entry for entry in self.entries if entry.precision):
+            steps, errors = np.array(entry.precision).T
+            work, mark = steps * entry.microseconds_per_step, MARKERS[k % len(MARKERS)]
+            (curve,) = ax.plot(work, errors, f"{mark}-", color=COLOURS[k % len(COLOURS)], ms=4.5, label=entry.scheme)
+            ax.plot(work[:1], errors[:1], mark, color=curve.get_color(), ms=8.5)
+        ax.set(
+            xscale="log",
+            yscale="log",
+            xlabel="time of the run (µs)",
+            ylabel="largest error",
+            title=self.title.replace(", errors", "\nerrors"),
+        )
+        ax.legend()
+        return ax
 
 
 def compare(
@@ -120,11 +147,11 @@ def compare(
     target = reference if reference is not None else named[best] if best is not None else None
     entries = []
     for name, sol in sols.items():
-        order, error, note = orders[name]
+        order, precision, note = orders[name]
         if target is not None and order is not None and name != best and reference is None:
             label = f"{best} refined"
-            _, error, note = _order(system, named[name], step, steps, target, run)
-        entries.append(_entry(name, sol, order, error, note, float(np.median(seconds[name]))))
+            _, precision, note = _order(system, named[name], step, steps, target, run)
+        entries.append(_entry(name, sol, order, precision, note, float(np.median(seconds[name]))))
     return Comparison(f"{type(system).__name__}: {steps} steps of {step:g}, errors against {label}", tuple(entries))
 
 
@@ -138,19 +165,20 @@ def _named(schemes: Sequence[AbstractScheme]) -> dict[str, AbstractScheme]:
     return named
 
 
-def _order(system, scheme, step, steps, reference, run) -> tuple[float | None, float | None, str]:
-    """(order, error at the given step, note); None where it could not be measured, with the reason as note."""
+def _order(system, scheme, step, steps, reference, run) -> tuple[float | None, tuple[tuple[float, float], ...], str]:
+    """(order, (steps, error) of every step size, note); None where it could not be measured, with the reason as note."""
     stretch = min(steps, ORDER_STEPS)
     sizes = [step / 2**i for i in range(4)]
     try:
         found = convergence(system, scheme, step_sizes=sizes, time=stretch * step, reference=reference, **run)
     except ValueError as reason:
-        return None, None, str(reason)
+        return None, (), str(reason)
     first = next(iter(found.slopes.values()))
-    return first.order, float(first.errors[0]), " ".join(found.notes) if found.agrees is False else ""
+    precision = tuple((stretch * step / h, float(error)) for h, error in zip(found.step_sizes, first.errors, strict=True))
+    return first.order, precision, " ".join(found.notes) if found.agrees is False else ""
 
 
-def _entry(name: str, sol: Solution, order, error, note: str, seconds: float) -> Entry:
+def _entry(name: str, sol: Solution, order, precision, note: str, seconds: float) -> Entry:
     steps = max(1, (sol.rows - 1) * sol.save_every)
     energy, band, drift, slope = None, None, "not checked", None
     if sol.rows > 1:
@@ -164,7 +192,7 @@ def _entry(name: str, sol: Solution, order, error, note: str, seconds: float) ->
     return Entry(
         scheme=name,
         order=order,
-        error=error,
+        error=precision[0][1] if precision else None,
         energy_band=band,
         drift=drift,
         slope=slope,
@@ -173,4 +201,5 @@ def _entry(name: str, sol: Solution, order, error, note: str, seconds: float) ->
         newton_per_step=float(sol.stats["newton_iterations"]) / steps,
         ended="ok" if np.all(sol.ok) else f"stopped at t = {sol.t[-1]:g}",
         note=note or ("" if np.all(sol.ok) else str(sol.message)),
+        precision=precision,
     )

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,8 +11,12 @@ from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solut
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
+from dirax.solution.style import COLOURS, MARKERS, given_or_new, style
 from dirax.systems.system import AbstractSystem
 from dirax.text.tables import html_table, number, plain, text_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 REFINEMENT = 16
 """A refined reference has so many times smaller steps than the smallest measured ones."""
@@ -95,6 +99,29 @@ class Convergence:
     def _repr_html_(self) -> str:
         header, rows, title = self._table()
         return html_table(header, rows, title)
+
+    @style()
+    def plot(self, ax: "Axes | None" = None) -> "Axes":
+        """The errors over the step sizes, both logarithmic, and the measured slopes; hollow marks were not used."""
+        ax = given_or_new(ax)
+        for k, (name, slope) in enumerate(self.slopes.items()):
+            h, errors, colour = self.step_sizes, np.asarray(slope.errors), COLOURS[k % len(COLOURS)]
+            centre = np.exp(np.mean(np.log(errors[slope.used])) - slope.order * np.mean(np.log(h[slope.used])))
+            text = f"${name}$" if len(name) == 1 else name
+            ax.plot(h, centre * h**slope.order, color=colour, lw=0.9, label=f"{text}: order {slope.order:.2f}")
+            for used, fill in ((slope.used, colour), (~slope.used, "none")):
+                ax.plot(h[used], errors[used], MARKERS[k % len(MARKERS)], mfc=fill, color=colour, ms=5)
+        ax.set(
+            xscale="log",
+            yscale="log",
+            xlabel="step $h$",
+            ylabel="largest error",
+            title=f"{self.title}\nerrors against {self.reference}",
+        )
+        ax.set_xticks(self.step_sizes, [f"{h:.3g}" for h in self.step_sizes])
+        ax.minorticks_off()
+        ax.legend()
+        return ax
 
 
 def convergence(

@@ -278,8 +278,7 @@ class Replay:
     def params_of(self, lanes: np.ndarray) -> np.ndarray:
         """The numbers of the parameters of these trajectories, (entries, numbers)."""
         sol = self.sol
-        numbers = self.steps.parameters(sol.given_params, sol.batch if sol.batch_params else None)
-        return numbers[lanes] if sol.batch_params else np.broadcast_to(numbers, (len(lanes), len(numbers)))
+        return self.steps.parameters(sol.given_params, sol.batch if sol.batch_params else None, lanes)
 
 
 def _begun(system: Any, step: Any, same: Same, anew: bool, row: dict, params: Any):

@@ -6,6 +6,7 @@ from dirax.diagnostics.casimir_lines import casimir_lines
 from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
 from dirax.diagnostics.final_manifold_lines import final_manifold
+from dirax.diagnostics.flights import longest_flight
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.replay_lines import replayed
 from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line, Report
@@ -41,6 +42,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
       walk gives √steps of that);
     - symplecticity of one step (of Euler–Poincaré and Lie–Poisson systems: whether it is a Poisson map), and φ*Ω = Ω + dβ
       where there are constraints ([PY] §3.2): 32 ε · 2n · the condition number of the step's equations, at a few steps;
+    - runs with impacts: energy and momentum maps over the run, all else in the longest flight between two of them;
     - systems with ports ([BLM] §7.1): the power balance of every step and, with a discrete gradient, the books over the run,
       H − H(0) less what was supplied plus what was dissipated: 32 ε, however many steps;
     - energy: "bounded" or "drifts", told apart by windowed means (`dirax.diagnostics.drift`); a drift below
@@ -58,11 +60,19 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     if not isinstance(sol, Solution):
         raise TypeError(f"sol must be a dirax Solution (from dx.simulate or dx.load), but a {type(sol).__name__} was given.")
     generators = generators_of(sol, symmetries)
-    whole = reconstruct(sol) if sol.system is not None and sol.system.quotient_form() is not None else sol
+    flight, impacts = longest_flight(sol)
+    whole = (
+        flight
+        if flight is not sol
+        else reconstruct(sol)
+        if sol.system is not None and sol.system.quotient_form() is not None
+        else sol
+    )
     structure = structure_of(whole)
     lines = [
         _completion(sol),
-        _replayed(sol, whole, tolerance),
+        impacts,
+        _replayed(flight, whole, tolerance),
         *membership(whole, structure, tolerance),
         constraint(whole, structure, tolerance),
         hidden_constraint(whole, tolerance),

@@ -70,24 +70,25 @@ class StepsInNumbers:
         """About how many scalar operations a step takes."""
         return 4 * len(self.program.graph) * len(self.program.stages)
 
-    def parameters(self, params: Any, batch: int | None) -> np.ndarray:
-        """The numbers of `params`, (numbers,) or with a batch axis (B, numbers)."""
-        return self.program.parameters.flatten(params, batch)
+    def parameters(self, params: Any, batch: int | None, lanes: np.ndarray) -> np.ndarray:
+        """The numbers of `params` of these trajectories, (states, numbers); `batch` is None for params that all of them share."""
+        numbers = self.program.parameters.flatten(params, batch)
+        return np.broadcast_to(numbers, (len(lanes), len(numbers))) if batch is None else numbers[lanes]
 
     def step(
         self,
         states: np.ndarray,
         guesses: Sequence[np.ndarray],
         t: np.ndarray,
-        h: float,
+        h: float | np.ndarray,
         params: np.ndarray,
         noise: "Noise | None" = None,
     ) -> Attempts:
-        """A step of each state (states, s), with one guess (states, k) a stage."""
-        parts = []
+        """A step of each state (states, s), with one guess (states, k) a stage; h is one number, or one a state."""
+        parts, h = [], np.broadcast_to(h, t.shape)
         for low in range(0, max(len(states), 1), LANES):
             some = slice(low, low + LANES)
-            parts.append(self._step(states[some], [g[some] for g in guesses], t[some], h, params[some], noise))
+            parts.append(self._step(states[some], [g[some] for g in guesses], t[some], h[some], params[some], noise))
         join = np.concatenate
         return Attempts(
             [join(a) for a in zip(*(p.unknowns for p in parts), strict=True)],
@@ -99,7 +100,7 @@ class StepsInNumbers:
     def _step(self, states, guesses, t, h, params, noise) -> Attempts:
         unknowns, begun, good = [], [], np.ones(len(states), bool)
         for (index, fraction), guess in zip(self.program.stages, guesses, strict=True):
-            e, at = self.program.equations[index], (t, np.full(len(t), fraction * h), params)
+            e, at = self.program.equations[index], (t, fraction * h, params)
             u, solved = self._solved(index, guess, states, at, noise)
             known = self._values(index, u, states, at, noise)
             begun.append(states)
@@ -132,16 +133,16 @@ class StepsInNumbers:
         return jacobians, conditions
 
     def rows(
-        self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: "Noise | None" = None
+        self, made: Attempts, t: np.ndarray, h: float | np.ndarray, params: np.ndarray, noise: "Noise | None" = None
     ) -> dict[str, np.ndarray]:
         """The named arrays of the rows that the steps leave."""
-        parts = []
+        parts, h = [], np.broadcast_to(h, t.shape)
         stages = self.program.stages if needs_every_part(self.equation) else self.program.stages[:1]
         for i, (index, fraction) in enumerate(stages):
             rows, pieces = self.program.equations[index].rows, {}
             for low in range(0, max(len(t), 1), LANES):
                 some = slice(low, low + LANES)
-                at = (t[some], np.full(len(t[some]), fraction * h), params[some])
+                at = (t[some], fraction * h[some], params[some])
                 known = self._values(index, made.unknowns[i][some], made.states[i][some], at, noise)
                 for name, nodes in rows.items():
                     pieces.setdefault(name, []).append(self._read(known, nodes))

@@ -48,6 +48,15 @@ _MODULES = {
     "sine-gordon": "sine_gordon",
     "hanging-chain": "hanging_chain",
     "wave-line": "wave_line",
+    "bicycle": "bicycle",
+    "andrews-squeezer": "andrews_squeezer",
+    "four-bar": "four_bar",
+    "bricard": "bricard",
+    "tippe-top": "tippe_top",
+    "chaplygin-sphere": "chaplygin_sphere",
+    "rattleback": "rattleback",
+    "euler-disk": "euler_disk",
+    "flyball-governor": "flyball_governor",
 }
 """Name → the module here that defines `EXAMPLE`; a new system is a file and a line."""
 

@@ -37,6 +37,7 @@ BY_ITS_EQUATIONS = "The paper prints no numbers: its column is its complex equat
 def reproduction(progress: Progress = lambda fraction, text: None) -> Reproduction:
     """Run §6.3 and §8 of the paper: Figures 1–3 and a table."""
     from dirax.gallery.barbero_linan_figures import energy_figure, path_figure, zoom_figure
+    from dirax.gallery.barbero_linan_theorems import theorems
 
     progress(0.0, "four vortices, 500 steps")
     short = {number: vortex_run(number, ZOOM) for number in METHODS}
@@ -56,7 +57,8 @@ def reproduction(progress: Progress = lambda fraction, text: None) -> Reproducti
         "figure_02": energy_figure(long, energies(drifting), EVERY),
         "figure_03": zoom_figure(short),
     }
-    return Reproduction("BLM", TITLE, tuple(rows), figures)
+    progress(0.97, "theorems")
+    return Reproduction("BLM", TITLE, tuple(rows), figures, tuple(theorems()))
 
 
 # ------------------------------------------------------------------------------------------------------- point vortices

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from dirax.solution.plotting import BLUE, GREEN, PURPLE, VERMILION, new_figure
 from dirax.solution.solution import Solution
+from dirax.solution.style import BLUE, GREEN, PURPLE, VERMILION, new_figure
 
 
 def path_figure(methods: dict[int, np.ndarray], runge_kutta: np.ndarray) -> Any:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
+from dirax.show.scene import Scene, point, rod
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 LINKS, GRAVITY = 4, 9.81
@@ -35,6 +36,14 @@ def straight(links: int, angle: float = np.pi / 2) -> np.ndarray:
     return (np.arange(1, links + 1)[:, None] / links * [np.sin(angle), -np.cos(angle)]).ravel()
 
 
+def scene(links: int = LINKS) -> Scene:
+    """The chain in its plane."""
+    joint = lambda i: (0.0, 0.0, 0.0) if i == 0 else lambda q: jnp.stack([q[2 * i - 2], 0.0 * q[0], q[2 * i - 1]])
+    rods = (rod(joint(i), joint(i + 1)) for i in range(links))
+    masses = (point(joint(i), radius=0.016, trail=i == links, colour=int(i == links)) for i in range(1, links + 1))
+    return Scene((point(joint(0), colour="ink"), *rods, *masses), "front")
+
+
 EXAMPLE = Example(
     name="hanging-chain",
     title="Hanging chain",
@@ -44,4 +53,5 @@ EXAMPLE = Example(
     step=0.01,
     steps=500,
     coordinates=tuple(Coordinate(f"{letter}{i}") for i in range(1, LINKS + 1) for letter in "xy"),
+    scene=scene(),
 )

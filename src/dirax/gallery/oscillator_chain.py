@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
+from dirax.show.scene import Scene, point, rod
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 SITES, ALPHA = 12, 0.25
@@ -50,6 +51,14 @@ def toda_eigenvalues(q: np.ndarray, p: np.ndarray, alpha: float = ALPHA) -> np.n
     return np.linalg.eigvalsh(np.diag(alpha * np.asarray(p)) + upper + upper.T)
 
 
+def scene(sites: int = SITES) -> Scene:
+    """The displacements of the masses, drawn upwards, over their places at rest, a quarter apart."""
+    place = lambda i: jnp.array([0.25 * (i - (sites - 1) / 2), 0.0, 0.0])
+    mass = lambda i: lambda q: place(i) + jnp.array([0.0, 0.0, 1.0]) * q[i]
+    springs = (rod(mass(i), mass(i + 1)) for i in range(sites - 1))
+    return Scene((*springs, *(point(mass(i), radius=0.06) for i in range(sites))), "front")
+
+
 EXAMPLE = Example(
     name="oscillator-chain",
     title="Chain of Fermi, Pasta, Ulam and Tsingou",
@@ -59,4 +68,5 @@ EXAMPLE = Example(
     step=0.1,
     steps=2000,
     coordinates=tuple(Coordinate(f"q{i}") for i in range(1, SITES + 1)),
+    scene=scene(),
 )

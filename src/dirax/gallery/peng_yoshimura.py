@@ -43,7 +43,10 @@ def reproduction(progress: Progress = lambda fraction, text: None) -> Reproducti
     rows += heisenberg_rows(lines)
     progress(0.8, "figures")
     figures = {**disk_figures("+", disks["+"]), **disk_figures("-", disks["-"]), **heisenberg_figures(lines["+"])}
-    return Reproduction("PY", TITLE, tuple(rows), figures)
+    from dirax.gallery.peng_yoshimura_theorems import theorems
+
+    progress(0.97, "theorems")
+    return Reproduction("PY", TITLE, tuple(rows), figures, tuple(theorems()))
 
 
 # ------------------------------------------------------------------------------------------------------ rolling disk

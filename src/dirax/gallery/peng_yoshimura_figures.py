@@ -5,18 +5,9 @@ from typing import Any
 import numpy as np
 
 from dirax.gallery.peng_yoshimura_quantities import AXIS_END, SIGN, generalized_energy, path_energy
-from dirax.solution.plotting import (
-    BLUE,
-    ENERGY_ERROR,
-    GREEN,
-    VERMILION,
-    new_figure,
-    plot_coordinate,
-    plot_error,
-    plot_trajectory,
-    style,
-)
+from dirax.solution.plotting import ENERGY_ERROR, plot_coordinate, plot_error, plot_trajectory
 from dirax.solution.solution import Solution
+from dirax.solution.style import BLUE, GREEN, VERMILION, new_figure, style
 
 
 @style()

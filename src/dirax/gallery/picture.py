@@ -6,7 +6,8 @@ import numpy as np
 
 from dirax.gallery.rolling_disk import EXAMPLE, exact
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
-from dirax.solution.plotting import BLUE, ENERGY_ERROR, GREEN, INK, VERMILION, new_figure, plot_error, save_figure, style
+from dirax.solution.plotting import ENERGY_ERROR, plot_error
+from dirax.solution.style import BLUE, GREEN, INK, VERMILION, new_figure, save_figure, style
 
 SCHEMES = {
     "(+) Lagrange–Dirac": (PlusLagrangeDirac(), VERMILION, 0.7),

@@ -8,6 +8,8 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
+from dirax.gallery.theorems import HEADER as THEOREMS
+from dirax.gallery.theorems import HOLDS, Theorem
 from dirax.text.tables import plain, text_table
 
 AGREES, DIFFERS, WRONG, NEW, NOT_OURS = "agrees", "DIFFERS", "paper is wrong", "not in paper", "not reproduced"
@@ -44,29 +46,35 @@ class Row:
 
 @dataclass(frozen=True)
 class Reproduction:
-    """A paper's table and figures; prints as the table. `figures` maps a file name without ending to a matplotlib Figure."""
+    """A paper's tables and figures; prints as the tables: what it measured, and what it proves. `figures` maps a file name
+    without ending to a matplotlib Figure."""
 
     paper: str
     title: str
     rows: tuple[Row, ...]
     figures: dict[str, Any] = field(default_factory=dict, repr=False)
+    theorems: tuple[Theorem, ...] = ()
 
     @property
     def ok(self) -> bool:
-        """Whether every row says what it should: that dirax agrees with the paper, or shows where the paper is wrong."""
-        return all(row.verdict != DIFFERS for row in self.rows)
+        """Whether every row says what it should: that dirax agrees with the paper, or shows where the paper is wrong; and every
+        theorem holds."""
+        return all(row.verdict != DIFFERS for row in self.rows) and all(row.verdict == HOLDS for row in self.theorems)
 
     def to_dict(self) -> dict[str, Any]:
         """The table as plain Python values, fit for JSON."""
         rows = [row.to_dict() for row in self.rows]
-        return {"paper": self.paper, "title": self.title, "ok": self.ok, "rows": rows, "figures": sorted(self.figures)}
+        theorems = [theorem.to_dict() for theorem in self.theorems]
+        names = {"paper": self.paper, "title": self.title, "ok": self.ok}
+        return {**names, "rows": rows, "theorems": theorems, "figures": sorted(self.figures)}
 
     def __str__(self) -> str:
         marks, notes = self.notes()
         rows = [(row.quantity, row.paper, row.computed, row.verdict, mark) for row, mark in zip(self.rows, marks, strict=True)]
         text = text_table((*HEADER, "note") if notes else HEADER, rows if notes else [row[:4] for row in rows])
         notes = [fill(note, NOTE_WIDTH, subsequent_indent="    ") for note in notes]
-        return "\n".join([f"[{self.paper}] {self.title}", "", text, "", *notes])
+        proved = [text_table(THEOREMS, [theorem.cells for theorem in self.theorems]), ""] if self.theorems else []
+        return "\n".join([f"[{self.paper}] {self.title}", "", text, "", *proved, *notes])
 
     def notes(self) -> tuple[list[str], list[str]]:
         """The mark of each row ("" without a note, else "[1]", …; equal notes share one) and the marked notes."""
@@ -79,7 +87,7 @@ class Reproduction:
 
     def save_figures(self, folder: Path) -> list[Path]:
         """Write every figure as PNG into `folder`, which is made if it is missing; returns the files."""
-        from dirax.solution.plotting import save_figure
+        from dirax.solution.style import save_figure
 
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / f"{name}.png" for name in self.figures]

@@ -33,6 +33,7 @@ FASTER = 0.75
 def reproduction(progress: Progress = lambda fraction, text: None) -> Reproduction:
     """Run §7 of the paper: Table 1 and Figures 1, 3 and 4."""
     from dirax.gallery.rodriguez_leok_figures import energy_figure, helix_figure, pendulum_figure
+    from dirax.gallery.rodriguez_leok_theorems import theorems
 
     progress(0.0, "charged particle: Table 1")
     rows = table_rows()
@@ -49,7 +50,8 @@ def reproduction(progress: Progress = lambda fraction, text: None) -> Reproducti
         "figure_03": pendulum_figure(reduced),
         "figure_04": energy_figure(reduced, discrete_energy(reduced), discrete_energy(unreduced)),
     }
-    return Reproduction("RL", TITLE, tuple(rows), figures)
+    progress(0.97, "theorems")
+    return Reproduction("RL", TITLE, tuple(rows), figures, tuple(theorems()))
 
 
 # --------------------------------------------------------------------------------------------------- charged particle

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 
 from dirax.gallery import charged_particle
-from dirax.solution.plotting import BLUE, ENERGY_ERROR, INK, VERMILION, new_figure, plot_error, style
+from dirax.solution.plotting import ENERGY_ERROR, plot_error
 from dirax.solution.solution import Solution
+from dirax.solution.style import BLUE, INK, VERMILION, new_figure, style
 
 
 @style()

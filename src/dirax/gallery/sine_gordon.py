@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
+from dirax.show.scene import Scene, point, rod
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 SITES, LENGTH, SPEED = 16, 16.0, 0.5
@@ -44,6 +45,15 @@ def start(sites: int, length: float = LENGTH, speed: float = SPEED, at: float = 
     return {"q": q, "v": v}
 
 
+def scene(sites: int = SITES) -> Scene:
+    """Pendulums on an axle, each turned by its φ: the kink is a full turn of them."""
+    pivots = [(float(x), 0.0, 0.0) for x in places(sites)]
+    bob = lambda i: lambda q: jnp.stack([jnp.asarray(pivots[i][0]), jnp.sin(q[i]), -jnp.cos(q[i])])
+    arms = (rod(pivots[i], bob(i)) for i in range(sites))
+    bobs = (point(bob(i), radius=0.18) for i in range(sites))
+    return Scene((rod(pivots[0], pivots[-1]), *arms, *bobs), (0.45, -0.8, 0.4))
+
+
 EXAMPLE = Example(
     name="sine-gordon",
     title="Kink of the sine-Gordon equation",
@@ -53,4 +63,5 @@ EXAMPLE = Example(
     step=0.1,
     steps=100,
     coordinates=tuple(Coordinate(f"φ{i}") for i in range(1, SITES + 1)),
+    scene=scene(),
 )

@@ -17,6 +17,7 @@ import scipy.sparse as sp
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, point, rod
 from dirax.systems.port_hamiltonian import PortHamiltonian
 
 CELLS = 8
@@ -41,6 +42,14 @@ def pulse(cells: int = CELLS, place: float = 0.5, width: float = 0.1) -> np.ndar
     return x
 
 
+def scene(cells: int = CELLS) -> Scene:
+    """The strain, drawn upwards, over the middles of the cells."""
+    cell = lambda i: lambda x: jnp.stack([jnp.asarray((i + 0.5) / cells), 0.0 * x[0], 0.4 * x[2 * i]])
+    joined = (rod(cell(i), cell(i + 1)) for i in range(cells - 1))
+    line = rod((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.003)
+    return Scene((line, *joined, *(point(cell(i), radius=0.02) for i in range(cells))), "front")
+
+
 EXAMPLE = Example(
     name="wave-line",
     title="Wave equation with ports at its ends",
@@ -51,4 +60,5 @@ EXAMPLE = Example(
     step=0.02,
     steps=200,
     coordinates=tuple(Coordinate(f"{letter}{i}") for i in range(1, CELLS + 1) for letter in ("ε", "p")),
+    scene=scene(),
 )

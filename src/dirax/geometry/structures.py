@@ -191,7 +191,7 @@ def induced_dirac(one_forms: Callable | None, n: int) -> DiracStructure:
     the canonical symplectic structure.
     """
     function = None if one_forms is None else UserFunction(one_forms, "one_forms", ("q",))
-    return DiracStructure(_Induced(function, n), "two_form" if function is None else "annihilator", 2 * n)
+    return DiracStructure(Induced(function, n), "two_form" if function is None else "annihilator", 2 * n)
 
 
 @compiled
@@ -231,7 +231,9 @@ def _functions(**functions: Callable) -> _Functions:
     return _Functions(tuple(UserFunction(function, name, ("x",)) for name, function in functions.items()))
 
 
-class _Induced(eqx.Module):
+class Induced(eqx.Module):
+    """The matrices of the structure on T*Q that W induces, by which such a structure is known."""
+
     one_forms: UserFunction | None
     n: int = eqx.field(static=True)
 

@@ -240,4 +240,7 @@ def fibre_indices(fibre: Any) -> tuple[int, ...]:
 def check_fibre(fibre: tuple[int, ...], n: int) -> None:
     """Raise `ValueError` where the indices are not those of n coordinates."""
     if max(fibre) >= n:
-        raise ValueError(f"fibre {list(fibre)} does not fit a system of {n} coordinates, numbered 0 to {n - 1}.")
+        raise ValueError(
+            f"fibre {list(fibre)} does not fit a system of {n} coordinates, numbered 0 to {n - 1}; that of a second stage of "
+            "dx.reduce counts the shape coordinates x of the first."
+        )

@@ -8,6 +8,7 @@ from dirax.reduction.connection import AbstractConnection
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.left_invariant import reduced_by_left_translations
 from dirax.reduction.reduced import ReducedLagrangeDirac
+from dirax.reduction.stages import reduced_again
 from dirax.systems.system import AbstractSystem
 
 
@@ -32,12 +33,21 @@ def reduce(system: Any, connection: Any, params: Any = None) -> ReducedLagrangeD
         body = dx.reduce(dx.ManifoldLagrangian(lambda g, v: l(dx.SO3().to_algebra(g, v)), dx.SO3()), dx.SO3())
         sol = dx.reconstruct(dx.simulate(body, dx.DiscreteEulerPoincare(), q=g, v=v, step=0.01, steps=100))
 
+    A system that `dx.reduce` made is reduced again, by stages: with a connection whose fibre counts the shape coordinates x of
+    the first stage, it is the quotient by the product of both groups, in either order; with dx.SO2() or dx.SO3() after the
+    translations of the coordinates of dx.SE2() or dx.SE3(), that by the semidirect product, where the system is left-invariant.
+
+        twice = dx.reduce(dx.reduce(system, dx.LinearConnection(fibre=[3])), dx.LinearConnection(fibre=[0]))
+
     Raises `TypeError` for other systems and symmetries, and for missing params; `ValueError`, with the defect and where, for a
     Lagrangian or one-forms that the group does not leave alone, and for what has no reduced counterpart.
     """
+    if isinstance(system, ReducedLagrangeDirac) and isinstance(connection, AbstractConnection | AbstractLieGroup):
+        return reduced_again(system, connection, params)
     if isinstance(connection, AbstractLieGroup):
         return reduced_by_left_translations(system, connection, params)
-    lagrangian = system.lagrangian_form() if isinstance(system, AbstractSystem) else None
+    reduced = isinstance(system, ReducedLagrangeDirac)
+    lagrangian = system.system if reduced else system.lagrangian_form() if isinstance(system, AbstractSystem) else None
     if lagrangian is None:
         on_manifold = isinstance(system, AbstractSystem) and system.manifold_form() is not None
         way = ": write it in coordinates of its manifold, dx.in_coordinates." if on_manifold else "."

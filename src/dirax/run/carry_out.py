@@ -12,6 +12,7 @@ import numpy as np
 from dirax.engines.contract import Outcome, Problem
 from dirax.program.memo import Memo
 from dirax.program.user_functions import is_traced, values_matter
+from dirax.run.event_run import run_with_events
 from dirax.run.final_manifold import (
     is_singular,
     projected_onto_manifold,
@@ -74,6 +75,8 @@ def carried_out(
     settings: Settings, case: Case, steps: int, save_every: int, progress: Any, kind: Kind | None = None, entered: float = 0.0
 ) -> Solution:
     """The Solution of a run. Raises `ValueError` for data that a premise excludes."""
+    if settings.events:
+        return run_with_events(carried_out, _begun, settings, case, steps, save_every, progress, kind, entered)
     began = time.perf_counter()
     every = _checked_times(case, steps, save_every)
     kind = kind or kind_for(settings, case)

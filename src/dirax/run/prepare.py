@@ -133,6 +133,7 @@ def prepare(
     t0: float = 0.0,
     max_iterations: int = 50,
     compensated: bool = False,
+    events: Any = (),
 ) -> PreparedRun:
     """A run with everything found and compiled that its numbers do not change: the arguments are those of `dx.simulate`.
 
@@ -143,6 +144,6 @@ def prepare(
     """
     settings, case, steps, save_every = stated(
         system, scheme, step, steps, {"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, inputs, params, batch_params,
-        save_every, engine, project, check_initial, t0, max_iterations, compensated,
+        save_every, engine, project, check_initial, t0, max_iterations, compensated, events,
     )  # fmt: skip
     return PreparedRun(settings, case, steps, save_every, prepared(settings, case, steps, save_every))

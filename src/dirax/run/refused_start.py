@@ -31,7 +31,7 @@ def refuse_bad_start(
     if check_constraint:
         _refuse_off_constraint(system, initial, start)
     if start.jacobian is not None:
-        _refuse_singular_step(start, labels, singular)
+        _refuse_singular_step(start, labels, singular, initial.lagrangian is not None)
 
 
 def _refuse_outside_the_domain(initial: Initial) -> None:
@@ -82,7 +82,7 @@ def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Star
         )
 
 
-def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool) -> None:
+def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool, lagrangian: bool) -> None:
     residual, sparse = _lanes(start.residual, 1), isinstance(start.jacobian, SparseJacobians)
     jacobian = start.jacobian.product[:, 0, :, None] if sparse else _lanes(start.jacobian, 2)
     rows = np.isfinite(residual) & np.all(np.isfinite(jacobian), axis=2)
@@ -115,9 +115,17 @@ def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool) -
                 "The Lagrangian is singular (∂²L/∂v²), and a part of a composition ends at the momentum of a velocity on the "
                 "constraints, which such a Lagrangian does not determine: take the scheme by itself, with smaller steps"
             )
+        matrix = "its matrix ([PY] (21))"
+        if not lagrangian:
+            matrix = "the matrix of its equations"
+            way = (
+                "The equations of the system do not determine it with this scheme: dx.constraint_algorithm(system, near=…) says "
+                "what they leave free and on which manifold they hold, and a Hamiltonian on T*Q with one-forms is a "
+                "dx.HamiltonDirac, which dx.PlusHamiltonDirac and dx.MinusHamiltonDirac step"
+            )
         free = np.array2string(directions[lane], precision=2, suppress_small=True, max_line_width=1000)
         raise ValueError(
-            f"the first step has no unique solution: its matrix ([PY] (21)) has rank {ranks[lane]} of {unknowns} at the "
+            f"the first step has no unique solution: {matrix} has rank {ranks[lane]} of {unknowns} at the "
             f"initial data{_which(ranks < unknowns)}, and leaves the direction "
             f"{free} of the unknowns free. {way}."
         )

@@ -21,8 +21,9 @@ def solution_of(
     outcome: Outcome,
     row0: dict[str, Any] | None,
     traced: bool,
+    said: list[str] | None = None,
 ) -> Solution:
-    """The Solution of a run; `row0` is the given row 0 of a two-point start."""
+    """The Solution of a run; `row0` is the given row 0 of a two-point start, `said` why trajectories ended, where it is known."""
     p, fields, numbers = problem, outcome.fields, saved_steps(problem)
     ok, message = outcome.completed == p.steps, ""
     if not traced and p.batch is None and ok[0]:
@@ -30,7 +31,7 @@ def solution_of(
     elif traced:
         ok = ok if p.batch is not None else ok[0]
     else:
-        message = _messages(p, outcome, numbers)
+        message = _messages(p, outcome, numbers, said)
         if p.batch is None:
             ok, message = bool(ok[0]), message[0]
             numbers, fields = cut(p, outcome)
@@ -61,12 +62,13 @@ def solution_of(
     )
 
 
-def _messages(p: Problem, outcome: Outcome, numbers: np.ndarray) -> list[str]:
+def _messages(p: Problem, outcome: Outcome, numbers: np.ndarray, said: list[str] | None) -> list[str]:
     """Why each trajectory ended, "" where it did not."""
     good = np.asarray(outcome.completed)
     kept = good if p.batch is None else numbers[np.searchsorted(numbers, good, side="right") - 1]
     lanes = range(len(good))
-    return [explain(p, outcome, lane, kept=int(kept[lane])) if good[lane] < p.steps else "" for lane in lanes]
+    known = said or [""] * len(good)
+    return [(known[lane] or explain(p, outcome, lane, kept=int(kept[lane]))) if good[lane] < p.steps else "" for lane in lanes]
 
 
 def _times(p: Problem, numbers: np.ndarray, traced: bool):

@@ -7,6 +7,8 @@ from typing import Any
 import jax
 
 from dirax.engines.engine import AbstractEngine
+from dirax.run.event import Event, checked_events
+from dirax.run.impact import Impact
 from dirax.run.validate import (
     MOST_ITERATIONS,
     Case,
@@ -30,6 +32,7 @@ class Settings:
     check_initial: bool
     max_iterations: int
     compensated: bool
+    events: tuple = ()
 
     @cached_property
     def key(self) -> tuple:
@@ -42,14 +45,17 @@ class Settings:
 def stated(
     system: Any, scheme: Any, step: Any, steps: Any, data: dict[str, Any], inputs: Any, params: Any, batch_params: bool,
     save_every: Any, engine: Any, project: bool, check_initial: bool, t0: Any, max_iterations: Any, compensated: bool,
+    events: Any = (),
 ) -> tuple[Settings, Case, int, int]:  # fmt: skip
     """The settings and the case that the arguments of `simulate` state, steps and save_every; raises as it does."""
     check_kinds(system, scheme)
     on, steps, save_every = engine_from(engine), count(steps, "steps"), count(save_every, "save_every")
     max_iterations = count(max_iterations, "max_iterations", MOST_ITERATIONS)
+    events = checked_events(events, (Event, Impact))
     case = validated_case(data, params, batch_params, step, t0)
     system = system if inputs is None else system.with_inputs(inputs)
-    return Settings(system, scheme, on, project, check_initial, max_iterations, bool(compensated)), case, steps, save_every
+    settings = Settings(system, scheme, on, project, check_initial, max_iterations, bool(compensated), events)
+    return settings, case, steps, save_every
 
 
 def kind_of(case: Case) -> tuple:

@@ -34,6 +34,7 @@ def simulate(
     t0: float = 0.0,
     max_iterations: int = 50,
     compensated: bool = False,
+    events: Any = (),
 ) -> Solution:
     """Run `scheme` on `system` for `steps` steps of size `step` and return the Solution.
 
@@ -46,6 +47,9 @@ def simulate(
     constraint; `check_initial=False` accepts data off it as they are. `max_iterations` bounds Newton's iterations a step.
     `compensated` keeps what rounding takes from the state and gives it back at the next step (Kahan), so that conserved
     quantities do not drift over very long runs.
+    `events`: a list of `dx.Event`, whose zeros are found inside the steps and stand in `sol.events`; a terminal one ends the
+    trajectory there, which is no failure: `sol.ok` stays true, and `sol.message` says so. Every row is held while they are
+    looked for.
 
     Under `jax.grad`, `jit` or `vmap` the run is differentiable on both engines, and values are not checked.
 
@@ -63,6 +67,6 @@ def simulate(
     entered = time.perf_counter()
     settings, case, steps, save_every = stated(
         system, scheme, step, steps, {"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, inputs, params, batch_params,
-        save_every, engine, project, check_initial, t0, max_iterations, compensated,
+        save_every, engine, project, check_initial, t0, max_iterations, compensated, events,
     )  # fmt: skip
     return carried_out(settings, case, steps, save_every, progress, entered=entered)

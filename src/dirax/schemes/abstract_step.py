@@ -1,7 +1,7 @@
 """AbstractStep: one step of a scheme as a class, whose methods are the functions of its StepEquation."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from jaxtyping import Array, Float
@@ -84,6 +84,16 @@ class AbstractStep(ABC):
         """Where the step that leaves a saved row begins: the state and a first guess of the unknowns."""
         return self.start(data, h, params)
 
+    @property
+    def interpolation(self) -> Callable | None:
+        """`interpolate` of the StepEquation, for a method with a polynomial."""
+        return None
+
+    @property
+    def hermite(self) -> Callable | None:
+        """`between` of the StepEquation, for a method of second order in coordinates."""
+        return None
+
     def equation(self) -> StepEquation:
         """The StepEquation of the step."""
         return StepEquation(
@@ -101,4 +111,6 @@ class AbstractStep(ABC):
             review=self.review,
             guess=self.guess,
             resume=self.resume,
+            interpolate=self.interpolation,
+            between=self.hermite,
         )

@@ -62,6 +62,20 @@ class CollocationStep(AbstractStep):
         weights = self.tableau.weights.tolist()
         return state + h * jnp.concatenate([combined(weights, y), combined(weights, rates)])
 
+    @property
+    def interpolation(self):
+        return self.interpolate
+
+    @abstractmethod
+    def node(self, state: Array, params: Any) -> dict[str, Array]:
+        """The fields of nodes at a state."""
+
+    def interpolate(self, theta, u, state, t, h, params):
+        """At state + h Σ_j ∫_0^θ ℓ_j (ȧ_j, ḃ_j)."""
+        _, y, _, rates = self.nodes(u, state, t, h, params)
+        shares = self.tableau.integrals(theta)
+        return self.node(state + h * jnp.concatenate([combined(shares, y), combined(shares, rates)]), params)
+
     def equation(self) -> StepEquation:
         """The StepEquation, which says that it is made of stages where one matrix is that of all of the state."""
         if not np.allclose(self.tableau.conjugate, self.tableau.matrix, rtol=0.0, atol=1e-12):
@@ -105,6 +119,9 @@ class LagrangianCollocation(CollocationStep):
         return self.state.join(q=data["q"], p=data["p"]), jnp.tile(data["v"], self.tableau.stages)
 
     def unpack(self, state, u, t, h, params):
+        return self.node(state, params)
+
+    def node(self, state, params):
         q, p, work = self.state.split(state)
         return {"q": q, "p": p} | ({"work": work[0]} if self.system.forces is not None else {})
 
@@ -139,10 +156,13 @@ class RelationCollocation(CollocationStep):
         return data["x"], jnp.tile(data["velocity"], self.tableau.stages)
 
     def unpack(self, state, u, t, h, params):
+        return self.node(state, params)
+
+    def node(self, state, params):
         return self.form.node(state, params)
 
 
-def combined(coefficients: list[float], vectors: list[Float[Array, " n"]]) -> Float[Array, " n"]:
+def combined(coefficients: list[Any], vectors: list[Float[Array, " n"]]) -> Float[Array, " n"]:
     """Σ coefficient·vector."""
     total = coefficients[0] * vectors[0]
     for coefficient, vector in zip(coefficients[1:], vectors[1:], strict=True):

@@ -6,7 +6,7 @@ the rest by exact integrals of Lagrange polynomials.
 
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,21 @@ class Tableau:
     def stages(self) -> int:
         """Their number s."""
         return len(self.nodes)
+
+    @cached_property
+    def modes(self) -> list[list[float]]:
+        """(s, s): ℓ_j = Σ_k modes_jk P_k with the Legendre polynomials P_k of [0, 1]."""
+        values = np.polynomial.legendre.legvander(2.0 * self.nodes - 1.0, self.stages - 1)
+        return np.linalg.inv(values).T.tolist()
+
+    def integrals(self, theta: Any) -> list[Any]:
+        """∫_0^θ ℓ_j for every j: A of the node θ. `theta` a number or an array."""
+        x = 2.0 * theta - 1.0
+        p = [1.0 + 0.0 * x, x]
+        for k in range(1, self.stages):
+            p.append(((2 * k + 1) * x * p[k] - k * p[k - 1]) / (k + 1))
+        moments = [theta, *((p[k + 1] - p[k - 1]) / (4 * k + 2) for k in range(1, self.stages))]
+        return [sum((m * c for m, c in zip(moments[1:], row[1:], strict=True)), moments[0] * row[0]) for row in self.modes]
 
 
 @cache

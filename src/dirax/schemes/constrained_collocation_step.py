@@ -114,6 +114,16 @@ class ConstrainedCollocation(AbstractStep):
         moved = {"q": now.q + h * combined(weights, nodes.v), "p": now.p + h * combined(weights, nodes.rates)}
         return moved | ({"work": now.work + h * combined(weights, nodes.works)} if self.forced else {})
 
+    @property
+    def interpolation(self):
+        return self.interpolate
+
+    def interpolate(self, theta, u, state, t, h, params):
+        """q and p by the integrals of the velocities and of Ṗ at the nodes."""
+        nodes, now, shares = self.nodes(u, state, t, h, params), self.state.split(state), self.tableau.integrals(theta)
+        found = {"q": now.q + h * combined(shares, nodes.v), "p": now.p + h * combined(shares, nodes.rates)}
+        return found | ({"work": now.work[0] + h * combined(shares, nodes.works)} if self.forced else {})
+
     def first_reaction(self, data, params) -> Float[Array, " k"]:
         """λ of the equations of motion at the initial data: the one that keeps W v + b = 0 and G v + ∂g/∂t = 0."""
         t, q, v = jnp.asarray(data.get("t", 0.0), float), data["q"], data["v"]
@@ -230,3 +240,11 @@ class NonholonomicCollocation(ConstrainedCollocation):
             self.state.join(reaction=pull, **self.begun(data)),
             self.unknowns.join(reactions=jnp.tile(pull, (s - 1, 1)), **guess),
         )
+
+    def resume(self, data, h, params):
+        """With the λ_1 that was saved, where it was, and not with that of the equations of motion."""
+        state, u = self.start(data, h, params)
+        if "reactions" in data:
+            parts = self.state.split(state)
+            state = self.state.join(**parts._asdict() | {"reaction": self.rows.pick(data["reactions"][0])})
+        return state, u

@@ -2,16 +2,19 @@
 
 from typing import Any
 
-from dirax.geometry.cotangent_lift import CotangentLift
+from dirax.geometry.cotangent_lift import CotangentLift, cotangent_lift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
+from dirax.geometry.projected_map import ProjectedMap
 from dirax.geometry.spaces import Euclidean
 from dirax.schemes.blm_method_1_step import MethodOneStep
 from dirax.schemes.blm_method_2_step import NonholonomicStep, ProjectedThetaStep
+from dirax.schemes.constraint_manifold_premise import where_the_constraints_hold
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.schemes.discrete_structure_maps import PROJECTED, RelationPairs, structure_on_cotangent_bundle
 from dirax.schemes.discretized_relation import discretized_relation
 from dirax.schemes.growth_premise import nothing_grows
 from dirax.schemes.hidden_constraint_premise import nothing_hidden_in_lagrangian, nothing_hidden_in_relation
+from dirax.schemes.look_ahead_step import LookAheadStep
 from dirax.schemes.map_lift import ThetaLift, lift_of
 from dirax.schemes.projected_field import projected_field
 from dirax.schemes.projected_lift_step import ProjectedLiftStep
@@ -37,8 +40,12 @@ class DiscreteDirac(AbstractScheme):
     order of q. With a base point off the middle of the step (θ ≠ ½) what is off a constraint is multiplied by −θ/(1 − θ) or
     −(1 − θ)/θ in a step, whatever its size, and in the adjoint by the inverse: where that grows the run is refused. Method 2 of
     a DiracSystem with `holonomic` is stated here for graphs of two-forms and bivectors with {g_i, g_j} = 0, and by its resolved
-    chain for others. Multipliers are forces at the base point, ṗ = … + Wᵀλ; those of
-    `dx.LagrangeDAlembert` are impulses of the opposite sign.
+    chain for others. On T*Q the lift of dx.Theta(1.0) has the constraint W(q_1)Δq = 0 at the base point (q_1, p_0), which
+    restricts the state alone: its force leads to a state with a step ahead (`LookAheadStep`). Multipliers are forces at the
+    base point, ṗ = … + Wᵀλ; those of `dx.LagrangeDAlembert` are impulses of the opposite sign.
+
+    Method 2 of a relation with multipliers, closed ports say, also takes a `dx.ProjectedMap` whose projector has the constraint
+    manifold M_0 as its image ([BLM] §7.2): (ẋ, u) with ẋ tangent to M_0 satisfy the relation at its base point on M_0.
 
     Takes systems with a relation form or a Lagrangian form: DiracSystem, PortHamiltonian, ImplicitSystem, LiePoisson,
     LagrangeDirac, NonholonomicMechanics, PhaseSpaceLagrangian, ManifoldLagrangian and systems of one's own; and what
@@ -62,7 +69,7 @@ class DiscreteDirac(AbstractScheme):
         resolve = self.constraints == "resolve"
         equation = self._resolved(system, shape) if resolve else self._discretized(system, shape)
         flat = isinstance(_map_on_q(self.map).manifold(shape.n), Euclidean)
-        if equation is not None and not resolve and flat and self.map.base_fraction != 0.5:
+        if equation is not None and not resolve and flat and self.map.base_fraction != 0.5 and not self._looks_ahead(system):
             equation = nothing_grows(system, equation)
         if equation is None and not resolve:
             equation = self._resolved(system, shape)  # all that is known of the system is its final manifold
@@ -77,6 +84,8 @@ class DiscreteDirac(AbstractScheme):
     def _discretized(self, system: AbstractSystem, shape: Shape) -> StepEquation | None:
         """Method 1."""
         if (relation := system.relation_form(shape)) is not None:
+            if self._looks_ahead(system):
+                return LookAheadStep(system.phase_space_form(), shape, relation).equation()
             return discretized_relation(relation, shape.n, self.map)
         lagrangian, theta = system.lagrangian_form(), _theta_of(self.map)
         if lagrangian is not None and theta is not None:
@@ -86,8 +95,29 @@ class DiscreteDirac(AbstractScheme):
             return MethodOneStep(lagrangian, shape, lift_of(_map_on_q(self.map), lagrangian, shape.n)).equation()
         return None
 
+    def _looks_ahead(self, system: AbstractSystem) -> bool:
+        """Whether the constraint at the base point (q_1, p_0) restricts the state alone: its force is one of the step ahead."""
+        form = system.phase_space_form() if isinstance(self.map, CotangentLift) and _theta_of(self.map) == 1.0 else None
+        return form is not None and form.constraints.any
+
+    def adjoint(self, system: AbstractSystem) -> "DiscreteDirac | None":
+        """With constraints, that of the lift of dx.Theta(1.0) is the lift of dx.Theta(0.0), whose states are all of M_0."""
+        return DiscreteDirac(cotangent_lift(Theta(0.0))) if self._looks_ahead(system) else None
+
+    def part(self, system: AbstractSystem, shape: Shape) -> AbstractScheme:
+        if self._looks_ahead(system):
+            raise ValueError(
+                "with constraints the states of the lift of dx.Theta(1.0) are other ones for every step size, so that steps of "
+                "different sizes do not compose: compose dx.DiscreteDirac() with the midpoint map."
+            )
+        return self
+
     def _resolved(self, system: AbstractSystem, shape: Shape) -> StepEquation | None:
         """Method 2."""
+        relation = system.relation_form(shape)
+        if isinstance(self.map, ProjectedMap) and relation is not None and relation.multipliers:
+            make = lambda: discretized_relation(relation, shape.n, self.map, on_constraints=True)
+            return where_the_constraints_hold(system, relation.multipliers, self.map.manifold(shape.n), make)
         if (manifold := system.final_manifold(shape)) is not None:
             return projected_field(manifold, shape.n, _theta_of_points(self.map))
         if (relation := system.final_relation(shape)) is not None:
@@ -119,7 +149,7 @@ class DiscreteDirac(AbstractScheme):
     def discrete_structure(self, system: AbstractSystem, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
         if self.constraints == "discretize":
             relation = system.relation_form(shape)
-        elif system.final_manifold(shape) is None:
+        elif system.final_manifold(shape) is None or isinstance(self.map, ProjectedMap):
             relation = system.final_relation(shape) or system.relation_form(shape)
         else:
             return PROJECTED

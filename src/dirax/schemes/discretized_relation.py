@@ -69,9 +69,13 @@ def _weights(theta: tuple[float, ...], size: int):
     return theta[0] if len(set(theta)) == 1 else jnp.repeat(jnp.array(theta), size // 2)
 
 
-def discretized_relation(form: RelationForm, size: int, map: AbstractDiscretizationMap) -> StepEquation:
+def discretized_relation(
+    form: RelationForm, size: int, map: AbstractDiscretizationMap, on_constraints: bool = False
+) -> StepEquation:
     """The relation between (x, ẋ) of a system on M, discretized by a map on M: state x (`size`,), unknowns (ẋ, multipliers).
 
+    With `on_constraints` M is where the constraints of the relation hold, and the multipliers are those that keep ẋ tangent to
+    it ([BLM] §7.2): all `size` numbers of the relation are solved, in place of their tangential parts and of the constraints.
     Explicit time and ports are taken at t + `map.base_fraction` h, the time of the base point.
     """
     step, m, fraction = stepping(map, size), form.multipliers, map.base_fraction
@@ -80,6 +84,8 @@ def discretized_relation(form: RelationForm, size: int, map: AbstractDiscretizat
     def residual(u, state, t, h, params):
         x, velocity, _ = step.move(state, u[:d], h)
         r = form.residual(x, velocity, u[d:], t + fraction * h, params)
+        if on_constraints:
+            return r[:size]
         if step.tangent is None:
             return r
         return jnp.concatenate([step.tangent(state, x) @ r[:size], r[size:]])
@@ -99,8 +105,9 @@ def discretized_relation(form: RelationForm, size: int, map: AbstractDiscretizat
     def start(data, h, params):
         if "x" not in data:
             raise ValueError("this scheme is a one-step method in x: start it from one point, not from two.")
-        return data["x"], jnp.concatenate([step.initial(data["x"], data["velocity"]), jnp.zeros(m)])
+        return data["x"], jnp.concatenate([step.initial(data["x"], data["velocity"]), data.get("guess", jnp.zeros(m))])
 
+    labels = () if on_constraints else form.labels
     fields = {name: Field((size,)) for name in form.names}
     if form.saved:
         fields["multipliers"] = Field((form.saved,), "step", (form.axis,), "multipliers at the base point")
@@ -113,6 +120,6 @@ def discretized_relation(form: RelationForm, size: int, map: AbstractDiscretizat
         state_size=size,
         unknowns=d + m,
         fields=fields,
-        labels=Labels.numbered("component {} of the Dirac condition", d) + form.labels,
+        labels=Labels.numbered("component {} of the Dirac condition", size if on_constraints else d) + labels,
         canonical=form.canonical,
     )

@@ -86,6 +86,25 @@ class EnergyCollocationStep(AbstractStep):
         end = jnp.asarray(self.quadrature.end) @ u.reshape(self.tableau.stages, -1)
         return after + once(self.settle)(state, after, end, t, h, params)
 
+    @property
+    def interpolation(self):
+        return self.interpolate
+
+    @abstractmethod
+    def node(self, state: Array, params: Any) -> dict[str, Array]:
+        """The fields of nodes at a state."""
+
+    def unpack(self, state, u, t, h, params):
+        return self.node(state, params)
+
+    def interpolate(self, theta, u, state, t, h, params):
+        """At the integral of the polynomial of the rates, with its share of what is settled at the end."""
+        rates = self.nodes(u, state, t, h, params)
+        inner = state + h * (jnp.stack(self.tableau.integrals(theta)) @ rates)
+        end = state + h * (self.tableau.weights @ rates)
+        slope = jnp.asarray(self.quadrature.end) @ u.reshape(self.tableau.stages, -1)
+        return self.node(inner + theta * once(self.settle)(state, end, slope, t, h, params), params)
+
     def settled(self, before: Array, after: Array, energy: Any, work: Any, size: Any) -> dict[str, Array]:
         """The parts of what is added that belong to the energy at the end, with the work of the step and the size of the
         terms of the energy."""
@@ -261,7 +280,7 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         mean = self.slopes(state[: 2 * self.n], jnp.concatenate([v, jnp.zeros(self.n)]), t, params)
         return state, jnp.tile(self.rates(state[: 2 * self.n], mean, t, params)[: 2 * self.n], self.tableau.stages)
 
-    def unpack(self, state, u, t, h, params):
+    def node(self, state, params):
         now = self.state.split(state)
         row = {"q": now.q, "p": now.p, "energy_defect": now.energy_defect}
         return row | ({"work": now.work[0]} if self.working else {})
@@ -328,7 +347,7 @@ class HamiltonianEnergyCollocation(EnergyCollocationStep):
         rate = self.rates(x, self.slopes(x, x, t, params), t, params)[: self.n]
         return self.state.join(x=x, energy=self.form.hamiltonian(x, params)), jnp.tile(rate, self.tableau.stages)
 
-    def unpack(self, state, u, t, h, params):
+    def node(self, state, params):
         now = self.state.split(state)
         row = self.relation.node(now.x, params) | {"energy_defect": now.energy_defect}
         return row | ({"work": now.work} if self.form.ports is not None else {})

@@ -12,6 +12,7 @@ from dirax.program.user_functions import UserFunction
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows, step_constraints
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian, slot_derivatives
+from dirax.schemes.hermite import hermite
 from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field, Shape
@@ -168,6 +169,10 @@ class LagrangeDAlembertStep(AbstractStep):
             constraint = self.step_constraint(t, q, u.v, h, params)
             row |= {"multipliers": self.rows.all(u.multipliers), "constraint": constraint}
         return row | self.work.row(state)
+
+    @property
+    def hermite(self):
+        return hermite(self.system)
 
     # ------------------------------------------------------------------------------------------------------ the start
 

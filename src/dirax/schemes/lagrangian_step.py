@@ -11,6 +11,7 @@ from dirax.numerics.arrays import Data
 from dirax.program.tracing import along, gradient
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows
+from dirax.schemes.hermite import hermite
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field, Shape
 from dirax.schemes.work_of_forces import WorkOfForces
@@ -51,6 +52,11 @@ class LagrangianStep(AbstractStep):
     @property
     def canonical(self) -> bool:
         return not self.book.size
+
+    @property
+    def hermite(self):
+        system = self.system.lagrangian_form()
+        return None if system is None else hermite(system)
 
     def row(self, state: Float[Array, " s"]) -> dict[str, Array]:
         """What is saved of a state."""

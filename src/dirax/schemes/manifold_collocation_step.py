@@ -78,6 +78,19 @@ class ManifoldCollocation(AbstractStep):
         here = self.chart(self.state.split(state).q)
         return here.momentum_to_manifold(h * combined(self.tableau.weights.tolist(), list(parts)[:-1]), parts.momentum)
 
+    @property
+    def interpolation(self):
+        return self.interpolate
+
+    def interpolate(self, theta, u, state, t, h, params):
+        """r(θ) = h Σ_j ∫_0^θ ℓ_j Ṙ_j in the chart, with π(θ) = π_1 − h Σ_j ∫_θ^1 ℓ_j ∂ℓ/∂r_j."""
+        rates, slopes, _ = self.nodes(u, state, h, params)
+        shares, weights = self.tableau.integrals(theta), self.tableau.weights.tolist()
+        left = combined([b - share for b, share in zip(weights, shares, strict=True)], slopes)
+        here = self.chart(self.state.split(state).q)
+        q, p = here.momentum_to_manifold(h * combined(shares, rates), self.unknowns.split(u).momentum - h * left)
+        return {"q": q, "p": p}
+
     def residual(self, u, state, t, h, params):
         rates, slopes, momenta = self.nodes(u, state, h, params)
         weights, end = self.tableau.weights.tolist(), self.unknowns.split(u).momentum

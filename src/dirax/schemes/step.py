@@ -78,6 +78,10 @@ class StepEquation(eqx.Module):
       warns of what is wrong with them;
     - `resume(data, h, params) -> (state, u)`: where the step that leaves a saved row begins, of which `data` has the fields too,
       and which need not be the first: `start` sets sums since the start to zero, and may choose another chart, or take longer;
+    - `interpolate(theta, u, state, t, h, params) -> dict`, the fields of nodes at t + θh inside the step, 0 ≤ θ ≤ 1, by the
+      polynomial of the method, which joins both ends;
+    - `between(theta, row, after, h, params) -> dict`, the same of the rows at both ends, which hold the time `t` and the velocity
+      `v` too: for methods of second order. Where neither is said, the fields at t + θh are those of a step of length θh;
     - `collocation`, the stage relation or mean relation of which the unknowns are copies: a fact that engines may use or ignore.
 
     Equations are compared by the identity of their functions. One with other functions is made by `dataclasses.replace`.
@@ -98,6 +102,8 @@ class StepEquation(eqx.Module):
     review: Callable = eqx.field(static=True)
     guess: Callable = eqx.field(static=True)
     resume: Callable = eqx.field(static=True)
+    interpolate: Callable | None = eqx.field(static=True)
+    between: Callable | None = eqx.field(static=True)
     state_layout: Layout = eqx.field(static=True)
     unknown_layout: Layout = eqx.field(static=True)
     collocation: StageRelation | MeanRelation | None = eqx.field(static=True)
@@ -121,6 +127,8 @@ class StepEquation(eqx.Module):
         review: Callable | None = None,
         guess: Callable | None = None,
         resume: Callable | None = None,
+        interpolate: Callable | None = None,
+        between: Callable | None = None,
         collocation: StageRelation | MeanRelation | None = None,
     ):
         self.start, self.residual, self.advance, self.unpack = start, residual, advance, unpack
@@ -133,6 +141,7 @@ class StepEquation(eqx.Module):
         self.review = review or nothing_to_report
         self.guess = guess or previous_unknowns
         self.resume = resume or start
+        self.interpolate, self.between = interpolate, between
         self.collocation = collocation
         if len(self.labels) != self.unknowns:
             raise ValueError(f"labels need one entry per unknown ({self.unknowns}), but {len(self.labels)} were given.")

@@ -3,6 +3,7 @@
 import contextlib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -38,56 +39,85 @@ def scene_of(given: Any, dimension: int) -> Scene:
     return Scene((axes(), path(place), point(place, trail=True)), view)
 
 
-def described(scene: Scene, arrays: Arrays, runs: Sequence[tuple[dict[str, np.ndarray], Any]]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Motion:
+    """Where the parts of a scene are along one trajectory, at the times `t` (frames,): `places[k]` holds by name arrays
+    (frames, 3), quaternions (frames, 4) for turns, a single row where nothing moves; None for a part that this run cannot
+    place."""
+
+    t: np.ndarray
+    places: tuple[dict[str, np.ndarray] | None, ...]
+
+
+def motions(scene: Scene, runs: Sequence[tuple[dict[str, np.ndarray], Any]], most: int | None = None) -> list[Motion]:
+    """The motion of every run, (rows by name, params), at no more than `most` evenly spread rows each."""
+    moving = sum(4 if name == TURN else 3 for part in scene.parts for name, place in part.places.items() if callable(place))
+    most = most or min(FRAMES, max(64, NUMBERS // max(1, moving * len(runs))))
+    return [_motion(scene, rows, params, most, first=k == 0) for k, (rows, params) in enumerate(runs)]
+
+
+def described(
+    scene: Scene, arrays: Arrays, runs: Sequence[tuple[dict[str, np.ndarray], Any]], most: int | None = None
+) -> dict[str, Any]:
     """The scene for the page: its parts, and for each run (rows by name, params) the channels that move them.
 
     A run without the fields that a place needs has None for it, and is drawn without that part.
     """
-    places, parts = [], []
-    for part in scene.parts:
-        named = {}
+    channels, parts = [], []
+    found = motions(scene, runs, most)
+    for k, part in enumerate(scene.parts):
+        named: dict[str, Any] = {}
         for name, place in part.places.items():
             if callable(place):
-                named[name] = {"channel": len(places)}
-                places.append((name, place))
+                named[name] = {"channel": len(channels)}
+                channels.append((k, name))
             else:
-                named[name] = {"constant": _constant(name, place, part)}
+                named[name] = {"constant": _constant(name, place, part)[0].tolist()}
         parts.append({"kind": part.kind, "places": named, **part.settings})
-    most = max(64, NUMBERS // max(1, sum(4 if name == TURN else 3 for name, _ in places) * len(runs)))
     return {
         "parts": parts,
         "view": list(scene.direction),
-        "actors": [_actor(scene, places, arrays, *run, min(most, FRAMES), first=k == 0) for k, run in enumerate(runs)],
+        "actors": [{"t": arrays.add(m.t), "channels": [_channel(arrays, m.places[k], n) for k, n in channels]} for m in found],
     }
 
 
-def _constant(name: str, place: Any, part: Part) -> list[float]:
-    value = np.asarray(place, float)
-    return _checked(name, value[None], f"{name} of a {part.kind}")[0].tolist()
+def _constant(name: str, place: Any, part: Part) -> np.ndarray:
+    return _checked(name, np.asarray(place, float)[None], f"{name} of a {part.kind}")
 
 
-def _actor(
-    scene: Scene, places: list, arrays: Arrays, rows: dict[str, np.ndarray], params: Any, most: int, first: bool
-) -> dict[str, Any]:
+def _motion(scene: Scene, rows: dict[str, np.ndarray], params: Any, most: int, first: bool) -> Motion:
     if scene.fields is not None:
         with contextlib.suppress(KeyError):  # a run that has not what they are computed from
             rows = {**rows, **{name: np.asarray(a) for name, a in scene.fields(rows, params).items()}}
     total = len(rows["t"])
     chosen = np.unique(np.linspace(0, total - 1, min(total, most)).round().astype(int))
     frames = {name: np.asarray(a)[chosen] for name, a in rows.items()}
-    given = [(k, name, place, _names(place, frames)) for k, (name, place) in enumerate(places)]
+    wanted = [(k, name, place) for k, part in enumerate(scene.parts) for name, place in part.places.items() if callable(place)]
+    given = [(k, name, place, _names(place, frames)) for k, name, place in wanted]
     if first and (lost := [place for _, _, place, names in given if names is None]):
         raise ValueError(
             f"a place of the scene takes {', '.join(inspect.signature(lost[0]).parameters)}, but a row of this solution has "
             f"{', '.join(sorted(rows))} and params: name the arguments after these."
         )
-    usable = [(k, name, place, names) for k, name, place, names in given if names is not None]
+    unplaced = {k for k, _, _, names in given if names is None}
+    usable = [(k, name, place, names) for k, name, place, names in given if k not in unplaced and names is not None]
     values = _along([(place, names) for _, _, place, names in usable], frames, params)
-    channels: list[Any] = [None] * len(places)
+    places: list[dict[str, np.ndarray] | None] = [
+        None if k in unplaced else {n: _constant(n, place, part) for n, place in part.places.items() if not callable(place)}
+        for k, part in enumerate(scene.parts)
+    ]
     for (k, name, place, _), value in zip(usable, values, strict=True):
         what = f"the function {getattr(place, '__name__', 'lambda')} of a scene"
-        channels[k] = _channel(arrays, name, _checked(name, value, what))
-    return {"t": arrays.add(frames["t"]), "channels": channels}
+        of_part = places[k]
+        assert of_part is not None
+        of_part[name] = _filled(_checked(name, value, what))
+    return Motion(frames["t"], tuple(places))
+
+
+def _filled(values: np.ndarray) -> np.ndarray:
+    """Bodies stay where a run ended."""
+    finite = values[np.all(np.isfinite(values), axis=1)]
+    return np.where(np.isfinite(values), values, finite[-1] if len(finite) else 0.0)
 
 
 def _names(place: Callable, frames: Mapping[str, np.ndarray]) -> tuple[str, ...] | None:
@@ -132,13 +162,13 @@ def _checked(name: str, values: np.ndarray, what: str) -> np.ndarray:
     return np.concatenate([values, np.zeros((len(values), 3 - values.shape[1]))], axis=1)
 
 
-def _channel(arrays: Arrays, name: str, values: np.ndarray) -> list[Any]:
+def _channel(arrays: Arrays, places: Mapping[str, np.ndarray] | None, name: str) -> list[Any] | None:
     """The columns of a channel: a number where it does not change, else a record of the page's arrays."""
-    finite = values[np.all(np.isfinite(values), axis=1)]
-    values = np.where(np.isfinite(values), values, finite[-1] if len(finite) else 0.0)  # bodies stay where a run ended
+    if places is None:
+        return None
     if name == TURN:
-        return [_quantized(arrays, column, 32767.0, "i2") for column in values.T]
-    return [_quantized(arrays, column, None, "f4") for column in values.T]
+        return [_quantized(arrays, column, 32767.0, "i2") for column in places[name].T]
+    return [_quantized(arrays, column, None, "f4") for column in places[name].T]
 
 
 def _quantized(arrays: Arrays, column: np.ndarray, scale: float | None, kind: str) -> Any:

@@ -40,8 +40,9 @@ def text(
     source: str,
     data: dict[str, Any],
     arrays: Arrays,
+    small: bool = False,
 ) -> str:
-    """The whole page."""
+    """The whole page; of a `small` one only the motion and two plots are seen."""
     first = solutions[0]
     units = first.metadata.get("units", {})
     data = {
@@ -49,14 +50,15 @@ def text(
         "title": title,
         "names": list(names),
         "unit": str(units.get("t", "")),
-        "charts": charts(runs, plane, units),
+        "charts": _two(charts(runs, plane, units)) if small else charts(runs, plane, units),
         "bytes": arrays.size,
     }
     return Template(asset("page.html")).substitute(
+        kind="small" if small else "whole",
         title=html.escape(title),
         subtitle=html.escape(_subtitle(solutions)),
         verdict=_chip(reports),
-        statement=_statement(first),
+        statement=equations_html(first),
         runs=_runs(solutions, names, runs),
         verdicts="".join(_verdicts(report, names[k], k, runs, len(solutions)) for k, report in enumerate(reports)),
         details=_details(first, source),
@@ -98,6 +100,11 @@ def charts(runs: Sequence[Run], plane: tuple[int, ...], units: dict[str, Any]) -
             title = TITLES.get(name, name.replace("_", " ").capitalize())
             found.append(_over_time(title, name, range(len(table.columns)), ["value", "log"]))
     return found
+
+
+def _two(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The first plot over time, which is of the energy where there is one, and the phase plane."""
+    return [*[chart for chart in found if chart["kind"] == "time"][:1], *[chart for chart in found if chart["kind"] == "phase"]]
 
 
 def _over_time(title: str, table: str, columns: Any, modes: list[str], unit: str = "") -> dict[str, Any]:
@@ -154,7 +161,8 @@ def math(parts: Sequence[Written]) -> str:
     return " ".join(map(piece, parts))
 
 
-def _statement(sol: Solution) -> str:
+def equations_html(sol: Solution) -> str:
+    """The system in formulas, empty where there are no short ones."""
     equal = Written("=", "<mo>=</mo>")
     rows = [
         f'<div class="equation">{math([equation.left])} {math([equal, *equation.right])}</div>'

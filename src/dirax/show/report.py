@@ -3,6 +3,7 @@
 import hashlib
 import os
 from collections.abc import Callable, Mapping, Sequence
+from html import escape
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,12 @@ from dirax.show import frames, page, series
 from dirax.show.arrays import Arrays
 from dirax.show.series import Run
 from dirax.solution.solution import Solution
+
+SMALL = 1500
+"""Rows and frames of a view in a notebook."""
+
+VIEW_HEIGHT = 570
+"""Of a view in a notebook, in dots."""
 
 
 def report(
@@ -47,8 +54,8 @@ def report(
         dx.report([plus, minus], "both.html", names=["(+)", "(−)"])
     """
     path = Path(path)
-    _check_path(path, overwrite)
-    several = _checked(solutions)
+    checked_path(path, (".html", ".htm"), overwrite)
+    several = checked_solutions(solutions)
     text = html(several, scene=scene, names=names, title=title, symmetries=symmetries, exact=exact, verdicts=verdicts)
     beside = path.with_name(f".{path.name}.part")
     try:
@@ -68,22 +75,23 @@ def html(
     symmetries: Mapping[str, Callable] | None = None,
     exact: Callable | bool = True,
     verdicts: bool | Report | Sequence[Report] = True,
+    small: bool = False,
 ) -> str:
-    """The text of the page that `report` writes."""
+    """The text of the page that `report` writes; a `small` one has the motion and two plots, of fewer rows."""
     first, example = solutions[0], getattr(solutions[0], "example", None)
-    symmetries = symmetries or (dict(example.symmetries) if example is not None else None)
+    symmetries = symmetries or (dict(example.symmetries) if example is not None and not small else None)
     names = _names(solutions, names)
     labels = names if len(solutions) > 1 else ["computed" if first.batch is None else "trajectory"]
     runs = [run for k, sol in enumerate(solutions) for run in series.runs_of(sol, labels[k], k, symmetries)]
     if closed := _exact_run(first, exact, example):
         runs.append(closed)
     arrays = Arrays()
-    budget = series.EXACT_BYTES // len(runs)
-    described = [series.described(run, arrays, budget) for run in runs]
+    budget = 0 if small else series.EXACT_BYTES // len(runs)
+    described = [series.described(run, arrays, budget, SMALL if small else series.ROWS) for run in runs]
     main = np.asarray(first.fields.get("q", first.fields.get("x", next(iter(first.fields.values())))))
     given = scene if scene is not None else getattr(example, "scene", None)
     drawn = frames.scene_of(given, main.shape[-1])
-    picture = frames.described(drawn, arrays, [(run.rows, run.params) for run in runs])
+    picture = frames.described(drawn, arrays, [(run.rows, run.params) for run in runs], SMALL if small else None)
     return page.text(
         title=title or str(first.metadata.get("title") or type(first.system).__name__),
         solutions=solutions,
@@ -95,19 +103,32 @@ def html(
         source=str(getattr(example, "source", "")),
         data={"runs": described, "scene": picture},
         arrays=arrays,
+        small=small,
     )
 
 
-def _check_path(path: Path, overwrite: bool) -> None:
-    if path.suffix not in (".html", ".htm"):
-        raise ValueError(f"path must end in .html, but {str(path)!r} was given.")
+def notebook_view(sol: Solution) -> str:
+    """A solution in a notebook: the motion and two plots, in a frame of their own."""
+    text = html([sol], exact=False, verdicts=False, small=True)
+    title = escape(f"The motion of {sol.metadata.get('title') or type(sol.system).__name__}")
+    return (
+        f'<iframe srcdoc="{escape(text)}" title="{title}" sandbox="allow-scripts" '
+        f'style="width: 100%; height: {VIEW_HEIGHT}px; border: 0"></iframe>'
+    )
+
+
+def checked_path(path: Path, endings: Sequence[str], overwrite: bool) -> None:
+    """Raise before the work for a path that cannot be written."""
+    if path.suffix not in endings:
+        raise ValueError(f"path must end in {' or '.join(e for e in endings if e != '.htm')}, but {str(path)!r} was given.")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"the folder {path.parent} does not exist: create it before writing {path.name}.")
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: pass overwrite=True to replace it, or choose another path.")
 
 
-def _checked(solutions: Any) -> list[Solution]:
+def checked_solutions(solutions: Any) -> list[Solution]:
+    """One solution, or several of one system, as a list."""
     several = [solutions] if isinstance(solutions, Solution) else list(solutions) if isinstance(solutions, Sequence) else []
     others = [sol for sol in several if not isinstance(sol, Solution)]
     if others or not several:

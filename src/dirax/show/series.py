@@ -52,14 +52,14 @@ def coordinate_names(sol: Solution, count: int, letter: str = "q") -> tuple[str,
     return names if len(names) == count else tuple(f"{letter}{i}" for i in range(count))
 
 
-def runs_of(sol: Solution, label: str, group: int, symmetries: Mapping[str, Callable] | None) -> list[Run]:
-    """The runs of a solution: one, or the first of a batch."""
+def runs_of(sol: Solution, label: str, group: int, symmetries: Mapping[str, Callable] | None, measured: bool = True) -> list[Run]:
+    """The runs of a solution: one, or the first of a batch; with `measured=False` without tables."""
     if sol.batch is None:
         lanes, labels = [None], [label]
     else:
         lanes = list(range(min(sol.batch, LANES)))
         labels = [f"{label} {lane}".strip() for lane in lanes]
-    measured = _measured(sol, symmetries)
+    quantities = _measured(sol, symmetries) if measured else {}
     runs = []
     for lane, name in zip(lanes, labels, strict=True):
         of_lane = lambda a, lane=lane: np.asarray(a) if lane is None else np.asarray(a)[lane]
@@ -67,7 +67,7 @@ def runs_of(sol: Solution, label: str, group: int, symmetries: Mapping[str, Call
         params = sol.params
         if sol.batch_params and params is not None:
             params = jax.tree.map(lambda leaf, lane=lane: leaf[lane], params)
-        tables = {k: Table(k, columns, of_lane(values), exact) for k, (columns, values, exact) in measured.items()}
+        tables = {k: Table(k, columns, of_lane(values), exact) for k, (columns, values, exact) in quantities.items()}
         rows = {**nodes, "t": np.asarray(sol.t)}
         runs.append(Run(name, np.asarray(sol.t), rows, params, tables, group, ghost=bool(lane)))
     return runs
@@ -125,12 +125,12 @@ def kept_rows(values: np.ndarray, most: int) -> np.ndarray | None:
     return np.unique(np.concatenate(kept))
 
 
-def described(run: Run, arrays: Arrays, budget: int) -> dict[str, Any]:
-    """The tables of a run for the page; `budget`: bytes of full precision that this run may take."""
+def described(run: Run, arrays: Arrays, budget: int, most: int = ROWS) -> dict[str, Any]:
+    """The tables of a run for the page, of `most` rows; `budget`: bytes of full precision that this run may take."""
     t = np.asarray(run.t, float)
     tables = {}
     for table in sorted(run.tables.values(), key=lambda table: not table.exact):
-        kept = kept_rows(table.values, ROWS)
+        kept = kept_rows(table.values, most)
         values = table.values if kept is None else table.values[kept]
         exact = table.exact or 8 * values.size <= budget
         budget -= 8 * values.size * exact

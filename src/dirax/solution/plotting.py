@@ -1,23 +1,33 @@
 """Pictures of a Solution as matplotlib Axes and Figures, without pyplot and without global state.
 
 Names and units of axes come from `solution.metadata` ("coordinates" and "units"), which gallery systems fill in; a
-solution without them shows q0, q1, … Colours are those of Okabe and Ito, which the colour-blind can tell apart;
-reports on screen have them a shade darker or lighter (show/assets/report.css).
+solution without them shows q0, q1, … The style is that of style.py.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dirax.solution.labels import (
+    entry,
+    index_of,
+    label,
+    letter_and_index,
+    names_of,
+    position,
+    state_names,
+    state_symbol,
+    symbol,
+    time_label,
+    units_of,
+)
+from dirax.solution.section import crossings, states_of
+from dirax.solution.style import BLUE, COLOURS, given_or_new, new_figure, style
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
-ORANGE, SKY, INK, YELLOW = "#E69F00", "#56B4E9", "#222222", "#F0E442"
-COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, INK)
 
 MANY = 12
 """A batch of more trajectories than this is drawn in one translucent colour."""
@@ -27,77 +37,30 @@ ENVELOPE = 1000
 
 ENERGY_ERROR = "$|E - E_0| \\,/\\, |E_0|$"
 
-STYLE: dict[Any, Any] = {
-    "font.size": 9.5,
-    "axes.titlesize": 10.5,
-    "axes.titlelocation": "left",
-    "axes.labelcolor": INK,
-    "axes.edgecolor": "#8a8a8a",
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.formatter.use_mathtext": True,
-    "grid.color": "#e6e6e6",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.1,
-    "lines.solid_joinstyle": "round",
-    "xtick.color": "#555555",
-    "ytick.color": "#555555",
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "figure.dpi": 110,
-    "savefig.dpi": 160,
-    "path.simplify_threshold": 0.2,
-    "agg.path.chunksize": 20_000,
-}
-
-
-@contextmanager
-def style() -> Iterator[None]:
-    """matplotlib's settings for dirax pictures, in force inside the block only."""
-    import matplotlib
-    from cycler import cycler
-
-    with matplotlib.rc_context({**STYLE, "axes.prop_cycle": cycler(color=COLOURS)}):
-        yield
-
-
-def new_figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (5.6, 3.6), **grid: Any) -> "tuple[Figure, Any]":
-    """A Figure in the style of dirax, and its Axes: one, or an array of shape (rows, columns) squeezed; size in inches."""
-    from matplotlib.figure import Figure
-
-    with style():
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(rows, columns, **grid)
-    return figure, axes
-
 
 @style()
-def save_figure(figure: "Figure", path: Any) -> None:
-    """Write a figure in the format that the ending of `path` names, 160 dots per inch."""
-    figure.savefig(path)
+def plot_trajectory(
+    sol: Any, x: int | str = 0, y: int | str = 1, z: int | str | None = None, *, ax: "Axes | None" = None, **line: Any
+) -> "Axes":
+    """The path in the plane of two coordinates, or in the space of three, one curve a trajectory, a dot where each begins;
+    equal scales where the coordinates have the same unit and are not angles.
 
-
-@style()
-def plot_trajectory(sol: Any, x: int | str = 0, y: int | str = 1, *, ax: "Axes | None" = None, **line: Any) -> "Axes":
-    """The path in the plane of two coordinates, one curve a trajectory, a dot where each begins; equal scales where the
-    coordinates have the same unit and are not angles.
-
-    `x`, `y`: index or name of an entry of q (of `sol.x` where there is no q). Raises `ValueError` for unknown ones.
+    `x`, `y`, `z`: index or name of an entry of q (of `sol.x` where there is no q). `ax`: for three coordinates one of
+    matplotlib's projection "3d". Raises `ValueError` for unknown ones.
     """
-    i, j = _index(sol, x), _index(sol, y)
-    ax = _given_or_new(ax)
-    lanes = _lanes(sol, _position(sol))
+    chosen = [index_of(sol, each) for each in (x, y, z) if each is not None]
+    space = len(chosen) == 3
+    ax = given_or_new(ax, **({"projection": "3d"} if space else {}))
+    if space and not hasattr(ax, "set_zlabel"):
+        raise ValueError('ax must have the projection "3d" for a path in space: figure.add_subplot(projection="3d").')
+    lanes = _lanes(sol, position(sol))
     for path, kwargs in zip(lanes, _lines(len(lanes), line), strict=True):
-        (curve,) = ax.plot(path[:, i], path[:, j], **kwargs)
-        ax.plot(path[:1, i], path[:1, j], "o", ms=3.5, color=curve.get_color(), label="_start")
-    names, units = _names(sol), _units(sol)
-    ax.set(xlabel=_label(_symbol(names[i]), units[i]), ylabel=_label(_symbol(names[j]), units[j]))
-    if units[i] == units[j] != "rad":
+        (curve,) = ax.plot(*path[:, chosen].T, **kwargs)
+        ax.plot(*path[:1, chosen].T, "o", ms=3.5, color=curve.get_color(), label="_start")
+    names, units = names_of(sol), units_of(sol)
+    labels = [label(symbol(names[i]), units[i]) for i in chosen]
+    ax.set(**dict(zip(("xlabel", "ylabel", "zlabel"), labels, strict=False)))
+    if {units[i] for i in chosen} == {units[chosen[0]]} != {"rad"}:
         ax.set_aspect("equal", adjustable="datalim")
     return ax
 
@@ -108,15 +71,15 @@ def plot_coordinate(sol: Any, i: int | str = 0, *, field: str = "q", ax: "Axes |
 
     Raises `ValueError` for an unknown entry.
     """
-    index = _index(sol, i)
-    ax = _given_or_new(ax)
+    index = index_of(sol, i)
+    ax = given_or_new(ax)
     lanes = _lanes(sol, np.asarray(sol.fields[field]))
     for values, kwargs in zip(lanes, _lines(len(lanes), line), strict=True):
         ax.plot(sol.t, values[:, index], **kwargs)
-    position = ("q" in sol.fields and field == "q") or field == "x"
-    name = _names(sol)[index]
-    name = _symbol(name) if position else _symbol(field, name)
-    ax.set(xlabel=_time_label(sol), ylabel=_label(name, _units(sol)[index] if position else ""))
+    placed = ("q" in sol.fields and field == "q") or field == "x"
+    name = names_of(sol)[index]
+    name = symbol(name) if placed else symbol(field, name)
+    ax.set(xlabel=time_label(sol), ylabel=label(name, units_of(sol)[index] if placed else ""))
     return ax
 
 
@@ -133,8 +96,8 @@ def plot_energy(sol: Any, *, figure: "Figure | None" = None, **line: Any) -> "Fi
         plot_error(right, sol.t, values, **kwargs)
     relative = bool(np.all(energies[:, 0] != 0))
     unit = sol.metadata.get("units", {}).get("energy", "")
-    left.set(xlabel=_time_label(sol), ylabel=_label("energy $E$", unit))
-    right.set(xlabel=_time_label(sol), ylabel=ENERGY_ERROR if relative else _label("$|E - E_0|$", unit))
+    left.set(xlabel=time_label(sol), ylabel=label("energy $E$", unit))
+    right.set(xlabel=time_label(sol), ylabel=ENERGY_ERROR if relative else label("$|E - E_0|$", unit))
     return figure
 
 
@@ -148,18 +111,18 @@ def plot_error(ax: "Axes", t: Any, values: Any, **line: Any) -> None:
 @style()
 def plot_phase(sol: Any, i: int | str = 0, *, ax: "Axes | None" = None, **line: Any) -> "Axes":
     """The path in the phase plane (q_i, p_i). Raises `ValueError` for an unknown coordinate or a solution without p."""
-    index = _index(sol, i)
+    index = index_of(sol, i)
     if "q" not in sol.fields or "p" not in sol.fields:
         raise ValueError(
             f"a phase plane needs q and p, but this solution holds {', '.join(sol.fields)}: plot_trajectory shows x."
         )
-    ax = _given_or_new(ax)
+    ax = given_or_new(ax)
     lanes_q, lanes_p = _lanes(sol, np.asarray(sol.q)), _lanes(sol, np.asarray(sol.p))
     for q, p, kwargs in zip(lanes_q, lanes_p, _lines(len(lanes_q), line), strict=True):
         (curve,) = ax.plot(q[:, index], p[:, index], **kwargs)
         ax.plot(q[:1, index], p[:1, index], "o", ms=3.5, color=curve.get_color(), label="_start")
-    name = _names(sol)[index]
-    ax.set(xlabel=_label(_symbol(name), _units(sol)[index]), ylabel=_symbol("p", name))
+    name = names_of(sol)[index]
+    ax.set(xlabel=label(symbol(name), units_of(sol)[index]), ylabel=symbol("p", name))
     return ax
 
 
@@ -172,16 +135,82 @@ def plot_constraint(sol: Any, *, ax: "Axes | None" = None, **line: Any) -> "Axes
     residual = np.asarray(sol.constraint_residual())
     if residual.shape[-1] == 0:
         raise ValueError("this system has no constraints, so there is no residual to plot.")
-    ax = _given_or_new(ax)
+    ax = given_or_new(ax)
     worst = np.atleast_2d(np.max(np.abs(residual), axis=-1))
     for values, kwargs in zip(worst, _lines(len(worst), line), strict=True):
         _plot_log(ax, np.asarray(sol.t)[: values.size], values, **kwargs)
-    ax.set(xlabel=_time_label(sol), ylabel="largest constraint residual")
+    ax.set(xlabel=time_label(sol), ylabel="largest constraint residual")
     return ax
 
 
-def _given_or_new(ax: "Axes | None") -> "Axes":
-    return new_figure()[1] if ax is None else ax
+@style()
+def plot_momenta(sol: Any, symmetries: Mapping[str, Callable] | None = None, *, ax: "Axes | None" = None, **line: Any) -> "Axes":
+    """How far the momenta of symmetries have moved since the start, J(t) − J(0) with J = ⟨p, ξ(q)⟩, against time.
+
+    `symmetries`: generators ξ(q) -> (n,) by name, by default those of the gallery's system; where there are none, the
+    momenta p themselves are drawn. Raises `ValueError` for a solution without p.
+    """
+    if "p" not in sol.fields:
+        raise ValueError(f"momenta need p, but this solution holds {', '.join(sol.fields)}.")
+    symmetries = symmetries or dict(getattr(getattr(sol, "example", None), "symmetries", {}))
+    ax = given_or_new(ax)
+    if symmetries:
+        curves = {symbol(*letter_and_index(name)): np.asarray(sol.momentum_map(xi)) for name, xi in symmetries.items()}
+        curves = {name: values - values[..., :1] for name, values in curves.items()}
+        ylabel = "$J - J(0)$"
+    else:
+        curves = {symbol("p", name): np.asarray(sol.p)[..., k] for k, name in enumerate(names_of(sol))}
+        ylabel = "momentum $p$"
+    for k, (name, values) in enumerate(curves.items()):
+        lanes = np.atleast_2d(values)
+        for one, kwargs in zip(
+            lanes, _lines(len(lanes), {"label": name, "color": COLOURS[k % len(COLOURS)], **line}), strict=True
+        ):
+            ax.plot(sol.t, one, **kwargs)
+    ax.set(xlabel=time_label(sol), ylabel=ylabel)
+    ax.legend()
+    return ax
+
+
+@style()
+def plot_section(
+    sol: Any,
+    x: int | str = 0,
+    y: int | str = 1,
+    *,
+    through: int | str | None = None,
+    value: float = 0.0,
+    direction: int = 1,
+    points: Any = None,
+    ax: "Axes | None" = None,
+    **marks: Any,
+) -> "Axes":
+    """A Poincaré section: the states in which the coordinate `through` passes `value`, in the plane of `x` and `y`.
+
+    `x`, `y`, `through`: index or name of an entry of the state, the q (or x) and after them the momenta p_NAME.
+    `direction`: 1 counts passages upwards, −1 downwards, 0 both; they are interpolated between the saved rows. `points`:
+    states (k, n) found elsewhere, or a list of such arrays, one a trajectory, drawn instead.
+    Raises `ValueError` for unknown coordinates, and where neither `through` nor `points` is given.
+    """
+    names = state_names(sol)
+    i, j = entry(names, x), entry(names, y)
+    if points is None:
+        if through is None:
+            raise ValueError(f"give through=, one of {', '.join(names)}, or the points= of a section.")
+        k = entry(names, through)
+        lanes = [crossings(np.asarray(sol.t), lane, k, value, direction) for lane in _lanes(sol, states_of(sol))]
+    else:
+        lanes = [np.atleast_2d(lane) for lane in (points if isinstance(points, list | tuple) else [points])]
+    if any(lane.shape[-1] != len(names) for lane in lanes):
+        raise ValueError(f"points must be states ({', '.join(names)}), {len(names)} numbers, but they have {lanes[0].shape[-1]}.")
+    ax = given_or_new(ax)
+    for lane, kwargs in zip(lanes, _lines(len(lanes), marks), strict=True):
+        ax.plot(lane[:, i], lane[:, j], "o", **{"ms": 2.0, "mew": 0, **kwargs, "lw": 0})
+    units = [*units_of(sol), *[""] * len(names)]
+    ax.set(xlabel=label(state_symbol(names[i]), units[i]), ylabel=label(state_symbol(names[j]), units[j]))
+    if through is not None:
+        ax.set_title(f"where {state_symbol(names[entry(names, through)])} passes {value:g}")
+    return ax
 
 
 def _plot_log(ax: "Axes", t: np.ndarray, values: np.ndarray, **line: Any) -> None:
@@ -192,10 +221,6 @@ def _plot_log(ax: "Axes", t: np.ndarray, values: np.ndarray, **line: Any) -> Non
     ax.plot(t, np.where(values > 0, values, np.nan), **line)
 
 
-def _position(sol: Any) -> np.ndarray:
-    return np.asarray(sol.fields["q"] if "q" in sol.fields else sol.fields["x"])
-
-
 def _lanes(sol: Any, values: np.ndarray) -> np.ndarray:
     """Values with a batch axis in front, of length 1 for one trajectory."""
     return values if sol.batch is not None else values[None]
@@ -204,42 +229,5 @@ def _lanes(sol: Any, values: np.ndarray) -> np.ndarray:
 def _lines(count: int, line: dict) -> list[dict]:
     """Keywords of each of `count` curves: one label for all, and one translucent colour if they are many."""
     many = {"color": BLUE, "alpha": max(0.06, min(0.5, 6 / count)), "lw": 0.7} if count > MANY else {}
-    label = line.get("label")
-    return [{**many, **line, **({"label": label if k == 0 else "_more"} if label else {})} for k in range(count)]
-
-
-def _names(sol: Any) -> list[str]:
-    size = _position(sol).shape[-1]
-    field = "q" if "q" in sol.fields else "x"
-    names = list(sol.metadata.get("coordinates", ()))
-    return names if len(names) == size else [f"{field}{k}" for k in range(size)]
-
-
-def _units(sol: Any) -> list[str]:
-    size = _position(sol).shape[-1]
-    units = list(sol.metadata.get("units", {}).get("q", ()))
-    return units if len(units) == size else [""] * size
-
-
-def _index(sol: Any, which: int | str) -> int:
-    names = _names(sol)
-    if which in names:
-        return names.index(str(which))
-    if isinstance(which, int | np.integer) and -len(names) <= which < len(names):
-        return int(which) % len(names)
-    raise ValueError(f"no coordinate {which!r}: give an index from 0 to {len(names) - 1} or one of {', '.join(names)}.")
-
-
-def _symbol(name: str, index: str = "") -> str:
-    """A name in mathematical type, its digits at the end as an index: θ1 becomes θ₁."""
-    letters = name.rstrip("0123456789")
-    index = index or name[len(letters) :]
-    return f"${letters}_{{{index}}}$" if index else f"${letters}$" if len(letters) == 1 else letters
-
-
-def _label(name: str, unit: str) -> str:
-    return f"{name} ({unit})" if unit else name
-
-
-def _time_label(sol: Any) -> str:
-    return _label("$t$", sol.metadata.get("units", {}).get("t", ""))
+    called = line.get("label")
+    return [{**many, **line, **({"label": called if k == 0 else "_more"} if called else {})} for k in range(count)]

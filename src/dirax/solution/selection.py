@@ -93,7 +93,7 @@ def _rows(sol: Some, rows: range) -> Some:
 def _trajectories(sol: Some, lanes: Any) -> Some:
     """Some trajectories of a batch, as a batch or without its axis."""
     of_batch = lambda a: a[lanes] if np.ndim(a) == 2 else a
-    return sol.replace(
+    part = sol.replace(
         fields={k: a[lanes] for k, a in sol.fields.items()},
         derived={k: a[lanes] for k, a in sol.derived.items()},
         ok=np.asarray(sol.ok)[lanes] if not is_traced(sol.ok) else sol.ok[lanes],
@@ -101,6 +101,9 @@ def _trajectories(sol: Some, lanes: Any) -> Some:
         params=jax.tree.map(lambda leaf: leaf[lanes], sol.given_params) if sol.batch_params else sol.given_params,
         initial={k: of_batch(a) for k, a in sol.initial.items()},
     )
+    part.events = None if sol.events is None else sol.events.of_lanes(lanes)
+    part.impacts = None if sol.impacts is None else sol.impacts.of_lanes(lanes)
+    return part
 
 
 def _trajectory(sol: Some, lane: int) -> Some:
@@ -112,4 +115,4 @@ def _trajectory(sol: Some, lane: int) -> Some:
     part.ok, part.message = bool(part.ok), part.message[0] if part.message else ""
     nodes = [a.reshape(len(a), -1) for k, a in part.fields.items() if part.field_info[k].place == "node"]
     good = np.flatnonzero(~np.all(np.isnan(np.concatenate(nodes, axis=1)), axis=1))
-    return part if part.ok or not len(good) else _rows(part, range(int(good[-1]) + 1))
+    return part if not len(good) or good[-1] == part.rows - 1 else _rows(part, range(int(good[-1]) + 1))

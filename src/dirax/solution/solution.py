@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dirax.solution import export, plotting, saving, selection
+from dirax.solution import dense, export, plotting, saving, selection
 from dirax.solution.trajectory import Trajectory
 
 
@@ -30,6 +30,9 @@ class Solution(Trajectory):
     report: Callable[..., Path]
     """`sol.report(path)`: a page for a browser; `dirax.show`, which stands above this room, puts the method here."""
 
+    animate: Callable[..., Path]
+    """`sol.animate(path)`: the motion as .gif, .webp, .mp4 or .html, from `dirax.show` too."""
+
     def extend(self, steps: int, progress: Any = False) -> "Solution":
         """The solution of the run with `steps` more steps, with the bits of one run: the steps that are done are not repeated,
         except where Ctrl-C has interrupted them. Rows are saved as before; the last row of this solution is one of the longer
@@ -51,6 +54,8 @@ class Solution(Trajectory):
     __len__ = selection.count
     __iter__ = selection.each
 
+    at = dense.at
+
     save = saving.save
     to_xarray = export.to_xarray
     to_dataframe = export.to_dataframe
@@ -61,3 +66,5 @@ class Solution(Trajectory):
     plot_energy = plotting.plot_energy
     plot_phase = plotting.plot_phase
     plot_constraint = plotting.plot_constraint
+    plot_momenta = plotting.plot_momenta
+    plot_section = plotting.plot_section

@@ -47,6 +47,12 @@ class Trajectory:
     continuation: Any = None
     """(solution, more steps, progress) ↦ the solution of the longer run; None where it is not known how it was run."""
 
+    events: Any = None
+    """What `events=` found, the `Events` of the run; None for a run without."""
+
+    impacts: Any = None
+    """Those of the events that are impacts, which divide steps; None for a run without walls."""
+
     def __init__(
         self,
         *,
@@ -88,7 +94,7 @@ class Trajectory:
         """A copy with other values for some of the constructor's arguments."""
         given = {name: getattr(self, name) for name in GIVEN} | {"params": self._params}
         copy = type(self)(**(given | changes))
-        copy.example = self.example
+        copy.example, copy.events, copy.impacts = self.example, self.events, self.impacts
         return copy
 
     @property
@@ -215,7 +221,7 @@ class Trajectory:
 
     def _ending(self) -> str:
         if self.batch is None:
-            return "ok" if self.ok else str(self.message)
+            return str(self.message) or "ok" if self.ok else str(self.message)
         failed = np.flatnonzero(~np.asarray(self.ok))
         if not len(failed):
             return f"all {counted(self.batch, 'trajectory', 'trajectories')} ok"

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dirax.geometry.structures import DiracStructure
+from dirax.geometry.lagrangian_submanifolds import LagrangianSubmanifold
+from dirax.geometry.structures import DiracStructure, Induced
 from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import BRACKET_DEFECT, RATE_RANK
 from dirax.program.linear_solves import pseudo_inverse, solve
@@ -17,6 +18,7 @@ from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import UserFunction, evaluated
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
+from dirax.systems.hamilton_dirac import HamiltonDirac
 from dirax.systems.implicit_form import energy_of_x, names, point_of
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
@@ -48,6 +50,11 @@ class DiracSystem(AbstractSystem):
             raise TypeError(
                 f"structure must be a dx.DiracStructure, but a {type(structure).__name__} was given: "
                 "use one of its constructors, e.g. dx.DiracStructure.from_bivector(lambda x: …)."
+            )
+        if isinstance(hamiltonian, LagrangianSubmanifold):
+            raise TypeError(
+                "a dx.DiracSystem has a Hamiltonian; with a Lagrangian submanifold in the place of dH it is "
+                "dx.GeneralizedDiracSystem(structure, submanifold)."
             )
         self.structure = structure
         self.hamiltonian = UserFunction(hamiltonian, "hamiltonian", ("x",))
@@ -128,7 +135,16 @@ class DiracSystem(AbstractSystem):
     @property
     def canonical(self) -> bool:
         """Whether D is the canonical symplectic structure of T*Q in (q, p)."""
-        return self.structure.representation == "two_form" and getattr(self.structure.evaluate, "one_forms", 0) is None
+        return isinstance(self.structure.evaluate, Induced) and self.structure.evaluate.one_forms is None
+
+    def phase_space_form(self) -> HamiltonDirac | None:
+        """H(q, p) and the W(q) of a D that `dx.induced_dirac` made; None for others, and with holonomic constraints."""
+        induced = self.structure.evaluate
+        if not isinstance(induced, Induced) or self.holonomic is not None:
+            return None
+        forms, H = induced.one_forms, self.hamiltonian
+        one_forms = None if forms is None else lambda q, params: forms(q, params)
+        return HamiltonDirac(lambda q, p, params: H(jnp.concatenate([q, p]), params), one_forms)
 
     def hamiltonian_vector(
         self, x: Float[Numbers, " N"], covector: Float[Numbers, " N"], params: Any = None

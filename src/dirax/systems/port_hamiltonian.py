@@ -8,6 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from dirax.geometry.linear import LinearDirac
+from dirax.geometry.structures import DiracStructure
+from dirax.geometry.subspaces import PontryaginSubspace
 from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import STRUCTURE_DEFECT, TINY
 from dirax.program.sparse_matrix import SparseMatrix
@@ -16,6 +19,7 @@ from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.systems.constraints import no_constraint
 from dirax.systems.forms import EnergyForm, ImplicitForm, Observed, RelationForm
 from dirax.systems.implicit_form import in_time, names, point_of, uses_time, without_time
+from dirax.systems.port_structures import closed_structure, structure_of
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -140,6 +144,34 @@ class PortHamiltonian(AbstractSystem):
         driven = self.input(t, x, params)
         outputs = self.open_matrix(x, params).T @ gradient
         return driven, outputs, jnp.zeros(()) if self.R is None else _squared(self.R(x, params), gradient)
+
+    def dirac_structure(self, x: Any, params: Any = None) -> LinearDirac | PontryaginSubspace:
+        """The set of all (v, α) at x (N,) that the equations leave: with open ports {v − Bu = Jα for some u} ([BLM] (22)), a
+        coisotropic `dx.PontryaginSubspace`; with all ports closed that with Bᵀα = 0 ([BLM] (23)), a `dx.LinearDirac`; with some
+        closed Bᵀα = 0 of these alone, coisotropic too (Proposition 7.1, whose D^⊥ is the part with Bᵀα = 0).
+
+        Without inputs (ẋ, dH(x)) is in it. Raises `ValueError` with dissipation, and where J is not skew at x.
+        """
+        self._refuse_dissipation()
+        x = jnp.asarray(x, dtype=float)
+        self.sizes({"x": x}, params)
+        return structure_of(self, x, params)
+
+    def closed_dirac_structure(self) -> DiracStructure:
+        """(23) at every x, a `dx.DiracStructure` as `dx.DiracSystem` and `dx.DiscretizationMapDirac` take it: smooth where the
+        rank of the columns of B is constant. Raises `ValueError` with dissipation, and for a system whose ports are not all
+        closed."""
+        self._refuse_dissipation()
+        if self.B is not None and self.closed is not True:
+            raise ValueError("only a system whose ports are all closed has a Dirac structure: state it with closed=True.")
+        return closed_structure(self)
+
+    def _refuse_dissipation(self) -> None:
+        if self.R is not None:
+            raise ValueError(
+                "with dissipation R the pairs (v, α) of a port-Hamiltonian system are no coisotropic set: state it without R, as "
+                "a port of its own whose input is u = −R y."
+            )
 
     def energy_form(self, shape: Shape) -> EnergyForm:
         return EnergyForm(self.hamiltonian, self.differential, self.relation, self.ports)

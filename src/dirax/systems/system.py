@@ -53,7 +53,8 @@ class AbstractSystem(eqx.Module):
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         """The initial data, which hold the time `t` too, with everything a scheme may start from.
 
-        - From x: x and `velocity`, the ẋ there (a first guess of it, where the equations do not determine it).
+        - From x: x and `velocity`, the ẋ there (a first guess of it, where the equations do not determine it); and `guess`, that
+          of the multipliers of the relation form, where it is not zero.
         - From q with v or p, and from q alone where the system determines the rest: q, v, p; and x, `velocity` too where the
           system has a relation form.
         - From q0, q1: these two.
@@ -95,6 +96,11 @@ class AbstractSystem(eqx.Module):
         """The same system as a Hamiltonian on T*Q with constraints on velocities, a `dx.HamiltonDirac`; None where there is
         none."""
         return None
+
+    def phase_space_form(self) -> Any:
+        """The same system in x = (q, p) as a `dx.HamiltonDirac`, whose one-forms need not be counted among the constraints of
+        this one; its `hamiltonian_form` by default."""
+        return self.hamiltonian_form()
 
     def quotient_form(self) -> Any:
         """The same system as one on the quotient by its symmetry, a `dx.ReducedLagrangeDirac`; None where it is none."""

@@ -13,7 +13,7 @@ from dirax.diagnostics.bench.casadi_c import casadi_c
 from dirax.diagnostics.bench.ode import ExplicitODE, explicit_ode
 from dirax.diagnostics.bench.subject import Program, Skipped, Subject
 from dirax.diagnostics.bench.timing import interleaved, machine, summary
-from dirax.solution.plotting import new_figure
+from dirax.solution.style import new_figure
 from dirax.text.tables import html_table, number, plain, text_table
 
 NATIVE = "native"

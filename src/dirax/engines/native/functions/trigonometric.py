@@ -97,7 +97,7 @@ def tangent(e: Emitter, r: Reduced) -> str:
 
 def together(e: Emitter, wanted: Sequence[Collection[str]], values: Sequence[str]) -> list[dict[str, str]]:
     """By name, the functions wanted of each of the values; in scalar code the values share vectors."""
-    packed, group = list(values), Emitter(e.body, _group_width(len(values))) if e.width == 1 else e
+    packed, group = list(values), Emitter(e.body, _group_width(len(values))) if e.width == 1 and e.body.module.groups else e
     if group.width > e.width:
         padded = packed + packed[:1] * (-len(packed) % group.width)
         packed = [group.pack(padded[i : i + group.width]) for i in range(0, len(padded), group.width)]

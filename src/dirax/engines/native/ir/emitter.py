@@ -6,10 +6,13 @@ from contextlib import contextmanager
 
 
 class Module:
-    """A module under construction: its functions and the intrinsics that they declare."""
+    """A module under construction: its functions and the intrinsics that they declare.
 
-    def __init__(self, fma: bool):
-        self.fma = fma
+    `groups`: whether functions of several scalars may be found side by side in a vector, which changes no bit.
+    """
+
+    def __init__(self, fma: bool, groups: bool = True):
+        self.fma, self.groups = fma, groups
         self.functions: list[str] = []
         self.globals: list[str] = []
         self.declared: set[str] = set()

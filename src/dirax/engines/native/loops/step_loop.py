@@ -17,9 +17,9 @@ NUMBERS = "double %t0, double %h, i64 %offset, i64 %first, i64 %stop, i64 %every
 """Steps `first` to `stop` − 1 of the run, whose own first state is step number `offset`; a row every `every` steps."""
 
 
-def kernel_module(plan: Plan, width: int, fma: bool) -> str:
-    """IR of `run(lanes, params, outs, blocks, …)`: the kernel for consecutive blocks of `width` lanes."""
-    module = Module(fma)
+def kernel_module(plan: Plan, width: int, fma: bool, groups: bool = True) -> str:
+    """IR of `run(lanes, params, outs, blocks, …)`: the kernel for blocks of `width` lanes; `groups` as of `Module`."""
+    module = Module(fma, groups)
     add_far_reduction(module)
     add_dense_solve(module)
     _define_block(plan, module, width)

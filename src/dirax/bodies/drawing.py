@@ -1,0 +1,77 @@
+"""The scene of a machine for reports: bodies, wheels, balls, springs and the ground, from the model alone."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.bodies.contacts import Ellipsoid, Round
+from dirax.bodies.forces import Spring
+from dirax.bodies.frames import scalar, turn_matrix, unit, vector
+from dirax.show.scene import Part, Scene, ball, disk, plane, point, rod, spring
+
+
+def scene_of(model: Any, view: str = "oblique", trail: str = "") -> Scene:
+    """Rods from where a body hangs to its mass centre and to the bodies that hang on it; `trail` names a body whose mass centre
+    leaves one."""
+    parts: list[Part] = [plane()] if model.contacts else []
+    drawn = {contact.body for contact in model.contacts if _is_round(contact.shape)}
+    for contact in model.contacts:
+        parts += _contact(model, contact)
+    for body in model.bodies:
+        centre = _place(model, body.name, body.centre)
+        if body.name not in drawn or np.any(np.asarray(body.centre) != 0):
+            parts.append(point(centre, trail=body.name == trail))
+        if np.any(np.asarray(body.centre) != 0):
+            parts.append(rod(_place(model, body.name, (0.0, 0.0, 0.0)), centre))
+    for joint in model.joints:
+        if joint.parent != "ground" and np.any(np.asarray(joint.at) != 0):
+            parts.append(rod(_place(model, joint.parent, (0.0, 0.0, 0.0)), _place(model, joint.parent, joint.at)))
+        if np.any(np.asarray(joint.on) != 0):
+            parts.append(rod(_place(model, joint.body, (0.0, 0.0, 0.0)), _place(model, joint.body, joint.on)))
+    for force in model.forces:
+        if isinstance(force, Spring) and force.between is not None:
+            first, second = force.between
+            parts.append(spring(_place(model, *first), _place(model, *second)))
+    return Scene(tuple(parts), view=view)
+
+
+def _is_round(shape: Any) -> bool:
+    return isinstance(shape, Ellipsoid) or shape.radius != 0 or shape.tube != 0
+
+
+def _contact(model: Any, contact: Any) -> list[Part]:
+    if not _is_round(contact.shape):
+        return []
+    centre, number = _place(model, contact.body, contact.centre), lambda x: float(scalar(x, model.parameters))
+    turn = _turn(model, contact.body)
+    if isinstance(contact.shape, Ellipsoid):
+        return [ball(centre, turn, radius=float(np.mean(np.asarray(vector(contact.shape.semi_axes, model.parameters)))))]
+    shape: Round = contact.shape
+    if isinstance(shape.radius, float | int) and shape.radius == 0:
+        return [ball(centre, turn, radius=number(shape.tube))]
+    upright = _from_z(unit(shape.axis))
+    thick = 2 * number(shape.tube) or None
+    return [disk(centre, lambda q, params: turn(q, params) @ upright, number(shape.radius) + number(shape.tube), thick)]
+
+
+def _frame(model: Any, body: str, q: Any, params: Any) -> Any:
+    return model.frames(q, jnp.zeros_like(q), params or None)[body]
+
+
+def _place(model: Any, body: str, x: Any) -> Callable:
+    return lambda q, params: _frame(model, body, q, params).point(vector(x, params))
+
+
+def _turn(model: Any, body: str) -> Callable:
+    return lambda q, params: _frame(model, body, q, params).turn
+
+
+def _from_z(axis: np.ndarray) -> np.ndarray:
+    """A rotation that takes z to the axis."""
+    z = np.array([0.0, 0.0, 1.0])
+    across = np.cross(z, axis)
+    if np.linalg.norm(across) < 1e-12:
+        return np.eye(3) if axis[2] > 0 else np.diag([1.0, -1.0, -1.0])
+    return np.asarray(turn_matrix(unit(across), jnp.arccos(axis[2])))

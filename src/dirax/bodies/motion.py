@@ -1,0 +1,104 @@
+"""Motions: the elementary ways in which a joint moves a frame, each with its own coordinates."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import jax.numpy as jnp
+
+from dirax.bodies.frames import Frame, Vector, cross, quaternion_matrix, quaternion_spin, turn_matrix, unit, vector
+from dirax.program.tracing import along, gradient
+
+
+@dataclass(frozen=True)
+class Shift:
+    """By a vector (3,) of the frame, once and for all."""
+
+    by: Vector
+    names: tuple[str, ...] = ()
+
+    def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
+        """The frame moved, for the coordinates q and their rates v."""
+        by = vector(self.by, params)
+        return frame._replace(at=frame.point(by), velocity=frame.velocity_of(by))
+
+
+@dataclass(frozen=True)
+class TurnBy:
+    """By a fixed angle (rad) about an axis (3,), once and for all."""
+
+    axis: Vector
+    angle: float
+    names: tuple[str, ...] = ()
+
+    def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
+        """The frame moved, for the coordinates q and their rates v."""
+        return frame._replace(turn=frame.turn @ turn_matrix(unit(self.axis), jnp.asarray(self.angle)))
+
+
+@dataclass(frozen=True)
+class Slide:
+    """Along an axis (3,) of the frame, by a length that is the coordinate."""
+
+    axis: Vector
+    names: tuple[str, ...]
+
+    def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
+        """The frame moved, for the coordinates q and their rates v."""
+        axis = frame.turn @ unit(self.axis)
+        by = axis * q[0]
+        return frame._replace(at=frame.at + by, velocity=frame.velocity + cross(frame.spin, by) + axis * v[0])
+
+
+@dataclass(frozen=True)
+class Turn:
+    """About an axis (3,) of the frame, by an angle (rad) that is the coordinate."""
+
+    axis: Vector
+    names: tuple[str, ...]
+
+    def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
+        """The frame moved, for the coordinates q and their rates v."""
+        axis = unit(self.axis)
+        return frame._replace(turn=frame.turn @ turn_matrix(axis, q[0]), spin=frame.spin + (frame.turn @ axis) * v[0])
+
+
+@dataclass(frozen=True)
+class Quaternion:
+    """By a unit quaternion (w, x, y, z), whose four numbers are coordinates, with |Q| = 1 as a holonomic constraint."""
+
+    names: tuple[str, ...]
+
+    def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
+        """The frame moved, for the coordinates q and their rates v."""
+        spin = frame.spin + frame.turn @ quaternion_spin(q, v)
+        return frame._replace(turn=frame.turn @ quaternion_matrix(q), spin=spin)
+
+
+@dataclass(frozen=True)
+class Glide:
+    """Over the surface z = height(x, y) of the frame, at a distance from it along its normal; x and y of the point below are
+    the coordinates. The frame does not turn."""
+
+    height: Callable
+    distance: float
+    names: tuple[str, ...]
+
+    def below(self, q: Any) -> Any:
+        """The point of the surface (3,)."""
+        return jnp.stack([q[0], q[1], self.height(q[0], q[1])])
+
+    def normal(self, q: Any) -> Any:
+        """The unit normal there, upwards (3,)."""
+        slope = gradient(lambda xy: self.height(xy[0], xy[1]))(jnp.stack([q[0], q[1]]))
+        return jnp.stack([-slope[0], -slope[1], jnp.ones(())]) / jnp.sqrt(1.0 + slope @ slope)
+
+    def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
+        """The frame moved, for the coordinates q and their rates v."""
+        place = lambda q: self.below(q) + self.distance * self.normal(q)
+        by = frame.turn @ place(q)
+        rate = frame.turn @ along(place, (q,), (v,))
+        return frame._replace(at=frame.at + by, velocity=frame.velocity + cross(frame.spin, by) + rate)
+
+
+Motion: TypeAlias = Shift | TurnBy | Slide | Turn | Quaternion | Glide

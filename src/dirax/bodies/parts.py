@@ -1,0 +1,50 @@
+"""Body: what moves, with its mass and its inertia."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.bodies.frames import Frame, Number, Vector, scalar, vector
+
+Inertia: TypeAlias = Sequence[Number] | Sequence[Sequence[Number]] | np.ndarray
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body.
+
+    - `mass`; `centre` (3,), the mass centre in the body's frame, its origin by default;
+    - `inertia` about the mass centre, in the axes of the body's frame: three principal moments, or the matrix (3, 3).
+
+    The body's frame is where its joint puts it. Units are the user's.
+    """
+
+    name: str
+    mass: Number = 0.0
+    inertia: Inertia = (0.0, 0.0, 0.0)
+    centre: Vector = (0.0, 0.0, 0.0)
+
+    def inertia_matrix(self, params: Any) -> Any:
+        """(3, 3)."""
+        if np.ndim(self.inertia) == 1:
+            return vector(self.inertia, params) * np.eye(3)  # type: ignore[arg-type]
+        rows = [vector(row, params) for row in self.inertia]  # type: ignore[arg-type]
+        return np.stack(rows) if all(isinstance(row, np.ndarray) for row in rows) else jnp.stack(rows)
+
+    def kinetic_energy(self, frame: Frame, params: Any) -> Any:
+        """m |ċ|²/2 + ω·I ω/2."""
+        u, spin = frame.velocity_of(vector(self.centre, params)), frame.turn.T @ frame.spin
+        return scalar(self.mass, params) * (u @ u) / 2 + spin @ (self.inertia_matrix(params) @ spin) / 2
+
+    def momentum(self, frame: Frame, params: Any) -> Any:
+        """m ċ (3,)."""
+        return scalar(self.mass, params) * frame.velocity_of(vector(self.centre, params))
+
+    def angular_momentum(self, frame: Frame, about: Any, params: Any) -> Any:
+        """(c − about) × m ċ + R I Rᵀ ω (3,)."""
+        arm = frame.point(vector(self.centre, params)) - about
+        own = frame.turn @ (self.inertia_matrix(params) @ (frame.turn.T @ frame.spin))
+        return jnp.cross(arm, self.momentum(frame, params)) + own

@@ -1,0 +1,141 @@
+"""linearize(): the linear equations of small motions about a relative equilibrium, of a system or of a scheme."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dirax.diagnostics.linearized_field import FieldAt, linearized_chain, linearized_lagrangian
+from dirax.diagnostics.linearized_step import StepAt, linearized_step
+from dirax.schemes.step import AbstractScheme
+from dirax.systems.system import AbstractSystem
+
+AT_REST = 1e-7
+"""Size of the acceleration in the moving frame, relative to its terms, that an equilibrium may have."""
+
+TANGENT = 1e-6
+"""How far the linearized equations may lead out of a space that they keep, relative to their size."""
+
+RANK = 1e-9
+"""Singular values, relative to the largest one, that count as zero."""
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """ẏ = A y, or y_{k+1} = M y_k: small motions on the constraints, modulo the given symmetries.
+
+    - `matrix` (d, d): A of the system, M of a scheme; `basis` (N, d): the directions y in the coordinates of the state, (q, v)
+      or x, and of a scheme its own;
+    - `eigenvalues` (d,): of A, or log(μ)/h for the eigenvalues μ of M, by real part, largest first; `multipliers`: μ, None of A;
+    - `residual`: how far the place is from a relative equilibrium, relative to the terms of the equations.
+    """
+
+    matrix: np.ndarray
+    basis: np.ndarray = field(repr=False)
+    residual: float
+    step: float | None = None
+
+    @property
+    def multipliers(self) -> np.ndarray | None:
+        """The eigenvalues of a step; None of a continuous system."""
+        return None if self.step is None else _sorted(np.linalg.eigvals(self.matrix))
+
+    @property
+    def eigenvalues(self) -> np.ndarray:
+        """Rates of growth with frequencies, complex numbers per unit of time."""
+        values = np.linalg.eigvals(self.matrix)
+        return _sorted(values if self.step is None else np.log(values.astype(complex)) / self.step)
+
+    @property
+    def modes(self) -> np.ndarray:
+        """The eigenvectors (N, d), in the coordinates of the state and in the order of `eigenvalues`."""
+        values, vectors = np.linalg.eig(self.matrix)
+        rates = values if self.step is None else np.log(values.astype(complex)) / self.step
+        return (self.basis @ vectors)[:, _order(rates)]
+
+    @property
+    def stable(self) -> bool:
+        """Whether no small motion grows, up to roundoff of multiple eigenvalues (1e-6)."""
+        return bool(self.eigenvalues[0].real <= 1e-6 * (1.0 + np.abs(self.eigenvalues).max())) if len(self.matrix) else True
+
+
+def _order(values: Any) -> np.ndarray:
+    return np.lexsort((-values.imag, -np.round(values.real, 9)))
+
+
+def _sorted(values: np.ndarray) -> np.ndarray:
+    return values[_order(values)]
+
+
+def linearize(
+    system: AbstractSystem,
+    at: Mapping[str, Any],
+    scheme: AbstractScheme | None = None,
+    *,
+    step: float | None = None,
+    symmetries: Any = (),
+    params: Any = None,
+) -> Linearization:
+    """The linearization of a system at an equilibrium or a relative equilibrium, on its constraints.
+
+    - `at`: the place, {"q": …, "v": …} of a system with a Lagrangian, {"x": …} of another one, the time as "t".
+    - `scheme` and `step`: the linearization of this scheme's step instead.
+    - `symmetries`: infinitesimal generators ξ(q) -> (n,), in a list or by name. A relative equilibrium moves along a combination
+      of them; the linear equations are those in the frame that moves with it, on the quotient by all of them. Without any, it
+      may move with a constant velocity along which the equations do not change, and nothing is divided out.
+
+    The equations are Ẋ = X − ξ with the vector field X of the system, restricted to the tangent space of the final manifold
+    {W v = 0, g = 0, G v = 0}: for nonholonomic systems the constraint forces depend on the place, and are differentiated too.
+
+        dx.linearize(bicycle.MODEL.system, bicycle.straight(5.0), symmetries=bicycle.SYMMETRIES).eigenvalues
+
+    Raises `ValueError` at a place that is no relative equilibrium, and for generators that are no symmetries; `TypeError` for
+    systems without a Lagrangian where symmetries or a scheme are given.
+    """
+    generators = list(symmetries.values()) if isinstance(symmetries, Mapping) else list(symmetries)
+    if (scheme is None) != (step is None):
+        raise ValueError("a scheme is linearized with its step: give scheme= and step= together, or neither.")
+    if system.lagrangian_form() is None:
+        if scheme is not None or generators:
+            raise TypeError(
+                f"schemes and symmetries are linearized of systems with a Lagrangian, but this is a {type(system).__name__}."
+            )
+        return _reduced(linearized_chain(system, at, params), None)
+    found = linearized_lagrangian(system.lagrangian_form(), at, generators, params)
+    if scheme is None:
+        return _reduced(found, None)
+    _reduced(found, None)  # the premises are those of the system
+    return _reduced(linearized_step(system, scheme, step, at, found, params), step)
+
+
+def _reduced(found: FieldAt | StepAt, step: float | None) -> Linearization:
+    if not found.residual <= AT_REST:
+        raise ValueError(
+            f"the place is no relative equilibrium: in the frame that moves with it the equations leave {found.residual:.3g} of "
+            "their terms. Give initial data that stay as they are, or the symmetries= along which they move."
+        )
+    tangent = _orthonormal(found.tangent)
+    size = np.abs(found.matrix).max(initial=1.0)
+    for name, space in (("the constraints", tangent), ("the symmetries", _orthonormal(found.symmetric))):
+        image = found.matrix @ space
+        outside = np.abs(image - space @ (space.T @ image)).max(initial=0.0)
+        if outside > TANGENT * size:
+            way = "the generators must be symmetries of the system" if name == "the symmetries" else "report this"
+            raise ValueError(f"the linear equations lead out of {name} by {outside:.3g}: {way}.")
+    across = tangent - _project(found.symmetric, tangent)
+    basis = _orthonormal(across)
+    return Linearization(basis.T @ found.matrix @ basis, basis, float(found.residual), step)
+
+
+def _project(space: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    basis = _orthonormal(space)
+    return basis @ (basis.T @ vectors)
+
+
+def _orthonormal(vectors: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of the span of the columns, without any where all of them are roundoff of unit vectors."""
+    if not vectors.size:
+        return vectors.reshape(len(vectors), -1)[:, :0]
+    u, values, _ = np.linalg.svd(vectors, full_matrices=False)
+    return u[:, values > RANK * (values[0] if values[0] > RANK else 1.0)]

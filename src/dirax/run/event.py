@@ -1,0 +1,107 @@
+"""Event: a function of the motion whose zeros are looked for along a run."""
+
+import inspect
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+from dirax.text.representation import value_text
+
+KNOWN = ("t", "q", "v", "p", "x", "params")
+"""What a function of an event may be given, by the names of its arguments."""
+
+TRACED = (
+    "events= are not looked for under jax.grad, jit and vmap, where how many there are cannot depend on values: run without "
+    "them, and use sol.at(t)."
+)
+
+
+class Event:
+    """Where a function of the motion goes through zero: `dx.simulate(…, events=[dx.Event(function)])`.
+
+    `function` returns one number of what the names of its arguments say: the time `t`, `q`, `v`, `p` or `x` at that time, and
+    `params`. `direction`: +1 for zeros through which it rises, −1 for those through which it falls, 0 for both. With `terminal`
+    the trajectory ends at the first of them.
+
+        section = dx.Event(lambda q, v: q[0], direction=+1)
+
+    Zeros are found inside the steps, on what `sol.at` is there, to a float's precision of the step. The function is looked at in
+    rows, at points between them, and at more where it comes near to zero. What is found is each change of sign: a function that
+    touches zero and goes back, and one that dips below it for less than 10⁻⁴ of a step, may count as two zeros or as none. At the
+    first row nothing is found, if the function is zero there.
+    Raises `TypeError` for something that is no function of such arguments, `ValueError` for another direction.
+    """
+
+    def __init__(self, function: Callable, direction: int = 0, terminal: bool = False):
+        if isinstance(direction, bool) or direction not in (-1, 0, 1):
+            raise ValueError(f"direction must be +1 (rising), −1 (falling) or 0 (both), but {direction!r} was given.")
+        self.function, self.direction, self.terminal = function, int(direction), bool(terminal)
+        self.arguments = names_of(function, "the function of an event")
+
+    def __call__(self, known: dict[str, Any]) -> Any:
+        """The function of what is known of one moment, by name."""
+        return self.function(**{name: known[name] for name in self.arguments})
+
+    def __repr__(self) -> str:
+        own = getattr(self.function, "__name__", type(self.function).__name__).replace("<lambda>", "lambda")
+        settings = f", direction={self.direction:+d}" * bool(self.direction) + ", terminal=True" * self.terminal
+        return f"Event({own}({', '.join(self.arguments)}){settings})"
+
+
+def names_of(function: Any, what: str, known: tuple[str, ...] = KNOWN) -> tuple[str, ...]:
+    """The arguments of a user's function that is given things by their names. Raises `TypeError`."""
+    expected = f"{what} takes some of {', '.join(known)} by their names, like lambda q: q[0]"
+    if not callable(function):
+        raise TypeError(f"{expected}, but {value_text(function)} was given.")
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        raise TypeError(f"{expected}, but the signature of {value_text(function)} is not known: wrap it in a lambda.") from None
+    needed = [p for p in parameters if p.name in known or p.default is p.empty]
+    wrong = [p.name for p in needed if p.name not in known or p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD, p.POSITIONAL_ONLY)]
+    if wrong or not needed:
+        raise TypeError(f"{expected}, but it takes {', '.join(wrong) or 'no argument'}.")
+    return tuple(p.name for p in needed)
+
+
+def checked_events(events: Any, kinds: tuple[type, ...]) -> tuple[Any, ...]:
+    """The events of a run, each of one of these kinds. Raises `TypeError`."""
+    if isinstance(events, kinds):
+        events = [events]
+    if not isinstance(events, Sequence) or isinstance(events, str):
+        raise TypeError(f"events must be a list of dx.Event(function, …) and dx.Impact(gap), but {value_text(events)} was given.")
+    for event in events:
+        if not isinstance(event, kinds):
+            hint = ": write dx.Event(function)" if callable(event) else ""
+            raise TypeError(
+                f"events must be a list of dx.Event(function, …) and dx.Impact(gap), but it holds {value_text(event)}{hint}."
+            )
+    return tuple(events)
+
+
+def refuse_unknown(event: Event, number: int, fields: Collection[str]) -> None:
+    """Raise `TypeError` for an event that asks for what no row says, of which the fields are these."""
+    names = ["t", *(name for name in ("q", "p", "x") if name in fields), *["v"] * ({"q", "p"} <= set(fields)), "params"]
+    missing = [name for name in event.arguments if name not in names]
+    if missing:
+        raise TypeError(
+            f"events[{number}] asks for {', '.join(missing)}, but a run of this system and scheme knows {', '.join(names)}."
+        )
+
+
+def evaluated(event: Event, number: int, known: dict[str, Any], params: Any) -> Any:
+    """The function of an event of what is known of one moment. Raises `TypeError` and `ValueError` for one that cannot be traced,
+    or that returns no number."""
+    try:
+        found = event({**known, "params": params})
+    except Exception as error:
+        raise TypeError(
+            f"events[{number}] could not be traced by JAX: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+        ) from error
+    if not hasattr(found, "shape") or found.shape != ():
+        came = f"shape {found.shape}: index or sum its result" if hasattr(found, "shape") else type(found).__name__
+        raise ValueError(f"the function of events[{number}] must return one number, but it returned {came}.")
+    if not jnp.issubdtype(found.dtype, jnp.floating):
+        raise TypeError(f"the function of events[{number}] must return a real number (float64), but its dtype is {found.dtype}.")
+    return found

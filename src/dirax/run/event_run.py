@@ -1,0 +1,168 @@
+"""A run with events: carried out in stretches of which every row is kept, and looked through."""
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from dirax.program.user_functions import is_traced
+from dirax.run.event import TRACED, Event
+from dirax.run.event_search import EventSearch
+from dirax.run.impact import Impact
+from dirax.run.impact_run import fly_all
+from dirax.solution.dense import Dense
+from dirax.solution.events import Events, joined
+from dirax.solution.solution import Solution
+
+FIRST_STRETCH = 256
+"""Steps of the first stretch of a run that may end at an event; every other one is as long as all before it."""
+
+
+def with_events(run: Any, events: tuple[Any, ...], steps: int, save_every: int, progress: Any, traced: bool) -> Solution:
+    """The Solution of a run with its events; `run(steps)` is that of so many steps with every row, with its impacts.
+
+    Raises `ValueError` under JAX's transformations and for functions that are not finite, `TypeError` for those that return no
+    number.
+    """
+    if traced:
+        raise ValueError(TRACED)
+    watch = any(event.terminal for event in events) and not any(isinstance(event, Impact) for event in events)
+    sol = run(min(steps, FIRST_STRETCH) if watch else steps)
+    if is_traced(sol.t, sol.fields):
+        raise ValueError(TRACED)
+    searched = Searched(sol, events)
+    searched.go_on(sol)
+    while watch and not searched.over and int(sol.stats["steps"]) < steps:
+        done = int(sol.stats["steps"])
+        sol = sol.extend(min(done, steps - done), progress)
+        searched.go_on(sol)
+    return searched.solution(save_every, steps)
+
+
+class Searched:
+    """A run as far as it has been looked through."""
+
+    def __init__(self, sol: Solution, events: tuple[Any, ...]):
+        self.events, self.sol, self.done, self.seconds = events, sol, 0, 0.0
+        self.found: Events | None = None
+        self.endings = np.full(sol.batch or 1, np.inf)
+        """When a terminal event ends each trajectory."""
+
+    @property
+    def over(self) -> bool:
+        """Whether no trajectory goes on: each has met a terminal event, or has failed."""
+        return bool(np.all(np.isfinite(self.endings) | ~np.atleast_1d(self.sol.ok)))
+
+    def go_on(self, sol: Solution) -> None:
+        """Look through the steps that a longer run has more."""
+        began, self.sol = time.perf_counter(), sol
+        own = [(i, event) for i, event in enumerate(self.events) if isinstance(event, Event)]
+        parts = [self.found] if self.found is not None else []
+        if sol.impacts is not None:
+            parts = [sol.impacts]
+        if sol.rows > 1 and own:
+            dense = Dense(sol)
+            last = int(dense.ends.max())
+            parts += [EventSearch(dense, event, i).found(self.done, last) for i, event in own]
+            self.done = last
+        if parts:
+            self.found = joined(parts)
+            for i, event in own:
+                if event.terminal:
+                    ends = self.found.of(i)
+                    np.minimum.at(self.endings, ends.lane, ends.t)
+            self.found = self.found[self.found.t <= self.endings[self.found.lane]]
+        self.seconds += time.perf_counter() - began
+
+    def solution(self, save_every: int, steps: int) -> Solution:
+        """The Solution of the run with the rows that are to be kept, and its events."""
+        sol, ended = self.sol, np.isfinite(self.endings)
+        kept = thinned(ended_at(sol, self.endings), save_every)
+        kept.stats = sol.stats | {"events_seconds": self.seconds}
+        kept.events = self.found
+        if np.any(ended):
+            own = [self._ending(lane) if ended[lane] else "" for lane in range(len(ended))]
+            if sol.batch is None:
+                kept.message = own[0]
+            else:
+                kept.message = [one or other for one, other in zip(own, sol.message or [""] * len(own), strict=True)]
+                kept.ok = np.where(ended, True, sol.ok)
+            kept.ok = True if sol.batch is None else kept.ok
+        kept.example = sol.example
+        if sol.continuation is not None:
+            kept.continuation = LongerWithEvents(self, save_every, steps)
+        return kept
+
+    def _ending(self, lane: int) -> str:
+        assert self.found is not None
+        own = self.found[self.found.lane == lane]
+        number = int(own.index[own.t == self.endings[lane]][-1])
+        return f"ended at t = {self.endings[lane]:.6g} by events[{number}], {self.events[number]!r}"
+
+
+@dataclass(frozen=True)
+class LongerWithEvents:
+    """`sol.extend` of a run with events: every row of it is known here."""
+
+    searched: Searched
+    save_every: int
+    steps: int
+
+    def __call__(self, sol: Solution, more: int, progress: Any) -> Solution:
+        """The solution of the run of so many more steps. One that an event has ended stays as it is."""
+        before = self.searched
+        if before.over:
+            return sol
+        after = Searched(before.sol, before.events)
+        after.done, after.found, after.endings = before.done, before.found, before.endings.copy()
+        after.go_on(before.sol.extend(self.steps - int(before.sol.stats["steps"]) + more, progress))
+        longer = after.solution(self.save_every, self.steps + more)
+        longer.metadata, longer.example = sol.metadata, sol.example
+        return longer
+
+
+def ended_at(sol: Solution, endings: np.ndarray) -> Solution:
+    """The solution without the rows after these times (B,): one trajectory ends before it, in a batch they are NaN."""
+    if not np.any(np.isfinite(endings)):
+        return sol
+    t = np.asarray(sol.t)
+    if sol.batch is None:
+        return sol[: int(np.searchsorted(t, endings[0], side="right"))]
+    fields = {}
+    for name, values in sol.fields.items():
+        rows = t if sol.field_info[name].place == "node" else t[1:]
+        after = rows[None, :] > endings[:, None]
+        fields[name] = np.where(after.reshape(*after.shape, *(1,) * (values.ndim - 2)), np.nan, values)
+    return sol.replace(fields=fields)
+
+
+def thinned(sol: Solution, every: int) -> Solution:
+    """The solution with every so many of its rows, and the last one."""
+    if every == 1 or sol.rows < 2:
+        return sol.replace()
+    first = int("q0" in sol.initial)
+    rows = np.unique([*range(first), *range(first, sol.rows, every), sol.rows - 1])
+    lead = (slice(None),) * (sol.batch is not None)
+    pick = lambda name, a: a[(*lead, rows if sol.field_info[name].place == "node" else rows[:-1])]
+    fields = {name: pick(name, np.asarray(a)) for name, a in sol.fields.items()}
+    return sol.replace(t=np.asarray(sol.t)[rows], fields=fields, save_every=every, derived={})
+
+
+def run_with_events(
+    carry_out: Any, begin: Any, settings: Any, case: Any, steps: int, save_every: int, progress: Any, kind: Any, entered: float
+) -> Solution:
+    """A run whose settings have events."""
+    plain = replace(settings, events=())
+    walls = [i for i, event in enumerate(settings.events) if isinstance(event, Impact)]
+
+    def run(count: int) -> Solution:
+        if not walls:
+            return carry_out(plain, case, count, 1, progress, kind, entered)
+        begun = begin(plain, case, count, 1, 1)
+        if begun.traced:
+            raise ValueError(TRACED)
+        return fly_all(plain, begun, tuple(settings.events[i] for i in walls), tuple(walls))
+
+    every = min(save_every, max(1, steps - int(case.two_points)))
+    return with_events(run, settings.events, steps, every, progress, case.traced or is_traced(case.data, case.params))

@@ -1,0 +1,172 @@
+"""Where the functions of events change their sign along a run, inside the steps."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dirax.numerics.brackets import bracketed_roots
+from dirax.program.memo import Same
+from dirax.run.event import Event, evaluated, refuse_unknown
+from dirax.solution.dense import Dense
+from dirax.solution.events import Events, joined
+
+FEWEST_POINTS = 4
+"""Points of a step at which a function is looked at, its beginning among them."""
+
+BLOCK = 2**16
+"""Points that are looked at together."""
+
+FINER, LEVELS = 8, 4
+"""Around a place where a function comes near to zero, the points are as many times closer, again and again."""
+
+
+class Brackets(NamedTuple):
+    """Places between which a function changes its sign: base + a and base + b, in steps, and its values there."""
+
+    lanes: np.ndarray
+    base: np.ndarray
+    a: np.ndarray
+    b: np.ndarray
+    fa: np.ndarray
+    fb: np.ndarray
+
+
+class EventSearch:
+    """Looks for one event in the steps of a run, of which every row was saved."""
+
+    def __init__(self, dense: Dense, event: Event, number: int):
+        self.dense, self.event, self.number = dense, event, number
+        refuse_unknown(event, number, dense.nodes)
+        tableau = getattr(getattr(dense.equation.stages[0][0], "collocation", None), "tableau", None)
+        self.points = max(FEWEST_POINTS, 0 if tableau is None else tableau.stages + 1)
+
+    def value(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """The function at base + x, in steps. Raises `ValueError` where it is not finite."""
+        numbers, theta = self._place(lanes, base, x)
+        return self._of(lanes, self.dense.inside(lanes, numbers, theta), self.dense.time_at(numbers, theta))
+
+    def _place(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The number of the step in which base + x lies, and where in it; the end of the last step belongs to that step."""
+        whole, last = np.floor(x), self.dense.ends[lanes] - 1
+        numbers = base + whole.astype(np.int64)
+        return np.minimum(numbers, last), np.where(numbers > last, 1.0, x - whole)
+
+    def at_rows(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """The function at saved rows."""
+        fields = {name: self.dense.saved[name][lanes, numbers] for name in self.dense.nodes}
+        if "v" in self.event.arguments:
+            fields["v"] = self.dense.velocities[lanes, numbers]
+        return self._of(lanes, fields, self.dense.time_at(numbers, np.zeros(len(numbers))))
+
+    def _of(self, lanes: np.ndarray, fields: dict[str, np.ndarray], t: np.ndarray) -> np.ndarray:
+        event, dense, number = self.event, self.dense, self.number
+        if "v" in event.arguments and "v" not in fields:
+            fields = fields | {"v": dense.velocity(lanes, fields, t)}
+        known = {name: fields[name] for name in event.arguments if name in fields} | {"t": t}
+        one = lambda known, params: evaluated(event, number, known, params)
+        return self._finite(dense.entries(one, lanes, known, "event", Same(event)), t)
+
+    def _finite(self, values: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """The values. Raises `ValueError` where one is not finite."""
+        bad = ~np.isfinite(values)
+        if np.any(bad):
+            raise ValueError(
+                f"the function of events[{self.number}] must be finite along the run, but it is {values[bad][0]} at "
+                f"t = {t[bad][0]:.6g}."
+            )
+        return values
+
+    def found(self, first: int, last: int) -> Events:
+        """The events in the steps from number `first` to before `last`."""
+        size = max(1, BLOCK // (self.points * len(self.dense.ends)))
+        parts = [self._located(self._brackets(at, min(at + size, last))) for at in range(first, last, size)]
+        return joined(parts or [self._located(_none())])
+
+    def _brackets(self, first: int, last: int) -> Brackets:
+        """The changes of sign in the steps from number `first` to before `last`, and their surroundings where the function comes
+        near to zero."""
+        lanes, numbers = np.nonzero(np.arange(first, last)[None] < self.dense.ends[:, None])
+        if not len(lanes):
+            return _none()
+        numbers = numbers + first
+        values = self._at_points(lanes, numbers)
+        x = np.arange(self.points + 1) / self.points
+        some, at = np.nonzero(_changes(values[:, :-1], values[:, 1:]))
+        found = [Brackets(lanes[some], numbers[some], x[at], x[at + 1], values[some, at], values[some, at + 1])]
+        # dips between points: inside the step, and around its beginning with the last point of the step before
+        some, at = np.nonzero(dips(values[:, :-2], values[:, 1:-1], values[:, 2:]))
+        found.append(self._dipped(lanes[some], numbers[some], x[at], x[at + 2]))
+        follows = np.flatnonzero((numbers[1:] == numbers[:-1] + 1) & (lanes[1:] == lanes[:-1])) + 1
+        around = follows[dips(values[follows - 1, -2], values[follows, 0], values[follows, 1])]
+        step = np.full(len(around), 1 / self.points)
+        found.append(self._dipped(lanes[around], numbers[around], -step, step))
+        if first > 0:  # around the first row of the block
+            starts = np.flatnonzero(numbers == first)
+            before = self._at_points(lanes[starts], numbers[starts] - 1)[:, -2]
+            starts = starts[dips(before, values[starts, 0], values[starts, 1])]
+            step = np.full(len(starts), 1 / self.points)
+            found.append(self._dipped(lanes[starts], numbers[starts], -step, step))
+        return Brackets(*map(np.concatenate, zip(*found, strict=True)))
+
+    def _at_points(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """The function at the points of these steps, both ends among them, (entries, points + 1)."""
+        values, inner = np.empty((len(lanes), self.points + 1)), np.arange(1, self.points) / self.points
+        repeated = lambda a: np.repeat(a, len(inner))
+        values[:, 0] = self.at_rows(lanes, numbers)
+        values[:, 1:-1] = self.value(repeated(lanes), repeated(numbers), np.tile(inner, len(lanes))).reshape(len(lanes), -1)
+        values[:, -1] = self.at_rows(lanes, numbers + 1)
+        return values
+
+    def _dipped(self, lanes: np.ndarray, base: np.ndarray, low: np.ndarray, high: np.ndarray) -> Brackets:
+        """The changes of sign between two places around the one where the function is nearest to zero."""
+        found, parts = [], np.arange(2 * FINER + 1) / (2 * FINER)
+        for _ in range(LEVELS):
+            if not len(lanes):
+                break
+            x = low[:, None] + (high - low)[:, None] * parts
+            count = x.shape[1]
+            values = self.value(np.repeat(lanes, count), np.repeat(base, count), x.ravel()).reshape(x.shape)
+            change = _changes(values[:, :-1], values[:, 1:])
+            some, at = np.nonzero(change)
+            found.append(Brackets(lanes[some], base[some], x[some, at], x[some, at + 1], values[some, at], values[some, at + 1]))
+            left = np.flatnonzero(~change.any(axis=1))
+            lowest = np.clip(np.argmin(np.abs(values[left]), axis=1), 1, count - 2)
+            near = dips(*(values[left, lowest + i] for i in (-1, 0, 1)))
+            left, lowest = left[near], lowest[near]
+            lanes, base, low, high = lanes[left], base[left], x[left, lowest - 1], x[left, lowest + 1]
+        return Brackets(*map(np.concatenate, zip(*found, strict=True))) if found else _none()
+
+    def _located(self, brackets: Brackets) -> Events:
+        """The events in brackets, of the direction that is asked for."""
+        rises = np.where(brackets.fa != 0.0, brackets.fa < 0.0, brackets.fb > 0.0)
+        direction = np.where(rises, 1, -1)
+        asked = direction == self.event.direction if self.event.direction else np.ones(len(direction), bool)
+        lanes, base, a, b, fa, fb = (array[asked] for array in brackets)
+        x = bracketed_roots(lambda x, which: self.value(lanes[which], base[which], x), a, b, fa, fb)
+        dense = self.dense
+        numbers, theta = self._place(lanes, base, x)
+        inside = dense.inside(lanes, numbers, theta)
+        fields: dict[str, Any] = {name: inside.get(name, dense.of_rows(name, lanes, numbers)) for name in dense.nodes}
+        t = dense.time_at(numbers, theta)
+        order = np.lexsort((t, lanes))
+        index, found = np.full(len(t), self.number), {name: array[order] for name, array in fields.items()}
+        return Events(t[order], index, direction[asked][order], lanes[order], found)
+
+
+def _none() -> Brackets:
+    whole, real = np.zeros(0, np.int64), np.zeros(0)
+    return Brackets(whole, whole, real, real, real, real)
+
+
+def _changes(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Where the sign changes; a zero belongs to what comes before it."""
+    return ((before < 0.0) & (after >= 0.0)) | ((before > 0.0) & (after <= 0.0))
+
+
+def dips(before: np.ndarray, middle: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Where a function of one sign is nearest to zero in the middle, and bends so much that it may reach zero beside it, four
+    times as much as a parabola has to."""
+    sign = np.sign(middle)
+    before, middle, after = sign * before, sign * middle, sign * after
+    bend = before - 2.0 * middle + after
+    return (middle > 0.0) & (middle <= before) & (middle <= after) & (middle <= bend / 2.0)

@@ -1,0 +1,114 @@
+"""Impact: a wall that the motion bounces off, and what happens to the momentum there."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.program.evaluation.functions import program_of
+from dirax.program.linear_solves import scaled_pseudo_inverse, solve
+from dirax.program.tracing import gradient
+from dirax.run.event import names_of
+
+KNOWN = ("t", "q", "params")
+"""What the gap may be given, by the names of its arguments."""
+
+
+class Impact:
+    """A wall: the motion bounces where `gap` becomes zero, `dx.simulate(…, events=[dx.Impact(gap, restitution=1.0)])`.
+
+    `gap` returns one number of `q`, the time `t` and `params`, by the names of its arguments: positive off the wall.
+    `restitution` is e in [0, 1] of v⁺·n = −e v⁻·n, relative to a wall that moves.
+
+    The step in which a wall is hit is divided (Fetecau, Marsden, Ortiz, West 2003): a step of the scheme of length αh that ends
+    on the wall, α found with it; a jump of the momentum along ∂gap/∂q, and along the forces of constraints, so that these hold
+    after it too (Rodríguez Abella, Colombo 2025); and a step of (1 − α)h, so that the rows stand at their times. With e = 1 the
+    jump keeps the energy of Lagrangians that are quadratic in v, at walls at rest, and with constraints that are
+    linear in v; and the momentum along every symmetry of the wall.
+
+        ball = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1])
+        sol = dx.simulate(ball, dx.LagrangeDAlembert(), events=[dx.Impact(lambda q: q[1])], q=…, v=…, step=0.01, steps=1000)
+
+    `sol.events` has the times, and q and p after each impact; the row at the beginning of a step has the multipliers of
+    its part before the impact. Where impacts accumulate (Zeno) the trajectory ends with a message.
+    Raises `TypeError` for something that is no function of such arguments, `ValueError` for a restitution outside of [0, 1].
+    """
+
+    terminal = False
+
+    def __init__(self, gap: Callable, restitution: float = 1.0):
+        number = not isinstance(restitution, bool) and isinstance(restitution, int | float | np.number)
+        if not number or not 0.0 <= restitution <= 1.0:
+            raise ValueError(f"restitution must be a number from 0 to 1, but {restitution!r} was given.")
+        self.arguments = names_of(gap, "gap", KNOWN)
+        self.gap, self.restitution = gap, float(restitution)
+
+    def __call__(self, t: Any, q: Any, params: Any) -> Any:
+        """The gap at one place."""
+        known = {"t": t, "q": q, "params": params}
+        return self.gap(**{name: known[name] for name in self.arguments})
+
+    def __repr__(self) -> str:
+        own = getattr(self.gap, "__name__", type(self.gap).__name__).replace("<lambda>", "lambda")
+        return f"Impact({own}({', '.join(self.arguments)}), restitution={self.restitution:g})"
+
+
+def jump(system: Any, impact: Impact, q: Any, p: Any, t: Any, params: Any) -> Any:
+    """(p⁺, v⁺, speed, share): the momentum and the velocity after an impact; how fast the gap grew before it; and the part
+    of the wall's normal that constraints leave, relative to all of it.
+
+    With M = ∂²L/∂v² and the constraints C v + b = 0: v⁻ on the constraints, and v⁺ = v⁻ − (1 + e)(n·v⁻ + ∂gap/∂t)/(n·d) d with
+    d the projection of M⁻¹n onto ker C, in the metric M.
+    """
+    v = system.complete({"q": q, "p": p, "t": t}, params, False)["v"]
+    metric = system.velocity_hessian(t, q, v, params)
+    normal, rate = gradient(lambda q, t: impact(t, q, params), (0, 1))(q, jnp.asarray(t, float))
+    lifted = free = solve(metric, normal)
+    if system.constraints.any:
+        rows = system.constraints.matrix(t, q, params)
+        forces = solve(metric, rows.T)
+        inverse = scaled_pseudo_inverse(rows @ forces)[0]
+        v = v - forces @ (inverse @ system.constraints.velocity_defect(t, q, v, params))
+        lifted = free - forces @ (inverse @ (rows @ free))
+    speed, size = normal @ v + rate, normal @ lifted
+    after = v - ((1.0 + impact.restitution) * speed / size) * lifted
+    return system.lagrangian_form().legendre(q, after, params, t), after, speed, size / (normal @ free)
+
+
+class Numbers:
+    """A function of arrays and params, by its scalar program: of one place in floats, of many in NumPy; else compiled."""
+
+    def __init__(self, function: Callable, values: list[np.ndarray], params: Any, *key: Any):
+        self.leaves, structure = jax.tree.flatten(params)
+        self.leaves = [np.asarray(leaf, float) for leaf in self.leaves]
+        count = len(values)
+
+        def flat(*numbers):
+            return function(*numbers[:count], jax.tree.unflatten(structure, numbers[count:]))
+
+        shapes = [jax.ShapeDtypeStruct(np.shape(a), jnp.float64) for a in [*values, *self.leaves]]
+        found = program_of(flat, shapes, (*key, structure))
+        self.program = found[0] if found else None
+        self.fixed = [x for leaf in self.leaves for x in leaf.ravel().tolist()]
+        self.of_many = jax.jit(jax.vmap(flat, in_axes=(0,) * count + (None,) * len(self.leaves)))
+
+    def one(self, *values: Any) -> np.ndarray:
+        """The numbers of the results at one place."""
+        floats = self.program and self.program.in_floats
+        if self.program is None or floats is None:
+            return np.concatenate([np.ravel(a) for a in self.many(*(np.asarray(value)[None] for value in values))])
+        flat = [x for value in values for x in np.ravel(value).tolist()]
+        try:
+            return np.array(floats((*flat, *self.fixed)))
+        except (ArithmeticError, ValueError):
+            return np.full(sum(nodes.size for nodes in self.program.results), np.nan)
+
+    def many(self, *values: Any) -> list[np.ndarray]:
+        """The results at many places, arrays with an axis of them in front."""
+        arrays = [np.asarray(a, float) for a in values]
+        if self.program is None:
+            return [np.asarray(a) for a in jax.tree.leaves(self.of_many(*arrays, *self.leaves))]
+        count = len(arrays[0])
+        return self.program.in_numpy([*arrays, *(np.broadcast_to(leaf, (count, *leaf.shape)) for leaf in self.leaves)])

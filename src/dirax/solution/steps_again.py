@@ -1,0 +1,268 @@
+"""The steps of a run once more, where they are asked for: the state that each leaves and its unknowns, kept once found."""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.engines.contract import Problem
+from dirax.engines.in_jax import in_scalars
+from dirax.engines.policy import engine_of
+from dirax.engines.steps_in_numbers import StepsInNumbers
+from dirax.engines.xla.lane import Numerics, first_lane, take_step
+from dirax.program.compiled import compiled
+from dirax.program.evaluation.functions import in_numpy
+from dirax.program.graph import GraphTooLarge
+from dirax.program.interpreter import UnsupportedPrimitive
+from dirax.program.memo import Memo, Same
+from dirax.schemes.step import Field, StepEquation, composed_row, needs_every_part
+from dirax.solution.trajectory import Trajectory
+
+MANY = 2000
+"""Steps from which on it pays to compile them."""
+
+UPDATES = 50
+"""Newton's updates a step, where it is solved by JAX."""
+
+
+def begun(equation: Any, system: Any, row: dict[str, Any], t: Any, h: Any, params: Any) -> tuple[Any, tuple]:
+    """State and first guesses of all stages of the step that leaves a row: what the scheme says, and sums since the start."""
+    data = {**row, **system.complete({**row, "t": t}, params, False), "t": t}
+    (first, fraction), *others = equation.stages
+    state, u = first.resume(data, fraction * h, params)
+    parts, layout = first.state_layout.split(state)._asdict(), first.state_layout
+    kept = {name: jnp.reshape(row[name], layout[name]) for name in ("work", "energy_defect") if name in row and name in layout}
+    state = layout.join(**parts | {name: a for name, a in kept.items() if a.size})
+    return state, (u, *(stage.resume(data, part * h, params)[1] for stage, part in others))
+
+
+def stepped(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> tuple[Any, tuple, tuple]:
+    """The state after a step, and of each stage the unknowns and the state that it left, by JAX."""
+    written, jacobians = in_scalars(equation, params, False)
+    numerics = Numerics(jacobians=jacobians)
+    lane, unknowns, states = take_step(written, first_lane(state, guess), t, h, params, UPDATES, numerics=numerics)
+    return jnp.where(lane.completed > 0, lane.state, jnp.nan), unknowns, states
+
+
+def row_of(equation: Any, unknowns: tuple, states: tuple, t: Any, h: Any, params: Any) -> dict[str, Any]:
+    """The row that a step leaves."""
+    rows = []
+    count = len(equation.stages) if needs_every_part(equation) else 1
+    for (stage, fraction), u, state in list(zip(equation.stages, unknowns, states, strict=True))[:count]:
+        rows.append(stage.unpack(state, u, t, fraction * h, params))
+        t = t + fraction * h
+    return composed_row(equation, rows)
+
+
+class Entries:
+    """Functions of entries: places of any trajectories of a run, arrays with an axis of entries in front."""
+
+    def __init__(self, sol: Trajectory):
+        self.sol = sol
+        self.leaves, self.structure = jax.tree.flatten(sol.given_params)
+        self.leaves = [np.asarray(leaf) for leaf in self.leaves]
+
+    def params(self, lanes: np.ndarray) -> list[np.ndarray]:
+        """The leaves of the params of these trajectories."""
+        if self.sol.batch_params and self.sol.batch is not None:
+            return [leaf[lanes] for leaf in self.leaves]
+        return [np.broadcast_to(leaf, (len(lanes), *leaf.shape)) for leaf in self.leaves]
+
+    def __call__(self, function: Callable, lanes: np.ndarray, values: Any, *key: Any) -> Any:
+        """`function(values, params)` of every entry, a pytree of arrays; `key` is equal for functions that are."""
+        leaves, structure = jax.tree.flatten(values)
+        if not len(lanes):  # one entry, for the shapes of what there is none of
+            one = [np.zeros((1, *np.shape(leaf)[1:])) for leaf in leaves]
+            found = self(function, np.zeros(1, int), jax.tree.unflatten(structure, one), *key)
+            return jax.tree.map(lambda a: a[:0], found)
+        arrays = [np.asarray(leaf, float) for leaf in leaves] + self.params(lanes)
+        count, size = len(leaves), len(lanes)
+
+        def flat(*numbers):
+            params = jax.tree.unflatten(self.structure, numbers[count:])
+            return function(jax.tree.unflatten(structure, numbers[:count]), params)
+
+        found = in_numpy(flat, arrays, (*key, structure, self.structure))
+        if found is None:  # no scalar program: by JAX, in sizes that are powers of two
+            more = np.minimum(np.arange(1 << max(size - 1, 0).bit_length()), max(size - 1, 0))
+            given = [jnp.asarray(a[more]) for a in arrays]
+            found = jax.tree.map(
+                lambda a: np.asarray(a)[:size], compiled_call(Keyed(_each(flat), key, structure, self.structure), *given)
+            )
+        return found
+
+
+class Keyed:
+    """A function that is compared by its key."""
+
+    def __init__(self, function: Callable, *key: Any):
+        self.function, self.key = function, key
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Keyed) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
+@compiled
+def compiled_call(function: Keyed, *values: Any) -> Any:
+    """The function of these values, compiled once for its key."""
+    return function.function(*values)
+
+
+def _each(function: Callable) -> Callable:
+    return lambda *arrays: jax.vmap(function)(*arrays)
+
+
+_solved_equations: Memo[StepEquation] = Memo(64)
+
+
+def _solved(equation: StepEquation) -> StepEquation:
+    about = {"unknowns": Field((equation.unknowns,), "step", ("unknown",))}
+    return replace(equation, unpack=lambda state, u, t, h, params: {"unknowns": u}, fields=about)
+
+
+class StepsAgain:
+    """The steps of a run by number: `states` (B, steps, s) that they leave, `unknowns` (B, steps, k) of all stages in order."""
+
+    def __init__(self, sol: Trajectory, counts: np.ndarray, entries: Entries):
+        self.sol, self.counts, self.entries = sol, counts, entries
+        self.equation: Any = sol.equation
+        stages = [stage for stage, _ in self.equation.stages]
+        shape = (sol.batch or 1, int(counts[-1]))
+        self.ends = np.cumsum([stage.unknowns for stage in stages])
+        self.known = np.zeros(shape, bool)
+        self.states = np.empty((*shape, stages[0].state_size))
+        self.unknowns = np.empty((*shape, self.ends[-1]))
+
+    @cached_property
+    def in_numbers(self) -> StepsInNumbers | None:
+        """The steps in NumPy; None where they are no scalar program."""
+        try:
+            return StepsInNumbers.of(self.equation, self.sol.given_params, self.sol.batch_params)
+        except (UnsupportedPrimitive, GraphTooLarge):
+            return None
+
+    @property
+    def key(self) -> tuple:
+        """Equal for runs of one equation."""
+        return Same(self.equation), Same(self.sol.system)
+
+    def time(self, number: np.ndarray) -> np.ndarray:
+        """The times at which steps begin."""
+        return float(self.sol.t[0]) + number * float(self.sol.step)
+
+    def at(self, lanes: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States and unknowns of these steps, NaN where a step has no solution."""
+        missing = ~self.known[lanes, numbers]
+        if np.any(missing):
+            self._find(lanes[missing], numbers[missing])
+        return self.states[lanes, numbers], self.unknowns[lanes, numbers]
+
+    def _find(self, lanes: np.ndarray, numbers: np.ndarray) -> None:
+        rows = np.searchsorted(self.counts, numbers, side="right") - 1
+        left = np.zeros((self.sol.batch or 1, len(self.counts)), np.int64) - 1
+        np.maximum.at(left, (lanes, rows), numbers - self.counts[rows])
+        lanes, rows = np.nonzero(left >= 0)  # steps from every row that is begun with
+        left, number = left[lanes, rows], self.counts[rows]
+        state, u = self._begun(lanes, rows, self.time(number))
+        while len(lanes):
+            after, u = self._whole(lanes, state, u, self.time(number))
+            self.states[lanes, number], self.unknowns[lanes, number] = state, u
+            self.known[lanes, number] = True
+            on = left > 0
+            lanes, left, number, state, u = lanes[on], left[on] - 1, number[on] + 1, after[on], u[on]
+
+    def _begun(self, lanes: np.ndarray, rows: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        sol = self.sol
+        take = lambda a, at: np.asarray(a)[at] if sol.batch is None else np.asarray(a)[lanes, at]
+        row = {name: take(a, rows) for name, a in sol.fields.items() if sol.field_info[name].place == "node"}
+        if sol.rows > 1:
+            of_steps = {name: a for name, a in sol.fields.items() if sol.field_info[name].place == "step"}
+            row |= {name: take(a, np.minimum(rows, sol.rows - 2)) for name, a in of_steps.items()}
+        return self.begin(lanes, row, t)
+
+    def begin(self, lanes: np.ndarray, row: dict[str, np.ndarray], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States and first guesses of steps that leave rows."""
+        sol, equation = self.sol, self.equation
+        h = np.full(len(lanes), float(sol.step))
+
+        def function(values, params):
+            row, t, h = values
+            state, guess = begun(equation, sol.system, row, t, h, params)
+            return jnp.concatenate([state, *guess])
+
+        found = self.entries(function, lanes, (row, t, h), "begun", *self.key)
+        size = equation.stages[0][0].state_size
+        return found[:, :size], found[:, size:]
+
+    def step(self, lanes, state, u, t, h) -> tuple[np.ndarray, np.ndarray]:
+        """The states after a step of length h, a number or one an entry, and the unknowns of all stages."""
+        if self.in_numbers is None:
+            return self.entries(self._one_step, lanes, (state, u, t, np.broadcast_to(h, t.shape)), "step", *self.key)
+        made = self.in_numbers.step(state, self._split(u), t, h, self._numbers(lanes))
+        bad = ~made.good
+        made.after[bad] = np.nan
+        return made.after, np.concatenate([np.where(bad[:, None], np.nan, part) for part in made.unknowns], axis=1)
+
+    def _whole(self, lanes, state, u, t) -> tuple[np.ndarray, np.ndarray]:
+        """`step` with the length of the run's: by machine code where there are many, and they do not depend on the time."""
+        if len(lanes) >= MANY and self.solved is not None:
+            sol = self.sol
+            params = jax.tree.map(lambda a: np.asarray(a)[lanes] if sol.batch_params else np.asarray(a), sol.given_params)
+            problem = Problem(
+                equation=self.solved, state=state, guess=(u,), h=float(sol.step), t0=float(sol.t[0]), steps=1, params=params,
+                batch=len(lanes), batch_params=sol.batch_params,
+            )  # fmt: skip
+            with contextlib.suppress(UnsupportedPrimitive, ImportError):
+                out = engine_of("native").run(problem)
+                good = (out.completed == 1)[:, None]
+                return np.where(good, out.last_state, np.nan), np.where(good, out.fields["unknowns"][:, 0], np.nan)
+        return self.step(lanes, state, u, t, float(self.sol.step))
+
+    @cached_property
+    def solved(self) -> StepEquation | None:
+        """The equation with its unknowns for rows; None for a step that depends on the time, of several parts, or that is no
+        scalar program."""
+        numbers = self.in_numbers
+        if numbers is None or len(self.equation.stages) > 1 or not self.ends[-1] or self.sol.stats.get("engine") == "xla":
+            return None
+        traced, graph = numbers.program.equations[0], numbers.program.graph
+        if numbers.program.shared.t in graph.reachable([*traced.residual, *traced.advance]):
+            return None
+        return _solved_equations.get(Same(self.equation), lambda: _solved(self.equation))
+
+    def row(self, lanes, state, u, t) -> dict[str, np.ndarray]:
+        """The rows that are at these states, by the steps of the run's length that leave them."""
+        h = np.full(len(t), float(self.sol.step))
+        if self.in_numbers is None:
+            return self.entries(self._one_row, lanes, (state, u, t, h), "row", *self.key)
+        made = self.in_numbers.step(state, self._split(u), t, h, self._numbers(lanes))
+        rows = self.in_numbers.rows(made, t, h, self._numbers(lanes))
+        where = lambda a: made.good.reshape(-1, *(1,) * (a.ndim - 1))
+        return {name: np.where(where(a), a, np.nan) for name, a in rows.items()}
+
+    def _one_step(self, values, params):
+        state, u, t, h = values
+        after, unknowns, _ = stepped(self.equation, state, self._split(u), t, h, params)
+        return after, jnp.concatenate(unknowns)
+
+    def _one_row(self, values, params):
+        state, u, t, h = values
+        _, unknowns, states = stepped(self.equation, state, self._split(u), t, h, params)
+        return row_of(self.equation, unknowns, states, t, h, params)
+
+    def _split(self, u: Any) -> tuple:
+        """The unknowns of each stage."""
+        return tuple(u[..., end - stage.unknowns : end] for end, (stage, _) in zip(self.ends, self.equation.stages, strict=True))
+
+    def _numbers(self, lanes: np.ndarray) -> np.ndarray:
+        steps, sol = self.in_numbers, self.sol
+        assert steps is not None
+        return steps.parameters(sol.given_params, sol.batch if sol.batch_params else None, lanes)

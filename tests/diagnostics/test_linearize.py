@@ -1,0 +1,100 @@
+"""Linear equations of small motions against those written by hand."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+
+
+def test_a_pendulum_down_and_up():
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 4.0 * jnp.cos(q[0]))
+    down = dx.linearize(system, {"q": [0.0], "v": [0.0]})
+    assert down.eigenvalues == pytest.approx([2j, -2j], abs=1e-14) and down.stable and down.multipliers is None
+    up = dx.linearize(system, {"q": [np.pi], "v": [0.0]})
+    assert up.eigenvalues == pytest.approx([2.0, -2.0], abs=1e-14) and not up.stable
+    assert np.abs(up.modes[1] / up.modes[0]) == pytest.approx([2.0, 2.0])
+
+
+def test_a_rod_with_its_length_as_a_constraint_swings_as_fast():
+    """In x and y with x² + y² = 1 the tension counts: the frequency is √g, and there are two directions of four."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.0 * q[1], holonomic=lambda q: jnp.array([q @ q - 1.0]))
+    found = dx.linearize(system, {"q": [0.0, -1.0], "v": [0.0, 0.0]})
+    assert found.matrix.shape == (2, 2) and found.eigenvalues == pytest.approx([3j, -3j], abs=1e-14)
+
+
+def test_a_constraint_said_twice_changes_nothing():
+    once = lambda q: jnp.array([q @ q - 1.0])
+    twice = lambda q: jnp.array([q @ q - 1.0, 2.0 * q @ q - 2.0])
+    place, found = {"q": [0.0, -1.0], "v": [0.0, 0.0]}, []
+    for holonomic in (once, twice):
+        system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.0 * q[1], holonomic=holonomic)
+        found.append(dx.linearize(system, place, dx.LagrangeDAlembert(), step=0.1).eigenvalues)
+        assert dx.linearize(system, place).eigenvalues == pytest.approx([3j, -3j], abs=1e-13)
+    assert found[0] == pytest.approx(found[1], abs=1e-12) and found[0] == pytest.approx([3j, -3j], abs=0.05)
+
+
+def test_forces_and_parameters():
+    system = dx.LagrangeDirac(lambda q, v, p: v @ v / 2 - p["k"] * q @ q / 2, forces=lambda t, q, v, p: -p["c"] * v)
+    found = dx.linearize(system, {"q": [0.0], "v": [0.0]}, params={"k": 4.0, "c": 5.0})
+    assert found.eigenvalues == pytest.approx([-1.0, -4.0], abs=1e-13)
+
+
+def test_a_circular_orbit_is_a_relative_equilibrium_of_turns():
+    """Kepler in the frame that turns: 0 of the symmetry's quotient, and ±iω of the radius."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 1.0 / jnp.sqrt(q @ q))
+    turns = lambda q: jnp.array([-q[1], q[0]])
+    place = {"q": [2.0, 0.0], "v": [0.0, np.sqrt(0.5)]}
+    found = dx.linearize(system, place, symmetries={"turns": turns})
+    rate = np.sqrt(1 / 8)
+    assert found.eigenvalues == pytest.approx([1j * rate, 0.0, -1j * rate], abs=1e-12)
+    with pytest.raises(ValueError, match="no relative equilibrium"):
+        dx.linearize(system, place)
+    with pytest.raises(ValueError, match=r"symmetries by .*must be symmetries"):
+        dx.linearize(system, {"q": [2.0, 0.0], "v": [0.0, 0.0]} | place, symmetries=[turns, lambda q: jnp.ones(2)])
+
+
+def test_a_symmetry_that_is_not_linear_in_q():
+    """The orbit in log-polar coordinates (log r, φ) turned by a generator that bends: (0, 1) pushed by φ ↦ sinh φ."""
+    lagrangian = lambda q, v: jnp.exp(2 * q[0]) * (v[0] ** 2 + v[1] ** 2 / jnp.sqrt(1 + q[1] ** 2) ** 2) / 2 + jnp.exp(-q[0])
+    system = dx.LagrangeDirac(lagrangian)
+    turns = lambda q: jnp.stack([jnp.zeros(()), jnp.sqrt(1 + q[1] ** 2)])
+    place = {"q": [np.log(2.0), 0.7], "v": [0.0, np.sqrt(1 / 8) * np.sqrt(1 + 0.49)]}
+    found = dx.linearize(system, place, symmetries=[turns])
+    rate = np.sqrt(1 / 8)
+    assert found.eigenvalues == pytest.approx([1j * rate, 0.0, -1j * rate], abs=1e-12)
+
+
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(2), dx.Composition(dx.LagrangeDAlembert(), "suzuki4")])
+def test_a_step_has_the_multipliers_of_its_stability_function(scheme):
+    """Of an oscillator: Cayley's for midpoint, the (2, 2) Padé approximant for two Gauss nodes."""
+    system, z = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2), 0.3j
+    found = dx.linearize(system, {"q": [0.0], "v": [0.0]}, scheme, step=0.3)
+    midpoint = lambda z: (1 + z / 2) / (1 - z / 2)
+    gamma = 1 / (4 - 4 ** (1 / 3))
+    expected = {
+        dx.LagrangeDAlembert: midpoint(z),
+        dx.Collocation: (1 + z / 2 + z * z / 12) / (1 - z / 2 + z * z / 12),
+        dx.Composition: midpoint(gamma * z) ** 4 * midpoint((1 - 4 * gamma) * z),
+    }[type(scheme)]
+    assert found.multipliers == pytest.approx([expected, np.conj(expected)], abs=1e-13)
+    assert found.eigenvalues == pytest.approx(np.log([expected, np.conj(expected)]) / 0.3, abs=1e-12)
+
+
+def test_a_system_on_its_final_manifold():
+    """A port-Hamiltonian oscillator that decays: x in place of q and v."""
+    system = dx.PortHamiltonian(
+        lambda x: x @ x / 2, J=lambda x: jnp.array([[0.0, 1.0], [-1.0, 0.0]]), R=lambda x: jnp.diag(jnp.array([0.0, 0.2]))
+    )
+    found = dx.linearize(system, {"x": [0.0, 0.0]})
+    assert found.eigenvalues == pytest.approx(np.roots([1.0, 0.2, 1.0]), abs=1e-13)
+    with pytest.raises(ValueError, match="no relative equilibrium"):
+        dx.linearize(system, {"x": [0.5, 0.0]})
+    with pytest.raises(TypeError, match="with a Lagrangian"):
+        dx.linearize(system, {"x": [0.0, 0.0]}, dx.DiscreteDirac(), step=0.1)
+
+
+def test_a_scheme_needs_a_step():
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2)
+    with pytest.raises(ValueError, match="give scheme= and step= together"):
+        dx.linearize(system, {"q": [0.0], "v": [0.0]}, dx.LagrangeDAlembert())

@@ -1,0 +1,84 @@
+"""Runs written as C: compiled by whatever C compiler there is, the rows have the bits of the run."""
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import dirax as dx
+from dirax import gallery
+from dirax.cli.commands import app
+from dirax.engines.native import compile as llvm
+
+COMPILER = shutil.which("cc")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
+
+
+def rows_of(path, *arguments):
+    """The columns that the program prints, by name; and its exit status."""
+    flags = ["-O1", "-ffp-contract=off", *["-mfma"] * (llvm.has_fma() and llvm.host()[0].startswith("x86_64"))]
+    program = path.with_suffix("")
+    subprocess.run([COMPILER, *flags, "-o", program, path, "-lm"], check=True)
+    run = subprocess.run([program, *arguments], capture_output=True, text=True)
+    lines = run.stdout.splitlines()
+    numbers = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
+    return dict(zip(lines[0].split(","), numbers.T, strict=True)), run.returncode
+
+
+def columns(found, name):
+    return np.stack([values for key, values in found.items() if key.startswith(name) and key[len(name) :].isdigit()], axis=1)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "name, scheme",
+    [
+        ("double-pendulum", dx.LagrangeDAlembert()),
+        ("rolling-disk", dx.PlusLagrangeDirac()),
+        ("kepler", dx.Composition(dx.LagrangeDAlembert(), "suzuki4")),
+        ("chaplygin-sphere", dx.LagrangeDAlembert()),
+    ],
+)
+def test_the_rows_have_the_bits_of_the_run(tmp_path, name, scheme):
+    example, path = gallery.get(name), tmp_path / "run.c"
+    settings = {**example.initial, "params": example.params, "step": example.step, "steps": 200, "save_every": 9}
+    sol = dx.export_c(path, example.system, scheme, **settings)
+    found, status = rows_of(path)
+    assert status == 0 and np.array_equal(found["t"], sol.t)
+    assert np.array_equal(columns(found, "q"), sol.q) and np.array_equal(columns(found, "p"), sol.p)
+
+
+@needs_compiler
+def test_angles_far_out_are_reduced_alike(tmp_path):
+    """Sines of arguments beyond 2²⁰ take the slow way."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 1e-3 * np.float64(1.0) * _cosine(q))
+    start = {"q": [3.0e6, -7.0e9], "v": [4.0e5, 3.0e14]}
+    sol = dx.export_c(tmp_path / "far.c", system, dx.LagrangeDAlembert(), **start, step=0.1, steps=40)
+    found, _ = rows_of(tmp_path / "far.c", "40", "1")
+    assert np.array_equal(columns(found, "q"), sol.q) and np.abs(sol.q).max() > 1e15
+
+
+def _cosine(q):
+    import jax.numpy as jnp
+
+    return jnp.sum(jnp.cos(q))
+
+
+def test_what_is_not_written_says_why(tmp_path):
+    example = gallery.get("pendulum")
+    run = {**example.initial, "params": example.params, "step": 0.01, "steps": 5}
+    with pytest.raises(ValueError, match=r"must end in \.c"):
+        dx.export_c(tmp_path / "run", example.system, example.scheme, **run)
+    with pytest.raises(ValueError, match="collocation"):
+        dx.export_c(tmp_path / "run.c", example.system, dx.Collocation(3), **run)
+
+
+def test_the_command_writes_a_file(tmp_path):
+    path = tmp_path / "pendulum.c"
+    command = ["export", "c", "pendulum", "--out", str(path), "--set", "steps=3"]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert "int main(" in path.read_text("utf-8")
+    again = CliRunner().invoke(app, command)
+    assert again.exit_code != 0 and "--overwrite" in again.output

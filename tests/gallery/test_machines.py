@@ -1,0 +1,102 @@
+"""Machines of the gallery against published digits, their integrals, and closed solutions."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import dirax as dx
+from dirax import gallery
+from dirax.gallery import (
+    andrews_squeezer,
+    bricard,
+    chaplygin_sphere,
+    euler_disk,
+    flyball_governor,
+    four_bar,
+    rattleback,
+    tippe_top,
+)
+
+
+def test_andrews_squeezer_ends_where_the_test_set_says():
+    """Symmetric steps, extrapolated twice; the reference of the IVP test set."""
+    ends = [andrews_squeezer.EXAMPLE.simulate(step=0.03 / n, steps=n, save_every=n).q[-1] for n in (4000, 8000, 16000)]
+    once = [(4 * b - a) / 3 for a, b in itertools.pairwise(ends)]
+    assert np.abs(ends[-1] - andrews_squeezer.REFERENCE).max() < 2e-6
+    assert np.abs((16 * once[1] - once[0]) / 15 - andrews_squeezer.REFERENCE).max() < 4e-9
+
+
+def test_the_parallelogram_is_a_pendulum():
+    sol = four_bar.EXAMPLE.simulate(step=0.005, steps=400)
+    field = lambda t, y: [y[1], -1.2 * 9.81 * np.sin(y[0])]
+    exact = solve_ivp(field, (0.0, 2.0), [0.8, 0.0], rtol=1e-12, atol=1e-12).y[0, -1]
+    assert sol.q[-1] == pytest.approx([exact, -exact, exact], abs=2e-4)
+    assert sol.q[:, 0] + sol.q[:, 1] == pytest.approx(0.0, abs=1e-13)
+    assert four_bar.MODEL.constraints == ("closing hinge: x", "closing hinge: z")
+
+
+def test_one_demand_of_the_last_hinge_of_bricard_is_redundant():
+    example = bricard.EXAMPLE
+    names = bricard.MODEL.redundant(example.initial["q"])
+    assert len(bricard.MODEL.constraints) == 5 and len(names) == 1 and names[0].startswith("last hinge")
+    smaller = bricard.MODEL.without(*names)
+    assert len(smaller.constraints) == 4 and smaller.redundant(example.initial["q"]) == ()
+
+
+def test_chaplygins_sphere_keeps_its_angular_momentum_in_space():
+    sol = chaplygin_sphere.EXAMPLE.simulate(steps=2000, save_every=200)
+    seen = chaplygin_sphere.MODEL.observables(sol, about_contact=chaplygin_sphere.about_contact)
+    assert np.ptp(seen["about_contact"], axis=0).max() < 1e-12 and np.abs(sol.q[-1, 4:]).max() > 0.1
+    assert np.ptp(seen["energy"]) < 1e-5 and np.ptp(seen["angular_momentum"], axis=0).max() > 1e-3
+
+
+def test_eulers_disk_runs_round_as_moffatt_says():
+    """Its steady motion is a relative equilibrium, with one frequency of nutation, and at another rate it is none."""
+    place = euler_disk.steady(0.3)
+    assert place["v"][:2] == pytest.approx([-place["v"][2] * place["q"][1], 0.0], abs=1e-12)
+    found = dx.linearize(euler_disk.MODEL.system, place, symmetries=euler_disk.SYMMETRIES)
+    assert found.residual < 1e-12 and found.stable
+    assert np.sort(np.abs(found.eigenvalues.imag))[-2] > 10.0
+    other = euler_disk.MODEL.state(
+        {"disc.roll": place["q"][3]}, {"disc.yaw": 1.1 * place["v"][2], "disc.roll": 0.0, "disc.spin": place["v"][4]}
+    )
+    with pytest.raises(ValueError, match="no relative equilibrium"):
+        dx.linearize(euler_disk.MODEL.system, other, symmetries=euler_disk.SYMMETRIES)
+
+
+def test_the_rattleback_turns_round_one_way_only():
+    changes = {}
+    for spin in (-5.0, 5.0):
+        start = rattleback.MODEL.state({"stone.roll": 0.01, "stone.pitch": 0.01}, {"stone.yaw": spin})
+        sol = rattleback.EXAMPLE.simulate(**start, step=2e-3, steps=2500)
+        changes[spin] = np.diff(sol.q[::25, 3]) / 0.05
+        assert sol.ok and np.ptp(sol.energy()) < 1e-2 * sol.energy()[0]
+    assert changes[-5.0][0] < -4.0 and changes[-5.0].max() > 1.0
+    assert changes[5.0].min() > 4.0
+
+
+def test_the_tippe_top_turns_over_and_keeps_jelletts_integral():
+    sol = tippe_top.EXAMPLE.simulate(steps=10_000, save_every=500)
+    upright = lambda q, v: tippe_top.MODEL.frames(q, v)["top"].turn[2, 2]
+    seen = tippe_top.MODEL.observables(sol, jellett=tippe_top.jellett, upright=upright)
+    assert seen["upright"][0] > 0.99 and seen["upright"].min() < 0.0
+    assert np.ptp(seen["jellett"]) < 1e-3 * seen["jellett"][0] and np.all(np.diff(sol.energy()) < 1e-9)
+
+
+def test_the_governor_turns_freely_and_its_damper_takes_energy():
+    sol = flyball_governor.EXAMPLE.simulate(steps=1000, save_every=20)
+    seen = flyball_governor.MODEL.observables(sol)
+    about = seen["angular_momentum"][:, 2]
+    assert np.ptp(about) < 1e-12 * about[0] and np.abs(sol.q[:, 2] + sol.q[:, 4]).max() < 1e-10
+    assert np.abs(sol.constraint_residual()).max() < 1e-12 and np.ptp(sol.q[:, 1]) > 0.01
+    assert seen["energy"][-1] < seen["energy"][0] - 0.1
+    assert seen["energy"] - sol.work == pytest.approx(seen["energy"][0], rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["bicycle", "andrews-squeezer", "euler-disk"])
+def test_machines_are_drawn(name):
+    example = gallery.get(name)
+    kinds = {part.kind for part in example.scene.parts}
+    assert kinds >= {"bicycle": {"disk", "plane"}, "andrews-squeezer": {"rod", "spring"}, "euler-disk": {"disk"}}[name]

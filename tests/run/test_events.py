@@ -1,0 +1,115 @@
+"""Events: found to the last digits, none is missed, both engines, batches, ends, and what is refused."""
+
+import jax
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.gallery import poincare_section
+
+OSCILLATOR = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+START = {"q": [1.0], "v": [0.0], "step": 0.1, "steps": 300}
+
+
+def position(q):
+    return q[0]
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_zeros_are_found_inside_the_steps(engine):
+    events = [dx.Event(position), dx.Event(lambda t, v: v[0] + 0.0 * t, direction=-1), dx.Event(lambda q: q[0] - 0.99999)]
+    sol = dx.simulate(OSCILLATOR, dx.Collocation(8), engine=engine, events=events, **START)
+    first, second, third = (sol.events.of(i) for i in range(3))
+    assert np.max(np.abs(first.t - np.pi * (np.arange(10) + 0.5)[: len(first)])) <= 1e-13
+    assert len(first) == 10 and np.array_equal(first.direction, [-1, 1] * 5)
+    assert np.max(np.abs(first.q)) <= 1e-15 and np.max(np.abs(np.abs(first.p) - 1.0)) <= 1e-13
+    # v = −sin t, which is zero at the first row, falls through zero at 2π, 4π, …
+    assert np.max(np.abs(second.t - 2 * np.pi * np.arange(1, 5))) <= 1e-13
+    # 9·10⁻³ apart, inside one step of .1: around every maximum, and once after the start
+    assert len(third) == 9 and np.max(np.abs(third.q - 0.99999)) <= 1e-15
+    plain = dx.simulate(OSCILLATOR, dx.Collocation(8), engine=engine, **START)
+    assert np.array_equal(plain.q, sol.q) and np.array_equal(plain.p, sol.p) and set(sol.fields) == set(plain.fields)
+
+
+def test_schemes_without_a_polynomial_have_them_on_their_cubic():
+    sol = dx.simulate(OSCILLATOR, dx.LagrangeDAlembert(), events=[dx.Event(position)], **START)
+    assert np.max(np.abs(sol.events.q)) <= 1e-15
+    assert np.max(np.abs(sol.at(sol.events.t).q)) <= 1e-13
+    angle = 2 * np.arctan(0.05) / 0.1  # of the midpoint rule, a rotation
+    assert np.max(np.abs(sol.events.t * angle - np.pi * (np.arange(len(sol.events)) + 0.5))) <= 1e-4
+
+
+def test_a_terminal_event_ends_a_trajectory_and_no_other():
+    ends = dx.Event(lambda q: q[0] - 0.7, terminal=True)
+    many = {"q": np.array([[1.0], [2.0], [0.5]]), "v": np.zeros((3, 1)), "step": 0.1, "steps": 700}
+    batch = dx.simulate(OSCILLATOR, dx.Collocation(4), events=[dx.Event(position), ends], **many)
+    assert np.all(batch.ok) and [bool(text) for text in batch.message] == [True, True, False]
+    assert np.max(np.abs(batch.events.of(1).t - np.arccos([0.7, 0.35]))) <= 1e-9
+    assert list(batch.events.of(1).lane) == [0, 1] and set(batch.events.of(0).lane) == {2}
+    for lane, amplitude in enumerate([1.0, 2.0, 0.5]):
+        one = dx.simulate(
+            OSCILLATOR, dx.Collocation(4), q=[amplitude], v=[0.0], step=0.1, steps=700, events=[dx.Event(position), ends]
+        )
+        assert one.ok and np.array_equal(one.q, batch[lane].q) and np.array_equal(one.events.t, batch[lane].events.t)
+        assert (lane == 2) == (one.message == "") and one.t[-1] == batch[lane].t[-1]
+        assert one.extend(5).t[-1] == pytest.approx(one.t[-1] + 0.5 * (lane == 2))
+
+
+def test_rows_are_thinned_and_longer_runs_have_more_events():
+    short = dx.simulate(OSCILLATOR, dx.Collocation(4), save_every=70, events=[dx.Event(position)], **START)
+    assert np.allclose(short.t, [0.0, 7.0, 14.0, 21.0, 28.0, 30.0])
+    longer = short.extend(100)
+    assert np.array_equal(longer.events.t[: len(short.events)], short.events.t) and len(longer.events) == 13
+    assert longer.t[-1] == pytest.approx(40.0) and longer.t[1] == pytest.approx(7.0)
+
+
+def test_a_prepared_run_has_them():
+    run = dx.prepare(OSCILLATOR, dx.Collocation(4), events=[dx.Event(position)], **START)
+    assert np.array_equal(run(q=[2.0]).events.t, run().events.t)  # the frequency does not depend on the amplitude
+    assert np.max(np.abs(run(q=[2.0]).events.p)) == pytest.approx(2.0)
+
+
+def test_the_section_of_henon_and_heiles():
+    events = poincare_section.section(orbits=6, steps=200).events
+    finer = poincare_section.section(orbits=6, steps=400, step=0.25).events
+    assert len(events) == len(finer) and np.max(np.abs(events.q[:, 0])) <= 1e-15
+    soon = events.t < 30
+    assert np.max(np.abs(events.t - finer.t)[soon]) <= 1e-6
+    energy = np.sum(events.p**2 + events.q**2, axis=1) / 2 + events.q[:, 0] ** 2 * events.q[:, 1] - events.q[:, 1] ** 3 / 3
+    assert np.max(np.abs(energy - 1 / 8)) <= 1e-7 and np.all(events.p[:, 0] > 0)
+
+
+def test_the_picture_of_a_section(tmp_path):
+    poincare_section.picture(tmp_path / "section.png", orbits=3, steps=50)
+    assert (tmp_path / "section.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("events", "error", "text"),
+    [
+        ([position], TypeError, "write dx.Event"),
+        (3, TypeError, "list of dx.Event"),
+        ([dx.Event(lambda q: q)], ValueError, r"one number, but it returned shape \(1,\)"),
+        ([dx.Event(lambda x: x[0])], TypeError, r"asks for x, but a run .* knows t, q, p, v, params"),
+        ([dx.Event(lambda q: np.log(q))], TypeError, r"events\[0\] could not be traced"),
+        ([dx.Event(lambda q: jax.numpy.log(q[0]))], ValueError, "must be finite along the run, but it is nan at t = 1."),
+    ],
+)
+def test_bad_events_are_refused(events, error, text):
+    with pytest.raises(error, match=text):
+        dx.simulate(OSCILLATOR, dx.Collocation(2), events=events, **START)
+
+
+def test_bad_arguments_of_an_event_are_refused():
+    with pytest.raises(ValueError, match="rising"):
+        dx.Event(position, direction=2)
+    with pytest.raises(TypeError, match="it takes angle"):
+        dx.Event(lambda angle: angle)
+    with pytest.raises(TypeError, match="but 3 was given"):
+        dx.Event(3)
+    with pytest.raises(ValueError, match=r"use sol.at\(t\)"):
+        jax.grad(
+            lambda x: dx.simulate(OSCILLATOR, dx.Collocation(2), q=x, v=x, step=0.1, steps=3, events=[dx.Event(position)]).q[
+                -1, 0
+            ]
+        )(jax.numpy.ones(1))

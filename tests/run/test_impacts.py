@@ -1,0 +1,129 @@
+"""Impacts: times, energy, momenta and constraints through walls, accumulation, and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+
+BALL = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1])
+FLOOR = dx.Impact(lambda q: q[1])
+DROP = {"q": [0.0, 1.0], "v": [0.3, 0.0]}
+FALL = np.sqrt(2.0)
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_a_ball_bounces_at_the_right_times_and_keeps_its_energy(engine):
+    sol = dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=200, events=[FLOOR], engine=engine, **DROP)
+    events = sol.events
+    assert len(events) == 4 and np.max(np.abs(events.t - FALL * (1 + 2 * np.arange(4)))) <= 1e-13
+    assert np.max(np.abs(sol.energy() - sol.energy()[0])) <= 1e-14 and np.ptp(sol.p[:, 0]) <= 1e-15
+    assert np.max(np.abs(events.q[:, 1])) <= 1e-14 and np.all(events.p[:, 1] > 0)
+    t = np.linspace(1.3, 1.5, 9)
+    assert np.max(np.abs(sol.at(t).q[:, 1] - np.where(t < FALL, 1 - t**2 / 2, FALL * (t - FALL) - (t - FALL) ** 2 / 2))) <= 1e-14
+    assert sol.ok and sol.message == "" and dx.verify(sol).ok
+
+
+def test_events_stand_beside_walls():
+    sol = dx.simulate(
+        BALL, dx.Collocation(2), step=0.3, steps=20, events=[FLOOR, dx.Event(lambda q: q[1] - 0.5, direction=-1)], **DROP
+    )
+    assert np.array_equal(sol.events.index, [1, 0, 1, 0][: len(sol.events)])
+    assert np.max(np.abs(sol.events.of(1).t - [1.0, 1.0 + 2 * FALL])) <= 1e-13
+
+
+def test_a_batch_has_the_bits_of_single_runs():
+    q, v = np.array([[0.0, 1.0], [0.0, 2.0]]), np.array([[0.3, 0.0], [0.1, 0.0]])
+    batch = dx.simulate(BALL, dx.LagrangeDAlembert(), q=q, v=v, step=0.05, steps=60, events=[FLOOR])
+    for lane in range(2):
+        one = dx.simulate(BALL, dx.LagrangeDAlembert(), q=q[lane], v=v[lane], step=0.05, steps=60, events=[FLOOR])
+        assert np.array_equal(one.q, batch[lane].q) and np.array_equal(one.events.t, batch[lane].events.t)
+
+
+def test_many_impacts_leave_the_energy_where_it_is():
+    box = dx.LagrangeDirac(lambda q, v: v @ v / 2)
+    walls = [dx.Impact(lambda q: q[0]), dx.Impact(lambda q: 1 - q[0]), dx.Impact(lambda q: q[1]), dx.Impact(lambda q: 1 - q[1])]
+    sol = dx.simulate(box, dx.LagrangeDAlembert(), q=[0.1, 0.2], v=[1.0, 0.7], step=0.05, steps=1000, events=walls)
+    folded = lambda x: np.abs((x + 1) % 2 - 1)
+    assert len(sol.events) == 85 and np.max(np.abs(sol.q[:, 1] - folded(0.2 + 0.7 * sol.t))) <= 1e-12
+    assert np.max(np.abs(sol.energy() - sol.energy()[0])) <= 1e-14
+
+
+@pytest.mark.soak
+def test_a_hundred_thousand_impacts_leave_the_energy_where_it_is():
+    sol = dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.5, steps=570_000, events=[FLOOR], **DROP)
+    assert len(sol.events) >= 100_000 and np.max(np.abs(sol.energy() - sol.energy()[0])) <= 1e-11
+
+
+@pytest.mark.parametrize(
+    "scheme", [dx.LagrangeDAlembert(), dx.DiscreteDirac(), dx.Collocation(2)], ids=lambda s: type(s).__name__
+)
+def test_an_ellipse_bounces(scheme):
+    system = dx.LagrangeDirac(lambda q, v: (v[0] ** 2 + v[1] ** 2 + 0.3 * v[2] ** 2) / 2 - q[1])
+    wall = dx.Impact(lambda q: q[1] - jnp.sqrt(jnp.sin(q[2]) ** 2 + 0.25 * jnp.cos(q[2]) ** 2))
+    sol = dx.simulate(system, scheme, q=[0.0, 2.0, 0.4], v=[0.1, 0.0, 0.3], step=0.02, steps=1000, events=[wall])
+    gaps = sol.q[:, 1] - np.sqrt(np.sin(sol.q[:, 2]) ** 2 + 0.25 * np.cos(sol.q[:, 2]) ** 2)
+    assert len(sol.events) >= 8 and np.min(gaps) >= -1e-13 and np.ptp(sol.p[:, 0]) <= 1e-15
+    assert np.max(np.abs(sol.energy() - sol.energy()[0])) <= 2e-14
+
+
+def test_a_blade_stays_on_its_line_through_impacts():
+    blade = dx.LagrangeDirac(
+        lambda q, v: (v[0] ** 2 + v[1] ** 2 + 0.5 * v[2] ** 2) / 2, lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
+    )
+    start = {"q": [0.0, 0.0, 0.2], "v": [np.cos(0.2), np.sin(0.2), 0.3]}
+    rink = dx.Impact(lambda q: 1.0 - q[0] ** 2 - q[1] ** 2)
+    sol = dx.simulate(blade, dx.DiscreteDirac(constraints="resolve"), step=0.02, steps=600, events=[rink], **start)
+    after = sol.events
+    assert len(after) >= 5 and np.max(np.abs(np.sum(after.q[:, :2] ** 2, axis=1) - 1)) <= 1e-13
+    assert np.max(np.abs(np.sin(after.q[:, 2]) * after.p[:, 0] - np.cos(after.q[:, 2]) * after.p[:, 1])) <= 1e-15
+    assert np.max(np.abs(sol.energy() - sol.energy()[0])) <= 1e-14
+
+
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(3, nodes="lobatto")], ids=lambda s: type(s).__name__)
+def test_a_rod_is_as_long_after_an_impact(scheme):
+    rod = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.81 * q[1], holonomic=lambda q: jnp.array([(q @ q - 1) / 2]))
+    wall = dx.Impact(lambda q: q[0] + 0.2)
+    sol = dx.simulate(rod, scheme, q=[0.6, -0.8], v=[0.8, 0.6], step=0.01, steps=500, events=[wall])
+    assert sol.ok and len(sol.events) >= 3 and np.max(np.abs(np.sum(sol.q**2, axis=1) - 1)) <= 1e-13
+    assert np.max(np.abs(np.sum(sol.events.q * sol.events.p, axis=1))) <= 1e-13
+    assert np.max(np.abs(sol.energy() - sol.energy()[0])) <= 2e-3
+
+
+def test_a_wall_that_moves_gives_its_velocity():
+    free = dx.LagrangeDirac(lambda q, v: v @ v / 2)
+    piston = dx.Impact(lambda t, q, params: q[0] - params["u"] * t)
+    sol = dx.simulate(free, dx.LagrangeDAlembert(), q=[0.5], v=[-1.0], step=0.05, steps=40, params={"u": 0.1}, events=[piston])
+    assert sol.events.t == pytest.approx([0.5 / 1.1], abs=1e-14) and sol.p[-1] == pytest.approx([1.2], abs=1e-14)
+
+
+def test_impacts_that_accumulate_end_the_run():
+    wall = dx.Impact(lambda q: q[1], restitution=0.5)
+    sol = dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=200, events=[wall], **DROP)
+    assert not sol.ok and "accumulate at t = 4.24264 (Zeno)" in sol.message
+    assert sol.events.t[-1] == pytest.approx(FALL * 3, abs=1e-8) and sol.t[-1] <= FALL * 3
+    slow = sol.events.p[:5, 1]
+    assert np.max(np.abs(slow - FALL * 0.5 ** np.arange(1, 6))) <= 1e-13
+    dead = dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=200, events=[dx.Impact(lambda q: q[1], 0.0)], **DROP)
+    assert not dead.ok and "Zeno" in dead.message and dead.t[-1] <= FALL
+
+
+def test_what_is_refused():
+    run = lambda wall, scheme=None, **start: dx.simulate(
+        BALL, scheme or dx.LagrangeDAlembert(), step=0.05, steps=20, events=[wall], **{**DROP, **start}
+    )
+    with pytest.raises(ValueError, match=r"must not be negative at the start, but it is -1"):
+        run(FLOOR, q=[0.0, -1.0])
+    with pytest.raises(ValueError, match="at the start of trajectory 1"):
+        run(FLOOR, q=[[0.0, 1.0], [0.0, -1.0]])
+    with pytest.raises(ValueError, match="one number"):
+        run(dx.Impact(lambda q: q))
+    with pytest.raises(TypeError, match="with a composition"):
+        run(FLOOR, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"))
+    with pytest.raises(ValueError, match="from 0 to 1"):
+        dx.Impact(lambda q: q[0], restitution=1.5)
+    with pytest.raises(TypeError, match="it takes v"):
+        dx.Impact(lambda q, v: q[0])
+    with pytest.raises(ValueError, match=r"under jax\.grad"):
+        jax.grad(lambda x: run(FLOOR, q=jnp.stack([0.0, x])).q[-1, 1])(1.0)

@@ -1,0 +1,131 @@
+"""sol.at(t): its order, its ends, batches, derivatives, and what it refuses."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax import gallery
+
+HENON = gallery.get("henon-heiles")
+TIMES = np.linspace(0.013, 3.97, 101)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return HENON.simulate(dx.Collocation(8), step=0.1, steps=40).at(TIMES)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "order"),
+    [
+        (dx.Collocation(2), 3),
+        (dx.Collocation(4), 5),
+        (dx.Collocation(3, nodes="lobatto"), 3),
+        (dx.EnergyCollocation(2), 3),
+        (dx.LagrangeDAlembert(), 2),
+        (dx.DiscreteDirac(), 2),
+        (dx.PlusLagrangeDirac(), 1),
+        (dx.Composition(dx.LagrangeDAlembert(), "suzuki4"), 4),
+    ],
+    ids=repr,
+)
+def test_the_order_between_rows(scheme, order, exact):
+    errors = []
+    for steps in (10, 20, 40):
+        found = HENON.simulate(scheme, step=4.0 / steps, steps=steps).at(TIMES)
+        errors.append([np.max(np.abs(getattr(found, name) - getattr(exact, name))) for name in ("q", "p")])
+    slopes = -np.polyfit(np.arange(3), np.log2(errors), 1)[0]
+    assert np.all(slopes > order - 0.25), (slopes, errors)
+
+
+CONSTRAINED = {
+    "rod": (
+        dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.81 * q[1], holonomic=lambda q: jnp.array([(q @ q - 1) / 2])),
+        {"q": [0.6, -0.8], "v": [0.8, 0.6]},
+    ),
+    "blade": (
+        dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0], lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])),
+        {"q": [0.0, 0.0, 0.2], "v": [np.cos(0.2), np.sin(0.2), 0.3]},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CONSTRAINED)
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        dx.Collocation(3, nodes="lobatto"),
+        dx.LagrangeDAlembert(),
+        dx.DiscreteDirac(constraints="resolve"),
+        dx.Composition(dx.LagrangeDAlembert(), "suzuki4"),
+    ],
+    ids=lambda scheme: type(scheme).__name__,
+)
+def test_the_rows_are_joined(name, scheme):
+    system, start = CONSTRAINED[name]
+    sol = dx.simulate(system, scheme, step=0.02, steps=8, **start)
+    rows = sol.at(sol.t)
+    for field in ("q", "p"):
+        assert np.max(np.abs(getattr(rows, field) - sol.fields[field])) <= 1e-13
+    near = sol.at(0.06 + 0.02 * np.array([-1e-6, 1e-6]))
+    assert np.max(np.abs(near.q - sol.q[3])) <= 1e-6 and np.max(np.abs(near.p - sol.p[3])) <= 1e-4
+    if "multipliers" in rows.fields:
+        assert np.array_equal(sol.at(0.07).multipliers, sol.multipliers[3])
+
+
+@pytest.mark.parametrize("name", ["rigid-body", "lc-ladder", "heavy-top-so3"])
+def test_systems_of_other_kinds(name):
+    example = gallery.get(name)
+    sol = example.simulate(steps=6)
+    fine = example.simulate(step=example.step / 4, steps=24)
+    field = "x" if "x" in sol.fields else "q"
+    t = sol.t[0] + 2.5 * sol.step
+    scale = np.max(np.abs(np.diff(np.asarray(sol.fields[field]), axis=0)))
+    assert np.max(np.abs(getattr(sol.at(t), field) - fine.fields[field][10])) <= 0.05 * scale
+
+
+def test_thinned_rows_and_batches_have_what_single_runs_with_every_row_have():
+    q, v = np.array([[0.0, 0.1], [0.1, -0.2]]), np.array([[0.4, 0.0], [0.3, 0.1]])
+    own = np.array([[0.1, 1.0, 2.2], [0.4, 0.05, 2.5]])
+    for scheme in (dx.Collocation(3), dx.LagrangeDAlembert()):
+        batch = dx.simulate(HENON.system, scheme, q=q, v=v, step=0.25, steps=10)
+        thin = dx.simulate(HENON.system, dx.Collocation(3), q=q, v=v, step=0.25, steps=10, save_every=4)
+        for lane in range(2):
+            one = dx.simulate(HENON.system, scheme, q=q[lane], v=v[lane], step=0.25, steps=10)
+            assert np.array_equal(batch.at(own).q[lane], one.at(own[lane]).q)
+            assert np.array_equal(batch[lane].at(own[lane]).p, one.at(own[lane]).p)
+            assert batch.at(1.1).q.shape == (2, 2) and one.at(1.1).q.shape == (2,)
+            if isinstance(scheme, dx.Collocation):
+                assert np.max(np.abs(thin.at(own).q[lane] - one.at(own[lane]).q)) <= 1e-13
+
+
+@pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.LagrangeDAlembert()], ids=lambda s: type(s).__name__)
+def test_derivatives_go_through_it(scheme):
+    run = lambda x: dx.simulate(HENON.system, scheme, q=jnp.stack([x, 0.1]), v=jnp.array([0.3, 0.2]), step=0.1, steps=4)
+    slope = jax.grad(lambda x: run(x).at(0.237).q[1])(0.05)
+    above, below = (float(run(np.float64(0.05 + e)).at(0.237).q[1]) for e in (1e-5, -1e-5))
+    assert abs(slope - (above - below) / 2e-5) <= 1e-9
+
+
+def test_times_that_are_refused():
+    sol = HENON.simulate(dx.Collocation(2), step=0.1, steps=10)
+    for t in (-0.1, 1.1, np.nan, [0.5, np.inf]):
+        with pytest.raises(ValueError, match="inside the run, from 0 to 1"):
+            sol.at(t)
+    with pytest.raises(TypeError, match="a time or an array of times"):
+        sol.at("now")
+    with pytest.raises(ValueError, match=r"shape \(1, 1\)"):
+        sol.at([[0.5]])
+    with pytest.raises(ValueError, match="only one"):
+        sol[:1].at(0.0)
+
+
+def test_an_engine_without_scalar_programs_is_not_asked_for_them():
+    def lagrangian(q, v):
+        return v @ v / 2 - jax.scipy.special.i0(q[0])
+
+    sol = dx.simulate(dx.LagrangeDirac(lagrangian), dx.Collocation(2), q=[0.4], v=[0.2], step=0.1, steps=3, engine="xla")
+    assert np.max(np.abs(sol.at(sol.t).q - sol.q)) <= 1e-13
+    assert sol.at(0.123).q.shape == (1,)
