@@ -37,8 +37,6 @@ class CollocationKernels:
         self.places: Any = None
         self._run: tuple[Any, Any] | None = None
 
-    finds_sizes = False
-
     @functools.cached_property
     def record(self) -> Record:
         """What is kept of a trajectory."""
@@ -62,6 +60,9 @@ class CollocationKernels:
         library, _, cached = linked("run", (self.digest, width, "collocation"), text, lambda: self.operations)
         self._run = library, SIGNATURE(library["run"])
         return self._run[1], cached
+
+    def of_sizes(self, width: int) -> None:
+        """No kernel: sizes are found by NumPy."""
 
 
 _kernels: Memo[CollocationKernels | None] = Memo(KEPT)

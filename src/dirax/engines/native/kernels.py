@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from dirax.engines.compensation import increments
-from dirax.engines.first_sizes import FirstSizes
 from dirax.engines.native import compile as llvm
 from dirax.engines.native import kernel_cache
 from dirax.engines.native.gradients.linearized_loop import LinearizedLoop, backward, forward
 from dirax.engines.native.loops.plan import Plan
 from dirax.engines.native.loops.record import Record
+from dirax.engines.native.loops.sizes import sizes_module
 from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.newton_step import newton_correction
 from dirax.engines.step_program import KEPT, StepProgram, step_program
@@ -41,6 +41,7 @@ class Kernels:
         self.places: Any = None
         self.digest = _digest(self)
         self._runs: dict[int, tuple[Any, Any]] = {}
+        self._of_sizes: dict[int, tuple[Any, Any]] = {}
         self._linearizations: dict[tuple[bool, int], tuple[Any, Any]] = {}
 
     @property
@@ -53,11 +54,6 @@ class Kernels:
         """What is kept of a lane."""
         return self.bare.record
 
-    @property
-    def finds_sizes(self) -> bool:
-        """Whether a kernel finds the sizes of unknowns and equations where a record has none."""
-        return self.step.sizes_are_written
-
     def kernel(self, width: int) -> tuple[Any, bool]:
         """The compiled `run` for a width, and whether it came from a cache."""
         if width in self._runs:
@@ -65,6 +61,14 @@ class Kernels:
         library, cached = self._library("run", width, lambda: kernel_module(self._planned(), width, llvm.has_fma()))
         self._runs[width] = library, SIGNATURE(library["run"])
         return self._runs[width][1], cached
+
+    def of_sizes(self, width: int) -> Any:
+        """The compiled `run` that finds the sizes; None where they are not written as nodes."""
+        if width not in self._of_sizes and self.step.sizes_are_written:
+            text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
+            library, _ = self._library("run", width, text, "sizes", level=0)
+            self._of_sizes[width] = library, SIGNATURE(library["run"])
+        return self._of_sizes.get(width, (None, None))[1]
 
     def linearized(self, reverse: bool, width: int) -> Any:
         """The compiled `linearized` for a width: tangents forward or cotangents backward. Raises `UnsupportedPrimitive`."""
@@ -78,9 +82,9 @@ class Kernels:
         """Raise `UnsupportedPrimitive` for a step with too many operations."""
         self._planned()
 
-    def _library(self, name: str, width: int, text: Callable[[], str], *more: str) -> tuple[Any, bool]:
+    def _library(self, name: str, width: int, text: Callable[[], str], *more: str, level: int = 2) -> tuple[Any, bool]:
         """The linked code that exports `name`, and whether it came from the disk."""
-        library, self.operations, cached = linked(name, (self.digest, width, *more), text, lambda: self.operations)
+        library, self.operations, cached = linked(name, (self.digest, width, *more), text, lambda: self.operations, level)
         return library, cached
 
     def _linearized(self, reverse: bool) -> LinearizedLoop:
@@ -99,9 +103,6 @@ class Kernels:
                 g = self._graph()
                 plan = self._plan(g)
                 plan.corrections = [newton_correction(g, e, rows) for e, rows in zip(step.equations, step.jacobians, strict=True)]
-                if self.finds_sizes:
-                    pairs = zip(step.equations, plan.corrections, strict=True)
-                    plan.sizes = [FirstSizes(g, e, step.shared.h, c.order) if e.unknowns else None for e, c in pairs]
                 if self.compensated:
                     plan.increments = [increments(g, e) for e in step.equations]
             except GraphTooLarge as error:
@@ -119,14 +120,14 @@ class Kernels:
         return self.step.graph.copy(NODE_LIMIT)
 
 
-def linked(name: str, key: tuple, text: Callable[[], str], operations: Callable[[], int]) -> tuple[Any, int, bool]:
+def linked(name: str, key: tuple, text: Callable[[], str], operations: Callable[[], int], level: int = 2) -> tuple[Any, int, bool]:
     """The linked code of the IR `text()` that exports `name`, the operations of a step, and whether it came from the disk."""
     entry = kernel_cache.name_of(*key, *llvm.version())
     stored = kernel_cache.read(entry)
     if stored is not None:
         with contextlib.suppress(RuntimeError):  # the linker does not take it: it is compiled anew
             return llvm.load(stored.code, (name,)), stored.operations, True
-    code = llvm.object_code(text())
+    code = llvm.object_code(text(), level=level)
     kernel_cache.write(entry, kernel_cache.Kernel(operations(), code))
     return llvm.load(code, (name,)), operations(), False
 

@@ -14,7 +14,6 @@ from dirax.engines.native import compile as llvm
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.loops.record import DOUBTFUL
-from dirax.engines.sizes import sizes_of
 from dirax.engines.threads import thread_count
 
 SHARES = 4
@@ -71,8 +70,6 @@ class Lanes:
             table[:, self.record.state] = p.state
             for stage, guess in enumerate(p.guess):
                 table[:, self.record.unknowns(stage, np.shape(guess)[-1])] = guess
-            if not made.finds_sizes:
-                self.record.put_sizes(table, sizes_of(p))
         else:
             table = np.array(p.record)
         self.records = self._blocked(table)

@@ -10,7 +10,6 @@ from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.lanes import TOGETHER, arrays_saved
 from dirax.engines.native.loops.record import DOUBTFUL
-from dirax.engines.sizes import sizes_of
 
 
 class Places:
@@ -54,8 +53,6 @@ class OneLane:
             memory[self.record.state] = p.state
             for stage, guess in enumerate(p.guess):
                 memory[self.record.unknowns(stage, np.shape(guess)[-1])] = guess
-            if not made.finds_sizes:
-                self.record.put_sizes(memory, sizes_of(p))
         else:
             memory[: places.record] = p.record[0]
         if places.outs > places.params:

@@ -4,13 +4,12 @@ import time
 
 import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem, Progress, finished
+from dirax.engines.contract import Outcome, Problem, Progress, finished
 from dirax.engines.native.collocation_kernels import collocation_kernels
-from dirax.engines.native.kernels import Kernels, kernels
+from dirax.engines.native.kernels import kernels
 from dirax.engines.native.lanes import Lanes, width_for
-from dirax.engines.native.loops.record import DOUBTFUL
 from dirax.engines.native.one_lane import OneLane, places_of
-from dirax.engines.sizes import grown, sizes_there
+from dirax.engines.native.sizes_of_lanes import find_sizes, with_present_sizes
 from dirax.program.interpreter import UnsupportedPrimitive
 
 CHUNK_SECONDS = 0.1
@@ -55,9 +54,8 @@ class Ready:
         places = places_of(p, self.made)
         lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
         fields = lanes.fields
-        if places is None and self.made.finds_sizes:
-            lanes.advance(self.kernel, p.after, p.after)
-            look_closer(lanes)
+        if p.record is None:
+            find_sizes(lanes, self.made.of_sizes(self.width) if self.notes["kernel_cached"] else None)
         compile_seconds, cached, started = self.compile_seconds, self.notes["kernel_cached"], time.perf_counter()
         done, interrupted, threads = p.after, False, 1
         count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
@@ -66,9 +64,6 @@ class Ready:
                 count = min(count, p.steps - done)
                 tick = time.perf_counter()
                 lanes.advance(self.kernel, done, done + count, threads)
-                if done == p.after and lanes.doubtful:
-                    look_closer(lanes)
-                    lanes.advance(self.kernel, done, done + count, threads)
                 done += count
                 rate = count / max(time.perf_counter() - tick, 1e-9)
                 count = max(1, int(rate * CHUNK_SECONDS))
@@ -81,7 +76,7 @@ class Ready:
         if not interrupted:
             by_newton = self.is_collocation and _by_newton(lanes)
             if not self.is_collocation:
-                _with_present_sizes(lanes, self.made)
+                with_present_sizes(lanes, self.made)
         run_seconds = time.perf_counter() - started
         closing = lanes.close(self.kernel)
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
@@ -119,44 +114,3 @@ def _by_newton(lanes: Lanes | OneLane) -> bool:
         for lane in left:
             lanes.again(newton, lane)
     return bool(left)
-
-
-def look_closer(lanes: Lanes | OneLane) -> None:
-    """Find the sizes that are in doubt."""
-    p, record, table = lanes.problem, lanes.record, lanes.table()
-    doubtful = np.flatnonzero(table[:, record.status] == DOUBTFUL)
-    if len(doubtful):
-        own = table[doubtful]
-        guess = tuple(own[:, record.unknowns(i, stage.unknowns)] for i, (stage, _) in enumerate(p.equation.stages))
-        record.put_sizes(own, sizes_there(p, doubtful, own[:, record.completed], own[:, record.state], guess))
-        own[:, record.status] = OK
-        lanes.put(doubtful, own)
-
-
-RESUMED = 16
-"""How often trajectories go on with other sizes."""
-
-
-def _with_present_sizes(lanes: Lanes | OneLane, made: Kernels) -> None:
-    """Go on with trajectories whose unknowns have become larger than where they began. An attempt that does not come to another
-    step leaves no trace."""
-    p, record = lanes.problem, lanes.record
-    if not lanes.stuck:
-        return
-    table = lanes.table()
-    failed, tried = np.flatnonzero(table[:, record.status] == NOT_CONVERGED), 0
-    while len(failed) and tried < RESUMED:
-        tried, own, stages = tried + 1, table[failed], [stage.unknowns for stage, _ in p.equation.stages]
-        places = [record.sizes(i, k) for i, k in enumerate(stages)]
-        before = tuple(np.stack([own[:, part] for part in pair], axis=1) for pair in places)
-        guess = tuple(own[:, record.unknowns(i, k)] for i, k in enumerate(stages))
-        sizes, more = grown(p, failed, own[:, record.completed], own[:, record.state], guess, before)
-        if not np.any(more):
-            return
-        record.put_sizes(own, sizes)
-        own[:, record.status] = OK
-        before, chosen = table[failed[more]], failed[more]
-        after = lanes.attempt(chosen, made, own[more])
-        further = after[:, record.completed] > own[more, record.completed]
-        lanes.put(chosen, np.where(further[:, None], after, before))
-        table, failed = lanes.table(), chosen[further & (after[:, record.status] == NOT_CONVERGED)]

@@ -8,7 +8,7 @@ import numpy as np
 from dirax.engines.native.gradients.recording import Recorded
 from dirax.engines.native.kernels import kernels
 from dirax.engines.native.lanes import Lanes, width_for
-from dirax.engines.native.run import look_closer
+from dirax.engines.native.sizes_of_lanes import find_sizes
 
 SEGMENT_BYTES = 2**26
 """Memory for the steps that are gone over at a time."""
@@ -24,9 +24,7 @@ class Segments:
         made = kernels(p.equation, p.params, True, p.compensated)
         self.lanes = Lanes(p, made, width_for(p.batch or 1))
         self.kernel, _ = made.kernel(self.lanes.width)
-        _, outs = self.lanes.arrays(1)
-        self.lanes.call(self.kernel, self.lanes.records, outs, 0, 0, 1, 1)
-        look_closer(self.lanes)
+        find_sizes(self.lanes, made.of_sizes(self.lanes.width))
         self.linearized = made.linearized(reverse, self.lanes.width)
         row_bytes = 8 * (p.batch or 1) * self.stages * (task.state_size + task.unknowns)
         self.length = max(1, SEGMENT_BYTES // row_bytes)

@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from dirax.engines.first_sizes import FirstSizes
 from dirax.engines.native.loops.record import Record
 from dirax.engines.newton_step import Correction
 from dirax.engines.step_program import Inputs, TracedEquation
@@ -27,8 +26,6 @@ class Plan:
     )  # how the row of a step is made of its stages', by field; "first" if not said
     compensated: bool = False
     increments: list[list[int | None]] = field(default_factory=list)
-    sizes: list[FirstSizes | None] = field(default_factory=list)
-    """Those of each equation, None of one without unknowns; empty where others find them."""
 
     @property
     def state_size(self) -> int:

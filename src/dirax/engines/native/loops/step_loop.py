@@ -7,7 +7,7 @@ from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.dense import add_dense_solve
 from dirax.engines.native.loops.plan import RUN, Plan, frontier
-from dirax.engines.native.loops.record import DOUBTFUL, Frame, Record
+from dirax.engines.native.loops.record import Frame, Record
 from dirax.engines.native.loops.stage import Block, bind_sizes, emit_stage
 
 WRITTEN_OUT = 64
@@ -53,8 +53,6 @@ def _define_block(plan: Plan, module: Module, width: int) -> None:
         known.bind(node, b.load(e.real, b.at(e.real, "%params", i)))
     if len(plan.stages) == 1:
         known.bind(plan.shared.h, e.mul(e.splat("%h"), e.const(plan.stages[0][1])))
-    if plan.sizes:
-        _emit_sizes(plan, frame, known)
     if len(plan.stages) == 1:
         bind_sizes(known, frame, plan.corrections[0])
     known.require(frontier(plan.graph, level, plan.outputs, RUN))
@@ -67,36 +65,6 @@ def _define_block(plan: Plan, module: Module, width: int) -> None:
     give_back()
     pointers = "ptr noalias %lanes, ptr noalias %params, ptr noalias %outs"
     module.define(f"define internal void @block({pointers}, {NUMBERS}) noinline", b)
-
-
-def _emit_sizes(plan: Plan, frame: Frame, known: Region) -> None:
-    """The sizes of every stage at the first state, in lanes whose record has none."""
-    e = frame.emitter
-    b, first = e.body, frame.sizes
-    none = e.compare("oeq", b.load(e.real, first), e.const(0.0))
-    with b.when(e.any(none)):
-        time = e.add(e.splat("%t0"), e.mul(e.splat(b.put("sitofp i64 %offset to double")), e.splat("%h")))
-        b.store(e.real, e.select(none, e.const(1.0), b.load(e.real, first)), first)
-        for stage, (index, fraction) in enumerate(plan.stages):
-            found, equation = plan.sizes[index], plan.equations[index]
-            if found is None:
-                continue
-            region = Region(e, plan.graph, known)
-            region.bind(plan.shared.t, time)
-            if len(plan.stages) > 1:
-                region.bind(plan.shared.h, e.mul(e.splat("%h"), e.const(fraction)))
-            k, offset = len(equation.unknowns), stage * plan.record.history
-            values = frame.loads([*frame.state, *frame.slots(frame.unknowns, k, offset)])
-            for node, value in zip([*equation.state, *equation.unknowns], values, strict=True):
-                region.bind(node, value)
-            region.require(found.outputs)
-            places = [*frame.slots(frame.sizes, k, offset), *frame.slots(frame.rows, k, offset), frame.status]
-            doubt = e.select(
-                e.compare("oeq", region.value(found.sure), e.const(1.0)), b.load(e.real, frame.status), e.const(float(DOUBTFUL))
-            )
-            new = [*(region.value(n) for n in (*found.unknowns, *found.equations)), doubt]
-            old = frame.loads(places)
-            frame.stores([e.select(none, a, c) for a, c in zip(new, old, strict=True)], places)
 
 
 def _transfers(frame: Frame, record: Record) -> tuple[Callable[[], None], Callable[[], None]]:

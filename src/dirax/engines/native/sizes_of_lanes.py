@@ -1,0 +1,65 @@
+"""The sizes of unknowns and equations in the records of trajectories: where a run begins, and where it stops too early."""
+
+from typing import Any
+
+import numpy as np
+
+from dirax.engines.contract import NOT_CONVERGED, OK
+from dirax.engines.native.kernels import Kernels
+from dirax.engines.native.lanes import Lanes
+from dirax.engines.native.loops.record import DOUBTFUL
+from dirax.engines.native.one_lane import OneLane
+from dirax.engines.sizes import grown, sizes_of, sizes_there
+
+RESUMED = 16
+"""How often trajectories go on with other sizes."""
+
+
+def find_sizes(lanes: Lanes | OneLane, kernel: Any) -> None:
+    """Write the sizes into records that have none: by a kernel of their own, which takes longer to compile than NumPy takes once,
+    or, where that is None, by NumPy."""
+    if kernel is not None:
+        lanes.advance(kernel, 0, 0)
+        look_closer(lanes)
+    else:
+        table = lanes.table()
+        lanes.record.put_sizes(table, sizes_of(lanes.problem))
+        lanes.put(np.arange(len(table)), table)
+
+
+def look_closer(lanes: Lanes | OneLane) -> None:
+    """Find the sizes that are in doubt."""
+    if not lanes.doubtful:
+        return
+    p, record, table = lanes.problem, lanes.record, lanes.table()
+    doubtful = np.flatnonzero(table[:, record.status] == DOUBTFUL)
+    own = table[doubtful]
+    guess = tuple(own[:, record.unknowns(i, stage.unknowns)] for i, (stage, _) in enumerate(p.equation.stages))
+    record.put_sizes(own, sizes_there(p, doubtful, own[:, record.completed], own[:, record.state], guess))
+    own[:, record.status] = OK
+    lanes.put(doubtful, own)
+
+
+def with_present_sizes(lanes: Lanes | OneLane, made: Kernels) -> None:
+    """Go on with trajectories whose unknowns have become larger than where they began. An attempt that does not come to another
+    step leaves no trace."""
+    p, record = lanes.problem, lanes.record
+    if not lanes.stuck:
+        return
+    table = lanes.table()
+    failed, tried = np.flatnonzero(table[:, record.status] == NOT_CONVERGED), 0
+    while len(failed) and tried < RESUMED:
+        tried, own, stages = tried + 1, table[failed], [stage.unknowns for stage, _ in p.equation.stages]
+        places = [record.sizes(i, k) for i, k in enumerate(stages)]
+        before = tuple(np.stack([own[:, part] for part in pair], axis=1) for pair in places)
+        guess = tuple(own[:, record.unknowns(i, k)] for i, k in enumerate(stages))
+        sizes, more = grown(p, failed, own[:, record.completed], own[:, record.state], guess, before)
+        if not np.any(more):
+            return
+        record.put_sizes(own, sizes)
+        own[:, record.status] = OK
+        before, chosen = table[failed[more]], failed[more]
+        after = lanes.attempt(chosen, made, own[more])
+        further = after[:, record.completed] > own[more, record.completed]
+        lanes.put(chosen, np.where(further[:, None], after, before))
+        table, failed = lanes.table(), chosen[further & (after[:, record.status] == NOT_CONVERGED)]
