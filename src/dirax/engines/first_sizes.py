@@ -19,6 +19,10 @@ from dirax.program.evaluation.in_numpy import Values, in_parts
 from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.memo import Memo, Same
+from dirax.program.rounding import rounding_nodes
+
+ROUNDINGS = 64.0
+"""Roundings up to which an unknown is zero."""
 
 SOLVED = 1e-10
 """What a solution with good pivots leaves of a right-hand side, relative to its terms."""
@@ -29,19 +33,19 @@ class FirstSizes:
     there is no doubt and 0 where there is. `order` is that of the pivots, found here where it is not given."""
 
     def __init__(self, graph: Graph, equation: TracedEquation, h: int, order: list[tuple[int, int]] | None = None):
-        g, unknowns, state, residual = graph, equation.unknowns, equation.state, equation.residual
+        g, unknowns, residual = graph, equation.unknowns, equation.residual
         k, size = len(unknowns), lambda node: g.make("abs", node)
         total = lambda nodes: reduce(g.add, nodes, g.zero)
-        rows = jacobian(g, residual, [*unknowns, *state, h])
+        rows = jacobian(g, residual, [*unknowns, h])
         matrix = [[row.get(j, g.zero) for j in range(k)] for row in rows]
         factors = Factors(g, matrix, order or pivot_order(g, matrix))
         change = factors.solve(g, residual)
         solution = [size(g.sub(u, d)) for u, d in zip(unknowns, change, strict=True)]
-        operands = [*(g.add(size(u), a) for u, a in zip(unknowns, solution, strict=True)), *map(size, state)]
         products = lambda row, values: [g.mul(size(row[j]), value) for j, value in enumerate(values) if j in row]
-        terms = [total([size(r), *products(row, operands)]) for r, row in zip(residual, rows, strict=True)]
+        rounded = rounding_nodes(g, residual)
+        terms = [total([e, *products(row, solution)]) for e, row in zip(rounded, rows, strict=True)]
         known = factors.bounds(g, terms)
-        moved = factors.bounds(g, [size(g.mul(h, row.get(k + len(state), g.zero))) for row in rows])
+        moved = factors.bounds(g, [size(g.mul(h, row.get(k, g.zero))) for row in rows])
         least = g.constant(LEAST_SIZE)
         own = [total([a, size(u), least]) for a, u in zip(known, unknowns, strict=True)]
         equations = [g.add(total(products(row, own)), least) for row in rows]
@@ -49,8 +53,11 @@ class FirstSizes:
         sure = g.make("finite", total([*own, *equations]))
         below = lambda a, b: g.make("and", sure, g.make("le", a, b))
         for a, m, u in zip(known, moved, solution, strict=True):
+            blurred = g.mul(g.constant(EPSILON), a)
             reached = g.add(u, g.make("sqrt", g.mul(m, a)))
-            sure = below(g.mul(g.constant(EPSILON), a), g.mul(g.constant(4.0 * STALLED), reached))
+            clear = g.make("le", blurred, g.mul(g.constant(4.0 * STALLED), reached))
+            zero = g.make("and", g.make("le", u, g.mul(g.constant(ROUNDINGS), blurred)), g.make("lt", least, a))
+            sure = g.make("and", sure, g.make("or", clear, zero))
         for r, row in zip(residual, matrix, strict=True):
             of_row = [g.mul(a, d) for a, d in zip(row, change, strict=True)]
             sure = below(size(g.sub(total(of_row), r)), g.mul(g.constant(SOLVED), total([size(r), *map(size, of_row)])))

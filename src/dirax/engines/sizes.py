@@ -1,9 +1,10 @@
 """How large the unknowns and the equations of a step are: the units in which an engine measures them.
 
-At the first guess u and the first state x of a step with the residual r, the terms of its equations have the sizes
-|r| + |r_u||u| + |r_x||x|, and a last place of each changes the unknowns by
+At the first guess u and the first state x of a step with the residual r, the terms of its equations have the sizes E that
+`program/rounding.py` finds, however they cancel, and |r_u||u*| at the solution u* of the linearized step. A last place of each
+changes the unknowns by
 
-    ε |r_u⁻¹| (|r| + |r_u||u| + |r_x||x|)        (Skeel 1979).
+    ε |r_u⁻¹| (E + |r_u||u*|)        (Skeel 1979).
 
 Without the ε this is the size of an unknown, and |r_u| times these sizes that of an equation. Data may be special, such as a
 link that hangs straight: what the derivatives are near the end of a short step counts as well. All sizes are rounded to powers
@@ -28,12 +29,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Problem
-from dirax.engines.first_sizes import first_sizes
+from dirax.engines.first_sizes import ROUNDINGS, first_sizes
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import balanced_inverse, power_of_two
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.compiled import compiled
 from dirax.program.roots import FEWEST_SPARSE
+from dirax.program.rounding import rounding
 
 
 def sizes_of(problem: Problem) -> tuple[np.ndarray, ...]:
@@ -93,8 +95,9 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
     firsts = _first_of_each(stages)
     try:
         program = step_program(p.equation, *key)
-        none = np.zeros((batch, 0)), np.zeros((batch, 0, state.shape[1] + 1))
+        none = np.zeros((batch, 0)), np.zeros((batch, 0, 1))
         linear = lambda i, u, x, part: program.linearized(*key, u, x, t, part * h[i], i, True) if u.shape[1] else none
+        terms = lambda i, u, x: program.terms(*key, u, x, t, h[i], i) if u.shape[1] else np.zeros((batch, 0))
         end, first = state, linear(0, guesses[0], state, SHORT)
         for i in firsts:
             u = _updated(*(linear(i, guesses[i], end, SHORT) if i else first), guesses[i], np)
@@ -106,7 +109,8 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
             if same is None:
                 short = linear(i, u, state, SHORT)[1] if i else first[1]
                 near = linear(i, u, end, SHORT)[1]
-                found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, state, end, h[i][:, None], np))
+                both = terms(i, u, state), terms(i, u, end)
+                found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, both, h[i][:, None], np))
             else:
                 found.append(found[same])
     except (UnsupportedPrimitive, GraphTooLarge):
@@ -167,18 +171,15 @@ NEAR = 1.0 / 16.0
 COUPLED = 1e-3
 """Unknowns that change others by less than this of their sizes are not coupled."""
 
-ROUNDINGS = 64.0
-"""Roundings up to which an unknown is zero."""
-
 
 def _nearby(count: int) -> np.ndarray:
     """A factor near 1 for each of so many numbers, all of them different."""
     return 1.0 + NEAR * (np.modf(np.arange(1, count + 1) * (np.sqrt(5.0) - 1.0) / 2.0)[0] - 0.5)
 
 
-def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, state: Any, end: Any, h: Any, xp: ModuleType) -> Any:
-    """(…, 2, k) from r (…, k) and its derivatives by (u, x, h) at the state, and those of a short step there and near its `end`,
-    (…, k, k + s + 1)."""
+def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: tuple, h: Any, xp: ModuleType) -> Any:
+    """(…, 2, k) from r (…, k) and its derivatives by (u, h) at the state, and those of a short step there and near its end,
+    (…, k, k + 1); `rounded` are the sizes of the terms (…, k) at either place."""
     if not u.shape[-1]:
         return xp.ones((*u.shape[:-1], 2, 0))
     k, applied = u.shape[-1], lambda matrix, vector: (matrix @ vector[..., None])[..., 0]
@@ -188,10 +189,7 @@ def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, state: Any
         inverse = balanced_inverse(slopes[..., :k], xp)
         solution = xp.abs(u - finite(applied(inverse, residual)))
         largest = xp.maximum(xp.abs(u), solution)
-        terms = [
-            xp.abs(residual) + applied(xp.abs(derivatives[..., :-1]), xp.concatenate([largest, xp.abs(x)], axis=-1))
-            for derivatives, x in zip(both, (state, end), strict=True)
-        ]
+        terms = [of + applied(xp.abs(slopes[..., :k]), largest) for of, slopes in zip(rounded, both, strict=True)]
         inverses = [xp.abs(balanced_inverse(derivatives[..., :k], xp)) for derivatives in (short, near)]
         sizes = [finite(applied(inverse, of)) for inverse, of in zip(inverses, terms, strict=True)]
 
@@ -221,9 +219,13 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
     def one(state, guess, params):
         def linear(i, u, x, part):
             stage, fraction = equation.stages[i]
-            residual = lambda u, x, h: stage.residual(u, x, t, h, params)
-            by_u, by_x, by_h = jax.jacfwd(residual, argnums=(0, 1, 2))(u, x, part * fraction * h)
-            return residual(u, x, part * fraction * h), jnp.concatenate([by_u, by_x, by_h[:, None]], axis=1)
+            residual = lambda u, h: stage.residual(u, x, t, h, params)
+            by_u, by_h = jax.jacfwd(residual, argnums=(0, 1))(u, part * fraction * h)
+            return residual(u, part * fraction * h), jnp.concatenate([by_u, by_h[:, None]], axis=1)
+
+        def terms(i, u, x):
+            stage, fraction = equation.stages[i]
+            return rounding(lambda u, x, t, h: stage.residual(u, x, t, h, params), u, x, t, fraction * h)
 
         end, found = state, []
         for i in _first_of_each(equation.stages):
@@ -233,7 +235,8 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
         end = end * _nearby(len(state))
         for i, u in enumerate(guess):
             short, near = linear(i, u, state, SHORT)[1], linear(i, u, end, SHORT)[1]
-            found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, state, end, equation.stages[i][1] * h, jnp))
+            both = terms(i, u, state), terms(i, u, end)
+            found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, both, equation.stages[i][1] * h, jnp))
         return tuple(found)
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params

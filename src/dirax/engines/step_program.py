@@ -20,6 +20,7 @@ from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.interpreter import Nodes, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
+from dirax.program.rounding import rounding_nodes
 from dirax.program.scalar_program import ScalarProgram
 
 KEPT = 128
@@ -197,51 +198,67 @@ class StepProgram:
 
     @cached_property
     def slopes(self) -> tuple[Graph, list[list[int]]]:
-        """A graph of the step with the derivatives of every residual by its unknowns, its state and h, row by row."""
+        """A graph of the step with the derivatives of every residual by its unknowns and by h, row by row."""
         g = self.graph.copy()
-        inputs = [[*e.unknowns, *e.state, self.shared.h] for e in self.equations]
+        inputs = [[*e.unknowns, self.shared.h] for e in self.equations]
         rows = [jacobian(g, e.residual, i) for e, i in zip(self.equations, inputs, strict=True)]
         return g, [[row.get(j, g.zero) for row in r for j in range(len(i))] for r, i in zip(rows, inputs, strict=True)]
 
+    @cached_property
+    def rounded(self) -> tuple[Graph, list[list[int]]]:
+        """A graph of the step with the sizes of the terms of every residual."""
+        g = self.graph.copy()
+        return g, [rounding_nodes(g, e.residual) for e in self.equations]
+
     def linearized(
-        self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_state: bool = False
+        self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_h: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(residual, Jacobian) of a stage in numbers, (entries, k) and (entries, k, k), or (entries, k, k + s + 1) with those
-        of the state and of h; arguments have an axis of entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
-        index = self.stages[stage][0]
-        first, shared, graph = self.equations[index], self.shared, self.graph
-        inputs = [*first.unknowns, *first.state, shared.h] if by_state else first.unknowns
-        k, few = len(first.unknowns), len(u) * len(inputs) * len(graph) <= IN_NUMBERS
-        entries: list[int] = []
+        """(residual, Jacobian) of a stage in numbers, (entries, k) and (entries, k, k), or (entries, k, k + 1) with the derivative
+        by h; arguments have an axis of entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
+        index, graph = self.stages[stage][0], self.graph
+        e, entries = self.equations[index], []
+        inputs = [*e.unknowns, self.shared.h] if by_h else e.unknowns
+        k, few = len(e.unknowns), len(u) * len(inputs) * len(graph) <= IN_NUMBERS
         if few:
             graph = graph.copy()
-        elif by_state:
+        elif by_h:
             graph, entries = self.slopes[0], self.slopes[1][index]
         else:
             entries = [row.get(j, graph.zero) for row in self.jacobians[index] for j in range(k)]
         node = lambda nodes: np.asarray(nodes, dtype=np.int64)
-        leaves = self.parameters.flatten(params, len(u) if batch_params else None)
 
-        def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
-            known = Values(graph, len(arguments[0]))
-            for nodes, array in zip((first.unknowns, first.state, shared.t, shared.h, shared.params), arguments, strict=True):
-                known.bind(node(nodes), array)
-            slopes = known.slopes(first.residual, inputs) if few else known.read(node(entries).reshape(k, -1))
-            return [known.read(node(first.residual)), slopes]
+        def read(known: Values) -> list[np.ndarray]:
+            slopes = known.slopes(e.residual, inputs) if few else known.read(node(entries).reshape(k, -1))
+            return [known.read(node(e.residual)), slopes]
 
-        residual, slopes = in_parts(part, [u, state, t, h, np.broadcast_to(leaves, (len(u), self.parameters.size))])
+        residual, slopes = self._in_numbers(read, graph, index, params, batch_params, u, state, t, h)
         return residual, slopes
+
+    def terms(self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0) -> np.ndarray:
+        """The sizes of the terms of a stage's residual in numbers, (entries, k); arguments as above."""
+        index, (graph, nodes) = self.stages[stage][0], self.rounded
+        return self._in_numbers([nodes[index]], graph, index, params, batch_params, u, state, t, h)[0]
 
     def advanced(self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0) -> np.ndarray:
         """The state after a stage in numbers, (entries, s); arguments as above."""
-        shared, count, e = self.shared, len(u), self.equations[self.stages[stage][0]]
+        index = self.stages[stage][0]
+        return self._in_numbers([self.equations[index].advance], self.graph, index, params, batch_params, u, state, t, h)[0]
+
+    def _in_numbers(self, outputs: Any, graph: Graph, index: int, params: Any, batch_params: bool, *arguments) -> list[np.ndarray]:
+        """Nodes of a graph that begins as that of the step, (entries, …) each; `outputs` are lists of them, or a function that
+        reads them."""
+        e, shared, count = self.equations[index], self.shared, len(arguments[0])
         leaves = self.parameters.flatten(params, count if batch_params else None)
-        known, leaves = Values(self.graph, count), np.broadcast_to(leaves, (count, self.parameters.size))
-        node = lambda nodes: np.asarray(nodes, dtype=np.int64)
-        bound = (e.unknowns, u), (e.state, state), (shared.t, t), (shared.h, h), (shared.params, leaves)
-        for nodes, array in bound:
-            known.bind(node(nodes), array)
-        return known.read(node(e.advance))
+        inputs = (e.unknowns, e.state, shared.t, shared.h, shared.params)
+        read = outputs if callable(outputs) else lambda known: [known.read(np.asarray(nodes, dtype=np.int64)) for nodes in outputs]
+
+        def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
+            known = Values(graph, len(arguments[0]))
+            for nodes, array in zip(inputs, arguments, strict=True):
+                known.bind(np.asarray(nodes, dtype=np.int64), array)
+            return read(known)
+
+        return in_parts(part, [*arguments, np.broadcast_to(leaves, (count, self.parameters.size))])
 
 
 _programs: Memo[StepProgram | UnsupportedPrimitive] = Memo(KEPT)
@@ -264,10 +281,10 @@ def step_program(equation: Any, params: Any, batch_params: bool) -> StepProgram:
 
 
 def linearized(
-    equation: Any, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_state: bool = False
+    equation: Any, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_h: bool = False
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """`StepProgram.linearized`; None for a step that is no scalar program."""
     try:
-        return step_program(equation, params, batch_params).linearized(params, batch_params, u, state, t, h, stage, by_state)
+        return step_program(equation, params, batch_params).linearized(params, batch_params, u, state, t, h, stage, by_h)
     except (UnsupportedPrimitive, GraphTooLarge):
         return None

@@ -33,8 +33,8 @@ def rounding(function: Callable, *values: Array) -> Array:
     return rounding_p.bind(*map(operand, captured), *map(operand, values), jaxpr=jaxpr)[0]
 
 
-def _rounding_nodes(g: Graph, outputs: list[int], inputs: set[int]) -> list[int]:
-    """The nodes of E for outputs; operands, and what no operation gives, have a rounding each."""
+def rounding_nodes(g: Graph, outputs: list[int], inputs: set[int] | frozenset[int] = frozenset()) -> list[int]:
+    """The nodes of E for outputs of a graph, which gains them; `inputs`, and what no operation gives, have a rounding each."""
     error: dict[int, int] = {}
     for node in g.reachable(outputs):
         if g.is_constant(node) or g.is_boolean(node):
@@ -82,7 +82,7 @@ def _by_derivatives(jaxpr: ClosedJaxpr, *operands) -> list[Array]:
 
 
 def _of(g: Graph, nodes: Nodes, inputs: set[int]) -> Nodes:
-    found = dict(zip(nodes.ravel().tolist(), _rounding_nodes(g, nodes.ravel().tolist(), inputs), strict=True))
+    found = dict(zip(nodes.ravel().tolist(), rounding_nodes(g, nodes.ravel().tolist(), inputs), strict=True))
     return elementwise(lambda node: found[node], nodes)
 
 
