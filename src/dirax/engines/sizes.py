@@ -95,22 +95,22 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
     firsts = _first_of_each(stages)
     try:
         program = step_program(p.equation, *key)
-        none = np.zeros((batch, 0)), np.zeros((batch, 0, 1))
-        linear = lambda i, u, x, part: program.linearized(*key, u, x, t, part * h[i], i, True) if u.shape[1] else none
-        terms = lambda i, u, x: program.terms(*key, u, x, t, h[i], i) if u.shape[1] else np.zeros((batch, 0))
-        end, first = state, linear(0, guesses[0], state, SHORT)
+        leaves = program.parameters.flatten(p.params, p.batch if p.batch_params else None)
+        leaves = np.broadcast_to(leaves, (batch, program.parameters.size))
+        look = lambda i, u, x, part=1.0: program.look(leaves, u, x, t, part * h[i], i)
+        end = state
         for i in firsts:
-            u = _updated(*(linear(i, guesses[i], end, SHORT) if i else first), guesses[i], np)
-            end = program.advanced(*key, u, end, t, SHORT * h[i], i)
+            residual, slopes, *_ = look(i, guesses[i], end, SHORT)
+            end = look(i, _updated(residual, slopes, guesses[i], np), end, SHORT)[-1]
         end = end * _nearby(end.shape[1])
         found: list[np.ndarray] = []
         for i, (stage, u) in enumerate(zip(stages, guesses, strict=True)):
             same = next((j for j in range(i) if stages[j] == stage and np.array_equal(guesses[j], u)), None)
             if same is None:
-                short = linear(i, u, state, SHORT)[1] if i else first[1]
-                near = linear(i, u, end, SHORT)[1]
-                both = terms(i, u, state), terms(i, u, end)
-                found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, both, h[i][:, None], np))
+                residual, slopes, terms, _ = look(i, u, state)
+                short, near = (look(i, u, x, SHORT)[1] for x in (state, end))
+                both = terms, look(i, u, end)[2]
+                found.append(_sizes(residual, slopes, short, near, u, both, h[i][:, None], np))
             else:
                 found.append(found[same])
     except (UnsupportedPrimitive, GraphTooLarge):
@@ -186,12 +186,12 @@ def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: t
     finite = lambda sizes: xp.where(xp.isfinite(sizes), sizes, 0.0)
     with np.errstate(all="ignore"):
         both = slopes, near
-        inverse = balanced_inverse(slopes[..., :k], xp)
+        inverse, *others = balanced_inverse(xp.stack([d[..., :k] for d in (slopes, short, near)]), xp)
         solution = xp.abs(u - finite(applied(inverse, residual)))
         largest = xp.maximum(xp.abs(u), solution)
         terms = [of + applied(xp.abs(slopes[..., :k]), largest) for of, slopes in zip(rounded, both, strict=True)]
-        inverses = [xp.abs(balanced_inverse(derivatives[..., :k], xp)) for derivatives in (short, near)]
-        sizes = [finite(applied(inverse, of)) for inverse, of in zip(inverses, terms, strict=True)]
+        inverses = [xp.abs(other) for other in others]
+        sizes = [finite(applied(other, of)) for other, of in zip(inverses, terms, strict=True)]
 
         blurred = EPSILON * finite(applied(xp.abs(inverse), terms[0]))
         moved = finite(applied(xp.abs(inverse), xp.abs(h * slopes[..., -1])))

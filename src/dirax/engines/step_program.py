@@ -196,69 +196,98 @@ class StepProgram:
 
         return jax.jit(function)  # so that JAX traces it once for all the places that a loop has it in
 
-    @cached_property
-    def slopes(self) -> tuple[Graph, list[list[int]]]:
-        """A graph of the step with the derivatives of every residual by its unknowns and by h, row by row."""
-        g = self.graph.copy()
-        inputs = [[*e.unknowns, self.shared.h] for e in self.equations]
-        rows = [jacobian(g, e.residual, i) for e, i in zip(self.equations, inputs, strict=True)]
-        return g, [[row.get(j, g.zero) for row in r for j in range(len(i))] for r, i in zip(rows, inputs, strict=True)]
-
-    @cached_property
-    def rounded(self) -> tuple[Graph, list[list[int]]]:
-        """A graph of the step with the sizes of the terms of every residual."""
-        g = self.graph.copy()
-        return g, [rounding_nodes(g, e.residual) for e in self.equations]
-
-    def linearized(
-        self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_h: bool = False
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(residual, Jacobian) of a stage in numbers, (entries, k) and (entries, k, k), or (entries, k, k + 1) with the derivative
-        by h; arguments have an axis of entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
-        index, graph = self.stages[stage][0], self.graph
-        e, entries = self.equations[index], []
-        inputs = [*e.unknowns, self.shared.h] if by_h else e.unknowns
-        k, few = len(e.unknowns), len(u) * len(inputs) * len(graph) <= IN_NUMBERS
-        if few:
-            graph = graph.copy()
-        elif by_h:
-            graph, entries = self.slopes[0], self.slopes[1][index]
-        else:
-            entries = [row.get(j, graph.zero) for row in self.jacobians[index] for j in range(k)]
-        node = lambda nodes: np.asarray(nodes, dtype=np.int64)
+    def linearized(self, params: Any, batch_params: bool, u, state, t, h) -> tuple[np.ndarray, np.ndarray]:
+        """(residual, Jacobian) of the first stage in numbers, (entries, k) and (entries, k, k); arguments have an axis of
+        entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
+        index, graph = self.stages[0][0], self.graph
+        e = self.equations[index]
+        k, few = len(e.unknowns), len(u) * len(e.unknowns) * len(graph) <= IN_NUMBERS
+        entries = [] if few else [row.get(j, graph.zero) for row in self.jacobians[index] for j in range(k)]
+        graph = graph.copy() if few else graph
 
         def read(known: Values) -> list[np.ndarray]:
-            slopes = known.slopes(e.residual, inputs) if few else known.read(node(entries).reshape(k, -1))
-            return [known.read(node(e.residual)), slopes]
+            slopes = known.slopes(e.residual, e.unknowns) if few else known.read(_nodes(entries).reshape(k, k))
+            return [known.read(_nodes(e.residual)), slopes]
 
-        residual, slopes = self._in_numbers(read, graph, index, params, batch_params, u, state, t, h)
+        leaves = self.parameters.flatten(params, len(u) if batch_params else None)
+        residual, slopes = self._in_numbers(read, graph, e, u, state, t, h, leaves)
         return residual, slopes
 
-    def terms(self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0) -> np.ndarray:
-        """The sizes of the terms of a stage's residual in numbers, (entries, k); arguments as above."""
-        index, (graph, nodes) = self.stages[stage][0], self.rounded
-        return self._in_numbers([nodes[index]], graph, index, params, batch_params, u, state, t, h)[0]
-
-    def advanced(self, params: Any, batch_params: bool, u, state, t, h, stage: int = 0) -> np.ndarray:
-        """The state after a stage in numbers, (entries, s); arguments as above."""
+    def look(self, leaves: np.ndarray, u, state, t, h, stage: int) -> list[np.ndarray]:
+        """A stage in numbers: residual (entries, k), its derivatives by the unknowns and by h (entries, k, k + 1), the sizes of
+        its terms (entries, k), and the state after it (entries, s)."""
         index = self.stages[stage][0]
-        return self._in_numbers([self.equations[index].advance], self.graph, index, params, batch_params, u, state, t, h)[0]
+        e, shared, k = self.equations[index], self.shared, len(self.equations[index].unknowns)
+        graph, entries, terms = self._looks[index]
+        if len(u) == 1 and self._looked[index] and (function := self._in_floats[index]):
+            given = np.concatenate([u[0], state[0], t, h, leaves[0]]).tolist()
+            try:
+                values = np.array(function(given))[None]
+                return [
+                    values[:, :k],
+                    values[:, k : k + k * (k + 1)].reshape(1, k, k + 1),
+                    *np.split(values[:, k + k * (k + 1) :], [k], 1),
+                ]
+            except (ArithmeticError, ValueError):
+                pass
+        self._looked[index] = True
 
-    def _in_numbers(self, outputs: Any, graph: Graph, index: int, params: Any, batch_params: bool, *arguments) -> list[np.ndarray]:
-        """Nodes of a graph that begins as that of the step, (entries, …) each; `outputs` are lists of them, or a function that
-        reads them."""
-        e, shared, count = self.equations[index], self.shared, len(arguments[0])
-        leaves = self.parameters.flatten(params, count if batch_params else None)
-        inputs = (e.unknowns, e.state, shared.t, shared.h, shared.params)
-        read = outputs if callable(outputs) else lambda known: [known.read(np.asarray(nodes, dtype=np.int64)) for nodes in outputs]
+        def read(known: Values) -> list[np.ndarray]:
+            written = (
+                known.read(_nodes(entries).reshape(k, k + 1)) if entries else known.slopes(e.residual, [*e.unknowns, shared.h])
+            )
+            return [known.read(_nodes(e.residual)), written, known.read(_nodes(terms)), known.read(_nodes(e.advance))]
+
+        return self._in_numbers(read, graph, e, u, state, t, h, leaves)
+
+    @cached_property
+    def _looks(self) -> list[tuple[Graph, list[int], list[int]]]:
+        """For each equation a graph of the step, in it the derivatives of the residual by the unknowns and by h, where they are
+        written as nodes, and the sizes of its terms."""
+        made = []
+        for e in self.equations:
+            g, inputs = self.graph.copy(), [*e.unknowns, self.shared.h]
+            rows = jacobian(g, e.residual, inputs) if self.sizes_are_written else []
+            made.append((g, [row.get(j, g.zero) for row in rows for j in range(len(inputs))], rounding_nodes(g, e.residual)))
+        return made
+
+    @cached_property
+    def _looked(self) -> list[bool]:
+        """Which equations were looked at before: a function of floats is compiled for a second time, and not for one."""
+        return [False] * len(self.equations)
+
+    @cached_property
+    def _in_floats(self) -> list[Floats | None]:
+        shared = self.shared
+        inputs = [[*e.unknowns, *e.state, shared.t, shared.h, *shared.params] for e in self.equations]
+        looks = [
+            [*e.residual, *entries, *terms, *e.advance]
+            for e, (_, entries, terms) in zip(self.equations, self._looks, strict=True)
+        ]
+        return [
+            in_floats(g, given, wanted, most=WRITTEN) if entries else None
+            for (g, entries, _), given, wanted in zip(self._looks, inputs, looks, strict=True)
+        ]
+
+    def _in_numbers(
+        self, read: Callable[[Values], list[np.ndarray]], graph: Graph, e: TracedEquation, *arguments
+    ) -> list[np.ndarray]:
+        """What `read` reads of a graph that begins as that of the step; u, state, t, h, parameters have an axis of entries."""
+        shared = self.shared
+        inputs = [_nodes(nodes) for nodes in (e.unknowns, e.state, shared.t, shared.h, shared.params)]
 
         def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
             known = Values(graph, len(arguments[0]))
             for nodes, array in zip(inputs, arguments, strict=True):
-                known.bind(np.asarray(nodes, dtype=np.int64), array)
+                known.bind(nodes, array)
             return read(known)
 
-        return in_parts(part, [*arguments, np.broadcast_to(leaves, (count, self.parameters.size))])
+        *others, leaves = arguments
+        return in_parts(part, [*others, np.broadcast_to(leaves, (len(others[0]), self.parameters.size))])
+
+
+def _nodes(nodes: Any) -> Nodes:
+    return np.asarray(nodes, dtype=np.int64)
 
 
 _programs: Memo[StepProgram | UnsupportedPrimitive] = Memo(KEPT)
@@ -280,11 +309,9 @@ def step_program(equation: Any, params: Any, batch_params: bool) -> StepProgram:
     return found
 
 
-def linearized(
-    equation: Any, params: Any, batch_params: bool, u, state, t, h, stage: int = 0, by_h: bool = False
-) -> tuple[np.ndarray, np.ndarray] | None:
+def linearized(equation: Any, params: Any, batch_params: bool, u, state, t, h) -> tuple[np.ndarray, np.ndarray] | None:
     """`StepProgram.linearized`; None for a step that is no scalar program."""
     try:
-        return step_program(equation, params, batch_params).linearized(params, batch_params, u, state, t, h, stage, by_h)
+        return step_program(equation, params, batch_params).linearized(params, batch_params, u, state, t, h)
     except (UnsupportedPrimitive, GraphTooLarge):
         return None

@@ -120,7 +120,9 @@ class Kernels:
         return self.step.graph.copy(NODE_LIMIT)
 
 
-def linked(name: str, key: tuple, text: Callable[[], str], operations: Callable[[], int], level: int = 2) -> tuple[Any, int, bool]:
+def linked(
+    name: str, key: tuple, text: Callable[[], str], operations: Callable[[], int], level: int = 2
+) -> tuple[Any, int, bool]:
     """The linked code of the IR `text()` that exports `name`, the operations of a step, and whether it came from the disk."""
     entry = kernel_cache.name_of(*key, *llvm.version())
     stored = kernel_cache.read(entry)
