@@ -141,14 +141,15 @@ def test_a_start_that_is_a_root(scheme):
 
 
 def test_what_fails_fails_in_any_units():
-    """A pendulum of 1.2e-10 with h = .9, and Kepler's problem with h = .7, were "solved" while updates were compared with 1."""
-    for case, data, scheme in (
-        (PENDULUM, {"q": [np.sin(1.0), -np.cos(1.0)], "v": [0.0, 0.0]}, dx.LagrangeDAlembert()),
-        (KEPLER, {"q": [0.2, 0.0], "v": [0.0, 3.0]}, dx.DiscreteDirac()),
-    ):
-        wild = dataclasses.replace(case, data=data, step=0.9)
-        runs = [wild.run(units, scheme, "native", steps=200) for units in (Units(), *UNITS)]
-        assert len({(bool(sol.ok), sol.rows) for sol in runs}) == 1
+    """A pendulum of 1.2e-10 with h = .9, and Kepler's problem with h = .7, were "solved" while updates were compared with 1. Newton's
+    method wanders before it fails, from a first momentum that is known to a rounding: at which step it does is not the same."""
+    data = {"q": [np.sin(1.0), -np.cos(1.0)], "v": [0.0, 0.0]}
+    wild = dataclasses.replace(PENDULUM, data=data, step=0.9)
+    runs = [wild.run(units, dx.LagrangeDAlembert(), "native", steps=200) for units in (Units(), *UNITS)]
+    assert all(not sol.ok and sol.rows < 10 and "did not converge" in sol.message for sol in runs)
+    wild = dataclasses.replace(KEPLER, data={"q": [0.2, 0.0], "v": [0.0, 3.0]}, step=0.7)
+    runs = [wild.run(units, dx.DiscreteDirac(), "native", steps=200) for units in (Units(), *UNITS)]
+    assert len({(bool(sol.ok), sol.rows, sol.stats["newton_iterations"]) for sol in runs}) == 1
 
 
 def test_data_off_the_constraint_are_off_it_in_any_units():
