@@ -11,6 +11,7 @@ import pytest
 
 import dirax as dx
 from curved_pendulum import along, exact, metric, place, slopes, sphere
+from dirax.schemes import blm_method_2_step
 
 METHOD_2 = dx.DiscreteDirac(constraints="resolve")
 
@@ -230,3 +231,23 @@ def test_wrong_statements():
         dx.simulate(SPHERICAL, METHOD_2, x=Y0, step=0.1, steps=1)
     with pytest.raises(ValueError, match=r"not from two points"):
         dx.simulate(SPHERICAL, METHOD_2, q0=Y0, q1=Y0, step=0.1, steps=1, check_initial=False)
+
+
+def test_accelerations_in_place_and_as_unknowns(monkeypatch):
+    """Where there are few, λ and the direction of the first half are solved for in place: the same step."""
+
+    def run(few):
+        monkeypatch.setattr(blm_method_2_step, "FEW", few)
+        system = dx.LagrangeDirac(
+            lambda q, v: (1 + q[0] ** 2) * v @ v / 2 - 3 * q[2],
+            lambda q: jnp.stack([jnp.stack([-q[1], q[0], jnp.zeros(()), jnp.ones(())])]),
+            holonomic=lambda q: jnp.stack([q[:3] @ q[:3] - 1.0]),
+            forces=lambda t, q, v: -0.1 * v * jnp.cos(t),
+        )
+        start = {"q": [0.6, 0.0, 0.8, 0.0], "v": [0.4, 0.5, -0.3, -0.3], "step": 0.05, "steps": 40}
+        return dx.simulate(system, dx.DiscreteDirac(constraints="resolve"), **start)
+
+    here, there = run(4), run(0)
+    assert here.ok and there.ok and here.stats["unknowns"] < there.stats["unknowns"]
+    for name in ("q", "p", "multipliers", "work"):
+        np.testing.assert_allclose(here.fields[name], there.fields[name], rtol=1e-11, atol=1e-12)

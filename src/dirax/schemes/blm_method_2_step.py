@@ -8,10 +8,14 @@ from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data
 from dirax.program.linear_solves import solve
-from dirax.program.tracing import along, gradient, once
+from dirax.program.tracing import along, gradient, jacobian, once
 from dirax.schemes.lagrangian_step import LagrangianStep, numbered, one_point_only
 from dirax.schemes.layout import Layout
 from dirax.systems.nonholonomic import NonholonomicMechanics
+
+FEW = 6
+"""Coordinates up to which accelerations are solved for in place: a step of three and a constraint takes .7 of the time of one in
+which they are unknowns, in batches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,55 +91,76 @@ class ProjectedThetaStep(ThetaStep):
 
     P(q̃, p̃) = (q', p'): q̃ = q' + M⁻¹G(q')ᵀs with g(q') = 0, and p̃ = p' + [W; G](q')ᵀσ with the velocity of p' on the other
     constraints; M = ∂²L/∂v² at (q', v). Unknowns are v, σ, the acceleration a and λ of the base point, and s and w of the first
-    half, where h w moves q and M(w − v) = Gᵀs; and v', σ', s' and w' of the second. No matrix is inverted in the equations:
-    (∂L/∂v)˙ = ∂L/∂q + f + [W; G]ᵀλ and ([W; G] v + …)˙ = 0 along v̇ = a. Constraints at the times t_k, t_k + θh and t_k + h hold
+    half, where h w moves q and M(w − v) = Gᵀs; and v', σ', s' and w' of the second. The equations of a and λ are
+    (∂L/∂v)˙ = ∂L/∂q + f + [W; G]ᵀλ and ([W; G] v + …)˙ = 0 along v̇ = a: where there are few of them they are solved in place,
+    else no matrix is inverted. Constraints at the times t_k, t_k + θh and t_k + h hold
     to roundoff at all three points.
     """
 
     @property
     def unknowns(self) -> Layout:
         n, k, c = self.shape.n, self.rows.count, self.rows.holonomic
-        moved = n if c else 0
-        return Layout(
-            v=n, sigma=k, a=n, multipliers=k, s=c, w=moved, end_v=n, end_sigma=k, end_s=c, end_w=moved
-        )  # fmt: skip
+        moved, last = (n if count else 0 for count in (c * (not self.in_place), c))
+        flow = {} if self.in_place else {"a": n, "multipliers": k}
+        return Layout(v=n, sigma=k, **flow, s=c, w=moved, end_v=n, end_sigma=k, end_s=c, end_w=last)
+
+    @property
+    def in_place(self) -> bool:
+        """Whether a and λ are functions of (q, v) and w one of (q, v, s), and no unknowns."""
+        return self.shape.n <= FEW and not self.system.forces_see_multipliers
 
     def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
         one_point_only(data)
         v = data["v"]
-        guess = self.unknowns.join(v=v, end_v=v, **({"w": v, "end_w": v} if self.rows.holonomic else {}))
+        guess = self.unknowns.join(**{name: v for name in ("v", "end_v", "w", "end_w") if self.unknowns[name] == v.shape})
         return self.book.start(data["q"], data["p"]), guess
 
     def residual(self, u, state, t, h, params):
         (q0, p0, _), parts, rows = self.state.split(state), self.unknowns.split(u), self.rows
-        at, q, q1 = self._base(u, state, t, h)
-        p, rate, along_flow = self._flow(at, q, parts.v, parts.a, parts.multipliers, params)
+        at, q, q1 = self._base(u, state, t, h, params)
+        p, rate, along_flow, _ = self._flow(at, q, parts, params)
         begun = p0 + rows.force(t, q0, parts.sigma, params) - (p - (1.0 - self.theta) * h * rate)
         ended = self.system.legendre(q1, parts.end_v, params, t + h) + rows.force(t + h, q1, parts.end_sigma, params)
         ends = [
             begun,
             rows.velocity_defect(at, q, parts.v, params),
-            along_flow,
+            *along_flow,
             ended - (p + self.theta * h * rate),
             rows.velocity_defect(t + h, q1, parts.end_v, params),
         ]
         return jnp.concatenate([*ends, self._position(u, state, t, h, params)] if rows.holonomic else ends)
 
     def advance(self, u, state, t, h, params):
-        at, q, q1 = self._base(u, state, t, h)
+        at, q, q1 = self._base(u, state, t, h, params)
         parts = self.unknowns.split(u)
         end = [q1, self.system.legendre(q1, parts.end_v, params, t + h)]
-        return self.book.after(state, end, at, q, parts.v, h, params, self._forces(parts.multipliers))
+        forces = None if self.in_place else self._forces(parts.multipliers)
+        return self.book.after(state, end, at, q, parts.v, h, params, forces)
 
     def unpack(self, state, u, t, h, params):
-        return self.row(state) | {"multipliers": self.rows.all(self.unknowns.split(u).multipliers)}
+        at, q, _ = self._base(u, state, t, h, params)
+        return self.row(state) | {"multipliers": self.rows.all(self._flow(at, q, self.unknowns.split(u), params)[-1])}
 
     def _forces(self, multipliers: Array) -> Any:
         """The forces where these are the multipliers, which are those of the system with the opposite sign."""
         return self.system.forces_at(-self.rows.all(multipliers))
 
-    def _flow(self, t: Any, q: Array, v: Array, a: Array, multipliers: Array, params: Any) -> tuple[Array, Array, Array]:
-        return once(self._at_point)(t, q, v, a, multipliers, params)
+    def _flow(self, t: Any, q: Array, parts: Any, params: Any) -> tuple[Array, Array, tuple[Array, ...], Array]:
+        """(p, ṗ, equations of a and λ, λ) at a point of M_f."""
+        if self.in_place:
+            p, rate, multipliers = once(self._solved)(t, q, parts.v, params)
+            return p, rate, (), multipliers
+        p, rate, defect = once(self._at_point)(t, q, parts.v, parts.a, parts.multipliers, params)
+        return p, rate, (defect,), parts.multipliers
+
+    def _solved(self, t: Any, q: Array, v: Array, params: Any) -> tuple[Array, Array, Array]:
+        """(p, ṗ, λ) at a point of M_f, where M a = b + [W; G]ᵀλ."""
+        none, rows = jnp.zeros(self.rows.count), self.rows
+        p, rate, defect = self._at_point(t, q, v, jnp.zeros_like(v), none, params)
+        matrix = rows.matrix(t, q, params)
+        lifted = solve(self._mass(t, q, v, params), jnp.concatenate([matrix.T, -defect[: len(v), None]], axis=1))
+        multipliers = -solve(matrix @ lifted[:, :-1], defect[len(v) :] + matrix @ lifted[:, -1])
+        return p, rate + matrix.T @ multipliers, multipliers
 
     def _at_point(self, t: Any, q: Array, v: Array, a: Array, multipliers: Array, params: Any) -> tuple[Array, Array, Array]:
         """(p, ṗ, what is zero where a and λ are those of the flow) at a point of M_f."""
@@ -151,24 +176,35 @@ class ProjectedThetaStep(ThetaStep):
             return along(function, (jnp.asarray(t, float), q, v), (jnp.ones(()), v, a))
         return along(lambda q, v: function(t, q, v), (q, v), (v, a))
 
+    def _first(self, t: Any, q: Array, parts: Any, params: Any) -> Float[Array, " n"]:
+        """w of the first half, which is v + M⁻¹G(q_k)ᵀs."""
+        if not self.in_place:
+            return parts.w
+        if not self.theta:
+            return parts.v
+        return parts.v + solve(self._mass(t, q, parts.v, params), self.rows.holonomic_force(t, q, parts.s, params))
+
+    def _mass(self, t: Any, q: Array, v: Array, params: Any) -> Float[Array, "n n"]:
+        return jacobian(lambda v: self.system.legendre(q, v, params, t))(v)
+
     def _pushed(self, t: Any, q: Array, v: Array, w: Array, s: Array, params: Any) -> Float[Array, " n"]:
         """M(w − v) − G(q)ᵀs, zero where w is the direction of the projection onto g = 0 at q."""
         change = along(lambda v: self.system.legendre(q, v, params, t), (v,), (w - v,))
         return change - self.rows.holonomic_force(t, q, s, params)
 
-    def _base(self, u: Array, state: Array, t: Any, h: Any) -> tuple[Any, Array, Array]:
+    def _base(self, u: Array, state: Array, t: Any, h: Any, params: Any) -> tuple[Any, Array, Array]:
         """The time of the base point, the base point, and where the second half ends."""
         q0, parts, theta = self.state.split(state).q, self.unknowns.split(u), self.theta
-        first, second = (parts.w, parts.end_w) if self.rows.holonomic else (parts.v, parts.v)
+        first, second = (parts.v, parts.v) if not self.rows.holonomic else (self._first(t, q0, parts, params), parts.end_w)
         q = q0 + theta * h * first
         return t + theta * h, q, q + (1.0 - theta) * h * second
 
     def _position(self, u: Array, state: Array, t: Any, h: Any, params: Any) -> Array:
         """g at the base and at the end, and the directions of both halves; a half of length zero needs no force."""
         (q0, _, _), parts, rows = self.state.split(state), self.unknowns.split(u), self.rows
-        at, q, q1 = self._base(u, state, t, h)
+        at, q, q1 = self._base(u, state, t, h, params)
         onto = rows.position(at, q, params) / h if self.theta else parts.s
         last = rows.position(t + h, q1, params) / h if self.theta < 1.0 else parts.end_s
-        begun = self._pushed(t, q0, parts.v, parts.w, parts.s, params)
+        begun = [] if self.in_place else [self._pushed(t, q0, parts.v, parts.w, parts.s, params)]
         ended = self._pushed(t + h, q1, parts.v, parts.end_w, parts.end_s, params)
-        return jnp.concatenate([onto, begun, ended, last])
+        return jnp.concatenate([onto, *begun, ended, last])
