@@ -141,8 +141,8 @@ def test_a_start_that_is_a_root(scheme):
 
 
 def test_what_fails_fails_in_any_units():
-    """A pendulum of 1.2e-10 with h = .9, and Kepler's problem with h = .7, were "solved" while updates were compared with 1. Newton's
-    method wanders before it fails, from a first momentum that is known to a rounding: at which step it does is not the same."""
+    """A pendulum of 1.2e-10 with h = .9, and Kepler's problem with h = .7, were "solved" while updates were compared with 1.
+    Newton's method wanders before it fails, from a first momentum that is known to a rounding: at which step is not the same."""
     data = {"q": [np.sin(1.0), -np.cos(1.0)], "v": [0.0, 0.0]}
     wild = dataclasses.replace(PENDULUM, data=data, step=0.9)
     runs = [wild.run(units, dx.LagrangeDAlembert(), "native", steps=200) for units in (Units(), *UNITS)]
@@ -200,8 +200,8 @@ def test_a_bicycle_that_goes_nearly_straight():
         holonomic=lambda q: jnp.stack([q[4] + 0.3 * jnp.cos(q[3]) - 0.3]),
     )
     for steer, rate in ((1e-5, -1e-4), (0.0, 0.0)):
-        data = {"q": [0.0, 0.0, 0.0, steer, 0.0], "v": [4.0, 0.0, 0.0, rate, 0.0]}
-        sol = dx.simulate(bicycle, dx.LagrangeDAlembert(), **data, step=0.01, steps=60, project=True)
+        q, v = [0.0, 0.0, 0.0, steer, 0.0], [4.0, 0.0, 0.0, rate, 0.0]
+        sol = dx.simulate(bicycle, dx.LagrangeDAlembert(), q=q, v=v, step=0.01, steps=60, project=True)
         lines = [line for line in dx.verify(sol).lines if steer or line.quantity != "steps replayed"]  # that sees 1e-32
         assert sol.ok and "VIOLATED" not in [line.verdict for line in lines]
 

@@ -30,6 +30,7 @@ import numpy as np
 
 from dirax.engines.contract import Problem
 from dirax.engines.first_sizes import ROUNDINGS, first_sizes
+from dirax.engines.stage_look import stage_look
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import balanced_inverse, power_of_two
 from dirax.numerics.tolerances import EPSILON
@@ -97,7 +98,7 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
         program = step_program(p.equation, *key)
         leaves = program.parameters.flatten(p.params, p.batch if p.batch_params else None)
         leaves = np.broadcast_to(leaves, (batch, program.parameters.size))
-        look = lambda i, u, x, part=1.0: program.look(leaves, u, x, t, part * h[i], i)
+        look = lambda i, u, x, part=1.0: stage_look(program, i)(u, x, t, part * h[i], leaves)
         end = state
         for i in firsts:
             residual, slopes, *_ = look(i, guesses[i], end, SHORT)

@@ -20,7 +20,6 @@ from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.interpreter import Nodes, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
-from dirax.program.rounding import rounding_nodes
 from dirax.program.scalar_program import ScalarProgram
 
 KEPT = 128
@@ -206,75 +205,19 @@ class StepProgram:
         graph = graph.copy() if few else graph
 
         def read(known: Values) -> list[np.ndarray]:
-            slopes = known.slopes(e.residual, e.unknowns) if few else known.read(_nodes(entries).reshape(k, k))
-            return [known.read(_nodes(e.residual)), slopes]
+            slopes = known.slopes(e.residual, e.unknowns) if few else known.read(nodes_array(entries).reshape(k, k))
+            return [known.read(nodes_array(e.residual)), slopes]
 
         leaves = self.parameters.flatten(params, len(u) if batch_params else None)
-        residual, slopes = self._in_numbers(read, graph, e, u, state, t, h, leaves)
+        residual, slopes = self.in_numbers(read, graph, e, u, state, t, h, leaves)
         return residual, slopes
 
-    def look(self, leaves: np.ndarray, u, state, t, h, stage: int) -> list[np.ndarray]:
-        """A stage in numbers: residual (entries, k), its derivatives by the unknowns and by h (entries, k, k + 1), the sizes of
-        its terms (entries, k), and the state after it (entries, s)."""
-        index = self.stages[stage][0]
-        e, shared, k = self.equations[index], self.shared, len(self.equations[index].unknowns)
-        graph, entries, terms = self._looks[index]
-        if len(u) == 1 and self._looked[index] and (function := self._in_floats[index]):
-            given = np.concatenate([u[0], state[0], t, h, leaves[0]]).tolist()
-            try:
-                values = np.array(function(given))[None]
-                return [
-                    values[:, :k],
-                    values[:, k : k + k * (k + 1)].reshape(1, k, k + 1),
-                    *np.split(values[:, k + k * (k + 1) :], [k], 1),
-                ]
-            except (ArithmeticError, ValueError):
-                pass
-        self._looked[index] = True
-
-        def read(known: Values) -> list[np.ndarray]:
-            written = (
-                known.read(_nodes(entries).reshape(k, k + 1)) if entries else known.slopes(e.residual, [*e.unknowns, shared.h])
-            )
-            return [known.read(_nodes(e.residual)), written, known.read(_nodes(terms)), known.read(_nodes(e.advance))]
-
-        return self._in_numbers(read, graph, e, u, state, t, h, leaves)
-
-    @cached_property
-    def _looks(self) -> list[tuple[Graph, list[int], list[int]]]:
-        """For each equation a graph of the step, in it the derivatives of the residual by the unknowns and by h, where they are
-        written as nodes, and the sizes of its terms."""
-        made = []
-        for e in self.equations:
-            g, inputs = self.graph.copy(), [*e.unknowns, self.shared.h]
-            rows = jacobian(g, e.residual, inputs) if self.sizes_are_written else []
-            made.append((g, [row.get(j, g.zero) for row in rows for j in range(len(inputs))], rounding_nodes(g, e.residual)))
-        return made
-
-    @cached_property
-    def _looked(self) -> list[bool]:
-        """Which equations were looked at before: a function of floats is compiled for a second time, and not for one."""
-        return [False] * len(self.equations)
-
-    @cached_property
-    def _in_floats(self) -> list[Floats | None]:
-        shared = self.shared
-        inputs = [[*e.unknowns, *e.state, shared.t, shared.h, *shared.params] for e in self.equations]
-        looks = [
-            [*e.residual, *entries, *terms, *e.advance]
-            for e, (_, entries, terms) in zip(self.equations, self._looks, strict=True)
-        ]
-        return [
-            in_floats(g, given, wanted, most=WRITTEN) if entries else None
-            for (g, entries, _), given, wanted in zip(self._looks, inputs, looks, strict=True)
-        ]
-
-    def _in_numbers(
+    def in_numbers(
         self, read: Callable[[Values], list[np.ndarray]], graph: Graph, e: TracedEquation, *arguments
     ) -> list[np.ndarray]:
         """What `read` reads of a graph that begins as that of the step; u, state, t, h, parameters have an axis of entries."""
         shared = self.shared
-        inputs = [_nodes(nodes) for nodes in (e.unknowns, e.state, shared.t, shared.h, shared.params)]
+        inputs = [nodes_array(nodes) for nodes in (e.unknowns, e.state, shared.t, shared.h, shared.params)]
 
         def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
             known = Values(graph, len(arguments[0]))
@@ -286,7 +229,8 @@ class StepProgram:
         return in_parts(part, [*others, np.broadcast_to(leaves, (len(others[0]), self.parameters.size))])
 
 
-def _nodes(nodes: Any) -> Nodes:
+def nodes_array(nodes: Any) -> Nodes:
+    """Nodes in an array, also none."""
     return np.asarray(nodes, dtype=np.int64)
 
 

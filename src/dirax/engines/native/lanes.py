@@ -124,7 +124,7 @@ class Lanes:
         self.call(kernel, self.records.copy(), outs, 0, 1, 1, self.threads)
         return {name: rows[:, 0] for name, rows in closing.items()}
 
-    def attempt(self, numbers: np.ndarray, made: Kernels, table: np.ndarray) -> np.ndarray:
+    def attempt(self, numbers: np.ndarray, made: Kernels | CollocationKernels, table: np.ndarray) -> np.ndarray:
         """The records (n, quantities) after some of the trajectories went on from others, which are not kept: one by one, since
         each is at another step, and with the bits that it has alone."""
         p, kernel = self.problem, made.kernel(1)[0]

@@ -97,7 +97,7 @@ class OneLane:
         memory[record.status], memory[record.differences] = OK, 0.0
         self.advance(kernel, int(memory[record.completed]), self.problem.steps)
 
-    def attempt(self, numbers: np.ndarray, made: Kernels, table: np.ndarray) -> np.ndarray:
+    def attempt(self, numbers: np.ndarray, made: Kernels | CollocationKernels, table: np.ndarray) -> np.ndarray:
         """The record after going on from one, which is not kept."""
         kept, self.memory[: self.places.record] = self.memory[: self.places.record].copy(), table[0]
         self.advance(made.kernel(1)[0], int(table[0, self.record.completed]), self.problem.steps)

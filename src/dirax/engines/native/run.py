@@ -72,11 +72,9 @@ class Ready:
                     progress(done, p.steps)
         except KeyboardInterrupt:
             interrupted = True
-        by_newton = False
-        if not interrupted:
-            by_newton = self.is_collocation and _by_newton(lanes)
-            if not self.is_collocation:
-                with_present_sizes(lanes, self.made)
+        by_newton = self.is_collocation and not interrupted and _by_newton(lanes)
+        if not (interrupted or self.is_collocation):
+            with_present_sizes(lanes, self.made)
         run_seconds = time.perf_counter() - started
         closing = lanes.close(self.kernel)
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from dirax.engines.contract import NOT_CONVERGED, OK
+from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.lanes import Lanes
 from dirax.engines.native.loops.record import DOUBTFUL
@@ -40,7 +41,7 @@ def look_closer(lanes: Lanes | OneLane) -> None:
     lanes.put(doubtful, own)
 
 
-def with_present_sizes(lanes: Lanes | OneLane, made: Kernels) -> None:
+def with_present_sizes(lanes: Lanes | OneLane, made: Kernels | CollocationKernels) -> None:
     """Go on with trajectories whose unknowns have become larger than where they began. An attempt that does not come to another
     step leaves no trace."""
     p, record = lanes.problem, lanes.record

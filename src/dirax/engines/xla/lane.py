@@ -121,7 +121,7 @@ def take_step(
 
     carry = (lane.state, lane.lost, jnp.asarray(t, float), lane.status, jnp.zeros_like(lane.iterations), lane.max_residual)
     if len(stages) > 1 and len({(stage.residual, stage.advance, stage.guess) for stage in stages}) == 1:
-        one = lambda carry, given: solved(carry, *given, stages[0], known[0])
+        one = lambda carry, given: solved(carry, given[0], given[1], given[2], stages[0], known[0])
         given = jnp.array(fractions), jnp.stack(lane.history), None if sizes is None else jnp.stack(sizes)
         carry, (histories, solutions, left) = jax.lax.scan(one, carry, given)
         history, unknowns, states = tuple(histories), tuple(solutions), tuple(left)
