@@ -21,8 +21,11 @@ from dirax.program.graph_derivatives import jacobian
 from dirax.program.memo import Memo, Same
 from dirax.program.rounding import rounding_nodes
 
-ROUNDINGS = 64.0
-"""Roundings up to which an unknown is zero."""
+TYPICAL = 2.0**-6
+"""What a rounding comes to beside its bound, which all roundings of all terms would have to reach together."""
+
+NOTHING = 2.0**-40
+"""What is not the size of an unknown, beside the value at which it would matter: zero with the roundoff of zero."""
 
 SOLVED = 1e-10
 """What a solution with good pivots leaves of a right-hand side, relative to its terms."""
@@ -34,6 +37,7 @@ class FirstSizes:
 
     def __init__(self, graph: Graph, equation: TracedEquation, h: int, order: list[tuple[int, int]] | None = None):
         g, unknowns, residual = graph, equation.unknowns, equation.residual
+        self.graph = g
         k, size = len(unknowns), lambda node: g.make("abs", node)
         total = lambda nodes: reduce(g.add, nodes, g.zero)
         rows = jacobian(g, residual, [*unknowns, h])
@@ -47,7 +51,11 @@ class FirstSizes:
         known = factors.bounds(g, terms)
         moved = factors.bounds(g, [size(g.mul(h, row.get(k, g.zero))) for row in rows])
         least = g.constant(LEAST_SIZE)
-        own = [total([a, size(u), least]) for a, u in zip(known, unknowns, strict=True)]
+        own = [total([g.mul(g.constant(TYPICAL), a), size(u), least]) for a, u in zip(known, unknowns, strict=True)]
+        own = [
+            self._at_least(own, [(e, row[j]) for e, row in zip(rounded, rows, strict=True) if j in row])
+            for j, own in enumerate(own)
+        ]
         equations = [g.add(total(products(row, own)), least) for row in rows]
 
         sure = g.make("finite", total([*own, *equations]))
@@ -55,13 +63,21 @@ class FirstSizes:
         for a, m, u in zip(known, moved, solution, strict=True):
             blurred = g.mul(g.constant(EPSILON), a)
             reached = g.add(u, g.make("sqrt", g.mul(m, a)))
-            clear = g.make("le", blurred, g.mul(g.constant(4.0 * STALLED), reached))
-            zero = g.make("and", g.make("le", u, g.mul(g.constant(ROUNDINGS), blurred)), g.make("lt", least, a))
-            sure = g.make("and", sure, g.make("or", clear, zero))
+            sure = below(blurred, g.mul(g.constant(4.0 * STALLED), reached))
         for r, row in zip(residual, matrix, strict=True):
             of_row = [g.mul(a, d) for a, d in zip(row, change, strict=True)]
             sure = below(size(g.sub(total(of_row), r)), g.mul(g.constant(SOLVED), total([size(r), *map(size, of_row)])))
-        self.graph, self.unknowns, self.equations, self.sure = g, own, equations, g.select(sure, g.one, g.zero)
+        self.unknowns, self.equations, self.sure = own, equations, g.select(sure, g.one, g.zero)
+
+    def _at_least(self, own: int, where: list[tuple[int, int]]) -> int:
+        """The size of an unknown; where that is nothing beside what would matter in an equation that it is in, a part of this."""
+        g, natural = self.graph, self.graph.zero
+        for e, slope in where:
+            there = g.make("lt", g.zero, g.make("abs", slope))
+            size = g.div(e, g.make("abs", g.select(there, slope, g.one)))
+            natural = g.make("max", natural, g.select(there, size, g.zero))
+        nothing = g.make("lt", own, g.mul(g.constant(NOTHING), natural))
+        return g.select(nothing, g.mul(g.constant(TYPICAL), natural), own)
 
     @property
     def outputs(self) -> list[int]:

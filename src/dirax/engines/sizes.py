@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Problem
-from dirax.engines.first_sizes import ROUNDINGS, first_sizes
+from dirax.engines.first_sizes import NOTHING, TYPICAL, first_sizes
 from dirax.engines.stage_look import stage_look
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import balanced_inverse, power_of_two
@@ -172,6 +172,9 @@ NEAR = 1.0 / 16.0
 COUPLED = 1e-3
 """Unknowns that change others by less than this of their sizes are not coupled."""
 
+ROUNDINGS = 64.0
+"""Roundings up to which an unknown is zero."""
+
 
 def _nearby(count: int) -> np.ndarray:
     """A factor near 1 for each of so many numbers, all of them different."""
@@ -192,7 +195,7 @@ def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: t
         largest = xp.maximum(xp.abs(u), solution)
         terms = [of + applied(xp.abs(slopes[..., :k]), largest) for of, slopes in zip(rounded, both, strict=True)]
         inverses = [xp.abs(other) for other in others]
-        sizes = [finite(applied(other, of)) for other, of in zip(inverses, terms, strict=True)]
+        sizes = [TYPICAL * finite(applied(other, of)) for other, of in zip(inverses, terms, strict=True)]
 
         blurred = EPSILON * finite(applied(xp.abs(inverse), terms[0]))
         moved = finite(applied(xp.abs(inverse), xp.abs(h * slopes[..., -1])))
@@ -203,7 +206,10 @@ def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: t
         coupled = coupled & xp.swapaxes(coupled, -1, -2)
         hidden = ~known & (solution > ROUNDINGS * blurred) & ~xp.any(coupled & known[..., None, :], axis=-1)
         too_short = xp.any(hidden, axis=-1, keepdims=True)
-        unknowns = power_of_two(xp.maximum(xp.where(too_short, reached, xp.maximum(*sizes)), xp.abs(u)), xp)
+        unknowns = xp.maximum(xp.where(too_short, reached, xp.maximum(*sizes)), xp.abs(u))
+        there = slopes[..., :k] != 0.0
+        natural = xp.max(xp.where(there, rounded[0][..., None] / xp.abs(xp.where(there, slopes[..., :k], 1.0)), 0.0), axis=-2)
+        unknowns = power_of_two(xp.where(unknowns < NOTHING * natural, TYPICAL * natural, unknowns), xp)
         equations = (finite(applied(xp.abs(derivatives[..., :k]), unknowns)) for derivatives in both)
         return xp.stack([unknowns, power_of_two(xp.maximum(*equations), xp)], axis=-2)
 

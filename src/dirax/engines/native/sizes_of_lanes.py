@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import numpy as np
 
 from dirax.engines.contract import NOT_CONVERGED, OK
@@ -11,9 +12,13 @@ from dirax.engines.native.lanes import Lanes
 from dirax.engines.native.loops.record import DOUBTFUL
 from dirax.engines.native.one_lane import OneLane
 from dirax.engines.sizes import grown, sizes_of, sizes_there
+from dirax.program.memo import Memo, Same
 
 RESUMED = 16
 """How often trajectories go on with other sizes."""
+
+_looked: Memo[tuple] = Memo(64)
+"""What a closer look at single trajectories found, for runs that begin as others did."""
 
 
 def find_sizes(lanes: Lanes | OneLane, kernel: Any) -> None:
@@ -36,7 +41,10 @@ def look_closer(lanes: Lanes | OneLane) -> None:
     doubtful = np.flatnonzero(table[:, record.status] == DOUBTFUL)
     own = table[doubtful]
     guess = tuple(own[:, record.unknowns(i, stage.unknowns)] for i, (stage, _) in enumerate(p.equation.stages))
-    record.put_sizes(own, sizes_there(p, doubtful, own[:, record.completed], own[:, record.state], guess))
+    look = lambda: sizes_there(p, doubtful, own[:, record.completed], own[:, record.state], guess)
+    numbers = p.t0, p.h, p.first_step, own.tobytes(), *(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(p.params))
+    found = look() if p.batch is not None else _looked.get((Same(p.equation), *numbers), look)
+    record.put_sizes(own, found)
     own[:, record.status] = OK
     lanes.put(doubtful, own)
 
