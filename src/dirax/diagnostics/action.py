@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.diagnostics.rows import consecutive, over_rows
 from dirax.diagnostics.structure_lines import structure_of
-from dirax.schemes.discrete_structure_pairs import LagrangianPairs
+from dirax.schemes.discrete_structure_pairs import AbstractPairs
 from dirax.solution.solution import Solution
 
 
@@ -57,6 +57,7 @@ def discrete_energy(solution: Solution, sign: str | None = None) -> np.ndarray:
         E⁺ = ⟨p_{k+1}, q_{k+1} − q_k⟩ − L_d(q_k, q_{k+1}),   p_{k+1} = D2 L_d(q_k, q_{k+1}),
         E⁻ = ⟨p_k, q_{k+1} − q_k⟩ − L_d(q_k, q_{k+1}),       p_k = −D1 L_d(q_k, q_{k+1}),
 
+    on a manifold −R⁻¹_{q_{k+1}}(q_k) in E⁺ and R⁻¹_{q_k}(q_{k+1}) in E⁻ taking the place of q_{k+1} − q_k with its retraction R:
     h times an energy each, and not the energy of the system at a node, which is `solution.energy()`. `sign`: "+" or "-"; by
     default that of the scheme, "+" for one that is neither. Raises as `action_sum`, and `ValueError` for another sign.
     """
@@ -68,9 +69,9 @@ def discrete_energy(solution: Solution, sign: str | None = None) -> np.ndarray:
     return energies if solution.batch is not None else energies[0]
 
 
-def _pairs(solution: Solution) -> LagrangianPairs:
+def _pairs(solution: Solution) -> AbstractPairs:
     pairs = structure_of(solution)
-    if not isinstance(pairs, LagrangianPairs):
+    if not isinstance(pairs, AbstractPairs):
         raise TypeError(
             "action sums are of schemes with a discrete Lagrangian on Q × Q, such as dx.LagrangeDAlembert and "
             f"dx.PlusLagrangeDirac, but this run was by {solution.scheme!r}."
@@ -83,7 +84,7 @@ def _pairs(solution: Solution) -> LagrangianPairs:
     return pairs
 
 
-def _over_steps(function: Any, pairs: LagrangianPairs, solution: Solution) -> np.ndarray:
+def _over_steps(function: Any, pairs: AbstractPairs, solution: Solution) -> np.ndarray:
     """(B, steps)."""
     return over_rows(eqx.Partial(function, pairs), solution, (consecutive(solution, ("q",), 2, np.arange(solution.rows - 1)),))
 
@@ -92,23 +93,27 @@ def _plain(solution: Solution, values: np.ndarray) -> Any:
     return values if solution.batch is not None else float(values[0])
 
 
-def _lagrangian(pairs, rows, params):
+def _lagrangian(of, rows, params):
+    pairs, rows, params = of.in_coordinates(rows, 0, params)
     return pairs.lagrangian(rows["t"][0], *rows["q"], params)
 
 
-def _plus_energy(pairs, rows, params):
+def _plus_energy(of, rows, params):
+    pairs, rows, params = of.in_coordinates(rows, 1, params)
     q0, q1 = rows["q"]
     return pairs.slots(rows["t"][0], q0, q1, params)[1] @ (q1 - q0) - _lagrangian(pairs, rows, params)
 
 
-def _minus_energy(pairs, rows, params):
+def _minus_energy(of, rows, params):
+    pairs, rows, params = of.in_coordinates(rows, 0, params)
     q0, q1 = rows["q"]
     return -pairs.slots(rows["t"][0], q0, q1, params)[0] @ (q1 - q0) - _lagrangian(pairs, rows, params)
 
 
-def _varied(pairs, rows, along, params):
+def _varied(of, rows, along, params):
     """(the term of the inner row, the sum of its sizes)."""
-    t, (q0, q1, q2) = rows["t"], rows["q"]
+    pairs, rows, params = of.in_coordinates(rows | {"along": along}, 1, params)
+    along, t, (q0, q1, q2) = rows["along"], rows["t"], rows["q"]
     arriving, leaving = pairs.slots(t[0], q0, q1, params)[1], pairs.slots(t[1], q1, q2, params)[0]
     admissible = along - pairs.annihilator(t[1], q1, params) @ along
     sizes = (jnp.abs(arriving) + jnp.abs(leaving)) @ jnp.abs(admissible)

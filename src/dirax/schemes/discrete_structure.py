@@ -64,6 +64,11 @@ class AbstractDiscreteStructure(eqx.Module):
         return f"no relation between the two-forms before and after a step is known for the {self.claims[0].quantity}"
 
     @property
+    def own_states(self) -> bool:
+        """Whether `step_form` is that of every state of the scheme, which need not be (q, p)."""
+        return False
+
+    @property
     def own_constraints(self) -> bool:
         """Whether a step imposes constraints between its points, whose terms have the sizes `constraint_size`."""
         return False

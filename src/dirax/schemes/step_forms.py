@@ -136,6 +136,8 @@ class ChartedForm(RowForm):
 
 def form_of_steps(system: Any, step: Any, equation: Any, structure: AbstractDiscreteStructure | str) -> AbstractStepForm | str:
     """The form of the steps of an equation by what the system and the equation say of themselves, or why none is known."""
+    if not isinstance(structure, str) and structure.own_states:
+        return structure.step_form
     fields = equation.stages[0][0].fields
     constrained = "multipliers" in fields
     if system.dual is not None and not constrained:
