@@ -285,7 +285,7 @@ def test_projection_of_initial_data_onto_the_constraint():
 
 
 def test_constraints_and_forces_go_along_or_are_refused():
-    """In coordinates they are pulled back; by the group's reduction and in charts they have no place."""
+    """In coordinates they are pulled back; in the group's reduction forces have no place."""
     run = {"step": 0.1, "steps": 2}
     disk = dx.ManifoldLagrangian(
         lambda q, v: v @ v / 2, dx.Sphere(2), lambda q: jnp.stack([-q[1], q[0]])[None], affine=lambda q: -jnp.ones(1),
@@ -299,6 +299,3 @@ def test_constraints_and_forces_go_along_or_are_refused():
     assert on_circle.multipliers.mean() == pytest.approx(1.0, abs=1e-2)  # those of Method 1 alternate around it
     with pytest.raises(ValueError, match="forces"):
         dx.reduce(suslov, SO3)
-    with pytest.raises(ValueError, match=r"without one_forms and forces: use dx\.DiscreteDirac"):
-        g, v = np.array([1.0, 0, 0, 0]), np.zeros(4)
-        dx.simulate(suslov, dx.InCharts(dx.LieGroupExp(SO3)), q=g, v=v, **run)

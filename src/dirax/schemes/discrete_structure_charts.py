@@ -80,7 +80,7 @@ class PairsInCharts(AbstractPairs):
         """As that in coordinates, in roundings of the numbers that the rows hold."""
         pairs, local, where = self.in_coordinates(rows, 1, params)
         frame = jnp.abs(self.local.chart(rows["q"][1]).frame)
-        size = (jnp.abs(rows["q"]) @ frame) / jnp.sum(frame**2, axis=0)
+        size = (jnp.abs(rows["q"]) @ frame) / jnp.sum(frame**2, axis=0)[None]
         return pairs.defects(local, where, jnp.ravel(size))
 
 
