@@ -14,6 +14,7 @@ from dirax.engines.configure import configure
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.geometry.charts import Atlas, RetractionChart, chart_at, check_chart
+from dirax.geometry.complete_lift import complete_lift, symplectic_equations
 from dirax.geometry.cotangent_lift import CotangentBundle, cotangent_lift, symplecticity_defect
 from dirax.geometry.discrete import (
     DiscretizationMapDirac,
@@ -186,10 +187,12 @@ __all__ += [
     "chart_at",
     "check_chart",
     "check_discretization_map",
+    "complete_lift",
     "cotangent_lift",
     "induced_dirac",
     "minus_legendre",
     "plus_legendre",
+    "symplectic_equations",
     "symplecticity_defect",
 ]
 # How time is cut

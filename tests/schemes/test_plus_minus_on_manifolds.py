@@ -1,5 +1,7 @@
 """(±) and Lagrange–d'Alembert equations on manifolds, in charts, beside equations in R^N that know no chart."""
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -188,7 +190,7 @@ def test_a_composition_has_its_order_in_q_and_p():
     rows = [dx.simulate(TIED, scheme, **FROM["tied"], step=1.0 / n, steps=n) for n in (8, 16, 32, 64)]
     for name in ("q", "p"):
         ends = [getattr(sol, name)[-1] for sol in rows]
-        changes = [np.linalg.norm(b - a) for a, b in zip(ends, ends[1:], strict=False)]
+        changes = [np.linalg.norm(b - a) for a, b in itertools.pairwise(ends)]
         assert np.log2(changes[-2] / changes[-1]) == pytest.approx(4, abs=0.3), name
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from dirax.diagnostics.one_step import differentiated_steps
 from dirax.diagnostics.power_balance import keeps_books
-from dirax.diagnostics.report import NOT_CHECKED, Line
+from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
 from dirax.diagnostics.rows import consecutive, over_rows, shape_of
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
 from dirax.program.memo import Same
@@ -103,6 +103,8 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     text = form.told(values[lane, row], f"worst of {len(rows)} steps at t = {float(sol.t[rows[row]]):.6g}{of_lane(sol, lane)}")
     limit = roundoff_limit(tolerance, sol.equation.stages[0][0].state_size * condition)
     line = judged(sol, name, np.max(np.where(np.isfinite(defect), defect, 0.0), axis=1), limit, text)
+    if line.verdict == VIOLATED and (excuse := form.excuse(values[lane, row])):
+        line = Line(name, line.value, limit, NOT_CHECKED, text + excuse)
     line.details["condition"] = condition
     return line
 

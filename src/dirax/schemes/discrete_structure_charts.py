@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data
-from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm, Claim, DifferentiatedStep
+from dirax.schemes.discrete_structure import AbstractStepForm, Claim, DifferentiatedStep
 from dirax.schemes.discrete_structure_pairs import AbstractPairs, LagrangianPairs
 from dirax.schemes.lagrangian_in_charts import LagrangianInCharts
 from dirax.schemes.step_forms import ChartedForm

@@ -1,6 +1,7 @@
 """The search of the constraint algorithm: level by level, until it repeats or nothing is left ([BLM] §3)."""
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -16,7 +17,6 @@ from dirax.systems.affine_equations import Solved, explicit, solved, switching
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
 from dirax.systems.constraint_points import Function, Points
 from dirax.systems.forms import ImplicitForm
-
 
 MOST_CHOICES = 6
 """Choices of pivots, beyond the best one of a point, that the functions of a chain change between."""
@@ -133,9 +133,7 @@ class Search:
             usual = np.nanmax(np.abs([here, *others]), axis=0)
             found = solved(equations, here, free, entries, usual)
             null = np.linalg.svd(matrices[0])[2][rank:].T
-            everywhere = lambda found: switching(
-                [found, *self.others(found, equations, (here, *others), free, entries, usual)], equations, entries, usual
-            )
+            everywhere = partial(self.everywhere, equations, (here, *others), free, entries, usual)
             if not found.count:
                 return self.finish(everywhere(found), null, rank)
             missed = self.at_points(lambda x, params, found=found: (found.conditions(x, params),))
@@ -172,25 +170,26 @@ class Search:
                     tried.add(found.pivots)
                     yield found
 
-    def others(
+    def everywhere(
         self,
-        found: Solved,
         equations: Callable,
         matrices: Iterable[np.ndarray],
         rank: int,
         entries: np.ndarray,
         usual: np.ndarray,
-    ) -> list[Solved]:
-        """Other choices of pivots, at the point and around it, for where one that depends on x vanishes further away."""
+        found: Solved,
+    ) -> Solved:
+        """The equations solved by the pivots of `found`, and by others, chosen at the point and around it, where those that
+        depend on x vanish further away."""
         if np.all(np.isfinite(entries[list(found.pivots[0])])):
-            return []
+            return found
         more = {found.pivots: found}
         for matrix in matrices:
             for choice in self.choices(equations, matrix, rank, entries, usual):
                 if len(more) > MOST_CHOICES:
                     break
                 more.setdefault(choice.pivots, choice)
-        return list(more.values())[1:]
+        return switching(list(more.values()), equations, entries, usual)
 
     def landing(self, choices: Iterable[Solved], equations: Callable, usual: np.ndarray) -> Landing:
         """The nearest point where the conditions vanish and a choice of pivots is regular; else what the first choice gave."""
