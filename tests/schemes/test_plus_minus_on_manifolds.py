@@ -2,6 +2,7 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -165,6 +166,53 @@ def test_on_a_group_left_invariant_systems_are_reduced_to_its_algebra(system, sc
         turned = lambda q, p: SO3.matrix(q) @ SO3.body_momentum(q, p)
         spatial = np.array([turned(q, p) for q, p in zip(jnp.asarray(whole.q[::10]), jnp.asarray(whole.p[::10]), strict=True)])
         assert np.ptp(spatial, axis=0).max() < 1e-13
+
+
+def test_the_midpoint_equations_are_those_of_the_geodesic_map_in_any_atlas():
+    run = FROM["tied"] | {"step": H, "steps": 20}
+    known = dx.simulate(TIED, dx.LagrangeDAlembert(), **run)
+    centres = {len(np.unique(known.chart, axis=0))}
+    for atlas in (None, dx.Atlas(SPACE, leave_at=0.15), dx.Atlas(SPACE, exponential=True)):
+        sol = dx.simulate(TIED, dx.InCharts(dx.RiemannianExp(SPACE), atlas), **run)
+        np.testing.assert_allclose(sol.q, known.q, atol=1e-12)
+        np.testing.assert_allclose(sol.p, known.p, atol=1e-11)
+        centres.add(len(np.unique(sol.chart, axis=0)))
+    assert len(centres) > 1  # other charts
+    assert dx.verify(sol)["discrete Dirac structure"].verdict == "ok"
+
+
+@pytest.mark.parametrize("scheme", SCHEMES.values())
+def test_reduction_by_the_rotation_about_the_vertical(scheme):
+    """L_d and w_d are functions on Q × Q: in the angles (φ, ϑ, θ), where the rotation is a translation, the same equations."""
+    point = lambda y: jnp.stack([jnp.sin(y[0]) * jnp.cos(y[1]), jnp.sin(y[0]) * jnp.sin(y[1]), jnp.cos(y[0]), y[2]])
+    one_sided = {dx.PlusLagrangeDirac: lambda q0, q1: ROW(q1), dx.MinusLagrangeDirac: lambda q0, q1: ROW(q0)}[scheme]
+    wd = lambda q0, q1, h: (one_sided(q0, q1) @ (q1 - q0))[None] / h
+    inward = lambda f: lambda y0, y1, h: f(point(y0), point(y1), h)
+    of_manifold, of_angles = (dx.LagrangeDAlembert(a, b, "incoming") for a, b in ((chord, wd), (inward(chord), inward(wd))))
+    angles = dx.in_coordinates(TIED, point)
+    y = jnp.array([np.arccos(0.8), 0.0, 0.0])
+    rate = np.linalg.lstsq(np.asarray(jax.jacfwd(point)(y)), TIED_V0, rcond=None)[0]
+    run = {"step": H, "steps": 12}  # the motion passes the pole later, where angles end
+    whole = dx.simulate(TIED, of_manifold, **FROM["tied"], **run)
+    reduced = dx.simulate(dx.reduce(angles, dx.LinearConnection(fibre=[1, 2])), of_angles, q=y, v=rate, **run)
+    assert whole.ok and reduced.ok
+    back = dx.reconstruct(reduced)
+    np.testing.assert_allclose(jax.vmap(point)(jnp.asarray(back.q)), whole.q, atol=1e-11)
+
+
+def test_on_a_flat_manifold_a_connection_reduces_at_once():
+    space = dx.Product(dx.Euclidean(1), dx.Torus(2))
+    free = lambda q, v: v @ v / 2 + 0.3 * jnp.cos(q[1]) * v[2] - q[0] ** 2 / 2 - jnp.sin(q[1])
+    whole, fibre = dx.ManifoldLagrangian(free, space), dx.LinearConnection(fibre=[2])
+    run = {"q": [0.3, 0.2, 0.1], "v": [0.1, 0.4, 0.5], "step": H, "steps": 30}
+    sol, reduced = (
+        dx.simulate(whole, dx.PlusLagrangeDirac(), **run),
+        dx.simulate(dx.reduce(whole, fibre), dx.PlusLagrangeDirac(), **run),
+    )
+    np.testing.assert_allclose(dx.reconstruct(reduced).q, sol.q, atol=1e-12)
+    assert np.ptp(reduced.mu) == 0.0
+    with pytest.raises(TypeError, match="in_coordinates"):
+        dx.reduce(TIED, dx.LinearConnection(fibre=[3]))
 
 
 def test_forces_and_their_work():

@@ -8,12 +8,14 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from dirax.geometry.manifolds import AbstractManifold
+from dirax.geometry.spaces import AbstractFlat, Product
 from dirax.numerics.arrays import Data, Numbers
 from dirax.program.linear_solves import solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import Constraints
+from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem, refuse_start
 
 
@@ -26,7 +28,10 @@ class ManifoldLagrangian(AbstractSystem):
     tangent vectors, with `affine(q[, params])` (m,) W(q) v + b(q) = 0; `forces(t, q, v[, params])` (N,) is the covector of
     other forces. Of one-forms and forces only what acts on tangent vectors matters; one-forms and b may take `t` first.
 
-    Stepped by `dx.DiscreteDirac` with a discretization map on Q, and without constraints and forces by `dx.InCharts`.
+    Stepped by `dx.DiscreteDirac` with a discretization map on Q, and where Q has a retraction by `dx.PlusLagrangeDirac`,
+    `dx.MinusLagrangeDirac` and `dx.LagrangeDAlembert`, in charts, with a discrete Lagrangian of one's own too; by `dx.InCharts`
+    with that of a map. Reduced by `dx.reduce`: on a group by it, on a flat manifold by a connection, on others where
+    translations of coordinates are symmetries, as the system that `dx.in_coordinates` gives.
 
         ball = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - q[2], dx.Sphere(3), one_forms=lambda q: a(q)[None])
         dx.simulate(ball, dx.DiscreteDirac(dx.SphereProjection()), q=q, v=v, step=0.01, steps=1000)
@@ -68,6 +73,15 @@ class ManifoldLagrangian(AbstractSystem):
     def depends_on_time(self) -> bool:
         """Whether a constraint takes the time."""
         return any(f is not None and f.takes_time for f in (self.one_forms, self.affine))
+
+    def flat_form(self) -> LagrangeDirac | None:
+        """The same system in the coordinates of R^N or of a torus, which are those of its points; None on other manifolds."""
+        factors = self.manifold.factors if isinstance(self.manifold, Product) else (self.manifold,)
+        if not all(isinstance(factor, AbstractFlat) for factor in factors):
+            return None
+        functions = {"one_forms": self.one_forms, "forces": self.forces, "affine": self.affine}
+        given = {name: function.function for name, function in functions.items() if function is not None}
+        return LagrangeDirac(self.lagrangian.function, **given)
 
     def manifold_form(self) -> "ManifoldLagrangian":
         """The system itself."""
