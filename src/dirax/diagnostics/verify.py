@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from dirax.diagnostics.action import stationary_action
 from dirax.diagnostics.casimir_lines import casimir_lines
 from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
@@ -74,6 +75,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         impacts,
         _replayed(flight, whole, tolerance),
         *membership(whole, structure, tolerance),
+        stationary_action(whole, structure, tolerance),
         constraint(whole, structure, tolerance),
         hidden_constraint(whole, tolerance),
         final_manifold(whole, tolerance),

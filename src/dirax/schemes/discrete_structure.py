@@ -65,8 +65,9 @@ class AbstractDiscreteStructure(eqx.Module):
         return f"no relation between the two-forms before and after a step is known for the {self.claims[0].quantity}"
 
     @property
-    def two_form(self) -> Callable | None:
-        """The two-form (x, params) ↦ (n, n) of the symplectic manifold whose points x the states are, where they are those."""
+    def two_form(self) -> tuple[Callable, tuple[str, ...], float] | None:
+        """The two-form (x, params) ↦ (n, n) of the symplectic manifold whose points x the states are, where they are those; with
+        the names of what is saved of a point, and the fraction of a step at which the map has its base point."""
         return None
 
     @property

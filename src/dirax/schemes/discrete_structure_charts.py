@@ -31,6 +31,10 @@ class PairsInCharts(AbstractPairs):
     share: float = eqx.field(static=True, default=0.0)
 
     @property
+    def default_sign(self) -> str:
+        return self.sign or "+"
+
+    @property
     def pairs(self) -> LagrangianPairs:
         """The structure in coordinates."""
         local = self.local

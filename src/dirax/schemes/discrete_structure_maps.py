@@ -47,8 +47,9 @@ class RelationPairs(AbstractDiscreteStructure):
         return (self._name, "multipliers") if self.relation.saved else (self._name,)
 
     @property
-    def two_form(self) -> Callable | None:
-        return self.relation.two_form
+    def two_form(self) -> tuple[Callable, tuple[str, ...], float] | None:
+        form = self.relation.two_form
+        return None if form is None else (form, self.relation.names, self.map.base_fraction)
 
     @property
     def _name(self) -> str:

@@ -27,7 +27,10 @@ SIGNS = {"+": "(+)-", "-": "(−)-", None: ""}
 class AbstractPairs(AbstractDiscreteStructure):
     """A structure of a discrete Lagrangian on Q × Q."""
 
-    sign: eqx.AbstractVar[str | None]
+    @property
+    @abstractmethod
+    def default_sign(self) -> str:
+        """The sign of the scheme, "+" for one that is neither."""
 
     @abstractmethod
     def in_coordinates(self, rows: Data, centre: int, params: Any) -> tuple["LagrangianPairs", Data, Any]:
@@ -58,6 +61,10 @@ class LagrangianPairs(AbstractPairs):
     share: float = eqx.field(static=True, default=0.0)
     quadrature: Any = None
     """f_d^± as a function (t, q0, v, h, params), where they are not by the quadrature of L_d."""
+
+    @property
+    def default_sign(self) -> str:
+        return self.sign or "+"
 
     def in_coordinates(self, rows: Data, centre: int, params: Any) -> tuple["LagrangianPairs", Data, Any]:
         return self, rows, params

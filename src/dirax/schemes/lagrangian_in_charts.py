@@ -67,6 +67,7 @@ class LagrangianInCharts(eqx.Module):
 
         def force(t, r, v, where):
             q, velocity = self.chart(where[1]).velocity_to_manifold(r, v)
+            assert forces is not None
             covector = forces(t, q, velocity, where[0])
             return gradient(lambda r: self.points(where, r)[0] @ covector)(r)
 
@@ -118,8 +119,8 @@ class LagrangianInCharts(eqx.Module):
             covector = h / len(inverses) * forces(t + fraction * h, x, w / h, where[0])
             base = lambda r0, r1, inverse=inverse: inverse(*self.points(where, r0, r1))[0]
             found.append(gradient(lambda r0, r1, base=base, f=covector: base(r0, r1) @ f, (0, 1))(r, r + h * v))
-        first, last = zip(*found, strict=True)
-        return sum(first[1:], first[0]), sum(last[1:], last[0])
+        first, last = (jnp.sum(jnp.stack(ends), axis=0) for ends in zip(*found, strict=True))
+        return first, last
 
     def _inverses(self, rule: Any) -> list[tuple[float, Callable]]:
         """(fraction of the step at which x lies, (q0, q1) ↦ (x, w)) of each point of a rule."""

@@ -176,7 +176,7 @@ def form_of_steps(system: Any, step: Any, equation: Any, structure: AbstractDisc
         if structure.own_states:
             return structure.step_form
         if structure.two_form is not None:
-            return TwoFormOfPoints(system, step, structure.two_form, structure.reads, structure.map.base_fraction)
+            return TwoFormOfPoints(system, step, *structure.two_form)
     fields = equation.stages[0][0].fields
     constrained = "multipliers" in fields
     if system.dual is not None and not constrained:
