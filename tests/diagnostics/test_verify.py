@@ -129,6 +129,7 @@ def test_everything_else_holds_on_the_disk(request, name):
         "steps replayed",
         f"{sign}-discrete Dirac structure",
         "saved p and multipliers",
+        "action sum stationary",
         "constraint",
         "momentum map p[3]",
         "structural relation φ*Ω = Ω + dβ",
