@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.program.user_functions import UserFunction
 
-Form = Float[Array, "2*n 2*n"]
+Form = Float[Array, "k k"]
 
 
 def complete_lift(two_form: Callable, x: ArrayLike, v: ArrayLike) -> Form:

@@ -158,7 +158,7 @@ class LagrangianPairs(AbstractPairs):
         Legendre momenta and the force of the three points."""
         return self.defects(rows, params, jnp.abs(jnp.ravel(rows["q"])))
 
-    def defects(self, rows: dict[str, Array], params: Any, sizes: Float[Array, " 3*n"]) -> Float[Array, "3"]:
+    def defects(self, rows: dict[str, Array], params: Any, sizes: Float[Array, " k"]) -> Float[Array, "3"]:
         """The same in roundings of numbers of these sizes, of which the coordinates of the three points are made."""
         h, t, (q0, q1, q2), p = self.step, rows["t"][0], rows["q"], rows["p"][1]
         n, here = q0.shape[0], t + h
