@@ -5,8 +5,6 @@ it fails. A benchmark of the IFToMM library with N = 40, a speed of 1 m/s of the
 row is a pendulum: ((N + 1)/3 + N) θ̈ = ((N + 1)/2 + N) g sin θ. SI units.
 """
 
-import numpy as np
-
 from dirax.bodies import Body, Model, revolute
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert

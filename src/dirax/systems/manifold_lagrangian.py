@@ -165,7 +165,7 @@ class ManifoldLagrangian(AbstractSystem):
         return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params), params)
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
-        """How far the point is from the manifold, and (W v + b, g, G v + ∂g/∂t) with the velocity that belongs to the saved momentum."""
+        """How far the point is from the manifold, and (W v + b, g, G v + ∂g/∂t) with the velocity of the saved momentum."""
         q, off = row["q"], self.manifold.defect(row["q"])[None]
         if not self.constraints.any:
             return off
