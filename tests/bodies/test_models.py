@@ -131,6 +131,30 @@ def test_mistakes_in_data_name_the_coordinates():
         b.ball("ground", "a", "zzq")
 
 
+def test_friction_without_a_normal_force_is_refused():
+    model = b.Model(
+        rods("a"),
+        [b.gliding("ground", "a", lambda x, y: 0.1 * x * x, 0.5)],
+        contacts=[b.ball_contact("a", 0.5, motion="slides", friction=0.2)],
+    )
+    with pytest.raises(ValueError, match=r"contact 'a' has friction, but its joint keeps it on the ground.*free\(\)"):
+        _ = model.system
+
+
+def test_loops_of_constraints_that_contradict_each_other_are_not_closed():
+    """Two pins of one rod at a distance that it has not."""
+    model = b.Model(
+        rods("a"),
+        [
+            b.free("ground", "a", "zxz"),
+            b.ball("ground", "a", name="first", closes=True),
+            b.ball("ground", "a", name="second", at=(2.0, 0, 0), on=(1.0, 0, 0), closes=True),
+        ],
+    )
+    with pytest.raises(ValueError, match=r"cannot be assembled.*(first|second): x by .*Change the lengths"):
+        model.state()
+
+
 WHERE = {"at": (0.3, -0.2, 0.5), "on": (0.1, 0.4, -0.3), "turned": ((1.0, 2.0, -1.0), 0.7)}
 
 
