@@ -234,8 +234,8 @@ def test_machines_are_measured_and_other_programs_are_columns_where_they_are_ins
     assert 0 < rows["euler-disk"]["microseconds"] < 1e4 and 0 < rows["euler-disk"]["drift"] < 1e-2
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: True if name == "mujoco" else found(name))
-    shown = machines.bench_machines(["euler-disk", "car-axis"], 1, 20)
+    shown = machines.bench_machines([gallery.get("euler-disk"), gallery.get("car-axis")], 1, 20)
     assert shown.installed == ("MuJoCo",)
     assert [line[-1] for line in shown.cells()] == [machines.NO_ROLLING, machines.NO_TIME]
-    with pytest.raises(ValueError, match="'kepler' is no machine"):
-        machines.bench_machines(["kepler"])
+    refused = call("bench", "--machines", "kepler")
+    assert refused.exit_code and "'kepler' is no machine" in refused.output

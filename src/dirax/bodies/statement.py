@@ -68,8 +68,8 @@ def _forces(model: Any) -> Callable | None:
     for contact in resisting:
         if contact.rubs and f"{contact.name}: touches" not in places:
             raise ValueError(
-                f"contact {contact.name!r} has friction, but its joint keeps it on the ground, or the constraint is left out: there "
-                "is no normal force to see. Let the body hang on the ground by free(), or give the contact a drag."
+                f"contact {contact.name!r} has friction, but its joint keeps it on the ground, or the constraint is left out: "
+                "there is no normal force to see. Let the body hang on the ground by free(), or give the contact a drag."
             )
 
     def forces(t, q, v, multipliers, params):

@@ -8,14 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from dirax import gallery
 from dirax.diagnostics.bench.timing import machine
 from dirax.text.tables import number, plain, text_table
 
-MACHINES = (
-    *("bicycle", "euler-disk", "rattleback", "tippe-top", "chaplygin-sphere", "n-trailer", "trikke", "snakeboard-gait"),
-    *("andrews-squeezer", "four-bar", "bricard", "flyball-governor", "n-four-bar", "car-axis", "slider-crank"),
-)
 OTHERS = {"MuJoCo": "mujoco", "Exudyn": "exudyn", "pinocchio": "pinocchio"}
 """Programs for machines, and the module that is imported where they are installed: each is then a column."""
 
@@ -98,27 +93,19 @@ class Machines:
 
 
 def bench_machines(
-    names: Sequence[str] = (), repeats: int = 5, steps: int = 1000, tell: Callable[[float | None, str], None] | None = None
+    examples: Sequence[Any], repeats: int = 5, steps: int = 1000, tell: Callable[[float | None, str], None] | None = None
 ) -> Machines:
-    """Measure machines of the gallery, all of them without names; runs are cut after `steps`.
-
-    Raises `ValueError` for a system of the gallery that is no machine.
-    """
-    unknown = [name for name in names if name not in MACHINES]
-    if unknown:
-        raise ValueError(f"{unknown[0]!r} is no machine of the gallery: there are {', '.join(MACHINES)}.")
+    """Measure examples of the gallery, each by its own scheme; runs are cut after `steps`."""
     installed = [name for name, module in OTHERS.items() if importlib.util.find_spec(module) is not None]
     rows = []
-    for k, name in enumerate(chosen := tuple(names) or MACHINES):
+    for k, example in enumerate(examples):
         if tell is not None:
-            tell(k / len(chosen), name)
-        rows.append(_measured(name, repeats, steps, installed))
+            tell(k / len(examples), example.name)
+        rows.append(_measured(example, repeats, min(steps, example.steps), installed))
     return Machines(tuple(rows), machine(), repeats)
 
 
-def _measured(name: str, repeats: int, steps: int, installed: Sequence[str]) -> MachineRow:
-    example = gallery.get(name)
-    steps = min(steps, example.steps)
+def _measured(example: Any, repeats: int, steps: int, installed: Sequence[str]) -> MachineRow:
     seconds, sol = [], example.simulate(steps=steps)
     for _ in range(repeats):
         before = time.process_time()
@@ -129,7 +116,7 @@ def _measured(name: str, repeats: int, steps: int, installed: Sequence[str]) -> 
     size = max(np.abs(energy).max(), 1e-300)
     drift = np.ptp(energy - getattr(sol, "work", 0.0)) / size  # a Solution has it where there are forces
     return MachineRow(
-        name,
+        example.name,
         example.step,
         steps,
         int(sol.stats["unknowns"]),
