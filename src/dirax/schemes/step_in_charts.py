@@ -26,8 +26,14 @@ VELOCITIES = ("v", "end_v")
 
 
 def lagrangian_in_charts(system: Any, rule: Any, constraint: Any, exponential: bool = False) -> LagrangianInCharts:
-    """The discrete Lagrangian of a system on a manifold; raises `TypeError` for a manifold without a retraction."""
+    """The discrete Lagrangian of a system on a manifold; raises `TypeError` for a manifold without a retraction, and for holonomic
+    constraints."""
     on_manifold = system.manifold_form()
+    if on_manifold.holonomic is not None:
+        raise TypeError(
+            "discrete Lagrangians on a manifold do not keep holonomic constraints: take them into the manifold, or use "
+            'dx.DiscreteDirac(map, "resolve").'
+        )
     if not isinstance(on_manifold.manifold, AbstractGeodesicManifold):
         raise TypeError(
             f"discrete Lagrangians on a manifold need one with a retraction, and {on_manifold.manifold!r} has none: use "
