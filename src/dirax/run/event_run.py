@@ -129,10 +129,11 @@ def ended_at(sol: Solution, endings: np.ndarray) -> Solution:
     t = np.asarray(sol.t)
     if sol.batch is None:
         return sol[: int(np.searchsorted(t, endings[0], side="right"))]
+    t = np.broadcast_to(t, (sol.batch, sol.rows))
     fields = {}
     for name, values in sol.fields.items():
-        rows = t if sol.field_info[name].place == "node" else t[1:]
-        after = rows[None, :] > endings[:, None]
+        rows = t if sol.field_info[name].place == "node" else t[:, 1:]
+        after = rows > endings[:, None]
         fields[name] = np.where(after.reshape(*after.shape, *(1,) * (values.ndim - 2)), np.nan, values)
     return sol.replace(fields=fields)
 
@@ -146,7 +147,7 @@ def thinned(sol: Solution, every: int) -> Solution:
     lead = (slice(None),) * (sol.batch is not None)
     pick = lambda name, a: a[(*lead, rows if sol.field_info[name].place == "node" else rows[:-1])]
     fields = {name: pick(name, np.asarray(a)) for name, a in sol.fields.items()}
-    return sol.replace(t=np.asarray(sol.t)[rows], fields=fields, save_every=every, derived={})
+    return sol.replace(t=np.asarray(sol.axis)[rows], fields=fields, save_every=every, derived={})
 
 
 def run_with_events(

@@ -21,6 +21,9 @@ COMPOSED = ("first", "sum", "mean", "each")
 """How the row of a composed step is made of those of its parts."""
 
 
+CLOCK = "clock"
+"""The field of nodes and the part of the state that are the time, where steps have lengths of their own."""
+
 SHOWN = 200
 """Equations that are named where a step is shown."""
 

@@ -85,11 +85,11 @@ def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinate
     if lead:
         variables["ok"] = Variable(lead, np.asarray(sol.ok, dtype=bool), {"long_name": "whether every step was solved"})
 
-    time = {"long_name": "time", "units": _unit(units, "t")}
-    axes = {"time": Variable(("time",), np.asarray(sol.t), time)}
+    time = {"long_name": "number of steps times step, of which clock is the time" if sol.has_own_times else "time", "units": _unit(units, "t")}
+    axes = {"time": Variable(("time",), np.asarray(sol.axis), time)}
     if any(entry["place"] == "step" for entry in layout):
         about = {**time, "long_name": "time at which a step begins"}
-        axes["interval"] = Variable(("interval",), np.asarray(sol.t)[:-1], about)
+        axes["interval"] = Variable(("interval",), np.asarray(sol.axis)[:-1], about)
     names = _checked_names(sol, coordinates, sizes.get("coordinate", 0))
     if names:
         axes["coordinate"] = Variable(("coordinate",), np.array(names, dtype=object), {"long_name": "coordinate"})
