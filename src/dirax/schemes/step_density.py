@@ -17,11 +17,7 @@ class LocalFrequency:
 
     system: Any
     lagrangian: Any
-
-    @classmethod
-    def of(cls, system: Any) -> "LocalFrequency":
-        """That of a system. Raises `TypeError` for one that is neither a Lagrangian nor a relation between x and ẋ in x alone."""
-        return cls(system, system.lagrangian_form())
+    """Its `lagrangian_form`, None where the places are points x."""
 
     def at(self, t: Any, place: Numbers, params: Any) -> Any:
         """ρ(t, q) or ρ(t, x)."""

@@ -125,13 +125,11 @@ class VariableStep(AbstractStep):
         return state, start({**data, "t": time}, self.place(state, h, params).length, params)[1]
 
     def _first_density(self, data, params):
-        return self.density(jnp.asarray(data["t"], float), data["q" if "q" in data else "x"], params)
+        return self.density(jnp.asarray(data["t"], float), data["q" if "q" in self.inner.fields else "x"], params)
 
     def check(self, data, h, params):
         complete = self.system.complete({**data, "t": data.get("t", 0.0)}, params, False)
         density = self._first_density({**complete, "t": data.get("t", 0.0)}, params)
-        if np.shape(density) != ():
-            raise ValueError(f"density must return one number, but it returned shape {np.shape(density)}: index or sum its result.")
         if not (np.isfinite(density) and density > 0.0):
             raise ValueError(
                 f"density must be positive and finite along the motion, but it is {float(density):.6g} where the run begins: give "

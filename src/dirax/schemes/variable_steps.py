@@ -50,8 +50,15 @@ class VariableSteps(AbstractScheme):
                 f"dx.VariableSteps takes a scheme of one part, but {type(self.scheme).__name__} has {len(inner.stages)}: "
                 "compose the variable steps instead, dx.Composition(dx.VariableSteps(scheme), …)."
             )
-        density = self.density.at if self.density is not None else LocalFrequency.of(system).at
-        return VariableStep(inner, system, density).equation()
+        if (density := self.density) is None:
+            if system.lagrangian_form() is None and "x" not in inner.fields:
+                raise TypeError(
+                    f"the local frequency is that of a Lagrangian or of points x, and a {type(system).__name__} has neither: give "
+                    "dx.VariableSteps(scheme, density=lambda q: …)."
+                )
+            return VariableStep(inner, system, LocalFrequency(system, system.lagrangian_form()).at).equation()
+        one = density.returning(())
+        return VariableStep(inner, system, lambda t, *values: one(*density.given(t, *values))).equation()
 
     def adjoint(self, system: Any) -> "VariableSteps | None":
         """The same with the adjoint of the scheme."""
