@@ -131,6 +131,7 @@ def test_files_and_longer_runs(sol, tmp_path):
 
 @pytest.mark.parametrize("engine", ["native", "xla"])
 def test_derivatives(engine):
+    @jax.jit
     def end(x):
         run = dx.simulate(
             EXAMPLE.system, LOW, q=jnp.stack([x, 0.2]), v=[0.1, 1.1], params=EXAMPLE.params, step=0.1, steps=30, engine=engine

@@ -59,10 +59,10 @@ class VariableStep(AbstractStep):
         middle = density + 0.5 * h * self.growth(own, time, params)
         return Place(own, density, time, middle, jnp.where(middle > 0.0, h / middle, jnp.nan))
 
-    def row(self, own, time, params, u=None) -> dict[str, Any]:
-        """The fields of nodes at a state of the scheme: numbers that depend on the step that leaves it are NaN."""
-        nowhere = jnp.full(self.inner.unknowns, jnp.nan) if u is None else u
-        row = self.inner.unpack(own, nowhere, time, jnp.nan, params)
+    def row(self, own, time, params, step=None) -> dict[str, Any]:
+        """The fields of nodes at a state of the scheme, which `check` has found not to depend on the step (u, h) that leaves it."""
+        step = jnp.full(self.inner.unknowns + 1, jnp.nan) if step is None else step
+        row = self.inner.unpack(own, step[:-1], time, step[-1], params)
         return {name: row[name] for name in ("q", "p", "x") if name in row}
 
     def growth(self, own, time, params):
@@ -97,12 +97,10 @@ class VariableStep(AbstractStep):
         return jnp.concatenate([after, density[None], time[None]])
 
     def unpack(self, state, u, t, h, params):
-        at = self.place(state, h, params)
-        return {
-            **self.inner.unpack(at.state, u, at.time, at.length, params),
-            "step_density": at.density,
-            CLOCK: at.time,
-        }
+        own, density, time = state[:-2], state[-2], state[-1]
+        only_nodes = all(field.place == "node" for field in self.inner.fields.values())
+        length = jnp.nan if only_nodes else self.place(state, h, params).length
+        return {**self.inner.unpack(own, u, time, length, params), "step_density": density, CLOCK: time}
 
     def guess(self, state, previous, h, params):
         at = self.place(state, h, params)
@@ -137,7 +135,7 @@ class VariableStep(AbstractStep):
             )
         self.inner.check(data, h / float(density), params)
         own, u = self.inner.start({**complete, "t": data.get("t", 0.0)}, h / density, params)
-        if moves(lambda u: tuple(self.row(own, 0.0, params, u).values()), u):
+        if moves(lambda step: tuple(self.row(own, 0.0, params, step).values()), jnp.append(u, h)):
             raise TypeError(
                 "dx.VariableSteps takes schemes whose q and p at a row do not depend on the step that leaves it, such as "
                 "dx.Collocation(4) and dx.DiscreteDirac(): this one is no such scheme on this system."
