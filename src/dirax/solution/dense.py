@@ -84,6 +84,8 @@ class Dense:
         """The fields at times (T,), (T, …) or (B, T, …), with derivatives. Raises `ValueError` for rows of which some were not
         saved."""
         sol = self.sol
+        if sol.impacts is not None:
+            raise ValueError("under jax.grad, jit and vmap sol.at does not look into steps that walls divide: use rows and events.")
         if sol.save_every != 1:
             raise ValueError("under jax.grad, jit and vmap sol.at needs every row: leave save_every= out.")
         t0, h, last = jnp.asarray(sol.axis[0]), jnp.asarray(sol.step), sol.rows - 2
