@@ -8,6 +8,7 @@ import pytest
 import dirax as dx
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.gallery.kepler import EXAMPLE, exact
+from dirax.gallery.rolling_disk import EXAMPLE as ROLLING_DISK
 
 E = 0.99
 Q, V = np.array([1 - E, 0.0]), np.array([0.0, np.sqrt((1 + E) / (1 - E))])
@@ -160,6 +161,19 @@ def test_time_is_that_of_the_system():
         driven, dx.VariableSteps(dx.Collocation(4), lambda t, q: 2.0 + jnp.sin(t)), q=[0.0], v=[0.0], step=0.2, steps=60, t0=0.0
     )
     np.testing.assert_allclose(run.q[:, 0], 1.0 - np.cos(run.t), atol=1e-10)
+
+
+def test_nonholonomic_steps_of_both_kinds_come_to_the_same_motion():
+    disk = ROLLING_DISK
+    start, ends = disk.initial | {"params": disk.params}, []
+    for scheme in (dx.LagrangeDAlembert(), dx.DiscreteDirac(constraints="resolve")):
+        variable = dx.VariableSteps(scheme, lambda q: 1.0 + 0.5 * jnp.sin(q[2]))
+        run = dx.simulate(disk.system, variable, step=0.02, steps=200, **start)
+        assert np.ptp(run.energy()) < 1e-3 * abs(run.energy()[0]) and dx.verify(run)["steps taken back"].verdict == "ok"
+        moment = run.at(2.0)
+        assert abs(moment.clock - 2.0) < 1e-13
+        ends.append(moment.q)
+    np.testing.assert_allclose(*ends, atol=2e-2)
 
 
 def test_compositions_of_variable_steps_have_their_order():

@@ -24,6 +24,9 @@ COMPOSED = ("first", "sum", "mean", "each")
 CLOCK = "clock"
 """The field of nodes and the part of the state that are the time, where steps have lengths of their own."""
 
+STEP_DENSITY = "step_density"
+"""Those that are the step density z, of which the value in the middle of a step sets its length, step/z."""
+
 SHOWN = 200
 """Equations that are named where a step is shown."""
 

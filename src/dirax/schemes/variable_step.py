@@ -11,7 +11,7 @@ from dirax.program.legendre import constrained_velocity, moves
 from dirax.program.tracing import along
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.layout import Layout
-from dirax.schemes.step import CLOCK, Field, StepEquation
+from dirax.schemes.step import CLOCK, STEP_DENSITY, Field, StepEquation
 
 
 class Place(NamedTuple):
@@ -36,7 +36,7 @@ class VariableStep(AbstractStep):
 
     @property
     def state(self) -> Layout:
-        return Layout(**self.inner.state_layout, step_density=(), **{CLOCK: ()})
+        return Layout(**self.inner.state_layout, **{STEP_DENSITY: (), CLOCK: ()})
 
     @property
     def unknowns(self) -> Layout:
@@ -45,7 +45,7 @@ class VariableStep(AbstractStep):
     @property
     def fields(self) -> dict[str, Field]:
         density = Field((), "node", (), "step density z: the step that leaves the row is about step/z long")
-        return {**self.inner.fields, "step_density": density, CLOCK: Field((), "node", (), "time")}
+        return {**self.inner.fields, STEP_DENSITY: density, CLOCK: Field((), "node", (), "time")}
 
     @property
     def labels(self):
@@ -100,7 +100,7 @@ class VariableStep(AbstractStep):
         own, density, time = state[:-2], state[-2], state[-1]
         only_nodes = all(field.place == "node" for field in self.inner.fields.values())
         length = jnp.nan if only_nodes else self.place(state, h, params).length
-        return {**self.inner.unpack(own, u, time, length, params), "step_density": density, CLOCK: time}
+        return {**self.inner.unpack(own, u, time, length, params), STEP_DENSITY: density, CLOCK: time}
 
     def guess(self, state, previous, h, params):
         at = self.place(state, h, params)
@@ -114,7 +114,7 @@ class VariableStep(AbstractStep):
         return self._begun(self.inner.start, data, self._first_density(data, params), data["t"], h, params)
 
     def resume(self, data, h, params):
-        return self._begun(self.inner.resume, data, data["step_density"], data[CLOCK], h, params)
+        return self._begun(self.inner.resume, data, data[STEP_DENSITY], data[CLOCK], h, params)
 
     def _begun(self, start, data, density, time, h, params):
         own, _ = start({**data, "t": time}, h / density, params)
@@ -154,7 +154,7 @@ class VariableStep(AbstractStep):
         found = interpolate(theta, u, at.state, at.time, at.length, params)
         after = self.advance(u, state, t, h, params)
         density = at.density + theta * (after[-2] - at.density)
-        return {**found, "step_density": density, CLOCK: at.time + theta * at.length}
+        return {**found, STEP_DENSITY: density, CLOCK: at.time + theta * at.length}
 
     @property
     def hermite(self):
@@ -164,7 +164,7 @@ class VariableStep(AbstractStep):
         between = self.inner.between
         assert between is not None
         found = between(theta, row, after, after[CLOCK] - row[CLOCK], params)
-        return found | {name: row[name] + theta * (after[name] - row[name]) for name in ("step_density", CLOCK)}
+        return found | {name: row[name] + theta * (after[name] - row[name]) for name in (STEP_DENSITY, CLOCK)}
 
     def remark(self, state, t, h, params):
         at = self.place(state, h, params)

@@ -44,7 +44,8 @@ class VariableSteps(AbstractScheme):
         self.density = density if given else UserFunction(density, "density", ("q",), timed=True)
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        inner = make_step_equation(self.scheme, system, shape)
+        # momenta that are means over both steps at a row are those of equal steps: as in compositions
+        inner = make_step_equation(self.scheme.part(system, shape), system, shape)
         if not isinstance(inner, StepEquation):
             raise TypeError(
                 f"dx.VariableSteps takes a scheme of one part, but {type(self.scheme).__name__} has {len(inner.stages)}: "

@@ -9,7 +9,7 @@ import numpy as np
 
 from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
-from dirax.schemes.step import CLOCK
+from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.solution.steps_again import Entries, Keyed, StepsAgain, begun, compiled_call, row_of, stepped
 from dirax.solution.trajectory import Trajectory
 
@@ -67,11 +67,8 @@ class Dense:
         single = len(self.equation.stages) == 1
         self.interpolate = first.interpolate if single else None
         self.between = first.between if single and sol.save_every == 1 else None
-        if sol.has_own_times and self.interpolate is None and self.between is None:
-            raise ValueError(
-                "between the rows of variable steps sol.at needs a scheme with a polynomial, such as dx.Collocation(4), which this "
-                "one has not."
-            )
+        if sol.has_own_times and not single:
+            raise ValueError("between the rows of a composition of variable steps nothing is known: compose another scheme.")
 
     @property
     def nodes(self) -> dict[str, Any]:
@@ -126,6 +123,8 @@ class Dense:
             found = self.interpolate(theta, u, state, t, h, params)
             return {name: found.get(name, row[name]) for name in row}
         part = jnp.maximum(theta, AT_ROW) * h
+        if CLOCK in row:
+            part = _step_for(part / h, row[STEP_DENSITY], end - t, h)
         state, u, _ = stepped(self.equation, state, guess, t, part, params)
         _, unknowns, states = stepped(self.equation, state, u, t + part, h, params)
         made = row_of(self.equation, unknowns, states, t + part, h, params)
@@ -262,6 +261,10 @@ class Dense:
         if not np.all(at_row):
             off = ~at_row
             lanes_all, lanes, t, part = lanes, lanes[off], t[off], np.maximum(theta[off], AT_ROW) * h[off]
+            if self.sol.has_own_times:
+                at = numbers[off]
+                length = self.time_at(lanes, at + 1, 0.0) - t
+                part = _step_for(part / h[off], self.saved[STEP_DENSITY][lanes, at], length, h[off])
             states, u = self.again.at(lanes, numbers[off])
             states, u = self.again.step(lanes, states, u, t, part)
             made = self.again.row(lanes, states, u, t + part)
@@ -326,6 +329,11 @@ class Dense:
                 f"sol.at takes times inside the run, from {first:.6g} to {last:.6g}, but {times[outside].flat[0]!r} is not among "
                 "them: run more steps, or go on with sol.extend(steps)."
             )
+
+
+def _step_for(theta: Any, density: Any, length: Any, h: Any) -> Any:
+    """The step of variable steps that lasts θ of the `length` that the step of h from a place of this density lasts."""
+    return theta * length * density * h / (h - theta * (h - density * length))
 
 
 def _velocity(system: Any, row: dict, t: Any, params: Any) -> Any:
