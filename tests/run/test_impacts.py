@@ -151,5 +151,5 @@ def test_what_is_refused():
     with pytest.raises(TypeError, match="it takes v"):
         dx.Impact(lambda q, v: q[0])
     with pytest.raises(ValueError, match=r"under jax\.grad"):
-        both = [FLOOR, dx.Event(lambda q: q[0])]
-        jax.grad(lambda x: dx.simulate(BALL, dx.LagrangeDAlembert(), q=[0.0, x], v=[0.3, 0.0], step=0.05, steps=20, events=both).t[0])(1.0)
+        run_both = {"step": 0.05, "steps": 20, "events": [FLOOR, dx.Event(lambda q: q[0])]}
+        jax.grad(lambda x: dx.simulate(BALL, dx.LagrangeDAlembert(), q=[0.0, x], v=[0.3, 0.0], **run_both).q[-1, 1])(1.0)

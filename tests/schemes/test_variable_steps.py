@@ -118,7 +118,9 @@ def test_between_rows_and_events(sol):
 
 
 def test_files_and_longer_runs(sol, tmp_path):
-    batch = dx.simulate(EXAMPLE.system, SCHEME, q=np.stack([Q, Q / 2]), v=np.stack([V, V / 2]), params=EXAMPLE.params, step=0.1, steps=30)
+    batch = dx.simulate(
+        EXAMPLE.system, SCHEME, q=np.stack([Q, Q / 2]), v=np.stack([V, V / 2]), params=EXAMPLE.params, step=0.1, steps=30
+    )
     for ending in (".zarr", ".nc"):
         batch.save(tmp_path / f"batch{ending}")
         loaded = dx.load(tmp_path / f"batch{ending}", system=EXAMPLE.system, scheme=SCHEME)

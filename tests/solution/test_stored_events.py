@@ -32,7 +32,9 @@ def test_runs_without_events_say_nothing_of_them(tmp_path):
     assert dx.load(tmp_path / "run.zarr").events is None and "events" not in sol.to_xarray().attrs
 
 
-@pytest.mark.parametrize("said", [{"others": {"count": 1, "fields": {}}}, {"events": {}}, {"events": {"count": -1, "fields": {}}}])
+@pytest.mark.parametrize(
+    "said", [{"others": {"count": 1, "fields": {}}}, {"events": {}}, {"events": {"count": -1, "fields": {}}}]
+)
 def test_records_of_another_form(said):
     with pytest.raises(ValueError, match="unknown form"):
         shapes_in(said)

@@ -16,9 +16,9 @@ SAMPLED = 64
 
 
 def taken_back(sol: Solution, tolerance: float | None) -> Line | None:
-    """The largest difference of Φ_{−h}(Φ_h(x)) from x of any number of the state, relative to what rounding of every operation may
-    do; None of steps that all have one length, where other lines say more. A scheme that does not say that it is self-adjoint is not
-    blamed for not being it."""
+    """The largest difference of Φ_{−h}(Φ_h(x)) from x of any number of the state, relative to what rounding of every operation
+    may do; None of steps that all have one length, where other lines say more. A scheme that does not say that it is
+    self-adjoint is not blamed for not being it."""
     if not sol.has_own_times:
         return None
     try:
@@ -50,4 +50,6 @@ def taken_back(sol: Solution, tolerance: float | None) -> Line | None:
     line = judged(sol, NAME, per_trajectory, roundoff_limit(tolerance, 1), text)
     if line.verdict == OK or (sol.scheme is not None and sol.scheme.adjoint(sol.system) == sol.scheme):
         return line
-    return Line(NAME, line.value, None, NOT_CHECKED, "the scheme is not self-adjoint: for reversible steps compose it with its adjoint")
+    return Line(
+        NAME, line.value, None, NOT_CHECKED, "the scheme is not self-adjoint: for reversible steps compose it with its adjoint"
+    )

@@ -100,7 +100,9 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")
     lane, row = worst_place(defect)
-    text = form.told(values[lane, row], f"worst of {len(rows)} steps at t = {sol.time_of(rows[row], lane):.6g}{of_lane(sol, lane)}")
+    text = form.told(
+        values[lane, row], f"worst of {len(rows)} steps at t = {sol.time_of(rows[row], lane):.6g}{of_lane(sol, lane)}"
+    )
     limit = roundoff_limit(tolerance, sol.equation.stages[0][0].state_size * condition)
     line = judged(sol, name, np.max(np.where(np.isfinite(defect), defect, 0.0), axis=1), limit, text)
     line.details["condition"] = condition

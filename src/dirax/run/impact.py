@@ -35,8 +35,8 @@ class Impact:
     saltation matrix): up to four in a step, found by the sign of the gap at quarters of it. `sol.events` then has four entries a
     step, in the order of time in each trajectory, NaN where there are none.
 
-    The p that `dx.LagrangeDAlembert` saves with nonholonomic constraints, the mean over the two steps at a row, is off by O(h²) at the
-    ends of a step that is divided, though the motion is not: `dx.DiscreteDirac(constraints="resolve")` has no such rows.
+    The p that `dx.LagrangeDAlembert` saves with nonholonomic constraints, the mean over the two steps at a row, is off by O(h²)
+    at the ends of a step that is divided, though the motion is not: `dx.DiscreteDirac(constraints="resolve")` has no such rows.
 
     `sol.events` has the times, and q and p after each impact; the row at the beginning of a step has the multipliers of
     its part before the impact. Where impacts accumulate (Zeno) the trajectory ends with a message.

@@ -52,7 +52,7 @@ class TracedFlight:
 
     def fly(self, state, u, params, t0, h):
         """Rows (steps + 1, …), impacts (steps, MOST, …) with NaN where there are none, the last state and its unknowns."""
-        step = lambda carry, k: self._step(*carry, t0 + k * h, h, params)
+        step = lambda carry, k: self._step(carry[0], carry[1], t0 + k * h, h, params)
         (state, u), (rows, hits) = jax.lax.scan(step, (state, u), jnp.arange(self.problem.steps, dtype=float))
         t = t0 + self.problem.steps * h
         closing = self.equation.unpack(state, u, t, h, params)
@@ -175,7 +175,7 @@ def fly_traced(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tu
     of_params = lead if p.batch_params and p.batch is not None else lambda a: jnp.broadcast_to(a, (p.batch or 1, *jnp.shape(a)))
     t0, h = jnp.asarray(p.t0, float), jnp.asarray(p.h, float)
     given = lead(p.state), lead(p.guess[0]), jax.tree.map(lambda a: of_params(jnp.asarray(a)), p.params)
-    one = lambda lane: flight.fly(*lane, t0, h)
+    one = lambda lane: flight.fly(lane[0], lane[1], lane[2], t0, h)
     rows, hits, last, unknowns = jax.jit(lambda given: jax.lax.map(one, given))(given)
     good = jnp.all(jnp.isfinite(last), axis=1)
     states = jnp.all(jnp.isfinite(rows["q"]), axis=-1)

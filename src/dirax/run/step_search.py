@@ -38,7 +38,7 @@ def tolerable(tolerance: Any) -> float:
 
 
 def step_for(run: Callable[..., Solution], settings: Settings, case: Case, tolerance: float) -> tuple[float, dict[str, Any]]:
-    """The step of a case, and what is said of it in `stats`; `run(settings, case, steps, save_every, progress)` carries a run out.
+    """The step of a case, and what is said of it in `stats`; `run(settings, case, steps, save_every, progress)` runs it.
 
     Raises `ValueError` for runs that JAX traces, that start from two points or have steps of lengths of their own, and where no
     step has this error: at rest, below rounding.
@@ -55,7 +55,9 @@ def step_for(run: Callable[..., Solution], settings: Settings, case: Case, toler
         trials += 1
         coarse = run(plain, replace(case, h=h), STRETCH, 1, False)
         if coarse.has_own_times:
-            raise ValueError("tolerance= finds one step for the whole run, and variable steps have lengths of their own: give step=.")
+            raise ValueError(
+                "tolerance= finds one step for the whole run, and variable steps have lengths of their own: give step=."
+            )
         fine = run(plain, replace(case, h=h / 2.0), 2 * STRETCH, 2, False)
         if not (np.all(coarse.ok) and np.all(fine.ok)):
             return math.inf
@@ -86,6 +88,6 @@ def step_for(run: Callable[..., Solution], settings: Settings, case: Case, toler
             break
     where = f"{good:.3g} and {bad:.3g}" if good and bad < math.inf else f"{good or bad:.3g}"
     raise ValueError(
-        f"no step was found whose error over the first {STRETCH} steps is {tolerance:g} of the motion's size (looked up to {where}): "
-        "the motion is at rest there, or the tolerance is below rounding; give step=."
+        f"no step was found whose error over the first {STRETCH} steps is {tolerance:g} of the motion's size (the last were "
+        f"{where}): the motion is at rest there, or the tolerance is below rounding; give step=."
     )

@@ -60,7 +60,7 @@ class VariableStep(AbstractStep):
         return Place(own, density, time, middle, jnp.where(middle > 0.0, h / middle, jnp.nan))
 
     def row(self, own, time, params, step=None) -> dict[str, Any]:
-        """The fields of nodes at a state of the scheme, which `check` has found not to depend on the step (u, h) that leaves it."""
+        """The fields of nodes at a state of the scheme: `check` has found that they do not depend on the step (u, h) from it."""
         step = jnp.full(self.inner.unknowns + 1, jnp.nan) if step is None else step
         row = self.inner.unpack(own, step[:-1], time, step[-1], params)
         return {name: row[name] for name in ("q", "p", "x") if name in row}
@@ -130,8 +130,8 @@ class VariableStep(AbstractStep):
         density = self._first_density({**complete, "t": data.get("t", 0.0)}, params)
         if not (np.isfinite(density) and density > 0.0):
             raise ValueError(
-                f"density must be positive and finite along the motion, but it is {float(density):.6g} where the run begins: give "
-                "another one, dx.VariableSteps(scheme, density=lambda q: …)."
+                f"density must be positive and finite along the motion, but it is {float(density):.6g} where the run begins: "
+                "give another one, dx.VariableSteps(scheme, density=lambda q: …)."
             )
         self.inner.check(data, h / float(density), params)
         own, u = self.inner.start({**complete, "t": data.get("t", 0.0)}, h / density, params)

@@ -27,8 +27,8 @@ class VariableSteps(AbstractScheme):
 
         scheme = dx.VariableSteps(dx.Collocation(4), density=lambda q: (q @ q) ** -0.75)
 
-    `sol.t` are the times of the rows, in a batch (B, rows) those of each trajectory, and `sol.step_density` is z; the order is that
-    of the scheme. Takes schemes of one part whose q and p at a row are in their state; may itself be composed.
+    `sol.t` are the times of the rows, in a batch (B, rows) those of each trajectory, and `sol.step_density` is z; the order is
+    that of the scheme. Takes schemes of one part whose q and p at a row are in their state; may itself be composed.
     Raises `TypeError` for other schemes and densities, `ValueError` for densities that are not positive where the run begins;
     one in which z does not stay positive ends there.
     """
@@ -40,8 +40,8 @@ class VariableSteps(AbstractScheme):
         if not isinstance(scheme, AbstractScheme):
             raise TypeError(f"scheme must be a dirax scheme such as dx.Collocation(4), but {scheme!r:.80} was given.")
         self.scheme = scheme
-        given = density is None or isinstance(density, UserFunction)
-        self.density = density if given else UserFunction(density, "density", ("q",), timed=True)
+        given = isinstance(density, UserFunction) or density is None
+        self.density = density if given else UserFunction(density, "density", ("q",), timed=True)  # type: ignore[assignment]
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         # momenta that are means over both steps at a row are those of equal steps: as in compositions
@@ -54,8 +54,8 @@ class VariableSteps(AbstractScheme):
         if (density := self.density) is None:
             if system.lagrangian_form() is None and "x" not in inner.fields:
                 raise TypeError(
-                    f"the local frequency is that of a Lagrangian or of points x, and a {type(system).__name__} has neither: give "
-                    "dx.VariableSteps(scheme, density=lambda q: …)."
+                    f"the local frequency is that of a Lagrangian or of points x, and a {type(system).__name__} has neither: "
+                    "give dx.VariableSteps(scheme, density=lambda q: …)."
                 )
             return VariableStep(inner, system, LocalFrequency(system, system.lagrangian_form()).at).equation()
         one = density.returning(())

@@ -82,7 +82,9 @@ class Dense:
         saved."""
         sol = self.sol
         if sol.impacts is not None:
-            raise ValueError("under jax.grad, jit and vmap sol.at does not look into steps that walls divide: use rows and events.")
+            raise ValueError(
+                "under jax.grad, jit and vmap sol.at does not look into steps that walls divide: use rows and events."
+            )
         if sol.save_every != 1:
             raise ValueError("under jax.grad, jit and vmap sol.at needs every row: leave save_every= out.")
         t0, h, last = jnp.asarray(sol.axis[0]), jnp.asarray(sol.step), sol.rows - 2

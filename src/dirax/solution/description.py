@@ -53,8 +53,9 @@ def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinate
     """The solution in full.
 
     Dimensions: `trajectory` (in a batch), `time` (saved rows), `interval` (the step leaving a row), `coordinate`,
-    `constraint`, `events`, `impacts`. Variables: every saved field, `energy`, `constraint_residual`, the initial data, what `sol.events` holds, and `ok` in a batch.
-    `units` and `coordinates` default to what `sol.metadata` says. Attributes record what was run, as text and as JSON.
+    `constraint`, `events`, `impacts`. Variables: every saved field, `energy`, `constraint_residual`, the initial data, what
+    `sol.events` holds, and `ok` in a batch. `units` and `coordinates` default to what `sol.metadata` says. Attributes record
+    what was run, as text and as JSON.
 
     Raises `ValueError` for unknown, repeated or too few names, and for a solution inside `jax.grad`, `jit` or `vmap`.
     """
@@ -92,7 +93,10 @@ def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinate
     if lead:
         variables["ok"] = Variable(lead, np.asarray(sol.ok, dtype=bool), {"long_name": "whether every step was solved"})
 
-    time = {"long_name": "number of steps times step, of which clock is the time" if sol.has_own_times else "time", "units": _unit(units, "t")}
+    time = {
+        "long_name": "number of steps times step, of which clock is the time" if sol.has_own_times else "time",
+        "units": _unit(units, "t"),
+    }
     axes = {"time": Variable(("time",), np.asarray(sol.axis), time)}
     if any(entry["place"] == "step" for entry in layout):
         about = {**time, "long_name": "time at which a step begins"}

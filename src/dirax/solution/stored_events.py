@@ -48,6 +48,6 @@ def events_in(kind: str, record: Mapping[str, Any], arrays: Mapping[str, np.ndar
     """The events of one kind, of the arrays of a file."""
     count = record["count"]
     own = lambda name, shape, dtype: arrays[f"{kind}_{name}"] if count else np.zeros((0, *shape), dtype)
-    whole = [own(name, (), np.int64) for name in WHOLE]
+    index, direction, lane = (own(name, (), np.int64) for name in WHOLE)
     fields = {name: own(name, shape, float) for name, shape in record["fields"].items()}
-    return Events(own("t", (), float), *whole, fields)
+    return Events(own("t", (), float), index, direction, lane, fields)
