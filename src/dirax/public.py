@@ -80,6 +80,7 @@ from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, 
 from dirax.schemes.layout import Layout
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
+from dirax.schemes.variable_steps import VariableSteps
 from dirax.show import scene
 from dirax.show.report import report
 from dirax.solution.loading import load
@@ -219,6 +220,7 @@ __all__ += [
     "StepEquation",
     "StepSequence",
     "SymmetricComposition",
+    "VariableSteps",
     "discrete_constraint_algorithm",
     "make_step_equation",
 ]

@@ -36,7 +36,7 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     lane, row = worst_place(values)
     kind = "discrete constraint of each step" if steps else "constraint at each row"
     text = (
-        f"{kind}, relative to its terms; at most {np.max(residual[:, given:]):.2g}, at t = {float(sol.t[row + given]):.6g}"
+        f"{kind}, relative to its terms; at most {np.max(residual[:, given:]):.2g}, at t = {sol.time_of(row + given, lane):.6g}"
         f"{of_lane(sol, lane)}"
     )
     if redundant := sol.stats.get("redundant_constraints"):
@@ -59,7 +59,7 @@ def hidden_constraint(sol: Solution, tolerance: float | None) -> Line | None:
     values = over_rows(eqx.Partial(_hidden_terms, system), sol, items)
     scale = float(np.nanmax(values[..., 1])) or 1.0
     lane, row = worst_place(values[..., 0])
-    text = f"∂g/∂q v + ∂g/∂t at each row, relative to its terms, worst at t = {float(sol.t[row]):.6g}{of_lane(sol, lane)}"
+    text = f"∂g/∂q v + ∂g/∂t at each row, relative to its terms, worst at t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
     return judged(sol, "hidden constraint", np.nanmax(values[..., 0], axis=1) / scale, roundoff_limit(tolerance, 1), text)
 
 

@@ -118,7 +118,7 @@ class Replay:
         if self.from_points:
             counts[1:] = 1.0 + np.arange(self.sol.rows - 1, dtype=float) * self.sol.save_every
         last = self.sol.rows - 1
-        left = np.rint((float(self.sol.t[last]) - float(self.sol.t[last - 1])) / float(self.sol.step)) if last else 0.0
+        left = np.rint((float(self.sol.axis[last]) - float(self.sol.axis[last - 1])) / float(self.sol.step)) if last else 0.0
         if last and 1 <= left <= counts[last] - counts[last - 1]:
             counts[last] = counts[last - 1] + left
         return counts
@@ -135,7 +135,7 @@ class Replay:
 
     def times(self) -> np.ndarray:
         """The times that the rows should have."""
-        return float(self.sol.t[0]) + self.counts * float(self.sol.step)
+        return float(self.sol.axis[0]) + self.counts * float(self.sol.step)
 
     # ------------------------------------------------------------------------------------------ where steps begin
 

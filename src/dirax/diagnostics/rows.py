@@ -104,7 +104,7 @@ def _constraint(system: AbstractSystem, row: dict, params: Any):
 
 def times_at(sol: Solution, rows: np.ndarray) -> np.ndarray:
     """The times of rows, (…, rows)."""
-    t = np.asarray(sol.t)[rows]
+    t = np.asarray(sol.t)[..., rows]
     return t if sol.batch is None else np.broadcast_to(t, (sol.batch, len(rows)))
 
 

@@ -54,7 +54,7 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         of_claim = values[..., first : first + len(claim.parts)]
         first += len(claim.parts)
         lane, row = worst_place(np.max(of_claim, axis=-1))
-        text = f"{claim.statement}; worst at t = {float(sol.t[row + middle]):.6g}{of_lane(sol, lane)}"
+        text = f"{claim.statement}; worst at t = {sol.time_of(row + middle, lane):.6g}{of_lane(sol, lane)}"
         if len(claim.parts) > 1:
             each = zip(claim.parts, of_claim[lane, row], strict=True)
             text += ": " + ", ".join(f"{part} {value:.2g}" for part, value in each)
@@ -100,7 +100,9 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")
     lane, row = worst_place(defect)
-    text = form.told(values[lane, row], f"worst of {len(rows)} steps at t = {float(sol.t[rows[row]]):.6g}{of_lane(sol, lane)}")
+    text = form.told(
+        values[lane, row], f"worst of {len(rows)} steps at t = {sol.time_of(rows[row], lane):.6g}{of_lane(sol, lane)}"
+    )
     limit = roundoff_limit(tolerance, sol.equation.stages[0][0].state_size * condition)
     line = judged(sol, name, np.max(np.where(np.isfinite(defect), defect, 0.0), axis=1), limit, text)
     if line.verdict == VIOLATED and (excuse := form.excuse(values[lane, row])):

@@ -61,7 +61,7 @@ def of_lane(sol: Solution, lane: int) -> str:
 
 def steps_of(sol: Solution) -> int:
     """The number of steps of the run, at least 1."""
-    return max(1, round(float(sol.t[-1] - sol.t[0]) / float(sol.step)))
+    return max(1, round(float(sol.axis[-1] - sol.axis[0]) / float(sol.step)))
 
 
 def sampled_terms(sol: Solution, terms: Callable) -> np.ndarray:
