@@ -12,6 +12,7 @@ from jax.extend.core import ClosedJaxpr
 from dirax.numerics.newton import damped_step
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported
 from dirax.program.linear_solves import equilibrated_inverse
+from dirax.program.memo import Memo, Same
 from dirax.program.rules.reductions import factors_of_product
 from dirax.program.scalar_program import ScalarProgram, numpy_rule
 from dirax.program.tracing import jacobian, of_one_result
@@ -137,12 +138,21 @@ def _of_finite(function: Callable, matrices: np.ndarray) -> list[np.ndarray]:
     return [np.where(spread(a), a, np.nan) for a in function(np.where(spread(matrices), matrices, 0.0))]
 
 
+_equations: Memo[tuple[Callable, Callable]] = Memo(128)
+
+
+def _with_slope(residual: ClosedJaxpr) -> tuple[Callable, Callable]:
+    """A residual and its derivative by the last argument, for arguments with an axis of entries."""
+    slope = jax.make_jaxpr(jacobian(of_one_result(residual), len(residual.in_avals) - 1))(*residual.in_avals)
+    value, linear = (ScalarProgram.of(jaxpr, by_numpy=True).in_numpy for jaxpr in (residual, slope))
+    return value, linear
+
+
 @numpy_rule("dirax_root")
 def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
     """The method of `dirax.program.roots`, for all entries side by side."""
     closed: ClosedJaxpr = equation.params["residual"]
-    slope = jax.make_jaxpr(jacobian(of_one_result(closed), len(operands) - 1))(*closed.in_avals)
-    residual, linear = (ScalarProgram.of(jaxpr, by_numpy=True).in_numpy for jaxpr in (closed, slope))
+    residual, linear = _equations.get(Same(closed), lambda: _with_slope(closed))
     most = equation.params["max_steps"]
 
     def find(arrays: list[np.ndarray]) -> list[np.ndarray]:
