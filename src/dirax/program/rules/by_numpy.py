@@ -10,7 +10,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from dirax.numerics.newton import damped_step
-from dirax.program.evaluation.in_numpy import Values
+from dirax.program.evaluation.in_numpy import Slopes, Values
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
 from dirax.program.linear_solves import equilibrated_inverse
@@ -55,13 +55,14 @@ def derivative_in_numbers(made: ScalarProgram, interpreter: Interpreter, equatio
     if inner is None or len(inner.graph) * sum(operands[k].size for k in wanted) < LARGE_DERIVATIVE:
         return list(RULES["dirax_derivative"](interpreter, equation, *operands))
     (result,), inputs = inner.results, [node for k in wanted for node in inner.inputs[k].ravel().tolist()]
-    ends = np.cumsum([operands[k].size for k in wanted])[:-1]
+    ends, outputs, plans = np.cumsum([operands[k].size for k in wanted])[:-1], result.ravel().tolist(), []
 
     def slopes(arrays: list[np.ndarray]) -> list[np.ndarray]:
-        known = Values(inner.graph.copy(), len(arrays[0]))
+        plans[:] = plans or [Slopes(inner.graph, outputs, inputs)]
+        known = Values(inner.graph, len(arrays[0]))
         for nodes, array in zip(inner.inputs, arrays, strict=True):
             known.bind(nodes, array)
-        parts = np.split(known.slopes(result.ravel().tolist(), inputs), ends, axis=2)
+        parts = np.split(known.slopes(outputs, inputs, plans[0]), ends, axis=2)
         return [part.reshape(len(part), *v.aval.shape) for part, v in zip(parts, equation.outvars, strict=True)]
 
     return made.between(list(operands), [v.aval.shape for v in equation.outvars], slopes)
