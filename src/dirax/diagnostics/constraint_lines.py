@@ -3,13 +3,11 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.energy_lines import energy_terms
 from dirax.diagnostics.report import NOT_CHECKED, Line
-from dirax.diagnostics.rows import constraint_of, over_rows, times_at
+from dirax.diagnostics.rows import at_rows, constraint_at, constraint_of, energy_at, over_rows, times_at
 from dirax.diagnostics.verdicts import SAMPLED_ROWS, judged, of_lane, roundoff_limit, sampled_terms, spread, worst_place
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.solution.solution import Solution
@@ -55,23 +53,18 @@ def hidden_constraint(sol: Solution, tolerance: float | None) -> Line | None:
     system = None if sol.system is None else sol.system.lagrangian_form()
     if system is None or system.holonomic is None or "constraint" not in sol.fields:
         return None
-    items = (times_at(sol, np.arange(sol.rows)), np.asarray(sol.q), np.asarray(sol.p))
-    values = over_rows(eqx.Partial(_hidden_terms, system), sol, items)
-    scale = float(np.nanmax(values[..., 1])) or 1.0
-    lane, row = worst_place(values[..., 0])
+    hidden, items = at_rows(sol, _hidden, system), {"q": np.asarray(sol.q), "p": np.asarray(sol.p)}
+    values = over_rows(hidden, sol, ({**items, "t": times_at(sol, np.arange(sol.rows))},))
+    values, scale = np.max(np.abs(values), axis=-1), float(np.nanmax(sampled_terms(sol, hidden))) or 1.0
+    lane, row = worst_place(values)
     text = f"∂g/∂q v + ∂g/∂t at each row, relative to its terms, worst at t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
-    return judged(sol, "hidden constraint", np.nanmax(values[..., 0], axis=1) / scale, roundoff_limit(tolerance, 1), text)
+    return judged(sol, "hidden constraint", np.nanmax(values, axis=1) / scale, roundoff_limit(tolerance, 1), text)
 
 
-def _hidden_terms(system: LagrangeDirac, t, q, p, params: Any):
-    """The largest |G v + ∂g/∂t|, and the largest of |∂(G v + ∂g/∂t)/∂(q, p)||(q, p)|."""
-
-    def defect(q, p):
-        return system.constraints.hidden_defect(t, q, system.inverse_legendre(q, p, params, t=t), params)
-
-    of_q, of_p = jax.jacfwd(defect, argnums=(0, 1))(q, p)
-    size = jnp.abs(of_q) @ jnp.abs(q) + jnp.abs(of_p) @ jnp.abs(p)
-    return jnp.stack([jnp.max(jnp.abs(defect(q, p))), jnp.max(size)])
+def _hidden(system: LagrangeDirac, row: dict, params: Any):
+    """G v + ∂g/∂t."""
+    velocity = system.inverse_legendre(row["q"], row["p"], params, t=row["t"])
+    return system.constraints.hidden_defect(row["t"], row["q"], velocity, params)
 
 
 def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str) -> Any:
@@ -88,16 +81,9 @@ def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str)
     if sol.system is None:
         nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
         return float(max(1.0, *(np.nanmax(np.abs(a)) for a in nodes)))
-    terms = energy_terms if sol.system.constrains_differential else _constraint_terms
-    return float(np.nanmax(sampled_terms(sol, terms))) or 1.0
+    function = energy_at if sol.system.constrains_differential else constraint_at
+    return float(np.nanmax(sampled_terms(sol, at_rows(sol, function)))) or 1.0
 
 
 def _own_size(structure: AbstractDiscreteStructure, speed, row: dict, params: Any):
     return structure.constraint_size(row, jnp.asarray(speed), params)
-
-
-def _constraint_terms(system: Any, t, row: dict, params: Any):
-    """Σ |∂c/∂row_i| |row_i|, the largest over the constraints c."""
-    derivative = jax.jacfwd(lambda row: system.constraint_at({**row, "t": t}, params))(row)
-    terms = (jnp.abs(derivative[name]).reshape(derivative[name].shape[0], -1) @ jnp.abs(row[name]).ravel() for name in row)
-    return jnp.max(sum(terms), initial=0.0)

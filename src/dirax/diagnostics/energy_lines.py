@@ -2,14 +2,12 @@
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.power_balance import balances, has_power, keeps_books
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Line
-from dirax.diagnostics.rows import energy_of
+from dirax.diagnostics.rows import at_rows, energy_at, energy_of
 from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled_terms, steps_of
 from dirax.numerics.tolerances import EPSILON
 from dirax.schemes.step import CLOCK
@@ -104,10 +102,4 @@ def _motion(sol: Solution, lane: int) -> np.ndarray:
 def energy_scale(sol: Solution, energy: np.ndarray) -> float:
     """|E| + |∂E/∂row| |row|, the largest: what roundings of the rows do to the energy, in units of ε."""
     scale = float(np.nanmax(np.abs(energy)))
-    return scale if sol.system is None else scale + float(np.nanmax(sampled_terms(sol, energy_terms)))
-
-
-def energy_terms(system: Any, t, row: dict, params: Any):
-    """Σ |∂E/∂row_i| |row_i|."""
-    gradient = jax.grad(lambda row: system.energy_at({**row, "t": t}, params))(row)
-    return sum(jnp.sum(jnp.abs(gradient[name] * row[name])) for name in row)
+    return scale if sol.system is None else scale + float(np.nanmax(sampled_terms(sol, at_rows(sol, energy_at))))

@@ -16,8 +16,8 @@ from dirax.program.memo import Same
 from dirax.solution.solution import Solution
 from dirax.solution.trajectory import SavedRow
 
-MOST_OPERATIONS = 4e9
-"""Scalar operations of the steps that are taken again, some ten seconds: of longer runs as many rows, evenly spread."""
+MOST_OPERATIONS = 1e8
+"""Scalar operations of the steps that are taken again, a second or so: of longer runs as many rows, evenly spread."""
 
 
 APART = 16

@@ -1,14 +1,16 @@
 """Constraints that follow from others: found where a run begins, left out of its equations, and reported."""
 
+from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dirax.numerics.ranks import rank_of_equations
 from dirax.numerics.tolerances import CONSTRAINT_DEFECT
 from dirax.program.compiled import compiled
+from dirax.program.evaluation.functions import at_values
+from dirax.program.memo import Same
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
 
@@ -58,7 +60,10 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
             f"initial data{where}: its row of [W; ∂g/∂q] is zero there. Leave it out, or start elsewhere."
         )
     q = jnp.asarray(system.point(data))
-    near, positions, velocities = map(np.asarray, _nearby(system, q, params, jnp.asarray(t0, float)))
+    values = np.asarray(q, float), params, np.asarray(t0, float)
+    nearby = _Nearby(Same(system))
+    found = at_values(nearby, values)
+    near, positions, velocities = map(np.asarray, compiled(nearby)(*values) if found is None else found[0])
     worst = max((positions, velocities), key=lambda residual: np.max(np.abs(residual), initial=0.0))
     if np.max(np.abs(worst), initial=0.0) > CONSTRAINT_DEFECT * (1 + np.max(np.abs(q))):
         raise ValueError(
@@ -75,15 +80,19 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
         )
 
 
-@compiled
-def _nearby(system, q, params, t):
-    """[W; G] at an admissible point near q, and the residuals of g and of the velocities' constraints that no point and no
-    velocity nearest to q makes zero."""
-    constraints: Constraints = system.constraints
-    still = jnp.zeros_like(q)
-    nearest = system.project_position(q, still, params, t)
-    v = system.project_velocity(nearest, still, params, t)
-    residuals = constraints.position_defect(t, nearest, params), constraints.velocity_defect(t, nearest, v, params)
-    direction = jax.random.uniform(jax.random.key(0), q.shape, minval=0.5)
-    away = nearest + AWAY * (1.0 + jnp.max(jnp.abs(q))) * direction
-    return constraints.matrix(t, system.project_position(away, still, params, t), params), *residuals
+@dataclass(frozen=True)
+class _Nearby:
+    """(q, params, t) ↦ [W; G] at an admissible point near q, and the residuals of g and of the velocities' constraints that no
+    point and no velocity nearest to q makes zero."""
+
+    same: Same
+
+    def __call__(self, q, params, t):
+        system, constraints = self.same.object, self.same.object.constraints
+        still = jnp.zeros_like(q)
+        nearest = system.project_position(q, still, params, t)
+        v = system.project_velocity(nearest, still, params, t)
+        residuals = constraints.position_defect(t, nearest, params), constraints.velocity_defect(t, nearest, v, params)
+        direction = np.random.default_rng(len(q)).uniform(0.5, 1.0, len(q))
+        away = nearest + AWAY * (1.0 + jnp.max(jnp.abs(q))) * direction
+        return constraints.matrix(t, system.project_position(away, still, params, t), params), *residuals

@@ -26,8 +26,8 @@ VELOCITIES = ("v", "end_v")
 
 
 def lagrangian_in_charts(system: Any, rule: Any, constraint: Any, exponential: bool = False) -> LagrangianInCharts:
-    """The discrete Lagrangian of a system on a manifold; raises `TypeError` for a manifold without a retraction, and for holonomic
-    constraints."""
+    """The discrete Lagrangian of a system on a manifold. Raises `TypeError` for a manifold without a retraction, and for
+    holonomic constraints."""
     on_manifold = system.manifold_form()
     if on_manifold.holonomic is not None:
         raise TypeError(
