@@ -130,7 +130,7 @@ def test_what_fails_in_a_call_is_tried_alone_and_the_rest_together():
     while waiting:
         rest.append(waiting.taken(0.5, 2))
     assert rest[0] == [10, 11, 12, 13, 14] and rest[-2:] == [[1], [2]]
-    assert sorted(sum(rest, [])) == [1, 2, *range(10, 40)]
+    assert sorted(task for call in rest for task in call) == [1, 2, *range(10, 40)]
 
 
 def test_units_and_names_of_coordinates(tmp_path):
