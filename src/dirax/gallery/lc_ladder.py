@@ -28,7 +28,8 @@ def scene(sections: int = 4) -> Scene:
         node, ground = (k + 1.0, 0.0, 0.0), (k + 1.0, 0.0, -0.9)
         charge = lambda x, k=k: jnp.stack([k + 1.0 + 0.0 * x[k], 0.0 * x[k], 0.8 * x[k]])
         flux = lambda x, k=sections + k: jnp.stack([0.8 * x[k], 0.0 * x[k], 0.0 * x[k]])
-        parts += [spring((float(k), 0.0, 0.0), node, radius=0.1), rod(node, ground, radius=0.012)]
+        parts += [spring((float(k), 0.0, 0.0), node, turns=4, radius=0.1)]
+        parts += [rod(node, (k + 1.0, 0.0, -0.4), radius=0.012), rod((k + 1.0, 0.0, -0.55), ground, radius=0.012)]
         parts += [box((k + 1.0, 0.0, -0.4 - gap), size=(0.4, 0.4, 0.05), colour="ink") for gap in (0.0, 0.15)]
         parts += [rod(node, charge, radius=0.07, colour=1), arrow((k + 0.5, 0.0, 0.3), flux, colour=2)]
     return Scene((*parts, rod((0.0, 0.0, -0.9), (float(sections), 0.0, -0.9)), rod((0.0, 0.0, -0.9), (0.0, 0.0, 0.0))), "front")
