@@ -114,16 +114,19 @@ def packed(plan: Plan) -> bytes:
 
 
 _plans: dict[int, Any] = {}
+_loading = threading.Lock()
 
 
 def run_packed(plan: bytes, tasks: Sequence[Task]) -> list[Outcome]:
     """The outcomes of tasks in another process, which keeps the plan that it was given last."""
     key = hash(plan)
-    if key not in _plans:
-        loaded = pickle.loads(plan)
-        _plans.clear()
-        _plans[key] = loaded
-    return [_outcome(_plans[key], task) for task in tasks]
+    with _loading:  # threads of one process share the plan, and what is compiled for it
+        if key not in _plans:
+            loaded = pickle.loads(plan)
+            _plans.clear()
+            _plans[key] = loaded
+        common = _plans[key]
+    return [_outcome(common, task) for task in tasks]
 
 
 def _outcome(plan: Plan, task: Task) -> Outcome:
