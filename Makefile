@@ -43,7 +43,8 @@ format: $(READY)  ## Repair style with ruff
 	$(RUN) ruff check --fix
 	$(RUN) ruff format
 
-docs: $(READY)  ## Build the documentation in site/, every warning an error
+docs: $(READY)  ## Check the spelling and build the documentation in site/, every warning an error
+	$(BIN)/codespell *.md docs src tests benchmarks
 	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict
 
 soak: $(READY) fuzz  ## The long tests that `make test` leaves out
