@@ -53,7 +53,9 @@ def _refuse_other_systems(system: Any, group: AbstractLieGroup) -> None:
             f"dx.reduce by {name} takes a dx.ManifoldLagrangian on {name}, or a dx.LagrangeDirac in the coordinates of its "
             f"elements, but a {type(system).__name__} was given."
         )
-    more = {"forces": system.forces, "affine": system.affine, "holonomic constraints": system.holonomic}
+    more = {"forces": system.forces, "affine": system.affine}
+    if isinstance(system, ManifoldLagrangian):
+        more["holonomic constraints"] = system.holonomic
     given = [n for n, function in more.items() if function is not None] + ["explicit time"] * system.depends_on_time
     if given:
         raise ValueError(
