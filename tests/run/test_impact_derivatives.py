@@ -38,6 +38,7 @@ def test_derivatives_of_two_bounces():
     np.testing.assert_allclose(jacobian[8], jax.grad(lambda a: fall(*a))(jnp.asarray(at)), rtol=1e-11)
 
 
+@pytest.mark.soak
 def test_reverse_mode_and_second_derivatives():
     """A ball falls from height y onto a floor at 0, e = .8: y(T) = .8 u s − s²/2 with u = √(2y) = t₁ and s = T − t₁."""
     ball = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0])

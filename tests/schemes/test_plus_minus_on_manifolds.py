@@ -35,7 +35,9 @@ def of_middle(q0, q1, h):
     return (ROW((q0 + q1) / 2) @ (q1 - q0))[None] / h
 
 
-@pytest.mark.parametrize(("name", "engine"), [("free", "native"), ("tied", "native"), ("tied", "xla")])
+@pytest.mark.parametrize(
+    ("name", "engine"), [("free", "native"), ("tied", "native"), pytest.param("tied", "xla", marks=pytest.mark.soak)]
+)
 def test_a_users_discrete_lagrangian_beside_the_form_constrained_in_flat_space(name, engine):
     """D2 L_d + D1 L_d + λ q + μ W = 0 with |q| = 1 in R^N are the same equations."""
     tied = name == "tied"

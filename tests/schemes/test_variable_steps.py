@@ -132,7 +132,7 @@ def test_files_and_longer_runs(sol, tmp_path):
     assert np.array_equal(thin.t[:4], sol.t[:28:7])
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_derivatives(engine):
     @jax.jit
     def end(x):
