@@ -14,7 +14,7 @@ from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
 from dirax.solution.solution import Solution
-from dirax.solution.trajectory import SavedRow
+from dirax.solution.trajectory import SavedRow, last_rows
 
 MOST_OPERATIONS = 1e8
 """Scalar operations of the steps that are taken again, a second or so: of longer runs as many rows, evenly spread."""
@@ -108,8 +108,7 @@ class Replay:
     @cached_property
     def ends(self) -> np.ndarray:
         """The last row (B,) that each trajectory reached, −1 where there is none."""
-        reached = [np.all(np.isfinite(self.saved[name]).reshape(*self.saved[name].shape[:2], -1), axis=2) for name in self.nodes]
-        return np.max(np.where(np.logical_and.reduce(reached), np.arange(self.sol.rows), -1), axis=1)
+        return last_rows([self.saved[name] for name in self.nodes])
 
     @cached_property
     def counts(self) -> np.ndarray:

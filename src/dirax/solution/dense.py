@@ -11,7 +11,7 @@ from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
 from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.solution.steps_again import Entries, Keyed, StepsAgain, begun, compiled_call, row_of, stepped
-from dirax.solution.trajectory import Trajectory
+from dirax.solution.trajectory import Trajectory, last_rows
 
 AT_ROW = 1e-12
 """Part of a step by which a time may lie off a saved row and still be at it, where steps of a part are taken."""
@@ -159,9 +159,7 @@ class Dense:
     @cached_property
     def ends(self) -> np.ndarray:
         """The number of the last step + 1 that each trajectory reached, (B,)."""
-        good = [np.isfinite(self.saved[name]).reshape(*self.saved[name].shape[:2], -1).all(axis=2) for name in self.nodes]
-        rows = np.max(np.where(np.logical_and.reduce(good), np.arange(self.sol.rows), 0), axis=1)
-        return self.counts[rows]
+        return self.counts[np.maximum(last_rows([self.saved[name] for name in self.nodes]), 0)]
 
     @cached_property
     def velocities(self) -> np.ndarray:

@@ -263,3 +263,9 @@ def _along(function, nodes, params, axes):
     """`function` of every row, compiled once per function and shape: a system's bound method is compared by its system."""
     along = jax.vmap(lambda row, params: function(SavedRow(row), params), in_axes=(0, None))
     return (along if axes is None else jax.vmap(along, in_axes=axes))(nodes, params)
+
+
+def last_rows(nodes: list[np.ndarray]) -> np.ndarray:
+    """The last row (B,) that each trajectory reached, −1 where there is none, by the arrays (B, rows, …) of the nodes."""
+    reached = [np.isfinite(a).reshape(*a.shape[:2], -1).all(axis=2) for a in nodes]
+    return np.max(np.where(np.logical_and.reduce(reached), np.arange(nodes[0].shape[1]), -1), axis=1)
