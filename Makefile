@@ -29,8 +29,8 @@ install: $(READY)  ## Make the virtual environment .venv and install the locked 
 demo: $(READY)  ## Reproduce the papers: out/index.html shows figures, tables and the systems in motion
 	$(BIN)/dirax reproduce all --out $(OUT)
 
-test: lint types  ## The whole test suite: style, types, import order, tests
-	$(RUN) pytest -n $(WORKERS) --dist worksteal
+test: lint  ## The whole test suite: style, types beside it, import order, tests
+	@$(MAKE) --no-print-directory types & types=$$!; $(RUN) pytest -n $(WORKERS) --dist worksteal; tests=$$?; wait $$types && exit $$tests
 
 lint: $(READY)  ## Check style with ruff
 	$(RUN) ruff check
@@ -43,7 +43,8 @@ format: $(READY)  ## Repair style with ruff
 	$(RUN) ruff check --fix
 	$(RUN) ruff format
 
-docs: $(READY)  ## Build the documentation in site/, every warning an error
+docs: $(READY)  ## Check the spelling and build the documentation in site/, every warning an error
+	$(BIN)/codespell *.md docs src tests benchmarks
 	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict
 
 soak: $(READY) fuzz  ## The long tests that `make test` leaves out

@@ -72,3 +72,9 @@ def test_links_that_lead_nowhere_are_named(tmp_path):
         "a.html points to c.html, which is not there",
         "b.html loads https://x.org/y.png",
     ]
+
+
+def test_words_are_spelt_right(capsys, monkeypatch):
+    codespell = pytest.importorskip("codespell_lib", reason="the documentation's packages are not installed")
+    monkeypatch.chdir(ROOT)
+    assert codespell.main(*map(str, [*ROOT.glob("*.md"), ROOT / "docs", ROOT / "src"])) == 0, capsys.readouterr().out

@@ -14,6 +14,7 @@ from dirax.engines.configure import configure
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.geometry.charts import Atlas, RetractionChart, chart_at, check_chart
+from dirax.geometry.complete_lift import complete_lift, symplectic_equations
 from dirax.geometry.cotangent_lift import CotangentBundle, cotangent_lift, symplecticity_defect
 from dirax.geometry.discrete import (
     DiscretizationMapDirac,
@@ -79,6 +80,7 @@ from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, 
 from dirax.schemes.layout import Layout
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import AbstractScheme, Field, Shape, StepEquation, StepSequence, make_step_equation
+from dirax.schemes.variable_steps import VariableSteps
 from dirax.show import scene
 from dirax.show.report import report
 from dirax.solution.loading import load
@@ -186,10 +188,12 @@ __all__ += [
     "chart_at",
     "check_chart",
     "check_discretization_map",
+    "complete_lift",
     "cotangent_lift",
     "induced_dirac",
     "minus_legendre",
     "plus_legendre",
+    "symplectic_equations",
     "symplecticity_defect",
 ]
 # How time is cut
@@ -216,6 +220,7 @@ __all__ += [
     "StepEquation",
     "StepSequence",
     "SymmetricComposition",
+    "VariableSteps",
     "discrete_constraint_algorithm",
     "make_step_equation",
 ]

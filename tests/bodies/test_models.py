@@ -41,17 +41,6 @@ def test_a_free_body_keeps_momentum_and_angular_momentum_in_every_description(ro
     assert np.ptp(seen["energy"]) < 1e-5 and seen["energy"] == pytest.approx(sol.energy(), abs=1e-12)
 
 
-def test_euler_angles_and_quaternions_have_the_same_motion():
-    ends = []
-    for rotation, start in (("zxz", {"top.nutation": 0.5}), ("quaternion", {"top.qx": np.sin(0.25)})):
-        model = b.Model([b.Body("top", **ROD, centre=(0, 0, 0.4))], [b.ball("ground", "top", rotation)])
-        spin = {"top.spin": 9.0, "top.precession": 0.0} if rotation == "zxz" else {"top.qz": 4.5 * np.cos(0.25)}
-        data = model.state(start, spin if rotation == "zxz" else {**spin, "top.qy": -4.5 * np.sin(0.25), "top.qx": 0.0})
-        sol = dx.simulate(model.system, dx.LagrangeDAlembert(), **data, step=5e-4, steps=1000, save_every=1000)
-        ends.append(np.asarray(model.frames(sol.q[-1], np.zeros(len(sol.q[-1])))["top"].turn))
-    assert ends[0] == pytest.approx(ends[1], abs=2e-5)
-
-
 def test_parameters_springs_dampers_and_motors():
     model = b.Model(
         [b.Body("cart", "m")],
@@ -140,6 +129,30 @@ def test_mistakes_in_data_name_the_coordinates():
         model.state({"a.qw": 1.0}, {"a.qw": 1.0})
     with pytest.raises(ValueError, match="rotation must be"):
         b.ball("ground", "a", "zzq")
+
+
+def test_friction_without_a_normal_force_is_refused():
+    model = b.Model(
+        rods("a"),
+        [b.gliding("ground", "a", lambda x, y: 0.1 * x * x, 0.5)],
+        contacts=[b.ball_contact("a", 0.5, motion="slides", friction=0.2)],
+    )
+    with pytest.raises(ValueError, match=r"contact 'a' has friction, but its joint keeps it on the ground.*free\(\)"):
+        _ = model.system
+
+
+def test_loops_of_constraints_that_contradict_each_other_are_not_closed():
+    """Two pins of one rod at a distance that it has not."""
+    model = b.Model(
+        rods("a"),
+        [
+            b.free("ground", "a", "zxz"),
+            b.ball("ground", "a", name="first", closes=True),
+            b.ball("ground", "a", name="second", at=(2.0, 0, 0), on=(1.0, 0, 0), closes=True),
+        ],
+    )
+    with pytest.raises(ValueError, match=r"cannot be assembled.*(first|second): x by .*Change the lengths"):
+        model.state()
 
 
 WHERE = {"at": (0.3, -0.2, 0.5), "on": (0.1, 0.4, -0.3), "turned": ((1.0, 2.0, -1.0), 0.7)}

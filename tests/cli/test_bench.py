@@ -14,7 +14,7 @@ import dirax as dx
 from dirax import gallery
 from dirax.cli.bench import subject
 from dirax.cli.commands import app
-from dirax.diagnostics.bench import casadi_c, measure, ode_solvers
+from dirax.diagnostics.bench import casadi_c, machines, measure, ode_solvers
 from dirax.diagnostics.bench.engines import plain_run
 from dirax.diagnostics.bench.measure import PROGRAMS, SAME_STEPS, Bench, Row, bench
 from dirax.diagnostics.bench.ode import eliminate, explicit_ode, pivot_order
@@ -223,3 +223,19 @@ def test_the_command_refuses_what_it_cannot_do(tmp_path):
         result = call("bench", *arguments)
         assert result.exit_code == 1 and message in result.stderr, result.output
     assert call("bench", "kepler", "--repeats", 0).exit_code == 2
+
+
+def test_machines_are_measured_and_other_programs_are_columns_where_they_are_installed(tmp_path, monkeypatch):
+    done = call("bench", "--machines", "--quick", "--steps", "60", "--json", tmp_path / "m.json")
+    assert done.exit_code == 0 and "left out: not installed" in done.output and "euler-disk" in done.output
+    rows = {row["name"]: row for row in json.loads((tmp_path / "m.json").read_text())["rows"]}
+    assert rows["car-axis"]["drift"] is None  # its constraints take the time
+    assert rows["car-axis"]["constraint"] < 1e-12 and 0 < rows["car-axis"]["error"] < 1e-2
+    assert 0 < rows["euler-disk"]["microseconds"] < 1e4 and 0 < rows["euler-disk"]["drift"] < 1e-2
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: True if name == "mujoco" else found(name))
+    shown = machines.bench_machines([gallery.get("euler-disk"), gallery.get("car-axis")], 1, 20)
+    assert shown.installed == ("MuJoCo",)
+    assert [line[-1] for line in shown.cells()] == [machines.NO_ROLLING, machines.NO_TIME]
+    refused = call("bench", "--machines", "kepler")
+    assert refused.exit_code and "'kepler' is no machine" in refused.output

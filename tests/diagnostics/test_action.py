@@ -67,3 +67,16 @@ def test_mistakes():
         dx.action_sum(gallery.get("rolling-disk").simulate(steps=10, save_every=5))
     with pytest.raises(TypeError, match="a discrete Lagrangian on Q × Q"):
         dx.action_sum(gallery.get("rigid-body").simulate(steps=10))
+
+
+def test_the_line_of_verify_sees_a_path_that_is_no_solution():
+    """Stationary to roundoff at a trajectory; the same run with points moved by 1e-6 is not. What is no solution is refused."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.cos(q[0]))
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[0.3, 0.1], v=[0.2, 0.5], step=0.1, steps=40)
+    line = dx.verify(sol)["action sum stationary"]
+    assert line.verdict == "ok" and line.value < 2e-15
+    sol.fields["q"] = sol.q + 1e-6 * np.sin(9 * np.arange(41))[:, None]
+    moved = dx.verify(sol)["action sum stationary"]
+    assert moved.verdict == "VIOLATED" and moved.value > 1e-8
+    with pytest.raises(TypeError, match="must be a dirax Solution"):
+        dx.action_sum(3)

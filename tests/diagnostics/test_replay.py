@@ -83,7 +83,7 @@ def test_every_damage_is_seen(name):
     assert_seen(run(name))
 
 
-@pytest.mark.parametrize("name", ["plain", "composed", "discrete gradient", "holonomic"])
+@pytest.mark.parametrize("name", ["plain", pytest.param("composed", marks=pytest.mark.soak), "discrete gradient", "holonomic"])
 def test_also_where_not_every_step_is_saved(name):
     assert_seen(run(name, save_every=7))
 

@@ -1,6 +1,7 @@
-"""Memory over many systems: what is compiled for those that are gone is released."""
+"""Many systems, and many threads: what is compiled for those that are gone is released, and nothing that still runs."""
 
 import gc
+import threading
 from pathlib import Path
 
 import jax
@@ -43,3 +44,22 @@ def test_nothing_grows(kind):
     more_maps, more_megabytes = used()
     assert more_maps - maps < 3 * MORE
     assert more_megabytes - megabytes < 0.5 * MORE
+
+
+def test_the_first_runs_of_a_system_in_several_threads():
+    """Each may have compiled the step: none lets go of the code that another one runs."""
+
+    def last(system, begin, found):
+        begin.wait()
+        run = {"q": [1.0], "v": [0.0], "step": 0.01, "steps": 100_000, "save_every": 1000, "engine": "native"}
+        found.append(dx.simulate(system, dx.LagrangeDAlembert(), **run).q[-1, 0])
+
+    for length in (1.0, 1.1, 1.2):
+        system = dx.LagrangeDirac(lambda q, v, length=length: v @ v / 2 + jnp.cos(q[0]) * length)
+        begin, found = threading.Barrier(6), []
+        threads = [threading.Thread(target=last, args=(system, begin, found)) for _ in range(6)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(found) == 6 and len(set(found)) == 1

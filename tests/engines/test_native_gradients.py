@@ -139,6 +139,7 @@ def test_second_derivatives_of_a_nonlinear_run(engine, holonomic):
         np.testing.assert_allclose(jax.vmap(jax.grad(slope))(jnp.array([k, k])), wanted, rtol=1e-7)
 
 
+@pytest.mark.soak
 def test_jit_and_vmap():
     (mine, z), (theirs, _) = end_of_swing("native"), end_of_swing("xla")
     expected = jax.jit(jax.jacrev(theirs))(z)

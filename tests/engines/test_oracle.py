@@ -38,7 +38,7 @@ print(one.stats["engine"], one.stats.get("not_native", ""))
 """
 
 
-@pytest.mark.parametrize("engine", ["xla", "auto"])
+@pytest.mark.parametrize("engine", ["xla", pytest.param("auto", marks=pytest.mark.soak)])
 def test_xla_runs_without_the_compiler(engine):
     """A single trajectory, a batch that is written in scalars, a failure with its message, a gradient."""
     program = ALONE.replace("ENGINE", repr(engine))

@@ -46,7 +46,7 @@ def test_a_table_read_where_the_params_are_captured(engine):
     assert not failed.ok and "step" in failed.message and len(failed.t) < 31
 
 
-@pytest.mark.parametrize("engine", ["xla", "auto"])
+@pytest.mark.parametrize("engine", [pytest.param("xla", marks=pytest.mark.soak), "auto"])
 def test_derivatives_beside_an_index(engine):
     """By the floating parameter, of which the index chooses the entry: by central differences of the closed form."""
     chosen = oscillator(lambda p: p["table"][p["k"]])

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
+from scipy.optimize import brentq, root
+from scipy.spatial.transform import Rotation
 
 import dirax as dx
 from dirax.gallery import bicycle
@@ -37,6 +38,101 @@ def test_weave_and_capsize_speeds():
     capsize = lambda speed: np.poly(at_speed(speed).matrix)[4]
     assert brentq(weave, 4.0, 4.5, xtol=1e-13) == pytest.approx(4.29238253634111, abs=1e-10)
     assert brentq(capsize, 5.9, 6.1, xtol=1e-13) == pytest.approx(6.02426201538837, abs=1e-10)
+
+
+def test_the_eigenvalues_from_rest_to_ten_metres_a_second_are_those_of_the_published_matrices():
+    """M q̈ + v C₁ q̇ + (g K₀ + v² K₂) q = 0 of lean and steer, Meijaard et al. 2007, eq. (6.2)."""
+    mass = np.array([[80.81722, 2.31941332208709], [2.31941332208709, 0.29784188199686]])
+    first = np.array([[0.0, 33.86641391492494], [-0.85035641456978, 1.68540397397560]])
+    still = np.array([[-80.95, -2.59951685249872], [-2.59951685249872, -0.80329488458618]])
+    riding = np.array([[0.0, 76.59734589573222], [0.0, 2.65431523794604]])
+    for speed in (0.0, 0.5, 1.0, 2.5, 4.0, 5.5, 7.0, 8.5, 10.0):
+        across = -np.linalg.solve(mass, np.hstack([9.81 * still + speed**2 * riding, speed * first]))
+        expected = np.linalg.eigvals(np.vstack([np.eye(2, 4, 2), across]))
+        found = at_speed(speed).eigenvalues
+        assert max(np.abs(found - value).min() for value in expected) < 2e-12
+
+
+def newton_euler_defect(data):
+    """What forces at the two contacts leave of the equations of Newton and Euler for all bodies, of the torques about the axles
+    and about the steering axis, of bodies that circle at a constant rate; relative to the weight."""
+    q, v = (dict(zip(bicycle.MODEL.coordinates, data[name], strict=True)) for name in "qv")
+    turn = Rotation.from_euler("ZXY", [q["frame.yaw"], q["frame.roll"], q["frame.pitch"]]).as_matrix()
+    tilt = bicycle.TILT
+    steering = turn @ [-np.sin(tilt), 0.0, np.cos(tilt)]
+    turned = Rotation.from_rotvec(q["steer"] * steering).as_matrix() @ turn
+    up, rate = np.array([0.0, 0.0, 1.0]), v["frame.yaw"]
+    rear = np.array([q["frame.x"], q["frame.y"], q["frame.z"]])
+    axis_at = rear + turn @ [1.1, 0.0, -0.3]
+    front = axis_at + turned @ (np.array([1.02, 0.0, 0.05]) - [1.1, 0.0, -0.3])
+    middle = rear + np.cross(up, [v["frame.x"], v["frame.y"], 0.0]) / rate
+
+    def inertia(xx, yy, zz, xz):
+        return np.array([[xx, 0, xz], [0, yy, 0], [xz, 0, zz]])
+
+    parts = [  # mass, inertia, attitude, place, rate about the axle, in front
+        (85.0, inertia(9.2, 11.0, 2.8, -2.4), turn, rear + turn @ [0.3, 0, 0.6], 0.0, False),
+        (2.0, inertia(0.0603, 0.12, 0.0603, 0.0), turn, rear, v["rear wheel"], False),
+        (4.0, inertia(0.05892, 0.06, 0.00708, 0.00756), turned, axis_at + turned @ [-0.2, 0, 0.7], 0.0, True),
+        (3.0, inertia(0.1405, 0.28, 0.1405, 0.0), turned, front, v["front wheel"], True),
+    ]
+    contacts = []
+    for centre, axle, radius, spin in (
+        (rear, turn[:, 1], 0.3, v["rear wheel"]),
+        (front, turned[:, 1], 0.35, v["front wheel"]),
+    ):
+        low = (up @ axle) * axle - up
+        contacts.append(centre + radius * low / np.linalg.norm(low))
+        slip = rate * np.cross(up, centre - middle) + np.cross(rate * up + spin * axle, contacts[-1] - centre)
+        assert abs(contacts[-1][2]) < 1e-12 and np.abs(slip).max() < 1e-11  # both wheels are on the ground and roll
+    rows, wanted = [], []
+
+    def balance(about, bodies, touching, along=None):
+        """Moments about a point, along a direction or all three."""
+        needed = np.zeros(3)
+        for mass, own, attitude, place, spin, _ in bodies:
+            momentum = attitude @ own @ attitude.T @ (rate * up + spin * attitude[:, 1])
+            pulled = mass * (rate**2 * np.cross(up, np.cross(up, place - middle)) + 9.81 * up)
+            needed = needed + np.cross(place - about, pulled) + rate * np.cross(up, momentum)
+        arms = np.zeros((3, 6))
+        for k in touching:
+            arms[:, 3 * k : 3 * k + 3] = np.cross(contacts[k] - about, np.eye(3)).T
+        pick = np.eye(3) if along is None else np.array([along])
+        rows.append(pick @ arms)
+        wanted.append(pick @ needed)
+
+    rows.append(np.hstack([np.eye(3), np.eye(3)]))
+    wanted.append(sum(m * (rate**2 * np.cross(up, np.cross(up, p - middle)) + 9.81 * up) for m, _, _, p, _, _ in parts))
+    balance(np.zeros(3), parts, (0, 1))
+    balance(axis_at, [part for part in parts if part[5]], (1,), steering)
+    balance(rear, parts[1:2], (0,), turn[:, 1])
+    balance(front, parts[3:], (1,), turned[:, 1])
+    matrix, sought = np.vstack(rows), np.concatenate(wanted)
+    forces = np.linalg.lstsq(matrix, sought, rcond=None)[0]
+    return np.abs(matrix @ forces - sought).max() / (94 * 9.81)
+
+
+def test_circular_motions_are_relative_equilibria_by_newton_and_euler():
+    """The handlebar-forward family of Basu-Mandal et al. 2007, which leaves straight riding at the capsize speed."""
+
+    def missed(x, steer):
+        found = bicycle.MODEL.accelerations(**bicycle.circling(steer, *x))
+        return [found["frame.roll"], found["steer"]]
+
+    speeds = {}
+    near = 6.0 / (1.02 / np.cos(bicycle.TILT))
+    x = np.array([-(6.0 * near) / 9.81, near]) * 0.001
+    for before, steer in ((0.001, 0.001), (0.001, 0.03), (0.03, 0.1), (0.1, 0.3)):
+        solved = root(missed, x * steer / before, args=(steer,), tol=1e-12)
+        x = solved.x
+        assert np.abs(solved.fun).max() < 1e-10
+        data = bicycle.circling(steer, *x)
+        speeds[steer] = abs(data["v"][bicycle.MODEL.coordinates.index("rear wheel")] * bicycle.REAR)
+        assert newton_euler_defect(data) < 1e-11
+        found = dx.linearize(bicycle.MODEL.system, data, symmetries=bicycle.SYMMETRIES)
+        assert found.residual < 1e-12
+    assert speeds[0.001] == pytest.approx(6.02426201538837, abs=1e-4) and speeds[0.3] < speeds[0.001]
+    assert newton_euler_defect(bicycle.circling(0.1, -0.2, 0.5)) > 1e-3
 
 
 def test_the_discrete_equations_have_these_eigenvalues_to_second_order():
@@ -88,3 +184,31 @@ def test_it_rides_with_both_wheels_on_the_ground():
     assert np.ptp(sol.energy()) < 1e-6 * sol.energy()[0]
     with pytest.raises(ValueError, match=r"no relative equilibrium.*symmetries"):
         dx.linearize(bicycle.MODEL.system, bicycle.EXAMPLE.initial, symmetries=bicycle.SYMMETRIES)
+
+
+@pytest.mark.soak
+def test_a_steering_torque_that_keeps_it_upright_is_found_by_gradients_through_the_run():
+    """The program of docs/tutorials/riding_a_bicycle.md: below the weave speed, from no torque at all."""
+    import re
+    from pathlib import Path
+
+    page = (Path(__file__).parents[2] / "docs" / "tutorials" / "riding_a_bicycle.md").read_text("utf-8")
+    program = re.search(r"<!-- no-test -->\n```python\n(.*?)```", page, re.DOTALL)
+    assert program is not None
+    import jax
+    import jax.numpy as jnp
+    from scipy.optimize import minimize
+
+    names = {"bicycle": bicycle, "dx": dx, "b": dx.bodies, "np": np, "jax": jax, "jnp": jnp, "minimize": minimize}
+    exec(program.group(1), names)
+    cost, best, ridden = names["cost"], names["best"], names["ridden"]
+    apart = 1e-4 * np.eye(4)
+    slopes = [(cost(jnp.asarray(x))[0] - cost(jnp.asarray(-x))[0]) / 2e-4 for x in apart]
+    assert np.asarray(cost(jnp.zeros(4))[1]) == pytest.approx(np.array(slopes, float), rel=2e-3)
+    gains = dict(zip(names["GAINS"], best.x.tolist(), strict=True))
+    place = bicycle.straight(3.0)
+    growth = [
+        dx.linearize(ridden.system, place, symmetries=bicycle.SYMMETRIES, params=params).eigenvalues.real.max()
+        for params in (ridden.params, gains)
+    ]
+    assert best.fun < 1e-3 and growth[0] > 1.5 and growth[1] < 0.3

@@ -11,12 +11,18 @@ from dirax import gallery
 from dirax.gallery import (
     andrews_squeezer,
     bricard,
+    car_axis,
     chaplygin_sphere,
     euler_disk,
     flyball_governor,
     four_bar,
+    n_four_bar,
+    n_trailer,
     rattleback,
+    slider_crank,
+    snakeboard_gait,
     tippe_top,
+    trikke,
 )
 
 
@@ -26,6 +32,59 @@ def test_andrews_squeezer_ends_where_the_test_set_says():
     once = [(4 * b - a) / 3 for a, b in itertools.pairwise(ends)]
     assert np.abs(ends[-1] - andrews_squeezer.REFERENCE).max() < 2e-6
     assert np.abs((16 * once[1] - once[0]) / 15 - andrews_squeezer.REFERENCE).max() < 4e-9
+
+
+def test_the_car_axis_ends_where_the_test_set_says():
+    sol = car_axis.EXAMPLE.simulate(dx.Collocation(4, "lobatto"), step=3 / 2000, steps=2000, save_every=2000)
+    assert sol.ok and np.abs(sol.q[-1] - car_axis.REFERENCE).max() < 2e-12
+
+
+def test_the_slider_crank_ends_where_the_test_set_says():
+    """Symmetric steps, extrapolated once; the elastic coordinates are millionths of a metre."""
+    coarse, fine = (slider_crank.EXAMPLE.simulate(step=0.1 / n, steps=n, save_every=n).q[-1] for n in (40_000, 80_000))
+    assert (4 * fine - coarse) / 3 == pytest.approx(slider_crank.REFERENCE, abs=3e-10)
+
+
+def test_a_row_of_windows_folds_through_its_singular_position_as_one_pendulum():
+    """All uprights turn alike, ((N + 1)/3 + N) θ̈ = ((N + 1)/2 + N) g sin θ, also past the flat position, twice."""
+    windows, example = 4, n_four_bar.EXAMPLE
+    ratio = ((windows + 1) / 2 + windows) / ((windows + 1) / 3 + windows)
+    exact = solve_ivp(lambda t, y: [y[1], ratio * 9.81 * np.sin(y[0])], (0, 2.5), [0.0, 1.0], rtol=1e-12, atol=1e-12).y[0, -1]
+    sol = example.simulate(step=0.005, steps=500)
+    energy = sol.energy()
+    assert sol.ok and exact > 3 * np.pi / 2 and np.abs(sol.constraint_residual()).max() < 1e-11
+    assert sol.q[-1] == pytest.approx(exact * np.sign(sol.q[-1]), abs=2e-3)
+    assert energy[0] == pytest.approx(n_four_bar.energy(windows), rel=1e-14) and np.ptp(energy) < 1e-4 * energy[0]
+
+
+def test_trailers_follow_and_settle_on_their_circles():
+    """θ̇_k = v_{k−1} sin(θ_{k−1} − θ_k)/d_k at the start, and R_k² = R_{k−1}² − d_k² in the end."""
+    model, example = n_trailer.MODEL, n_trailer.EXAMPLE
+    start = model.state({"steer": 0.3, "trailer 1": 0.4, "trailer 2": -0.2}, {"car.x": 2.0})
+    v, speed, angle = dict(zip(model.coordinates, start["v"], strict=True)), 2.0, 0.0
+    rate = v["car.angle"]
+    assert rate == pytest.approx(speed * np.tan(0.3) / n_trailer.WHEELBASE)
+    for name, length, bend in zip(n_trailer.TRAILERS, n_trailer.LENGTHS, (0.4, -0.2, 0.0), strict=True):
+        rate = speed * np.sin(-bend) / length
+        speed *= np.cos(bend)
+        angle += v[name]
+        assert v["car.angle"] + angle == pytest.approx(rate, abs=1e-12)
+    sol = example.simulate(step=0.02, steps=1000)
+    turning, radius = n_trailer.STEERED, n_trailer.WHEELBASE / np.tan(n_trailer.STEERED)
+    assert sol.ok and sol.q[-1, 3] == pytest.approx(turning, abs=2e-3)
+    for bend, length in zip(sol.q[-1, 4:], n_trailer.LENGTHS, strict=True):
+        assert np.sin(-bend) == pytest.approx(length / radius, abs=5e-3)
+        radius = np.sqrt(radius**2 - length**2)
+
+
+@pytest.mark.parametrize("ridden", [snakeboard_gait, trikke])
+def test_gaits_ride_ahead_on_their_skates_alone(ridden):
+    """Motors do all the work, skates none: the energy is their work; and no skate slides at the middle of a step."""
+    sol = ridden.EXAMPLE.simulate(steps=1000)
+    assert sol.ok and np.abs(sol.constraint_residual()).max() < 1e-13 and sol.q[-1, 0] > 0.8
+    assert sol.energy() - sol.work == pytest.approx(sol.energy()[0], abs=2e-2)
+    still = ridden.EXAMPLE.simulate(steps=100, **{"v": np.zeros(len(sol.q[0])), "q": 0 * sol.q[0]}, step=1e-4)
+    assert np.abs(still.q[-1, :2]).max() < 1e-3
 
 
 def test_the_parallelogram_is_a_pendulum():

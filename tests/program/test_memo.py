@@ -36,7 +36,7 @@ def test_errors_of_what_is_made_are_passed_on():
         Memo(1).get("key", make)
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_a_system_that_was_run_is_let_go(engine):
     def run():
         system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 1 + jnp.cos(q[0]))

@@ -80,7 +80,10 @@ CASES: list[Any] = [  # name, fibre, discrete Lagrangian, step, coordinates, ini
 ON_GROUPS = ("free-top", "heavy-top-so3", "suslov", "chaplygin-sleigh-se2", "underwater-vehicle")
 """Reduced by a whole group, over one point: the only connection is the trivial one."""
 
-MACHINES = ("bicycle", "tippe-top", "chaplygin-sphere", "rattleback", "euler-disk", "flyball-governor")
+MACHINES = (
+    *("bicycle", "tippe-top", "chaplygin-sphere", "rattleback", "euler-disk", "flyball-governor"),
+    *("snakeboard-gait", "trikke", "n-trailer"),
+)
 """They have translations, and rolling, friction or closed loops: no run is made on the quotient."""
 
 WITHOUT = {
@@ -106,6 +109,9 @@ WITHOUT = {
     "andrews-squeezer": "a mechanism that hangs on the ground",
     "four-bar": "a mechanism that hangs on the ground",
     "bricard": "a mechanism that hangs on the ground",
+    "n-four-bar": "a mechanism that hangs on the ground",
+    "car-axis": "constraints and springs that take the time",
+    "slider-crank": "driven by a constraint that takes the time",
 }
 """Why the others are not here."""
 

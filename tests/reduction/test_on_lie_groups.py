@@ -18,6 +18,7 @@ UNEVEN = np.array([[1.0, 0.1, 0.3], [0.1, 1.5, 0.2], [0.3, 0.2, 2.0]])
 TOP = gallery.get("heavy-top")
 
 
+@pytest.mark.soak
 def test_batches_are_their_trajectories_and_derivatives_those_of_differences():
     top = dx.EulerPoincare(SO3, lambda xi, params: xi @ (params * xi) / 2)
     xi = np.array([[0.1, 1.0, 0.2], [0.5, -0.2, 0.7]])

@@ -218,7 +218,7 @@ def test_the_energy_error_grows_like_a_random_walk():
     assert np.max(np.abs(energy - energy[0])) < 0.02 * np.sqrt(100_000) * 2.3e-16 * 10
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_gradients_are_those_of_differences(engine):
     system = dx.LagrangeDirac(double_pendulum)
 

@@ -176,7 +176,10 @@ SYSTEMS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.soak) if n == "heavy top" else n for n in SYSTEMS])
+LONG = ("heavy top", "Euler–Poincaré")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.soak) if n in LONG else n for n in SYSTEMS])
 def test_every_system_with_a_bracket(name):
     system, data, step = SYSTEMS[name]
     run = lambda scheme, h, n, **more: dx.simulate(system, scheme, step=h, steps=n, **data, **more)

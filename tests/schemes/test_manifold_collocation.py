@@ -64,6 +64,7 @@ def test_a_free_body_on_so3_has_its_order_and_keeps_its_spatial_momentum():
     np.testing.assert_allclose(spatial, np.broadcast_to(spatial[0], (17, 3)), atol=1e-13)
 
 
+@pytest.mark.soak
 def test_both_engines_agree_on_the_sphere():
     system = dx.ManifoldLagrangian(pendulum, dx.Sphere(3))
     native, arrays = (

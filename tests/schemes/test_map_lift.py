@@ -285,7 +285,7 @@ def test_projection_of_initial_data_onto_the_constraint():
 
 
 def test_constraints_and_forces_go_along_or_are_refused():
-    """In coordinates they are pulled back; by the group's reduction and in charts they have no place."""
+    """In coordinates they are pulled back; in the group's reduction forces have no place."""
     run = {"step": 0.1, "steps": 2}
     disk = dx.ManifoldLagrangian(
         lambda q, v: v @ v / 2, dx.Sphere(2), lambda q: jnp.stack([-q[1], q[0]])[None], affine=lambda q: -jnp.ones(1),
@@ -299,6 +299,22 @@ def test_constraints_and_forces_go_along_or_are_refused():
     assert on_circle.multipliers.mean() == pytest.approx(1.0, abs=1e-2)  # those of Method 1 alternate around it
     with pytest.raises(ValueError, match="forces"):
         dx.reduce(suslov, SO3)
-    with pytest.raises(ValueError, match=r"without one_forms and forces: use dx\.DiscreteDirac"):
-        g, v = np.array([1.0, 0, 0, 0]), np.zeros(4)
-        dx.simulate(suslov, dx.InCharts(dx.LieGroupExp(SO3)), q=g, v=v, **run)
+
+
+def test_a_circle_of_latitude_is_a_holonomic_constraint_on_the_sphere():
+    """Without forces the motion on it is uniform; the height stays to roundoff, the angle is of second order."""
+    height, rate = 0.6, 1.3
+    radius = np.sqrt(1 - height**2)
+    system = dx.ManifoldLagrangian(lambda q, v: v @ v / 2, dx.Sphere(3), holonomic=lambda q: q[2:] ** 3 - height**3)
+    data = {"q": [radius, 0.0, height], "v": [0.0, radius * rate, 0.0]}
+    missed = []
+    for steps in (20, 40):
+        sol = dx.simulate(system, dx.DiscreteDirac(dx.SphereProjection(), "resolve"), **data, step=1 / steps, steps=steps)
+        assert sol.ok and np.abs(sol.constraint_residual()).max() < 1e-13 and np.abs(sol.q[:, 2] - height).max() < 1e-14
+        missed.append(abs(np.arctan2(sol.q[-1, 1], sol.q[-1, 0]) - rate))
+    assert missed[1] < 1e-12 or np.log2(missed[0] / missed[1]) == pytest.approx(2.0, abs=0.1)
+    with pytest.raises(TypeError, match="do not keep holonomic constraints"):
+        dx.simulate(system, dx.PlusLagrangeDirac(), **data, step=0.05, steps=2)
+    off = {"q": [0.81, 0.0, np.sqrt(1 - 0.81**2)], "v": [0.0, 1.0, 0.0]}
+    moved = dx.simulate(system, dx.DiscreteDirac(dx.SphereProjection(), "resolve"), **off, project=True, step=0.05, steps=2)
+    assert np.abs(moved.constraint_residual()).max() < 1e-13 and moved.q[0, 2] == pytest.approx(height, abs=1e-14)

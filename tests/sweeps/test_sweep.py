@@ -7,6 +7,7 @@ import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +16,11 @@ import pytest
 import xarray as xr
 
 import dirax as dx
-from dirax.sweeps import commit, executors, store, task
+from dirax.sweeps import arrange, commit, executors, store, sweep, task
 from dirax.sweeps.case import Case
 from dirax.sweeps.grid import cut
 from dirax.sweeps.layout import decoded_texts, encoded_texts
+from dirax.sweeps.queue import Queue
 from swept_pendulums import OVER, SYSTEM, case, files, same, single, study
 
 
@@ -73,6 +75,62 @@ def test_processes_give_the_same_bits_and_a_pool_that_would_fork_is_not_used(don
     with ProcessPoolExecutor(1) as pool:
         assert same(done[0], study(tmp_path / "pool.zarr", executor=pool))
         assert not pool._processes
+
+
+@pytest.fixture
+def cluster():
+    """A cluster of dask in threads of this process."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.Client(processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None) as client:
+        yield client
+
+
+def test_a_cluster_of_dask_gives_the_same_bits_in_fewer_calls_than_tasks(done, tmp_path, cluster, monkeypatch):
+    calls, taken = [], Queue.taken
+
+    def noting(queue, *given):
+        calls.append(taken(queue, *given))
+        return calls[-1]
+
+    monkeypatch.setattr(Queue, "taken", noting)
+    monkeypatch.setattr(arrange, "TASKS_PER_SLOT", 30)
+    assert same(done[0], study(tmp_path / "dask.zarr", executor="dask", task_seconds=1e-6))
+    tasks = len(list((tmp_path / "dask.zarr").glob("status/c.*")))
+    assert sum(map(len, calls)) == tasks and len(calls) < tasks
+    assert same(done[0], study(tmp_path / "client.zarr", executor=cluster))
+
+
+@pytest.mark.soak
+def test_without_a_client_dask_gets_a_cluster_of_its_own(done, tmp_path):
+    pytest.importorskip("distributed")
+    assert same(done[0], study(tmp_path / "dask.zarr", executor="dask"))
+
+
+def test_what_a_worker_finished_before_it_died_is_not_run_again(done, tmp_path):
+    path = tmp_path / "study.zarr"
+    study(path)
+    layout, axes = store.layout_of(path), store.axes_of(path)
+    left = sweep._task(axes, layout.grid, next(iter(layout.grid)), None)
+    plan = SimpleNamespace(folder=path, layout=layout)  # with nothing to run
+    found = task.finished(plan, left)
+    assert found.ok == left.points and found.failed == found.refused == 0
+    (path / layout.file("status", left.index)).unlink()
+    assert task.finished(plan, left) is None
+
+
+def test_what_fails_in_a_call_is_tried_alone_and_the_rest_together():
+    tasks = list(range(40))
+    waiting = Queue(tasks)
+    assert waiting.taken(1.0, 2) == [0]  # nothing is known of their time
+    waiting.took(0.1)
+    assert waiting.taken(1.0, 2) == list(range(1, 10)) and waiting.taken(0.0, 2) == [10]
+    waiting.put_alone([1, 2])
+    waiting.put_back([10])
+    rest = []
+    while waiting:
+        rest.append(waiting.taken(0.5, 2))
+    assert rest[0] == [10, 11, 12, 13, 14] and rest[-2:] == [[1], [2]]
+    assert sorted(task for call in rest for task in call) == [1, 2, *range(10, 40)]
 
 
 def test_units_and_names_of_coordinates(tmp_path):

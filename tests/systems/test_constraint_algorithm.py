@@ -288,3 +288,47 @@ def test_the_point_of_a_chain_is_the_nearest_one():
 def test_a_search_that_ends_at_the_first_level_has_the_dimension_of_the_whole_space():
     chain = constraint_algorithm(dx.ImplicitSystem(lambda x: jnp.diag(x), lambda x: jnp.ones(2)), near=np.array([0.0, 1.0]))
     assert chain.verdict == "irregular" and not chain.levels and chain.dimension == 2
+
+
+def turning(rows):
+    """ẋ = y − s g/c, by two equations of rank one whose coefficients (cos z, sin z) turn with ż = 1; ẏ = −x."""
+
+    def equations(x):
+        c, s = jnp.cos(x[2]), jnp.sin(x[2])
+        return jnp.array([[c, 0.0, 0.0], [s, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])[np.array(rows)]
+
+    def right(x):
+        c, s, g = jnp.cos(x[2]), jnp.sin(x[2]), x[0] ** 2 + x[1] ** 2 - 1
+        return jnp.stack([c * x[1] - s * g, s * x[1] + c * g, -x[0], 1.0])[np.array(rows)]
+
+    return dx.ImplicitSystem(equations, right)
+
+
+@pytest.mark.parametrize(("near", "engine"), [([1.0, 0.0, 0.0], "native"), ([1.0, 0.0, 0.1], "xla")])
+def test_a_pivot_that_vanishes_along_a_run_is_left_for_another(near, engine):
+    """M_f is the cylinder; the pivot cos z of its point is zero at a node of the run, z = π/2."""
+    chain = constraint_algorithm(turning([0, 1, 2, 3]), near=np.array(near))
+    assert (chain.verdict, chain.dimension) == ("determined", 2)
+    side = np.array([0.9, 0.6, np.pi / 2])
+    np.testing.assert_allclose(chain.project(side), [*side[:2] / np.hypot(*side[:2]), np.pi / 2], atol=1e-14)
+    np.testing.assert_allclose(jax.jit(chain.field)(jnp.array([0.8, 0.6, np.pi / 2])), [0.6, -0.8, 1.0], atol=1e-14)
+    h = np.pi / 40
+    sol = dx.simulate(
+        chain.resolved(), dx.DiscreteDirac(constraints="resolve"), x=[1.0, 0.0, 0.0], step=h, steps=60, engine=engine
+    )
+    assert sol.ok, sol.message
+    np.testing.assert_allclose(np.hypot(*sol.x[:, :2].T), 1.0, atol=1e-14)
+    angle = np.unwrap(np.arctan2(-sol.x[:, 1], sol.x[:, 0]))
+    np.testing.assert_allclose(np.diff(angle), angle[1], atol=1e-13)  # every step is the same turn, whatever the pivot
+    assert angle[-1] == pytest.approx(60 * h, rel=h**2)
+
+
+def test_the_freedom_that_is_left_out_turns_with_the_point():
+    """x × ẋ = Ax on the cone x·Ax = 0 leaves ẋ free along x, at half a turn along −x₀: ẋ is the rotation all the way round."""
+    cross = lambda x: jnp.array([[0.0, x[2], -x[1]], [-x[2], 0.0, x[0]], [x[1], -x[0], 0.0]])
+    cone = dx.DiracSystem(dx.DiracStructure.from_two_form(cross), lambda x: (x[0] ** 2 + x[1] ** 2 - x[2] ** 2) / 2)
+    chain = constraint_algorithm(cone, near=np.array([1.0, 0.0, 1.0]))
+    assert (chain.verdict, chain.freedom) == ("gauge freedom", 1)
+    for angle in np.linspace(0, np.pi, 5):
+        x = np.array([np.cos(angle), np.sin(angle), 1.0])
+        np.testing.assert_allclose(chain.field(x), [np.sin(angle), -np.cos(angle), 0.0], atol=1e-12)

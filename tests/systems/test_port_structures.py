@@ -115,6 +115,7 @@ def test_a_projector_on_the_closed_port():
     np.testing.assert_allclose(sol.x, np.concatenate([theirs.q, theirs.p], axis=1), atol=1e-13)
 
 
+@pytest.mark.soak
 def test_its_order():
     def field(t, x):
         q, p = x[:3], x[3:]

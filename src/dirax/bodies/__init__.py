@@ -7,9 +7,11 @@
     )
     sol = dirax.simulate(pendulum.system, dirax.LagrangeDAlembert(), **pendulum.state({"angle": 1.0}), step=0.01, steps=1000)
 
-A model is plain data and states a `dx.LagrangeDirac`; schemes, engines and diagnostics know nothing of it.
+A model is plain data and states a `dx.LagrangeDirac`, or a `dx.ManifoldLagrangian` with its rotations on SO(3); schemes,
+engines and diagnostics know nothing of it.
 
-model.py              Model: the system, names, observables; assembly.py its initial data, checks.py its mistakes
+model.py              Model: names, energy, observables; model_constraints.py its constraints, statement.py the systems,
+                      assembly.py its initial data, checks.py its mistakes
 parts.py              Body; joints.py, contacts.py, forces.py what is between bodies
 motion.py, frames.py  how a joint moves a frame, with its velocity
 drawing.py            the scene of a report

@@ -52,7 +52,7 @@ def assembled(model: Any, q: Any, v: Any, params: Any) -> dict[str, np.ndarray]:
 def _rest(model: Any) -> np.ndarray:
     """Zero, and quaternions of no rotation."""
     q = np.zeros(len(model.coordinates))
-    for _, place in model._quaternions:
+    for _, place in model.quaternions:
         q[place.start] = 1.0
     return q
 

@@ -164,14 +164,23 @@ def gliding(
     return Joint(name, "gliding", parent, body, motions, **where)
 
 
-def rolling_wheel(parent: str, body: str, radius: float, tube: float = 0.0, name: str = "", **where: Any) -> Joint:
-    """A wheel that touches the plane z = 0: x and y of the point of contact, the yaw of its heading about z, the roll about
-    the heading, and the spin about its axle, the axis y of the body. `radius` is that of the circle that its rim is around,
-    `tube` that of the rim."""
+def rolling_wheel(
+    parent: str,
+    body: str,
+    radius: float,
+    tube: float = 0.0,
+    name: str = "",
+    height: Callable | None = None,
+    **where: Any,
+) -> Joint:
+    """A wheel that touches the plane z = 0, or the surface z = height(x, y): x and y of the point of contact, the yaw of its
+    heading about the normal, the roll about the heading, and the spin about its axle, the axis y of the body. `radius` is that
+    of the circle that its rim is around, `tube` that of the rim."""
     name = name or body
+    x, y = f"{name}.x", f"{name}.y"
+    on_plane: tuple[Motion, ...] = (Slide(X, (x,)), Slide(Y, (y,)))
     motions = (
-        Slide(X, (f"{name}.x",)),
-        Slide(Y, (f"{name}.y",)),
+        *(on_plane if height is None else (Glide(height, 0.0, (x, y), leans=True),)),
         Turn(Z, (f"{name}.yaw",)),
         Shift((0.0, 0.0, tube)),
         Turn(X, (f"{name}.roll",)),

@@ -14,20 +14,20 @@ from dirax.bodies.contacts import Contact
 from dirax.bodies.drawing import scene_of
 from dirax.bodies.forces import Damper, Motor, Spring
 from dirax.bodies.frames import GROUND as GROUND_FRAME
-from dirax.bodies.frames import Frame, Vector, unit, vector
-from dirax.bodies.joints import Joint, norm_defect, stacked
-from dirax.bodies.motion import Glide, Quaternion
+from dirax.bodies.frames import Frame, Vector, vector
+from dirax.bodies.joints import Joint
+from dirax.bodies.model_constraints import MachineConstraints
+from dirax.bodies.motion import Quaternion
 from dirax.bodies.parts import Body
+from dirax.bodies.statement import discretization_map, in_coordinates, on_manifold
 from dirax.diagnostics.linearized_field import accelerations
-from dirax.program.tracing import gradient, jacobian
+from dirax.geometry.maps import ProductMap
 from dirax.program.user_functions import evaluated
 from dirax.show.scene import Scene
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 
 Force: TypeAlias = Spring | Damper | Motor
-
-VANISHES = 1e-11
-"""Size of a constraint at points chosen at random below which it is met by the joints alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Model:
         check_masses(self)
         _ = self.tree
         check_coordinates(self)
-        unknown = [name for name in self.dropped if name not in (*self._all_holonomic, *self._all_rows)]
+        unknown = [name for name in self.dropped if name not in (*self.demands.all_holonomic, *self.demands.all_rows)]
         if unknown:
             raise ValueError(f"no constraint is called {unknown[0]!r}: there are {', '.join(self.constraints)}.")
 
@@ -73,7 +73,7 @@ class Model:
         return tuple(name for joint in self.joints for name in joint.coordinates)
 
     @cached_property
-    def _places(self) -> dict[str, slice]:
+    def places(self) -> dict[str, slice]:
         """Where the coordinates of each joint are."""
         ends = np.cumsum([0, *(len(joint.coordinates) for joint in self.joints)])
         return {joint.name: slice(int(a), int(b)) for joint, a, b in zip(self.joints, ends[:-1], ends[1:], strict=True)}
@@ -90,23 +90,25 @@ class Model:
         params = self.params if params is None else params
         found = {GROUND: GROUND_FRAME}
         for joint in self.tree:
-            place = self._places[joint.name]
+            place = self.places[joint.name]
             found[joint.body] = joint.move(found[joint.parent], q[place], v[place], params)
         return found
 
-    def _named(self, values: Any) -> dict[str, Any]:
+    def named(self, values: Any) -> dict[str, Any]:
+        """Values (n,) by the names of the coordinates."""
         return {name: values[k] for k, name in enumerate(self.coordinates)}
 
-    @property
-    def _quaternions(self) -> list[tuple[Joint, slice]]:
+    @cached_property
+    def quaternions(self) -> list[tuple[Joint, slice]]:
+        """The joints with a quaternion, and where it is, in the order of the coordinates."""
         found = []
         for joint in self.tree:
-            start = self._places[joint.name].start
+            start = self.places[joint.name].start
             for motion in joint.motions:
                 if isinstance(motion, Quaternion):
                     found.append((joint, slice(start, start + 4)))
                 start += len(motion.names)
-        return found
+        return sorted(found, key=lambda place: place[1].start)
 
     def _gyration(self, joint: Joint) -> float:
         """A moment of inertia for the rate of |Q|, which is zero: any positive number makes the Lagrangian regular."""
@@ -121,7 +123,7 @@ class Model:
         params = self.params if params is None else params
         frames = self.frames(q, v, params)
         total = sum(body.kinetic_energy(frames[body.name], params) for body in self.bodies)
-        for joint, place in self._quaternions:
+        for joint, place in self.quaternions:
             total += 2 * self._gyration(joint) * ((q[place] @ v[place]) / (q[place] @ q[place])) ** 2
         return total
 
@@ -136,7 +138,7 @@ class Model:
                 total -= mass * (gravity @ frames[body.name].point(vector(body.centre, params)))
         for force in self.forces:
             if isinstance(force, Spring):
-                total += force.energy(frames, self._named(q), params)
+                total += force.energy(frames, self.named(q), params)
         return total
 
     def energy(self, q: Any, v: Any, params: Any = None) -> Any:
@@ -168,132 +170,40 @@ class Model:
         names = ("energy", "momentum", "angular_momentum", *more)
         return {name: np.array(values) for name, values in zip(names, zip(*rows, strict=True), strict=True)}
 
-    # ------------------------------------------------------------------ constraints
+    # ------------------------------------------------------------------ the system
 
     @cached_property
-    def _all_holonomic(self) -> tuple[str, ...]:
-        joints = [f"{joint.name}: {condition}" for joint in self.joints for condition in joint.conditions]
-        return (
-            *(f"{joint.name}: |Q| = 1" for joint, _ in self._quaternions),
-            *joints,
-            *(f"{contact.name}: touches" for contact in self.contacts),
-        )
-
-    @cached_property
-    def _all_rows(self) -> tuple[str, ...]:
-        return tuple(f"{contact.name}: {row}" for contact in self.contacts for row in contact.rows)
-
-    def _all_defects(self, q: Any, params: Any) -> Any:
-        frames = self.frames(q, jnp.zeros_like(q), params)
-        found = [norm_defect(q[place]) for _, place in self._quaternions]
-        for joint in self.joints:
-            if joint.closes:
-                found += joint.defect(frames[joint.parent], frames[joint.body], params)
-        for contact in self.contacts:
-            found.append(jnp.zeros(()) if self._glide(contact) else contact.gap(frames[contact.body], params))
-        return stacked(found) if found else jnp.zeros((0,))
-
-    def _all_rates(self, q: Any, v: Any, params: Any) -> Any:
-        frames = self.frames(q, v, params)
-        found = []
-        for contact in self.contacts:
-            found += contact.rates(frames[contact.body], self._normal(contact, q), params)
-        return stacked(found) if found else jnp.zeros((0,))
-
-    def _all_one_forms(self, q: Any, params: Any) -> Any:
-        return jacobian(lambda v: self._all_rates(q, v, params))(jnp.zeros_like(q))
-
-    def _glide(self, contact: Contact) -> tuple[Glide, slice] | None:
-        """The surface over which the contact's body glides, and where its coordinates are."""
-        joint = next(joint for joint in self.tree if joint.body == contact.body)
-        start = self._places[joint.name].start
-        first = joint.motions[0] if joint.motions else None
-        return (first, slice(start, start + 2)) if isinstance(first, Glide) else None
-
-    def _normal(self, contact: Contact, q: Any) -> Any:
-        glide = self._glide(contact)
-        return unit(contact.normal) if glide is None else glide[0].normal(q[glide[1]])
-
-    @cached_property
-    def _kept(self) -> tuple[list[int], list[int]]:
-        """Which holonomic constraints and one-forms are those of the system: not dropped, and not met by the tree alone."""
-        params, rng = self.params, np.random.default_rng(0)
-        points = [rng.uniform(-0.9, 0.9, len(self.coordinates)) for _ in range(3)]
-        sizes = np.zeros(len(self._all_holonomic)), np.zeros(len(self._all_rows))
-        for q in points:
-            values = [self._all_defects, lambda q, p: jnp.sum(jnp.abs(self._all_one_forms(q, p)), axis=1)]
-            for size, value in zip(sizes, values, strict=True):
-                if size.size:
-                    found = np.abs(np.asarray(evaluated(value, q, params)))
-                    size[:] = np.maximum(size, np.where(np.isfinite(found), found, 1.0))
-        names = self._all_holonomic, self._all_rows
-        holonomic, rows = (
-            [k for k, name in enumerate(of) if size[k] > VANISHES and name not in self.dropped]
-            for of, size in zip(names, sizes, strict=True)
-        )
-        return holonomic, rows
+    def demands(self) -> MachineConstraints:
+        """Its constraints as functions, by name."""
+        return MachineConstraints(self)
 
     @property
     def constraints(self) -> tuple[str, ...]:
-        """The names of the constraints: one-forms, then holonomic ones, in the order of multipliers."""
-        holonomic, rows = self._kept
-        return (*(self._all_rows[k] for k in rows), *(self._all_holonomic[k] for k in holonomic))
-
-    # ------------------------------------------------------------------ the system
+        """The names of the constraints of `system`: one-forms, then holonomic ones, in the order of multipliers."""
+        return self.demands.names
 
     @cached_property
     def system(self) -> LagrangeDirac:
         """The machine as a Lagrangian with constraints and forces, for every scheme that takes one."""
-        holonomic, rows = (np.array(kept, dtype=int) for kept in self._kept)
-        lagrangian = lambda q, v, params: self.kinetic_energy(q, v, params) - self.potential_energy(q, params)
-        one_forms = lambda q, params: self._all_one_forms(q, params)[rows]
-        positions = lambda q, params: self._all_defects(q, params)[holonomic]
-        return LagrangeDirac(
-            self._stated(lagrangian, "q, v"),
-            self._stated(one_forms, "q") if rows.size else None,
-            holonomic=self._stated(positions, "q") if holonomic.size else None,
-            forces=self._force_function(rows.size),
-        )
+        return in_coordinates(self)
 
-    def _stated(self, function: Callable, arguments: str) -> Callable:
-        """A function that takes params if the model has parameters, as `LagrangeDirac` asks for."""
-        if self.parameters:
-            return function
-        if arguments == "q":
-            return lambda q: function(q, {})
-        return lambda q, v: function(q, v, {})
+    @cached_property
+    def manifold_system(self) -> ManifoldLagrangian:
+        """The same machine in the same coordinates, with its quaternions as points of SO(3), which a discretization map leaves
+        there: no constraint |Q| = 1 and no multiplier for it.
 
-    def _force_function(self, rows: int) -> Callable | None:
-        pushing = [force for force in self.forces if not isinstance(force, Spring)]
-        resisting = [contact for contact in self.contacts if contact.resists]
-        if not pushing and not resisting:
-            return None
-        places = {name: k for k, name in enumerate(self.constraints)}
+            scheme = dx.DiscreteDirac(model.discretization_map, constraints="resolve")
+            dx.simulate(model.manifold_system, scheme, **model.state(…), step=0.01, steps=1000)
 
-        def forces(t, q, v, multipliers, params):
-            frames, named = self.frames(q, v, params), (self._named(q), self._named(v))
-            pressures = [-multipliers[places[f"{contact.name}: touches"]] if contact.rubs else 0.0 for contact in resisting]
-            felt = [
-                contact.force(frames[contact.body], self._normal(contact, q), jnp.maximum(pressure, 0.0), params)
-                for contact, pressure in zip(resisting, pressures, strict=True)
-            ]
+        Raises `ValueError` for Coulomb friction, which needs the normal force.
+        """
+        return on_manifold(self)
 
-            def power(w):
-                moved, along = self.frames(q, w, params), self._named(w)
-                total = sum((force.power(frames, moved, t, *named, along, params) for force in pushing), jnp.zeros(()))
-                for contact, force in zip(resisting, felt, strict=True):
-                    total += force @ contact.slip(moved[contact.body], self._normal(contact, q), params)
-                return total
-
-            return gradient(power)(v)
-
-        if any(contact.rubs for contact in resisting):
-            if self.parameters:
-                return forces
-            return lambda t, q, v, multipliers: forces(t, q, v, multipliers, {})
-        if self.parameters:
-            return lambda t, q, v, params: forces(t, q, v, None, params)
-        return lambda t, q, v: forces(t, q, v, None, {})
+    @cached_property
+    def discretization_map(self) -> ProductMap:
+        """The map for `manifold_system`: midpoints of lengths and angles, and of rotations the middle of the one-parameter
+        subgroup between them."""
+        return discretization_map(self)
 
     # ------------------------------------------------------------------ initial data
 

@@ -78,27 +78,43 @@ class Quaternion:
 @dataclass(frozen=True)
 class Glide:
     """Over the surface z = height(x, y) of the frame, at a distance from it along its normal; x and y of the point below are
-    the coordinates. The frame does not turn."""
+    the coordinates. The frame does not turn, or where it `leans` its z turns to the normal and its x stays over the x axis."""
 
     height: Callable
     distance: float
     names: tuple[str, ...]
+    leans: bool = False
 
     def below(self, q: Any) -> Any:
         """The point of the surface (3,)."""
         return jnp.stack([q[0], q[1], self.height(q[0], q[1])])
 
+    def _slope(self, q: Any) -> Any:
+        return gradient(lambda xy: self.height(xy[0], xy[1]))(jnp.stack([q[0], q[1]]))
+
     def normal(self, q: Any) -> Any:
         """The unit normal there, upwards (3,)."""
-        slope = gradient(lambda xy: self.height(xy[0], xy[1]))(jnp.stack([q[0], q[1]]))
+        slope = self._slope(q)
         return jnp.stack([-slope[0], -slope[1], jnp.ones(())]) / jnp.sqrt(1.0 + slope @ slope)
+
+    def _lean(self, q: Any) -> tuple[Any, Any, Any]:
+        """The axes that lean, each (3,)."""
+        slope, normal = self._slope(q)[0], self.normal(q)
+        first = jnp.stack([jnp.ones(()), jnp.zeros(()), slope]) / jnp.sqrt(1.0 + slope**2)
+        return first, cross(normal, first), normal
 
     def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
         """The frame moved, for the coordinates q and their rates v."""
         place = lambda q: self.below(q) + self.distance * self.normal(q)
         by = frame.turn @ place(q)
         rate = frame.turn @ along(place, (q,), (v,))
-        return frame._replace(at=frame.at + by, velocity=frame.velocity + cross(frame.spin, by) + rate)
+        moved = frame._replace(at=frame.at + by, velocity=frame.velocity + cross(frame.spin, by) + rate)
+        if not self.leans:
+            return moved
+        lean = lambda q: jnp.stack(self._lean(q))
+        axes, rates = lean(q), along(lean, (q,), (v,))
+        spin = sum(cross(axis, rate) for axis, rate in zip(axes, rates, strict=True)) / 2
+        return moved._replace(turn=frame.turn @ axes.T, spin=frame.spin + frame.turn @ spin)
 
 
 Motion: TypeAlias = Shift | TurnBy | Slide | Turn | Quaternion | Glide

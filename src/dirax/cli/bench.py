@@ -6,6 +6,7 @@ from pathlib import Path
 
 from dirax import gallery
 from dirax.cli.subject import INITIAL
+from dirax.diagnostics.bench.machines import Machines, bench_machines
 from dirax.diagnostics.bench.measure import Bench, bench
 from dirax.diagnostics.bench.subject import Subject
 from dirax.gallery.example import Example
@@ -16,6 +17,12 @@ LONGEST = 2000
 
 QUICK, QUICK_STEPS, QUICK_REPEATS = ("kepler", "rolling-disk", "vortices"), 100, 2
 """What `--quick` times where nothing else is asked for."""
+
+MACHINES = (
+    *("bicycle", "euler-disk", "rattleback", "tippe-top", "chaplygin-sphere", "n-trailer", "trikke", "snakeboard-gait"),
+    *("andrews-squeezer", "four-bar", "bricard", "flyball-governor", "n-four-bar", "car-axis", "slider-crank"),
+)
+QUICK_MACHINES = ("car-axis", "euler-disk")
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -34,6 +41,28 @@ def run_bench(
     chosen = [gallery.get(name) for name in (names or (QUICK if quick else gallery.names()))]
     longest = steps or (QUICK_STEPS if quick else LONGEST)
     return bench([subject(e, longest) for e in chosen], repeats or (QUICK_REPEATS if quick else 7), tell)
+
+
+def run_machines(
+    names: Sequence[str],
+    repeats: int | None,
+    quick: bool,
+    tell: Callable[[float | None, str], None] | None = None,
+    steps: int | None = None,
+    table: Path | None = None,
+) -> Machines:
+    """`bench_machines` of these machines, of all of them without names, stored as JSON where a path is given.
+
+    Raises `ValueError` for a system of the gallery that is no machine.
+    """
+    chosen = [gallery.get(name) for name in (names or (QUICK_MACHINES if quick else MACHINES))]
+    others = [example.name for example in chosen if example.name not in MACHINES]
+    if others:
+        raise ValueError(f"{others[0]!r} is no machine of the gallery: there are {', '.join(MACHINES)}.")
+    found = bench_machines(chosen, repeats or (QUICK_REPEATS if quick else 5), steps or (QUICK_STEPS if quick else 1000), tell)
+    if table is not None:
+        table.write_text(json.dumps(found.to_dict(), indent=1, ensure_ascii=False) + "\n", "utf-8")
+    return found
 
 
 def subject(example: Example, longest: int) -> Subject:

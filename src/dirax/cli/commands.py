@@ -220,6 +220,9 @@ def bench(
         int | None, typer.Option(min=1, help="most steps of a timed trajectory [default: 2000]", show_default=False)
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="three systems, 100 steps, 2 repeats, unless given")] = False,
+    machines: Annotated[
+        bool, typer.Option("--machines", help="machines alone: time, end error, drift of energy and constraints")
+    ] = False,
     table: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="store everything measured in FILE", show_default=False)
     ] = None,
@@ -232,10 +235,18 @@ def bench(
     Each is a column if it is installed, as a ratio to one lane of the native engine. The libraries for ordinary
     differential equations run at the end error of the scheme. What cannot run is left out, and the reason said. The whole
     gallery takes about a quarter of an hour. The exit status is 1 when a system could not be timed.
+    With --machines MuJoCo, Exudyn and pinocchio are columns where they are installed, which say what they cannot state.
     """
-    from dirax.cli.bench import check_targets, run_bench, store
+    from dirax.cli.bench import check_targets, run_bench, run_machines, store
 
     check_targets(table, picture)
+    if machines:
+        if picture is not None:
+            raise ValueError("--machines is a table, which --plot does not draw: leave --plot out.")
+        with progress_bar("starting") as tell:
+            measured = run_machines(names or (), repeats, quick, tell, steps, table)
+        show_table(measured.title, measured.header, measured.cells(), str(measured), measured.notes())
+        return
     with progress_bar("starting") as tell:
         found = run_bench(names or (), repeats, quick, tell, steps)
     show_table(found.title, found.header, found.cells(), str(found), found.notes())

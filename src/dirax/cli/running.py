@@ -70,7 +70,7 @@ def description(example: Example, sol: Solution, report: Report, out: Path | Non
             "steps": sol.stats["steps"],
             "ok": np.asarray(sol.ok).tolist(),
             "message": sol.message,
-            "t": float(sol.t[-1]),
+            "t": sol.time_of(-1),
             field: np.asarray(sol.fields[field])[..., -1, :],
             "stats": sol.stats,
             "report": report.to_dict(),

@@ -6,9 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.diagnostics.report import Line
 from dirax.diagnostics.rows import consecutive, over_rows
 from dirax.diagnostics.structure_lines import structure_of
-from dirax.schemes.discrete_structure_pairs import LagrangianPairs
+from dirax.diagnostics.verdicts import judged, roundoff_limit
+from dirax.schemes.discrete_structure_pairs import AbstractPairs
 from dirax.solution.solution import Solution
 
 
@@ -44,10 +46,7 @@ def action_variation(solution: Solution, variation: Any) -> Variation:
     q = np.asarray(solution.q)
     if np.shape(variation) != q.shape:
         raise ValueError(f"variation must have the shape of q, {q.shape}, but it has shape {np.shape(variation)}.")
-    inner = np.arange(solution.rows - 2)
-    items = consecutive(solution, ("q",), 3, inner)
-    along = np.take(np.asarray(variation, float), inner + 1, axis=q.ndim - 2)
-    found = over_rows(eqx.Partial(_varied, pairs), solution, (items, along)).sum(axis=1)
+    found = _varied_terms(pairs, solution, variation).sum(axis=1)
     return Variation(_plain(solution, found[:, 0]), _plain(solution, found[:, 1]))
 
 
@@ -57,20 +56,43 @@ def discrete_energy(solution: Solution, sign: str | None = None) -> np.ndarray:
         E⁺ = ⟨p_{k+1}, q_{k+1} − q_k⟩ − L_d(q_k, q_{k+1}),   p_{k+1} = D2 L_d(q_k, q_{k+1}),
         E⁻ = ⟨p_k, q_{k+1} − q_k⟩ − L_d(q_k, q_{k+1}),       p_k = −D1 L_d(q_k, q_{k+1}),
 
+    on a manifold −R⁻¹_{q_{k+1}}(q_k) in E⁺ and R⁻¹_{q_k}(q_{k+1}) in E⁻ taking the place of q_{k+1} − q_k with its retraction R:
     h times an energy each, and not the energy of the system at a node, which is `solution.energy()`. `sign`: "+" or "-"; by
     default that of the scheme, "+" for one that is neither. Raises as `action_sum`, and `ValueError` for another sign.
     """
     pairs = _pairs(solution)
-    chosen = sign or pairs.sign or "+"
+    chosen = sign or pairs.default_sign
     if chosen not in ("+", "-"):
         raise ValueError(f'sign must be "+" or "-", but {sign!r} was given.')
     energies = _over_steps(_plus_energy if chosen == "+" else _minus_energy, pairs, solution)
     return energies if solution.batch is not None else energies[0]
 
 
-def _pairs(solution: Solution) -> LagrangianPairs:
+def stationary_action(solution: Solution, structure: Any, tolerance: float | None) -> Line | None:
+    """The line of the variational principle: the derivative of the action sum along a variation at random, relative to the sum
+    of the sizes of its terms; None for runs of other schemes, of which `membership` says why."""
+    if not isinstance(structure, AbstractPairs) or solution.save_every != 1 or solution.rows < 3:
+        return None
+    terms = _varied_terms(structure, solution, np.random.default_rng(0).normal(size=np.shape(solution.q)))
+    value, size = np.nansum(terms, axis=1).T
+    relative = np.abs(value) / np.where(size > 0, size, 1.0)
+    text = "Σ⟨D₂L_d + D₁L_d, δq⟩ along a variation δq ∈ Δ at random, relative to its terms"
+    return judged(solution, "action sum stationary", relative, roundoff_limit(tolerance, 1), text)
+
+
+def _varied_terms(structure: AbstractPairs, solution: Solution, variation: Any) -> np.ndarray:
+    """(the term, the sum of its sizes) of each inner row, (B, rows − 2, 2)."""
+    inner = np.arange(solution.rows - 2)
+    items = consecutive(solution, ("q",), 3, inner)
+    along = np.take(np.asarray(variation, float), inner + 1, axis=np.ndim(solution.q) - 2)
+    return over_rows(eqx.Partial(_varied, structure), solution, (items, along))
+
+
+def _pairs(solution: Solution) -> AbstractPairs:
+    if not isinstance(solution, Solution):
+        raise TypeError(f"solution must be a dirax Solution, but a {type(solution).__name__} was given.")
     pairs = structure_of(solution)
-    if not isinstance(pairs, LagrangianPairs):
+    if not isinstance(pairs, AbstractPairs):
         raise TypeError(
             "action sums are of schemes with a discrete Lagrangian on Q × Q, such as dx.LagrangeDAlembert and "
             f"dx.PlusLagrangeDirac, but this run was by {solution.scheme!r}."
@@ -83,7 +105,7 @@ def _pairs(solution: Solution) -> LagrangianPairs:
     return pairs
 
 
-def _over_steps(function: Any, pairs: LagrangianPairs, solution: Solution) -> np.ndarray:
+def _over_steps(function: Any, pairs: AbstractPairs, solution: Solution) -> np.ndarray:
     """(B, steps)."""
     return over_rows(eqx.Partial(function, pairs), solution, (consecutive(solution, ("q",), 2, np.arange(solution.rows - 1)),))
 
@@ -92,23 +114,27 @@ def _plain(solution: Solution, values: np.ndarray) -> Any:
     return values if solution.batch is not None else float(values[0])
 
 
-def _lagrangian(pairs, rows, params):
+def _lagrangian(of, rows, params):
+    pairs, rows, params = of.in_coordinates(rows, 0, params)
     return pairs.lagrangian(rows["t"][0], *rows["q"], params)
 
 
-def _plus_energy(pairs, rows, params):
+def _plus_energy(of, rows, params):
+    pairs, rows, params = of.in_coordinates(rows, 1, params)
     q0, q1 = rows["q"]
     return pairs.slots(rows["t"][0], q0, q1, params)[1] @ (q1 - q0) - _lagrangian(pairs, rows, params)
 
 
-def _minus_energy(pairs, rows, params):
+def _minus_energy(of, rows, params):
+    pairs, rows, params = of.in_coordinates(rows, 0, params)
     q0, q1 = rows["q"]
     return -pairs.slots(rows["t"][0], q0, q1, params)[0] @ (q1 - q0) - _lagrangian(pairs, rows, params)
 
 
-def _varied(pairs, rows, along, params):
+def _varied(of, rows, along, params):
     """(the term of the inner row, the sum of its sizes)."""
-    t, (q0, q1, q2) = rows["t"], rows["q"]
+    pairs, rows, params = of.in_coordinates(rows | {"along": along}, 1, params)
+    along, t, (q0, q1, q2) = rows["along"], rows["t"], rows["q"]
     arriving, leaving = pairs.slots(t[0], q0, q1, params)[1], pairs.slots(t[1], q1, q2, params)[0]
     admissible = along - pairs.annihilator(t[1], q1, params) @ along
     sizes = (jnp.abs(arriving) + jnp.abs(leaving)) @ jnp.abs(admissible)

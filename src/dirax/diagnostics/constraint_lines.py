@@ -3,14 +3,12 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.energy_lines import energy_terms
 from dirax.diagnostics.report import NOT_CHECKED, Line
-from dirax.diagnostics.rows import constraint_of, over_rows, times_at
-from dirax.diagnostics.verdicts import SAMPLED_ROWS, judged, of_lane, roundoff_limit, sampled_terms, spread, worst_place
+from dirax.diagnostics.rows import at_rows, constraint_at, constraint_of, energy_at, over_rows, times_at
+from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, sampled, sampled_terms, worst_place
 from dirax.numerics.tolerances import TINY
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.solution.solution import Solution
@@ -37,7 +35,7 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     lane, row = worst_place(values)
     kind = "discrete constraint of each step" if steps else "constraint at each row"
     text = (
-        f"{kind}, relative to its terms; at most {np.max(residual[:, given:]):.2g}, at t = {float(sol.t[row + given]):.6g}"
+        f"{kind}, relative to its terms; at most {np.max(residual[:, given:]):.2g}, at t = {sol.time_of(row + given, lane):.6g}"
         f"{of_lane(sol, lane)}"
     )
     if redundant := sol.stats.get("redundant_constraints"):
@@ -56,25 +54,30 @@ def hidden_constraint(sol: Solution, tolerance: float | None) -> Line | None:
     system = None if sol.system is None else sol.system.lagrangian_form()
     if system is None or system.holonomic is None or "constraint" not in sol.fields:
         return None
-    items = (times_at(sol, np.arange(sol.rows)), np.asarray(sol.q), np.asarray(sol.p))
-    values = over_rows(eqx.Partial(_hidden_terms, system), sol, items)
-    scale = np.nanmax(values[:, :, 1], axis=(0, 1))
-    missed = np.max(values[:, :, 0] / np.where(scale > 0, scale, TINY), axis=2)
-    lane, row = worst_place(missed)
-    text = f"∂g/∂q v + ∂g/∂t at each row, relative to its terms, worst at t = {float(sol.t[row]):.6g}{of_lane(sol, lane)}"
-    return judged(sol, "hidden constraint", np.nanmax(missed, axis=1), roundoff_limit(tolerance, 1), text)
+    hidden, items = at_rows(sol, _hidden, system), {"q": np.asarray(sol.q), "p": np.asarray(sol.p)}
+    values = np.abs(over_rows(hidden, sol, ({**items, "t": times_at(sol, np.arange(sol.rows))},)))
+    terms = sampled(sol, at_rows(sol, _constraint_terms, system))[..., -values.shape[-1] :]
+    values = np.max(values / _largest(sampled_terms(sol, hidden), terms), axis=-1)
+    lane, row = worst_place(values)
+    text = f"∂g/∂q v + ∂g/∂t at each row, relative to its terms, worst at t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
+    return judged(sol, "hidden constraint", np.nanmax(values, axis=1), roundoff_limit(tolerance, 1), text)
 
 
-def _hidden_terms(system: LagrangeDirac, t, q, p, params: Any):
-    """|G v + ∂g/∂t|, and the sizes of the terms of these and of |∂(G v + ∂g/∂t)/∂(q, p)||(q, p)|."""
+def _hidden(system: LagrangeDirac, row: dict, params: Any):
+    """G v + ∂g/∂t."""
+    velocity = system.inverse_legendre(row["q"], row["p"], params, t=row["t"])
+    return system.constraints.hidden_defect(row["t"], row["q"], velocity, params)
 
-    def defect(q, p):
-        return system.constraints.hidden_defect(t, q, system.inverse_legendre(q, p, params, t=t), params)
 
-    of_q, of_p = jax.jacfwd(defect, argnums=(0, 1))(q, p)
-    size, missed = jnp.abs(of_q) @ jnp.abs(q) + jnp.abs(of_p) @ jnp.abs(p), jnp.abs(defect(q, p))
-    terms = system.constraint_terms(t, q, system.inverse_legendre(q, p, params, t=t), params)
-    return jnp.stack([missed, size + terms[-len(missed) :]])
+def _constraint_terms(system: LagrangeDirac, row: dict, params: Any):
+    velocity = system.inverse_legendre(row["q"], row["p"], params, t=row["t"])
+    return system.constraint_terms(row["t"], row["q"], velocity, params)
+
+
+def _largest(*sizes: np.ndarray) -> np.ndarray:
+    """The sums of sizes (B, rows, …), the largest of each over all rows."""
+    found = sum(np.nanmax(size, axis=(0, 1)) for size in sizes)
+    return np.where(found > 0, found, TINY)
 
 
 def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str) -> Any:
@@ -84,29 +87,17 @@ def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str)
         q = np.asarray(sol.q)
         speed = np.abs(np.diff(q, axis=-2)) / (sol.step * sol.save_every)
         speed = np.nanmax(speed, axis=tuple(range(speed.ndim - 1)), initial=0.0)
-        rows = spread(sol.rows, SAMPLED_ROWS)
-        items = {"t": times_at(sol, rows), "q": q[..., rows, :]}
-        scale = np.nanmax(over_rows(eqx.Partial(_own_size, structure, speed), sol, (items,)), axis=(0, 1))
-        return np.where(scale > 0, scale, TINY)
+        return _largest(sampled(sol, eqx.Partial(_own_size, structure, speed)))
     if sol.system is None:
         nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
         return float(max(np.nanmax(np.abs(a)) for a in nodes)) or TINY
+    form = sol.system.lagrangian_form()
     if sol.system.constrains_differential:
-        return float(np.nanmax(sampled_terms(sol, energy_terms))) or TINY
-    scale = np.nanmax(sampled_terms(sol, _constraint_terms), axis=(0, 1))
-    return np.where(scale > 0, scale, TINY)
+        return float(np.nanmax(sampled_terms(sol, at_rows(sol, energy_at)))) or TINY
+    if form is not None and form.constraints.any and "p" in sol.fields:
+        return _largest(sampled(sol, at_rows(sol, _constraint_terms, form)))
+    return float(np.nanmax(sampled_terms(sol, at_rows(sol, constraint_at)))) or TINY
 
 
 def _own_size(structure: AbstractDiscreteStructure, speed, row: dict, params: Any):
     return structure.constraint_size(row, jnp.asarray(speed), params)
-
-
-def _constraint_terms(system: Any, t, row: dict, params: Any):
-    """The sizes of the terms of the constraints: of a Lagrangian system, those of each; else Σ |∂c/∂row_i| |row_i|, the largest
-    over the constraints c."""
-    form = system.lagrangian_form()
-    if form is not None and form.constraints.any and "p" in row:
-        return form.constraint_terms(t, row["q"], form.inverse_legendre(row["q"], row["p"], params, t=t), params)
-    derivative = jax.jacfwd(lambda row: system.constraint_at({**row, "t": t}, params))(row)
-    terms = (jnp.abs(derivative[name]).reshape(derivative[name].shape[0], -1) @ jnp.abs(row[name]).ravel() for name in row)
-    return jnp.max(sum(terms), initial=0.0)[None]

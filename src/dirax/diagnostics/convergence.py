@@ -156,6 +156,10 @@ def convergence(
     exact = reference if callable(reference) and not isinstance(reference, AbstractScheme) else None
     stride = np.round(h[0] / h).astype(int)
     runs = [_run(system, scheme, size, time, int(every), run) for size, every in zip(h, stride, strict=True)]
+    if runs[0].has_own_times:
+        raise ValueError(
+            "dx.convergence compares runs at common times, and variable steps have none: compare sol.q with a solution at sol.t."
+        )
     common = runs[0].t
     measured, notes = [_quantities(sol) for sol in runs], []
     explicit, by = None, reference if isinstance(reference, AbstractScheme) else scheme

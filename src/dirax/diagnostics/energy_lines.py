@@ -2,16 +2,15 @@
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.power_balance import balances, has_power, keeps_books
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Line
-from dirax.diagnostics.rows import energy_of
+from dirax.diagnostics.rows import at_rows, energy_at, energy_of
 from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled_terms, steps_of
 from dirax.numerics.tolerances import EPSILON
+from dirax.schemes.step import CLOCK
 from dirax.solution.solution import Solution
 
 JUMP = 1000.0
@@ -47,10 +46,10 @@ def energy_line(sol: Solution) -> Line:
     if changes:
         change = float(np.nanmax(np.abs(energy - energy[:, :1])))
         return Line(name, change, None, NOT_CHECKED, f"the system {changes}; it changed by {change:.3g}")
-    t, found = np.asarray(sol.t), []
+    times, found = sol.times, []
     for lane, series in enumerate(energy):
         good = np.isfinite(series)
-        found.append(judge(t[good], series[good], _motion(sol, lane)[good], roundoff))
+        found.append(judge(times[lane][good], series[good], _motion(sol, lane)[good], roundoff))
     order = (NOT_CHECKED, BOUNDED, DRIFTS)
     lane = max(range(len(found)), key=lambda i: (order.index(found[i].verdict), abs(found[i].drift)))
     worst = found[lane]
@@ -79,7 +78,7 @@ def _jump(sol: Solution, energy: np.ndarray, roundoff: float) -> Line | None:
     lane, step = (int(i) for i in np.unravel_index(int(np.argmax(np.where(jumps, change[:, 2:-2], 0.0))), jumps.shape))
     by, others = change[lane, step + 2], around[lane, step]
     text = (
-        f"jumps by {by:.3g} within the step from t = {float(sol.t[step + 2]):.6g}{of_lane(sol, lane)}, next to changes of "
+        f"jumps by {by:.3g} within the step from t = {sol.time_of(step + 2, lane):.6g}{of_lane(sol, lane)}, next to changes of "
         f"{others:.2g}, in {np.sum(jumps)} steps: the Lagrangian has a jump there, which no step sees, or the step is too long"
     )
     return Line("energy", float(by), float(JUMP * others), VIOLATED, text)
@@ -95,7 +94,7 @@ def port_lines(sol: Solution, tolerance: float | None) -> list[Line]:
 
 def _motion(sol: Solution, lane: int) -> np.ndarray:
     """All node fields of one trajectory side by side, (rows, d)."""
-    nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"]
+    nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node" and k != CLOCK]
     rows = [a if sol.batch is None else a[lane] for a in nodes]
     return np.concatenate([a.reshape(len(a), -1) for a in rows], axis=1)
 
@@ -103,10 +102,4 @@ def _motion(sol: Solution, lane: int) -> np.ndarray:
 def energy_scale(sol: Solution, energy: np.ndarray) -> float:
     """|E| + |∂E/∂row| |row|, the largest: what roundings of the rows do to the energy, in units of ε."""
     scale = float(np.nanmax(np.abs(energy)))
-    return scale if sol.system is None else scale + float(np.nanmax(sampled_terms(sol, energy_terms)))
-
-
-def energy_terms(system: Any, t, row: dict, params: Any):
-    """Σ |∂E/∂row_i| |row_i|."""
-    gradient = jax.grad(lambda row: system.energy_at({**row, "t": t}, params))(row)
-    return sum(jnp.sum(jnp.abs(gradient[name] * row[name])) for name in row)
+    return scale if sol.system is None else scale + float(np.nanmax(sampled_terms(sol, at_rows(sol, energy_at))))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.bench.ode import ExplicitODE, explicit_ode
+from dirax.diagnostics.bench.ode import ExplicitODE, completed, explicit_ode
 from dirax.diagnostics.bench.subject import Skipped
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.memo import Same
@@ -67,7 +67,7 @@ def explicit_solution(system: AbstractSystem, run: Mapping[str, Any]) -> Explici
     inputs, params = run.get("inputs"), jax.tree.map(jnp.asarray, run.get("params"))
     system, t0 = system if inputs is None else system.with_inputs(inputs), float(run.get("t0", 0.0))
     if run.get("project"):
-        complete = system.complete({**data, "t": jnp.asarray(t0)}, params, True)
+        complete = completed(system, {**data, "t": jnp.asarray(t0)}, params, True)
         data = {name: complete[name] for name in ("q", "v", "x") if name in complete and (name != "v" or "q" in complete)}
     try:
         ode = explicit_ode(system, {**data, "t": jnp.asarray(t0)}, params)

@@ -33,7 +33,7 @@ def final_manifold(sol: Solution, tolerance: float | None) -> Line | None:
     size = float(np.nanmax(found[..., 1])) or 1.0
     values = np.where(np.isnan(found[..., 0]), 0.0, found[..., 0]) / size
     lane, row = worst_place(values)
-    text = f"the constraints of M_f at each row, worst at t = {float(sol.t[row]):.6g}{of_lane(sol, lane)}"
+    text = f"the constraints of M_f at each row, worst at t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
     line = judged(sol, name, np.max(values, axis=1), roundoff_limit(tolerance, 1), text)
     if line.verdict != VIOLATED:
         return line
@@ -50,7 +50,7 @@ def _chain_of(sol: Solution) -> ConstraintChain | None:
     """The chain around the first row, None for a Lagrangian that is regular there."""
     assert sol.system is not None
     first = lambda name: np.asarray(sol.fields[name]).reshape(-1, *np.shape(sol.fields[name])[-2:])[0, 0]
-    q, t, params = first("q"), float(sol.t[0]), sol.params_of_one
+    q, t, params = first("q"), sol.time_of(0), sol.params_of_one
     v = initial_of_one(sol).get("v", np.zeros_like(q))
     system = sol.system
     if system.lagrangian_form() is None or system.metric_form() is not None or system.final_relation(shape_of(sol)) is not None:

@@ -48,11 +48,17 @@ class Equations:
             [balance + constraints.matrix(t, q, params).T @ u, along(velocity, (t, q, v), (jnp.ones(()), v, a))]
         )
 
-    def linear(self, z: Any, w: Any, params: Any) -> tuple[Any, Any, Any]:
-        """The equations at z = (q, v), w = (a, u), with their derivatives by z and by w."""
+    def by_w(self, z: Any, w: Any, params: Any) -> tuple[Any, Any]:
+        """The equations at z = (q, v), w = (a, u), with their derivative by w."""
+        n = z.shape[0] // 2
+        at = lambda w: self(z[:n], z[n:], w[:n], w[n:], params)
+        return at(w), jacobian(at)(w)
+
+    def linear(self, z: Any, w: Any, params: Any) -> tuple[Any, Any]:
+        """Their derivatives by z and by w."""
         n = z.shape[0] // 2
         at = lambda z, w: self(z[:n], z[n:], w[:n], w[n:], params)
-        return at(z, w), jacobian(lambda z: at(z, w))(z), jacobian(lambda w: at(z, w))(w)
+        return jacobian(lambda z: at(z, w))(z), jacobian(lambda w: at(z, w))(w)
 
     def momentum(self, q: Any, v: Any, params: Any) -> tuple[Any, Any]:
         """The derivatives of ∂L/∂v by q and by v."""
@@ -84,7 +90,7 @@ def _solved(equations: Equations, z: Any, params: Any) -> np.ndarray:
     n = z.size // 2
     w = np.zeros(n + sum(equations.system.constraints.sizes(z[:n], params)))
     for _ in range(3):  # affine in (a, u), but for forces that see the multipliers
-        missed, _, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
+        missed, by_w = (np.asarray(x) for x in evaluated(equations.by_w, z, w, params))
         w = w - np.linalg.lstsq(by_w, missed, rcond=RANK)[0]
     return w
 
@@ -94,7 +100,7 @@ def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generato
     q, v = (np.asarray(at[name], float) for name in ("q", "v"))
     n, z, equations = q.size, np.concatenate([q, v]), equations_of(system, float(at.get("t", 0.0)))
     w = _solved(equations, z, params)
-    _, by_z, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
+    by_z, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
     derivative = np.zeros((2 * n, 2 * n))
     derivative[:n, n:] = np.eye(n)
     derivative[n:] = -np.linalg.lstsq(by_w, by_z, rcond=RANK)[0][:n]

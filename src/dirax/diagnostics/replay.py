@@ -14,10 +14,10 @@ from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
 from dirax.solution.solution import Solution
-from dirax.solution.trajectory import SavedRow
+from dirax.solution.trajectory import SavedRow, last_rows
 
-MOST_OPERATIONS = 4e9
-"""Scalar operations of the steps that are taken again, some ten seconds: of longer runs as many rows, evenly spread."""
+MOST_OPERATIONS = 1e8
+"""Scalar operations of the steps that are taken again, a second or so: of longer runs as many rows, evenly spread."""
 
 
 APART = 16
@@ -108,8 +108,7 @@ class Replay:
     @cached_property
     def ends(self) -> np.ndarray:
         """The last row (B,) that each trajectory reached, −1 where there is none."""
-        reached = [np.all(np.isfinite(self.saved[name]).reshape(*self.saved[name].shape[:2], -1), axis=2) for name in self.nodes]
-        return np.max(np.where(np.logical_and.reduce(reached), np.arange(self.sol.rows), -1), axis=1)
+        return last_rows([self.saved[name] for name in self.nodes])
 
     @cached_property
     def counts(self) -> np.ndarray:
@@ -118,7 +117,7 @@ class Replay:
         if self.from_points:
             counts[1:] = 1.0 + np.arange(self.sol.rows - 1, dtype=float) * self.sol.save_every
         last = self.sol.rows - 1
-        left = np.rint((float(self.sol.t[last]) - float(self.sol.t[last - 1])) / float(self.sol.step)) if last else 0.0
+        left = np.rint((float(self.sol.axis[last]) - float(self.sol.axis[last - 1])) / float(self.sol.step)) if last else 0.0
         if last and 1 <= left <= counts[last] - counts[last - 1]:
             counts[last] = counts[last - 1] + left
         return counts
@@ -135,7 +134,7 @@ class Replay:
 
     def times(self) -> np.ndarray:
         """The times that the rows should have."""
-        return float(self.sol.t[0]) + self.counts * float(self.sol.step)
+        return float(self.sol.axis[0]) + self.counts * float(self.sol.step)
 
     # ------------------------------------------------------------------------------------------ where steps begin
 

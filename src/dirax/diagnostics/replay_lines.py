@@ -40,7 +40,7 @@ def replayed(sol: Solution, tolerance: float | None) -> Line:
     ratio = found.ratios(limit)
     entry, number = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
     lane, row = int(at.lanes[entry]), int(at.rows[entry])
-    where = f"{found.name(int(number))} at t = {float(sol.t[row]):.6g}{of_lane(sol, lane)}"
+    where = f"{found.name(int(number))} at t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
     per_trajectory = np.zeros(sol.batch or 1)
     np.maximum.at(per_trajectory, at.lanes, np.max(ratio, axis=1))
     return judged(sol, NAME, per_trajectory, limit, f"{found.told()}; worst {where}, off by {found.missed[entry, number]:.2g}")
@@ -106,7 +106,7 @@ class _Comparison:
             values = self.replay.saved[name]
             values = values.reshape(*values.shape[:2], -1)
             pieces.append(values[self.at.lanes, np.minimum(self.at.rows, values.shape[1] - 1)])
-        return np.concatenate([*pieces, np.asarray(self.replay.sol.t, float)[self.at.rows][:, None]], axis=1)
+        return np.concatenate([*pieces, np.asarray(self.replay.sol.axis, float)[self.at.rows][:, None]], axis=1)
 
     def _said(self, again: Again) -> tuple[np.ndarray, np.ndarray]:
         """What steps say of the rows that they leave, and of the next ones; NaN where nothing."""

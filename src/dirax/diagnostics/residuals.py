@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.rows import over_rows
+from dirax.diagnostics.rows import over_rows, times_at
 from dirax.diagnostics.verdicts import spread
 from dirax.engines.step_program import linearized
 from dirax.schemes.step_forms import started
@@ -25,8 +25,8 @@ def residual_size(sol: Solution) -> float | None:
     rows = spread(sol.rows, ROWS).astype(int)
     nodes = {name: np.asarray(a) for name, a in sol.fields.items() if sol.field_info[name].place == "node"}
     at = {name: np.take(a, rows, axis=int(sol.batch is not None)) for name, a in nodes.items()}
-    times = np.asarray(sol.t)[rows]
-    at["t"] = times if sol.batch is None else np.broadcast_to(times, (sol.batch, len(rows)))
+    at["t"] = times_at(sol, rows)
+    times = np.atleast_2d(at["t"])[0]
     try:
         begun = over_rows(eqx.Partial(_started, sol.system, sol.step, sol.equation), sol, (at,))[0]
     except (KeyError, TypeError, ValueError):  # the scheme does not start from a saved row

@@ -75,14 +75,14 @@ def _piece(function, items, params, axis):
 
 def energy_of(sol: Solution) -> np.ndarray:
     """`sol.energy()`, found here where it was not before. Raises as it does."""
-    return _of_nodes(sol, "energy", _energy) if sol.system is not None else np.asarray(sol.energy())
+    return _of_nodes(sol, "energy", energy_at) if sol.system is not None else np.asarray(sol.energy())
 
 
 def constraint_of(sol: Solution) -> np.ndarray:
     """`sol.constraint_residual()`, found here where it was not before. Raises as it does."""
     if sol.system is None or "constraint" in sol.fields:
         return np.asarray(sol.constraint_residual())
-    return _of_nodes(sol, "constraint_residual", _constraint)
+    return _of_nodes(sol, "constraint_residual", constraint_at)
 
 
 def _of_nodes(sol: Solution, name: str, function: Callable) -> np.ndarray:
@@ -90,21 +90,32 @@ def _of_nodes(sol: Solution, name: str, function: Callable) -> np.ndarray:
         return np.asarray(sol.derived[name])
     nodes = {key: np.asarray(a) for key, a in sol.fields.items() if sol.field_info[key].place == "node"}
     nodes["t"] = times_at(sol, np.arange(sol.rows))
-    found = over_rows(eqx.Partial(function, sol.system), sol, (nodes,))
+    found = over_rows(at_rows(sol, function), sol, (nodes,))
     return found if sol.batch is not None else found[0]
 
 
-def _energy(system: AbstractSystem, row: dict, params: Any):
-    return system.energy_at(SavedRow(row), params)
+def at_rows(sol: Solution, function: Callable, system: AbstractSystem | None = None) -> eqx.Partial:
+    """function(system, row, params) as one of rows, of the system of the run or another."""
+    return eqx.Partial(_at_row, function, sol.system if system is None else system)
 
 
-def _constraint(system: AbstractSystem, row: dict, params: Any):
-    return system.constraint_at(SavedRow(row), params)
+def _at_row(function: Callable, system: AbstractSystem, row: dict, params: Any):
+    return function(system, SavedRow(row), params)
+
+
+def energy_at(system: AbstractSystem, row: dict, params: Any):
+    """The energy of a row."""
+    return system.energy_at(row, params)
+
+
+def constraint_at(system: AbstractSystem, row: dict, params: Any):
+    """The constraint of a row."""
+    return system.constraint_at(row, params)
 
 
 def times_at(sol: Solution, rows: np.ndarray) -> np.ndarray:
     """The times of rows, (…, rows)."""
-    t = np.asarray(sol.t)[rows]
+    t = np.asarray(sol.t)[..., rows]
     return t if sol.batch is None else np.broadcast_to(t, (sol.batch, len(rows)))
 
 

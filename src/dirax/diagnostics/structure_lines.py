@@ -7,7 +7,7 @@ import numpy as np
 
 from dirax.diagnostics.one_step import differentiated_steps
 from dirax.diagnostics.power_balance import keeps_books
-from dirax.diagnostics.report import NOT_CHECKED, Line
+from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
 from dirax.diagnostics.rows import consecutive, over_rows, shape_of
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
 from dirax.program.memo import Same
@@ -53,7 +53,7 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         of_claim = values[..., first : first + len(claim.parts)]
         first += len(claim.parts)
         lane, row = worst_place(np.max(of_claim, axis=-1))
-        text = f"{claim.statement}; worst at t = {float(sol.t[row + middle]):.6g}{of_lane(sol, lane)}"
+        text = f"{claim.statement}; worst at t = {sol.time_of(row + middle, lane):.6g}{of_lane(sol, lane)}"
         if len(claim.parts) > 1:
             each = zip(claim.parts, of_claim[lane, row], strict=True)
             text += ": " + ", ".join(f"{part} {value:.2g}" for part, value in each)
@@ -109,9 +109,13 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")
     lane, row = worst_place(defect)
-    text = form.told(values[lane, row], f"worst of {len(rows)} steps at t = {float(sol.t[rows[row]]):.6g}{of_lane(sol, lane)}")
+    text = form.told(
+        values[lane, row], f"worst of {len(rows)} steps at t = {sol.time_of(rows[row], lane):.6g}{of_lane(sol, lane)}"
+    )
     limit = roundoff_limit(tolerance, sol.equation.stages[0][0].state_size * condition)
     line = judged(sol, name, np.max(np.where(np.isfinite(defect), defect, 0.0), axis=1), limit, text)
+    if line.verdict == VIOLATED and (excuse := form.excuse(values[lane, row])):
+        line = Line(name, line.value, limit, NOT_CHECKED, text + excuse)
     line.details["condition"] = condition
     return line
 

@@ -1,6 +1,6 @@
 """How a measured value becomes a line with a verdict, and the places in a solution at which values are taken."""
 
-from collections.abc import Callable
+import math
 
 import equinox as eqx
 import numpy as np
@@ -14,7 +14,13 @@ ROUNDINGS = 32
 """Roundings, each of half a unit in the last place, that the equations of one step are allowed, and their safety factor."""
 
 SAMPLED_ROWS = 64
-"""Rows at which natural scales are taken."""
+"""Rows at which natural scales are taken, of small systems and few trajectories."""
+
+SAMPLED_ENTRIES = 2**13
+"""Rows, each with one of its numbers changed, that are evaluated for a scale, unless four of each trajectory are more."""
+
+DISTURBANCE = 2.0**-26
+"""By how much, relatively, a number is changed for a scale."""
 
 
 def where_reached(values: np.ndarray, items: dict[str, np.ndarray]) -> np.ndarray:
@@ -61,12 +67,37 @@ def of_lane(sol: Solution, lane: int) -> str:
 
 def steps_of(sol: Solution) -> int:
     """The number of steps of the run, at least 1."""
-    return max(1, round(float(sol.t[-1] - sol.t[0]) / float(sol.step)))
+    return max(1, round(float(sol.axis[-1] - sol.axis[0]) / float(sol.step)))
 
 
-def sampled_terms(sol: Solution, terms: Callable) -> np.ndarray:
-    """terms(system, row, params) at a few rows."""
+def sampled(sol: Solution, function: eqx.Partial) -> np.ndarray:
+    """`function`(row, params) at a few rows, (B, rows, …)."""
     rows = spread(sol.rows, SAMPLED_ROWS)
-    lead = (slice(None),) * (sol.batch is not None)
-    nodes = {k: np.asarray(a)[(*lead, rows)] for k, a in sol.fields.items() if sol.field_info[k].place == "node"}
-    return over_rows(eqx.Partial(terms, sol.system), sol, (times_at(sol, rows), nodes))
+    items = {k: np.take(np.asarray(a), rows, axis=int(sol.batch is not None)) for k, a in _nodes(sol).items()}
+    return over_rows(function, sol, ({**items, "t": times_at(sol, rows)},))
+
+
+def sampled_terms(sol: Solution, function: eqx.Partial) -> np.ndarray:
+    """Σ |∂f/∂x_i| |x_i| of each entry of f = `function`(row, params) over the numbers x_i of a row, at a few rows (B, rows, …):
+    what roundings of the rows do to f, in units of ε.
+
+    By differences, which a scale is content with: f needs no derivative, and what is known of f at all rows is enough.
+    """
+    nodes = _nodes(sol)
+    axis, count = int(sol.batch is not None), 1 + sum(math.prod(sol.field_info[k].shape) for k in nodes)
+    rows = spread(sol.rows, min(SAMPLED_ROWS, max(4, SAMPLED_ENTRIES // (count * (sol.batch or 1)))))
+    items, first = {"t": np.repeat(times_at(sol, rows), count, axis=axis)}, 1
+    for name, values in nodes.items():
+        many = np.repeat(np.take(values, rows, axis=axis), count, axis=axis).astype(float)
+        many = many.reshape(*many.shape[:axis], len(rows), count, -1)
+        for i in range(many.shape[-1]):
+            many[..., first + i, i] *= 1.0 + DISTURBANCE
+        first += many.shape[-1]
+        items[name] = many.reshape(*many.shape[:axis], -1, *values.shape[axis + 1 :])
+    found = over_rows(function, sol, (items,))
+    found = found.reshape(len(found), len(rows), count, -1)
+    return np.sum(np.abs(found[:, :, 1:] - found[:, :, :1]), axis=2) / DISTURBANCE
+
+
+def _nodes(sol: Solution) -> dict[str, np.ndarray]:
+    return {k: np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"}

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from dirax.diagnostics.action import stationary_action
 from dirax.diagnostics.casimir_lines import casimir_lines
 from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
@@ -11,6 +12,7 @@ from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum
 from dirax.diagnostics.replay_lines import replayed
 from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line, Report
 from dirax.diagnostics.residuals import residual_size
+from dirax.diagnostics.reversal_line import taken_back
 from dirax.diagnostics.structure_lines import membership, structure_of, symplecticity
 from dirax.diagnostics.verdicts import steps_of
 from dirax.engines.stopping import STALLED
@@ -29,7 +31,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     (absolute Jacobian times |q|). The tolerances are roundoff's:
 
     - steps replayed: every saved number of every row, of any scheme and of compositions, against the step from the row before,
-      taken again in NumPy: 32 ε of what it would be off if every operation were; of very long runs as many rows as ten seconds
+      taken again in NumPy: 32 ε of what it would be off if every operation were; of long runs as many rows as a second or two
       are enough for, and the line says so;
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
@@ -42,6 +44,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
       walk gives √steps of that);
     - symplecticity of one step (of Euler–Poincaré and Lie–Poisson systems: whether it is a Poisson map), and φ*Ω = Ω + dβ
       where there are constraints ([PY] §3.2): 32 ε · 2n · the condition number of the step's equations, at a few steps;
+    - variable steps: a step and the step back, 32 ε of what it would be off if every operation were;
     - runs with impacts: energy and momentum maps over the run, all else in the longest flight between two of them;
     - systems with ports ([BLM] §7.1): the power balance of every step and, with a discrete gradient, the books over the run,
       H − H(0) less what was supplied plus what was dissipated: 32 ε, however many steps;
@@ -74,6 +77,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         impacts,
         _replayed(flight, whole, tolerance),
         *membership(whole, structure, tolerance),
+        stationary_action(whole, structure, tolerance),
         constraint(whole, structure, tolerance),
         hidden_constraint(whole, tolerance),
         final_manifold(whole, tolerance),
@@ -83,6 +87,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         *quotient_momentum(sol, tolerance),
         *casimir_lines(sol, tolerance),
         symplecticity(whole, tolerance),
+        taken_back(sol, tolerance),
     ]
     return Report(_title(sol), tuple(line for line in lines if line is not None))
 
@@ -97,7 +102,7 @@ def _completion(sol: Solution) -> Line:
     ok, messages = np.atleast_1d(sol.ok), np.atleast_1d(sol.message)
     residual = float(np.max(sol.stats["max_residual"])) if "max_residual" in sol.stats else None
     if np.all(ok):
-        text = f"every step was solved, up to t = {float(sol.t[-1]):.6g}"
+        text = f"every step was solved, up to t = {sol.time_of(-1):.6g}"
         if residual is None or (size := residual_size(sol)) is None:
             return Line("steps solved", residual, None, OK, text)
         text = f"{text}; the largest residual, {residual:.2g}, relative to its terms"

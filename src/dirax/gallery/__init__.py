@@ -57,6 +57,12 @@ _MODULES = {
     "rattleback": "rattleback",
     "euler-disk": "euler_disk",
     "flyball-governor": "flyball_governor",
+    "n-four-bar": "n_four_bar",
+    "car-axis": "car_axis",
+    "slider-crank": "slider_crank",
+    "snakeboard-gait": "snakeboard_gait",
+    "trikke": "trikke",
+    "n-trailer": "n_trailer",
 }
 """Name → the module here that defines `EXAMPLE`; a new system is a file and a line."""
 

@@ -52,6 +52,11 @@ def straight(speed: float) -> dict[str, np.ndarray]:
     return MODEL.state({"frame.z": REAR}, {"frame.x": speed, **turning})
 
 
+def circling(steer: float, roll: float, rate: float) -> dict[str, np.ndarray]:
+    """With these angles of handlebar and frame (rad), turning at a rate (rad/s): a circular motion where nothing accelerates."""
+    return MODEL.state({"steer": steer, "frame.roll": roll}, {"frame.yaw": rate, "frame.roll": 0.0, "steer": 0.0})
+
+
 def moved(k: int):
     """The generator of translations in one coordinate."""
     return lambda q: jnp.zeros(9).at[k].set(1.0)

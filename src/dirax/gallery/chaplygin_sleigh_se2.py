@@ -8,13 +8,17 @@ x = μ = (m u, m (w + a ω), m a (w + a ω) + I ω). u = c tanh s, κω = ± c s
 `dx.reconstruct` gives the motion (cos φ, sin φ, x, y) in the plane.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
+from dirax.gallery import chaplygin_sleigh
 from dirax.gallery.chaplygin_sleigh import PARAMS
 from dirax.gallery.example import Coordinate, Example
 from dirax.geometry.lie_groups import SE2
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.schemes.euler_poincare import DiscreteEulerPoincare
+from dirax.show.scene import Scene
 
 
 def lagrangian(xi, params):
@@ -35,6 +39,22 @@ def exact(t, x, params=None) -> np.ndarray:
     return np.stack([m * c * np.tanh(s), m * a * turns, m * kappa**2 * turns], axis=1)
 
 
+def motion(rows, params):
+    """The sleigh in the plane, q = (x, y, φ), by integration of ξ from the origin."""
+    m, a, inertia = (float(params[name]) for name in ("m", "a", "I"))
+    middle, step = (rows["x"][1:] + rows["x"][:-1]) / 2, np.diff(rows["t"])
+    turned = step * middle[:, 2] / (m * a**2 + inertia)
+    heading = np.concatenate([[0.0], np.cumsum(turned)])
+    along, half = step * middle[:, 0] / m, heading[:-1] + turned / 2
+    moved = np.cumsum(along[:, None] * np.stack([np.cos(half), np.sin(half)], axis=1), axis=0)
+    return {"q": np.column_stack([np.concatenate([np.zeros((1, 2)), moved]), heading])}
+
+
+def scene() -> Scene:
+    """The same sleigh on its plane."""
+    return replace(chaplygin_sleigh.scene(), fields=motion)
+
+
 EXAMPLE = Example(
     name="chaplygin-sleigh-se2",
     title="Chaplygin sleigh on SE(2)",
@@ -47,4 +67,5 @@ EXAMPLE = Example(
     steps=1000,
     coordinates=(Coordinate("μ1"), Coordinate("μ2"), Coordinate("μφ")),
     exact=exact,
+    scene=scene(),
 )

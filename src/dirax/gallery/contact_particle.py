@@ -17,6 +17,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, axes, box, point
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 PARAMS = {"beta": 0.0, "kappa": 0.0}
@@ -40,6 +41,13 @@ def one_forms(q):
     return jnp.stack([-q[1], jnp.zeros(()), jnp.ones(())])[None]
 
 
+def scene() -> Scene:
+    """The particle, and the plane of admissible velocities that it carries."""
+    place = lambda q: q
+    tilt = lambda q: jnp.stack([1 + jnp.sqrt(1 + q[1] ** 2), 0.0 * q[0], -q[1], 0.0 * q[2]])  # of the normal to (−y, 0, 1)
+    return Scene((axes(), box(place, tilt, size=(0.8, 0.8, 0.02), colour=2), point(place, trail=True)))
+
+
 EXAMPLE = Example(
     name="contact-particle",
     title="Particle on a contact distribution",
@@ -51,4 +59,5 @@ EXAMPLE = Example(
     step=0.05,
     steps=2000,
     coordinates=(Coordinate("x"), Coordinate("y"), Coordinate("z")),
+    scene=scene(),
 )

@@ -9,6 +9,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_gradient import DiscreteGradient
+from dirax.show.scene import Scene, arrow, box, disk, rod, turn
 from dirax.systems.interconnection import interconnect
 from dirax.systems.port_hamiltonian import PortHamiltonian
 
@@ -39,6 +40,22 @@ def exact(t, x, params=None) -> np.ndarray:
     return rest + (np.exp(np.outer(np.atleast_1d(t), values)) * part @ vectors.T).real
 
 
+def motion(rows, params):
+    """The angle of the rotor, by integration of ω = p/J, and the current."""
+    speed = rows["x"][:, 1] / float(params["J"])
+    angle = np.concatenate([[0.0], np.cumsum(np.diff(rows["t"]) * (speed[1:] + speed[:-1]) / 2)])
+    return {"angle": angle[:, None], "current": rows["x"][:, :1] / float(params["L"])}
+
+
+def scene() -> Scene:
+    """The rotor between two magnets, and the current as an arrow along its shaft."""
+    shaft = rod((0.0, 0.0, -0.5), (0.0, 0.0, 0.5), radius=0.03)
+    rotor = disk((0.0, 0.0, 0.0), lambda angle: turn([0, 0, 1], angle[0]), radius=0.6, thickness=0.3)
+    magnets = (box((side, 0.0, 0.0), size=(0.3, 0.9, 0.5), colour=k) for k, side in enumerate((-0.95, 0.95), start=1))
+    current = arrow((0.0, 0.0, 0.5), lambda current: jnp.stack([0.0 * current[0], 0.0 * current[0], current[0]]), colour=3)
+    return Scene((shaft, rotor, *magnets, current), fields=motion)
+
+
 EXAMPLE = Example(
     name="dc-motor",
     title="Direct-current motor",
@@ -53,4 +70,5 @@ EXAMPLE = Example(
     steps=500,
     coordinates=(Coordinate("Φ"), Coordinate("p")),
     exact=exact,
+    scene=scene(),
 )

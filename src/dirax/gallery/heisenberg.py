@@ -12,6 +12,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.lagrange_dirac import PlusLagrangeDirac
+from dirax.show.scene import Scene, axes, path, point, rod
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 TWO_POINTS = {"q0": np.array([1.0, 0.0, 0.1]), "q1": np.array([1.05, 0.1, 0.0])}
@@ -33,6 +34,12 @@ def exact(t, q, v, params=None) -> np.ndarray:
     return np.asarray(q) + np.atleast_1d(np.asarray(t, float))[:, None] * np.asarray(v)
 
 
+def scene() -> Scene:
+    """The straight line; the particle falls by twice the area that the rod from the axis to the point below it sweeps."""
+    place, below = (lambda q: q), (lambda q: q * jnp.array([1.0, 1.0, 0.0]))
+    return Scene((axes(), path(place), path(below), rod((0.0, 0.0, 0.0), below), rod(below, place), point(place, trail=True)))
+
+
 EXAMPLE = Example(
     name="heisenberg",
     title="Heisenberg system",
@@ -44,4 +51,5 @@ EXAMPLE = Example(
     steps=100_000,
     coordinates=(Coordinate("x"), Coordinate("y"), Coordinate("z")),
     exact=exact,
+    scene=scene(),
 )

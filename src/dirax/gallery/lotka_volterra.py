@@ -12,6 +12,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, path, plane, point, rod
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 
 PARAMS = {"a": 1.0, "b": 1.0, "c": 1.0, "d": 1.0}
@@ -27,6 +28,14 @@ def hamiltonian(q, params):
     return params["c"] * q[0] - params["d"] * jnp.log(q[0]) + params["b"] * q[1] - params["a"] * jnp.log(q[1])
 
 
+def scene() -> Scene:
+    """The two populations as rods along the axes, and the point that they make."""
+    both = lambda q: q
+    prey, predator = (lambda q: q * jnp.array([1.0, 0.0])), (lambda q: q * jnp.array([0.0, 1.0]))
+    rods = rod((0.0, 0.0), prey, radius=0.03, colour=1), rod((0.0, 0.0), predator, radius=0.03, colour=2)
+    return Scene((plane(), path(both), *rods, point(both, trail=True)), view="tilted")
+
+
 EXAMPLE = Example(
     name="lotka-volterra",
     title="Lotka–Volterra",
@@ -38,4 +47,5 @@ EXAMPLE = Example(
     step=0.05,
     steps=2000,
     coordinates=(Coordinate("x"), Coordinate("y")),
+    scene=scene(),
 )

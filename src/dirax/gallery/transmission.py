@@ -14,6 +14,7 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.schemes.discrete_dirac import DiscreteDirac
+from dirax.show.scene import Scene, box, plane, point, rod, spring
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 PARAMS = {"beta": 0.0}
@@ -33,6 +34,18 @@ def one_forms(q):
     return jnp.stack([-jnp.sin(q[2]), jnp.ones(()), jnp.zeros(())])[None]
 
 
+def scene() -> Scene:
+    """The pendulum, and the oscillators x and y side by side, each on a spring."""
+    bob = lambda q: jnp.stack([jnp.sin(q[2]), 0.0 * q[2], 1.0 - jnp.cos(q[2])])
+    parts = [rod((0.0, 0.0, 1.0), bob), point(bob, radius=0.1, trail=True)]
+    for number, at in enumerate((0.7, 1.4)):
+        mass = lambda q, i=number, at=at: jnp.stack([q[i], at + 0.0 * q[i], 0.15 + 0.0 * q[i]])
+        wall = (-3.0, at, 0.15)
+        parts += [box(wall, size=(0.06, 0.4, 0.3), colour="ink"), spring(wall, mass, radius=0.08)]
+        parts += [box(mass, size=(0.3, 0.3, 0.3), colour=number + 1)]
+    return Scene((plane(), *parts))
+
+
 EXAMPLE = Example(
     name="transmission",
     title="Transmission driven by a pendulum",
@@ -44,4 +57,5 @@ EXAMPLE = Example(
     step=0.05,
     steps=2000,
     coordinates=(Coordinate("x"), Coordinate("y"), Coordinate("ξ", "rad")),
+    scene=scene(),
 )

@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
+from dirax.gallery.heavy_top import along
 from dirax.geometry.lie_groups import SE3
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.schemes.euler_poincare import DiscreteEulerPoincare
+from dirax.show.scene import Scene, arrow, attitudes, axes, box, point, rod
 
 INERTIA = np.array([1.0, 2.0, 2.5, 1.0, 1.5, 2.0])
 """Masses and moments of inertia, the fluid's share included, in the order of ξ."""
@@ -24,6 +26,25 @@ PARAMS = {"mgl": 0.5}
 def lagrangian(xi, gamma, params):
     """½ V·M V + ½ Ω·I Ω + m g l Γ_3, a scalar."""
     return xi @ (jnp.asarray(INERTIA) * xi) / 2 + params["mgl"] * gamma[2]
+
+
+def motion(rows, params):
+    """The attitude: its heading by integration of Ω = I⁻¹Π, its tilt that of Γ, which points down."""
+    return {"attitude": attitudes(rows["t"], rows["x"][:, 3:6] / INERTIA[3:], upright=-rows["x"][:, 6:])}
+
+
+def scene() -> Scene:
+    """The vehicle, as one sees it who travels with it, its weight below, and its velocity with a trail."""
+    weight = lambda attitude: along(attitude, jnp.array([0.0, 0.0, 0.5]))
+    velocity = lambda attitude, x: along(attitude, x[:3] / INERTIA[:3])
+    parts = (
+        box([0.0, 0.0, 0.0], lambda attitude: attitude, size=(1.4, 0.8, 0.4)),
+        rod([0.0, 0.0, 0.0], weight),
+        point(weight, radius=0.1, colour=1),
+        arrow([0.0, 0.0, 0.0], velocity, scale=1.2),
+        point(lambda attitude, x: 1.2 * velocity(attitude, x), radius=0.03, trail=True),
+    )
+    return Scene((axes(length=0.5), *parts), fields=motion)
 
 
 EXAMPLE = Example(
@@ -38,4 +59,5 @@ EXAMPLE = Example(
     steps=2000,
     coordinates=tuple(Coordinate(name) for name in ("P1", "P2", "P3", "Π1", "Π2", "Π3", "Γ1", "Γ2", "Γ3")),
     plane=(6, 7),
+    scene=scene(),
 )

@@ -16,6 +16,8 @@ from dirax.geometry.linear import LinearDirac
 from dirax.geometry.structures import canonical_two_form
 from dirax.geometry.subspaces import AnyArray
 from dirax.numerics.tolerances import ONE_FORM_RANK, STRUCTURE_DEFECT
+from dirax.program.linear_solves import pseudo_inverse
+from dirax.program.tracing import jacobian
 from dirax.program.user_functions import UserFunction, is_traced
 
 Vector = Float[Array, " n"]
@@ -32,6 +34,18 @@ def annihilator_projector(one_forms: Float[Array, "m n"]) -> Float[Array, "n n"]
     if one_forms.shape[0] == 0:
         return jnp.zeros((one_forms.shape[1], one_forms.shape[1]))
     return jnp.linalg.pinv(one_forms, rtol=ONE_FORM_RANK) @ one_forms
+
+
+def projector_slope(one_forms: Callable, q: Float[Array, " n"], covector: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """∂(P(q)α)_i/∂q_j of P(q), the `annihilator_projector` of the one-forms W(q) (m, n), for a covector α that stays:
+    dP = W⁺ dW (1 − P) + (W⁺ dW (1 − P))ᵀ where the rank of W is constant (Golub, Pereyra 1973, Lemma 4.1)."""
+    w = one_forms(q)
+    if w.shape[0] == 0:
+        return jnp.zeros((q.shape[0], q.shape[0]))
+    inverse, moved = pseudo_inverse(w, ONE_FORM_RANK), jacobian(one_forms)(q)  # (n, m); (m, n, n), by q last
+    across = jnp.eye(q.shape[0]) - inverse @ w
+    first = inverse @ jnp.einsum("mij,i->mj", moved, across @ covector)
+    return first + across @ jnp.einsum("mij,m->ij", moved, inverse.T @ covector)
 
 
 class FiniteDifferenceDirac(eqx.Module):

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from dirax.geometry.squared_angles import Scalar, norm
 from dirax.numerics.tolerances import POINT_DEFECT
 from dirax.program.tracing import value_along
-from dirax.program.user_functions import evaluated, is_traced
+from dirax.program.user_functions import evaluated, is_traced, note_values_matter
 
 Vector: TypeAlias = Float[Array, " N"]
 
@@ -71,6 +71,7 @@ class AbstractManifold(eqx.Module):
         self._check_shape(x, name)
         if is_traced(x):
             return
+        note_values_matter()
         defect = evaluated(self.defect, x)
         if not is_traced(defect):  # a constant inside a traced function
             self._refuse_off(float(defect), name, tolerance)
@@ -85,6 +86,7 @@ class AbstractManifold(eqx.Module):
         self._check_shape(v, name)
         if is_traced(x, v):
             return
+        note_values_matter()
         off, defect, size = evaluated(self._defects, x, v)
         if is_traced(off, defect, size):
             return

@@ -29,12 +29,12 @@ def damped_step(update: Callable, u: Any, units: Any, xp: ModuleType = np) -> tu
     equations nor those of the unknowns matter, and the domain of the equations is not left.
 
     `update(u)` (…, k) is A⁻¹ r(u), with one A for all u; `units` (…, k) those of the unknowns. With NumPy, leading axes hold
-    equations side by side; where no shorter step is an improvement, u stays.
+    equations side by side; where no shorter step above the roundoff of u is an improvement, u stays.
     """
     size = lambda v: xp.max(xp.abs(v) / units, axis=-1)
     change = update(u)
-    here = size(change)
-    at_floor = here <= AT_FLOOR * size(u)
+    here, floor = size(change), AT_FLOOR * size(u)
+    at_floor = here <= floor
 
     def improves(fraction):
         following = update(u - fraction[..., None] * change)
@@ -46,7 +46,7 @@ def damped_step(update: Callable, u: Any, units: Any, xp: ModuleType = np) -> tu
         fraction = xp.where(searching, fraction / 2.0, fraction)
         return fraction, better | searching & improves(fraction)
 
-    unfinished = lambda carry: ~carry[1] & (carry[0] > SHORTEST)
+    unfinished = lambda carry: ~carry[1] & (carry[0] > SHORTEST) & (carry[0] * here > floor)
     whole = xp.ones(here.shape)
     with np.errstate(all="ignore"):
         better = at_floor if xp is np and np.all(at_floor) else at_floor | improves(whole)

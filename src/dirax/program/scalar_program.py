@@ -81,10 +81,27 @@ class ScalarProgram:
         known = Values(self.graph, len(leaves[0]))
         for nodes, leaf in zip(self.inputs, leaves, strict=True):
             known.bind(nodes, leaf)
+        orders = iter(self._orders)
         for step in self.opaque:
-            for nodes, array in zip(step.results, step.function([known.read(o) for o in step.operands]), strict=True):
+            operands = [known.read(nodes, next(orders)) for nodes in step.operands]
+            for nodes, array in zip(step.results, step.function(operands), strict=True):
                 known.bind(nodes, array)
-        return [known.read(nodes) for nodes in self.results]
+        return [known.read(nodes, next(orders)) for nodes in self.results]
+
+    @functools.cached_property
+    def _orders(self) -> list[list[int]]:
+        """What is left to compute, in order, for the operands of each opaque computation, and then for each result."""
+        flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
+        known, orders = set(flat(self.inputs)), []
+        for step in self.opaque:
+            orders += [self._next(nodes, known) for nodes in step.operands]
+            known.update(flat(step.results))
+        return orders + [self._next(nodes, known) for nodes in self.results]
+
+    def _next(self, nodes: Nodes, known: set[int]) -> list[int]:
+        order = self.graph.reachable(nodes.ravel().tolist(), known)
+        known.update(order)
+        return order
 
     @functools.cached_property
     def in_floats(self) -> Floats | None:

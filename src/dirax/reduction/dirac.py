@@ -82,7 +82,7 @@ class ReducedGeneratingFunctionDirac(eqx.Module):
         return self._image((p0, q1), (-q0, -p1))
 
     def membership_defect(self, pair: Six, covector: Six) -> Float[Array, " four_n"]:
-        """The covector − [Ω̂♭_{d±}](pair), side by side: zero iff (pair, covector) ∈ [D̂^{d±}] ([RL] (3.12), (3.13))."""
+        """The covector − Ω̂♭_{d±}(pair), side by side: zero iff (pair, covector) ∈ [D̂^{d±}] ([RL] (3.12), (3.13))."""
         if len(covector) != 6:
             raise ValueError(f"a covector is a tuple of six arrays, but {len(covector)} were given.")
         return jnp.concatenate([jnp.asarray(a, float) - b for a, b in zip(covector, self.flat(pair), strict=True)])

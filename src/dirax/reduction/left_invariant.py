@@ -54,6 +54,8 @@ def _refuse_other_systems(system: Any, group: AbstractLieGroup) -> None:
             f"elements, but a {type(system).__name__} was given."
         )
     more = {"forces": system.forces, "affine": system.affine}
+    if isinstance(system, ManifoldLagrangian):
+        more["holonomic constraints"] = system.holonomic
     given = [n for n, function in more.items() if function is not None] + ["explicit time"] * system.depends_on_time
     if given:
         raise ValueError(

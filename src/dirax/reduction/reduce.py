@@ -19,8 +19,9 @@ def reduce(system: AbstractSystem, connection: AbstractLieGroup, params: Any = N
 def reduce(system: Any, connection: Any, params: Any = None) -> ReducedLagrangeDirac | EulerPoincare:
     """The system on the quotient by a symmetry; run it with the same q=, v= as `system`, and undo it by `dx.reconstruct`.
 
-    With a connection, the quotient of a `dx.LagrangeDirac` or `dx.NonholonomicMechanics` system by the translations of
-    `connection.fibre` ([RL] §4); that these leave it alone is checked at the start of a run.
+    With a connection, the quotient of a `dx.LagrangeDirac` or `dx.NonholonomicMechanics` system, or of a
+    `dx.ManifoldLagrangian` on R^n, a torus or a product of these, by the translations of `connection.fibre` ([RL] §4, §6); that
+    these leave it alone is checked at the start of a run. Of one on another manifold it takes `dx.in_coordinates`.
 
         reduced = dx.reduce(system, dx.LinearConnection(fibre=[0]))
         sol = dx.reconstruct(dx.simulate(reduced, dx.PlusLagrangeDirac("midpoint"), q=q, v=v, step=0.01, steps=100))
@@ -48,8 +49,9 @@ def reduce(system: Any, connection: Any, params: Any = None) -> ReducedLagrangeD
         return reduced_by_left_translations(system, connection, params)
     reduced = isinstance(system, ReducedLagrangeDirac)
     lagrangian = system.system if reduced else system.lagrangian_form() if isinstance(system, AbstractSystem) else None
+    on_manifold = isinstance(system, AbstractSystem) and system.manifold_form() is not None
+    lagrangian = system.manifold_form().flat_form() if on_manifold else lagrangian
     if lagrangian is None:
-        on_manifold = isinstance(system, AbstractSystem) and system.manifold_form() is not None
         way = ": write it in coordinates of its manifold, dx.in_coordinates." if on_manifold else "."
         raise TypeError(f"dx.reduce takes a dx.LagrangeDirac system, but one of type {type(system).__name__} was given{way}")
     if not isinstance(connection, AbstractConnection):

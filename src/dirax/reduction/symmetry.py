@@ -145,14 +145,14 @@ def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, para
         there, _, derivative = pulled_back(g, t, q, v)
         moved = affine_rows(constraints, t, there, params)
         moved = jnp.hstack([moved[:, : q.size] @ derivative, moved[:, q.size :]])
-        return off_span(moved, affine_rows(constraints, t, q, params))
+        return moved if _sees_multipliers(system) else off_span(moved, affine_rows(constraints, t, q, params))
 
     def holonomic(g, t, q, v):
         return constraints.position_defect(t, action(g, q), params)
 
     def forces(g, t, q, v):
         there, rate, derivative = pulled_back(g, t, q, v)
-        return system.forces(t, there, rate, params) @ derivative
+        return forces_at(system, t, there, rate, params) @ derivative
 
     functions = {"lagrangian": lagrangian}
     for moved in (one_forms, holonomic, forces):
@@ -170,6 +170,19 @@ def affine_rows(constraints: Constraints, t: Any, q: Float[Array, " n"], params:
 def off_span(moved: Float[Array, "m r"], fixed: Float[Array, "m r"]) -> Float[Array, "m r"]:
     """The rows `moved` less their parts in the span of the rows `fixed`."""
     return moved - moved @ jnp.linalg.pinv(fixed) @ fixed
+
+
+def _sees_multipliers(system: Any) -> bool:
+    """Whether the forces depend on the multipliers, and so on the one-forms themselves, not on their span alone."""
+    return getattr(system, "forces_see_multipliers", False)
+
+
+def forces_at(system: Any, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, "k n"]:
+    """The forces, as one row; where they see the multipliers, one row for random ones and one for their opposites."""
+    if not _sees_multipliers(system):
+        return system.forces(t, q, v, params)[None]
+    random = np.random.default_rng(2).uniform(0.2, 1.0, sum(system.constraints.sizes(q, params)))
+    return jnp.stack([system.forces_at(jnp.asarray(sign * random))(t, q, v, params) for sign in (1, -1)])
 
 
 def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: Any, v: Any) -> Invariance:
@@ -202,7 +215,7 @@ def translation_symmetries(
     system: Any, q: Any, v: Any = None, params: Any = None, samples: int = 64, radius: float = 1.0
 ) -> np.ndarray:
     """Directions d, the rows of a (k, n) matrix with orthonormal rows, in which neither L nor constraints nor forces change
-    (of the one-forms, their span).
+    (of the one-forms, their span; forces that see the multipliers are those of fixed ones, and then the one-forms themselves).
 
     Found from ∂L/∂q at `samples` random points within `radius` of (q, v); `cyclic_coordinates` are those along the axes.
     """
@@ -218,11 +231,12 @@ def translation_symmetries(
         along = [lambda q: system.lagrangian.at(t, q, v, params)]
         if system.one_forms is not None:
             fixed = affine_rows(constraints, t, q, params)
-            along.append(lambda q: off_span(affine_rows(constraints, t, q, params), fixed))
+            rows = lambda q: affine_rows(constraints, t, q, params)
+            along.append(rows if _sees_multipliers(system) else lambda q: off_span(rows(q), fixed))
         if system.holonomic is not None:
             along.append(lambda q: constraints.position_defect(t, q, params))
         if system.forces is not None:
-            along.append(lambda q: system.forces(t, q, v, params))
+            along.append(lambda q: forces_at(system, t, q, v, params))
         inside = jnp.full((1, q.size), along[0](q))  # not finite where L is not
         return jnp.concatenate([*(jnp.reshape(jax.jacfwd(function)(q), (-1, q.size)) for function in along), inside])
 

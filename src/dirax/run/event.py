@@ -12,8 +12,8 @@ KNOWN = ("t", "q", "v", "p", "x", "params")
 """What a function of an event may be given, by the names of its arguments."""
 
 TRACED = (
-    "events= are not looked for under jax.grad, jit and vmap, where how many there are cannot depend on values: run without "
-    "them, and use sol.at(t)."
+    "dx.Event is not looked for under jax.grad, jit and vmap, where how many there are cannot depend on values: run without "
+    "it, and use sol.at(t); dx.Impact is."
 )
 
 

@@ -10,7 +10,8 @@ from dirax.program.user_functions import is_traced
 from dirax.run.event import TRACED, Event
 from dirax.run.event_search import EventSearch
 from dirax.run.impact import Impact
-from dirax.run.impact_run import fly_all
+from dirax.run.impact_run import check_walls, fly_all
+from dirax.run.impact_traced import fly_traced
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
 from dirax.solution.solution import Solution
@@ -129,10 +130,11 @@ def ended_at(sol: Solution, endings: np.ndarray) -> Solution:
     t = np.asarray(sol.t)
     if sol.batch is None:
         return sol[: int(np.searchsorted(t, endings[0], side="right"))]
+    t = np.broadcast_to(t, (sol.batch, sol.rows))
     fields = {}
     for name, values in sol.fields.items():
-        rows = t if sol.field_info[name].place == "node" else t[1:]
-        after = rows[None, :] > endings[:, None]
+        rows = t if sol.field_info[name].place == "node" else t[:, 1:]
+        after = rows > endings[:, None]
         fields[name] = np.where(after.reshape(*after.shape, *(1,) * (values.ndim - 2)), np.nan, values)
     return sol.replace(fields=fields)
 
@@ -145,8 +147,8 @@ def thinned(sol: Solution, every: int) -> Solution:
     rows = np.unique([*range(first), *range(first, sol.rows, every), sol.rows - 1])
     lead = (slice(None),) * (sol.batch is not None)
     pick = lambda name, a: a[(*lead, rows if sol.field_info[name].place == "node" else rows[:-1])]
-    fields = {name: pick(name, np.asarray(a)) for name, a in sol.fields.items()}
-    return sol.replace(t=np.asarray(sol.t)[rows], fields=fields, save_every=every, derived={})
+    fields = {name: pick(name, a) for name, a in sol.fields.items()}
+    return sol.replace(t=sol.axis[rows], fields=fields, save_every=every, derived={})
 
 
 def run_with_events(
@@ -154,15 +156,25 @@ def run_with_events(
 ) -> Solution:
     """A run whose settings have events."""
     plain = replace(settings, events=())
+    every = min(save_every, max(1, steps - int(case.two_points)))
     walls = [i for i, event in enumerate(settings.events) if isinstance(event, Impact)]
 
     def run(count: int) -> Solution:
         if not walls:
             return carry_out(plain, case, count, 1, progress, kind, entered)
         begun = begin(plain, case, count, 1, 1)
-        if begun.traced:
-            raise ValueError(TRACED)
-        return fly_all(plain, begun, tuple(settings.events[i] for i in walls), tuple(walls))
+        own = tuple(settings.events[i] for i in walls)
+        check_walls(plain.system, begun.problem, own, tuple(walls))
+        return (fly_traced if begun.traced else fly_all)(plain, begun, own, tuple(walls))
 
-    every = min(save_every, max(1, steps - int(case.two_points)))
-    return with_events(run, settings.events, steps, every, progress, case.traced or is_traced(case.data, case.params))
+    traced = case.traced or is_traced(case.data, case.params)
+    if len(walls) == len(settings.events):
+        sol = run(steps)
+        if is_traced(sol.t, sol.fields):
+            found = sol.events
+            sol = thinned(sol, every)
+            sol.events = sol.impacts = found
+            return sol
+        if not traced:
+            return with_events(lambda _: sol, settings.events, steps, every, progress, False)
+    return with_events(run, settings.events, steps, every, progress, traced)

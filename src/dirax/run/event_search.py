@@ -43,7 +43,7 @@ class EventSearch:
     def value(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> np.ndarray:
         """The function at base + x, in steps. Raises `ValueError` where it is not finite."""
         numbers, theta = self._place(lanes, base, x)
-        return self._of(lanes, self.dense.inside(lanes, numbers, theta), self.dense.time_at(numbers, theta))
+        return self._of(lanes, self.dense.inside(lanes, numbers, theta), self.dense.time_at(lanes, numbers, theta))
 
     def _place(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The number of the step in which base + x lies, and where in it; the end of the last step belongs to that step."""
@@ -56,7 +56,7 @@ class EventSearch:
         fields = {name: self.dense.saved[name][lanes, numbers] for name in self.dense.nodes}
         if "v" in self.event.arguments:
             fields["v"] = self.dense.velocities[lanes, numbers]
-        return self._of(lanes, fields, self.dense.time_at(numbers, np.zeros(len(numbers))))
+        return self._of(lanes, fields, self.dense.time_at(lanes, numbers, np.zeros(len(numbers))))
 
     def _of(self, lanes: np.ndarray, fields: dict[str, np.ndarray], t: np.ndarray) -> np.ndarray:
         event, dense, number = self.event, self.dense, self.number
@@ -147,7 +147,7 @@ class EventSearch:
         numbers, theta = self._place(lanes, base, x)
         inside = dense.inside(lanes, numbers, theta)
         fields: dict[str, Any] = {name: inside.get(name, dense.of_rows(name, lanes, numbers)) for name in dense.nodes}
-        t = dense.time_at(numbers, theta)
+        t = dense.time_at(lanes, numbers, theta)
         order = np.lexsort((t, lanes))
         index, found = np.full(len(t), self.number), {name: array[order] for name, array in fields.items()}
         return Events(t[order], index, direction[asked][order], lanes[order], found)

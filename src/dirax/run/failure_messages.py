@@ -14,6 +14,7 @@ from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import balanced_condition, balanced_inverse
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
 from dirax.program.roots import FEWEST_SPARSE, sparse_equations
+from dirax.schemes.step import CLOCK
 
 SMALLER = "a smaller step may help"
 
@@ -29,7 +30,10 @@ def explain(problem: Problem, outcome: Outcome, lane: int, kept: int | None = No
     p, completed = problem, int(outcome.completed[lane])
     time_of = lambda steps: p.t0 + (p.first_step + steps) * p.h
     kept = completed if kept is None else kept
-    rows = f"kept up to step {p.first_step + kept} (t = {time_of(kept):.6g})"
+    if CLOCK in (layout := p.equation.stages[0][0].state_layout):  # steps have lengths of their own
+        reached = float(np.asarray(outcome.last_state[lane])[layout.place(CLOCK)][0])
+        time_of = lambda steps: reached if steps == completed else np.nan
+    rows = f"kept up to step {p.first_step + kept}" + f" (t = {time_of(kept):.6g})" * bool(np.isfinite(time_of(kept)))
     if int(outcome.status[lane]) == OK:
         return f"interrupted by the user; {rows}."
     at = time_of(completed)

@@ -271,7 +271,6 @@ class Flight:
 def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> Solution:
     """The Solution of a problem with impacts, of which every row is saved. Raises `TypeError` and `ValueError`."""
     p, system, started = begun.problem, settings.system, time.perf_counter()
-    _check(system, p, walls, numbers)
     lanes = p.batch or 1
     one = lambda a, lane: np.asarray(a)[lane] if p.batch is not None else np.asarray(a)
     params = lambda lane: jax.tree.map(lambda leaf: np.asarray(leaf)[lane], p.params) if p.batch_params else p.params
@@ -337,7 +336,8 @@ def _functions(system: Any, p: Problem, walls: tuple[Impact, ...]) -> tuple[Numb
     return Numbers(gaps, [t, q], p.params, "gaps", *own), jumps
 
 
-def _check(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> None:
+def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> None:
+    """Raise `TypeError` and `ValueError` for walls that these steps cannot bounce off, and gaps that are none."""
     stages = p.equation.stages
     layout = stages[0][0].state_layout
     if system.lagrangian_form() is None or len(stages) > 1 or set(layout) - {"q", "p", "work"} or not {"q", "p"} <= set(layout):

@@ -1,14 +1,16 @@
 """Constraints that follow from others: found where a run begins, left out of its equations, and reported."""
 
+from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dirax.numerics.ranks import rank_of_equations
 from dirax.numerics.tolerances import CONSTRAINT_DEFECT
 from dirax.program.compiled import compiled
+from dirax.program.evaluation.functions import at_values
+from dirax.program.memo import Same
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
 
@@ -58,7 +60,10 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
             f"initial data{where}: its row of [W; ∂g/∂q] is zero there. Leave it out, or start elsewhere."
         )
     q = jnp.asarray(system.point(data))
-    near, left, terms = map(np.asarray, _nearby(system, q, params, jnp.asarray(t0, float)))
+    values = np.asarray(q, float), params, np.asarray(t0, float)
+    nearby = _Nearby(Same(system))
+    found = at_values(nearby, values)
+    near, left, terms = map(np.asarray, compiled(nearby)(*values) if found is None else found[0])
     bad = np.abs(left) > CONSTRAINT_DEFECT * terms
     if np.any(bad):
         worst = np.where(bad, left, 0.0)
@@ -76,16 +81,19 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
         )
 
 
-@compiled
-def _nearby(system, q, params, t):
-    """[W; G] at an admissible point near q, and the residual (W v + b, g, G v + ∂g/∂t) that no point and no velocity nearest to
-    q makes zero, with the sizes of its terms."""
-    constraints: Constraints = system.constraints
-    still = jnp.zeros_like(q)
-    nearest = system.project_position(q, still, params, t)
-    v = system.project_velocity(nearest, still, params, t)
-    residual, terms = constraints.defect(t, nearest, v, params), constraints.terms(t, nearest, v, still, params)
-    direction = jax.random.uniform(jax.random.key(0), q.shape, minval=0.5)
-    size = jnp.max(jnp.abs(q))
-    away = nearest + AWAY * jnp.where(size > 0.0, size, 1.0) * direction
-    return constraints.matrix(t, system.project_position(away, still, params, t), params), residual, terms
+@dataclass(frozen=True)
+class _Nearby:
+    """(q, params, t) ↦ [W; G] at an admissible point near q, and the residual (W v + b, g, G v + ∂g/∂t) that no point and no
+    velocity nearest to q makes zero, with the sizes of its terms."""
+
+    same: Same
+
+    def __call__(self, q, params, t):
+        system, constraints = self.same.object, self.same.object.constraints
+        still = jnp.zeros_like(q)
+        nearest = system.project_position(q, still, params, t)
+        v = system.project_velocity(nearest, still, params, t)
+        residual, terms = constraints.defect(t, nearest, v, params), constraints.terms(t, nearest, v, still, params)
+        direction, size = np.random.default_rng(len(q)).uniform(0.5, 1.0, len(q)), jnp.max(jnp.abs(q))
+        away = nearest + AWAY * jnp.where(size > 0.0, size, 1.0) * direction
+        return constraints.matrix(t, system.project_position(away, still, params, t), params), residual, terms

@@ -1,11 +1,13 @@
 """simulate(): what a user calls to run a scheme on a system."""
 
 import time
+from dataclasses import replace
 from typing import Any
 
 from dirax.engines.engine import AbstractEngine
 from dirax.run.carry_out import carried_out
 from dirax.run.settings import stated
+from dirax.run.step_search import step_for, tolerable
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
@@ -15,8 +17,9 @@ def simulate(
     system: AbstractSystem,
     scheme: AbstractScheme,
     *,
-    step: float,
+    step: float | None = None,
     steps: int,
+    tolerance: float | None = None,
     q: Any = None,
     v: Any = None,
     p: Any = None,
@@ -43,6 +46,10 @@ def simulate(
     dataclasses count as pytrees; with `batch_params` its leaves have the batch axis too. Rows are saved every `save_every`
     steps, the last one always. `step` and `t` have the user's unit of time, and `t0` is the time of the first row.
     `inputs(t, x[, params])` drives an open port-Hamiltonian system.
+    `tolerance` in place of `step`: the step is found whose error over its first eight steps, by two half steps each, is
+    between a quarter of the tolerance and the tolerance, relative to the largest entry of q, p or x there, of a batch in its
+    worst trajectory; the error of a whole run grows beyond. It is `sol.step`, and `sol.stats` has `tolerance_error` and
+    `tolerance_trials`.
     `progress`: True for a bar, or a function of (steps done, steps in all). `project` moves initial data onto the
     constraint; `check_initial=False` accepts data off it as they are. `max_iterations` bounds Newton's iterations a step.
     `compensated` keeps what rounding takes from the state and gives it back at the next step (Kahan), so that conserved
@@ -58,15 +65,25 @@ def simulate(
     residual is saved with the others. Under a JAX transformation none are looked for.
 
     Raises `ValueError` or `TypeError`, naming the argument, for wrong shapes, dtypes and arities, values that are not
-    finite, `step` ≤ 0, `steps` < 1, data off the constraints, constraints that contradict each other, that are dependent at
-    the initial point alone, a Lagrangian singular together with its constraints ([PY] (21)), data off the final manifold of a
-    singular Lagrangian, and compositions of steps that leave it.
+    finite, `step` ≤ 0, `step` and `tolerance` both or neither, `steps` < 1, data off the constraints, constraints that
+    contradict each other, that are dependent at the initial point alone, a Lagrangian singular together with its constraints
+    ([PY] (21)), data off the final manifold of a singular Lagrangian, and compositions of steps that leave it.
     A run that fails midway, or is stopped by Ctrl-C, raises nothing: what was computed is
     kept, and `Solution.ok` and `.message` say what happened.
     """
     entered = time.perf_counter()
+    found: dict[str, Any] = {}
+    if (step is None) == (tolerance is None):
+        raise ValueError(
+            "one of step= and tolerance= must be given, " + ("and both were." if step is not None else "and none was.")
+        )
     settings, case, steps, save_every = stated(
-        system, scheme, step, steps, {"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, inputs, params, batch_params,
-        save_every, engine, project, check_initial, t0, max_iterations, compensated, events,
+        system, scheme, 1.0 if step is None else step, steps, {"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, inputs,
+        params, batch_params, save_every, engine, project, check_initial, t0, max_iterations, compensated, events,
     )  # fmt: skip
-    return carried_out(settings, case, steps, save_every, progress, entered=entered)
+    if tolerance is not None:
+        h, found = step_for(carried_out, settings, case, tolerable(tolerance))
+        case = replace(case, h=h)
+    sol = carried_out(settings, case, steps, save_every, progress, entered=entered)
+    sol.stats |= found
+    return sol

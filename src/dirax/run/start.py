@@ -68,13 +68,11 @@ def begun(equation: Any, case: Case, initial: Initial, by_jax: bool = False) -> 
     if case.two_points and len(equation.stages) > 1:
         raise ValueError("a composition cannot start from q0= and q1=, which belong to one step: give q= with v= or p=.")
     start = _of_every(_Beginning(equation, case.two_points), (equation,), case, initial.data, by_jax)
-    if not equation.stages[0][0].unknowns:
+    if not equation.stages[0][0].unknowns or case.traced or is_traced(start):  # what is traced cannot be checked
         return start
-    if equation.stages[0][0].unknowns >= FEWEST_SPARSE and not case.traced and not is_traced(start):
+    if equation.stages[0][0].unknowns >= FEWEST_SPARSE:
         return _with_sparse_first_step(equation, case, start)
-    first = None
-    if not by_jax and not case.traced and not is_traced(start):
-        first = _first_step_in_numbers(equation, case, start)
+    first = None if by_jax else _first_step_in_numbers(equation, case, start)
     if first is None:
         first = _of_every(_FirstStep(equation, case.two_points), (equation,), case, start._replace(row0=None), True)
     return start._replace(residual=first[0], jacobian=first[1])

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data
 from dirax.program.linear_solves import solve
-from dirax.program.tracing import along, gradient, jacobian, once
+from dirax.program.tracing import along, gradient, once
 from dirax.schemes.lagrangian_step import LagrangianStep, numbered, one_point_only
 from dirax.schemes.layout import Layout
 from dirax.systems.nonholonomic import NonholonomicMechanics
@@ -93,8 +93,7 @@ class ProjectedThetaStep(ThetaStep):
     constraints; M = ∂²L/∂v² at (q', v). Unknowns are v, σ, the acceleration a and λ of the base point, and s and w of the first
     half, where h w moves q and M(w − v) = Gᵀs; and v', σ', s' and w' of the second. The equations of a and λ are
     (∂L/∂v)˙ = ∂L/∂q + f + [W; G]ᵀλ and ([W; G] v + …)˙ = 0 along v̇ = a: where there are few of them they are solved in place,
-    else no matrix is inverted. Constraints at the times t_k, t_k + θh and t_k + h hold
-    to roundoff at all three points.
+    else no matrix is inverted. Constraints at the times t_k, t_k + θh and t_k + h hold to roundoff at all three points.
     """
 
     @property
@@ -117,7 +116,7 @@ class ProjectedThetaStep(ThetaStep):
 
     def residual(self, u, state, t, h, params):
         (q0, p0, _), parts, rows = self.state.split(state), self.unknowns.split(u), self.rows
-        at, q, q1 = self._base(u, state, t, h, params)
+        base = at, q, q1 = self._base(u, state, t, h, params)
         p, rate, along_flow, _ = self._flow(at, q, parts, params)
         begun = p0 + rows.force(t, q0, parts.sigma, params) - (p - (1.0 - self.theta) * h * rate)
         ended = self.system.legendre(q1, parts.end_v, params, t + h) + rows.force(t + h, q1, parts.end_sigma, params)
@@ -128,7 +127,7 @@ class ProjectedThetaStep(ThetaStep):
             ended - (p + self.theta * h * rate),
             rows.velocity_defect(t + h, q1, parts.end_v, params),
         ]
-        return jnp.concatenate([*ends, self._position(u, state, t, h, params)] if rows.holonomic else ends)
+        return jnp.concatenate([*ends, self._position(q0, parts, base, t, h, params)] if rows.holonomic else ends)
 
     def advance(self, u, state, t, h, params):
         at, q, q1 = self._base(u, state, t, h, params)
@@ -158,7 +157,9 @@ class ProjectedThetaStep(ThetaStep):
         none, rows = jnp.zeros(self.rows.count), self.rows
         p, rate, defect = self._at_point(t, q, v, jnp.zeros_like(v), none, params)
         matrix = rows.matrix(t, q, params)
-        lifted = solve(self._mass(t, q, v, params), jnp.concatenate([matrix.T, -defect[: len(v), None]], axis=1))
+        lifted = solve(
+            self.system.velocity_hessian(t, q, v, params), jnp.concatenate([matrix.T, -defect[: len(v), None]], axis=1)
+        )
         multipliers = -solve(matrix @ lifted[:, :-1], defect[len(v) :] + matrix @ lifted[:, -1])
         return p, rate + matrix.T @ multipliers, multipliers
 
@@ -182,10 +183,9 @@ class ProjectedThetaStep(ThetaStep):
             return parts.w
         if not self.theta:
             return parts.v
-        return parts.v + solve(self._mass(t, q, parts.v, params), self.rows.holonomic_force(t, q, parts.s, params))
-
-    def _mass(self, t: Any, q: Array, v: Array, params: Any) -> Float[Array, "n n"]:
-        return jacobian(lambda v: self.system.legendre(q, v, params, t))(v)
+        return parts.v + solve(
+            self.system.velocity_hessian(t, q, parts.v, params), self.rows.holonomic_force(t, q, parts.s, params)
+        )
 
     def _pushed(self, t: Any, q: Array, v: Array, w: Array, s: Array, params: Any) -> Float[Array, " n"]:
         """M(w − v) − G(q)ᵀs, zero where w is the direction of the projection onto g = 0 at q."""
@@ -199,10 +199,9 @@ class ProjectedThetaStep(ThetaStep):
         q = q0 + theta * h * first
         return t + theta * h, q, q + (1.0 - theta) * h * second
 
-    def _position(self, u: Array, state: Array, t: Any, h: Any, params: Any) -> Array:
+    def _position(self, q0: Array, parts: Any, base: tuple[Any, Array, Array], t: Any, h: Any, params: Any) -> Array:
         """g at the base and at the end, and the directions of both halves; a half of length zero needs no force."""
-        (q0, _, _), parts, rows = self.state.split(state), self.unknowns.split(u), self.rows
-        at, q, q1 = self._base(u, state, t, h, params)
+        (at, q, q1), rows = base, self.rows
         onto = rows.position(at, q, params) / h if self.theta else parts.s
         last = rows.position(t + h, q1, params) / h if self.theta < 1.0 else parts.end_s
         begun = [] if self.in_place else [self._pushed(t, q0, parts.v, parts.w, parts.s, params)]

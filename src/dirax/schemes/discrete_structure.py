@@ -5,6 +5,7 @@ states whose change in one step is known.
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -76,6 +77,17 @@ class AbstractDiscreteStructure(eqx.Module):
         return f"no relation between the two-forms before and after a step is known for the {self.claims[0].quantity}"
 
     @property
+    def two_form(self) -> tuple[Callable, tuple[str, ...], float] | None:
+        """The two-form (x, params) ↦ (n, n) of the symplectic manifold whose points x the states are, where they are those; with
+        the names of what is saved of a point, and the fraction of a step at which the map has its base point."""
+        return None
+
+    @property
+    def own_states(self) -> bool:
+        """Whether `step_form` is that of every state of the scheme, which need not be (q, p)."""
+        return False
+
+    @property
     def own_constraints(self) -> bool:
         """Whether a step imposes constraints between its points, whose terms have the sizes `constraint_size`."""
         return False
@@ -124,6 +136,10 @@ class AbstractStepForm(eqx.Module):
     def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, " numbers"]:
         """(by how much the change in that step differs from what it is to be, …, the condition of the step), the first
         relative to the size of the form after the step; numbers in between are for `told`."""
+
+    def excuse(self, numbers: Any) -> str:
+        """Why the change is not what it is to be, where nothing says that it is in this case; empty where it is."""
+        return ""
 
     def refusal(self, equation: Any, row: Data, params: Any) -> str:
         """Why the step does not start from a saved row; empty if it does."""

@@ -1,5 +1,6 @@
 """The discrete Dirac structures of discretization maps ([BLM] Definition 5.1), on points x and on T*Q of a Lagrangian."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -44,6 +45,11 @@ class RelationPairs(AbstractDiscreteStructure):
     @property
     def reads(self) -> tuple[str, ...]:
         return (self._name, "multipliers") if self.relation.saved else (self._name,)
+
+    @property
+    def two_form(self) -> tuple[Callable, tuple[str, ...], float] | None:
+        form = self.relation.two_form
+        return None if form is None else (form, self.relation.names, self.map.base_fraction)
 
     @property
     def _name(self) -> str:

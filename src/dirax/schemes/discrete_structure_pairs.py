@@ -1,5 +1,6 @@
 """The discrete Dirac structures of discrete Lagrangians on Q × Q: (+), (−) ([PY] §5, §6) and Lagrange–d'Alembert."""
 
+from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
@@ -23,7 +24,21 @@ Scalar = Float[Array, ""]
 SIGNS = {"+": "(+)-", "-": "(−)-", None: ""}
 
 
-class LagrangianPairs(AbstractDiscreteStructure):
+class AbstractPairs(AbstractDiscreteStructure):
+    """A structure of a discrete Lagrangian on Q × Q."""
+
+    @property
+    @abstractmethod
+    def default_sign(self) -> str:
+        """The sign of the scheme, "+" for one that is neither."""
+
+    @abstractmethod
+    def in_coordinates(self, rows: Data, centre: int, params: Any) -> tuple["LagrangianPairs", Data, Any]:
+        """The structure on R^d × R^d, with consecutive rows and params of its functions, in coordinates about one of the rows:
+        their q, p and a tangent vector `along` at the centre."""
+
+
+class LagrangianPairs(AbstractPairs):
     """The structure of three points in a row, for L_d, f_d^± and w_d on Q × Q, [W; ∂g/∂q] on Q, and g.
 
     (+) and (−): the element (X^{d±}, d_D^±L_d) at q1 of the induced structure ([PY] Definition 6.7, Proposition 5.17),
@@ -44,6 +59,15 @@ class LagrangianPairs(AbstractDiscreteStructure):
     shape: Shape = eqx.field(static=True)
     sign: str | None = eqx.field(static=True, default=None)
     share: float = eqx.field(static=True, default=0.0)
+    quadrature: Any = None
+    """f_d^± as a function (t, q0, v, h, params), where they are not by the quadrature of L_d."""
+
+    @property
+    def default_sign(self) -> str:
+        return self.sign or "+"
+
+    def in_coordinates(self, rows: Data, centre: int, params: Any) -> tuple["LagrangianPairs", Data, Any]:
+        return self, rows, params
 
     # ------------------------------------------------------------------ functions on Q × Q and Q
 
@@ -56,7 +80,8 @@ class LagrangianPairs(AbstractDiscreteStructure):
         """(f_d^−, f_d^+)(q0, q1)."""
         if self.system.forces is None:
             return jnp.zeros_like(q0), jnp.zeros_like(q0)
-        return discrete_forces(self.system.forces, self.rule)(t, q0, (q1 - q0) / self.step, self.step, params)
+        impulses = self.quadrature or discrete_forces(self.system.forces, self.rule)
+        return impulses(t, q0, (q1 - q0) / self.step, self.step, params)
 
     @once
     def slots(self, t: Any, q0: Vector, q1: Vector, params: Any) -> tuple[Vector, Vector]:
@@ -129,6 +154,10 @@ class LagrangianPairs(AbstractDiscreteStructure):
     def membership_terms(self, rows: Data, params: Any) -> Float[Array, "2 numbers"]:
         """(constraints, force, saved): the third is by how much the p and the multipliers saved at the middle point miss the
         Legendre momenta and the force of the three points."""
+        return self.defects(rows, params, jnp.abs(jnp.ravel(rows["q"])))
+
+    def defects(self, rows: dict[str, Array], params: Any, sizes: Float[Array, " k"]) -> Float[Array, "2 numbers"]:
+        """The same in roundings of numbers of these sizes, of which the coordinates of the three points are made."""
         h, t, (q0, q1, q2), p = self.step, rows["t"][0], rows["q"], rows["p"][1]
         n, here = q0.shape[0], t + h
         multipliers = rows["multipliers"][1] if self._constrained else jnp.zeros(0)
@@ -165,7 +194,7 @@ class LagrangianPairs(AbstractDiscreteStructure):
 
         z = jnp.concatenate([q0, q1, q2])
         moved = jnp.maximum(jnp.abs(q1 - q0), jnp.abs(q2 - q1))
-        size = jnp.abs(z) + jnp.tile(moved + h * self.system.speeds(here, q1, moved / h, params), 3)
+        size = sizes + jnp.tile(moved + h * self.system.speeds(here, q1, moved / h, params), 3)
         terms = jnp.abs(p1) + jnp.abs(p2) + jnp.abs(before0) + jnp.abs(before1)
         of_reaction = jnp.abs(jacobian(reaction_of)(q1)) @ size[n : 2 * n]
         largest = jnp.max(terms + jnp.abs(jacobian(force_of)(z)) @ size + of_reaction)

@@ -78,17 +78,11 @@ def _checked(system: Any, scheme: str) -> HamiltonDirac:
 
 
 @dataclass(frozen=True, eq=False)
-class HamiltonDiracStep(AbstractStep):
-    """One step in (q, p); unknowns are the velocity Δq/h, the momentum at which dH is taken, and μ."""
+class PhaseSpaceStep(AbstractStep):
+    """A step in x = (q, p) of a Hamiltonian on T*Q."""
 
     system: HamiltonDirac
     shape: Shape
-    plus: bool
-
-    @property
-    def rows(self) -> ConstraintRows:
-        """The constraints without the redundant ones."""
-        return ConstraintRows(self.system, self.shape)
 
     @property
     def n(self) -> int:
@@ -98,6 +92,18 @@ class HamiltonDiracStep(AbstractStep):
     @property
     def state(self) -> Layout:
         return Layout(q=self.n, p=self.n)
+
+
+@dataclass(frozen=True, eq=False)
+class HamiltonDiracStep(PhaseSpaceStep):
+    """One step in (q, p); unknowns are the velocity Δq/h, the momentum at which dH is taken, and μ."""
+
+    plus: bool
+
+    @property
+    def rows(self) -> ConstraintRows:
+        """The constraints without the redundant ones."""
+        return ConstraintRows(self.system, self.shape)
 
     @property
     def unknowns(self) -> Layout:

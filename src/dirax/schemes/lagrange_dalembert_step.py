@@ -1,5 +1,6 @@
 """One step of the discrete Lagrange–d'Alembert equations on Q: the step of the (+), (−), midpoint and trapezoidal schemes."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -39,6 +40,8 @@ class LagrangeDAlembertStep(AbstractStep):
     rule: str | UserFunction
     constraint: str | UserFunction
     momentum: str
+    quadrature: Callable | None = None
+    """f_d^± as a function (t, q0, v, h, params), where they are not by the quadrature of L_d."""
 
     def __post_init__(self):
         if isinstance(self.constraint, UserFunction) and not self.shape.m:
@@ -71,6 +74,8 @@ class LagrangeDAlembertStep(AbstractStep):
 
     def impulses(self, t, q, v, h, params, of_constraints=None):
         """(f_d^−, f_d^+), for forces; `of_constraints` are the impulses (μ, λ) of the step, for those that see them."""
+        if self.quadrature is not None:
+            return self.quadrature(t, q, v, h, params)
         seen = None if of_constraints is None else self.rows.all(of_constraints) / h
         forces = self.system.forces_at(seen)
         assert forces is not None

@@ -3,13 +3,17 @@
 from collections.abc import Callable
 from typing import Any
 
+from dirax.geometry.charts import Atlas
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import CONSTRAINTS, RULES, checked_rule, mirrored
-from dirax.schemes.discrete_structure_pairs import LagrangianPairs, structure_on_pairs
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure
+from dirax.schemes.discrete_structure_charts import PairsInCharts
+from dirax.schemes.discrete_structure_pairs import structure_on_pairs
 from dirax.schemes.lagrange_dalembert_part import LagrangeDAlembertPart
 from dirax.schemes.lagrange_dalembert_step import MOMENTA, LagrangeDAlembertStep
 from dirax.schemes.lagrange_poincare_dirac import LagrangePoincareDiracStep
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
+from dirax.schemes.step_in_charts import StepInCharts, lagrangian_in_charts
 from dirax.systems.system import AbstractSystem
 
 
@@ -39,6 +43,11 @@ class LagrangeDAlembert(AbstractScheme):
     with a one-sided constraint), p_k − W(q_k)ᵀ μ_k = −D1 L_d(q_k, q_{k+1}) ("outgoing"), or the mean of both (default
     otherwise), which has the order of q. Without constraints the three are the same.
     Solvable where [[D2 D1 L_d, Wᵀ], [D2 w_d, 0]] is invertible ([PY] (21)); L itself may be degenerate.
+
+    Of a `dx.ManifoldLagrangian` L_d and w_d are on its manifold, functions being of points of R^N, and the equations those of
+    T*_{q_k}Q, solved in charts ([RL] §6): R⁻¹_{q0}(q1)/h at q0 ("left") and −R⁻¹_{q1}(q0)/h at q1 ("right") take the place of
+    Δq/h, with the retraction R of the manifold, and "midpoint" is the middle of the geodesic with the velocity there.
+    Raises `TypeError` for a manifold without a retraction.
     """
 
     discrete_lagrangian: str | UserFunction
@@ -77,9 +86,8 @@ class LagrangeDAlembert(AbstractScheme):
     def part(self, system: Any, shape: Shape) -> AbstractScheme:
         return _part(self, self, system, shape)
 
-    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
-        share = MOMENTA[self.momentum]
-        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, self.constraint, share=share)
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
+        return _structure(self, system, shape, step)
 
 
 def checked_momentum(momentum: str) -> str:
@@ -121,8 +129,8 @@ class PlusLagrangeDirac(AbstractScheme):
     def part(self, system: Any, shape: Shape) -> AbstractScheme:
         return _part(self, self.lagrange_dalembert, system, shape)
 
-    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
-        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "right", share=MOMENTA[self.momentum], sign="+")
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
+        return _structure(self.lagrange_dalembert, system, shape, step, "+")
 
 
 class MinusLagrangeDirac(AbstractScheme):
@@ -158,8 +166,8 @@ class MinusLagrangeDirac(AbstractScheme):
     def part(self, system: Any, shape: Shape) -> AbstractScheme:
         return _part(self, self.lagrange_dalembert, system, shape)
 
-    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> LagrangianPairs | str:
-        return structure_on_pairs(system, shape, step, self.discrete_lagrangian, "left", share=MOMENTA[self.momentum], sign="-")
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
+        return _structure(self.lagrange_dalembert, system, shape, step, "-")
 
 
 class _Part(AbstractScheme):
@@ -168,6 +176,8 @@ class _Part(AbstractScheme):
     scheme: LagrangeDAlembert
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
+        if system.manifold_form() is not None:
+            return _in_charts(self.scheme, system, shape, part=True)
         return LagrangeDAlembertPart(self.scheme.step_on_q(system, shape)).equation()
 
 
@@ -177,10 +187,26 @@ def _part(scheme: AbstractScheme, general: LagrangeDAlembert, system: AbstractSy
 
 
 def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, sign: int = +1) -> StepEquation:
-    """The discrete Lagrange–d'Alembert equations of a system on Q, or on the quotient by its symmetry."""
+    """The discrete Lagrange–d'Alembert equations of a system on Q, in charts of Q, or on the quotient by its symmetry."""
+    if system.manifold_form() is not None:
+        return _in_charts(scheme, system, shape)
     quotient = system.quotient_form()
     if quotient is None:
         step = scheme.step_on_q(system, shape)
         # forces that see the multipliers are given those of both ends, which are of the order of the step
         return (LagrangeDAlembertPart(step) if step.system.forces_see_multipliers else step).equation()
     return LagrangePoincareDiracStep(quotient, scheme.step_on_q(quotient.unreduced(), shape), sign).equation()
+
+
+def _in_charts(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, part: bool = False) -> StepEquation:
+    local = lagrangian_in_charts(system, scheme.discrete_lagrangian, scheme.constraint)
+    return StepInCharts(local, Atlas(local.manifold), shape, scheme.momentum, part).equation()
+
+
+def _structure(
+    scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, step: Any, sign: str | None = None
+) -> AbstractDiscreteStructure | str:
+    rule, constraint, share = scheme.discrete_lagrangian, scheme.constraint, MOMENTA[scheme.momentum]
+    if system.manifold_form() is not None:
+        return PairsInCharts(lagrangian_in_charts(system, rule, constraint), step, shape, sign, share)
+    return structure_on_pairs(system, shape, step, rule, constraint, sign=sign, share=share)

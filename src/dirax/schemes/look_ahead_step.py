@@ -8,15 +8,14 @@ from jaxtyping import Array, Float
 
 from dirax.program.linear_solves import solve
 from dirax.program.roots import nearest_root
-from dirax.schemes.abstract_step import AbstractStep
+from dirax.schemes.hamilton_dirac import PhaseSpaceStep
 from dirax.schemes.layout import Layout
-from dirax.schemes.step import Field, Shape
+from dirax.schemes.step import Field
 from dirax.systems.forms import RelationForm
-from dirax.systems.hamilton_dirac import HamiltonDirac
 
 
 @dataclass(frozen=True, eq=False)
-class LookAheadStep(AbstractStep):
+class LookAheadStep(PhaseSpaceStep):
     """The discrete Dirac system of the lift of dx.Theta(1.0), with the base point (q_1, p_0):
 
         Δq/h = ∂H/∂p(q_1, p_0),   Δp/h = −∂H/∂q(q_1, p_0) + W(q_1)ᵀλ,   W(q_1) Δq/h = 0.
@@ -29,19 +28,8 @@ class LookAheadStep(AbstractStep):
     State x = (q, p); unknowns are Δq/h, p_1 and the velocity of the step after.
     """
 
-    system: HamiltonDirac
-    shape: Shape
     form: RelationForm
     """Of the system that is run, which says what is saved."""
-
-    @property
-    def n(self) -> int:
-        """Coordinates of Q."""
-        return self.shape.n // 2
-
-    @property
-    def state(self) -> Layout:
-        return Layout(q=self.n, p=self.n)
 
     @property
     def unknowns(self) -> Layout:

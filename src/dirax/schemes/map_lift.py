@@ -96,6 +96,10 @@ class Lift(NamedTuple):
         fixed = jax.lax.stop_gradient(self.manifold.frame(q0))
         return jax.vmap(lambda f: self.manifold.projection(q, f), 1, 1)(fixed)
 
+    def frame(self, q: Array) -> Float[Array, "N d"]:
+        """The frame of `end`: a basis of the tangent space at q by columns."""
+        return jnp.eye(self.manifold.dimension) if self.flat else self.manifold.frame(q)
+
     def components(self, q: Array, v: Array) -> Float[Array, " d"]:
         """The components of a tangent vector in the frame of `end`."""
         return v if self.flat else self.manifold.coordinates(q, v)

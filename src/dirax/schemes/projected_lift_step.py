@@ -64,7 +64,7 @@ class ProjectedLiftStep(LagrangianStep):
             rows.velocity_defect(t + h, q1, v1, params),
         ]
         if rows.holonomic:
-            missed = (self._pushed(t + h, q1, v1, parts.end_s, h, params) - at.q1) / h
+            missed = lift.tangents(q0, at.q1).T @ (self._pushed(t + h, q1, v1, parts.end_s, h, params) - at.q1) / h
             equations += [rows.position(at.t, at.q, params) / h, missed, rows.position(t + h, q1, params) / h]
         return jnp.concatenate(equations)
 
@@ -101,13 +101,16 @@ class ProjectedLiftStep(LagrangianStep):
         return p, rate + w.T @ multipliers, multipliers
 
     def _pushed(self, t: Any, q: Array, v: Array, s: Array, h: Any, params: Any) -> Float[Array, " N"]:
-        """q + h M⁻¹G(q)ᵀs; on submanifolds of R^N there are no holonomic constraints."""
-        return q + h * solve(self._mass(t, q, v, params), self.rows.holonomic_force(t, q, s, params))
+        """q + h M⁻¹G(q)ᵀs, on the manifold."""
+        frame = self.lift.frame(q)
+        mass, force = self._mass(t, q, v, params), self.rows.holonomic_force(t, q, s, params)
+        return self.lift.end(q, h * solve(frame.T @ mass @ frame, frame.T @ force))
 
     def _base(self, u: Array, state: Array, t: Any, h: Any, params: Any) -> Base:
         """The base point of the step from q̃0 to q̃1."""
         q0, parts = self.state.split(state).q, self.unknowns.split(u)
-        begun = self._pushed(t, q0, parts.velocity, parts.s, h, params) if self.rows.holonomic else q0
+        v0 = self.lift.frame(q0) @ parts.velocity
+        begun = self._pushed(t, q0, v0, parts.s, h, params) if self.rows.holonomic else q0
         return self.lift.base(begun, self.lift.end(q0, h * parts.velocity), t, h)
 
     def _end(self, u: Array, state: Array, at: Base, h: Any) -> Float[Array, " N"]:

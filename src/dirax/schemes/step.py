@@ -21,6 +21,12 @@ COMPOSED = ("first", "sum", "mean", "each")
 """How the row of a composed step is made of those of its parts."""
 
 
+CLOCK = "clock"
+"""The field of nodes and the part of the state that are the time, where steps have lengths of their own."""
+
+STEP_DENSITY = "step_density"
+"""Those that are the step density z, of which the value in the middle of a step sets its length, step/z."""
+
 SHOWN = 200
 """Equations that are named where a step is shown."""
 

@@ -1,7 +1,9 @@
 """The forms on the states of schemes: the canonical two-form of T*Q, in charts too, and Lie–Poisson bivectors."""
 
+from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -9,6 +11,9 @@ from jaxtyping import Array, Float
 from dirax.geometry.structures import canonical_two_form
 from dirax.numerics.arrays import Data
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm, DifferentiatedStep, nonzero
+
+CONSTANT = 1e-13
+"""Relative change of a two-form in one step up to which it is constant."""
 
 
 def started(system: Any, step: Any, equation: Any, rows: Data, params: Any) -> tuple[Array, Array]:
@@ -79,6 +84,37 @@ class CanonicalPoints(CanonicalForm):
         return ("x",)
 
 
+class TwoFormOfPoints(RowForm):
+    """Jᵀω(Φ(x))J = ω(x) for a two-form ω on the points x of a final manifold: of a phase-space Lagrangian dα, which the
+    midpoint rule preserves where dα is constant ([BLM] Proposition 6.3, printed: iff α is linear), and no other θ map
+    (Remark 6.4). Relative to ‖|J|ᵀ|ω||J|‖. The state is x.
+    """
+
+    two_form: Callable = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    theta: float = eqx.field(static=True)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return self.names
+
+    def told(self, numbers: Any, place: str) -> str:
+        return f"‖Jᵀ(ω∘Φ)J − ω‖/‖JᵀωJ‖ of the two-form ω of the final manifold, {place}"
+
+    def excuse(self, numbers: Any) -> str:
+        if numbers[1] > CONSTANT:
+            return "; ω changes from point to point, and the midpoint rule preserves constant ones ([BLM] Proposition 6.3)"
+        return "" if self.theta == 0.5 else f"; the map with θ = {self.theta} is not symplectic ([BLM] Remark 6.4)"
+
+    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "3"]:
+        """(‖Jᵀ(ω∘Φ)J − ω‖/‖JᵀωJ‖, ‖ω∘Φ − ω‖/‖ω‖, condition number)."""
+        (state, _), (after, jacobian, condition) = self.begins(equation, rows, params), step
+        before, there = self.two_form(state, params), self.two_form(after, params)
+        size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(there) @ jnp.abs(jacobian))
+        moved = jnp.max(jnp.abs(there - before)) / nonzero(jnp.max(jnp.abs(there)))
+        return jnp.stack([jnp.max(jnp.abs(jacobian.T @ there @ jacobian - before)) / nonzero(size), moved, condition])
+
+
 class LiePoissonForm(RowForm):
     """JΛJᵀ = Λ∘Φ for the bivector Λ of a dual: the step Φ is a Poisson map. The state begins with the point x.
 
@@ -136,6 +172,11 @@ class ChartedForm(RowForm):
 
 def form_of_steps(system: Any, step: Any, equation: Any, structure: AbstractDiscreteStructure | str) -> AbstractStepForm | str:
     """The form of the steps of an equation by what the system and the equation say of themselves, or why none is known."""
+    if not isinstance(structure, str):
+        if structure.own_states:
+            return structure.step_form
+        if structure.two_form is not None:
+            return TwoFormOfPoints(system, step, *structure.two_form)
     fields = equation.stages[0][0].fields
     constrained = "multipliers" in fields
     if system.dual is not None and not constrained:

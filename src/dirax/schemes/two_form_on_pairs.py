@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.geometry.finite_difference import projector_slope
 from dirax.numerics.arrays import Data
 from dirax.numerics.ranks import significant
 from dirax.numerics.tolerances import PAIR_RANK
@@ -56,8 +57,8 @@ class FormOnPairs(AbstractStepForm):
         def state_of(z):
             return jnp.concatenate([z[n:], d2(before, z[:n], z[n:])])
 
-        def force(z, c):
-            return pairs.annihilator(t, z[n:], params) @ (d2(before, z[:n], z[n:]) + d1(t, z[n:], c))
+        def sum_at_q1(z, c):
+            return d2(before, z[:n], z[n:]) + d1(t, z[n:], c)
 
         def lagrangian_two_form(t, z):
             """−dΘ of Θ = −D1 L_d dq0: dq0 ∧ dq1 with the coefficients −D1 D2 L_d, and nothing else (D1 D1 L_d is symmetric)."""
@@ -69,8 +70,10 @@ class FormOnPairs(AbstractStepForm):
         of_pair, (after, of_state, condition) = jacobian_of(state_of)(z), step
         q2, q2_of_pair = after[:n], of_state[:n] @ of_pair
         jacobian = jnp.concatenate([jnp.eye(2 * n)[n:], q2_of_pair])  # of φ
-        force_z, force_q2 = jacobian_of(force, argnums=(0, 1))(z, q2)
-        beta = jnp.concatenate([jnp.zeros((n, 2 * n)), force_z + force_q2 @ q2_of_pair])  # ∂_j β_i
+        of_z, of_q2 = jacobian_of(sum_at_q1, argnums=(0, 1))(z, q2)
+        force = pairs.annihilator(t, q1, params) @ (of_z + of_q2 @ q2_of_pair)
+        turning = projector_slope(lambda q: pairs.matrix(t, q, params), q1, sum_at_q1(z, q2))
+        beta = jnp.concatenate([jnp.zeros((n, 2 * n)), force.at[:, n:].add(turning)])  # ∂_j β_i
         two_form, two_form_after = lagrangian_two_form(before, z), lagrangian_two_form(t, jnp.concatenate([q1, q2]))
         change = jacobian.T @ two_form_after @ jacobian - two_form
         dbeta = beta.T - beta  # (dβ)_ij = ∂_i β_j − ∂_j β_i

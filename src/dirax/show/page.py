@@ -131,7 +131,7 @@ def _phase(columns: Sequence[str], positions: list[int], momenta: list[int], pla
 def _subtitle(solutions: Sequence[Solution]) -> str:
     first = solutions[0]
     unit = f" {u}" if (u := first.metadata.get("units", {}).get("t", "")) else ""
-    steps = f"step {float(first.step):g}{unit}, t = {float(first.t[0]):g} to {float(first.t[-1]):g}{unit}"
+    steps = f"step {float(first.step):g}{unit}, t = {first.time_of(0):g} to {first.time_of(-1):g}{unit}"
     batch = f", {first.batch} trajectories" if first.batch is not None else ""
     what = scheme_text(first) if len(solutions) == 1 else f"{len(solutions)} solutions side by side"
     return f"{what} · {steps}{batch}"

@@ -21,7 +21,7 @@ from dirax.solution.solution import Solution
 SMALL = 1500
 """Rows and frames of a view in a notebook."""
 
-VIEW_HEIGHT = 570
+VIEW_HEIGHT = 590
 """Of a view in a notebook, in dots."""
 
 

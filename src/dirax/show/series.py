@@ -68,8 +68,9 @@ def runs_of(sol: Solution, label: str, group: int, symmetries: Mapping[str, Call
         if sol.batch_params and params is not None:
             params = jax.tree.map(lambda leaf, lane=lane: leaf[lane], params)
         tables = {k: Table(k, columns, of_lane(values), exact) for k, (columns, values, exact) in quantities.items()}
-        rows = {**nodes, "t": np.asarray(sol.t)}
-        runs.append(Run(name, np.asarray(sol.t), rows, params, tables, group, ghost=bool(lane)))
+        t = sol.times[lane or 0]
+        rows = {**nodes, "t": t}
+        runs.append(Run(name, t, rows, params, tables, group, ghost=bool(lane)))
     return runs
 
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
+from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.solution.steps_again import Entries, Keyed, StepsAgain, begun, compiled_call, row_of, stepped
-from dirax.solution.trajectory import Trajectory
+from dirax.solution.trajectory import Trajectory, last_rows
 
 AT_ROW = 1e-12
 """Part of a step by which a time may lie off a saved row and still be at it, where steps of a part are taken."""
@@ -57,6 +58,8 @@ class Dense:
             )
         if sol.impacts is not None and sol.save_every != 1:
             raise ValueError("between the rows of a run with impacts sol.at needs every row: leave save_every= out.")
+        if sol.has_own_times and sol.save_every != 1:
+            raise ValueError("between the rows of a run of variable steps sol.at needs every row: leave save_every= out.")
         if sol.rows < 2:
             raise ValueError("there is no step between the rows of this solution, which has only one.")
         self.sol, self.equation = sol, sol.equation
@@ -64,6 +67,8 @@ class Dense:
         single = len(self.equation.stages) == 1
         self.interpolate = first.interpolate if single else None
         self.between = first.between if single and sol.save_every == 1 else None
+        if sol.has_own_times and not single:
+            raise ValueError("between the rows of a composition of variable steps nothing is known: compose another scheme.")
 
     @property
     def nodes(self) -> dict[str, Any]:
@@ -76,14 +81,22 @@ class Dense:
         """The fields at times (T,), (T, …) or (B, T, …), with derivatives. Raises `ValueError` for rows of which some were not
         saved."""
         sol = self.sol
+        if sol.impacts is not None:
+            raise ValueError(
+                "under jax.grad, jit and vmap sol.at does not look into steps that walls divide: use rows and events."
+            )
         if sol.save_every != 1:
             raise ValueError("under jax.grad, jit and vmap sol.at needs every row: leave save_every= out.")
-        t0, h, last = jnp.asarray(sol.t[0]), jnp.asarray(sol.step), sol.rows - 2
+        t0, h, last = jnp.asarray(sol.axis[0]), jnp.asarray(sol.step), sol.rows - 2
         numbers = jnp.clip(jnp.floor(jax.lax.stop_gradient((times - t0) / h)).astype(int), 0, last)
+        own_times = sol.has_own_times
         rows = {name: jnp.asarray(a) for name, a in self.nodes.items()}
         steps = {name: jnp.asarray(a) for name, a in sol.fields.items() if name not in rows}
 
         def lane(rows, steps, params, times, numbers, t0, h):
+            if own_times:
+                numbers = jnp.clip(jnp.searchsorted(jax.lax.stop_gradient(rows[CLOCK]), times, side="right") - 1, 0, last)
+
             def one(time, number):
                 row, after = ({name: a[number + i] for name, a in rows.items()} for i in (0, 1))
                 of_step = {name: a[number] for name, a in steps.items()}
@@ -99,9 +112,12 @@ class Dense:
         return compiled_call(whole, rows, steps, jax.tree.map(jnp.asarray, sol.params), times, numbers, t0, h)
 
     def _at_one(self, row, after, of_step, time, t, h, params) -> dict[str, Any]:
-        theta, system = (time - t) / h, self.sol.system
+        theta, system, end = (time - t) / h, self.sol.system, t + h
+        if CLOCK in row:
+            t, end = row[CLOCK], after[CLOCK]
+            theta = (time - t) / (end - t)
         if self.interpolate is None and self.between is not None:
-            row, after = ({**a, "t": s, "v": _velocity(system, a, s, params)} for a, s in ((row, t), (after, t + h)))
+            row, after = ({**a, "t": s, "v": _velocity(system, a, s, params)} for a, s in ((row, t), (after, end)))
             return {name: a for name, a in self.between(theta, row, after, h, params).items() if name in self.nodes}
         state, guess = begun(self.equation, system, row | of_step, t, h, params)
         if self.interpolate is not None:
@@ -109,6 +125,8 @@ class Dense:
             found = self.interpolate(theta, u, state, t, h, params)
             return {name: found.get(name, row[name]) for name in row}
         part = jnp.maximum(theta, AT_ROW) * h
+        if CLOCK in row:
+            part = _step_for(part / h, row[STEP_DENSITY], end - t, h)
         state, u, _ = stepped(self.equation, state, guess, t, part, params)
         _, unknowns, states = stepped(self.equation, state, u, t + part, h, params)
         made = row_of(self.equation, unknowns, states, t + part, h, params)
@@ -119,7 +137,7 @@ class Dense:
     @cached_property
     def counts(self) -> np.ndarray:
         """The number of the step that leaves each row."""
-        t = np.asarray(self.sol.t, float)
+        t = np.asarray(self.sol.axis, float)
         return np.rint((t - t[0]) / float(self.sol.step)).astype(np.int64)
 
     @cached_property
@@ -141,9 +159,7 @@ class Dense:
     @cached_property
     def ends(self) -> np.ndarray:
         """The number of the last step + 1 that each trajectory reached, (B,)."""
-        good = [np.isfinite(self.saved[name]).reshape(*self.saved[name].shape[:2], -1).all(axis=2) for name in self.nodes]
-        rows = np.max(np.where(np.logical_and.reduce(good), np.arange(self.sol.rows), 0), axis=1)
-        return self.counts[rows]
+        return self.counts[np.maximum(last_rows([self.saved[name] for name in self.nodes]), 0)]
 
     @cached_property
     def velocities(self) -> np.ndarray:
@@ -151,7 +167,7 @@ class Dense:
         batch, rows = self.saved["q"].shape[:2]
         lanes = np.repeat(np.arange(batch), rows)
         flat = {name: a.reshape(batch * rows, *a.shape[2:]) for name, a in self.saved.items() if name in self.nodes}
-        v = self.velocity(lanes, flat, np.tile(np.asarray(self.sol.t), batch))
+        v = self.velocity(lanes, flat, np.broadcast_to(np.asarray(self.sol.t), (batch, rows)).ravel())
         return v.reshape(batch, rows, -1)
 
     def velocity(self, lanes: np.ndarray, fields: dict[str, np.ndarray], t: np.ndarray) -> np.ndarray:
@@ -163,8 +179,16 @@ class Dense:
 
     def place(self, lanes: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The number of the step in which each time lies, and where in it, from 0 to 1."""
-        t0, h = float(self.sol.t[0]), float(self.sol.step)
+        t0, h = float(self.sol.axis[0]), float(self.sol.step)
         last = np.maximum(self.ends[lanes] - 1, 0)
+        if self.sol.has_own_times:
+            numbers = np.zeros(len(lanes), np.int64)
+            for lane in np.unique(lanes):
+                own = lanes == lane
+                numbers[own] = np.searchsorted(self.saved[CLOCK][lane, : self.ends[lane] + 1], times[own], side="right") - 1
+            numbers = np.clip(numbers, 0, last)
+            begins, ends = (self.time_at(lanes, numbers + i, 0.0) for i in (0, 1))
+            return numbers, np.clip((times - begins) / (ends - begins), 0.0, 1.0)
         numbers = np.clip(np.floor((times - t0) / h).astype(np.int64), 0, last)
         return numbers, np.clip((times - (t0 + numbers * h)) / h, 0.0, 1.0)
 
@@ -172,7 +196,7 @@ class Dense:
         """The fields of nodes inside steps (entries, …), and `v` where it is found on the way."""
         sol, again = self.sol, self.again
         h = np.full(len(theta), float(sol.step))
-        t = float(sol.t[0]) + numbers * h
+        t = self.time_at(lanes, numbers, 0.0)
         if sol.impacts is not None and np.any(hit := self._is_divided(lanes, numbers)):
             return self._with_impacts(lanes, numbers, theta, hit)
         if self.interpolate is not None:
@@ -182,7 +206,7 @@ class Dense:
             return self.entries(function, lanes, (theta, u, states, t, h), "interpolate", *again.key)
         if self.between is not None:
             pick = lambda at: {name: self.saved[name][lanes, at] for name in self.nodes} | {"v": self.velocities[lanes, at]}
-            rows = [pick(numbers + i) | {"t": t + i * h} for i in (0, 1)]
+            rows = [pick(numbers + i) | {"t": self.time_at(lanes, numbers + i, 0.0)} for i in (0, 1)]
             between = self.between
             function = lambda values, params: between(*values, params)
             return self.entries(function, lanes, (theta, *rows, h), "between", *again.key)
@@ -192,7 +216,7 @@ class Dense:
     def _divided(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of every impact: trajectory, number of the step, and where in it."""
         hits = self.sol.impacts
-        at = (hits.t - float(self.sol.t[0])) / float(self.sol.step)
+        at = (hits.t - float(self.sol.axis[0])) / float(self.sol.step)
         return hits.lane, np.floor(at).astype(np.int64), at - np.floor(at)
 
     def _is_divided(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
@@ -218,7 +242,7 @@ class Dense:
                 begins[i] = places[before[-1]]
                 for name in ("q", "p"):
                     row[name][i] = sol.impacts.fields[name][before[-1]]
-        t, part = self.time_at(numbers[some], begins), theta[some] - begins
+        t, part = self.time_at(lanes[some], numbers[some], begins), theta[some] - begins
         states, u = self.again.begin(lanes[some], row, t)
         moved = part > AT_ROW
         if np.any(moved):
@@ -237,6 +261,10 @@ class Dense:
         if not np.all(at_row):
             off = ~at_row
             lanes_all, lanes, t, part = lanes, lanes[off], t[off], np.maximum(theta[off], AT_ROW) * h[off]
+            if self.sol.has_own_times:
+                at = numbers[off]
+                length = self.time_at(lanes, at + 1, 0.0) - t
+                part = _step_for(part / h[off], self.saved[STEP_DENSITY][lanes, at], length, h[off])
             states, u = self.again.at(lanes, numbers[off])
             states, u = self.again.step(lanes, states, u, t, part)
             made = self.again.row(lanes, states, u, t + part)
@@ -272,7 +300,7 @@ class Dense:
             steps = {name: a for name, a in self.saved.items() if name not in fields}
             fields |= {name: a[lanes, np.minimum(numbers, a.shape[1] - 1)] for name, a in steps.items()}
         if sol.batch is not None:
-            beyond = flat > self.time_at(self.ends[lanes], 0.0) + SLACK * float(sol.step)
+            beyond = flat > self.time_at(lanes, self.ends[lanes], 0.0) + SLACK * float(sol.step)
             for a in fields.values():
                 a[beyond] = np.nan
         return {name: a.reshape(batch, times.shape[1], *a.shape[1:]) for name, a in fields.items()}
@@ -281,12 +309,19 @@ class Dense:
         """A field of which a polynomial says nothing: that of the row before."""
         return self.saved[name][lanes, np.searchsorted(self.counts, numbers, side="right") - 1]
 
-    def time_at(self, numbers: np.ndarray, theta: Any) -> np.ndarray:
+    def time_at(self, lanes: np.ndarray, numbers: np.ndarray, theta: Any) -> np.ndarray:
         """The times of places inside steps."""
-        return float(self.sol.t[0]) + (numbers + theta) * float(self.sol.step)
+        if not self.sol.has_own_times:
+            return float(self.sol.axis[0]) + (numbers + theta) * float(self.sol.step)
+        t = self.saved[CLOCK]
+        begins = t[lanes, numbers]
+        return begins + np.where(theta > 0.0, theta * (t[lanes, np.minimum(numbers + 1, t.shape[1] - 1)] - begins), 0.0)
 
     def _refuse_outside(self, times: np.ndarray) -> None:
-        first, last = float(self.sol.t[0]), float(self.sol.t[-1])
+        first, last = float(self.sol.axis[0]), float(self.sol.axis[-1])
+        if self.sol.has_own_times:  # those that have failed are NaN after their end
+            t, whole = self.saved[CLOCK], self.ends == np.max(self.ends)
+            first, last = float(np.max(t[:, 0])), float(np.min(t[whole, np.max(self.ends)]))
         slack = SLACK * float(self.sol.step) + 4 * np.spacing(max(abs(first), abs(last)))
         outside = ~((times >= first - slack) & (times <= last + slack))
         if np.any(outside):
@@ -294,6 +329,11 @@ class Dense:
                 f"sol.at takes times inside the run, from {first:.6g} to {last:.6g}, but {times[outside].flat[0]!r} is not among "
                 "them: run more steps, or go on with sol.extend(steps)."
             )
+
+
+def _step_for(theta: Any, density: Any, length: Any, h: Any) -> Any:
+    """The step of variable steps that lasts θ of the `length` that the step of h from a place of this density lasts."""
+    return theta * length * density * h / (h - theta * (h - density * length))
 
 
 def _velocity(system: Any, row: dict, t: Any, params: Any) -> Any:

@@ -15,6 +15,7 @@ import numpy as np
 from dirax.program.user_functions import is_traced
 from dirax.schemes.step import Field
 from dirax.solution.plain_forms import NotPlain, encode_params, encode_scheme
+from dirax.solution.stored_events import KINDS, arrays_of, record_of
 from dirax.solution.trajectory import Trajectory
 from dirax.text.tables import plain
 
@@ -52,8 +53,9 @@ def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinate
     """The solution in full.
 
     Dimensions: `trajectory` (in a batch), `time` (saved rows), `interval` (the step leaving a row), `coordinate`,
-    `constraint`. Variables: every saved field, `energy`, `constraint_residual`, the initial data, and `ok` in a batch.
-    `units` and `coordinates` default to what `sol.metadata` says. Attributes record what was run, as text and as JSON.
+    `constraint`, `events`, `impacts`. Variables: every saved field, `energy`, `constraint_residual`, the initial data, what
+    `sol.events` holds, and `ok` in a batch. `units` and `coordinates` default to what `sol.metadata` says. Attributes record
+    what was run, as text and as JSON.
 
     Raises `ValueError` for unknown, repeated or too few names, and for a solution inside `jax.grad`, `jit` or `vmap`.
     """
@@ -82,14 +84,23 @@ def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinate
         dims = _dimensions(f"initial_{name}", ["coordinate"], np.shape(values)[-1:], sizes)
         about = {"long_name": f"initial data {name}", "units": _unit(units, name)}
         variables[f"initial_{name}"] = Variable((*lead[: np.ndim(values) - 1], *dims), np.asarray(values), about)
+    for kind in KINDS:
+        if (found := getattr(sol, kind)) is not None:
+            for name, values in arrays_of(kind, found).items():
+                info = sol.field_info.get(name.removeprefix(f"{kind}_"))
+                dims = _dimensions(name, info.dims if info else (), values.shape[1:], sizes)
+                variables[name] = Variable((kind, *dims), values, {"long_name": name.replace("_", " of ", 1)})
     if lead:
         variables["ok"] = Variable(lead, np.asarray(sol.ok, dtype=bool), {"long_name": "whether every step was solved"})
 
-    time = {"long_name": "time", "units": _unit(units, "t")}
-    axes = {"time": Variable(("time",), np.asarray(sol.t), time)}
+    time = {
+        "long_name": "number of steps times step, of which clock is the time" if sol.has_own_times else "time",
+        "units": _unit(units, "t"),
+    }
+    axes = {"time": Variable(("time",), np.asarray(sol.axis), time)}
     if any(entry["place"] == "step" for entry in layout):
         about = {**time, "long_name": "time at which a step begins"}
-        axes["interval"] = Variable(("interval",), np.asarray(sol.t)[:-1], about)
+        axes["interval"] = Variable(("interval",), np.asarray(sol.axis)[:-1], about)
     names = _checked_names(sol, coordinates, sizes.get("coordinate", 0))
     if names:
         axes["coordinate"] = Variable(("coordinate",), np.array(names, dtype=object), {"long_name": "coordinate"})
@@ -208,6 +219,8 @@ def _attributes(sol: Trajectory, layout, derived: list[str], metadata: dict[str,
             plain({k: v for k, v in metadata.items() if k not in ("system", "scheme", "dirax_version")}, nonfinite=True)
         ),
     }
+    if events := {kind: record_of(found) for kind in KINDS if (found := getattr(sol, kind)) is not None}:
+        attributes["events"] = json.dumps(events)
     try:
         attributes["params"] = json.dumps(encode_params(sol.params))
     except NotPlain as value:

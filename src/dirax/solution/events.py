@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from dirax.program.user_functions import is_traced
+
 
 class Events:
     """What happened between the rows of a run, trajectory after trajectory, each in the order of time.
@@ -15,7 +17,8 @@ class Events:
     """
 
     def __init__(self, t: Any, index: Any, direction: Any, lane: Any, fields: dict[str, Any]):
-        self.t, self.index, self.direction, self.lane = np.asarray(t), np.asarray(index), np.asarray(direction), np.asarray(lane)
+        arrays = (t, index, direction, lane)
+        self.t, self.index, self.direction, self.lane = arrays if is_traced(arrays) else map(np.asarray, arrays)
         self.fields = fields
 
     def __getattr__(self, name: str):
@@ -44,6 +47,8 @@ class Events:
         return found
 
     def __repr__(self) -> str:
+        if is_traced(self.t):
+            return f"Events({len(self)} at most, traced)"
         stretch = f", from t = {np.min(self.t):.6g} to {np.max(self.t):.6g}" if len(self) else ""
         return f"Events({len(self)}{stretch})"
 

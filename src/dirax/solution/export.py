@@ -79,9 +79,9 @@ def _cells(column: np.ndarray) -> list:
 def _columns(sol: Trajectory, coordinates: Sequence[str] | None) -> dict[str, np.ndarray]:
     """The columns of the table by name, each with one entry a row."""
     said = describe(sol, coordinates=coordinates)
-    count, t = sol.batch or 1, np.asarray(sol.t)
-    columns = {} if sol.batch is None else {"trajectory": np.repeat(np.arange(count), len(t))}
-    columns["t"] = np.tile(t, count)
+    count = sol.batch or 1
+    columns = {} if sol.batch is None else {"trajectory": np.repeat(np.arange(count), sol.rows)}
+    columns["t"] = np.broadcast_to(np.asarray(sol.t), (count, sol.rows)).ravel()
     names = said.axes["coordinate"].values.tolist() if "coordinate" in said.axes else None
     position = "q" if "q" in said.variables else "x"
     lead = 1 if sol.batch is None else 2

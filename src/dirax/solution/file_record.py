@@ -12,6 +12,7 @@ from dirax.schemes.step import COMPOSED
 from dirax.solution.description import DERIVED, FORMAT
 from dirax.solution.saving import MOVED
 from dirax.solution.stored import Unreadable
+from dirax.solution.stored_events import shapes_in
 
 Kinds = Mapping[str, tuple[tuple[int, ...], np.dtype]]
 
@@ -29,6 +30,7 @@ class FileRecord:
     fields: list[dict[str, Any]]
     initial: list[str]
     derived: list[str]
+    events: dict[str, Any]
     stats: dict[str, Any]
     metadata: dict[str, Any]
     checksums: dict[str, int]
@@ -55,6 +57,7 @@ def file_record(about: Mapping[str, Any], kinds: Kinds) -> FileRecord:
         fields=read("fields", list),
         initial=_names("initial", read("initial", list)),
         derived=_names("derived", read("derived", list)),
+        events=read("events", dict) if "events" in about else {},
         stats=read("stats", dict),
         metadata={**read("metadata", dict), **{k: str(about[k]) for k in ("system", "scheme", "dirax_version")}},
         checksums=read("checksums", dict),
@@ -152,10 +155,13 @@ def _check_shapes(record: FileRecord, kinds: Kinds) -> None:
     for name in starts:
         if name in kinds and kinds[name][0][:-1] not in ((), lead):
             raise Unreadable(f"its variable {name:.60} has the shape {kinds[name][0]}")
-    known = {*wanted, *record.derived, *starts}
+    for name, shape in (of_events := shapes_in(record.events)).items():
+        if name in kinds and kinds[name][0] != shape:
+            raise Unreadable(f"its variable {name:.60} has the shape {kinds[name][0]} instead of {shape}")
+    known = {*wanted, *record.derived, *starts, *of_events}
     for name in kinds:
         if name not in known and not name.startswith(MOVED):
             raise Unreadable(f"its variable {name:.60} is not one that dirax wrote")
-    for name in (*wanted, *record.derived, *starts):
+    for name in (*wanted, *record.derived, *starts, *of_events):
         if name not in kinds:
             raise Unreadable(f"its variable {name:.60} is missing: the file is incomplete")

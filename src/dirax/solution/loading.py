@@ -16,6 +16,7 @@ from dirax.solution.plain_forms import decode_params, decode_scheme
 from dirax.solution.saving import MOVED, SEAL, checked_ending, checksum, seal
 from dirax.solution.solution import Solution
 from dirax.solution.stored import Stored, Unreadable, reading
+from dirax.solution.stored_events import events_in
 from dirax.solution.sweep_store import is_sweep, opened
 from dirax.solution.zarr_store import open_store
 
@@ -127,7 +128,7 @@ def _solution(said: FileRecord, arrays: dict[str, np.ndarray], params: Any) -> S
         message = [said.message.get(str(lane), "") for lane in range(len(ok))]
     if params is None and said.params is not None:
         params = decode_params(json.loads(said.params))
-    return Solution(
+    sol = Solution(
         t=arrays["time"],
         fields={e["name"]: arrays[e["variable"]] for e in said.fields},
         field_info={
@@ -146,3 +147,6 @@ def _solution(said: FileRecord, arrays: dict[str, np.ndarray], params: Any) -> S
         derived={name: arrays[name] for name in said.derived},
         metadata=said.metadata,
     )
+    for kind, record in said.events.items():
+        setattr(sol, kind, events_in(kind, record, arrays))
+    return sol

@@ -74,8 +74,8 @@ def plot_coordinate(sol: Any, i: int | str = 0, *, field: str = "q", ax: "Axes |
     index = index_of(sol, i)
     ax = given_or_new(ax)
     lanes = _lanes(sol, np.asarray(sol.fields[field]))
-    for values, kwargs in zip(lanes, _lines(len(lanes), line), strict=True):
-        ax.plot(sol.t, values[:, index], **kwargs)
+    for t, values, kwargs in zip(sol.times, lanes, _lines(len(lanes), line), strict=True):
+        ax.plot(t, values[:, index], **kwargs)
     placed = ("q" in sol.fields and field == "q") or field == "x"
     name = names_of(sol)[index]
     name = symbol(name) if placed else symbol(field, name)
@@ -91,9 +91,9 @@ def plot_energy(sol: Any, *, figure: "Figure | None" = None, **line: Any) -> "Fi
     else:
         left, right = figure.axes if figure.axes else figure.subplots(1, 2)
     energies = np.atleast_2d(np.asarray(sol.energy()))
-    for values, kwargs in zip(energies, _lines(len(energies), line), strict=True):
-        left.plot(sol.t, values, **kwargs)
-        plot_error(right, sol.t, values, **kwargs)
+    for t, values, kwargs in zip(sol.times, energies, _lines(len(energies), line), strict=True):
+        left.plot(t, values, **kwargs)
+        plot_error(right, t, values, **kwargs)
     relative = bool(np.all(energies[:, 0] != 0))
     unit = sol.metadata.get("units", {}).get("energy", "")
     left.set(xlabel=time_label(sol), ylabel=label("energy $E$", unit))
@@ -137,8 +137,8 @@ def plot_constraint(sol: Any, *, ax: "Axes | None" = None, **line: Any) -> "Axes
         raise ValueError("this system has no constraints, so there is no residual to plot.")
     ax = given_or_new(ax)
     worst = np.atleast_2d(np.max(np.abs(residual), axis=-1))
-    for values, kwargs in zip(worst, _lines(len(worst), line), strict=True):
-        _plot_log(ax, np.asarray(sol.t)[: values.size], values, **kwargs)
+    for t, values, kwargs in zip(sol.times, worst, _lines(len(worst), line), strict=True):
+        _plot_log(ax, t[: values.size], values, **kwargs)
     ax.set(xlabel=time_label(sol), ylabel="largest constraint residual")
     return ax
 
@@ -163,10 +163,9 @@ def plot_momenta(sol: Any, symmetries: Mapping[str, Callable] | None = None, *, 
         ylabel = "momentum $p$"
     for k, (name, values) in enumerate(curves.items()):
         lanes = np.atleast_2d(values)
-        for one, kwargs in zip(
-            lanes, _lines(len(lanes), {"label": name, "color": COLOURS[k % len(COLOURS)], **line}), strict=True
-        ):
-            ax.plot(sol.t, one, **kwargs)
+        lines = _lines(len(lanes), {"label": name, "color": COLOURS[k % len(COLOURS)], **line})
+        for t, one, kwargs in zip(sol.times, lanes, lines, strict=True):
+            ax.plot(t, one, **kwargs)
     ax.set(xlabel=time_label(sol), ylabel=ylabel)
     ax.legend()
     return ax
@@ -198,7 +197,7 @@ def plot_section(
         if through is None:
             raise ValueError(f"give through=, one of {', '.join(names)}, or the points= of a section.")
         k = entry(names, through)
-        lanes = [crossings(np.asarray(sol.t), lane, k, value, direction) for lane in _lanes(sol, states_of(sol))]
+        lanes = [crossings(t, lane, k, value, direction) for t, lane in zip(sol.times, _lanes(sol, states_of(sol)), strict=True)]
     else:
         lanes = [np.atleast_2d(lane) for lane in (points if isinstance(points, list | tuple) else [points])]
     if any(lane.shape[-1] != len(names) for lane in lanes):

@@ -139,7 +139,7 @@ def _plain(fields: dict[str, Any]) -> dict[str, Any]:
 
 def _lifted(solution: Solution, system: Any, fields: dict[str, Any], info: dict[str, Field], equation: Any = None) -> Solution:
     return Solution(
-        t=solution.t,
+        t=solution.axis,
         fields=fields,
         field_info=info,
         step=solution.step,

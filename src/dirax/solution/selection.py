@@ -66,7 +66,9 @@ def _between(sol: Trajectory, stretch: slice) -> range:
         raise TypeError("a stretch of time has no stride: simulate with save_every= for fewer rows.")
     if is_traced(sol.t):
         raise ValueError("times are traced here: choose rows by whole numbers, or outside of jax.grad, jit and vmap.")
-    t, slack = np.asarray(sol.t), SLACK * float(sol.step)
+    t, slack = np.asarray(sol.t), 0.0 if sol.has_own_times else SLACK * float(sol.step)
+    if t.ndim > 1:
+        raise ValueError("the trajectories of this batch have times of their own: take one of them first, sol[i][t0:t1].")
     first = 0 if stretch.start is None else int(np.searchsorted(t, stretch.start - slack, side="left"))
     last = len(t) if stretch.stop is None else int(np.searchsorted(t, stretch.stop + slack, side="right"))
     if first >= last:
@@ -87,7 +89,7 @@ def _rows(sol: Some, rows: range) -> Some:
     if rows.start > 0:
         names = ("q", "p") if "q" in sol.fields else ("x",)
         changes["initial"] = {k: sol.fields[k][(*lead, rows.start)] for k in names if k in sol.fields}
-    return sol.replace(t=sol.t[rows.start : rows.stop], fields=fields, **changes)
+    return sol.replace(t=sol.axis[rows.start : rows.stop], fields=fields, **changes)
 
 
 def _trajectories(sol: Some, lanes: Any) -> Some:

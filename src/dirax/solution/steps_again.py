@@ -20,7 +20,7 @@ from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
-from dirax.schemes.step import Field, StepEquation, composed_row, needs_every_part
+from dirax.schemes.step import CLOCK, Field, StepEquation, composed_row, needs_every_part
 from dirax.solution.trajectory import Trajectory
 
 MANY = 2000
@@ -32,6 +32,7 @@ UPDATES = 50
 
 def begun(equation: Any, system: Any, row: dict[str, Any], t: Any, h: Any, params: Any) -> tuple[Any, tuple]:
     """State and first guesses of all stages of the step that leaves a row: what the scheme says, and sums since the start."""
+    t = row.get(CLOCK, t)
     data = {**row, **system.complete({**row, "t": t}, params, False), "t": t}
     (first, fraction), *others = equation.stages
     state, u = first.resume(data, fraction * h, params)
@@ -156,7 +157,7 @@ class StepsAgain:
 
     def time(self, number: np.ndarray) -> np.ndarray:
         """The times at which steps begin."""
-        return float(self.sol.t[0]) + number * float(self.sol.step)
+        return float(self.sol.axis[0]) + number * float(self.sol.step)
 
     def at(self, lanes: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States and unknowns of these steps, NaN where a step has no solution."""
@@ -217,7 +218,7 @@ class StepsAgain:
             sol = self.sol
             params = jax.tree.map(lambda a: np.asarray(a)[lanes] if sol.batch_params else np.asarray(a), sol.given_params)
             problem = Problem(
-                equation=self.solved, state=state, guess=(u,), h=float(sol.step), t0=float(sol.t[0]), steps=1, params=params,
+                equation=self.solved, state=state, guess=(u,), h=float(sol.step), t0=float(sol.axis[0]), steps=1, params=params,
                 batch=len(lanes), batch_params=sol.batch_params,
             )  # fmt: skip
             with contextlib.suppress(UnsupportedPrimitive, ImportError):

@@ -12,7 +12,7 @@ from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
-from dirax.schemes.step import Field
+from dirax.schemes.step import CLOCK, Field
 from dirax.text.representation import counted, fields_html
 
 BLOCK = 2**16
@@ -73,7 +73,7 @@ class Trajectory:
         derived: dict[str, Any] | None = None,
         metadata: dict[str, Any] | None = None,
     ):
-        self.t, self.fields, self.field_info = t, fields, field_info
+        self.axis, self.fields, self.field_info = t, fields, field_info
         self.step, self.save_every, self.stats = step, save_every, stats
         self.ok, self.message = ok, message
         self.system, self.scheme, self.equation = system, scheme, equation
@@ -92,10 +92,29 @@ class Trajectory:
 
     def replace(self: Some, **changes: Any) -> Some:
         """A copy with other values for some of the constructor's arguments."""
-        given = {name: getattr(self, name) for name in GIVEN} | {"params": self._params}
+        given = {name: getattr(self, name) for name in GIVEN} | {"t": self.axis, "params": self._params}
         copy = type(self)(**(given | changes))
         copy.example, copy.events, copy.impacts = self.example, self.events, self.impacts
         return copy
+
+    @property
+    def t(self) -> Any:
+        """The times of the rows, (rows,); of a batch whose steps have lengths of their own (B, rows)."""
+        return self.fields.get(CLOCK, self.axis)
+
+    @property
+    def has_own_times(self) -> bool:
+        """Whether steps have lengths of their own, so that rows are not at t0 + k·step."""
+        return CLOCK in self.fields
+
+    @property
+    def times(self) -> np.ndarray:
+        """The times of the rows of every trajectory, (B, rows)."""
+        return np.broadcast_to(np.asarray(self.t), (self.batch or 1, self.rows))
+
+    def time_of(self, row: Any, lane: int = 0) -> float:
+        """The time of a row of a trajectory."""
+        return float(self.times[lane, row])
 
     @property
     def batch(self) -> int | None:
@@ -122,12 +141,12 @@ class Trajectory:
     @property
     def rows(self) -> int:
         """Number of saved rows."""
-        return len(self.t)
+        return len(self.axis)
 
     @property
     def nbytes(self) -> int:
         """Bytes of the saved arrays, `t` included."""
-        return int(self.t.nbytes + sum(np.asarray(a).nbytes for a in self.fields.values()))
+        return int(self.axis.nbytes + sum(np.asarray(a).nbytes for a in self.fields.values()))
 
     def energy(self):
         """The energy at every saved row, (…, rows): E = ⟨p, v⟩ − L for Lagrangian systems, H for Hamiltonian ones.
@@ -188,7 +207,7 @@ class Trajectory:
             return None
         lead = (self.rows,) if self.batch is None else (self.batch, self.rows)
         rows = {k: np.asarray(a).reshape(self.rows * count, *np.shape(a)[len(lead) :]) for k, a in nodes.items()}
-        rows["t"] = np.tile(np.asarray(self.t), count)
+        rows["t"] = np.broadcast_to(np.asarray(self.t), lead).ravel()
         repeated = lambda leaf: np.repeat(leaf, self.rows, axis=0)
         constant = lambda leaf: np.broadcast_to(leaf, (self.rows * count, *np.shape(leaf)))
         along = [(repeated if self.batch_params else constant)(np.asarray(leaf)) for leaf in leaves]
@@ -208,7 +227,7 @@ class Trajectory:
         if is_traced(self.t, self.fields, self.step):
             return {**about, "holds": f"{shapes}, traced"}
         every = "every step" if self.save_every == 1 else f"every {counted(self.save_every, 'step')}"
-        about["time"] = f"{self.t[0]:.6g} to {self.t[-1]:.6g}, step {float(self.step):.6g}, {every} saved"
+        about["time"] = f"{self.time_of(0):.6g} to {self.time_of(-1):.6g}, step {float(self.step):.6g}, {every} saved"
         about["holds"] = shapes
         if redundant := self.stats.get("redundant_constraints"):
             about["redundant"] = f"constraints {', '.join(map(str, redundant))}, left out because they follow from the others"
@@ -244,3 +263,9 @@ def _along(function, nodes, params, axes):
     """`function` of every row, compiled once per function and shape: a system's bound method is compared by its system."""
     along = jax.vmap(lambda row, params: function(SavedRow(row), params), in_axes=(0, None))
     return (along if axes is None else jax.vmap(along, in_axes=axes))(nodes, params)
+
+
+def last_rows(nodes: list[np.ndarray]) -> np.ndarray:
+    """The last row (B,) that each trajectory reached, −1 where there is none, by the arrays (B, rows, …) of the nodes."""
+    reached = [np.isfinite(a).reshape(*a.shape[:2], -1).all(axis=2) for a in nodes]
+    return np.max(np.where(np.logical_and.reduce(reached), np.arange(nodes[0].shape[1]), -1), axis=1)

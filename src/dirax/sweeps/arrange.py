@@ -37,7 +37,7 @@ def arranged(axes: Axes, trial: Trial, units: Any, coordinates: Any) -> tuple[La
     for name, values in axes.values.items():
         dims = axes.dims if axes.zipped else (name,)
         named[name] = (
-            Array(dims, (), TEXT if values.dtype.kind == "U" else values.dtype.name, {"units": own.get(name, "")}),
+            Array(dims, (), TEXT if values.dtype.kind == "U" else values.dtype.name, _unit(own.get(name, ""))),
             values,
         )
     arrays = _kept(trial.keep, own) if trial.keep.function is not None else _rows(sol, said)
@@ -73,8 +73,13 @@ def _kept(keep: Keep, units: Mapping[str, Any]) -> dict[str, Array]:
         if not like.size:
             raise ValueError(f"keep returned an empty array as {name}: leave it out.")
         dims = tuple(f"{name}_axis_{k}" for k in range(like.ndim))
-        found[name] = Array(dims, like.shape, like.dtype.name, {"units": str(units.get(name, ""))})
+        found[name] = Array(dims, like.shape, like.dtype.name, _unit(str(units.get(name, ""))))
     return found
+
+
+def _unit(text: str) -> dict[str, str]:
+    """What says the unit, nothing where there is none: xarray would label plots with empty brackets."""
+    return {"units": text} if text else {}
 
 
 def sized(axes: Axes, layout: Layout, trial: Trial, task_seconds: float, slots: int) -> Grid:

@@ -1,7 +1,6 @@
 """The tasks of a sweep to their ends: given out, run again where a worker died, given up after the third time."""
 
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from typing import Any
@@ -11,7 +10,8 @@ from dirax.sweeps.case import in_words
 from dirax.sweeps.commit import StoreError
 from dirax.sweeps.executors import Place, PlaceLost, own_processes, parallel
 from dirax.sweeps.progress import State
-from dirax.sweeps.task import Plan, Task
+from dirax.sweeps.queue import Queue
+from dirax.sweeps.task import Done, Plan, Task
 
 ATTEMPTS = 3
 """How often a task is tried."""
@@ -25,47 +25,53 @@ def drive(tasks: Iterable[Task], place: Place, executor: Any, plan: Plan, state:
 
     Raises `PointError`, `StoreError` and `PlaceLost`; what is under way then is given up.
     """
-    waiting, running = deque(tasks), {}
+    waiting, running = Queue(tasks), dict[Future, list[Task]]()
     tries: dict[Any, int] = {}
     given_up: list[str] = []
     spare: Place | None = None
+
+    def ended(task: Task, outcome: Done | BaseException) -> None:
+        if isinstance(outcome, Done):
+            waiting.took(outcome.seconds)
+            state.done += outcome.ok + outcome.failed + outcome.refused
+            state.failed += outcome.failed + outcome.refused
+        elif isinstance(outcome, PointError | StoreError):
+            raise outcome
+        else:
+            tries[task.index] = tries.get(task.index, 0) + (ATTEMPTS if _tried_elsewhere(outcome) else 1)
+            if tries[task.index] < ATTEMPTS:
+                waiting.put_alone([task])
+                return
+            state.given_up += task.points
+            first = {name: axis.ravel() for name, axis in task.values.items()}
+            given_up.append(f"{task.points} points from {described(first)} on: {in_words(outcome)}")
+        changed()
+
     try:
         while waiting or running:
             now = spare or place
-            while waiting and len(running) < now.slots():
-                task = waiting.popleft()
+            while waiting and len(running) < (slots := now.slots()):
+                call = waiting.taken(now.call_seconds, slots)
                 try:
-                    running[now.submit(task)] = task
+                    running[now.submit(call)] = call
                 except now.lost:
-                    waiting.appendleft(task)
+                    waiting.put_back(call)
                     spare = now = _spare(plan, executor)
-            ended, _ = wait(running, timeout=LOOK, return_when=FIRST_COMPLETED)
-            for future in ended:
-                task = running.pop(future)
+            for future in wait(running, timeout=LOOK, return_when=FIRST_COMPLETED).done:
+                call = running.pop(future)
                 error = _error(future)
                 if error is None:
-                    done = future.result()
-                    state.done += done.ok + done.failed + done.refused
-                    state.failed += done.failed + done.refused
-                    changed()
-                elif isinstance(error, PointError | StoreError):
-                    raise error
+                    for task, outcome in zip(call, future.result(), strict=True):
+                        ended(task, outcome)
                 elif isinstance(error, CancelledError):
                     raise PlaceLost("the executor has gone: it, or its scheduler, was ended")
-                elif isinstance(error, place.lost) and spare is None:
-                    spare = _spare(plan, executor)
-                    waiting.append(task)
                 elif isinstance(error, place.lost):
-                    waiting.append(task)
+                    spare = spare or _spare(plan, executor)
+                    waiting.put_back(call)
+                elif len(call) > 1:  # one of them is to blame
+                    waiting.put_alone(call)
                 else:
-                    tries[task.index] = tries.get(task.index, 0) + (ATTEMPTS if _tried_elsewhere(error) else 1)
-                    if tries[task.index] < ATTEMPTS:
-                        waiting.append(task)
-                        continue
-                    state.given_up += task.points
-                    first = {name: axis.ravel() for name, axis in task.values.items()}
-                    given_up.append(f"{task.points} points from {described(first)} on: {in_words(error)}")
-                    changed()
+                    ended(call[0], error)
     finally:
         for future in running:
             future.cancel()

@@ -107,7 +107,7 @@ def _affine_root(interpreter: Interpreter, equation: Any, *operands: Nodes) -> l
 def _run(run: Callable, sol: Solution, names: tuple[str, ...]) -> np.ndarray:
     lanes, rows = sol.batch or 0, sol.rows
     columns = [np.asarray(sol.fields[name]).reshape(lanes * rows, -1).T for name in names]
-    columns.append(np.tile(np.asarray(sol.t), lanes)[None])
+    columns.append(np.broadcast_to(np.asarray(sol.t), (lanes, sol.rows)).ravel()[None])
     for leaf in jax.tree.leaves(sol.given_params):
         values = np.asarray(leaf, dtype=np.float64)
         if sol.batch_params:

@@ -4,7 +4,7 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -12,11 +12,15 @@ from typing import Any
 import jax
 
 from dirax.engines.threads import thread_count
-from dirax.sweeps.processes import Processes, packed, run_packed
+from dirax.sweeps.processes import Outcome, Processes, packed, run_packed
 from dirax.sweeps.task import Done, Plan, Task, run_task
 
 AHEAD = 2
-"""Tasks that an executor which is not here is given for each of its workers, so that none waits for the next."""
+"""Calls that an executor which is not here is given for each of its workers, so that none waits for the next."""
+
+CALL_SECONDS = 1.0
+"""How long a call to such an executor takes, of several tasks where these are short: what a scheduler does costs some ten
+milliseconds a call."""
 
 ASK_AGAIN = 5.0
 """Seconds after which a cluster is asked again how many workers it has."""
@@ -28,13 +32,15 @@ class PlaceLost(ConnectionError):
 
 @dataclass
 class Place:
-    """`submit(task)` gives its future; `slots()` is how many tasks it is given at a time; `end(dropping)` gives up what is under
-    way; `lost` are exceptions that say that the place as a whole is gone."""
+    """`submit(tasks)` gives the future of a call that returns their outcomes; `slots()` is how many calls it is given at a time;
+    `end()` gives up what is under way; `lost` are exceptions that say that the place as a whole is gone; `call_seconds` is how
+    long a call should take, 0 for one task a call."""
 
-    submit: Callable[[Task], Future]
+    submit: Callable[[Sequence[Task]], Future]
     slots: Callable[[], int]
     end: Callable[[], None]
     lost: tuple[type[BaseException], ...] = ()
+    call_seconds: float = 0.0
 
 
 def checked(executor: Any) -> Any:
@@ -81,7 +87,8 @@ def place(executor: Any, plan: Plan) -> Iterator[Place]:
             yield found
     else:
         data, count = packed(plan), parallel(executor, False)
-        yield Place(lambda task: executor.submit(run_packed, data, task), lambda: AHEAD * count, lambda: None, (BrokenExecutor,))
+        submit = lambda tasks: executor.submit(run_packed, data, tasks)
+        yield Place(submit, lambda: AHEAD * count, lambda: None, (BrokenExecutor,), CALL_SECONDS)
 
 
 def own_processes(plan: Plan, count: int) -> Place:
@@ -121,6 +128,9 @@ def _here(plan: Plan) -> Iterator[Place]:
         finally:
             free.append(device)
 
+    def outcomes(tasks: Sequence[Task]) -> list[Outcome]:
+        return [run(task) for task in tasks]
+
     pool = ThreadPoolExecutor(count, thread_name_prefix="dirax-sweep")
 
     def end() -> None:
@@ -128,7 +138,7 @@ def _here(plan: Plan) -> Iterator[Place]:
         pool.shutdown(wait=True, cancel_futures=True)
 
     try:
-        yield Place(lambda task: pool.submit(run, task), lambda: count, end)
+        yield Place(lambda tasks: pool.submit(outcomes, tasks), lambda: count, end)
     finally:
         end()
 
@@ -159,11 +169,8 @@ def _dask(executor: Any, plan: Plan) -> Iterator[Place]:
                 count, asked = _threads_of(client), time.monotonic()
             return AHEAD * count
 
-        yield Place(
-            lambda task: pool.submit(run_packed, data, task),
-            slots,
-            lambda: pool.shutdown(wait=False),
-        )
+        submit = lambda tasks: pool.submit(run_packed, data, tasks)
+        yield Place(submit, slots, lambda: pool.shutdown(wait=False), call_seconds=CALL_SECONDS)
 
 
 def _is_client(executor: Any) -> bool:

@@ -106,7 +106,7 @@ class Keep:
         params = jax.tree.map(lambda leaf: np.asarray(leaf)[at], sol.given_params) if sol.batch_params else sol.given_params
         arrays = {name: np.asarray(a)[at] for name, a in sol.fields.items()}
         derived = {name: np.asarray(getattr(sol, name)())[at] for name in self.derived}
-        bare = sol.replace(t=jnp.asarray(sol.t), fields={}, derived={}, params=None, message="", initial={}, ok=True)
+        bare = sol.replace(t=jnp.asarray(sol.axis), fields={}, derived={}, params=None, message="", initial={}, ok=True)
 
         def one(fields: Any, derived: Any, params: Any) -> Any:
             return dict(self.function(bare.replace(fields=fields, derived=derived, params=params, batch_params=False)))  # type: ignore[misc]
@@ -186,7 +186,7 @@ def _as_columns(sol: Solution) -> Solution:
     params = jax.tree.map(lambda leaf: Column(np.asarray(leaf)), sol.given_params) if sol.batch_params else sol.given_params
     shown = _Together(
         **given,
-        t=Column(np.broadcast_to(sol.t, (sol.batch or 0, len(sol.t)))),
+        t=Column(np.broadcast_to(sol.t, (sol.batch or 0, sol.rows))),
         fields={name: Column(np.asarray(a)) for name, a in sol.fields.items()},
         params=params,
         ok=Column(np.asarray(sol.ok)),

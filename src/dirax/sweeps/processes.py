@@ -6,10 +6,14 @@ import pickle
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeAlias
 
-from dirax.sweeps.task import Done, Plan, Task, run_task
+from dirax.sweeps.task import Done, Plan, Task, finished, run_task
+
+Outcome: TypeAlias = "Done | Exception"
+"""What became of a task."""
 
 
 class WorkerDied(RuntimeError):
@@ -27,9 +31,9 @@ class Processes:
         self._lock = threading.Lock()
         self._ended = False
 
-    def submit(self, task: Task) -> Future:
-        """The future of a task. Its exception is `WorkerDied` where the process ended, or what the task raised."""
-        return self._pool.submit(self._ask, task)
+    def submit(self, tasks: Sequence[Task]) -> Future:
+        """The future of the outcomes of tasks. Its exception is `WorkerDied` where the process ended."""
+        return self._pool.submit(self._ask, tasks)
 
     def shutdown(self) -> None:
         """End all processes, whatever they do."""
@@ -42,10 +46,10 @@ class Processes:
         for process in running:
             _close(process)
 
-    def _ask(self, task: Task) -> Done:
+    def _ask(self, tasks: Sequence[Task]) -> list[Outcome]:
         process = getattr(self._local, "process", None) or self._started()
         try:
-            send(process.stdin, pickle.dumps(task))  # type: ignore[arg-type]
+            send(process.stdin, pickle.dumps(tasks))  # type: ignore[arg-type]
             answer = receive(process.stdout)  # type: ignore[arg-type]
         except OSError:
             answer = None
@@ -56,10 +60,7 @@ class Processes:
             with self._lock:
                 self._all.discard(process)
             raise WorkerDied(f"the process that ran it ended ({_ending(code)})")
-        result = pickle.loads(answer)
-        if isinstance(result, BaseException):
-            raise result
-        return result
+        return pickle.loads(answer)
 
     def _started(self) -> subprocess.Popen:
         with self._lock:
@@ -113,13 +114,27 @@ def packed(plan: Plan) -> bytes:
 
 
 _plans: dict[int, Any] = {}
+_loading = threading.Lock()
 
 
-def run_packed(plan: bytes, task: Task) -> Done:
-    """`run_task` in another process, which keeps the plan that it was given last."""
+def run_packed(plan: bytes, tasks: Sequence[Task]) -> list[Outcome]:
+    """The outcomes of tasks in another process, which keeps the plan that it was given last."""
     key = hash(plan)
-    if key not in _plans:
-        loaded = pickle.loads(plan)
-        _plans.clear()
-        _plans[key] = loaded
-    return run_task(_plans[key], task)
+    with _loading:  # threads of one process share the plan, and what is compiled for it
+        if key not in _plans:
+            loaded = pickle.loads(plan)
+            _plans.clear()
+            _plans[key] = loaded
+        common = _plans[key]
+    return [_outcome(common, task) for task in tasks]
+
+
+def _outcome(plan: Plan, task: Task) -> Outcome:
+    try:
+        return finished(plan, task) or run_task(plan, task)
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # it cannot travel, but its text can
+            return RuntimeError(f"{type(error).__name__}: {error}")
+        return error

@@ -56,7 +56,7 @@ def settled(
 
 def _take(path: Path, hold: Hold) -> None:
     if not os.access(path, os.W_OK):
-        raise StoreError(f"the store {path} cannot be written (permission denied): make it writable, or choose another path.")
+        raise StoreError(f"the store {path} cannot be written (it is read-only here): make it writable, or choose another path.")
     try:
         mine = hold.take(path)
     except OSError as error:

@@ -18,7 +18,7 @@ from dirax.sweeps.case import Case, Values
 from dirax.sweeps.commit import commit
 from dirax.sweeps.grid import Index
 from dirax.sweeps.keep import Keep
-from dirax.sweeps.layout import FAILED, MESSAGE, OK, REFUSED, STATUS, Layout
+from dirax.sweeps.layout import FAILED, MESSAGE, OK, OPEN, REFUSED, STATUS, Layout
 
 
 class Stopped(Exception):
@@ -52,9 +52,19 @@ class Task:
     left: np.ndarray | None = None
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        """That of the block."""
+        return next(iter(self.values.values())).shape
+
+    @property
+    def mask(self) -> np.ndarray:
+        """Which of the block's points are to be run."""
+        return np.ones(self.shape, bool) if self.left is None else self.left
+
+    @property
     def points(self) -> int:
         """How many trajectories are to be run."""
-        return int(np.sum(self.left)) if self.left is not None else next(iter(self.values.values())).size
+        return int(np.sum(self.mask))
 
 
 @dataclass(frozen=True)
@@ -79,8 +89,7 @@ def run_task(plan: Plan, task: Task, stopping: Callable[[], bool] | None = None)
     """Run the trajectories of a task and write them. Raises `PointError`, `StoreError`, and `Stopped` where `stopping()` says
     so."""
     started = time.perf_counter()
-    shape = next(iter(task.values.values())).shape
-    mask = np.ones(shape, bool) if task.left is None else task.left
+    shape, mask = task.shape, task.mask
     values = {name: axis[mask] for name, axis in task.values.items()}
     with _in_context(plan):
         found = _filled_up(plan, values, stopping) if plan.filled else results(plan, values, stopping)
@@ -96,8 +105,20 @@ def run_task(plan: Plan, task: Task, stopping: Callable[[], bool] | None = None)
         old[inside] = part
         blocks[name] = old
     commit(plan.folder, plan.layout, task.index, blocks)
-    counted = np.bincount(found[STATUS], minlength=4).tolist()
-    return Done(task.index, counted[OK], counted[FAILED], counted[REFUSED], time.perf_counter() - started)
+    return _counted(task, found[STATUS], time.perf_counter() - started)
+
+
+def finished(plan: Plan, task: Task) -> Done | None:
+    """How a task ended that is in the store already, run by a worker that died before it could say so."""
+    if not (plan.folder / plan.layout.file(STATUS, task.index)).exists():
+        return None
+    status = plan.layout.read(plan.folder, STATUS, task.index)[tuple(map(slice, task.shape))][task.mask]
+    return None if np.any(status == OPEN) else _counted(task, status, 0.0)
+
+
+def _counted(task: Task, status: np.ndarray, seconds: float) -> Done:
+    counts = np.bincount(status, minlength=4).tolist()
+    return Done(task.index, counts[OK], counts[FAILED], counts[REFUSED], seconds)
 
 
 def results(plan: Plan, values: Values, stopping: Callable[[], bool] | None = None) -> dict[str, np.ndarray]:

@@ -17,21 +17,8 @@ def main() -> None:
     from dirax.sweeps.processes import receive, run_packed, send
 
     plan = receive(sys.stdin.buffer)
-    while plan is not None and (task := receive(sys.stdin.buffer)) is not None:
-        try:
-            result = run_packed(plan, pickle.loads(task))
-        except Exception as error:
-            result = _plain(error)
-        send(answers, pickle.dumps(result))
-
-
-def _plain(error: Exception) -> Exception:
-    """The error, or one with its text where it cannot travel."""
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
-        return RuntimeError(f"{type(error).__name__}: {error}")
-    return error
+    while plan is not None and (tasks := receive(sys.stdin.buffer)) is not None:
+        send(answers, pickle.dumps(run_packed(plan, pickle.loads(tasks))))
 
 
 def _end_with_parent() -> None:

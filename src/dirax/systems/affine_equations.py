@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from dirax.numerics.tolerances import PIVOT
 from dirax.program.linear_solves import solve
@@ -24,6 +25,9 @@ THRESHOLD = 0.1
 
 VANISHING = 1e-3
 """A square part whose smallest singular value is less, in units of its usual rows and columns, is no good choice there."""
+
+REGULAR = 0.05
+"""About the same of the pivots that were chosen at a point, from which on others are looked at."""
 
 
 class Explicit(NamedTuple):
@@ -116,25 +120,68 @@ class Solved:
 def solved(equations: Callable, matrix: np.ndarray, rank: int, entries: np.ndarray, usual: np.ndarray | None = None) -> Solved:
     """The equations (x, params) ↦ (A, b) around a point where A is `matrix` (r, f) and has this rank; `entries` (r, f) are
     those of A, NaN where they depend on x; `usual` as in `pivots`."""
-    (r, f), (rows, columns) = matrix.shape, pivots(matrix, rank, usual)
-    rank = len(rows)
-    others, free = np.setdiff1d(np.arange(r), rows), np.setdiff1d(np.arange(f), columns)
-    zero = np.all(entries[others] == 0.0, axis=1)
+    rows, columns = pivots(matrix, rank, usual)
 
     @once
     def whole(x, params):
-        """(solution and kernel (f, 1 + f − rank), conditions)."""
         matrix, right = equations(x, params)
-        sides = jnp.concatenate([right[rows, None], -matrix[rows][:, free]], axis=1)
-        core = matrix[rows][:, columns]
-        top = solve(core, sides, apart=True) if rank > 1 else sides / core if rank else sides
-        missed = matrix[others][:, columns] @ top[:, 0] if rank else jnp.zeros(others.size)
-        return _whole(top, columns, free), right[others] - jnp.where(zero, 0.0, missed)
+        return _by_pivots(matrix, right, matrix[rows][:, columns], rows, columns, entries)
 
+    return _of(whole, matrix.shape[0] - len(rows), rows, columns)
+
+
+def switching(choices: list[Solved], equations: Callable, entries: np.ndarray, usual: np.ndarray) -> Solved:
+    """The equations solved by the first choice of pivots where it is regular, by the most regular one elsewhere: also inside a
+    compiled run, along which a pivot may vanish."""
+    if len(choices) == 1:
+        return choices[0]
+    places = [tuple(np.array(indices, int) for indices in choice.pivots) for choice in choices]
+    by_row, by_column = _sizes(usual)
+    rank = len(places[0][0])
+
+    def regularity(core, rows, columns):
+        """About the smallest singular value of the square part, in units of its usual rows and columns; 0 for one that is not."""
+        scaled = lax.stop_gradient(core) / by_row[rows] / by_column[:, columns]
+        if rank == 1:
+            return jnp.abs(scaled[0, 0])
+        inverse = jnp.max(jnp.abs(solve(scaled, jnp.eye(rank))))
+        return jnp.where(jnp.isfinite(inverse), 1.0 / inverse, 0.0)
+
+    @once
+    def whole(x, params):
+        matrix, right = equations(x, params)
+        cores = [matrix[rows][:, columns] for rows, columns in places]
+        sizes = [regularity(core, *place) for core, place in zip(cores, places, strict=True)]
+        sizes[0] = jnp.where(sizes[0] >= REGULAR, jnp.inf, sizes[0])
+        best, found = sizes[0], None
+        for size, core, (rows, columns) in zip(sizes, cores, places, strict=True):
+            chosen = size >= best
+            # where it is not chosen nothing is divided by it, in derivatives neither
+            own = _by_pivots(matrix, right, jnp.where(chosen, core, jnp.eye(rank)), rows, columns, entries)
+            found = own if found is None else tuple(jnp.where(chosen, a, b) for a, b in zip(own, found, strict=True))
+            best = jnp.maximum(best, size)
+        assert found is not None
+        return found
+
+    return _of(whole, choices[0].count, *places[0])
+
+
+def _by_pivots(matrix, right, core, rows: np.ndarray, columns: np.ndarray, entries: np.ndarray):
+    """(solution and kernel (f, 1 + f − rank), conditions) by the square part `core` in these rows and columns."""
+    (r, f), rank = matrix.shape, len(rows)
+    others, free = np.setdiff1d(np.arange(r), rows), np.setdiff1d(np.arange(f), columns)
+    zero = np.all(entries[others] == 0.0, axis=1)
+    sides = jnp.concatenate([right[rows, None], -matrix[rows][:, free]], axis=1)
+    top = solve(core, sides, apart=True) if rank > 1 else sides / core if rank else sides
+    missed = matrix[others][:, columns] @ top[:, 0] if rank else jnp.zeros(others.size)
+    return _whole(top, columns, free), right[others] - jnp.where(zero, 0.0, missed)
+
+
+def _of(whole: Callable, count: int, rows: np.ndarray, columns: np.ndarray) -> Solved:
     return Solved(
         lambda x, params: whole(x, params)[0][:, 0],
         lambda x, params: whole(x, params)[1],
-        r - rank,
+        count,
         lambda x, params: whole(x, params)[0][:, 1:],
         (tuple(rows.tolist()), tuple(columns.tolist())),
     )

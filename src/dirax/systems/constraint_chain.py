@@ -47,7 +47,8 @@ class ConstraintChain:
     - `coordinates` and `multiplier_names`; with a `clock` the last coordinate is the time, which no projection moves.
     - `freedom`: the number of undetermined directions of ẋ; `redundant`: that of undetermined multipliers.
 
-    The functions are smooth around `point`, where their bases were chosen, and traceable.
+    The functions are traceable, inside runs too. Their bases were chosen at `point`; where the pivots of these vanish further
+    away, others are taken there.
     """
 
     levels: tuple[ConstraintLevel, ...]
@@ -85,7 +86,7 @@ class ConstraintChain:
         return self._at(self._constraints, x, params)
 
     def field(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
-        """The tangent field ẋ on M_f; where it is not unique, the one whose undetermined part was zero at `point`.
+        """The tangent field ẋ on M_f; where it is not unique, the one without a part in the undetermined directions.
 
         Raises `ValueError` for a chain that ended empty or irregular.
         """

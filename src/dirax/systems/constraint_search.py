@@ -1,6 +1,7 @@
 """The search of the constraint algorithm: level by level, until it repeats or nothing is left ([BLM] §3)."""
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -12,10 +13,13 @@ from dirax.numerics.tolerances import MANIFOLD_RANK, ON_MANIFOLD
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import along, jacobian, once
 from dirax.program.user_functions import constant_entries, evaluated
-from dirax.systems.affine_equations import Solved, explicit, solved
+from dirax.systems.affine_equations import Solved, explicit, solved, switching
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
 from dirax.systems.constraint_points import Function, Points
 from dirax.systems.forms import ImplicitForm
+
+MOST_CHOICES = 6
+"""Choices of pivots, beyond the best one of a point, that the functions of a chain change between."""
 
 
 def rank_of(matrix: np.ndarray, reference: np.ndarray | None = None) -> int:
@@ -129,14 +133,15 @@ class Search:
             usual = np.nanmax(np.abs([here, *others]), axis=0)
             found = solved(equations, here, free, entries, usual)
             null = np.linalg.svd(matrices[0])[2][rank:].T
+            everywhere = partial(self.everywhere, equations, (here, *others), free, entries, usual)
             if not found.count:
-                return self.finish(found, null, rank)
+                return self.finish(everywhere(found), null, rank)
             missed = self.at_points(lambda x, params, found=found: (found.conditions(x, params),))
             size = 1.0 + np.abs(self.given(self.x)[1]).max(initial=0.0) + np.abs(self.x).max()
             if all(np.all(np.abs(missed(x)[0]) <= ON_MANIFOLD * size) for x in points):
-                return self.finish(found, null, rank)
+                return self.finish(everywhere(found), null, rank)
             landing = self.landing(self.choices(equations, here, free, entries, usual), equations, usual)
-            outcome = self.add(landing, points, rank, self._off_manifold(rank, place))
+            outcome = self.add(landing, points, rank, self._off_manifold(rank, place), everywhere)
             if outcome is not None:
                 return outcome
             self.rows = [*(self.rows if rank > self.explicit.rank else ()), self.tangency(self.parts[-1])]
@@ -165,6 +170,27 @@ class Search:
                     tried.add(found.pivots)
                     yield found
 
+    def everywhere(
+        self,
+        equations: Callable,
+        matrices: Iterable[np.ndarray],
+        rank: int,
+        entries: np.ndarray,
+        usual: np.ndarray,
+        found: Solved,
+    ) -> Solved:
+        """The equations solved by the pivots of `found`, and by others, chosen at the point and around it, where those that
+        depend on x vanish further away."""
+        if np.all(np.isfinite(entries[list(found.pivots[0])])):
+            return found
+        more = {found.pivots: found}
+        for matrix in matrices:
+            for choice in self.choices(equations, matrix, rank, entries, usual):
+                if len(more) > MOST_CHOICES:
+                    break
+                more.setdefault(choice.pivots, choice)
+        return switching(list(more.values()), equations, entries, usual)
+
     def landing(self, choices: Iterable[Solved], equations: Callable, usual: np.ndarray) -> Landing:
         """The nearest point where the conditions vanish and a choice of pivots is regular; else what the first choice gave."""
         first, regular, matrix = None, [], self.at_points(equations)
@@ -179,8 +205,11 @@ class Search:
         assert first is not None
         return min(regular)[2] if regular else first
 
-    def add(self, landing: Landing, points: list[np.ndarray], rank: int, note: str) -> ConstraintChain | None:
-        """Take the independent ones of the conditions as the constraints of a new level; the chain where that ends it."""
+    def add(
+        self, landing: Landing, points: list[np.ndarray], rank: int, note: str, everywhere: Callable
+    ) -> ConstraintChain | None:
+        """Take the independent ones of the conditions as the constraints of a new level; the chain where that ends it. Where
+        all of them are, they are those of `everywhere`, which takes other pivots further away."""
         conditions, function, x = landing.found.conditions, landing.function, landing.point
         number, old = len(self.levels), sum(level.count for level in self.levels)
         slopes = [function(x)[1] for x in points]
@@ -211,6 +240,8 @@ class Search:
                 "regular zero set. State such a constraint by a function whose derivative does not vanish.",
             )
         select = _independent(slope[old:], slope[:old], reference[old:], new)
+        if new == len(select.T):
+            conditions = everywhere(landing.found).conditions
         part = once(lambda x, params: select @ conditions(x, params))
 
         def constraints_of_level(x):
@@ -256,13 +287,18 @@ class Search:
         @once
         def kernel(x, params):
             free = family(x, params)[1] @ found.kernel(x, params)
-            return free @ solve(null.T @ free, jnp.eye(null.shape[1]), apart=True)
+            return free
 
         @once
         def solution(x, params):
             w, basis = family(x, params)
             rates = w + basis @ found.solution(x, params)
-            return rates - kernel(x, params) @ (null.T @ rates) if null.size else rates
+            if not null.size:
+                return rates
+            free = kernel(
+                x, params
+            )  # the part in it is zero: a condition that holds on, as one by the null space of a point does not
+            return rates - free @ solve(free.T @ free, free.T @ rates, apart=True)
 
         return self.end(GAUGE if freedom else DETERMINED, "; ".join(words) + ".", index, freedom, redundant, solution, kernel)
 

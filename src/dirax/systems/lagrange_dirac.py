@@ -13,7 +13,7 @@ from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import METRIC_RANK
 from dirax.program.linear_solves import scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import gradient, jacobian
+from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import Constraints, no_constraint
 from dirax.systems.forms import ImplicitForm
@@ -123,8 +123,11 @@ class LagrangeDirac(AbstractSystem):
         t: Any = 0.0,
     ) -> Float[Numbers, " n"]:
         """A velocity v with ∂L/∂v (q, v) = p; where L is degenerate the one nearest to `guess` (zero by default)."""
-        v0 = jnp.zeros_like(q) if guess is None else guess
-        return nearest_root(lambda v: self.legendre(q, v, params, t) - p, v0)
+        return self._velocity_of_momentum(t, q, p, params, jnp.zeros_like(q) if guess is None else guess)
+
+    @once
+    def _velocity_of_momentum(self, t, q, p, params, guess):
+        return nearest_root(lambda v: self.legendre(q, v, params, t) - p, guess)
 
     def energy(self, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any = None, t: Any = 0.0) -> Float[Numbers, ""]:
         """The energy E(q, v) = ⟨∂L/∂v, v⟩ − L(q, v); it is `generalized_energy` on the image of the Legendre transform."""

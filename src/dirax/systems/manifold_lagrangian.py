@@ -8,12 +8,14 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from dirax.geometry.manifolds import AbstractManifold
+from dirax.geometry.spaces import AbstractFlat, Product
 from dirax.numerics.arrays import Data, Numbers
 from dirax.program.linear_solves import solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import Constraints
+from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem, refuse_start
 
 
@@ -23,10 +25,15 @@ class ManifoldLagrangian(AbstractSystem):
     `lagrangian(q, v[, params])` returns a scalar and is used for points and tangent vectors only; `manifold` is a dirax
     manifold such as `dx.Product(dx.Sphere(3), dx.Sphere(3))`. Momenta are covectors, given as the tangent vectors that
     represent them in R^N. It must be regular on Q. `one_forms(q[, params])` (m, N) are the rows of constraints W(q) v = 0 on
-    tangent vectors, with `affine(q[, params])` (m,) W(q) v + b(q) = 0; `forces(t, q, v[, params])` (N,) is the covector of
-    other forces. Of one-forms and forces only what acts on tangent vectors matters; one-forms and b may take `t` first.
+    tangent vectors, with `affine(q[, params])` (m,) W(q) v + b(q) = 0; `holonomic(q[, params])` (c,) are constraints g(q) = 0
+    of points of Q; `forces(t, q, v[, params])` (N,) is the covector of other forces. Of one-forms and forces only what acts
+    on tangent vectors matters, of g its values on Q; one-forms, b and g may take `t` first.
 
-    Stepped by `dx.DiscreteDirac` with a discretization map on Q, and without constraints and forces by `dx.InCharts`.
+    Stepped by `dx.DiscreteDirac` with a discretization map on Q, and where Q has a retraction by `dx.PlusLagrangeDirac`,
+    `dx.MinusLagrangeDirac` and `dx.LagrangeDAlembert`, in charts, with a discrete Lagrangian of one's own too; by `dx.InCharts`
+    with that of a map. Reduced by `dx.reduce`: on a group by it, on a flat manifold by a connection, on others where
+    translations of coordinates are symmetries, as the system that `dx.in_coordinates` gives.
+    Holonomic constraints are kept at the nodes by `dx.DiscreteDirac` with constraints="resolve".
 
         ball = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - q[2], dx.Sphere(3), one_forms=lambda q: a(q)[None])
         dx.simulate(ball, dx.DiscreteDirac(dx.SphereProjection()), q=q, v=v, step=0.01, steps=1000)
@@ -39,7 +46,8 @@ class ManifoldLagrangian(AbstractSystem):
     one_forms: UserFunction | None
     forces: UserFunction | None
     affine: UserFunction | None
-    _tangential: UserFunction | None
+    holonomic: UserFunction | None
+    _constraints: Constraints
 
     def __init__(
         self,
@@ -49,25 +57,39 @@ class ManifoldLagrangian(AbstractSystem):
         *,
         forces: Callable | None = None,
         affine: Callable | None = None,
+        holonomic: Callable | None = None,
     ):
         if not isinstance(manifold, AbstractManifold):
             raise TypeError(f"manifold must be a dirax manifold such as dx.Sphere(3), but {manifold!r} was given.")
         self.lagrangian = UserFunction(lagrangian, "lagrangian", ("q", "v"))
         self.manifold = manifold
-        given = Constraints.of(one_forms, affine, None)
-        self.one_forms, self.affine = given.one_forms, given.affine
+        given = Constraints.of(one_forms, affine, holonomic)
+        self.one_forms, self.affine, self.holonomic = given.one_forms, given.affine, given.holonomic
         self.forces = None if forces is None else UserFunction(forces, "forces", ("t", "q", "v"))
-        self._tangential = None if given.one_forms is None else _tangential(given.one_forms, manifold)
+        tangential = None if given.one_forms is None else _tangential(given.one_forms, manifold)
+        self._constraints = Constraints(
+            tangential, given.affine, None if given.holonomic is None else _of_points(given.holonomic, manifold)
+        )
 
     @property
     def constraints(self) -> Constraints:
-        """The constraints, with the rows of W projected to the tangent space."""
-        return Constraints(self._tangential, self.affine, None)
+        """The constraints, with the rows of W projected to the tangent space, and g of the nearest point of the manifold: the
+        rows of ∂g/∂q are then tangent too."""
+        return self._constraints
 
     @property
     def depends_on_time(self) -> bool:
         """Whether a constraint takes the time."""
-        return any(f is not None and f.takes_time for f in (self.one_forms, self.affine))
+        return any(f is not None and f.takes_time for f in (self.one_forms, self.affine, self.holonomic))
+
+    def flat_form(self) -> LagrangeDirac | None:
+        """The same system in the coordinates of R^N or of a torus, which are those of its points; None on other manifolds."""
+        factors = self.manifold.factors if isinstance(self.manifold, Product) else (self.manifold,)
+        if not all(isinstance(factor, AbstractFlat) for factor in factors):
+            return None
+        functions = {"one_forms": self.one_forms, "forces": self.forces, "affine": self.affine, "holonomic": self.holonomic}
+        given = {name: function.function for name, function in functions.items() if function is not None}
+        return LagrangeDirac(self.lagrangian.function, **given)
 
     def manifold_form(self) -> "ManifoldLagrangian":
         """The system itself."""
@@ -97,21 +119,31 @@ class ManifoldLagrangian(AbstractSystem):
         return derivative @ v - value
 
     def project_position(self, q: Float[Numbers, " N"], v: Float[Numbers, " N"], params: Any = None, t: Any = 0.0) -> Numbers:
-        """The point of the manifold near q."""
-        return self.manifold.nearest(q)
+        """The point of the manifold with g = 0 near q, moved along the metric's inverse of Gᵀ."""
+        q = self.manifold.nearest(q)
+        if self.holonomic is None:
+            return q
+        frame, point = self.manifold.frame(q), self.manifold.local_parametrization(q)
+        lifted = self._lifted(q, v, frame, self.constraints.holonomic_matrix(t, q, params), params)
+        g = lambda s: self.constraints.position_defect(t, point(lifted @ s), params)
+        return point(lifted @ nearest_root(g, jnp.zeros(lifted.shape[1])))
+
+    def _lifted(self, q, v, frame, rows, params):
+        """metric⁻¹ rowsᵀ in components of the frame."""
+        hessian = jacobian(gradient(lambda v: self.lagrangian(q, v, params)))(v)
+        return solve(frame.T @ hessian @ frame, (rows @ frame).T)
 
     def project_velocity(self, q: Float[Numbers, " N"], v: Float[Numbers, " N"], params: Any = None, t: Any = 0.0) -> Numbers:
-        """The tangent vector at q with W v + b = 0 nearest to v, in the metric ∂²L/∂v² of the tangent space."""
+        """The tangent vector at q with W v + b = 0 and G v + ∂g/∂t = 0 nearest to v, in the metric ∂²L/∂v² of the tangent
+        space."""
         v, frame = self.manifold.projection(q, v), self.manifold.frame(q)
-        hessian = jacobian(gradient(lambda v: self.lagrangian(q, v, params)))(v)
-        rows = self.constraints.matrix(t, q, params)
-        lifted = frame @ solve(frame.T @ hessian @ frame, (rows @ frame).T)
+        lifted = frame @ self._lifted(q, v, frame, self.constraints.matrix(t, q, params), params)
         return self.constraints.nearest_velocity(t, q, v, lifted, params)
 
     # ------------------------------------------------------------------ AbstractSystem
 
-    def sizes(self, data: Data, params: Any) -> tuple[int, int]:
-        """(N, m)."""
+    def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
+        """(N, m), or (N, m, c) with holonomic constraints."""
         if set(data) - {"t"} == {"q"}:
             refuse_start(self, data, "q, v", "q, p")
         if "q" not in data:
@@ -126,31 +158,33 @@ class ManifoldLagrangian(AbstractSystem):
             out = self.forces.shape(jnp.zeros(()), q, q, params)
             if out.shape != q.shape:
                 raise ValueError(f"forces(t, q, v) must return shape {q.shape} like q, but it returned shape {out.shape}.")
-        return q.shape[0], Constraints(self.one_forms, self.affine, None).sizes(q, params)[0]
+        m, c = Constraints(self.one_forms, self.affine, self.holonomic).sizes(q, params)
+        return (q.shape[0], m) if self.holonomic is None else (q.shape[0], m, c)
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         q, t = data["q"], data.get("t", 0.0)
         v = data["v"] if "v" in data else self.inverse_legendre(q, data["p"], params)
         if project and self.constraints.any:
+            q = self.project_position(q, v, params, t)
             v = self.project_velocity(q, v, params, t)
         keep = "p" in data and not (project and self.constraints.any)
         return {"q": q, "v": v, "p": data["p"] if keep else self.legendre(q, v, params)}
 
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " m"]:
-        """W v + b."""
-        return self.constraints.nonholonomic_defect(data.get("t", 0.0), data["q"], data["v"], params)
+        """(W v + b, g, G v + ∂g/∂t)."""
+        return self.constraints.defect(data.get("t", 0.0), data["q"], data["v"], params)
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy at the saved point and momentum."""
         return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params), params)
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
-        """How far the point is from the manifold, and W v + b with the velocity that belongs to the saved momentum."""
+        """How far the point is from the manifold, and (W v + b, g, G v + ∂g/∂t) with the velocity of the saved momentum."""
         q, off = row["q"], self.manifold.defect(row["q"])[None]
         if not self.constraints.any:
             return off
         v = self.inverse_legendre(q, row["p"], params)
-        return jnp.concatenate([off, self.constraints.nonholonomic_defect(row.get("t", 0.0), q, v, params)])
+        return jnp.concatenate([off, self.constraints.defect(row.get("t", 0.0), q, v, params)])
 
     @property
     def energy_changes(self) -> str:
@@ -165,3 +199,10 @@ def _tangential(one_forms: UserFunction, manifold: AbstractManifold) -> UserFunc
     if one_forms.takes_time:
         return UserFunction(lambda t, q, params: rows(q, one_forms(t, q, params)), "one_forms", ("q",), timed=True)
     return UserFunction(lambda q, params: rows(q, one_forms(q, params)), "one_forms", ("q",), timed=True)
+
+
+def _of_points(holonomic: UserFunction, manifold: AbstractManifold) -> UserFunction:
+    """g of the nearest point of the manifold."""
+    if holonomic.takes_time:
+        return UserFunction(lambda t, q, params: holonomic(t, manifold.nearest(q), params), "holonomic", ("q",), timed=True)
+    return UserFunction(lambda q, params: holonomic(manifold.nearest(q), params), "holonomic", ("q",), timed=True)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.diagnostics.bench.subject import Skipped
+from dirax.program.memo import Same
 from dirax.program.user_functions import evaluated
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -31,6 +32,22 @@ class ExplicitODE:
     shown: int
 
 
+@dataclass(frozen=True)
+class _Completion:
+    """(data, params) ↦ the data as the system completes them."""
+
+    same: Same
+    project: bool
+
+    def __call__(self, data, params):
+        return self.same.object.complete(dict(data), params, self.project)
+
+
+def completed(system: AbstractSystem, data: Mapping[str, Any], params: Any, project: bool = False) -> dict[str, Any]:
+    """`system.complete(data, params, project)` of one trajectory, without a compiler where that can be."""
+    return evaluated(_Completion(Same(system), project), dict(data), params)
+
+
 def explicit_ode(system: AbstractSystem, data: Mapping[str, Array], params: Any) -> ExplicitODE:
     """The equations of motion solved for the derivatives, multipliers eliminated; `data` are initial data of one trajectory.
 
@@ -43,17 +60,17 @@ def explicit_ode(system: AbstractSystem, data: Mapping[str, Array], params: Any)
         case NonholonomicMechanics():
             return explicit_ode(system.lagrange_dirac(), data, params)
         case LagrangeDirac():
-            complete = system.complete(dict(data), params, False)
+            complete = completed(system, data, params)
             if "v" not in complete:
                 raise Skipped("the run starts from two points")
-            start = jnp.concatenate([complete["q"], complete["v"]])
+            start = np.concatenate([complete["q"], complete["v"]])
             return _solved(_newton_equations(system, len(complete["q"]), params), start, len(complete["q"]))
         case PhaseSpaceLagrangian():
             return _solved(_hamilton_equations(system, params), data["q"], len(data["q"]))
         case DiracSystem() if system.holonomic is not None and not system.is_graph:
             raise Skipped("its constraints make it a differential-algebraic equation")
         case DiracSystem():
-            x = system.complete(dict(data), params, False)["x"]
+            x = completed(system, data, params)["x"]
             return _solved(_dirac_equations(system, params), x, len(x))
         case PortHamiltonian() if not system.closed:
             return ExplicitODE(_open_ports(system, params), np.asarray(data["x"]), len(data["x"]))

@@ -35,7 +35,7 @@ class CollocationKernels:
         self.saved: Any = None
         """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
         self.places: Any = None
-        self._run: tuple[Any, Any] | None = None
+        self._run: Any = None
 
     @functools.cached_property
     def record(self) -> Record:
@@ -55,11 +55,11 @@ class CollocationKernels:
     def kernel(self, width: int) -> tuple[Any, bool]:
         """The compiled `run`, and whether it came from a cache."""
         if self._run is not None:
-            return self._run[1], True
+            return self._run, True
         text = lambda: collocation_module(self.plan, llvm.has_fma())
         library, _, cached = linked("run", (self.digest, width, "collocation"), text, lambda: self.operations)
-        self._run = library, SIGNATURE(library["run"])
-        return self._run[1], cached
+        self._run = llvm.function(library, "run", SIGNATURE)
+        return self._run, cached
 
     def of_sizes(self, width: int) -> None:
         """No kernel: sizes are found by NumPy."""

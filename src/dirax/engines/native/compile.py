@@ -96,3 +96,10 @@ def load(code: bytes, names: tuple[str, ...]):
         builder.export_symbol(name)
     number = next(_numbers)
     return builder.link(_jit(number // LINKED_TOGETHER), f"dirax_kernel_{number}")
+
+
+def function(library: Any, name: str, signature: Any) -> Any:
+    """A function of linked code, which keeps that code in memory: another thread may have linked it anew meanwhile."""
+    made = signature(library[name])
+    made.library = library
+    return made

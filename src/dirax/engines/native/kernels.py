@@ -40,9 +40,9 @@ class Kernels:
         """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
         self.places: Any = None
         self.digest = _digest(self)
-        self._runs: dict[int, tuple[Any, Any]] = {}
-        self._of_sizes: dict[int, tuple[Any, Any]] = {}
-        self._linearizations: dict[tuple[bool, int], tuple[Any, Any]] = {}
+        self._runs: dict[int, Any] = {}
+        self._of_sizes: dict[int, Any] = {}
+        self._linearizations: dict[tuple[bool, int], Any] = {}
 
     @property
     def bare(self) -> Plan:
@@ -57,26 +57,26 @@ class Kernels:
     def kernel(self, width: int) -> tuple[Any, bool]:
         """The compiled `run` for a width, and whether it came from a cache."""
         if width in self._runs:
-            return self._runs[width][1], True
+            return self._runs[width], True
         library, cached = self._library("run", width, lambda: kernel_module(self._planned(), width, llvm.has_fma()))
-        self._runs[width] = library, SIGNATURE(library["run"])
-        return self._runs[width][1], cached
+        self._runs[width] = llvm.function(library, "run", SIGNATURE)
+        return self._runs[width], cached
 
     def of_sizes(self, width: int) -> Any:
         """The compiled `run` that finds the sizes; None where they are not written as nodes."""
         if width not in self._of_sizes and self.step.sizes_are_written:
             text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
             library, _ = self._library("run", width, text, "sizes", level=0)
-            self._of_sizes[width] = library, SIGNATURE(library["run"])
-        return self._of_sizes.get(width, (None, None))[1]
+            self._of_sizes[width] = llvm.function(library, "run", SIGNATURE)
+        return self._of_sizes.get(width)
 
     def linearized(self, reverse: bool, width: int) -> Any:
         """The compiled `linearized` for a width: tangents forward or cotangents backward. Raises `UnsupportedPrimitive`."""
         if (reverse, width) not in self._linearizations:
             text = lambda: self._linearized(reverse).module(width, llvm.has_fma())
             library, _ = self._library("linearized", width, text, "backward" if reverse else "forward")
-            self._linearizations[reverse, width] = library, LINEARIZED_SIGNATURE(library["linearized"])
-        return self._linearizations[reverse, width][1]
+            self._linearizations[reverse, width] = llvm.function(library, "linearized", LINEARIZED_SIGNATURE)
+        return self._linearizations[reverse, width]
 
     def check(self) -> None:
         """Raise `UnsupportedPrimitive` for a step with too many operations."""

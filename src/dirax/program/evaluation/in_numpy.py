@@ -44,28 +44,46 @@ class Values:
                 table[row] = value
         return table.T.reshape(self.entries, *nodes.shape)
 
-    def slopes(self, nodes: list[int], inputs: list[int]) -> np.ndarray:
+    def slopes(self, nodes: list[int], inputs: list[int], plan: "Slopes | None" = None) -> np.ndarray:
         """The derivatives of nodes by inputs, (entries, nodes, inputs): forward over the graph, which only gains the
-        derivatives of single operations."""
-        g, values = self.graph, self._known
-        moving, factors = set(inputs), {}
-        for node in g.reachable(nodes):
-            args = g.args[node]
-            if node not in moving and any([a in moving for a in args]):
-                moving.add(node)
-                factors[node] = [] if g.op[node] == "select" else partials(g, node)
+        derivatives of single operations; `plan` where it has been made before."""
+        plan, values = plan or Slopes(self.graph, nodes, inputs), self._known
         with np.errstate(all="ignore"):
-            g.evaluate([*nodes, *(f for slopes in factors.values() for f in slopes if f is not None)], {}, values=values)
+            self.graph.evaluate(plan.needed, {}, values=values, order=plan.order)
             none = np.zeros((len(inputs), self.entries))
             rows = dict(zip(inputs, np.eye(len(inputs))[:, :, None] * np.ones(self.entries), strict=True))
-            for node, slopes in factors.items():
-                args = g.args[node]
-                if g.op[node] == "select":
-                    rows[node] = np.where(values[args[0]], rows.get(args[1], none), rows.get(args[2], none))
+            for node, terms in plan.terms:
+                if terms is None:
+                    condition, yes, no = self.graph.args[node]
+                    rows[node] = np.where(values[condition], rows.get(yes, none), rows.get(no, none))
                     continue
-                terms = [values[f] * rows[a] for a, f in zip(args, slopes, strict=True) if f is not None and a in rows]
-                rows[node] = sum(terms[1:], terms[0]) if terms else none
+                first, *others = terms
+                total = values[first[1]] * rows[first[0]]
+                for operand, factor in others:
+                    total += values[factor] * rows[operand]
+                rows[node] = total
         return np.stack([rows.get(node, none) for node in nodes]).transpose(2, 0, 1)
+
+
+class Slopes:
+    """What it takes to find the derivatives of nodes by inputs in numbers, found once."""
+
+    def __init__(self, graph: Graph, nodes: list[int], inputs: list[int]):
+        moving = set(inputs)
+        self.terms: list[tuple[int, list[tuple[int, int]] | None]] = []
+        """Nodes that depend on the inputs, with (operand that does, node of the derivative by it); None for a selection."""
+        for node in graph.reachable(nodes):
+            args = graph.args[node]
+            if node in moving or not any([a in moving for a in args]):
+                continue
+            if graph.op[node] == "select":
+                moving.add(node)
+                self.terms.append((node, None))
+            elif terms := [(a, f) for a, f in zip(args, partials(graph, node), strict=True) if f is not None and a in moving]:
+                moving.add(node)
+                self.terms.append((node, terms))
+        self.needed = [*nodes, *(factor for _, terms in self.terms for _, factor in terms or ())]
+        self.order = graph.reachable(self.needed)
 
 
 def in_parts(function: Callable, leaves: list[np.ndarray]) -> list[np.ndarray]:

@@ -10,11 +10,18 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from dirax.numerics.newton import damped_step
-from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported
+from dirax.program.evaluation.in_numpy import Slopes, Values
+from dirax.program.graph import GraphTooLarge
+from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
 from dirax.program.linear_solves import equilibrated_inverse
+from dirax.program.memo import Memo, Same
 from dirax.program.rules.reductions import factors_of_product
 from dirax.program.scalar_program import ScalarProgram, numpy_rule
 from dirax.program.tracing import jacobian, of_one_result
+
+LARGE_DERIVATIVE = 30_000
+"""Nodes of a function times numbers by which it is differentiated from which on a graph of the derivative takes longer than its
+values at a few entries."""
 
 LARGE_PRODUCT = 256
 """Multiplications of a product of arrays from which on it is no graph of them."""
@@ -38,6 +45,37 @@ def dot_general(made: ScalarProgram, interpreter: Interpreter, equation: Any, a:
         return [total.reshape(len(x), *shape)]
 
     return made.between([left, right], [shape], product)
+
+
+@numpy_rule("dirax_derivative")
+def derivative_in_numbers(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
+    """Derivatives of large functions by many numbers are found in numbers, with no graph of their own."""
+    jaxpr, wanted = equation.params["jaxpr"], equation.params["wanted"]
+    inner = _inner.get(Same(jaxpr), lambda: _plain(jaxpr))
+    if inner is None or len(inner.graph) * sum(operands[k].size for k in wanted) < LARGE_DERIVATIVE:
+        return list(RULES["dirax_derivative"](interpreter, equation, *operands))
+    (result,), inputs = inner.results, [node for k in wanted for node in inner.inputs[k].ravel().tolist()]
+    ends, outputs, plans = np.cumsum([operands[k].size for k in wanted])[:-1], result.ravel().tolist(), []
+
+    def slopes(arrays: list[np.ndarray]) -> list[np.ndarray]:
+        plans[:] = plans or [Slopes(inner.graph, outputs, inputs)]
+        known = Values(inner.graph, len(arrays[0]))
+        for nodes, array in zip(inner.inputs, arrays, strict=True):
+            known.bind(nodes, array)
+        parts = np.split(known.slopes(outputs, inputs, plans[0]), ends, axis=2)
+        return [part.reshape(len(part), *v.aval.shape) for part, v in zip(parts, equation.outvars, strict=True)]
+
+    return made.between(list(operands), [v.aval.shape for v in equation.outvars], slopes)
+
+
+_inner: Memo[ScalarProgram | None] = Memo(128)
+
+
+def _plain(jaxpr: ClosedJaxpr) -> ScalarProgram | None:
+    try:
+        return ScalarProgram.of(jaxpr)
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return None
 
 
 @numpy_rule("svd")
@@ -137,12 +175,21 @@ def _of_finite(function: Callable, matrices: np.ndarray) -> list[np.ndarray]:
     return [np.where(spread(a), a, np.nan) for a in function(np.where(spread(matrices), matrices, 0.0))]
 
 
+_equations: Memo[tuple[Callable, Callable]] = Memo(128)
+
+
+def _with_slope(residual: ClosedJaxpr) -> tuple[Callable, Callable]:
+    """A residual and its derivative by the last argument, for arguments with an axis of entries."""
+    slope = jax.make_jaxpr(jacobian(of_one_result(residual), len(residual.in_avals) - 1))(*residual.in_avals)
+    value, linear = (ScalarProgram.of(jaxpr, by_numpy=True).in_numpy for jaxpr in (residual, slope))
+    return value, linear
+
+
 @numpy_rule("dirax_root")
 def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
     """The method of `dirax.program.roots`, for all entries side by side."""
     closed: ClosedJaxpr = equation.params["residual"]
-    slope = jax.make_jaxpr(jacobian(of_one_result(closed), len(operands) - 1))(*closed.in_avals)
-    residual, linear = (ScalarProgram.of(jaxpr, by_numpy=True).in_numpy for jaxpr in (closed, slope))
+    residual, linear = _equations.get(Same(closed), lambda: _with_slope(closed))
     most = equation.params["max_steps"]
 
     def find(arrays: list[np.ndarray]) -> list[np.ndarray]:

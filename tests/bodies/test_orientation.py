@@ -1,0 +1,68 @@
+"""One machine with its rotations as Euler angles, as quaternions of length 1, and on SO(3) by a discretization map."""
+
+import numpy as np
+import pytest
+
+import dirax as dx
+
+b = dx.bodies
+TOP = b.Body("top", 1.0, (0.1, 0.1, 0.05), centre=(0, 0, 0.4))
+CASES = {  # rotation of the joint, initial place and velocities of one motion
+    "zxz": ({"top.nutation": 0.5}, {"top.spin": 9.0, "top.precession": 0.0}),
+    "quaternion": (
+        {"top.qx": np.sin(0.25)},
+        {"top.qz": 4.5 * np.cos(0.25), "top.qy": -4.5 * np.sin(0.25), "top.qx": 0.0},
+    ),
+}
+
+
+def turned(model, q):
+    return np.asarray(model.frames(q, np.zeros(len(q)))["top"].turn)
+
+
+def test_one_model_has_one_motion_in_all_three():
+    step = {"step": 2e-3, "steps": 250, "save_every": 250}
+    ends = []
+    for rotation, (place, velocity) in CASES.items():
+        model = b.Model([TOP], [b.ball("ground", "top", rotation)])
+        data = model.state(place, velocity)
+        sol = dx.simulate(model.system, dx.LagrangeDAlembert(), **data, **step)
+        ends.append(turned(model, sol.q[-1]))
+        if rotation == "quaternion":
+            on_group = dx.simulate(model.manifold_system, dx.DiscreteDirac(model.discretization_map), **data, **step)
+            ends.append(turned(model, on_group.q[-1]))
+            assert on_group.q[-1] @ on_group.q[-1] == pytest.approx(1.0, abs=1e-15)
+            about_vertical = model.observables(on_group)["angular_momentum"][:, 2]
+            assert about_vertical[-1] == pytest.approx(about_vertical[0], rel=1e-12) and about_vertical[0] > 0.3
+    for end in ends[1:]:
+        assert end == pytest.approx(ends[0], abs=1e-3)
+
+
+def test_a_rolling_ball_on_the_group_keeps_its_contact_and_its_momentum():
+    """Holonomic constraints and one-forms on R³ × SO(3), at the nodes to roundoff; Chaplygin's integral."""
+    ball = b.Model(
+        [b.Body("ball", 1.0, (0.2, 0.35, 0.5))],
+        [b.free("ground", "ball")],
+        contacts=[b.ball_contact("ball", 1.0)],
+        gravity=(0, 0, 0),
+    )
+    data = ball.state({"ball.z": 1.0, "ball.qx": 0.3}, {"ball.x": 0.5, "ball.qz": 0.6})
+    scheme = dx.DiscreteDirac(ball.discretization_map, "resolve")
+    assert ball.manifold_system.manifold.dimension == 6
+    about = lambda q, v: ball.angular_momentum(q, v, about=q[:3] - np.array([0.0, 0.0, 1.0]))
+    sol = dx.simulate(ball.manifold_system, scheme, **data, step=0.02, steps=100, save_every=100)
+    assert sol.ok and np.abs(sol.constraint_residual()).max() < 1e-13 and np.abs(sol.q[:, 2] - 1.0).max() < 1e-14
+    seen = ball.observables(sol, about=about)
+    assert np.ptp(seen["about"], axis=0).max() < 1e-4 and np.ptp(seen["energy"]) < 1e-6
+    both = dx.simulate(ball.system, dx.LagrangeDAlembert(), **data, step=0.02, steps=100, save_every=100)
+    assert sol.q[-1] == pytest.approx(both.q[-1], abs=1e-3) and np.abs(sol.q[-1] - sol.q[0]).max() > 0.5
+
+
+def test_friction_of_the_normal_force_is_not_stated_on_the_group():
+    ball = b.Model(
+        [b.Body("ball", 1.0, (0.2, 0.2, 0.2))],
+        [b.free("ground", "ball")],
+        contacts=[b.ball_contact("ball", 1.0, motion="slides", friction=0.1)],
+    )
+    with pytest.raises(ValueError, match=r"Coulomb friction.*take model\.system"):
+        _ = ball.manifold_system
