@@ -52,10 +52,6 @@ class FirstSizes:
         moved = factors.bounds(g, [size(g.mul(h, row.get(k, g.zero))) for row in rows])
         least = g.constant(LEAST_SIZE)
         own = [total([g.mul(g.constant(TYPICAL), a), size(u), least]) for a, u in zip(known, unknowns, strict=True)]
-        own = [
-            self._at_least(own, [(e, row[j]) for e, row in zip(rounded, rows, strict=True) if j in row])
-            for j, own in enumerate(own)
-        ]
         equations = [g.add(total(products(row, own)), least) for row in rows]
 
         sure = g.make("finite", total([*own, *equations]))
@@ -64,20 +60,21 @@ class FirstSizes:
             blurred = g.mul(g.constant(EPSILON), a)
             reached = g.add(u, g.make("sqrt", g.mul(m, a)))
             sure = below(blurred, g.mul(g.constant(4.0 * STALLED), reached))
+        for j, size_of in enumerate(own):
+            matters = self._matters([(e, row[j]) for e, row in zip(rounded, rows, strict=True) if j in row])
+            sure = below(g.mul(g.constant(NOTHING), matters), size_of)
         for r, row in zip(residual, matrix, strict=True):
             of_row = [g.mul(a, d) for a, d in zip(row, change, strict=True)]
             sure = below(size(g.sub(total(of_row), r)), g.mul(g.constant(SOLVED), total([size(r), *map(size, of_row)])))
         self.unknowns, self.equations, self.sure = own, equations, g.select(sure, g.one, g.zero)
 
-    def _at_least(self, own: int, where: list[tuple[int, int]]) -> int:
-        """The size of an unknown; where that is nothing beside what would matter in an equation that it is in, a part of this."""
-        g, natural = self.graph, self.graph.zero
-        for e, slope in where:
-            there = g.make("lt", g.zero, g.make("abs", slope))
-            size = g.div(e, g.make("abs", g.select(there, slope, g.one)))
-            natural = g.make("max", natural, g.select(there, size, g.zero))
-        nothing = g.make("lt", own, g.mul(g.constant(NOTHING), natural))
-        return g.select(nothing, g.mul(g.constant(TYPICAL), natural), own)
+    def _matters(self, where: list[tuple[int, int]]) -> int:
+        """The least size at which an unknown matters in an equation with these terms and this derivative by it, or ∞."""
+        g, least = self.graph, self.graph.constant(np.inf)
+        for terms, slope in where:
+            size = g.div(terms, g.make("abs", slope))
+            least = g.make("min", least, g.select(g.make("lt", g.zero, size), size, least))
+        return least
 
     @property
     def outputs(self) -> list[int]:

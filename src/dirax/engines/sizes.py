@@ -21,6 +21,7 @@ of very many unknowns are measured by 1.
 """
 
 import dataclasses
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -32,7 +33,7 @@ from dirax.engines.contract import Problem
 from dirax.engines.first_sizes import NOTHING, TYPICAL, first_sizes
 from dirax.engines.stage_look import stage_look
 from dirax.engines.stopping import STALLED
-from dirax.numerics.equilibration import balanced_inverse, power_of_two
+from dirax.numerics.equilibration import LEAST_SIZE, balanced_inverse, power_of_two
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.compiled import compiled
 from dirax.program.roots import FEWEST_SPARSE
@@ -98,7 +99,10 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
         program = step_program(p.equation, *key)
         leaves = program.parameters.flatten(p.params, p.batch if p.batch_params else None)
         leaves = np.broadcast_to(leaves, (batch, program.parameters.size))
-        look = lambda i, u, x, part=1.0: stage_look(program, i)(u, x, t, part * h[i], leaves)
+
+        def look(i, u, x, part=1.0, sizes=None):
+            return stage_look(program, i)(u, x, t, part * h[i], leaves, np.abs(u) if sizes is None else sizes)
+
         end = state
         for i in firsts:
             residual, slopes, *_ = look(i, guesses[i], end, SHORT)
@@ -110,8 +114,8 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
             if same is None:
                 residual, slopes, terms, _ = look(i, u, state)
                 short, near = (look(i, u, x, SHORT)[1] for x in (state, end))
-                both = terms, look(i, u, end)[2]
-                found.append(_sizes(residual, slopes, short, near, u, both, h[i][:, None], np))
+                both, again = (terms, look(i, u, end)[2]), lambda s, i=i, u=u: [look(i, u, x, 1.0, s)[2] for x in (state, end)]
+                found.append(_sizes(residual, slopes, short, near, u, both, again, h[i][:, None], np))
             else:
                 found.append(found[same])
     except (UnsupportedPrimitive, GraphTooLarge):
@@ -172,6 +176,9 @@ NEAR = 1.0 / 16.0
 COUPLED = 1e-3
 """Unknowns that change others by less than this of their sizes are not coupled."""
 
+ZERO = 2.0**20 * LEAST_SIZE
+"""Sizes below this are those of nothing."""
+
 ROUNDINGS = 64.0
 """Roundings up to which an unknown is zero."""
 
@@ -181,9 +188,11 @@ def _nearby(count: int) -> np.ndarray:
     return 1.0 + NEAR * (np.modf(np.arange(1, count + 1) * (np.sqrt(5.0) - 1.0) / 2.0)[0] - 0.5)
 
 
-def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: tuple, h: Any, xp: ModuleType) -> Any:
+def _sizes(
+    residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: tuple, again: Callable, h: Any, xp: ModuleType
+) -> Any:
     """(…, 2, k) from r (…, k) and its derivatives by (u, h) at the state, and those of a short step there and near its end,
-    (…, k, k + 1); `rounded` are the sizes of the terms (…, k) at either place."""
+    (…, k, k + 1); `rounded` are the sizes of the terms (…, k) at either place, and `again` those with unknowns of given sizes."""
     if not u.shape[-1]:
         return xp.ones((*u.shape[:-1], 2, 0))
     k, applied = u.shape[-1], lambda matrix, vector: (matrix @ vector[..., None])[..., 0]
@@ -193,10 +202,14 @@ def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: t
         inverse, *others = balanced_inverse(xp.stack([d[..., :k] for d in (slopes, short, near)]), xp)
         solution = xp.abs(u - finite(applied(inverse, residual)))
         largest = xp.maximum(xp.abs(u), solution)
-        terms = [of + applied(xp.abs(slopes[..., :k]), largest) for of, slopes in zip(rounded, both, strict=True)]
         inverses = [xp.abs(other) for other in others]
-        sizes = [TYPICAL * finite(applied(other, of)) for other, of in zip(inverses, terms, strict=True)]
 
+        def of_terms(rounded):
+            terms = [of + applied(xp.abs(d[..., :k]), largest) for of, d in zip(rounded, both, strict=True)]
+            sizes = [TYPICAL * finite(applied(other, of)) for other, of in zip(inverses, terms, strict=True)]
+            return terms, xp.maximum(*sizes)
+
+        terms, sizes = of_terms(rounded)
         blurred = EPSILON * finite(applied(xp.abs(inverse), terms[0]))
         moved = finite(applied(xp.abs(inverse), xp.abs(h * slopes[..., -1])))
         reached = solution + xp.sqrt(moved * blurred / EPSILON)
@@ -206,12 +219,20 @@ def _sizes(residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: t
         coupled = coupled & xp.swapaxes(coupled, -1, -2)
         hidden = ~known & (solution > ROUNDINGS * blurred) & ~xp.any(coupled & known[..., None, :], axis=-1)
         too_short = xp.any(hidden, axis=-1, keepdims=True)
-        unknowns = xp.maximum(xp.where(too_short, reached, xp.maximum(*sizes)), xp.abs(u))
-        there = slopes[..., :k] != 0.0
-        natural = xp.max(xp.where(there, rounded[0][..., None] / xp.abs(xp.where(there, slopes[..., :k], 1.0)), 0.0), axis=-2)
-        unknowns = power_of_two(xp.where(unknowns < NOTHING * natural, TYPICAL * natural, unknowns), xp)
+        unknowns = xp.maximum(xp.where(too_short, reached, sizes), xp.abs(u))
+        rounded = again(unknowns)
+        more, matters = of_terms(rounded)[1], _matters(slopes[..., :k], rounded[0], xp)
+        more = xp.where((more < ZERO) & (matters < xp.inf), TYPICAL * matters, more)
+        unknowns = power_of_two(xp.where(unknowns < NOTHING * more, more, unknowns), xp)
         equations = (finite(applied(xp.abs(derivatives[..., :k]), unknowns)) for derivatives in both)
         return xp.stack([unknowns, power_of_two(xp.maximum(*equations), xp)], axis=-2)
+
+
+def _matters(slopes: Any, terms: Any, xp: ModuleType) -> Any:
+    """The least size (…, k) at which an unknown matters in an equation that has terms (…, k) and it among them; ∞ in none."""
+    there = (slopes != 0.0) & (terms[..., None] > 0.0)
+    sizes = xp.where(there, terms[..., None] / xp.abs(xp.where(there, slopes, 1.0)), xp.inf)
+    return xp.min(xp.where(sizes > ZERO, sizes, xp.inf), axis=-2)
 
 
 def _arguments(p: Problem) -> tuple:
@@ -230,9 +251,11 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
             by_u, by_h = jax.jacfwd(residual, argnums=(0, 1))(u, part * fraction * h)
             return residual(u, part * fraction * h), jnp.concatenate([by_u, by_h[:, None]], axis=1)
 
-        def terms(i, u, x):
+        def terms(i, u, x, sizes):
             stage, fraction = equation.stages[i]
-            return rounding(lambda u, x, t, h: stage.residual(u, x, t, h, params), u, x, t, fraction * h)
+            numbers = u, x, t, fraction * h
+            errors = sizes, *map(jnp.abs, numbers[1:])
+            return rounding(lambda u, x, t, h: stage.residual(u, x, t, h, params), *numbers, errors=errors)
 
         end, found = state, []
         for i in _first_of_each(equation.stages):
@@ -242,8 +265,9 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
         end = end * _nearby(len(state))
         for i, u in enumerate(guess):
             short, near = linear(i, u, state, SHORT)[1], linear(i, u, end, SHORT)[1]
-            both = terms(i, u, state), terms(i, u, end)
-            found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, both, equation.stages[i][1] * h, jnp))
+            again = lambda sizes, i=i, u=u: [terms(i, u, x, sizes) for x in (state, end)]
+            part = equation.stages[i][1] * h
+            found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, again(jnp.abs(u)), again, part, jnp))
         return tuple(found)
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params

@@ -1,6 +1,6 @@
 """StepProgram: a step as one scalar program, of its functions traced at the flat sizes; what every engine asks of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -213,11 +213,12 @@ class StepProgram:
         return residual, slopes
 
     def in_numbers(
-        self, read: Callable[[Values], list[np.ndarray]], graph: Graph, e: TracedEquation, *arguments
+        self, read: Callable[[Values], list[np.ndarray]], graph: Graph, e: TracedEquation, *arguments, more: Sequence = ()
     ) -> list[np.ndarray]:
-        """What `read` reads of a graph that begins as that of the step; u, state, t, h, parameters have an axis of entries."""
-        shared = self.shared
-        inputs = [nodes_array(nodes) for nodes in (e.unknowns, e.state, shared.t, shared.h, shared.params)]
+        """What `read` reads of a graph that begins as that of the step; u, state, t, h, parameters, and what there is `more`,
+        pairs of nodes and values, have an axis of entries."""
+        shared, others = self.shared, [nodes for nodes, _ in more]
+        inputs = [nodes_array(nodes) for nodes in (e.unknowns, e.state, shared.t, shared.h, shared.params, *others)]
 
         def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
             known = Values(graph, len(arguments[0]))
@@ -225,8 +226,9 @@ class StepProgram:
                 known.bind(nodes, array)
             return read(known)
 
-        *others, leaves = arguments
-        return in_parts(part, [*others, np.broadcast_to(leaves, (len(others[0]), self.parameters.size))])
+        *first, leaves = arguments
+        leaves = np.broadcast_to(leaves, (len(first[0]), self.parameters.size))
+        return in_parts(part, [*first, leaves, *(values for _, values in more)])
 
 
 def nodes_array(nodes: Any) -> Nodes:

@@ -26,20 +26,24 @@ EXACT = frozenset(("neg", "abs", "max", "min", "select", "sign", "floor", "ceil"
 """Operations that do not round."""
 
 
-def rounding(function: Callable, *values: Array) -> Array:
+def rounding(function: Callable, *values: Array, errors: tuple[Array, ...] | None = None) -> Array:
     """The size of the terms of `function(*values)`, an array of floats of the shape of its value: the value is known up to a few
-    times 2⁻⁵³ of it, if the values are known to a last place each."""
+    times 2⁻⁵³ of it, if the values are known to a last place each, or to that of these `errors`."""
     jaxpr, captured, _ = closed_over(function, list(values))
-    return rounding_p.bind(*map(operand, captured), *map(operand, values), jaxpr=jaxpr)[0]
+    errors = tuple(jnp.abs(a) for a in values) if errors is None else errors
+    return rounding_p.bind(*map(operand, (*captured, *values, *errors)), jaxpr=jaxpr)[0]
 
 
-def rounding_nodes(g: Graph, outputs: list[int], inputs: set[int] | frozenset[int] = frozenset()) -> list[int]:
-    """The nodes of E for outputs of a graph, which gains them; `inputs`, and what no operation gives, have a rounding each."""
+def rounding_nodes(g: Graph, outputs: list[int], errors: dict[int, int] | None = None) -> list[int]:
+    """The nodes of E for outputs of a graph, which gains them; `errors` has those of E for some nodes, and what no operation
+    gives has a rounding."""
     error: dict[int, int] = {}
     for node in g.reachable(outputs):
-        if g.is_constant(node) or g.is_boolean(node):
+        if errors and node in errors:
+            error[node] = errors[node]
+        elif g.is_constant(node) or g.is_boolean(node):
             error[node] = g.zero
-        elif node in inputs or not g.args[node]:
+        elif not g.args[node]:
             error[node] = g.make("abs", node)
         else:
             error[node] = _error(g, node, error)
@@ -59,41 +63,52 @@ def _error(g: Graph, node: int, error: dict[int, int]) -> int:
 
 def _by_jax(*operands, jaxpr: ClosedJaxpr):
     """By the operations of the scalar program; where there is none, from the value and its derivatives."""
+    count = len(operands) - len(jaxpr.in_avals)
 
     def written() -> Callable:
         try:
             made = ScalarProgram.of(jaxpr)
             if not made.results:
                 return lambda *x: _by_derivatives(jaxpr, *x)
-            inputs = {node for nodes in made.inputs for node in nodes.ravel().tolist()}
-            made.results = [_of(made.graph, nodes, inputs) for nodes in made.results]
+            errors = [made.fresh(nodes.shape) for nodes in made.inputs[len(made.inputs) - count :]]
+            made.results = [_of(made.graph, nodes, made.inputs, errors) for nodes in made.results]
+            made.inputs += errors
             return made.in_jax
         except (UnsupportedPrimitive, GraphTooLarge):
             return lambda *x: _by_derivatives(jaxpr, *x)
 
-    return _written.get(Same(jaxpr), written)(*operands)
+    return _written.get((Same(jaxpr), count), written)(*operands)
 
 
 def _by_derivatives(jaxpr: ClosedJaxpr, *operands) -> list[Array]:
-    function = lambda *x: jaxpr_as_fun(jaxpr)(*x)[0]
-    value, slopes = function(*operands), jax.jacfwd(function, tuple(range(len(operands))))(*operands)
-    terms = (jnp.sum(jnp.abs(s * x), axis=tuple(range(value.ndim, s.ndim))) for s, x in zip(slopes, operands, strict=True))
+    function, count = lambda *x: jaxpr_as_fun(jaxpr)(*x)[0], len(jaxpr.in_avals)
+    values, given = operands[:count], operands[count:]
+    errors = [*map(jnp.abs, values[: count - len(given)]), *given]
+    value, slopes = function(*values), jax.jacfwd(function, tuple(range(count)))(*values)
+    terms = (jnp.sum(jnp.abs(s) * e, axis=tuple(range(value.ndim, s.ndim))) for s, e in zip(slopes, errors, strict=True))
     return [sum(terms, jnp.abs(value))]
 
 
-def _of(g: Graph, nodes: Nodes, inputs: set[int]) -> Nodes:
-    found = dict(zip(nodes.ravel().tolist(), rounding_nodes(g, nodes.ravel().tolist(), inputs), strict=True))
+def _of(g: Graph, nodes: Nodes, operands: list[Nodes], given: list[Nodes]) -> Nodes:
+    """The nodes of E, with those `given` for the last of the operands."""
+    flat = lambda arrays: [node for array in arrays for node in array.ravel().tolist()]
+    values = flat(operands)
+    errors = {node: g.make("abs", node) for node in values}
+    errors |= dict(zip(values[len(values) - len(flat(given)) :], flat(given), strict=True))
+    found = dict(zip(nodes.ravel().tolist(), rounding_nodes(g, nodes.ravel().tolist(), errors), strict=True))
     return elementwise(lambda node: found[node], nodes)
 
 
 @rule("dirax_rounding")
 def _rule(interpreter: Interpreter, equation: Any, *operands: Nodes):
-    (value,) = interpreter.run(equation.params["jaxpr"], *operands)
+    jaxpr = equation.params["jaxpr"]
+    count = len(jaxpr.in_avals)
+    (value,) = interpreter.run(jaxpr, *operands[:count])
     if isinstance(value, Unavailable):
         return [value]
-    return [_of(interpreter.graph, value, {node for nodes in operands for node in nodes.ravel().tolist()})]
+    return [_of(interpreter.graph, value, list(operands[:count]), list(operands[count:]))]
 
 
 _written: Memo[Callable] = Memo(128)
 rounding_p = plain_primitive("dirax_rounding", _by_jax, lambda *_, jaxpr: jaxpr.out_avals)
-"""The sizes of the terms of a jaxpr of floats with one result."""
+"""The sizes of the terms of a jaxpr of floats with one result, of its operands and of the errors of the last of them."""
