@@ -73,7 +73,10 @@ def stationary_action(solution: Solution, structure: Any, tolerance: float | Non
     of the sizes of its terms; None for runs of other schemes, of which `membership` says why."""
     if not isinstance(structure, AbstractPairs) or solution.save_every != 1 or solution.rows < 3:
         return None
-    terms = _varied_terms(structure, solution, np.random.default_rng(0).normal(size=np.shape(solution.q)))
+    q = np.asarray(solution.q)
+    moved = np.nanmax(np.abs(np.diff(q, axis=-2)), axis=tuple(range(q.ndim - 1)))  # the units of each coordinate
+    variation = np.where(moved > 0.0, moved, 1.0) * np.random.default_rng(0).normal(size=q.shape)
+    terms = _varied_terms(structure, solution, variation)
     value, size = np.nansum(terms, axis=1).T
     relative = np.abs(value) / np.where(size > 0, size, 1.0)
     text = "Σ⟨D₂L_d + D₁L_d, δq⟩ along a variation δq ∈ Δ at random, relative to its terms"

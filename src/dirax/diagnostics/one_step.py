@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.rows import over_rows
+from dirax.engines.sizes import sizes_near
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.xla.lane import first_lane, take_step
 from dirax.numerics.equilibration import condition_number
-from dirax.numerics.tolerances import TINY
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.linear_solves import solve
@@ -54,8 +54,8 @@ def differentiated_step(equation: Any, h: Any, state, guess, t, params) -> Diffe
 
     With r(u, x) = 0 and x' = a(u, x) of each stage, ∂x'/∂x = ∂_x a − ∂_u a (∂_u r)⁻¹ ∂_x r.
     """
-    lane = first_lane(state, (guess,) * len(equation.stages))
-    sizes = tuple(_sizes(stage, guess, state, t, fraction * h, params) for stage, fraction in equation.stages)
+    guesses = (guess,) * len(equation.stages)
+    lane, sizes = first_lane(state, guesses), sizes_near(equation, state, guesses, t, h, params)
     after, unknowns, _ = take_step(equation, lane, t, h, params, sizes, MAX_ITERATIONS, differentiable=False)
     jacobian, condition = jnp.eye(state.shape[0]), jnp.ones(())
     for (stage, fraction), u in zip(equation.stages, unknowns, strict=True):
@@ -72,13 +72,3 @@ def differentiated_step(equation: Any, h: Any, state, guess, t, params) -> Diffe
         t = t + fraction * h
     good = after.completed > 0
     return DifferentiatedStep(jnp.where(good, state, jnp.nan), jnp.where(good, jacobian, jnp.nan), condition)
-
-
-def _sizes(stage: Any, u, state, t, h, params):
-    """The sizes of the unknowns near u, as `dirax.engines.sizes` has them but for their rounding; 1 for the equations."""
-    if not stage.unknowns:
-        return jnp.ones((2, 0))
-    by_u, by_state = jax.jacfwd(lambda u, x: stage.residual(u, x, t, h, params), argnums=(0, 1))(u, state)
-    terms = jnp.abs(by_u) @ jnp.abs(u) + jnp.abs(by_state) @ jnp.abs(state)
-    size = jnp.abs(solve(by_u, jnp.eye(len(u)))) @ terms
-    return jnp.stack([jnp.where(size > TINY, size, TINY), jnp.ones(len(u))])

@@ -34,8 +34,9 @@ from dirax.engines.first_sizes import NOTHING, TYPICAL, first_sizes
 from dirax.engines.stage_look import stage_look
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import LEAST_SIZE, balanced_inverse, power_of_two
-from dirax.numerics.tolerances import EPSILON
+from dirax.numerics.tolerances import EPSILON, TINY
 from dirax.program.compiled import compiled
+from dirax.program.linear_solves import solve
 from dirax.program.roots import FEWEST_SPARSE
 from dirax.program.rounding import rounding
 
@@ -144,7 +145,7 @@ def _first_in_numbers(p: Problem) -> tuple[tuple[np.ndarray, ...], np.ndarray] |
                 found.append(np.ones((batch, 2, 0)))
                 continue
             values = first_sizes(program, index, u, state, t, np.full(batch, fraction * p.h), leaves)
-            found.append(values[:, :-1].reshape(batch, 2, -1))
+            found.append(power_of_two(values[:, :-1]).reshape(batch, 2, -1))
             sure &= values[:, -1] > 0.0
     except (UnsupportedPrimitive, GraphTooLarge):
         return None
@@ -272,6 +273,21 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params
     return one(*given) if axes is None else jax.vmap(one, in_axes=axes)(*given)
+
+
+def sizes_near(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> tuple:
+    """Sizes of the unknowns of each stage of a single step, from its derivatives alone; 1 for the equations."""
+
+    def one(stage, u, h):
+        if not stage.unknowns:
+            return jnp.ones((2, 0))
+        by_u, by_state = jax.jacfwd(lambda u, x: stage.residual(u, x, t, h, params), argnums=(0, 1))(u, state)
+        terms = jnp.abs(by_u) @ jnp.abs(u) + jnp.abs(by_state) @ jnp.abs(state)
+        size = jnp.abs(solve(by_u, jnp.eye(len(u)))) @ terms
+        return jnp.stack([jnp.where(jnp.isfinite(size) & (size > TINY), size, TINY), jnp.ones(len(u))])
+
+    found = (one(stage, u, fraction * h) for (stage, fraction), u in zip(equation.stages, guess, strict=True))
+    return jax.lax.stop_gradient(tuple(found))
 
 
 _compiled = compiled(sizes_at)

@@ -13,6 +13,7 @@ import numpy as np
 from dirax.engines.contract import Problem
 from dirax.engines.in_jax import in_scalars
 from dirax.engines.policy import engine_of
+from dirax.engines.sizes import sizes_near
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.xla.lane import Numerics, first_lane, take_step
 from dirax.program.compiled import compiled
@@ -46,7 +47,8 @@ def stepped(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any
     """The state after a step, and of each stage the unknowns and the state that it left, by JAX."""
     written, jacobians = in_scalars(equation, params, False)
     numerics = Numerics(jacobians=jacobians)
-    lane, unknowns, states = take_step(written, first_lane(state, guess), t, h, params, UPDATES, numerics=numerics)
+    sizes = sizes_near(written, state, guess, t, h, params)
+    lane, unknowns, states = take_step(written, first_lane(state, guess), t, h, params, sizes, UPDATES, numerics=numerics)
     return jnp.where(lane.completed > 0, lane.state, jnp.nan), unknowns, states
 
 

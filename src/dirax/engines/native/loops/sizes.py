@@ -7,6 +7,10 @@ from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.plan import Plan
 from dirax.engines.native.loops.record import DOUBTFUL
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
+from dirax.numerics.equilibration import BETWEEN, LEAST_SIZE
+
+EXPONENT = 0x7FF << 52
+"""The bits of a positive double that a power of two has."""
 
 
 def sizes_module(plan: Plan, width: int, fma: bool) -> str:
@@ -47,10 +51,16 @@ def _define_block(plan: Plan, module: Module, width: int) -> None:
             region.require(found.outputs)
             status = at(record.status)
             sure = e.compare("oeq", region.value(found.sure), e.const(1.0))
-            new = [region.value(node) for node in (*found.unknowns, *found.equations)]
+            new = [_power_of_two(e, region.value(node)) for node in (*found.unknowns, *found.equations)]
             new.append(e.select(sure, load(status), e.const(float(DOUBTFUL))))
             of_unknowns, of_equations = record.sizes(stage, k)
             for value, pointer in zip(new, [*places(of_unknowns), *places(of_equations), status], strict=True):
                 b.store(e.real, e.select(none, value, load(pointer)), pointer)
     b.line("ret void")
     module.define(f"define internal void @block(ptr %lanes, ptr %params, ptr %outs, {NUMBERS})", b)
+
+
+def _power_of_two(e: Emitter, size: str) -> str:
+    """As `numerics/equilibration.py` has it, for sizes from LEAST_SIZE."""
+    least = e.select(e.compare("olt", size, e.const(1.0 / LEAST_SIZE)), size, e.const(1.0 / LEAST_SIZE))
+    return e.from_bits(e.ints("and", e.bits(e.div(least, e.const(BETWEEN))), e.integer(EXPONENT)))
