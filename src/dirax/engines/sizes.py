@@ -31,7 +31,7 @@ import numpy as np
 
 from dirax.engines.contract import Problem
 from dirax.engines.first_sizes import NOTHING, TYPICAL, first_sizes
-from dirax.engines.stage_look import stage_look
+from dirax.engines.stage_look import END, RESIDUAL, SLOPES, TERMS, stage_look
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import LEAST_SIZE, balanced_inverse, power_of_two
 from dirax.numerics.tolerances import EPSILON, TINY
@@ -101,22 +101,28 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
         leaves = program.parameters.flatten(p.params, p.batch if p.batch_params else None)
         leaves = np.broadcast_to(leaves, (batch, program.parameters.size))
 
-        def look(i, u, x, part=1.0, sizes=None):
-            return stage_look(program, i)(u, x, t, part * h[i], leaves, np.abs(u) if sizes is None else sizes)
+        def look(i, u, *places, sizes=None, only=()):
+            """At several states, with a part of the step each: all of them at once, which is much quicker."""
+            many = lambda a: np.concatenate([a] * len(places))
+            x, steps = np.concatenate([x for x, _ in places]), np.concatenate([part * h[i] for _, part in places])
+            sizes = many(np.abs(u) if sizes is None else sizes)
+            values = stage_look(program, i)(many(u), x, many(t), steps, many(leaves), sizes, only)
+            return zip(*(np.split(a, len(places)) for a in values), strict=True)
 
         end = state
         for i in firsts:
-            residual, slopes, *_ = look(i, guesses[i], end, SHORT)
-            end = look(i, _updated(residual, slopes, guesses[i], np), end, SHORT)[-1]
+            stage_look(program, i).runs += 1
+            ((residual, slopes),) = look(i, guesses[i], (end, SHORT), only=(RESIDUAL, SLOPES))
+            ((end,),) = look(i, _updated(residual, slopes, guesses[i], np), (end, SHORT), only=(END,))
         end = end * _nearby(end.shape[1])
         found: list[np.ndarray] = []
         for i, (stage, u) in enumerate(zip(stages, guesses, strict=True)):
             same = next((j for j in range(i) if stages[j] == stage and np.array_equal(guesses[j], u)), None)
             if same is None:
-                residual, slopes, terms, _ = look(i, u, state)
-                short, near = (look(i, u, x, SHORT)[1] for x in (state, end))
-                both, again = (terms, look(i, u, end)[2]), lambda s, i=i, u=u: [look(i, u, x, 1.0, s)[2] for x in (state, end)]
-                found.append(_sizes(residual, slopes, short, near, u, both, again, h[i][:, None], np))
+                there, both = [(x, part) for part in (1.0, SHORT) for x in (state, end)], ((state, 1.0), (end, 1.0))
+                (residual, slopes, terms), (*_, other), (_, short, _), (_, near, _) = look(i, u, *there, only=OF_SIZES)
+                again = lambda s, i=i, u=u, both=both: [a for (a,) in look(i, u, *both, sizes=s, only=(TERMS,))]
+                found.append(_sizes(residual, slopes, short, near, u, (terms, other), again, h[i][:, None], np))
             else:
                 found.append(found[same])
     except (UnsupportedPrimitive, GraphTooLarge):
@@ -166,6 +172,9 @@ def _updated(residual: Any, slopes: Any, u: Any, xp: ModuleType) -> Any:
         change = (balanced_inverse(slopes[..., :k], xp) @ residual[..., None])[..., 0]
     return u - xp.where(xp.all(xp.isfinite(change), axis=-1, keepdims=True), change, 0.0)
 
+
+OF_SIZES = RESIDUAL, SLOPES, TERMS
+"""What is looked at everywhere."""
 
 SHORT = 0.25
 """The part of a step whose equations are inverted: those of a step that is too long may be singular anywhere."""

@@ -9,50 +9,59 @@ from dirax.program.graph_derivatives import jacobian
 from dirax.program.memo import Memo, Same
 from dirax.program.rounding import rounding_nodes
 
+RESIDUAL, SLOPES, TERMS, END = range(4)
+"""What there is to look at."""
+
+FEW = 4
+"""Entries up to which floats are quicker than arrays."""
+
 
 class StageLook:
-    """(u, state, t, h, parameters, sizes), with an axis of entries, ↦ residual (entries, k), its derivatives by the unknowns and
-    by h (entries, k, k + 1), the sizes of its terms (entries, k), with unknowns of these sizes, and the state after the stage
-    (entries, s)."""
+    """(u, state, t, h, parameters, sizes), with an axis of entries, ↦ what is asked for of: the residual (entries, k), its
+    derivatives by the unknowns and by h (entries, k, k + 1), the sizes of its terms (entries, k), with unknowns of these sizes,
+    and the state after the stage (entries, s)."""
 
     def __init__(self, program: StepProgram, index: int):
         self.program, self.equation = program, program.equations[index]
-        e, graph = self.equation, program.graph.copy()
-        inputs = [*e.unknowns, program.shared.h]
-        rows = jacobian(graph, e.residual, inputs) if program.sizes_are_written else []
-        self.slopes = [row.get(j, graph.zero) for row in rows for j in range(len(inputs))]
-        self.sizes = [graph.input(f"size{i}") for i in range(len(e.unknowns))]
+        e, h, known = self.equation, program.shared.h, program.jacobians[index] if program.sizes_are_written else []
+        graph = program.graph.copy()
+        self.inputs = [*e.unknowns, h]
+        by_h = jacobian(graph, e.residual, [h]) if known else []
+        rows = zip(known, by_h, strict=True)
+        k = len(e.unknowns)
+        self.slopes = [n for row, last in rows for n in (*(row.get(j, graph.zero) for j in range(k)), last.get(0, graph.zero))]
+        self.sizes = [graph.input(f"size{i}") for i in range(k)]
         errors = dict(zip(e.unknowns, self.sizes, strict=True))
-        self.terms, self.graph, self.inputs = rounding_nodes(graph, e.residual, errors), graph, inputs
-        self.looked = False
+        self.terms, self.graph = rounding_nodes(graph, e.residual, errors), graph
+        self.runs = 0
+        """In how many runs it was looked at: it is compiled for the second one."""
         self._floats: Floats | None = None
 
-    def __call__(self, u, state, t, h, leaves: np.ndarray, sizes: np.ndarray) -> list[np.ndarray]:
+    def __call__(self, u, state, t, h, leaves: np.ndarray, sizes: np.ndarray, only: tuple[int, ...]) -> list[np.ndarray]:
         k = len(self.equation.unknowns)
-        if len(u) == 1 and self.looked and (function := self._in_floats()):
+        if len(u) <= FEW and self.runs > 1 and (function := self._in_floats()):
             try:
-                values = np.array(function(np.concatenate([u[0], state[0], t, h, leaves[0], sizes[0]]).tolist()))[None]
+                given = np.concatenate([u, state, t[:, None], h[:, None], leaves, sizes], axis=1).tolist()
+                values = np.array([function(one) for one in given])
                 residual, slopes, terms, end = np.split(values, np.cumsum([k, k * (k + 1), k]), axis=1)
-                return [residual, slopes.reshape(1, k, k + 1), terms, end]
+                found = residual, slopes.reshape(-1, k, k + 1), terms, end
+                return [found[i] for i in only]
             except (ArithmeticError, ValueError):  # NumPy goes on with infinities
                 pass
-        self.looked = True
         graph = self.graph if self.slopes else self.graph.copy()  # to which derivatives in numbers are added
-        return self.program.in_numbers(self._read, graph, self.equation, u, state, t, h, leaves, more=[(self.sizes, sizes)])
+        read = lambda known: [self._read(known, i) for i in only]
+        return self.program.in_numbers(read, graph, self.equation, u, state, t, h, leaves, more=[(self.sizes, sizes)])
 
-    def _read(self, known: Values) -> list[np.ndarray]:
+    def _read(self, known: Values, what: int) -> np.ndarray:
         e, k = self.equation, len(self.equation.unknowns)
-        written = bool(self.slopes)
-        slopes = known.read(nodes_array(self.slopes).reshape(k, k + 1)) if written else known.slopes(e.residual, self.inputs)
-        return [
-            known.read(nodes_array(e.residual)),
-            slopes,
-            known.read(nodes_array(self.terms)),
-            known.read(nodes_array(e.advance)),
-        ]
+        if what == SLOPES and k and not self.slopes:
+            return known.slopes(e.residual, self.inputs)
+        if what == SLOPES:
+            return known.read(nodes_array(self.slopes).reshape(k, k + 1))
+        return known.read(nodes_array((e.residual, (), self.terms, e.advance)[what]))
 
     def _in_floats(self) -> Floats | None:
-        """As a function of floats, which is compiled for a second look and not for one."""
+        """As a function of floats."""
         if self._floats is None and self.slopes:
             e, shared = self.equation, self.program.shared
             given = [*e.unknowns, *e.state, shared.t, shared.h, *shared.params, *self.sizes]
