@@ -10,7 +10,7 @@ from functools import reduce
 
 import numpy as np
 
-from dirax.engines.newton_step import Factors, pivot_order
+from dirax.engines.newton_step import Factors, elimination
 from dirax.engines.step_program import KEPT, StepProgram, TracedEquation
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import LEAST_SIZE
@@ -33,23 +33,22 @@ SOLVED = 1e-10
 
 class FirstSizes:
     """The sizes of one equation as nodes of a graph, which gains them: of the `unknowns`, of the `equations`, and `sure`, 1 where
-    there is no doubt and 0 where there is. `order` is that of the pivots, found here where it is not given."""
+    there is no doubt and 0 where there is; from its Jacobian, and the order of the pivots."""
 
-    def __init__(self, graph: Graph, equation: TracedEquation, h: int, order: list[tuple[int, int]] | None = None):
+    def __init__(self, graph: Graph, equation: TracedEquation, h: int, matrix: list[list[int]], order: list[tuple[int, int]]):
         g, unknowns, residual = graph, equation.unknowns, equation.residual
         self.graph = g
-        k, size = len(unknowns), lambda node: g.make("abs", node)
+        size = lambda node: g.make("abs", node)
         total = lambda nodes: reduce(g.add, nodes, g.zero)
-        rows = jacobian(g, residual, [*unknowns, h])
-        matrix = [[row.get(j, g.zero) for j in range(k)] for row in rows]
-        factors = Factors(g, matrix, order or pivot_order(g, matrix))
+        rows, by_h = [{j: n for j, n in enumerate(row) if n != g.zero} for row in matrix], jacobian(g, residual, [h])
+        factors = Factors(g, matrix, order)
         change = factors.solve(g, residual)
         solution = [size(g.sub(u, d)) for u, d in zip(unknowns, change, strict=True)]
         products = lambda row, values: [g.mul(size(row[j]), value) for j, value in enumerate(values) if j in row]
         rounded = rounding_nodes(g, residual)
         terms = [total([e, *products(row, solution)]) for e, row in zip(rounded, rows, strict=True)]
         known = factors.bounds(g, terms)
-        moved = factors.bounds(g, [size(g.mul(h, row.get(k, g.zero))) for row in rows])
+        moved = factors.bounds(g, [size(g.mul(h, row.get(0, g.zero))) for row in by_h])
         least = g.constant(LEAST_SIZE)
         own = [total([g.mul(g.constant(TYPICAL), a), size(u), least]) for a, u in zip(known, unknowns, strict=True)]
         equations = [g.add(total(products(row, own)), least) for row in rows]
@@ -88,7 +87,8 @@ _known: Memo[FirstSizes] = Memo(KEPT)
 def first_sizes(program: StepProgram, index: int, *arguments: np.ndarray) -> np.ndarray:
     """The outputs of an equation of a step, (entries, 2k + 1); (u, state, t, h, parameters) have an axis of entries."""
     e, shared = program.equations[index], program.shared
-    made = _known.get((Same(program), index), lambda: FirstSizes(program.graph.copy(), e, shared.h))
+    found = elimination(program, index)
+    made = _known.get((Same(program), index), lambda: FirstSizes(program.graph.copy(), e, shared.h, *found))
     node = lambda nodes: np.asarray(nodes, dtype=np.int64)
 
     def part(arguments: list[np.ndarray]) -> list[np.ndarray]:

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dirax.engines.step_program import TracedEquation
+from dirax.engines.step_program import KEPT, StepProgram
 from dirax.program.graph import Graph
+from dirax.program.memo import Memo, Same
 
 ADMISSIBLE = 0.1
 """A pivot is considered if it is at least this much of the largest entry of its column at the sample points."""
@@ -34,13 +35,13 @@ class Correction:
     """The inputs that say how large the terms of each equation are."""
 
 
-def newton_correction(g: Graph, equation: TracedEquation, rows: list[dict[int, int]]) -> Correction:
-    """The correction of one Newton iteration of an equation whose Jacobian has these rows {column: node}."""
+def newton_correction(g: Graph, program: StepProgram, index: int) -> Correction:
+    """The correction of one Newton iteration of an equation of a step, in a graph that begins as that of the step."""
+    equation = program.equations[index]
     k = len(equation.unknowns)
     if k == 0:
         return Correction([], [], g.true, [], [], [], [], [])
-    matrix = [[row.get(j, g.zero) for j in range(k)] for row in rows]
-    order = pivot_order(g, matrix)
+    matrix, order = elimination(program, index)
     sizes = [g.input(f"size{i}") for i in range(k)]
     factors = Factors(g, matrix, order, sizes)
     right = [g.input(f"right{i}") for i in range(k)]
@@ -48,6 +49,20 @@ def newton_correction(g: Graph, equation: TracedEquation, rows: list[dict[int, i
     return Correction(
         matrix, factors.solve(g, equation.residual), factors.stable, order, right, again, sorted(factors.nodes), sizes
     )
+
+
+_known: Memo[tuple] = Memo(KEPT)
+
+
+def elimination(program: StepProgram, index: int) -> tuple[list[list[int]], list[tuple[int, int]]]:
+    """The Jacobian of an equation of a step, and the order of its pivots. Raises `GraphTooLarge`."""
+
+    def made():
+        g, rows = program.graph, program.jacobians[index]
+        matrix = [[row.get(j, g.zero) for j in range(len(rows))] for row in rows]
+        return matrix, pivot_order(g, matrix)
+
+    return _known.get((Same(program), index), made)
 
 
 def pivot_order(g: Graph, matrix: list[list[int]]) -> list[tuple[int, int]]:

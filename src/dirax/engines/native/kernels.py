@@ -102,7 +102,7 @@ class Kernels:
             try:
                 g = self._graph()
                 plan = self._plan(g)
-                plan.corrections = [newton_correction(g, e, rows) for e, rows in zip(step.equations, step.jacobians, strict=True)]
+                plan.corrections = [newton_correction(g, step, i) for i in range(len(step.equations))]
                 if self.compensated:
                     plan.increments = [increments(g, e) for e in step.equations]
             except GraphTooLarge as error:

@@ -26,7 +26,7 @@ def sizes_module(plan: Plan, width: int, fma: bool) -> str:
 def _define_block(plan: Plan, module: Module, width: int) -> None:
     b, record = Body(module), plan.record
     equations = zip(plan.equations, plan.corrections, strict=True)
-    sizes = [FirstSizes(plan.graph, e, plan.shared.h, c.order) if e.unknowns else None for e, c in equations]
+    sizes = [FirstSizes(plan.graph, e, plan.shared.h, c.jacobian, c.order) if e.unknowns else None for e, c in equations]
     e = Emitter(b, width)
     at = lambda place: b.at(e.real, "%lanes", place)
     places = lambda part: [at(i) for i in range(part.start or 0, part.stop)]
