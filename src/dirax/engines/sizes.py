@@ -21,7 +21,7 @@ of very many unknowns are measured by 1.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -199,7 +199,7 @@ def _nearby(count: int) -> np.ndarray:
 
 
 def _sizes(
-    residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: tuple, again: Callable, h: Any, xp: ModuleType
+    residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: Sequence, again: Callable, h: Any, xp: ModuleType
 ) -> Any:
     """(…, 2, k) from r (…, k) and its derivatives by (u, h) at the state, and those of a short step there and near its end,
     (…, k, k + 1); `rounded` are the sizes of the terms (…, k) at either place, and `again` those with unknowns of given sizes."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from dirax.engines.contract import Outcome, Problem, Progress, finished
 from dirax.engines.native.collocation_kernels import collocation_kernels
-from dirax.engines.native.kernels import kernels
+from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
 from dirax.engines.native.one_lane import OneLane, places_of
 from dirax.engines.native.sizes_of_lanes import find_sizes, with_present_sizes
@@ -72,9 +72,9 @@ class Ready:
                     progress(done, p.steps)
         except KeyboardInterrupt:
             interrupted = True
-        by_newton = self.is_collocation and not interrupted and _by_newton(lanes)
-        if not (interrupted or self.is_collocation):
-            with_present_sizes(lanes, self.made)
+        by_newton = _by_newton(lanes) if self.is_collocation and not interrupted else None
+        if not interrupted and (by_newton or not self.is_collocation):
+            with_present_sizes(lanes, by_newton or self.made)
         run_seconds = time.perf_counter() - started
         closing = lanes.close(self.kernel)
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
@@ -92,7 +92,7 @@ class Ready:
             interrupted=interrupted,
             compile_seconds=compile_seconds,
             run_seconds=run_seconds,
-            record=None if interrupted or by_newton else table,
+            record=None if interrupted or by_newton is not None else table,
             engine="native",
             notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
         )
@@ -100,15 +100,17 @@ class Ready:
         return outcome if whole else finished(p, outcome)
 
 
-def _by_newton(lanes: Lanes | OneLane) -> bool:
-    """Go on with trajectories whose fixed-point iteration has not converged, by Newton's method for all nodes together; whether
-    there are any."""
-    if left := lanes.left():
-        p = lanes.problem
-        try:
-            newton, _ = kernels(p.equation, p.params, p.batch_params, True).kernel(1)
-        except UnsupportedPrimitive:  # too large to be written out: they end where they are
-            return False
-        for lane in left:
-            lanes.again(newton, lane)
-    return bool(left)
+def _by_newton(lanes: Lanes | OneLane) -> Kernels | None:
+    """Go on with trajectories whose fixed-point iteration has not converged, by Newton's method for all nodes together, with
+    these kernels; None where there are no such trajectories."""
+    left, p = lanes.left(), lanes.problem
+    if not left:
+        return None
+    try:
+        made = kernels(p.equation, p.params, p.batch_params, True)
+        newton, _ = made.kernel(1)
+    except UnsupportedPrimitive:  # too large to be written out: they end where they are
+        return None
+    for lane in left:
+        lanes.again(newton, lane)
+    return made
