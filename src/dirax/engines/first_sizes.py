@@ -6,12 +6,14 @@ where these are too small, and where an unknown is not known to 4·STALLED of wh
 does for trajectories at which Newton's method stops too early.
 """
 
+from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
 
 from dirax.engines.newton_step import Factors, elimination
-from dirax.engines.step_program import KEPT, StepProgram, TracedEquation
+from dirax.engines.stage_look import RESIDUAL, SLOPES, TERMS, stage_look
+from dirax.engines.step_program import KEPT, StepProgram, TracedEquation, nodes_array
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import LEAST_SIZE
 from dirax.numerics.tolerances import EPSILON
@@ -31,24 +33,48 @@ SOLVED = 1e-10
 """What a solution with good pivots leaves of a right-hand side, relative to its terms."""
 
 
+@dataclass(frozen=True)
+class Linearized:
+    """Nodes of a graph: the unknowns and h; the residual, its derivatives by the unknowns and by h, the sizes of its terms."""
+
+    unknowns: list[int]
+    h: int
+    residual: list[int]
+    matrix: list[list[int]]
+    by_h: list[int]
+    terms: list[int]
+
+    @classmethod
+    def of(cls, g: Graph, equation: TracedEquation, h: int, matrix: list[list[int]]) -> "Linearized":
+        """Those of an equation with this Jacobian, in its graph."""
+        by_h = [row.get(0, g.zero) for row in jacobian(g, equation.residual, [h])]
+        return cls(equation.unknowns, h, equation.residual, matrix, by_h, rounding_nodes(g, equation.residual))
+
+    @classmethod
+    def inputs(cls, g: Graph, there: list[list[bool]]) -> "Linearized":
+        """Inputs of a graph, and zeros where the Jacobian has none."""
+        new = lambda name: [g.input(f"{name}{i}") for i in range(len(there))]
+        matrix = [[g.input(f"j{i},{j}") if entry else g.zero for j, entry in enumerate(row)] for i, row in enumerate(there)]
+        return cls(new("u"), g.input("h"), new("r"), matrix, new("h"), new("e"))
+
+
 class FirstSizes:
     """The sizes of one equation as nodes of a graph, which gains them: of the `unknowns`, of the `equations`, and `sure`, 1 where
-    there is no doubt and 0 where there is; from its Jacobian, and the order of the pivots."""
+    there is no doubt and 0 where there is; `order` is that of the pivots."""
 
-    def __init__(self, graph: Graph, equation: TracedEquation, h: int, matrix: list[list[int]], order: list[tuple[int, int]]):
-        g, unknowns, residual = graph, equation.unknowns, equation.residual
+    def __init__(self, g: Graph, given: Linearized, order: list[tuple[int, int]]):
+        unknowns, residual, matrix, rounded, h = given.unknowns, given.residual, given.matrix, given.terms, given.h
         self.graph = g
         size = lambda node: g.make("abs", node)
         total = lambda nodes: reduce(g.add, nodes, g.zero)
-        rows, by_h = [{j: n for j, n in enumerate(row) if n != g.zero} for row in matrix], jacobian(g, residual, [h])
+        rows = [{j: n for j, n in enumerate(row) if n != g.zero} for row in matrix]
         factors = Factors(g, matrix, order)
         change = factors.solve(g, residual)
         solution = [size(g.sub(u, d)) for u, d in zip(unknowns, change, strict=True)]
         products = lambda row, values: [g.mul(size(row[j]), value) for j, value in enumerate(values) if j in row]
-        rounded = rounding_nodes(g, residual)
         terms = [total([e, *products(row, solution)]) for e, row in zip(rounded, rows, strict=True)]
         known = factors.bounds(g, terms)
-        moved = factors.bounds(g, [size(g.mul(h, row.get(0, g.zero))) for row in by_h])
+        moved = factors.bounds(g, [size(g.mul(h, slope)) for slope in given.by_h])
         least = g.constant(LEAST_SIZE)
         own = [total([g.mul(g.constant(TYPICAL), a), size(u), least]) for a, u in zip(known, unknowns, strict=True)]
         equations = [g.add(total(products(row, own)), least) for row in rows]
@@ -81,20 +107,26 @@ class FirstSizes:
         return [*self.unknowns, *self.equations, self.sure]
 
 
-_known: Memo[FirstSizes] = Memo(KEPT)
+_known: Memo[tuple[FirstSizes, Linearized]] = Memo(KEPT)
 
 
-def first_sizes(program: StepProgram, index: int, *arguments: np.ndarray) -> np.ndarray:
-    """The outputs of an equation of a step, (entries, 2k + 1); (u, state, t, h, parameters) have an axis of entries."""
-    e, shared = program.equations[index], program.shared
-    found = elimination(program, index)
-    made = _known.get((Same(program), index), lambda: FirstSizes(program.graph.copy(), e, shared.h, *found))
-    node = lambda nodes: np.asarray(nodes, dtype=np.int64)
+def first_sizes(program: StepProgram, stage: int, u: np.ndarray, state, t, h: np.ndarray, leaves) -> np.ndarray:
+    """The outputs of a stage of a step, (entries, 2k + 1); the arguments have an axis of entries."""
+    matrix, order = elimination(program, program.stages[stage][0])
+
+    def made() -> tuple[FirstSizes, Linearized]:
+        g, zero = Graph(), program.graph.zero
+        given = Linearized.inputs(g, [[entry != zero for entry in row] for row in matrix])
+        return FirstSizes(g, given, order), given
+
+    first, given = _known.get((Same(program), program.stages[stage][0]), made)
+    residual, slopes, terms = stage_look(program, stage)(u, state, t, h, leaves, np.abs(u), (RESIDUAL, SLOPES, TERMS))
 
     def part(arguments: list[np.ndarray]) -> list[np.ndarray]:
-        known = Values(made.graph, len(arguments[0]))
-        for nodes, array in zip((e.unknowns, e.state, shared.t, shared.h, shared.params), arguments, strict=True):
-            known.bind(node(nodes), array)
-        return [known.read(node(made.outputs))]
+        known = Values(first.graph, len(arguments[0]))
+        nodes = given.unknowns, given.h, given.residual, given.matrix, given.by_h, given.terms
+        for own, array in zip(nodes, arguments, strict=True):
+            known.bind(nodes_array(own), array)
+        return [known.read(nodes_array(first.outputs))]
 
-    return in_parts(part, list(arguments))[0]
+    return in_parts(part, [u, h, residual, slopes[..., :-1], slopes[..., -1], terms])[0]

@@ -145,12 +145,12 @@ def _first_in_numbers(p: Problem) -> tuple[tuple[np.ndarray, ...], np.ndarray] |
             return None
         leaves = program.parameters.flatten(p.params, p.batch if p.batch_params else None)
         leaves = np.broadcast_to(leaves, (batch, program.parameters.size))
-        for (index, fraction), guess in zip(program.stages, p.guess, strict=True):
+        for stage, ((_, fraction), guess) in enumerate(zip(program.stages, p.guess, strict=True)):
             u = np.asarray(guess, float).reshape(batch, -1)
             if not u.shape[1]:
                 found.append(np.ones((batch, 2, 0)))
                 continue
-            values = first_sizes(program, index, u, state, t, np.full(batch, fraction * p.h), leaves)
+            values = first_sizes(program, stage, u, state, t, np.full(batch, fraction * p.h), leaves)
             found.append(power_of_two(values[:, :-1]).reshape(batch, 2, -1))
             sure &= values[:, -1] > 0.0
     except (UnsupportedPrimitive, GraphTooLarge):

@@ -15,6 +15,7 @@ from dirax.engines.native.engine import Native
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import arrays_saved
 from dirax.engines.native.loops.step_loop import kernel_module
+from dirax.engines.sizes import sizes_of
 from dirax.program.interpreter import UnsupportedPrimitive
 
 PROGRAM = """\
@@ -25,7 +26,7 @@ PROGRAM = """\
        cc -O2 {fma}-ffp-contract=off -o run {name} -lm && ./run > rows.csv          (rows of dirax.simulate, bit by bit)
        ./run STEPS EVERY                                                  (as many steps, a row every EVERY of them)
 
-   record[0] … record[{last_state}] is the state: {state}.
+   record[0] … record[{last_state}] is the state: {state}; the sizes by which unknowns are measured are those at this one.
    params: {params}.
    A program of one's own calls run(record, params, fields, 1, t0, h, 0, first, stop, every, iterations): steps first to stop − 1
    of a run that began at t0; fields point to the rows of {saved}. */
@@ -114,6 +115,7 @@ def c_program(p: Problem, name: str, title: str) -> str:
     start[record.state] = p.state
     for stage, guess in enumerate(p.guess):
         start[record.unknowns(stage, np.shape(guess)[-1])] = guess
+    record.put_sizes(start, sizes_of(p))
     values = made.step.parameters.flatten(p.params, None) if made.step.parameters.size else np.zeros(1)
     of = lambda numbers: ", ".join(float(x).hex() for x in np.ravel(numbers))
     columns = ["t", *(f"{s.name}{k}" for s in saved for k in range(s.size))]

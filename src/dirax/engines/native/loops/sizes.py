@@ -1,6 +1,6 @@
 """The kernel that finds the sizes of unknowns and equations: it is called once a run, so little is spent on its machine code."""
 
-from dirax.engines.first_sizes import FirstSizes
+from dirax.engines.first_sizes import FirstSizes, Linearized
 from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
@@ -26,7 +26,8 @@ def sizes_module(plan: Plan, width: int, fma: bool) -> str:
 def _define_block(plan: Plan, module: Module, width: int) -> None:
     b, record = Body(module), plan.record
     equations = zip(plan.equations, plan.corrections, strict=True)
-    sizes = [FirstSizes(plan.graph, e, plan.shared.h, c.jacobian, c.order) if e.unknowns else None for e, c in equations]
+    of = lambda e, c: FirstSizes(plan.graph, Linearized.of(plan.graph, e, plan.shared.h, c.jacobian), c.order)
+    sizes = [of(e, c) if e.unknowns else None for e, c in equations]
     e = Emitter(b, width)
     at = lambda place: b.at(e.real, "%lanes", place)
     places = lambda part: [at(i) for i in range(part.start or 0, part.stop)]
