@@ -85,7 +85,8 @@ def _by_derivatives(jaxpr: ClosedJaxpr, *operands) -> list[Array]:
     values, given = operands[:count], operands[count:]
     errors = [*map(jnp.abs, values[: count - len(given)]), *given]
     value, slopes = function(*values), jax.jacfwd(function, tuple(range(count)))(*values)
-    terms = (jnp.sum(jnp.abs(s) * e, axis=tuple(range(value.ndim, s.ndim))) for s, e in zip(slopes, errors, strict=True))
+    sums = lambda s, e: jnp.sum(jnp.abs(s) * jnp.broadcast_to(e, s.shape), axis=tuple(range(value.ndim, s.ndim)))
+    terms = (sums(s, e) for s, e in zip(slopes, errors, strict=True))
     return [sum(terms, jnp.abs(value))]
 
 
