@@ -8,8 +8,10 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", os.path.join(tempfile.gettemp
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MPLBACKEND", "Agg")
-# most of a test's time is compilation: less optimization halves it, and changes last digits at most
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+# most of a test's time is compilation: less optimization halves it, and changes last digits at most; small modules
+# are compiled faster in one piece than cut up for several threads
+QUICK = ("backend_optimization_level=0", "cpu_use_fusion_emitters=false", "cpu_parallel_codegen_split_count=1")
+os.environ.setdefault("XLA_FLAGS", " ".join(f"--xla_{flag}" for flag in QUICK))
 
 gc.set_threshold(50_000, 20, 100)  # tracing makes many objects that live
 
@@ -21,3 +23,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 hypothesis.settings.register_profile("dirax", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("dirax")
+
+
+def pytest_sessionfinish():
+    gc.freeze()  # pytest collects garbage several times when it ends: nothing of what lives now is looked at again

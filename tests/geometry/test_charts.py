@@ -24,10 +24,6 @@ MANIFOLDS = {
     "SO3": SO3(),
     "SE2": SE2(),
 }
-# compiled for few runs, not for speed
-quick_jit = functools.partial(
-    jax.jit, compiler_options={"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-)
 examples = settings(max_examples=10, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 
@@ -68,7 +64,7 @@ def chart_laws(name, exponential):
             - jnp.stack(chart.transition_velocity(r, s, third)),
         }
 
-    return quick_jit(jax.vmap(laws))
+    return jax.jit(jax.vmap(laws))
 
 
 @pytest.mark.parametrize("exponential", [False, True], ids=["retraction", "exponential"])
@@ -148,7 +144,7 @@ def test_a_curve_through_both_poles_does_not_see_its_charts():
     atlases = [Atlas(Sphere(3)), Atlas(Sphere(3), True, leave_at=0.3), Atlas(Sphere(3), centres=centres, leave_at=0.7)]
     runs = []
     for atlas in atlases:
-        run = quick_jit(lambda q, p, atlas=atlas: pendulum_in(atlas, q, p, h, steps))
+        run = jax.jit(lambda q, p, atlas=atlas: pendulum_in(atlas, q, p, h, steps))
         (points, covectors), changed = jax.tree.map(np.asarray, run(q, p))
         assert np.sum(changed) >= 6
         assert np.max(points[:, 2]) > 1.0 - 1e-3  # over both poles
@@ -180,7 +176,7 @@ def test_free_motion_is_exact_across_chart_changes():
         return followed, followed[0].base
 
     start = atlas.chart_at(group.identity())
-    scan = quick_jit(lambda: jax.lax.scan(step, (start, jnp.zeros(3), jnp.asarray(momentum)), None, 200))
+    scan = jax.jit(lambda: jax.lax.scan(step, (start, jnp.zeros(3), jnp.asarray(momentum)), None, 200))
     (chart, r, p), bases = scan()
     assert len(np.unique(np.asarray(bases), axis=0)) > 5
     exact = group.group_exp(jnp.asarray(10.0 * omega))

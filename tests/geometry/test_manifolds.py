@@ -28,10 +28,6 @@ MANIFOLDS = {
     **GROUPS,
     "Product": Product(Sphere(3), Torus(1), Product(SO3(), Euclidean(2))),
 }
-# compiled for few runs, not for speed
-quick_jit = functools.partial(
-    jax.jit, compiler_options={"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-)
 examples = settings(max_examples=12, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 
@@ -86,7 +82,7 @@ def manifold_laws(name):
             "vector from components": frame @ manifold.coordinates(x, w) - w,
         }
 
-    return quick_jit(jax.vmap(laws, (0, 0, 0, 0, None)))
+    return jax.jit(jax.vmap(laws, (0, 0, 0, 0, None)))
 
 
 @pytest.mark.parametrize("name", MANIFOLDS)
@@ -125,7 +121,7 @@ def group_laws(name):
         }
         return laws, group.matrix(g)
 
-    return quick_jit(jax.vmap(laws))
+    return jax.jit(jax.vmap(laws))
 
 
 def hat(group, xi):
@@ -160,7 +156,7 @@ def test_exponential_is_exact_to_second_order_at_the_identity(name):
     f = lambda xi: group.matrix(group.group_exp(xi))
     zero, xi = jnp.zeros(group.dimension), random_arrays(3, group.dimension)
     push = lambda x: jax.jvp(f, (x,), (xi,))[1]
-    first, second = quick_jit(lambda x: jax.jvp(push, (x,), (xi,)))(zero)
+    first, second = jax.jit(lambda x: jax.jvp(push, (x,), (xi,)))(zero)
     np.testing.assert_allclose(first, hat(group, xi), atol=1e-15)
     np.testing.assert_allclose(second, hat(group, xi) @ hat(group, xi), atol=1e-14)
 
@@ -252,7 +248,7 @@ def derivatives(f):
         pull = jax.grad(weighted, argnums=tuple(range(len(point))))
         return jax.jvp(push, point, direction), jax.jvp(pull, point, direction)
 
-    return quick_jit(evaluate)
+    return jax.jit(evaluate)
 
 
 def all_finite(tree):
@@ -323,7 +319,7 @@ def test_regular_root_and_its_derivatives():
     root = lambda c: regular_root(lambda z: z * z - c, jnp.ones_like(c))
     everything = lambda c: (root(c), jax.jacrev(root)(c), jax.jacfwd(root)(c), jax.jacfwd(jax.jacrev(root))(c), root(-c))
     c = jnp.array([2.0, 9.0, 1e-3])
-    value, reverse, forward, second, missing = quick_jit(everything)(c)
+    value, reverse, forward, second, missing = jax.jit(everything)(c)
     np.testing.assert_allclose(value, np.sqrt(c), rtol=3e-16)
     np.testing.assert_allclose(reverse, np.diag(0.5 / np.sqrt(c)), rtol=1e-14)
     np.testing.assert_allclose(forward, np.diag(0.5 / np.sqrt(c)), rtol=1e-14)
