@@ -84,9 +84,10 @@ def _by_derivatives(jaxpr: ClosedJaxpr, *operands) -> list[Array]:
     function, count = lambda *x: jaxpr_as_fun(jaxpr)(*x)[0], len(jaxpr.in_avals)
     values, given = operands[:count], operands[count:]
     errors = [*map(jnp.abs, values[: count - len(given)]), *given]
-    value, slopes = function(*values), jax.jacfwd(function, tuple(range(count)))(*values)
+    moving = tuple(i for i, a in enumerate(values) if jnp.issubdtype(jnp.result_type(a), jnp.floating))
+    value, slopes = function(*values), jax.jacfwd(function, moving)(*values)
     sums = lambda s, e: jnp.sum(jnp.abs(s) * jnp.broadcast_to(e, s.shape), axis=tuple(range(value.ndim, s.ndim)))
-    terms = (sums(s, e) for s, e in zip(slopes, errors, strict=True))
+    terms = (sums(s, e) for s, e in zip(slopes, (errors[i] for i in moving), strict=True))
     return [sum(terms, jnp.abs(value))]
 
 
