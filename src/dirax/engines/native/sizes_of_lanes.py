@@ -24,6 +24,8 @@ _looked: Memo[tuple] = Memo(64)
 def find_sizes(lanes: Lanes | OneLane, kernel: Any) -> None:
     """Write the sizes into records that have none: by a kernel of their own, which takes longer to compile than NumPy takes once,
     or, where that is None, by NumPy."""
+    if not lanes.record.kept:  # an explicit step
+        return
     if kernel is not None:
         lanes.advance(kernel, 0, 0)
         look_closer(lanes)
