@@ -29,6 +29,9 @@ TYPICAL = 2.0**-6
 NOTHING = 2.0**-40
 """What is not the size of an unknown, beside the value at which it would matter: zero with the roundoff of zero."""
 
+LOOSE = 2.0**8
+"""What is too much for the size of an unknown, beside the least value at which it would matter: a bound that is far too large."""
+
 SOLVED = 1e-10
 """What a solution with good pivots leaves of a right-hand side, relative to its terms."""
 
@@ -88,6 +91,7 @@ class FirstSizes:
         for j, size_of in enumerate(own):
             matters = self._matters([(e, row[j]) for e, row in zip(rounded, rows, strict=True) if j in row])
             sure = below(g.mul(g.constant(NOTHING), matters), size_of)
+            sure = below(size_of, g.mul(g.constant(LOOSE), matters))
         for r, row in zip(residual, matrix, strict=True):
             of_row = [g.mul(a, d) for a, d in zip(row, change, strict=True)]
             sure = below(size(g.sub(total(of_row), r)), g.mul(g.constant(SOLVED), total([size(r), *map(size, of_row)])))
