@@ -1,6 +1,7 @@
 """The Newton correction as nodes: the Jacobian, and its elimination with a pivot order fixed beforehand."""
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -32,7 +33,9 @@ class Correction:
     again: list[int]
     factors: list[int]
     sizes: list[int]
-    """The inputs that say how large the terms of each equation are."""
+    """The inputs that say how large the unknowns are."""
+    rows: list[int]
+    """How large the terms of the equations are, Σ|J_ij|(|u_j| + size_j), which has their units."""
 
 
 def newton_correction(g: Graph, program: StepProgram, index: int) -> Correction:
@@ -40,14 +43,17 @@ def newton_correction(g: Graph, program: StepProgram, index: int) -> Correction:
     equation = program.equations[index]
     k = len(equation.unknowns)
     if k == 0:
-        return Correction([], [], g.true, [], [], [], [], [])
+        return Correction([], [], g.true, [], [], [], [], [], [])
     matrix, order = elimination(program, index)
     sizes = [g.input(f"size{i}") for i in range(k)]
-    factors = Factors(g, matrix, order, sizes)
+    present = [g.add(g.make("abs", u), size) for u, size in zip(equation.unknowns, sizes, strict=True)]
+    terms = lambda row: [g.mul(g.make("abs", entry), u) for entry, u in zip(row, present, strict=True) if entry != g.zero]
+    rows = [reduce(g.add, terms(row), g.zero) for row in matrix]
+    factors = Factors(g, matrix, order, rows)
     right = [g.input(f"right{i}") for i in range(k)]
     again = factors.solve(g, right)
     return Correction(
-        matrix, factors.solve(g, equation.residual), factors.stable, order, right, again, sorted(factors.nodes), sizes
+        matrix, factors.solve(g, equation.residual), factors.stable, order, right, again, sorted(factors.nodes), sizes, rows
     )
 
 
@@ -136,14 +142,14 @@ class Factors:
             remaining.discard(i)
             pivot = a[i].get(j, g.zero)
             self.inverses[i] = g.recip(pivot)
+            guard = least if sizes is None else g.mul(least, sizes[i])
             for other in sorted(remaining):
                 entry = a[other].pop(j, None)
                 if entry is None:
                     continue
-                guard = least if sizes is None else g.mul(least, g.div(sizes[i], sizes[other]))
-                small = g.make("le", g.mul(guard, g.make("abs", entry)), g.make("abs", pivot))
-                self.stable = g.make("and", self.stable, small)
                 factor = g.mul(entry, self.inverses[i])
+                small = g.make("le", g.mul(guard, g.make("abs", factor)), g.one if sizes is None else sizes[other])
+                self.stable = g.make("and", self.stable, small)
                 self.multipliers.append((other, i, factor))
                 for c, upper in a[i].items():
                     if c != j:

@@ -63,7 +63,7 @@ class NewtonLoop:
         stable = inner.value(correction.stable)
         if correction.stable != g.true:
             change = by_partial_pivoting(
-                inner, correction.jacobian, self.equation.residual, change, stable, now, correction.sizes
+                inner, correction.jacobian, self.equation.residual, change, stable, now, correction.rows
             )
         self._apply(old, change, stable, now)
         return inner
@@ -142,10 +142,10 @@ def by_partial_pivoting(
     with b.when(e.any(weak)):
         nodes = [node for row in matrix for node in row]
         cold = Region(e, region.graph, region)
-        cold.require([*nodes, *right])
+        cold.require([*nodes, *right, *sizes])
         values, sides = [cold.value(n) for n in nodes], [cold.value(n) for n in right]
         if sizes:
-            units = [e.div(e.const(1.0), region.value(n)) for n in sizes]
+            units = [e.div(e.const(1.0), cold.value(n)) for n in sizes]
             values = [e.mul(value, units[i // k]) for i, value in enumerate(values)]
             sides = [e.mul(value, unit) for value, unit in zip(sides, units, strict=True)]
         store(values, entries)

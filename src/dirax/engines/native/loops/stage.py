@@ -93,8 +93,8 @@ def emit_stage(
 
 
 def bind_sizes(region: Region, frame: Frame, correction: Correction, offset: int | str = 0) -> None:
-    """The sizes of the equations of a stage, known in a region."""
-    pointers = frame.slots(frame.rows, len(correction.sizes), offset)
+    """The sizes of the unknowns of a stage, known in a region."""
+    pointers = frame.slots(frame.sizes, len(correction.sizes), offset)
     for node, value in zip(correction.sizes, frame.loads(pointers), strict=True):
         region.bind(node, value)
 
