@@ -1,4 +1,4 @@
-"""How large unknowns and equations are, by one linearization of the step in scalars: where that leaves no doubt, it is all that
+"""How large unknowns are, by one linearization of the step in scalars: where that leaves no doubt, it is all that
 has to be found.
 
 The inverse of the Jacobian is bounded by the sizes of its triangular factors, whose pivots are those of a kernel. There is doubt
@@ -62,7 +62,7 @@ class Linearized:
 
 
 class FirstSizes:
-    """The sizes of one equation as nodes of a graph, which gains them: of the `unknowns`, of the `equations`, and `sure`, 1 where
+    """The sizes of one equation as nodes of a graph, which gains them: of the `unknowns`, and `sure`, 1 where
     there is no doubt and 0 where there is; `order` is that of the pivots."""
 
     def __init__(self, g: Graph, given: Linearized, order: list[tuple[int, int]]):
@@ -80,9 +80,8 @@ class FirstSizes:
         moved = factors.bounds(g, [size(g.mul(h, slope)) for slope in given.by_h])
         least = g.constant(LEAST_SIZE)
         own = [total([g.mul(g.constant(TYPICAL), a), size(u), least]) for a, u in zip(known, unknowns, strict=True)]
-        equations = [g.add(total(products(row, own)), least) for row in rows]
 
-        sure = g.make("finite", total([*own, *equations]))
+        sure = g.make("finite", total(own))
         below = lambda a, b: g.make("and", sure, g.make("le", a, b))
         for a, m, u in zip(known, moved, solution, strict=True):
             blurred = g.mul(g.constant(EPSILON), a)
@@ -95,7 +94,7 @@ class FirstSizes:
         for r, row in zip(residual, matrix, strict=True):
             of_row = [g.mul(a, d) for a, d in zip(row, change, strict=True)]
             sure = below(size(g.sub(total(of_row), r)), g.mul(g.constant(SOLVED), total([size(r), *map(size, of_row)])))
-        self.unknowns, self.equations, self.sure = own, equations, g.select(sure, g.one, g.zero)
+        self.unknowns, self.sure = own, g.select(sure, g.one, g.zero)
 
     def _matters(self, where: list[tuple[int, int]]) -> int:
         """The least size at which an unknown matters in an equation with these terms and this derivative by it, or ∞."""
@@ -108,14 +107,14 @@ class FirstSizes:
     @property
     def outputs(self) -> list[int]:
         """All of them."""
-        return [*self.unknowns, *self.equations, self.sure]
+        return [*self.unknowns, self.sure]
 
 
 _known: Memo[tuple[FirstSizes, Linearized]] = Memo(KEPT)
 
 
 def first_sizes(program: StepProgram, stage: int, u: np.ndarray, state, t, h: np.ndarray, leaves) -> np.ndarray:
-    """The outputs of a stage of a step, (entries, 2k + 1); the arguments have an axis of entries."""
+    """The outputs of a stage of a step, (entries, k + 1); the arguments have an axis of entries."""
     matrix, order = elimination(program, program.stages[stage][0])
 
     def made() -> tuple[FirstSizes, Linearized]:

@@ -1,4 +1,4 @@
-"""How large the unknowns and the equations of a step are: the units in which an engine measures them.
+"""How large the unknowns of a step are: the units in which an engine measures them.
 
 At the first guess u and the first state x of a step with the residual r, the terms of its equations have the sizes E that
 `program/rounding.py` finds, however they cancel, and |r_u||u*| at the solution u* of the linearized step. A last place of each
@@ -6,10 +6,10 @@ changes the unknowns by
 
     ε |r_u⁻¹| (E + |r_u||u*|)        (Skeel 1979).
 
-Without the ε this is the size of an unknown, and |r_u| times these sizes that of an equation. Data may be special, such as a
-link that hangs straight: what the derivatives are near the end of a short step counts as well. All sizes are rounded to powers
-of two, by which one multiplies without rounding, and they scale with the units of lengths, masses and times: nothing in an
-engine is compared with 1.
+Without the ε this is the size of an unknown. Data may be special, such as a link that hangs straight: what the derivatives are
+near the end of a short step counts as well. All sizes are rounded to powers of two, and they scale with the units of lengths,
+masses and times: nothing in an engine is compared with 1. An equation is as large as its terms, |r_u|(|u| + sizes), wherever
+Newton's method stands.
 
 A velocity under constraints, whose size is |q|/h in short steps, is known to ε|q|/h. Where that is more than 4·STALLED of what it
 comes to, v, or √(a|q|) where motion begins with the acceleration a, and where nothing that it is coupled to is known better, the
@@ -42,9 +42,9 @@ from dirax.program.rounding import rounding
 
 
 def sizes_of(problem: Problem) -> tuple[np.ndarray, ...]:
-    """The sizes of the unknowns and of the equations of each stage, (2, k) or (B, 2, k), of a problem in numbers."""
+    """The sizes of the unknowns of each stage, (k,) or (B, k), of a problem in numbers."""
     if problem.size >= FEWEST_SPARSE:
-        return tuple(np.ones((*np.shape(guess)[:-1], 2, np.shape(guess)[-1])) for guess in problem.guess)
+        return tuple(np.ones(np.shape(guess)) for guess in problem.guess)
     found, sure = _first_in_numbers(problem) or (None, np.zeros(problem.batch or 1, bool))
     if found is not None and np.all(sure):
         return found
@@ -53,7 +53,7 @@ def sizes_of(problem: Problem) -> tuple[np.ndarray, ...]:
         closer = tuple(map(np.asarray, _compiled(*_arguments(problem))))
     if found is None:
         return closer
-    chosen = sure[:, None, None] if problem.batch is not None else sure[0]
+    chosen = sure[:, None] if problem.batch is not None else sure[0]
     return tuple(np.where(chosen, a, b) for a, b in zip(found, closer, strict=True))
 
 
@@ -70,7 +70,7 @@ def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.
 
     Data may be so special where a run begins that an unknown has no size there. Everything has an axis of the `lanes`."""
     found = sizes_there(problem, lanes, completed, state, guess)
-    more = np.any([np.any(new[:, 0] > old[:, 0], axis=1) for new, old in zip(found, sizes, strict=True)], axis=0)
+    more = np.any([np.any(new > old, axis=1) for new, old in zip(found, sizes, strict=True)], axis=0)
     return tuple(np.maximum(new, old) for new, old in zip(found, sizes, strict=True)), more
 
 
@@ -78,7 +78,7 @@ def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, stat
     """The sizes of some trajectories where they stand, looked at closely; arguments as above."""
     p = problem
     if p.size >= FEWEST_SPARSE:
-        return tuple(np.ones((len(lanes), 2, np.shape(u)[-1])) for u in guess)
+        return tuple(np.ones((len(lanes), np.shape(u)[-1])) for u in guess)
     moved = lambda a: np.asarray(a)[lanes] if p.batch is not None else np.asarray(a)[None][lanes]
     params = jax.tree.map(moved, p.params) if p.batch_params else p.params
     here = dataclasses.replace(p, state=state, guess=guess, params=params, batch=len(lanes), first_step=p.first_step + completed)
@@ -148,10 +148,10 @@ def _first_in_numbers(p: Problem) -> tuple[tuple[np.ndarray, ...], np.ndarray] |
         for stage, ((_, fraction), guess) in enumerate(zip(program.stages, p.guess, strict=True)):
             u = np.asarray(guess, float).reshape(batch, -1)
             if not u.shape[1]:
-                found.append(np.ones((batch, 2, 0)))
+                found.append(np.ones((batch, 0)))
                 continue
             values = first_sizes(program, stage, u, state, t, np.full(batch, fraction * p.h), leaves)
-            found.append(power_of_two(values[:, :-1]).reshape(batch, 2, -1))
+            found.append(power_of_two(values[:, :-1]))
             sure &= values[:, -1] > 0.0
     except (UnsupportedPrimitive, GraphTooLarge):
         return None
@@ -201,10 +201,10 @@ def _nearby(count: int) -> np.ndarray:
 def _sizes(
     residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: Sequence, again: Callable, h: Any, xp: ModuleType
 ) -> Any:
-    """(…, 2, k) from r (…, k) and its derivatives by (u, h) at the state, and those of a short step there and near its end,
+    """(…, k) from r (…, k) and its derivatives by (u, h) at the state, and those of a short step there and near its end,
     (…, k, k + 1); `rounded` are the sizes of the terms (…, k) at either place, and `again` those with unknowns of given sizes."""
     if not u.shape[-1]:
-        return xp.ones((*u.shape[:-1], 2, 0))
+        return xp.ones(u.shape)
     k, applied = u.shape[-1], lambda matrix, vector: (matrix @ vector[..., None])[..., 0]
     finite = lambda sizes: xp.where(xp.isfinite(sizes), sizes, 0.0)
     with np.errstate(all="ignore"):
@@ -233,9 +233,7 @@ def _sizes(
         rounded = again(unknowns)
         more, matters = of_terms(rounded)[1], _matters(slopes[..., :k], rounded[0], xp)
         more = xp.where((more < ZERO) & (matters < xp.inf), TYPICAL * matters, more)
-        unknowns = power_of_two(xp.where(unknowns < NOTHING * more, more, unknowns), xp)
-        equations = (finite(applied(xp.abs(derivatives[..., :k]), unknowns)) for derivatives in both)
-        return xp.stack([unknowns, power_of_two(xp.maximum(*equations), xp)], axis=-2)
+        return power_of_two(xp.where(unknowns < NOTHING * more, more, unknowns), xp)
 
 
 def _matters(slopes: Any, terms: Any, xp: ModuleType) -> Any:
@@ -285,15 +283,15 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
 
 
 def sizes_near(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> tuple:
-    """Sizes of the unknowns of each stage of a single step, from its derivatives alone; 1 for the equations."""
+    """Sizes of the unknowns of each stage of a single step, from its derivatives alone."""
 
     def one(stage, u, h):
         if not stage.unknowns:
-            return jnp.ones((2, 0))
+            return jnp.ones(0)
         by_u, by_state = jax.jacfwd(lambda u, x: stage.residual(u, x, t, h, params), argnums=(0, 1))(u, state)
         terms = jnp.abs(by_u) @ jnp.abs(u) + jnp.abs(by_state) @ jnp.abs(state)
         size = jnp.abs(solve(by_u, jnp.eye(len(u)))) @ terms
-        return jnp.stack([jnp.where(jnp.isfinite(size) & (size > TINY), size, TINY), jnp.ones(len(u))])
+        return jnp.where(jnp.isfinite(size) & (size > TINY), size, TINY)
 
     found = (one(stage, u, fraction * h) for (stage, fraction), u in zip(equation.stages, guess, strict=True))
     return jax.lax.stop_gradient(tuple(found))

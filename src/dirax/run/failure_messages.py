@@ -58,7 +58,7 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     """The stages of the failing step are replayed one by one, to see where it breaks."""
     params = jax.tree.map(lambda a: np.asarray(a[lane] if p.batch_params else a), p.params)
     state, last = np.asarray(outcome.last_state[lane]), np.asarray(outcome.last_unknowns[lane])
-    solved, known, sizes = [], {}, [a[lane if p.batch is not None else ...][0] for a in sizes_of(p)]
+    solved, known, sizes = [], {}, [a[lane if p.batch is not None else ...] for a in sizes_of(p)]
     for (stage, fraction), size in zip(p.equation.stages, sizes, strict=True):
         if id(stage) not in known:
             known[id(stage)] = in_numbers(stage, params)

@@ -1,4 +1,4 @@
-"""The sizes of unknowns and equations in the records of trajectories: where a run begins, and where it stops too early."""
+"""The sizes of unknowns in the records of trajectories: where a run begins, and where it stops too early."""
 
 from typing import Any
 
@@ -62,7 +62,7 @@ def with_present_sizes(lanes: Lanes | OneLane, made: Kernels | CollocationKernel
     while len(failed) and tried < RESUMED:
         tried, own, stages = tried + 1, table[failed], [stage.unknowns for stage, _ in p.equation.stages]
         places = [record.sizes(i, k) for i, k in enumerate(stages)]
-        before = tuple(np.stack([own[:, part] for part in pair], axis=1) for pair in places)
+        before = tuple(own[:, place] for place in places)
         guess = tuple(own[:, record.unknowns(i, k)] for i, k in enumerate(stages))
         sizes, more = grown(p, failed, own[:, record.completed], own[:, record.state], guess, before)
         if not np.any(more):

@@ -151,7 +151,7 @@ class Xla(AbstractEngine):
 
 
 def _sizes(p: Problem, numerics: Numerics, found: Callable) -> tuple | None:
-    """Those of the unknowns and of the equations of every stage; None for sparse ones, which are measured by 1."""
+    """Those of the unknowns of every stage; None for sparse ones, which are measured by 1."""
     return None if numerics.sparse is not None else found(p)
 
 

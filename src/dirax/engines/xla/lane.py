@@ -83,7 +83,7 @@ def first_lane(state, guess: tuple, xp=jnp, compensated: bool = False) -> Lane:
 def take_step(
     equation, lane: Lane, t, h, params, sizes, max_iterations: int, differentiable: bool = True, numerics: Numerics | None = None
 ) -> tuple[Lane, tuple, tuple]:
-    """One step of every stage, of unknowns and equations of these `sizes`; the lane after it (unchanged where it had failed or
+    """One step of every stage, with unknowns of these `sizes`; the lane after it (unchanged where it had failed or
     the step fails), and of each stage the unknowns and the state that it left.
 
     With `differentiable` it can be differentiated in reverse mode too, and no derivative passes through a step that failed."""

@@ -41,14 +41,14 @@ def newton_root(
     guess: Float[Array, " k"],
     args: tuple[Any, ...],
     max_iterations: int,
-    sizes: Float[Array, "2 k"] | None = None,
+    sizes: Float[Array, " k"] | None = None,
     running: Any = True,
     jacobian: Callable[..., Any] | None = None,
     linear_solver: AbstractLinearSolver | None = None,
 ) -> tuple[Float[Array, " k"], Int[Array, ""], Bool[Array, ""]]:
     """(u, number of updates, converged) of residual(u, *args) = 0; not for reverse mode, see `as_function`.
 
-    `sizes` are those of the unknowns and of the equations (`dirax/engines/sizes.py`), 1 where they are not given. The guess comes
+    `sizes` are those of the unknowns (`dirax/engines/sizes.py`), 1 where they are not given. The guess comes
     back where `running` is false. `jacobian(u, *args)` is that of the residual, derived here where it is not given, or what
     `linear_solver` takes for it, without sizes; that is `Dense()` where none is.
     """
@@ -97,14 +97,14 @@ def newton(
     linear_solver: AbstractLinearSolver,
     guess: Float[Array, " k"],
     max_iterations: int,
-    sizes: Float[Array, "2 k"] | None,
+    sizes: Float[Array, " k"] | None,
     running: Any,
 ) -> Search:
     """Newton's method in which a Jacobian serves several updates while they contract quickly, and is renewed otherwise."""
-    size, unit = (1.0, None) if sizes is None else (sizes[0], 1.0 / sizes[1])
+    size = 1.0 if sizes is None else sizes
 
-    def updated(s: Search, factors: Any) -> Search:
-        change = linear_solver.solve(factors, equation(s.u) if unit is None else unit * equation(s.u))
+    def updated(s: Search, factors: Any, unit: Any) -> Search:
+        change = linear_solver.solve(factors, unit * equation(s.u))
         u = s.u - change
         update = jnp.max(jnp.abs(change) / (jnp.abs(u) + size))
         ratio = jnp.where(s.updates > 0, update / s.update, jnp.nan)
@@ -117,8 +117,12 @@ def newton(
         return unfinished(s) & ((s.ratio < CONTRACTING) | (jnp.isnan(s.ratio) & (s.update < NEAR)))
 
     def with_new_jacobian(s: Search) -> Search:
-        factors = linear_solver.factorise(jacobian(s.u) if unit is None else unit[:, None] * jacobian(s.u))
-        return jax.lax.while_loop(contracting, lambda s: updated(s, factors), updated(s, factors))
+        matrix, unit = jacobian(s.u), 1.0
+        if sizes is not None:  # pivots are chosen among rows in units of the terms of their equations
+            unit = 1.0 / (jnp.abs(matrix) @ (jnp.abs(s.u) + sizes))
+            matrix = unit[:, None] * matrix
+        factors = linear_solver.factorise(matrix)
+        return jax.lax.while_loop(contracting, lambda s: updated(s, factors, unit), updated(s, factors, unit))
 
     start = Search(guess, jnp.array([jnp.inf, jnp.nan, 0.0]))
     return jax.lax.while_loop(unfinished, with_new_jacobian, start)

@@ -68,7 +68,7 @@ class _Kernel:
     def _sizes(self, places: list[str]) -> list[str]:
         """How large iterates are, those of all nodes of a kind alike: as the unknowns, rates; accelerations as rates by h."""
         b, one, found = self.body, self.one, []
-        first = self.plan.record.sizes(0, len(self.iterates))[0].start
+        first = self.plan.record.sizes(0, len(self.iterates)).start
         for place in places[first : first + len(self.iterates)]:
             size = b.load("double", place)
             found.append(self.all.splat(size if self.plan.gain is None else one.div(size, one.abs("%h"))))

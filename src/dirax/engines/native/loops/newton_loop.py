@@ -62,9 +62,7 @@ class NewtonLoop:
         change = [inner.value(n) for n in correction.change]
         stable = inner.value(correction.stable)
         if correction.stable != g.true:
-            change = by_partial_pivoting(
-                inner, correction.jacobian, self.equation.residual, change, stable, now, correction.rows
-            )
+            change = by_partial_pivoting(inner, correction.jacobian, self.equation.residual, change, stable, now, correction.rows)
         self._apply(old, change, stable, now)
         return inner
 
@@ -130,7 +128,7 @@ def by_partial_pivoting(
 ) -> list[str]:
     """The solution `change` of matrix·x = right, in lanes with a pivot that was too small solved for anew, one at a time.
 
-    Rows are divided by the `sizes` of their equations, powers of two, so that pivots are chosen whatever their units."""
+    Rows are divided by the `sizes` of their equations, so that pivots are chosen whatever their units."""
     e, k = region.emitter, len(change)
     b = e.body
     slots = lambda base, count: [b.at(e.real, base, i) for i in range(count)]

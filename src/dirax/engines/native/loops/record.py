@@ -16,8 +16,8 @@ DOUBTFUL = 3
 class Record:
     """The layout of a lane's record. Every quantity is a double, counters too, and stands `width` times, once a lane.
 
-    state · for each stage the unknowns of the step before, their first differences, their second, the sizes of unknowns, those
-    of equations · what rounding took from the state (with compensated summation) · good steps · outcome of the last · updates of
+    state · for each stage the unknowns of the step before, their first differences, their second, the sizes of unknowns ·
+    what rounding took from the state (with compensated summation) · good steps · outcome of the last · updates of
     Newton's method · largest residual.
     """
 
@@ -39,7 +39,7 @@ class Record:
 
     @cached_property
     def size(self) -> int:
-        return self.state_size + 5 * self.kept + self.lost + 4
+        return self.state_size + 4 * self.kept + self.lost + 4
 
     @cached_property
     def state(self) -> slice:
@@ -55,16 +55,15 @@ class Record:
         """First and second differences of the unknowns of all stages."""
         return slice(self.state_size + self.kept, self.state_size + 3 * self.kept)
 
-    def sizes(self, stage: int, count: int) -> tuple[slice, slice]:
-        """Those of the first `count` unknowns of a stage, and of its equations."""
+    def sizes(self, stage: int, count: int) -> slice:
+        """Those of the first `count` unknowns of a stage."""
         first = self.state_size + 3 * self.kept + stage * self.history
-        return slice(first, first + count), slice(first + self.kept, first + self.kept + count)
+        return slice(first, first + count)
 
     def put_sizes(self, table: np.ndarray, sizes: Sequence[np.ndarray]) -> None:
-        """Write those of every stage, (…, 2, k), into records (…, quantities)."""
+        """Write those of every stage, (…, k), into records (…, quantities)."""
         for stage, values in enumerate(sizes):
-            for number, part in enumerate(self.sizes(stage, values.shape[-1])):
-                table[..., part] = values[..., number, :]
+            table[..., self.sizes(stage, values.shape[-1])] = values
 
     @cached_property
     def completed(self) -> int:
@@ -88,7 +87,7 @@ class Frame:
     """Pointers to the quantities of a record in the frame of the kernel's function, and to those that a step needs besides.
 
     `kept` holds state and lost as they were before the step, `fresh` the unknowns found in it; `sizes` are those of the
-    unknowns and `rows` those of the equations.
+    unknowns.
     """
 
     emitter: Emitter
@@ -99,7 +98,6 @@ class Frame:
     slopes: str
     bends: str
     sizes: str
-    rows: str
     fresh: str
     completed: str
     status: str
@@ -113,7 +111,7 @@ class Frame:
         state = [b.alloca(e.real) for _ in range(record.state_size)]
         lost = [b.alloca(e.real) for _ in range(record.lost)]
         kept = [b.alloca(e.real) for _ in range(record.state_size + record.lost)]
-        arrays = [b.alloca(e.real, max(1, record.kept)) for _ in range(6)]
+        arrays = [b.alloca(e.real, max(1, record.kept)) for _ in range(5)]
         numbers = [b.alloca(e.real) for _ in range(4)]
         return cls(e, state, lost, kept, *arrays, *numbers)
 
@@ -125,7 +123,7 @@ class Frame:
     @property
     def of_stages(self) -> tuple[str, ...]:
         """The arrays that hold something of every stage, in the order of the record."""
-        return self.unknowns, self.slopes, self.bends, self.sizes, self.rows
+        return self.unknowns, self.slopes, self.bends, self.sizes
 
     @property
     def carried(self) -> list[str]:

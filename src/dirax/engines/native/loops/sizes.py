@@ -1,4 +1,4 @@
-"""The kernel that finds the sizes of unknowns and equations: it is called once a run, so little is spent on its machine code."""
+"""The kernel that finds the sizes of unknowns: it is called once a run, so little is spent on its machine code."""
 
 from dirax.engines.first_sizes import FirstSizes, Linearized
 from dirax.engines.native.functions.far_reduction import add_far_reduction
@@ -32,7 +32,7 @@ def _define_block(plan: Plan, module: Module, width: int) -> None:
     at = lambda place: b.at(e.real, "%lanes", place)
     places = lambda part: [at(i) for i in range(part.start or 0, part.stop)]
     load = lambda pointer: b.load(e.real, pointer)
-    first = at(record.sizes(0, 1)[0].start)
+    first = at(record.sizes(0, 1).start)
     none = e.compare("oeq", load(first), e.const(0.0))
     with b.when(e.any(none)):
         b.store(e.real, e.select(none, e.const(1.0), load(first)), first)
@@ -52,10 +52,9 @@ def _define_block(plan: Plan, module: Module, width: int) -> None:
             region.require(found.outputs)
             status = at(record.status)
             sure = e.compare("oeq", region.value(found.sure), e.const(1.0))
-            new = [_power_of_two(e, region.value(node)) for node in (*found.unknowns, *found.equations)]
+            new = [_power_of_two(e, region.value(node)) for node in found.unknowns]
             new.append(e.select(sure, load(status), e.const(float(DOUBTFUL))))
-            of_unknowns, of_equations = record.sizes(stage, k)
-            for value, pointer in zip(new, [*places(of_unknowns), *places(of_equations), status], strict=True):
+            for value, pointer in zip(new, [*places(record.sizes(stage, k)), status], strict=True):
                 b.store(e.real, e.select(none, value, load(pointer)), pointer)
     b.line("ret void")
     module.define(f"define internal void @block(ptr %lanes, ptr %params, ptr %outs, {NUMBERS})", b)

@@ -74,7 +74,7 @@ def _transfers(frame: Frame, record: Record) -> tuple[Callable[[], None], Callab
     if kept <= WRITTEN_OUT:
         places, memory = frame.slots("%lanes", record.size), frame.in_order(record)
         return lambda: frame.stores(frame.loads(places), memory), lambda: frame.stores(frame.loads(memory), places)
-    after = first + 5 * kept
+    after = first + 4 * kept
     singles = [*frame.state, *frame.lost, frame.completed, frame.status, frame.iterations, frame.max_residual]
     places = [e.body.at(e.real, "%lanes", i) for i in (*range(first), *range(after, record.size))]
     arrays = [(base, first + number * kept) for number, base in enumerate(frame.of_stages)]
