@@ -62,8 +62,8 @@ class Linearized:
 
 
 class FirstSizes:
-    """The sizes of one equation as nodes of a graph, which gains them: of the `unknowns`, and `sure`, 1 where
-    there is no doubt and 0 where there is; `order` is that of the pivots."""
+    """The sizes of one equation as nodes of a graph, which gains them: of the `unknowns`, and `sure`, 1 where there is no
+    doubt and 0 where there is; `order` is that of the pivots."""
 
     def __init__(self, g: Graph, given: Linearized, order: list[tuple[int, int]]):
         unknowns, residual, matrix, rounded, h = given.unknowns, given.residual, given.matrix, given.terms, given.h

@@ -15,6 +15,9 @@ ADMISSIBLE = 0.1
 GUARD = 1e-4
 """In a run, a pivot smaller than this beside its column sends the step to partial pivoting."""
 
+FORGIVEN = 1e-6
+"""The same for an update of Newton's method, which is measured by the residual after it: 1e6 roundings in it do no harm."""
+
 SAMPLES = 7
 
 
@@ -49,7 +52,7 @@ def newton_correction(g: Graph, program: StepProgram, index: int) -> Correction:
     present = [g.add(g.make("abs", u), size) for u, size in zip(equation.unknowns, sizes, strict=True)]
     terms = lambda row: [g.mul(g.make("abs", entry), u) for entry, u in zip(row, present, strict=True) if entry != g.zero]
     rows = [reduce(g.add, terms(row), g.zero) for row in matrix]
-    factors = Factors(g, matrix, order, rows)
+    factors = Factors(g, matrix, order, rows, FORGIVEN)
     right = [g.input(f"right{i}") for i in range(k)]
     again = factors.solve(g, right)
     return Correction(
@@ -131,18 +134,25 @@ class Factors:
     """Elimination of a matrix in a given pivot order: multipliers, upper rows, reciprocal pivots and the guard, for which rows
     are divided by their `sizes` if these are given."""
 
-    def __init__(self, g: Graph, matrix: list[list[int]], order: list[tuple[int, int]], sizes: list[int] | None = None):
+    def __init__(
+        self,
+        g: Graph,
+        matrix: list[list[int]],
+        order: list[tuple[int, int]],
+        sizes: list[int] | None = None,
+        least: float = GUARD,
+    ):
         self.order = order
         self.upper = [{j: entry for j, entry in enumerate(row) if entry != g.zero} for row in matrix]
         self.multipliers: list[tuple[int, int, int]] = []
         self.inverses: dict[int, int] = {}
-        self.stable, least = g.true, g.constant(GUARD)
+        self.stable = g.true
         a, remaining = self.upper, set(range(len(matrix)))
         for i, j in order:
             remaining.discard(i)
             pivot = a[i].get(j, g.zero)
             self.inverses[i] = g.recip(pivot)
-            guard = least if sizes is None else g.mul(least, sizes[i])
+            guard = g.constant(least) if sizes is None else g.mul(g.constant(least), sizes[i])
             for other in sorted(remaining):
                 entry = a[other].pop(j, None)
                 if entry is None:

@@ -17,8 +17,8 @@ class Record:
     """The layout of a lane's record. Every quantity is a double, counters too, and stands `width` times, once a lane.
 
     state · for each stage the unknowns of the step before, their first differences, their second, the sizes of unknowns ·
-    what rounding took from the state (with compensated summation) · good steps · outcome of the last · updates of
-    Newton's method · largest residual.
+    what rounding took from the state (with compensated summation) · good steps · outcome of the last · updates of Newton's
+    method · largest residual.
     """
 
     state_size: int
@@ -86,8 +86,7 @@ class Record:
 class Frame:
     """Pointers to the quantities of a record in the frame of the kernel's function, and to those that a step needs besides.
 
-    `kept` holds state and lost as they were before the step, `fresh` the unknowns found in it; `sizes` are those of the
-    unknowns.
+    `kept` holds state and lost as they were before the step, `fresh` the unknowns found in it; `sizes` are those of the unknowns.
     """
 
     emitter: Emitter
