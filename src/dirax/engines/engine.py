@@ -7,6 +7,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from dirax.engines.contract import Outcome, Problem, Progress
+from dirax.engines.walk import Walk
 
 
 class AbstractEngine(eqx.Module):
@@ -40,6 +41,10 @@ class AbstractEngine(eqx.Module):
         An engine that finds something once for all of them overrides it.
         """
         return self.run
+
+    def walk(self, problem: Problem) -> Walk:
+        """Steps of a problem of one trajectory and one part, a few at a time. Raises as `run`, at once or when it goes."""
+        return Walk(problem, self.prepared(problem))
 
     @abstractmethod
     def run_traced(self, problem: Problem) -> Outcome:

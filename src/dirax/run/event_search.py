@@ -6,6 +6,7 @@ import numpy as np
 
 from dirax.numerics.brackets import bracketed_roots
 from dirax.program.memo import Same
+from dirax.run.dips import dips
 from dirax.run.event import Event, evaluated, refuse_unknown
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
@@ -161,12 +162,3 @@ def _none() -> Brackets:
 def _changes(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Where the sign changes; a zero belongs to what comes before it."""
     return ((before < 0.0) & (after >= 0.0)) | ((before > 0.0) & (after <= 0.0))
-
-
-def dips(before: np.ndarray, middle: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Where a function of one sign is nearest to zero in the middle, and bends so much that it may reach zero beside it, four
-    times as much as a parabola has to."""
-    sign = np.sign(middle)
-    before, middle, after = sign * before, sign * middle, sign * after
-    bend = before - 2.0 * middle + after
-    return (middle > 0.0) & (middle <= before) & (middle <= after) & (middle <= bend / 2.0)

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.program.evaluation.functions import program_of
-from dirax.program.linear_solves import scaled_pseudo_inverse, solve
-from dirax.program.tracing import gradient
+from dirax.program.linear_solves import solve
 from dirax.run.event import names_of
+from dirax.schemes.collision_step import bounced, least_squares
+from dirax.schemes.step import StepEquation
 
 KNOWN = ("t", "q", "params")
 """What the gap may be given, by the names of its arguments."""
@@ -62,26 +63,15 @@ class Impact:
         return f"Impact({own}({', '.join(self.arguments)}), restitution={self.restitution:g})"
 
 
-def jump(system: Any, impact: Impact, q: Any, p: Any, t: Any, params: Any) -> Any:
-    """(p⁺, v⁺, speed, share): the momentum and the velocity after an impact; how fast the gap grew before it; and the part
-    of the wall's normal that constraints leave, relative to all of it.
-
-    With M = ∂²L/∂v² and the constraints C v + b = 0: v⁻ on the constraints, and v⁺ = v⁻ − (1 + e)(n·v⁻ + ∂gap/∂t)/(n·d) d with
-    d the projection of M⁻¹n onto ker C, in the metric M.
-    """
-    v = system.complete({"q": q, "p": p, "t": t}, params, False)["v"]
-    metric = system.velocity_hessian(t, q, v, params)
-    normal, rate = gradient(lambda q, t: impact(t, q, params), (0, 1))(q, jnp.asarray(t, float))
-    lifted = free = solve(metric, normal)
-    if system.constraints.any:
-        rows = system.constraints.matrix(t, q, params)
-        forces = solve(metric, rows.T)
-        inverse = scaled_pseudo_inverse(rows @ forces)[0]
-        v = v - forces @ (inverse @ system.constraints.velocity_defect(t, q, v, params))
-        lifted = free - forces @ (inverse @ (rows @ free))
-    speed, size = normal @ v + rate, normal @ lifted
-    after = v - ((1.0 + impact.restitution) * speed / size) * lifted
-    return system.lagrangian_form().legendre(q, after, params, t), after, speed, size / (normal @ free)
+def jump(system: Any, stage: StepEquation, impact: Impact, state: Any, t: Any, h: Any, params: Any) -> Any:
+    """`bounced` off one wall, of constraints that may depend on each other."""
+    now, constraints = stage.state_layout.split(state), system.constraints
+    v = system.complete({"q": now.q, "p": now.p, "t": t}, params, False)["v"]
+    if constraints.any:
+        rows = constraints.matrix(t, now.q, params)
+        forces = solve(system.velocity_hessian(t, now.q, v, params), rows.T)
+        v = v - forces @ least_squares(rows @ forces, constraints.velocity_defect(t, now.q, v, params))
+    return bounced(system, stage, lambda t, q: impact(t, q, params), impact.restitution, state, v, t, h, params)
 
 
 class Numbers:

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem
 from dirax.program.given_tangents import implicit
 from dirax.run.impact import Impact, jump
-from dirax.run.impact_run import ON_WALL, PARTS
 from dirax.run.result import solution_of
 from dirax.schemes.step import StepEquation
+from dirax.schemes.watched_step import ON_WALL, PARTS
 from dirax.solution.events import Events
 from dirax.solution.solution import Solution
 from dirax.solution.steps_again import stepped
@@ -93,19 +93,15 @@ class TracedFlight:
 
     def _bounced(self, state, u, wall, t, h, params):
         """The state after an impact, and a guess of the unknowns after it."""
-        layout = self.equation.state_layout
-        q, p = state[layout.place("q")], state[layout.place("p")]
 
         def off(one: Impact):
             def function():
-                after, v, _, _ = jump(self.system, one, q, p, t, params)
-                _, guess = self.equation.resume({"q": q, "p": after, "v": v, "t": t}, h, params)
+                after, guess, _, _ = jump(self.system, self.equation, one, state, t, h, params)
                 return after, jax.lax.stop_gradient(guess)
 
             return function
 
-        after, guess = jax.lax.switch(wall, [off(one) for one in self.walls])
-        return state.at[layout.place("p")].set(after), guess
+        return jax.lax.switch(wall, [off(one) for one in self.walls])
 
     def _next(self, state, u, t, at, h, params):
         """(θ, wall, whether there is one) of the next impact in what is left of a step."""

@@ -7,6 +7,8 @@ from dirax.engines.engine import AbstractEngine
 from dirax.engines.native.collocation_kernels import collocation_kernels
 from dirax.engines.native.kernels import kernels
 from dirax.engines.native.run import Ready
+from dirax.engines.native.walk import KernelWalk
+from dirax.engines.walk import Walk
 from dirax.program.interpreter import UnsupportedPrimitive
 
 
@@ -44,6 +46,10 @@ class Native(AbstractEngine):
     def prepared(self, problem: Problem) -> Callable[[Problem, Progress | None], Outcome]:
         """`run` with the kernel at hand."""
         return Ready(problem)
+
+    def walk(self, problem: Problem) -> Walk:
+        """With the kernel at hand."""
+        return KernelWalk(problem)
 
     def run_traced(self, problem: Problem) -> Outcome:
         """The same as one primitive of JAX, with derivatives by loops over the steps; those of the second order and higher are
