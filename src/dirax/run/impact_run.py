@@ -221,9 +221,9 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
         flights.append(flight)
     done = np.array([end[0] for end in ends])
     fields = {name: np.stack([flight.rows[name] for flight in flights]) for name in p.fields}
-    closing = {name: np.stack([flight.closing[name] for flight in flights]) for name in p.fields if p.is_node(name)}
-    for name, last in closing.items():
-        fields[name] = np.concatenate([fields[name], last[:, None]], axis=1)
+    closing = {name: np.stack([flight.closing[name] for flight in flights]) for name in p.fields}
+    for name in filter(p.is_node, closing):
+        fields[name] = np.concatenate([fields[name], closing[name][:, None]], axis=1)
     seconds = time.perf_counter() - started
     sample = run(own[0].with_numbers(steps=1, save_every=1), None)
     outcome = Outcome(
