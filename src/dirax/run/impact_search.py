@@ -7,13 +7,10 @@ import numpy as np
 
 from dirax.engines.contract import Outcome, Problem
 from dirax.numerics.brackets import bracketed_roots
-from dirax.run.dips import dips
+from dirax.run.dips import changes_beside_dips, dips
 from dirax.run.impact import Numbers
 from dirax.schemes.step import CLOCK
 from dirax.schemes.watched_step import ON_WALL, PARTS
-
-FINER, LEVELS = 8, 3
-"""Around a place where a gap comes near to zero, they are looked at in as many more, again and again."""
 
 SHORTEST = 1e-12
 """The shortest flight, in steps."""
@@ -77,9 +74,9 @@ class ImpactSearch:
                 values[part] = np.full(len(self.numbers), np.nan) if moved is None else self.gaps_at(moved[0], at + part)
             return values[part]
 
-        for k in range(1, PARTS + 1):
-            gap(k * rest / PARTS)
-        hits = [found for wall in range(len(self.numbers)) if (found := self._hit(wall, gap, values)) is not None]
+        places = np.linspace(0.0, rest, PARTS + 1)
+        g = np.array([gap(float(x)) for x in places])
+        hits = [found for wall in range(len(self.numbers)) if (found := self._hit(wall, gap, places, g[:, wall])) is not None]
         return min(hits) if hits else None
 
     def gaps_at(self, state: np.ndarray, at: float) -> np.ndarray:
@@ -91,28 +88,24 @@ class ImpactSearch:
                 raise ValueError(f"the gap of events[{number}] must be finite along the run, but it is {gap} at t = {t:.6g}.")
         return found
 
-    def _hit(self, wall: int, gap: Any, values: dict[float, np.ndarray]) -> tuple[float, int] | None:
+    def _hit(self, wall: int, gap: Any, places: np.ndarray, g: np.ndarray) -> tuple[float, int] | None:
         """When a wall is hit, and the wall."""
-        for _ in range(LEVELS):
-            places = sorted(values)
-            g = np.array([values[x][wall] for x in places])
-            below = np.flatnonzero(g < 0.0)
-            if len(below):
-                break
-            near = np.flatnonzero(dips(g[:-2], g[1:-1], g[2:])) + 1
-            if not len(near):
-                return None
-            for i in near:
-                for x in np.linspace(places[i - 1], places[i + 1], 2 * FINER + 1)[1:-1]:
-                    gap(float(x))
+        function = lambda x, _: np.array([gap(float(part))[wall] for part in x])
+        below, near = np.flatnonzero(g < 0.0), np.flatnonzero(dips(g[:-2], g[1:-1], g[2:])) + 1
+        near = near[near < below[0]] if len(below) else near
+        found = changes_beside_dips(function, places[near - 1], places[near + 1])
+        falls = np.flatnonzero((found.fa > 0.0) & (found.fb < 0.0))
+        if len(falls):
+            first = falls[np.argmin(found.a[falls])]
+            a, b = float(found.a[first]), float(found.b[first])
+        elif len(below):
+            a, b = float(places[below[0] - 1]), float(places[below[0]])
         else:
             return None
-        a, b = places[below[0] - 1], places[below[0]]
         while gap(a)[wall] <= 0.0:  # it begins on the wall: off it, and back in less than a part of a step?
             middle = (a + b) / 2.0
             a, b = (a, middle) if gap(middle)[wall] <= 0.0 else (middle, b)
             if b < SHORTEST:
                 return 0.0, wall
-        function = lambda x, _: np.array([gap(float(x[0]))[wall]])
         one = lambda x: np.array([x])
         return float(bracketed_roots(function, one(a), one(b), one(gap(a)[wall]), one(gap(b)[wall]))[0]), wall

@@ -161,14 +161,13 @@ class Dense:
         """The number of the last step + 1 that each trajectory reached, (B,)."""
         return self.counts[np.maximum(last_rows([self.saved[name] for name in self.nodes]), 0)]
 
-    @cached_property
-    def velocities(self) -> np.ndarray:
-        """v at every saved row, (B, rows, n)."""
-        batch, rows = self.saved["q"].shape[:2]
-        lanes = np.repeat(np.arange(batch), rows)
-        flat = {name: a.reshape(batch * rows, *a.shape[2:]) for name, a in self.saved.items() if name in self.nodes}
-        v = self.velocity(lanes, flat, np.broadcast_to(np.asarray(self.sol.t), (batch, rows)).ravel())
-        return v.reshape(batch, rows, -1)
+    def velocities(self, lanes: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """v at saved rows, (entries, n)."""
+        size = self.saved["q"].shape[1]
+        own, which = np.unique(lanes * size + rows, return_inverse=True)
+        lanes, rows = own // size, own % size
+        fields = {name: self.saved[name][lanes, rows] for name in self.nodes}
+        return self.velocity(lanes, fields, np.broadcast_to(np.asarray(self.sol.t), self.saved["q"].shape[:2])[lanes, rows])[which]
 
     def velocity(self, lanes: np.ndarray, fields: dict[str, np.ndarray], t: np.ndarray) -> np.ndarray:
         """The velocities that belong to q and p."""
@@ -205,7 +204,7 @@ class Dense:
             function = lambda values, params: interpolate(*values, params)
             return self.entries(function, lanes, (theta, u, states, t, h), "interpolate", *again.key)
         if self.between is not None:
-            pick = lambda at: {name: self.saved[name][lanes, at] for name in self.nodes} | {"v": self.velocities[lanes, at]}
+            pick = lambda at: {name: self.saved[name][lanes, at] for name in self.nodes} | {"v": self.velocities(lanes, at)}
             rows = [pick(numbers + i) | {"t": self.time_at(lanes, numbers + i, 0.0)} for i in (0, 1)]
             between = self.between
             function = lambda values, params: between(*values, params)
@@ -213,7 +212,7 @@ class Dense:
         return self._by_steps(lanes, numbers, theta, t, h)
 
     @cached_property
-    def _divided(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def divided(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of every impact: trajectory, number of the step, and where in it."""
         hits = self.sol.impacts
         at = (hits.t - float(self.sol.axis[0])) / float(self.sol.step)
@@ -221,7 +220,7 @@ class Dense:
 
     def _is_divided(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         """Which of these steps have an impact in them."""
-        of_lanes, of_steps, _ = self._divided
+        of_lanes, of_steps, _ = self.divided
         size = int(self.counts[-1]) + 1
         return np.isin(lanes * size + numbers, of_lanes * size + of_steps)
 
@@ -234,7 +233,7 @@ class Dense:
                 if name in found:
                     found[name][~hit] = values
         some = np.flatnonzero(hit)
-        of_lanes, of_steps, places = self._divided
+        of_lanes, of_steps, places = self.divided
         row, begins = {name: a[some] for name, a in found.items()}, np.zeros(len(some))
         for i, at in enumerate(some):
             before = np.flatnonzero((of_lanes == lanes[at]) & (of_steps == numbers[at]) & (places <= theta[at]))

@@ -20,6 +20,7 @@ from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
+from dirax.schemes.remembered import STATE, UNKNOWNS
 from dirax.schemes.step import CLOCK, Field, StepEquation, composed_row, needs_every_part
 from dirax.solution.trajectory import Trajectory
 
@@ -141,6 +142,10 @@ class StepsAgain:
         self.known = np.zeros(shape, bool)
         self.states = np.empty((*shape, stages[0].state_size))
         self.unknowns = np.empty((*shape, self.ends[-1]))
+        if STATE in sol.fields:
+            given = lambda name, into: np.asarray(sol.fields[name]).reshape(into.shape)
+            self.states, self.unknowns = given(STATE, self.states), given(UNKNOWNS, self.unknowns)
+            self.known = np.isfinite(self.unknowns).all(axis=2) & np.isfinite(self.states).all(axis=2)
 
     @cached_property
     def in_numbers(self) -> StepsInNumbers | None:

@@ -43,6 +43,13 @@ def program_of(function: Callable, shapes: list[jax.ShapeDtypeStruct], key: Hash
     return _programs.get((key, *((s.shape, s.dtype.str) for s in shapes)), lambda: _traced(function, shapes, True))
 
 
+def graph_program_of(function: Callable, shapes: list[jax.ShapeDtypeStruct], key: Hashable) -> ScalarProgram | None:
+    """The same as operations of the graph alone, which can be compiled; None where it has no such program."""
+    key = ("graph", key, *((s.shape, s.dtype.str) for s in shapes))
+    found = _programs.get(key, lambda: _traced(function, shapes, False))
+    return found and found[0]
+
+
 def at_values(function: Callable, values: tuple) -> tuple | None:
     """(`function(*values)`,) in NumPy, for concrete values; None where that cannot be."""
     leaves, structure = jax.tree.flatten(values)
