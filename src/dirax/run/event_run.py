@@ -1,7 +1,7 @@
 """A run with events: carried out in stretches of which every row is kept, and looked through."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ from dirax.run.event_search import EventSearch
 from dirax.run.impact import Impact
 from dirax.run.impact_run import check_walls, fly_all
 from dirax.run.impact_traced import fly_traced
-from dirax.schemes.remembered import STATE, UNKNOWNS, forgotten
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
 from dirax.solution.solution import Solution
@@ -79,7 +78,7 @@ class Searched:
 
     def solution(self, save_every: int, steps: int) -> Solution:
         """The Solution of the run with the rows that are to be kept, and its events."""
-        sol, ended = without_memory(self.sol), np.isfinite(self.endings)
+        sol, ended = self.sol, np.isfinite(self.endings)
         kept = thinned(ended_at(sol, self.endings), save_every)
         kept.stats = sol.stats | {"events_seconds": self.seconds}
         kept.events = self.found
@@ -124,16 +123,6 @@ class LongerWithEvents:
         return longer
 
 
-def without_memory(sol: Solution) -> Solution:
-    """The solution of the scheme that was asked for, with its fields alone."""
-    scheme, equation = forgotten(sol.scheme, sol.equation)
-    fields = {name: a for name, a in sol.fields.items() if name not in (STATE, UNKNOWNS)}
-    info = {name: sol.field_info[name] for name in fields}
-    plain = sol.replace(scheme=scheme, equation=equation, fields=fields, field_info=info)
-    plain.continuation = sol.continuation
-    return plain
-
-
 def ended_at(sol: Solution, endings: np.ndarray) -> Solution:
     """The solution without the rows after these times (B,): one trajectory ends before it, in a batch they are NaN."""
     if not np.any(np.isfinite(endings)):
@@ -166,7 +155,7 @@ def run_with_events(
     carry_out: Any, begin: Any, settings: Any, case: Any, steps: int, save_every: int, progress: Any, kind: Any, entered: float
 ) -> Solution:
     """A run whose settings have events."""
-    plain = settings.without_events
+    plain = replace(settings, events=())
     every = min(save_every, max(1, steps - int(case.two_points)))
     walls = [i for i, event in enumerate(settings.events) if isinstance(event, Impact)]
 

@@ -11,10 +11,10 @@ from dirax.program.memo import Memo, Same
 from dirax.program.scalar_program import ScalarProgram
 from dirax.run.event import Event, evaluated
 from dirax.schemes.hermite import cubic
-from dirax.schemes.remembered import STATE, UNKNOWNS
 from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.schemes.watched_step import velocity
 from dirax.solution.dense import Dense
+from dirax.solution.steps_in_bulk import steps_in_bulk
 
 FEWEST = 20_000
 """Steps of all trajectories from which on it pays to compile for them."""
@@ -34,20 +34,25 @@ class EventScan:
 
     def __init__(self, dense: Dense, event: Event, number: int, points: int):
         self.dense, self.event, self.number, self.points = dense, event, number, points
-        nodes, sol = dense.nodes, dense.sol
-        self.names = [name for name in ("q", "p", "x", CLOCK, STEP_DENSITY, STATE, UNKNOWNS) if name in sol.fields]
-        self.of_steps = [name for name in self.names if name not in nodes]
+        sol = dense.sol
+        self.names = [name for name in ("q", "p", "x", CLOCK, STEP_DENSITY) if name in dense.nodes]
         self.leaves, self.structure = jax.tree.flatten(sol.given_params)
+
+    @property
+    def _inside_sizes(self) -> tuple[int, ...]:
+        """Of the state and of the unknowns of a step, which a polynomial takes."""
+        first = self.dense.equation.stages[0][0]
+        return () if self.dense.interpolate is None else (first.state_size, first.unknowns)
 
     def run(self) -> Any:
         """The compiled scan; None where the function or the inside of a step is no scalar program, and without the compiler."""
         sol, key = self.dense.sol, (Same(self.dense.equation), Same(self.dense.sol.system), Same(self.event), self.structure)
         one = 1 if sol.batch is None else 2
         shapes = [jax.ShapeDtypeStruct(np.shape(sol.fields[name])[one:], jnp.float64) for name in self.names]
-        after = [shape for name, shape in zip(self.names, shapes, strict=True) if name not in self.of_steps]
         of_params = [np.shape(leaf)[bool(sol.batch_params and sol.batch is not None) :] for leaf in self.leaves]
         number = jax.ShapeDtypeStruct((), jnp.float64)
-        whole = [*shapes, *after, number, number, *(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in of_params)]
+        inside = [jax.ShapeDtypeStruct((size,), jnp.float64) for size in self._inside_sizes]
+        whole = [*shapes, *shapes, *inside, number, number, *(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in of_params)]
         try:
             program = graph_program_of(self._flat, whole, ("scan", *key))
         except (TypeError, ValueError):  # as the search will say
@@ -55,16 +60,14 @@ class EventScan:
         return None if program is None else _compiled.get(Same(program), lambda: _machine_code(program))
 
     def _flat(self, *numbers: Any) -> Any:
-        count = len(self.names)
-        after = [name for name in self.names if name not in self.of_steps]
-        row = dict(zip(self.names, numbers[:count], strict=True))
-        then = dict(zip(after, numbers[count : count + len(after)], strict=True))
-        t, h, *leaves = numbers[count + len(after) :]
-        return self._may_vanish(row, then, t, h, jax.tree.unflatten(self.structure, leaves))
+        count, more = len(self.names), len(self._inside_sizes)
+        row, then = (dict(zip(self.names, numbers[at : at + count], strict=True)) for at in (0, count))
+        state_and_unknowns, (t, h, *leaves) = numbers[2 * count : 2 * count + more], numbers[2 * count + more :]
+        return self._may_vanish(row, then, state_and_unknowns, t, h, jax.tree.unflatten(self.structure, leaves))
 
-    def _may_vanish(self, row: dict, after: dict, t: Any, h: Any, params: Any) -> Any:
+    def _may_vanish(self, row: dict, after: dict, step: tuple, t: Any, h: Any, params: Any) -> Any:
         """1 where the function may be zero in a step between two rows, else 0."""
-        inside = self._inside(row, after, t, h, params)
+        inside = self._inside(row, after, step, t, h, params)
         places = [k / self.points for k in range(-1, self.points + 2)]
         g = [self._value(inside(x), params) for x in places]
         g[1], g[-2] = (self._value(end, params) for end in self._ends(row, after, t, h, params))
@@ -98,14 +101,14 @@ class EventScan:
         about = (after[place] - row[place]) / (ends - begins)
         return [a | {"t": s, "about": about} for a, s in ((row, begins), (after, ends))]
 
-    def _inside(self, row: dict, after: dict, t: Any, h: Any, params: Any) -> Any:
+    def _inside(self, row: dict, after: dict, step: tuple, t: Any, h: Any, params: Any) -> Any:
         """x ↦ the fields at a part x of the step."""
         first, last = self._ends(row, after, t, h, params)
         begins, length = first["t"], last["t"] - first["t"]
         if (interpolate := self.dense.interpolate) is not None:
 
             def by_polynomial(x):
-                found = interpolate(x, row[UNKNOWNS], row[STATE], t, h, params)
+                found = interpolate(x, step[1], step[0], t, h, params)
                 return found | {"t": found.get(CLOCK, t + x * h), "about": first["about"]}
 
             return by_polynomial
@@ -124,13 +127,17 @@ class EventScan:
 
         return by_cubic
 
-    def steps(self, run: Any, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-        """(trajectories, numbers) of the steps, of those from number `first` to before `last`, that are to be looked into."""
+    def steps(self, run: Any, first: int, last: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """(trajectories, numbers) of the steps, of those from number `first` to before `last`, that are to be looked into; None
+        where the inside of steps is not known by machine code."""
         dense, lanes = self.dense, len(self.dense.ends)
         may, size = np.zeros((lanes, last - first + 1), bool), max(1, BLOCK // lanes)
         for low in range(first, last, size):
             high = min(low + size, last)
-            may[:, low - first : high - first] = self._block(run, low, high)
+            inside = steps_in_bulk(dense.again, low, high) if self._inside_sizes else ()
+            if inside is None:
+                return None
+            may[:, low - first : high - first] = self._block(run, low, high, inside)
         if (impacts := dense.sol.impacts) is not None and len(impacts):  # they divide steps
             of_lanes, of_steps, _ = dense.divided
             own = (of_steps >= first) & (of_steps < last)
@@ -140,16 +147,16 @@ class EventScan:
         of_lanes, numbers = np.nonzero(may[:, :-1] & (np.arange(first, last) < dense.ends[:, None]))
         return of_lanes, numbers + first
 
-    def _block(self, run: Any, low: int, high: int) -> np.ndarray:
+    def _block(self, run: Any, low: int, high: int, inside: tuple) -> np.ndarray:
         dense, lanes, count = self.dense, len(self.dense.ends), high - low
         of_lanes = np.repeat(np.arange(lanes), count)
         flat = lambda a: np.reshape(a, (lanes * count, -1))
         rows = [flat(dense.saved[name][:, low:high]) for name in self.names]
-        after = [flat(dense.saved[name][:, low + 1 : high + 1]) for name in self.names if name not in self.of_steps]
+        after = [flat(dense.saved[name][:, low + 1 : high + 1]) for name in self.names]
         t = np.tile(float(dense.sol.axis[0]) + np.arange(low, high) * float(dense.sol.step), lanes)
         h = np.full(lanes * count, float(dense.sol.step))
         params = [flat(leaf) for leaf in dense.entries.params(of_lanes)]
-        columns = [column for a in (*rows, *after, flat(t), flat(h), *params) for column in a.T]
+        columns = [column for a in (*rows, *after, *map(flat, inside), flat(t), flat(h), *params) for column in a.T]
         return run(columns, lanes * count).reshape(lanes, count) != 0.0
 
 

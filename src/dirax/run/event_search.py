@@ -85,8 +85,8 @@ class EventSearch:
         """(trajectories, numbers) of the steps to be looked into: of many, those in which the scan sees something."""
         if (last - first) * len(self.dense.ends) >= FEWEST:
             scan = EventScan(self.dense, self.event, self.number, self.points)
-            if (run := scan.run()) is not None:
-                return scan.steps(run, first, last)
+            if (run := scan.run()) is not None and (found := scan.steps(run, first, last)) is not None:
+                return found
         lanes, numbers = np.nonzero(np.arange(first, last)[None] < self.dense.ends[:, None])
         return lanes, numbers + first
 

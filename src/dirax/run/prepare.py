@@ -146,4 +146,4 @@ def prepare(
         system, scheme, step, steps, {"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, inputs, params, batch_params,
         save_every, engine, project, check_initial, t0, max_iterations, compensated, events,
     )  # fmt: skip
-    return PreparedRun(settings, case, steps, save_every, prepared(settings.without_events, case, steps, save_every))
+    return PreparedRun(settings, case, steps, save_every, prepared(settings, case, steps, save_every))

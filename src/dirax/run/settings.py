@@ -1,6 +1,6 @@
 """What is said of a run: Settings besides its numbers, and the Case that are its numbers."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +17,6 @@ from dirax.run.validate import (
     engine_from,
     validated_case,
 )
-from dirax.schemes.remembered import Remembered
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
 
@@ -41,12 +40,6 @@ class Settings:
         of_value = (jax.tree.flatten(module) for module in (self.system, self.scheme, self.engine))
         modules = ((structure, *leaves) for leaves, structure in of_value)
         return *modules, self.project, self.check_initial, self.compensated, self.max_iterations
-
-    @cached_property
-    def without_events(self) -> "Settings":
-        """Those of the run that is looked through for events; itself where there are none."""
-        watched = any(isinstance(event, Event) for event in self.events)
-        return replace(self, events=(), scheme=Remembered(self.scheme) if watched else self.scheme) if self.events else self
 
 
 def stated(

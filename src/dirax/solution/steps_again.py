@@ -20,7 +20,6 @@ from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
-from dirax.schemes.remembered import STATE, UNKNOWNS
 from dirax.schemes.step import CLOCK, Field, StepEquation, composed_row, needs_every_part
 from dirax.solution.trajectory import Trajectory
 
@@ -142,10 +141,6 @@ class StepsAgain:
         self.known = np.zeros(shape, bool)
         self.states = np.empty((*shape, stages[0].state_size))
         self.unknowns = np.empty((*shape, self.ends[-1]))
-        if STATE in sol.fields:
-            given = lambda name, into: np.asarray(sol.fields[name]).reshape(into.shape)
-            self.states, self.unknowns = given(STATE, self.states), given(UNKNOWNS, self.unknowns)
-            self.known = np.isfinite(self.unknowns).all(axis=2) & np.isfinite(self.states).all(axis=2)
 
     @cached_property
     def in_numbers(self) -> StepsInNumbers | None:
@@ -177,7 +172,7 @@ class StepsAgain:
         np.maximum.at(left, (lanes, rows), numbers - self.counts[rows])
         lanes, rows = np.nonzero(left >= 0)  # steps from every row that is begun with
         left, number = left[lanes, rows], self.counts[rows]
-        state, u = self._begun(lanes, rows, self.time(number))
+        state, u = self.begun_at(lanes, rows, self.time(number))
         while len(lanes):
             after, u = self._whole(lanes, state, u, self.time(number))
             self.states[lanes, number], self.unknowns[lanes, number] = state, u
@@ -185,7 +180,8 @@ class StepsAgain:
             on = left > 0
             lanes, left, number, state, u = lanes[on], left[on] - 1, number[on] + 1, after[on], u[on]
 
-    def _begun(self, lanes: np.ndarray, rows: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def begun_at(self, lanes: np.ndarray, rows: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`begin` at saved rows of these numbers."""
         sol = self.sol
         take = lambda a, at: np.asarray(a)[at] if sol.batch is None else np.asarray(a)[lanes, at]
         row = {name: take(a, rows) for name, a in sol.fields.items() if sol.field_info[name].place == "node"}
