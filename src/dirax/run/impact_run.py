@@ -15,7 +15,7 @@ from dirax.run.impact import Impact, Numbers, jump
 from dirax.run.impact_search import ImpactSearch
 from dirax.run.result import solution_of
 from dirax.schemes.collision_step import HELD, LEAVING, CollisionStep
-from dirax.schemes.step import CLOCK, STEP_DENSITY, StepEquation
+from dirax.schemes.step import CLOCK, PART, STEP_DENSITY, StepEquation
 from dirax.schemes.watched_step import NONE, PARTS, WatchedStep
 from dirax.solution.events import Events
 from dirax.solution.solution import Solution
@@ -28,9 +28,6 @@ ACCUMULATED = 1e-9
 
 AGAIN = 3
 """How often."""
-
-PART = "part_of_step"
-"""The field of an impact that says where in its step, by ε, it is: of steps that have lengths of their own."""
 
 
 @dataclass

@@ -14,7 +14,7 @@ from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem
 from dirax.program.given_tangents import implicit
 from dirax.run.impact import Impact, jump
 from dirax.run.result import solution_of
-from dirax.schemes.step import StepEquation
+from dirax.schemes.step import CLOCK, StepEquation
 from dirax.schemes.watched_step import ON_WALL, PARTS
 from dirax.solution.events import Events
 from dirax.solution.solution import Solution
@@ -40,9 +40,14 @@ class TracedFlight:
         """That of the only part of a step."""
         return self.problem.equation.stages[0][0]
 
+    def time(self, state, t):
+        """The time at a state: t, but where steps have lengths of their own."""
+        layout = self.equation.state_layout
+        return state[layout.place(CLOCK)][0] if CLOCK in layout else t
+
     def gaps(self, t, state, params):
         """Of every wall, (walls,)."""
-        q = state[self.equation.state_layout.place("q")]
+        t, q = self.time(state, t), state[self.equation.state_layout.place("q")]
         return jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in self.walls])
 
     def moved(self, state, u, t, h, params):
@@ -73,7 +78,7 @@ class TracedFlight:
             bounced, guess = self._bounced(there, of_part, wall, t + at * h, h, params)
             state, u = jnp.where(hit, bounced, there), jnp.where(hit, guess, of_part)
             place = self.equation.state_layout.place
-            here = t + at * h, self.number(wall), state[place("q")], state[place("p")]
+            here = self.time(state, t + at * h), self.number(wall), state[place("q")], state[place("p")]
             record = jax.tree.map(lambda a: jnp.where(hit, a, jnp.nan), here)
             return (state, u, at, ~hit), (record, of_part, length * h)
 
@@ -96,7 +101,7 @@ class TracedFlight:
 
         def off(one: Impact):
             def function():
-                after, guess, _, _ = jump(self.system, self.equation, one, state, t, h, params)
+                after, guess, _, _ = jump(self.system, self.equation, one, state, self.time(state, t), h, params)
                 return after, jax.lax.stop_gradient(guess)
 
             return function

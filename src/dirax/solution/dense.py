@@ -9,7 +9,7 @@ import numpy as np
 
 from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
-from dirax.schemes.step import CLOCK, STEP_DENSITY
+from dirax.schemes.step import CLOCK, PART, STEP_DENSITY
 from dirax.solution.steps_again import Entries, Keyed, StepsAgain, begun, compiled_call, row_of, stepped
 from dirax.solution.trajectory import Trajectory, last_rows
 
@@ -213,8 +213,10 @@ class Dense:
 
     @cached_property
     def divided(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of every impact: trajectory, number of the step, and where in it."""
+        """Of every impact: trajectory, number of the step, and where in it, by the time."""
         hits = self.sol.impacts
+        if self.sol.has_own_times:
+            return hits.lane, *self.place(hits.lane, hits.t)
         at = (hits.t - float(self.sol.axis[0])) / float(self.sol.step)
         return hits.lane, np.floor(at).astype(np.int64), at - np.floor(at)
 
@@ -233,24 +235,39 @@ class Dense:
                 if name in found:
                     found[name][~hit] = values
         some = np.flatnonzero(hit)
-        of_lanes, of_steps, places = self.divided
-        row, begins = {name: a[some] for name, a in found.items()}, np.zeros(len(some))
+        row, part, t = {name: a[some] for name, a in found.items()}, np.zeros(len(some)), np.zeros(len(some))
         for i, at in enumerate(some):
-            before = np.flatnonzero((of_lanes == lanes[at]) & (of_steps == numbers[at]) & (places <= theta[at]))
-            if len(before):
-                begins[i] = places[before[-1]]
-                for name in ("q", "p"):
-                    row[name][i] = sol.impacts.fields[name][before[-1]]
-        t, part = self.time_at(lanes[some], numbers[some], begins), theta[some] - begins
+            last, part[i], t[i] = self._since_impact(lanes[at], numbers[at], theta[at])
+            for name, values in sol.impacts.fields.items() if last is not None else ():
+                if name in row:
+                    row[name][i] = values[last]
         states, u = self.again.begin(lanes[some], row, t)
         moved = part > AT_ROW
         if np.any(moved):
             h = part[moved] * float(sol.step)
             states[moved] = self.again.step(lanes[some][moved], states[moved], u[moved], t[moved], h)[0]
-        for name in ("q", "p", "work"):
-            if name in found:
-                found[name][some] = states[:, layout.place(name)].reshape(found[name][some].shape)
+        for name in filter(layout.__contains__, found):
+            found[name][some] = states[:, layout.place(name)].reshape(found[name][some].shape)
         return found
+
+    def _since_impact(self, lane: int, number: int, theta: float) -> tuple[int | None, float, float]:
+        """(which it was, part, time): the last impact before a place in a step, None where there is none; which part of the step
+        of the run leads there from it, or from the row; and when it was."""
+        of_lanes, of_steps, places = self.divided
+        own = np.flatnonzero((of_lanes == lane) & (of_steps == number))
+        count = int(np.sum(places[own] <= theta + AT_ROW + 4 * np.spacing(float(number + 1))))
+        last, begins = (own[count - 1], places[own[count - 1]]) if count else (None, 0.0)
+        one, fields = np.array([lane]), self.sol.impacts.fields
+        time = lambda place: float(self.time_at(one, np.array([number]), np.array([place]))[0])
+        part, t = max(theta - begins, 0.0), time(begins)
+        if not self.sol.has_own_times or part == 0.0:
+            return last, part, t
+        then = own[count] if count < len(own) else None
+        ends, whole = (1.0, 1.0) if then is None else (places[then], fields[PART][then])
+        density = self.saved[STEP_DENSITY][lane, number] if last is None else fields[STEP_DENSITY][last]
+        whole -= 0.0 if last is None else fields[PART][last]
+        h = float(self.sol.step)
+        return last, _step_for(part / (ends - begins), density, time(ends) - t, whole * h) / h, t
 
     def _by_steps(self, lanes, numbers, theta, t, h) -> dict[str, np.ndarray]:
         nearest = numbers + (theta > 0.5)
