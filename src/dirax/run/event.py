@@ -12,8 +12,8 @@ KNOWN = ("t", "q", "v", "p", "x", "params")
 """What a function of an event may be given, by the names of its arguments."""
 
 TRACED = (
-    "dx.Event is not looked for under jax.grad, jit and vmap, where how many there are cannot depend on values: run without "
-    "it, and use sol.at(t); dx.Impact is."
+    "dx.Event is not looked for beside dx.Impact under jax.grad, jit and vmap, between the rows of steps that walls divide: give "
+    "one kind of them."
 )
 
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from dirax.program.user_functions import is_traced
 from dirax.run.event import TRACED, Event
-from dirax.run.event_search import EventSearch
+from dirax.run.event_search import EventSearch, places_for
+from dirax.run.event_traced import with_traced_events
 from dirax.run.impact import Impact
 from dirax.run.impact_run import check_walls, fly_all
 from dirax.run.impact_traced import fly_traced
@@ -26,12 +27,16 @@ def with_events(run: Any, events: tuple[Any, ...], steps: int, save_every: int, 
     Raises `ValueError` under JAX's transformations and for functions that are not finite, `TypeError` for those that return no
     number.
     """
-    if traced:
-        raise ValueError(TRACED)
     watch = any(event.terminal for event in events) and not any(isinstance(event, Impact) for event in events)
-    sol = run(min(steps, FIRST_STRETCH) if watch else steps)
-    if is_traced(sol.t, sol.fields):
-        raise ValueError(TRACED)
+    sol = run(min(steps, FIRST_STRETCH) if watch and not traced else steps)
+    if traced or is_traced(sol.t, sol.fields):
+        if any(isinstance(event, Impact) for event in events):
+            raise ValueError(TRACED)
+        sol = run(steps) if int(sol.rows) <= steps else sol
+        found = with_traced_events(sol, events, places_for(sol.equation))
+        kept = thinned(found, save_every)
+        kept.events = found.events
+        return kept
     searched = Searched(sol, events)
     searched.go_on(sol)
     while watch and not searched.over and int(sol.stats["steps"]) < steps:

@@ -18,6 +18,12 @@ FEWEST_POINTS = 4
 BLOCK = 2**16
 """Points that are looked at together."""
 
+def places_for(equation: Any) -> int:
+    """Points of a step at which functions are looked at, more of them for a polynomial of high degree."""
+    tableau = getattr(getattr(equation.stages[0][0], "collocation", None), "tableau", None)
+    return max(FEWEST_POINTS, 0 if tableau is None else tableau.stages + 1)
+
+
 class Brackets(NamedTuple):
     """Places between which a function changes its sign: base + a and base + b, in steps, and its values there."""
 
@@ -35,8 +41,7 @@ class EventSearch:
     def __init__(self, dense: Dense, event: Event, number: int):
         self.dense, self.event, self.number = dense, event, number
         refuse_unknown(event, number, dense.nodes)
-        tableau = getattr(getattr(dense.equation.stages[0][0], "collocation", None), "tableau", None)
-        self.points = max(FEWEST_POINTS, 0 if tableau is None else tableau.stages + 1)
+        self.points = places_for(dense.equation)
 
     def value(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> np.ndarray:
         """The function at base + x, in steps. Raises `ValueError` where it is not finite."""

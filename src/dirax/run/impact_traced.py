@@ -129,7 +129,7 @@ class TracedFlight:
             found = jnp.any(below[:, wall])
             roots.append(jax.lax.cond(
                 found,
-                lambda i=first[wall], f=of_wall, g=values[:, wall]: _bracketed(f, places[i - 1], g[i - 1], places[i], g[i]),
+                lambda i=first[wall], f=of_wall, g=values[:, wall]: bracketed_fall(f, places[i - 1], g[i - 1], places[i], g[i]),
                 lambda: jnp.zeros(()),
             ))  # fmt: skip
             finds.append(found)
@@ -144,7 +144,7 @@ class TracedFlight:
         return jax.lax.cond(hit, theta, lambda: jnp.zeros(())), wall, hit
 
 
-def _bracketed(function, a, fa, b, fb):
+def bracketed_fall(function, a, fa, b, fb):
     """The place between a, where a function is not negative, and b, where it is, through which it falls: by the rule of false
     position that halves the value of an end that stays (Illinois), off a place at which it begins with zero."""
 

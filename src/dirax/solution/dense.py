@@ -1,5 +1,6 @@
 """Between the rows of a run: the fields at any time, by what the scheme says of the inside of a step."""
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -112,25 +113,37 @@ class Dense:
         return compiled_call(whole, rows, steps, jax.tree.map(jnp.asarray, sol.params), times, numbers, t0, h)
 
     def _at_one(self, row, after, of_step, time, t, h, params) -> dict[str, Any]:
-        theta, system, end = (time - t) / h, self.sol.system, t + h
-        if CLOCK in row:
-            t, end = row[CLOCK], after[CLOCK]
-            theta = (time - t) / (end - t)
-        if self.interpolate is None and self.between is not None:
-            row, after = ({**a, "t": s, "v": _velocity(system, a, s, params)} for a, s in ((row, t), (after, end)))
-            return {name: a for name, a in self.between(theta, row, after, h, params).items() if name in self.nodes}
-        state, guess = begun(self.equation, system, row | of_step, t, h, params)
-        if self.interpolate is not None:
-            _, (u,), _ = stepped(self.equation, state, guess, t, h, params)
-            found = self.interpolate(theta, u, state, t, h, params)
-            return {name: found.get(name, row[name]) for name in row}
-        part = jnp.maximum(theta, AT_ROW) * h
-        if CLOCK in row:
-            part = _step_for(part / h, row[STEP_DENSITY], end - t, h)
-        state, u, _ = stepped(self.equation, state, guess, t, part, params)
-        _, unknowns, states = stepped(self.equation, state, u, t + part, h, params)
-        made = row_of(self.equation, unknowns, states, t + part, h, params)
-        return {name: jnp.where(theta > AT_ROW, made[name], row[name]) for name in row}
+        begins, ends = row.get(CLOCK, t), after.get(CLOCK, t + h)
+        length = ends - begins if CLOCK in row else h
+        return self.inside_one(row, after, of_step, t, h, params)((time - begins) / length)
+
+    def inside_one(self, row, after, of_step, t, h, params) -> Callable:
+        """θ ↦ the fields of nodes at a part θ of the step between two rows, with the fields of the step, as JAX traces them."""
+        system, begins, ends = self.sol.system, row.get(CLOCK, t), after.get(CLOCK, t + h)
+        if self.interpolate is None and (between := self.between) is not None:
+            both = ({**a, "t": s, "v": _velocity(system, a, s, params)} for a, s in ((row, begins), (after, ends)))
+            first, last = both
+            return lambda theta: {n: a for n, a in between(theta, first, last, h, params).items() if n in self.nodes}
+        state, guess = begun(self.equation, system, row | of_step, begins, h, params)
+        if (interpolate := self.interpolate) is not None:
+            _, (u,), _ = stepped(self.equation, state, guess, begins, h, params)
+
+            def by_polynomial(theta):
+                found = interpolate(theta, u, state, begins, h, params)
+                return {name: found.get(name, row[name]) for name in row}
+
+            return by_polynomial
+
+        def by_step(theta):
+            part = jnp.maximum(theta, AT_ROW) * h
+            if CLOCK in row:
+                part = _step_for(part / h, row[STEP_DENSITY], ends - begins, h)
+            there, u, _ = stepped(self.equation, state, guess, begins, part, params)
+            _, unknowns, states = stepped(self.equation, there, u, begins + part, h, params)
+            made = row_of(self.equation, unknowns, states, begins + part, h, params)
+            return {name: jnp.where(theta > AT_ROW, made[name], row[name]) for name in row}
+
+        return by_step
 
     # ------------------------------------------------------------------------------------------ of numbers
 
