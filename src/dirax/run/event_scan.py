@@ -113,15 +113,14 @@ class EventScan:
 
             return by_polynomial
         place = "q" if "q" in row else "x"
-        rates = [self._velocity(end, end["about"], params) for end in (first, last)]
+        v, v_after = (self._velocity(end, end["about"], params) for end in (first, last))
         between = self.dense.between
 
         def by_cubic(x):
             t = begins + x * length
             if between is not None:
-                ends = ({**end, "v": rate} for end, rate in zip((first, last), rates, strict=True))
-                return between(x, *ends, h, params) | {"t": t}
-            moved = cubic(x, row[place], after[place], *rates, length)
+                return between(x, {**first, "v": v}, {**last, "v": v_after}, h, params) | {"t": t}
+            moved = cubic(x, row[place], after[place], v, v_after, length)
             others = {name: row[name] + x * (after[name] - row[name]) for name in ("q", "p", "x") if name in row}
             return {**others, place: moved, "t": t, "about": first["about"]}
 

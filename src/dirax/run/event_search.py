@@ -18,6 +18,7 @@ FEWEST_POINTS = 4
 BLOCK = 2**16
 """Points that are looked at together."""
 
+
 def places_for(equation: Any) -> int:
     """Points of a step at which functions are looked at, more of them for a polynomial of high degree."""
     tableau = getattr(getattr(equation.stages[0][0], "collocation", None), "tableau", None)

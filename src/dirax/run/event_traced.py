@@ -26,7 +26,9 @@ def with_traced_events(sol: Solution, events: tuple[Event, ...], points: int) ->
     nodes = {name: lead(a) for name, a in dense.nodes.items()}
     steps = {name: lead(a) for name, a in sol.fields.items() if name not in nodes}
     own = sol.batch_params and sol.batch is not None
-    params = jax.tree.map(lambda a: jnp.asarray(a) if own else jnp.broadcast_to(jnp.asarray(a), (lanes, *jnp.shape(a))), sol.params)
+    params = jax.tree.map(
+        lambda a: jnp.asarray(a) if own else jnp.broadcast_to(jnp.asarray(a), (lanes, *jnp.shape(a))), sol.params
+    )
     times = jnp.asarray(sol.axis, float)[:-1]
     search = TracedSearch(dense, events, points)
 
@@ -34,7 +36,7 @@ def with_traced_events(sol: Solution, events: tuple[Event, ...], points: int) ->
         def lane(own):
             nodes, steps, params = own
             rows, after = ({name: a[i : len(a) - 1 + i] for name, a in nodes.items()} for i in (0, 1))
-            return jax.lax.map(lambda step: search.of_step(*step, h, params), (rows, after, steps, times))
+            return jax.lax.map(lambda step: search.of_step((*step, h, params)), (rows, after, steps, times))
 
         return jax.lax.map(lane, (nodes, steps, params))
 
@@ -51,7 +53,11 @@ def with_traced_events(sol: Solution, events: tuple[Event, ...], points: int) ->
     kept = lambda a: jnp.where((t <= endings).reshape(*t.shape, *(1,) * (a.ndim - 2)), a, jnp.nan)
     whole = lambda a: jnp.concatenate(kept(a))
     found = Events(
-        whole(t), whole(index), whole(direction), jnp.repeat(jnp.arange(lanes), t.shape[1]), {n: whole(a) for n, a in fields.items()}
+        whole(t),
+        whole(index),
+        whole(direction),
+        jnp.repeat(jnp.arange(lanes), t.shape[1]),
+        {n: whole(a) for n, a in fields.items()},
     )
     sol = _ended(sol, endings) if any(event.terminal for event in events) else sol
     sol.events = found
@@ -74,10 +80,11 @@ class TracedSearch:
     def __init__(self, dense: Dense, events: tuple[Event, ...], points: int):
         self.dense, self.events, self.points = dense, events, points
 
-    def of_step(self, row, after, of_step, t, h, params) -> tuple:
-        """(times, index, direction, fields) of what is found in a step, (events, points, …), NaN where there is nothing."""
-        fixed = jax.lax.stop_gradient((row, after, of_step, t, h, params))
-        found = [self._of_event(number, event, (row, after, of_step, t, h, params), fixed) for number, event in enumerate(self.events)]
+    def of_step(self, step: tuple) -> tuple:
+        """(times, index, direction, fields) of what is found in a step (its rows, the fields of steps, t, h, params): (events,
+        points, …), NaN where there is nothing."""
+        fixed = jax.lax.stop_gradient(step)
+        found = [self._of_event(number, event, step, fixed) for number, event in enumerate(self.events)]
         return jax.tree.map(lambda *parts: jnp.stack(parts), *found)
 
     def _of_event(self, number: int, event: Event, step: tuple, fixed: tuple) -> tuple:
@@ -118,7 +125,9 @@ class TracedSearch:
         def value(theta):
             time, fields = begins + theta * length, inside(theta)
             if "v" in event.arguments:
-                fields = fields | {"v": self.dense.sol.system.complete({"q": fields["q"], "p": fields["p"], "t": time}, params, False)["v"]}
+                fields = fields | {
+                    "v": self.dense.sol.system.complete({"q": fields["q"], "p": fields["p"], "t": time}, params, False)["v"]
+                }
             known = {name: fields[name] for name in event.arguments if name in fields} | {"t": time}
             return evaluated(event, number, known, params)
 

@@ -263,7 +263,9 @@ def _flight(engine: Any, run: Any, system: Any, p: Problem, walls: tuple[Impact,
     search = ImpactSearch(p, numbers, run, Numbers(gaps, [t, q], p.params, "gaps", *own))
     jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, state, t, h, params)
     key = "jump", Same(system), Same(p.equation)
-    jumps = [Numbers(jumped(wall), [np.asarray(p.state), t, t], p.params, *key, same) for wall, same in zip(walls, own, strict=True)]
+    jumps = [
+        Numbers(jumped(wall), [np.asarray(p.state), t, t], p.params, *key, same) for wall, same in zip(walls, own, strict=True)
+    ]
     return Flight(search, jumps, *(engine.walk(one) for one in (many, replace(many, steps=1), hit)))
 
 

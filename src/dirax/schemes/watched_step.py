@@ -1,6 +1,6 @@
 """A step that looks where it goes: with walls in its way it ends, or says which one is hit first and about where."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from dirax.program.legendre import constrained_velocity
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.hermite import cubic
-from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import CLOCK, Field, StepEquation
 
@@ -52,7 +51,7 @@ class WatchedStep(AbstractStep):
         return self.inner.fields
 
     @property
-    def labels(self) -> Labels:
+    def labels(self) -> Sequence[str]:
         return self.inner.labels
 
     def residual(self, u, state, t, h, params):
@@ -115,8 +114,8 @@ class WatchedStep(AbstractStep):
         begins, ends = first.get(CLOCK, t), last.get(CLOCK, t + h)
         length = ends - begins
         about = (last["q"] - first["q"]) / length
-        rates = [velocity(self.system, row["q"], row["p"], s, about, params) for row, s in ((first, begins), (last, ends))]
-        return lambda x: (begins + x * length, cubic(x, first["q"], last["q"], *rates, length))
+        v, v_after = (velocity(self.system, row["q"], row["p"], s, about, params) for row, s in ((first, begins), (last, ends)))
+        return lambda x: (begins + x * length, cubic(x, first["q"], last["q"], v, v_after, length))
 
 
 def velocity(system: Any, q, p, t, about, params):

@@ -180,7 +180,9 @@ class Dense:
         own, which = np.unique(lanes * size + rows, return_inverse=True)
         lanes, rows = own // size, own % size
         fields = {name: self.saved[name][lanes, rows] for name in self.nodes}
-        return self.velocity(lanes, fields, np.broadcast_to(np.asarray(self.sol.t), self.saved["q"].shape[:2])[lanes, rows])[which]
+        return self.velocity(lanes, fields, np.broadcast_to(np.asarray(self.sol.t), self.saved["q"].shape[:2])[lanes, rows])[
+            which
+        ]
 
     def velocity(self, lanes: np.ndarray, fields: dict[str, np.ndarray], t: np.ndarray) -> np.ndarray:
         """The velocities that belong to q and p."""
@@ -269,10 +271,10 @@ class Dense:
         of_lanes, of_steps, places = self.divided
         own = np.flatnonzero((of_lanes == lane) & (of_steps == number))
         count = int(np.sum(places[own] <= theta + AT_ROW + 4 * np.spacing(float(number + 1))))
-        last, begins = (own[count - 1], places[own[count - 1]]) if count else (None, 0.0)
+        last, begins = (int(own[count - 1]), places[own[count - 1]]) if count else (None, 0.0)
         one, fields = np.array([lane]), self.sol.impacts.fields
         time = lambda place: float(self.time_at(one, np.array([number]), np.array([place]))[0])
-        part, t = max(theta - begins, 0.0), time(begins)
+        part, t = max(float(theta - begins), 0.0), time(begins)
         if not self.sol.has_own_times or part == 0.0:
             return last, part, t
         then = own[count] if count < len(own) else None
@@ -280,7 +282,7 @@ class Dense:
         density = self.saved[STEP_DENSITY][lane, number] if last is None else fields[STEP_DENSITY][last]
         whole -= 0.0 if last is None else fields[PART][last]
         h = float(self.sol.step)
-        return last, _step_for(part / (ends - begins), density, time(ends) - t, whole * h) / h, t
+        return last, float(_step_for(part / (ends - begins), density, time(ends) - t, whole * h) / h), t
 
     def _by_steps(self, lanes, numbers, theta, t, h) -> dict[str, np.ndarray]:
         nearest = numbers + (theta > 0.5)

@@ -48,7 +48,7 @@ _timed: Memo[StepEquation] = Memo(64)
 
 
 def _with_time(equation: StepEquation) -> StepEquation:
-    """The equation with the time in its state, so that steps from any row can be taken together; its rows are state and unknowns."""
+    """The equation with the time in its state, so that steps from any row can be taken together; rows are state and unknowns."""
     own = lambda function: lambda u, state, t, h, params: function(u, state[:-1], state[-1], h, params)
     advance = own(equation.advance)
     about = lambda size, name: Field((size,), "step", (name,))
