@@ -4,7 +4,9 @@ import inspect
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from dirax.text.representation import value_text
 
@@ -105,3 +107,9 @@ def evaluated(event: Event, number: int, known: dict[str, Any], params: Any) -> 
     if not jnp.issubdtype(found.dtype, jnp.floating):
         raise TypeError(f"the function of events[{number}] must return a real number (float64), but its dtype is {found.dtype}.")
     return found
+
+
+def captures_traced(function: Callable, *arguments: Any) -> tuple[Any, bool]:
+    """The shape of what a function returns, and whether it closes over values that JAX traces."""
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    return shape, any(isinstance(value, Tracer) for value in closed.consts)

@@ -11,6 +11,7 @@ import numpy as np
 from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem, finished
 from dirax.engines.walk import Walk
 from dirax.program.memo import Memo, Same
+from dirax.run.event import captures_traced
 from dirax.run.impact import Impact, Numbers, jump
 from dirax.run.impact_search import ImpactSearch
 from dirax.run.result import solution_of
@@ -152,12 +153,12 @@ class Flight:
 
     def _searched(self, state: np.ndarray, u: np.ndarray, step: int, at: float) -> tuple[np.ndarray, np.ndarray] | None:
         """`_divided` from a part of a step on, by a search for each impact."""
-        search = self.search
+        search, first = self.search, at == 0.0
         while True:
             found = search.next(state, u, step + at, 1.0 - at)
             part = 1.0 - at if found is None else found[0]
             out, moved = search.part(state, u, step + at, part)
-            if at == 0.0:
+            if first:
                 self._keep(step, {name: rows[0] for name, rows in out.fields.items()})
             if moved is None:
                 self.status = int(out.status[0])
@@ -165,7 +166,7 @@ class Flight:
             state, u = moved
             if found is None:
                 return state, u
-            at = at + part or np.finfo(float).tiny  # an impact where the step begins has its row, too
+            at, first = at + part, False
             hit = self._bounced(state, found[1], step + at)
             if hit is None:
                 return None
@@ -269,8 +270,9 @@ def _flight(engine: Any, run: Any, system: Any, p: Problem, walls: tuple[Impact,
     return Flight(search, jumps, *(engine.walk(one) for one in (many, replace(many, steps=1), hit)))
 
 
-def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> None:
-    """Raise `TypeError` and `ValueError` for walls that these steps cannot bounce off, and gaps that are none."""
+def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> bool:
+    """Whether a gap closes over values that JAX traces. Raises `TypeError` and `ValueError` for walls that these steps cannot
+    bounce off, and gaps that are none."""
     stages = p.equation.stages
     layout = stages[0][0].state_layout
     if system.lagrangian_form() is None or len(stages) > 1 or not {"q", "p"} <= set(layout):
@@ -283,9 +285,10 @@ def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tup
         raise ValueError("a run with dx.Impact starts from q= with v= or p=, not from two points.")
     t, q = jax.ShapeDtypeStruct((), jnp.float64), jax.ShapeDtypeStruct((layout["q"][0],), jnp.float64)
     own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], p.params) if p.batch_params else p.params
+    traced = False
     for wall, number in zip(walls, numbers, strict=True):
         try:
-            found = jax.eval_shape(wall, t, q, own)
+            found, seen = captures_traced(wall, t, q, own)
         except Exception as error:
             raise TypeError(
                 f"the gap of events[{number}] could not be traced by JAX: {type(error).__name__}: "
@@ -294,6 +297,8 @@ def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tup
         if not hasattr(found, "shape") or found.shape != ():
             came = f"shape {found.shape}: index or sum its result" if hasattr(found, "shape") else type(found).__name__
             raise ValueError(f"the gap of events[{number}] must return one number, but it returned {came}.")
+        traced = traced or seen
+    return traced
 
 
 def _refuse_behind(flight: Flight, lane: int | None) -> None:
@@ -302,6 +307,8 @@ def _refuse_behind(flight: Flight, lane: int | None) -> None:
     state = np.asarray(p.state)
     gaps = flight.search.gaps.one(p.t0, state[flight.q])
     for number, gap in zip(flight.search.numbers, gaps, strict=True):
+        if not np.isfinite(gap):
+            raise ValueError(f"the gap of events[{number}] must be finite along the run, but it is {gap} at the start{whose}.")
         if not gap >= -1e-12 * (1.0 + np.max(np.abs(state[flight.q]))):
             raise ValueError(
                 f"the gap of events[{number}] must not be negative at the start{whose}, but it is {gap:.6g}: begin in front "
