@@ -100,6 +100,7 @@ def test_a_million_impacts_leave_energy_and_momentum_where_they_are(name, impact
         assert np.ptp(np.hypot(*np.diff(sol.events.q[:, :2], axis=0).T)) <= 1e-11
 
 
+@pytest.mark.soak
 def test_a_rolling_ball_in_a_cylinder():
     """A ball that rolls on a plane inside an upright cylinder. Between walls the centre goes straight on; at them it is reflected
     and the ball goes on rolling, so that all chords are one length, as in a round billiard, up to the O(h²) of the scheme."""
@@ -119,7 +120,12 @@ def test_a_rolling_ball_in_a_cylinder():
 
 
 @pytest.mark.parametrize(
-    "scheme", [dx.LagrangeDAlembert(), dx.DiscreteDirac(), dx.Collocation(2)], ids=lambda s: type(s).__name__
+    "scheme",
+    [
+        dx.DiscreteDirac(),
+        *(pytest.param(scheme, marks=pytest.mark.soak) for scheme in (dx.LagrangeDAlembert(), dx.Collocation(2))),
+    ],
+    ids=lambda s: type(s).__name__,
 )
 def test_an_ellipse_bounces(scheme):
     system = dx.LagrangeDirac(lambda q, v: (v[0] ** 2 + v[1] ** 2 + 0.3 * v[2] ** 2) / 2 - q[1])
@@ -171,6 +177,29 @@ def test_schemes_with_more_in_their_state(scheme):
     fallen = np.where(t < FALL, 1 - t**2 / 2, FALL * (t - FALL) - (t - FALL) ** 2 / 2)
     assert np.max(np.abs(sol.at(t).q[:, 1] - fallen)) <= 1e-13
     assert np.array_equal(sol.at(sol.events.t).p[:, 1] > 0, np.ones(count, bool))
+
+
+ODD = {
+    "relativistic": lambda q, v: -jnp.sqrt(1 - v @ v) - 0.2 * q[1],
+    "without symmetry": lambda q, v: v @ v / 2 + 0.3 * v[0] * v[1] ** 2 + (v @ v) ** 2 / 10 - 0.2 * q[1],
+}
+
+
+@pytest.mark.parametrize("name", ["relativistic", pytest.param("without symmetry", marks=pytest.mark.soak)])
+def test_lagrangians_that_are_not_quadratic(name):
+    system = dx.LagrangeDirac(ODD[name])
+    sol = dx.simulate(system, dx.Collocation(3), step=0.05, steps=400, events=[FLOOR], **DROP)
+    assert sol.ok and len(sol.events) >= 3
+    assert np.max(np.abs(sol.energy() - sol.energy()[0])) <= 1e-14 and np.ptp(sol.p[:, 0]) <= 1e-14
+
+
+@pytest.mark.soak
+def test_restitution_is_that_of_the_velocity():
+    fast = dx.LagrangeDirac(ODD["relativistic"])
+    loses = dx.simulate(fast, dx.Collocation(3), step=0.05, steps=100, events=[dx.Impact(lambda q: q[1], 0.7)], **DROP)
+    velocity = lambda p: p[1] / np.sqrt(1 + p @ p)
+    before = loses.at(loses.events.t[0] - 1e-9).p
+    assert velocity(loses.events.p[0]) == pytest.approx(-0.7 * velocity(before), abs=1e-8)
 
 
 def test_the_search_and_the_step_onto_the_wall_agree(monkeypatch):

@@ -31,7 +31,13 @@ class Event:
     Zeros are found inside the steps, on what `sol.at` is there, to a float's precision of the step. The function is looked at in
     rows, at points between them, and at more where it comes near to zero. What is found is each change of sign: a function that
     touches zero and goes back, and one that dips below it for less than 10⁻⁴ of a step, may count as two zeros or as none. At the
-    first row nothing is found, if the function is zero there.
+    first row nothing is found, if the function is zero there. Where steps have neither a polynomial nor the cubic, and in runs of
+    many steps, dips are looked for where a cubic through rows and velocities shows them.
+
+    Under `jax.grad`, `jit` and `vmap` the times and places of events are differentiated: those that are seen by the sign of the
+    function at four points of a step, or one more than a polynomial has stages. `sol.events` then has a place for each of them in
+    the order of time in each trajectory, NaN where there is no event; after a terminal one rows are NaN as well.
+
     Raises `TypeError` for something that is no function of such arguments, `ValueError` for another direction.
     """
 

@@ -26,8 +26,8 @@ class Impact:
     The step in which a wall is hit is divided (Fetecau, Marsden, Ortiz, West 2003): a step of the scheme of length αh that ends
     on the wall, α found with it; a jump of the momentum along ∂gap/∂q, and along the forces of constraints, so that these hold
     after it too (Rodríguez Abella, Colombo 2025); and a step of (1 − α)h, so that the rows stand at their times. With e = 1 the
-    jump keeps the energy of Lagrangians that are quadratic in v, at walls at rest, and with constraints that are
-    linear in v; and the momentum along every symmetry of the wall.
+    jump keeps the energy at walls at rest and with constraints that are linear in v; and always the momentum along every symmetry
+    of the wall.
 
         ball = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1])
         sol = dx.simulate(ball, dx.LagrangeDAlembert(), events=[dx.Impact(lambda q: q[1])], q=…, v=…, step=0.01, steps=1000)

@@ -4,8 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
+from dirax.program.legendre import moves
 from dirax.program.linear_solves import scaled_pseudo_inverse, solve
 from dirax.program.tracing import gradient
 from dirax.schemes.abstract_step import AbstractStep
@@ -19,6 +21,9 @@ SUMS = ("work", "energy_defect")
 
 LEAVING = "leaving"
 """The field with a guess of the unknowns of the step that leaves the wall."""
+
+UPDATES = 8
+"""Updates of Newton's method for the jump of a Lagrangian that is not quadratic in v."""
 
 HELD = 1e-12
 """Part of a wall's normal that constraints must leave."""
@@ -110,21 +115,48 @@ def bounced(
     """(state⁺, u, speed, share): the state after an impact at `state`, on the wall of `gap(t, q)`, and a guess of the unknowns of
     the step of h that leaves it; how fast the gap grew before; and the part of the wall's normal that constraints leave.
 
-    With M = ∂²L/∂v² and the constraints C v + b = 0: v⁺ = v⁻ − (1 + e)(n·v⁻ + ∂gap/∂t)/(n·d) d, with d the projection of M⁻¹n
-    onto ker C, in the metric M, and v⁻ = `v` on the constraints.
+    Its momentum is p⁻ + λn + Cᵀμ on the constraints C v + b = 0, with λ such that v⁺·n = −e v⁻·n, relative to a wall that moves;
+    at e = 1 and a wall at rest such that the energy is that before, which is the same where L is quadratic in v: then, with
+    M = ∂²L/∂v² and d the projection of M⁻¹n onto ker C in the metric M, v⁺ = v⁻ − (1 + e)(n·v⁻ + ∂gap/∂t)/(n·d) d.
     """
     now = stage.state_layout.split(state)._asdict()
     q, form = now["q"], system.lagrangian_form()
-    metric = system.velocity_hessian(t, q, v, params)
     normal, rate = gradient(lambda q, t: gap(t, q), (0, 1))(q, jnp.asarray(t, float))
-    lifted = free = solve(metric, normal)
-    if system.constraints.any:
-        rows = form.constraints.matrix(t, q, params)
+    rows = form.constraints.matrix(t, q, params) if system.constraints.any else None
+
+    def projected(metric, covector):
+        free = solve(metric, covector)
+        if rows is None:
+            return free
         forces = solve(metric, rows.T)
-        lifted = free - forces @ solution(rows @ forces, rows @ free)
-    speed, size = normal @ v + rate, normal @ lifted
-    after = v - ((1.0 + restitution) * speed / size) * lifted
-    data = {"q": q, "p": form.legendre(q, after, params, t), "v": after, "t": t}
+        return free - forces @ solution(rows @ forces, rows @ free)
+
+    momentum = lambda v: form.legendre(q, v, params, t)
+    quadratic = not moves(jax.hessian(lambda v: form.lagrangian.at(t, q, v, params)), v)
+    metric = system.velocity_hessian(t, q, v if quadratic else jnp.zeros_like(v), params)
+    lifted, speed = projected(metric, normal), normal @ v + rate
+    strength = -(1.0 + restitution) * speed / (normal @ lifted)
+    after = v + strength * lifted
+    if not quadratic:
+        after = _with_momentum(system, momentum, projected, (t, q, params), normal, rate, restitution, v, after, strength)
+    data = {"q": q, "p": momentum(after), "v": after, "t": t}
     own, u = stage.resume(data | {name: now[name] for name in (STEP_DENSITY, CLOCK) if name in now}, h, params)
     kept = {name: now[name] for name in SUMS if name in now}
-    return stage.state_layout.replace(own, **kept), u, speed, size / (normal @ free)
+    return stage.state_layout.replace(own, **kept), u, speed, (normal @ lifted) / (normal @ solve(metric, normal))
+
+
+def _with_momentum(system, momentum, projected, at, normal, rate, restitution, before, after, strength):
+    """v⁺ of a Lagrangian that is not quadratic in v, by Newton's method for it and λ from what they nearly are."""
+    t, q, params = at
+    energy = lambda v: momentum(v) @ v - system.lagrangian_form().lagrangian.at(t, q, v, params)
+    keeps, start, kept = (restitution == 1.0) & (rate == 0.0), momentum(before), energy(before)
+    speed = normal @ before + rate
+    for _ in range(UPDATES):
+        metric = system.velocity_hessian(t, q, after, params)
+        missed = projected(metric, start + strength * normal - momentum(after))
+        lifted, slope = projected(metric, normal), metric @ after
+        by_energy = (kept - energy(after) - slope @ missed) / (slope @ lifted)
+        by_speed = (-restitution * speed - rate - normal @ (after + missed)) / (normal @ lifted)
+        change = jnp.where(keeps, by_energy, by_speed)
+        after, strength = after + missed + change * lifted, strength + change
+    return after
