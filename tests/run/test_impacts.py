@@ -7,7 +7,7 @@ import pytest
 
 import dirax as dx
 from dirax.gallery import rolling_ball
-from dirax.run.impact_run import Flight
+from dirax.run.flight import Flight
 
 BALL = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1])
 FLOOR = dx.Impact(lambda q: q[1])
@@ -228,6 +228,31 @@ def test_impacts_that_accumulate_end_the_run():
     assert np.max(np.abs(slow - FALL * 0.5 ** np.arange(1, 6))) <= 1e-13
     dead = dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=200, events=[dx.Impact(lambda q: q[1], 0.0)], **DROP)
     assert not dead.ok and "Zeno" in dead.message and dead.t[-1] <= FALL
+
+
+def test_what_was_run_before_an_interrupt_is_kept(monkeypatch):
+    run = lambda **more: dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=400, events=[FLOOR], **DROP | more)
+    whole, noted = run(), Flight._noted
+
+    def interrupted(flight, *given):
+        if len(flight.hits) == 3:
+            raise KeyboardInterrupt
+        return noted(flight, *given)
+
+    monkeypatch.setattr(Flight, "_noted", interrupted)
+    sol = run()
+    assert not sol.ok and "interrupted by the user; kept up to step 197" in sol.message
+    assert np.array_equal(sol.q, whole.q[:198]) and np.array_equal(sol.events.t, whole.events.t[:3])
+    both = run(q=[[0.0, 1.0], [0.0, 2.0]], v=[[0.3, 0.0], [0.3, 0.0]])
+    assert "step 0" in both.message[1] and np.array_equal(both.q[1, 0], [0.0, 2.0]) and np.all(np.isnan(both.q[1, 1:]))
+
+
+def test_longer_runs_have_the_bits_of_one_run():
+    run = lambda steps: dx.simulate(
+        BALL, dx.LagrangeDAlembert(), step=0.05, steps=steps, save_every=7, events=[FLOOR, dx.Event(lambda q: q[0] - 1)], **DROP
+    )
+    longer, whole = run(60).extend(90), run(150)
+    assert np.array_equal(longer.q, whole.q) and np.array_equal(longer.events.t, whole.events.t) and len(whole.events) == 4
 
 
 def test_what_is_refused():

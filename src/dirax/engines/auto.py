@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dirax.engines import policy
 from dirax.engines.contract import Outcome, Problem, Progress
 from dirax.engines.engine import AbstractEngine
-from dirax.engines.walk import Walk
+from dirax.engines.walk import AbstractWalk, WalkByRuns
 from dirax.engines.xla import Xla
 from dirax.program.interpreter import UnsupportedPrimitive
 
@@ -38,10 +38,10 @@ class Auto(AbstractEngine):
 
         return by_arrays
 
-    def walk(self, problem: Problem) -> Walk:
+    def walk(self, problem: Problem) -> AbstractWalk:
         """By the native engine, or that which `prepared` takes."""
         native, _ = self._native(problem)
-        return Walk(problem, self.prepared(problem)) if native is None else native.walk(problem)
+        return WalkByRuns(problem, self.prepared(problem)) if native is None else native.walk(problem)
 
     def _native(self, problem: Problem) -> tuple[AbstractEngine | None, str | None]:
         """The native engine, or why it does not take the problem."""

@@ -7,7 +7,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from dirax.engines.contract import Outcome, Problem, Progress
-from dirax.engines.walk import Walk
+from dirax.engines.walk import AbstractWalk, WalkByRuns
 
 
 class AbstractEngine(eqx.Module):
@@ -42,9 +42,9 @@ class AbstractEngine(eqx.Module):
         """
         return self.run
 
-    def walk(self, problem: Problem) -> Walk:
+    def walk(self, problem: Problem) -> AbstractWalk:
         """Steps of a problem of one trajectory and one part, a few at a time. Raises as `run`, at once or when it goes."""
-        return Walk(problem, self.prepared(problem))
+        return WalkByRuns(problem, self.prepared(problem))
 
     @abstractmethod
     def run_traced(self, problem: Problem) -> Outcome:

@@ -138,7 +138,7 @@ class EventScan:
                 return None
             may[:, low - first : high - first] = self._block(run, low, high, inside)
         if (impacts := dense.sol.impacts) is not None and len(impacts):  # they divide steps
-            of_lanes, of_steps, _ = dense.divided
+            of_lanes, of_steps, _ = dense.divided.impacts
             own = (of_steps >= first) & (of_steps < last)
             may[of_lanes[own], of_steps[own] - first] = True
         may[:, 0] = True

@@ -72,7 +72,7 @@ class WatchedStep(AbstractStep):
         after = self.inner.advance(u, own, t, h, params)
         wall, place = self.seen(u, own, after, t, h, params)
         free = (wall == NONE) | (alert == 0.0)
-        return jnp.concatenate([jnp.where(free, after, jnp.nan), jnp.stack([alert, wall, place])])
+        return jnp.concatenate([after, jnp.stack([jnp.where(free, alert, jnp.nan), wall, place])])
 
     # ------------------------------------------------------------------------------------------ what is in the way
 

@@ -10,12 +10,10 @@ import numpy as np
 
 from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
-from dirax.schemes.step import CLOCK, PART, STEP_DENSITY
+from dirax.schemes.step import CLOCK, STEP_DENSITY
+from dirax.solution.divided_steps import AT_ROW, DividedSteps, step_for
 from dirax.solution.steps_again import Entries, Keyed, StepsAgain, begun, compiled_call, row_of, stepped
 from dirax.solution.trajectory import Trajectory, last_rows
-
-AT_ROW = 1e-12
-"""Part of a step by which a time may lie off a saved row and still be at it, where steps of a part are taken."""
 
 SHORT = 1e-3
 """Part of a step from which on there is no doubt that it can be solved."""
@@ -137,7 +135,7 @@ class Dense:
         def by_step(theta):
             part = jnp.maximum(theta, AT_ROW) * h
             if CLOCK in row:
-                part = _step_for(part / h, row[STEP_DENSITY], ends - begins, h)
+                part = step_for(part / h, row[STEP_DENSITY], ends - begins, h)
             there, u, _ = stepped(self.equation, state, guess, begins, part, params)
             _, unknowns, states = stepped(self.equation, there, u, begins + part, h, params)
             made = row_of(self.equation, unknowns, states, begins + part, h, params)
@@ -211,8 +209,8 @@ class Dense:
         sol, again = self.sol, self.again
         h = np.full(len(theta), float(sol.step))
         t = self.time_at(lanes, numbers, 0.0)
-        if sol.impacts is not None and np.any(hit := self._is_divided(lanes, numbers)):
-            return self._with_impacts(lanes, numbers, theta, hit)
+        if sol.impacts is not None and np.any(hit := self.divided.among(lanes, numbers)):
+            return self.divided.inside(lanes, numbers, theta, hit)
         if self.interpolate is not None:
             states, u = again.at(lanes, numbers)
             interpolate = self.interpolate
@@ -227,62 +225,9 @@ class Dense:
         return self._by_steps(lanes, numbers, theta, t, h)
 
     @cached_property
-    def divided(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of every impact: trajectory, number of the step, and where in it, by the time."""
-        hits = self.sol.impacts
-        if self.sol.has_own_times:
-            return hits.lane, *self.place(hits.lane, hits.t)
-        at = (hits.t - float(self.sol.axis[0])) / float(self.sol.step)
-        return hits.lane, np.floor(at).astype(np.int64), at - np.floor(at)
-
-    def _is_divided(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """Which of these steps have an impact in them."""
-        of_lanes, of_steps, _ = self.divided
-        size = int(self.counts[-1]) + 1
-        return np.isin(lanes * size + numbers, of_lanes * size + of_steps)
-
-    def _with_impacts(self, lanes: np.ndarray, numbers: np.ndarray, theta: np.ndarray, hit: np.ndarray) -> dict[str, np.ndarray]:
-        """The fields inside steps, some of which walls divide: by the scheme's own step from the last impact before."""
-        sol, layout = self.sol, self.equation.stages[0][0].state_layout
-        found = {name: a[lanes, numbers].astype(float) for name, a in self.saved.items() if name in self.nodes}
-        if not np.all(hit):
-            for name, values in self.inside(lanes[~hit], numbers[~hit], theta[~hit]).items():
-                if name in found:
-                    found[name][~hit] = values
-        some = np.flatnonzero(hit)
-        row, part, t = {name: a[some] for name, a in found.items()}, np.zeros(len(some)), np.zeros(len(some))
-        for i, at in enumerate(some):
-            last, part[i], t[i] = self._since_impact(lanes[at], numbers[at], theta[at])
-            for name, values in sol.impacts.fields.items() if last is not None else ():
-                if name in row:
-                    row[name][i] = values[last]
-        states, u = self.again.begin(lanes[some], row, t)
-        moved = part > AT_ROW
-        if np.any(moved):
-            h = part[moved] * float(sol.step)
-            states[moved] = self.again.step(lanes[some][moved], states[moved], u[moved], t[moved], h)[0]
-        for name in filter(layout.__contains__, found):
-            found[name][some] = states[:, layout.place(name)].reshape(found[name][some].shape)
-        return found
-
-    def _since_impact(self, lane: int, number: int, theta: float) -> tuple[int | None, float, float]:
-        """(which it was, part, time): the last impact before a place in a step, None where there is none; which part of the step
-        of the run leads there from it, or from the row; and when it was."""
-        of_lanes, of_steps, places = self.divided
-        own = np.flatnonzero((of_lanes == lane) & (of_steps == number))
-        count = int(np.sum(places[own] <= theta + AT_ROW + 4 * np.spacing(float(number + 1))))
-        last, begins = (int(own[count - 1]), places[own[count - 1]]) if count else (None, 0.0)
-        one, fields = np.array([lane]), self.sol.impacts.fields
-        time = lambda place: float(self.time_at(one, np.array([number]), np.array([place]))[0])
-        part, t = max(float(theta - begins), 0.0), time(begins)
-        if not self.sol.has_own_times or part == 0.0:
-            return last, part, t
-        then = own[count] if count < len(own) else None
-        ends, whole = (1.0, 1.0) if then is None else (places[then], fields[PART][then])
-        density = self.saved[STEP_DENSITY][lane, number] if last is None else fields[STEP_DENSITY][last]
-        whole -= 0.0 if last is None else fields[PART][last]
-        h = float(self.sol.step)
-        return last, float(_step_for(part / (ends - begins), density, time(ends) - t, whole * h) / h), t
+    def divided(self) -> DividedSteps:
+        """The steps that walls divide."""
+        return DividedSteps(self)
 
     def _by_steps(self, lanes, numbers, theta, t, h) -> dict[str, np.ndarray]:
         nearest = numbers + (theta > 0.5)
@@ -295,7 +240,7 @@ class Dense:
             if self.sol.has_own_times:
                 at = numbers[off]
                 length = self.time_at(lanes, at + 1, 0.0) - t
-                part = _step_for(part / h[off], self.saved[STEP_DENSITY][lanes, at], length, h[off])
+                part = step_for(part / h[off], self.saved[STEP_DENSITY][lanes, at], length, h[off])
             states, u = self.again.at(lanes, numbers[off])
             states, u = self.again.step(lanes, states, u, t, part)
             made = self.again.row(lanes, states, u, t + part)
@@ -360,11 +305,6 @@ class Dense:
                 f"sol.at takes times inside the run, from {first:.6g} to {last:.6g}, but {times[outside].flat[0]!r} is not among "
                 "them: run more steps, or go on with sol.extend(steps)."
             )
-
-
-def _step_for(theta: Any, density: Any, length: Any, h: Any) -> Any:
-    """The step of variable steps that lasts θ of the `length` that the step of h from a place of this density lasts."""
-    return theta * length * density * h / (h - theta * (h - density * length))
 
 
 def _velocity(system: Any, row: dict, t: Any, params: Any) -> Any:

@@ -8,7 +8,7 @@ from dirax.engines.native.collocation_kernels import collocation_kernels
 from dirax.engines.native.kernels import kernels
 from dirax.engines.native.run import Ready
 from dirax.engines.native.walk import KernelWalk
-from dirax.engines.walk import Walk
+from dirax.engines.walk import AbstractWalk
 from dirax.program.interpreter import UnsupportedPrimitive
 
 
@@ -47,7 +47,7 @@ class Native(AbstractEngine):
         """`run` with the kernel at hand."""
         return Ready(problem)
 
-    def walk(self, problem: Problem) -> Walk:
+    def walk(self, problem: Problem) -> AbstractWalk:
         """With the kernel at hand."""
         return KernelWalk(problem)
 

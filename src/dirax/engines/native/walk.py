@@ -5,14 +5,16 @@ import numpy as np
 from dirax.engines.contract import Problem
 from dirax.engines.native.kernels import kernels
 from dirax.engines.native.lanes import arrays_saved
-from dirax.engines.walk import Walk
+from dirax.engines.walk import AbstractWalk, rows_of
 
 
-class KernelWalk(Walk):
+class KernelWalk(AbstractWalk):
     """Raises `UnsupportedPrimitive` for a step that cannot be compiled."""
 
     def __init__(self, p: Problem):
-        super().__init__(p)
+        self.problem, self.rows = p, rows_of(p)
+        self.state, self.unknowns = np.asarray(p.state), np.asarray(p.guess[0])
+        self.iterations, self.max_residual = 0, 0.0
         made = kernels(p.equation, p.params, p.batch_params, p.compensated)
         self.kernel, self.record = made.kernel(1)[0], made.record
         self._memory = np.zeros(self.record.size)
