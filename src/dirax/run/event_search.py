@@ -10,13 +10,13 @@ from dirax.run.dips import changes, changes_beside_dips, dips
 from dirax.run.event import Event, evaluated, refuse_unknown
 from dirax.run.event_scan import FEWEST, EventScan
 from dirax.solution.dense import Dense
-from dirax.solution.events import Events, joined
+from dirax.solution.events import Events
 
 FEWEST_POINTS = 4
 """Points of a step at which a function is looked at, its beginning among them."""
 
-BLOCK = 2**16
-"""Points that are looked at together."""
+TOGETHER = 1024
+"""Steps that are looked into together: fewer than those for which `StepsAgain` takes machine code, which has other last digits."""
 
 
 def places_for(equation: Any) -> int:
@@ -83,9 +83,9 @@ class EventSearch:
     def found(self, first: int, last: int) -> Events:
         """The events in the steps from number `first` to before `last`."""
         lanes, numbers = self._steps(first, last)
-        size = max(1, BLOCK // self.points)
-        parts = [self._located(self._brackets(lanes[i : i + size], numbers[i : i + size])) for i in range(0, len(lanes), size)]
-        return joined(parts or [self._located(_none())])
+        blocks = [slice(i, i + TOGETHER) for i in range(0, len(lanes), TOGETHER)]
+        parts = [self._brackets(lanes[block], numbers[block]) for block in blocks]
+        return self._located(Brackets(*map(np.concatenate, zip(*parts, strict=True))) if parts else _none())
 
     def _steps(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
         """(trajectories, numbers) of the steps to be looked into: of many, those in which the scan sees something."""
