@@ -38,10 +38,13 @@ class Auto(AbstractEngine):
 
         return by_arrays
 
-    def walk(self, problem: Problem) -> AbstractWalk:
+    def walks(self, problem: Problem) -> Callable[[Problem], AbstractWalk]:
         """By the native engine, or that which `prepared` takes."""
         native, _ = self._native(problem)
-        return WalkByRuns(problem, self.prepared(problem)) if native is None else native.walk(problem)
+        if native is not None:
+            return native.walks(problem)
+        run = self.prepared(problem)
+        return lambda problem: WalkByRuns(problem, run)
 
     def _native(self, problem: Problem) -> tuple[AbstractEngine | None, str | None]:
         """The native engine, or why it does not take the problem."""

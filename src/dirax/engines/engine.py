@@ -42,9 +42,11 @@ class AbstractEngine(eqx.Module):
         """
         return self.run
 
-    def walk(self, problem: Problem) -> AbstractWalk:
-        """Steps of a problem of one trajectory and one part, a few at a time. Raises as `run`, at once or when it goes."""
-        return WalkByRuns(problem, self.prepared(problem))
+    def walks(self, problem: Problem) -> Callable[[Problem], AbstractWalk]:
+        """What makes walks of this problem of one trajectory and one part, and of others that differ from it in numbers alone.
+        Raises as `run`, at once or when one of them goes."""
+        run = self.prepared(problem)
+        return lambda problem: WalkByRuns(problem, run)
 
     @abstractmethod
     def run_traced(self, problem: Problem) -> Outcome:

@@ -16,7 +16,7 @@ FEWEST_POINTS = 4
 """Points of a step at which a function is looked at, its beginning among them."""
 
 TOGETHER = 1024
-"""Steps that are looked into together: fewer than those for which `StepsAgain` takes machine code, which has other last digits."""
+"""Steps that are looked into together: fewer than `StepsAgain` takes machine code for, which has other last digits."""
 
 
 def places_for(equation: Any) -> int:

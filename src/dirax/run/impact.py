@@ -1,6 +1,7 @@
 """Impact: a wall that the motion bounces off, and what happens to the momentum there."""
 
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import jax
@@ -78,18 +79,27 @@ class Numbers:
     """A function of arrays and params, by its scalar program: of one place in floats, of many in NumPy; else compiled."""
 
     def __init__(self, function: Callable, values: list[np.ndarray], params: Any, *key: Any):
-        self.leaves, structure = jax.tree.flatten(params)
-        self.leaves = [np.asarray(leaf, float) for leaf in self.leaves]
+        leaves, structure = jax.tree.flatten(params)
         count = len(values)
 
         def flat(*numbers):
             return function(*numbers[:count], jax.tree.unflatten(structure, numbers[count:]))
 
-        shapes = [jax.ShapeDtypeStruct(np.shape(a), jnp.float64) for a in [*values, *self.leaves]]
+        shapes = [jax.ShapeDtypeStruct(np.shape(a), jnp.float64) for a in [*values, *leaves]]
         found = program_of(flat, shapes, (*key, structure))
         self.program = found[0] if found else None
+        self.of_many = jax.jit(jax.vmap(flat, in_axes=(0,) * count + (None,) * len(leaves)))
+        self._set(params)
+
+    def _set(self, params: Any) -> None:
+        self.leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(params)]
         self.fixed = [x for leaf in self.leaves for x in leaf.ravel().tolist()]
-        self.of_many = jax.jit(jax.vmap(flat, in_axes=(0,) * count + (None,) * len(self.leaves)))
+
+    def of(self, params: Any) -> "Numbers":
+        """The same with other params."""
+        other = copy(self)
+        other._set(params)
+        return other
 
     def one(self, *values: Any) -> np.ndarray:
         """The numbers of the results at one place."""

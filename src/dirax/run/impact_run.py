@@ -1,6 +1,7 @@
 """A run with impacts: all its trajectories, and what is refused."""
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -38,16 +39,17 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
         )
         for lane in range(lanes)
     ]
-    run = settings.engine.prepared(own[0])
+    run, interrupted = settings.engine.prepared(own[0]), False
     flights: list[Flight] = []
+    flight_of = _flights(settings.engine, run, system, own[0], walls, numbers)
     for number, lane in enumerate(own):
-        flight = _flight(settings.engine, run, system, lane, walls, numbers)
+        flight = flight_of(lane)
         _refuse_behind(flight, number if p.batch is not None else None)
-        if any(other.interrupted for other in flights):
-            flight.interrupted = True
+        if interrupted:
             flight.finish()
         else:
             flight.fly()
+            interrupted = flight.interrupted
         flights.append(flight)
     done = np.array([flight.done for flight in flights])
     fields = {name: np.stack([flight.rows[name] for flight in flights]) for name in p.fields}
@@ -66,7 +68,7 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
         last_state=np.stack([flight.state for flight in flights]),
         last_unknowns=np.stack([flight.unknowns for flight in flights]),
         engine=sample.engine,
-        interrupted=any(flight.interrupted for flight in flights),
+        interrupted=interrupted,
         run_seconds=seconds,
         notes={**sample.notes, "impacts": sum(len(flight.hits) for flight in flights)},
     )
@@ -79,28 +81,41 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
 _steps: Memo[tuple[StepEquation, StepEquation]] = Memo(64)
 
 
-def _flight(engine: Any, run: Any, system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> Flight:
+def _flights(
+    engine: Any, run: Any, system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]
+) -> Callable[[Problem], Flight]:
+    """What makes the flight of a trajectory, for those that differ in numbers alone from this one."""
     stage = p.equation.stages[0][0]
     gaps = lambda t, q, params: jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in walls])
-    own = tuple(map(Same, walls))
+    same = tuple(map(Same, walls))
     watched, collision = _steps.get(
-        ("walls", Same(system), Same(p.equation), *own),
+        ("walls", Same(system), Same(p.equation), *same),
         lambda: (
             WatchedStep(stage, system, gaps).equation(),
             CollisionStep(stage, system, gaps, tuple(wall.restitution for wall in walls)).equation(),
         ),
     )
-    state, (u,) = alerted(p.state, 1.0), p.guess
-    many = replace(p, equation=watched, state=state, save_every=1)
-    hit = replace(p, equation=collision, state=state, guess=(np.append(u, 0.5),), save_every=1, steps=1)
-    t, q = np.zeros(()), np.zeros(stage.state_layout["q"][0])
-    search = ImpactSearch(p, numbers, run, Numbers(gaps, [t, q], p.params, "gaps", *own))
+
+    def problems(p: Problem) -> tuple[Problem, Problem, Problem]:
+        state, (u,) = alerted(p.state, 1.0), p.guess
+        many = replace(p, equation=watched, state=state, save_every=1)
+        hit = replace(p, equation=collision, state=state, guess=(np.append(u, 0.5),), save_every=1, steps=1)
+        return many, many.with_numbers(steps=1), hit
+
+    t, q, state = np.zeros(()), np.zeros(stage.state_layout["q"][0]), np.asarray(p.state)
+    gap = Numbers(gaps, [t, q], p.params, "gaps", *same)
     jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, state, t, h, params)
     key = "jump", Same(system), Same(p.equation)
-    jumps = [
-        Numbers(jumped(wall), [np.asarray(p.state), t, t], p.params, *key, same) for wall, same in zip(walls, own, strict=True)
-    ]
-    return Flight(search, jumps, *(engine.walk(one) for one in (many, replace(many, steps=1), hit)))
+    jumps = [Numbers(jumped(wall), [state, t, t], p.params, *key, own) for wall, own in zip(walls, same, strict=True)]
+    many, _, hit = problems(p)
+    watch, collide = engine.walks(many), engine.walks(hit)
+
+    def flight(p: Problem) -> Flight:
+        many, one, hit = problems(p)
+        search = ImpactSearch(p, numbers, run, gap.of(p.params))
+        return Flight(search, [one.of(p.params) for one in jumps], watch(many), watch(one), collide(hit))
+
+    return flight
 
 
 def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> bool:

@@ -47,9 +47,9 @@ class Native(AbstractEngine):
         """`run` with the kernel at hand."""
         return Ready(problem)
 
-    def walk(self, problem: Problem) -> AbstractWalk:
-        """With the kernel at hand."""
-        return KernelWalk(problem)
+    def walks(self, problem: Problem) -> Callable[[Problem], AbstractWalk]:
+        """Walks by a kernel."""
+        return KernelWalk
 
     def run_traced(self, problem: Problem) -> Outcome:
         """The same as one primitive of JAX, with derivatives by loops over the steps; those of the second order and higher are
