@@ -177,6 +177,9 @@ def test_schemes_with_more_in_their_state(scheme):
     fallen = np.where(t < FALL, 1 - t**2 / 2, FALL * (t - FALL) - (t - FALL) ** 2 / 2)
     assert np.max(np.abs(sol.at(t).q[:, 1] - fallen)) <= 1e-13
     assert np.array_equal(sol.at(sol.events.t).p[:, 1] > 0, np.ones(count, bool))
+    q, v = np.array([[0.0, 1.0], [0.0, 1.7]]), np.array([[0.3, 0.0], [0.1, 0.2]])
+    batch = dx.simulate(SLOPE, scheme, step=0.1, steps=120, events=[FLOOR], q=q, v=v)
+    assert np.array_equal(batch[0].q, sol.q) and np.array_equal(batch[0].events.t, sol.events.t) and dx.verify(batch).ok
 
 
 ODD = {
