@@ -1,23 +1,32 @@
 """What is killed loses nothing: the caller, a worker, the scheduler, at three moments each; at twenty in `make soak`."""
 
 import json
+import multiprocessing
 import os
 import random
 import signal
-import subprocess
 import sys
 import time
 import warnings
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import xarray as xr
 
-from swept_pendulums import files, same, study
+import swept_pendulums
+from swept_pendulums import LONG, files, same, study
 
-PROGRAM = Path(__file__).parents[1] / "swept_pendulums.py"
-LONG = {"steps": 40_000, "save_every": 10_000, "task_seconds": 0.1}
-"""About 240 points × 40 000 steps, two seconds of one processor."""
+
+@pytest.fixture(scope="module", autouse=True)
+def nursery():
+    """Processes are forked from one that has imported everything and started nothing: each is there at once."""
+    context = multiprocessing.get_context("forkserver")
+    used = ("xarray", "zarr", "dask.array", "distributed.cli.dask_scheduler", "distributed.cli.dask_worker")
+    context.set_forkserver_preload(["swept_pendulums", *used])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+        yield context
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +36,27 @@ def uninterrupted(tmp_path_factory):
 
 
 def started(path, how):
-    """The study in a process of its own."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, str(PROGRAM), str(path), how]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    """The study in a process of its own, which says its last words in a file beside the store."""
+    return forked(swept_pendulums.main, path, how, words=path.with_name("words.txt"))
+
+
+def forked(function, *arguments, words=os.devnull):
+    """A process that calls a function of the study's module."""
+    process = multiprocessing.get_context("forkserver").Process(target=swept_pendulums.called, args=(words, function, *arguments))
+    process.start()
+    return process
+
+
+def ended(process):
+    """Wait for a process; its exit status."""
+    process.join(200.0)
+    assert process.exitcode is not None
+    return process.exitcode
+
+
+def words_beside(path):
+    """The last words of a study."""
+    return path.with_name("words.txt").read_text()
 
 
 def marks(path):
@@ -45,7 +71,7 @@ def marks(path):
 def wait_for(path, process, count, patience=120.0):
     """Until so many tasks are done, or the process has ended."""
     end = time.monotonic() + patience
-    while process.poll() is None and (not path.exists() or len(list(path.glob("status/c.*"))) < count):
+    while process.is_alive() and (not path.exists() or len(list(path.glob("status/c.*"))) < count):
         assert time.monotonic() < end
         time.sleep(0.01)
 
@@ -65,7 +91,7 @@ def kill_callers(tmp_path, uninterrupted, moments):
         process = started(path, "here")
         wait_for(path, process, moment)
         process.kill()
-        process.communicate()
+        ended(process)
         before = marks(path)
         assert before >= min(moment, 1)
     finished(path, uninterrupted)
@@ -82,8 +108,7 @@ def kill_workers(tmp_path, uninterrupted, moments):
         workers = [int(pid) for listing in children for pid in listing.read_text().split()]
         for worker in workers[:1]:
             os.kill(worker, signal.SIGKILL)
-    _, error = process.communicate(timeout=200)
-    assert process.returncode == 0, error.decode()
+    assert ended(process) == 0, words_beside(path)
     finished(path, uninterrupted)
 
 
@@ -96,7 +121,7 @@ def test_a_worker_is_killed(tmp_path, uninterrupted):
     kill_workers(tmp_path, uninterrupted, (1, 4, 8))
 
 
-@pytest.mark.soak
+@pytest.mark.skipif(find_spec("distributed") is None, reason="dask.distributed is not installed: pip install dirax[dask]")
 def test_a_scheduler_and_its_workers_are_killed(tmp_path, uninterrupted):
     kill_schedulers(tmp_path, uninterrupted, (1, 4, 8))
 
@@ -115,23 +140,20 @@ def kill_schedulers(tmp_path, uninterrupted, moments):
     path = tmp_path / "study.zarr"
     for number, moment in enumerate(moments):
         address = tmp_path / f"scheduler{number}.json"
-        run = lambda module, *rest: subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.{module}", *rest], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        scheduler = run("dask_scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(address))
-        worker = run("dask_worker", "--scheduler-file", str(address), "--nthreads", "2", "--no-dashboard", "--no-nanny")
+        scheduler = forked(swept_pendulums.scheduler, address)
+        worker = forked(swept_pendulums.dask_worker, address)
         try:
             while not address.exists():
                 time.sleep(0.05)
             process = started(path, json.loads(address.read_text())["address"])
             wait_for(path, process, marks(path) + moment)
             scheduler.kill()
-            _, error = process.communicate(timeout=120)
+            code = ended(process)
         finally:
-            for ended in (scheduler, worker):
-                ended.kill()
-                ended.wait()
-        assert process.returncode == 0 or "the same call again goes on from there" in error.decode()
+            for one in (scheduler, worker):
+                one.kill()
+                ended(one)
+        assert code == 0 or "the same call again goes on from there" in words_beside(path)
     finished(path, uninterrupted)
 
 
@@ -139,9 +161,8 @@ def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(tmp_path, uninterrupted):
     path = tmp_path / "study.zarr"
     process = started(path, "here")
     wait_for(path, process, 3)
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=60)
-    assert process.returncode != 0 and "of 240 points done, kept in" in error.decode()
+    os.kill(process.pid, signal.SIGINT)
+    assert ended(process) != 0 and "of 240 points done, kept in" in words_beside(path)
     assert not any("unfinished" in name for name in files(path))
     finished(path, uninterrupted)
 
@@ -156,7 +177,7 @@ def test_a_task_that_kills_its_worker_three_times_is_left_open_and_the_rest_goes
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        data = study(tmp_path / "deadly.zarr", case=deadly, executor=2)
+        data = study(tmp_path / "deadly.zarr", case=deadly, executor=1)
     assert any("failed three times" in str(one.message) and "signal 9" in str(one.message) for one in caught)
     left = int((data.status == 0).sum())
     assert 0 < left < 120 and data.status.values[-1, -1] == 0
