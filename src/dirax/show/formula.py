@@ -19,8 +19,8 @@ LONGEST = 420
 
 NODES = 4000
 
-WIDE = 28
-"""Characters of a term from which on a line may break inside its parentheses."""
+WIDE = 29
+"""Most letters of a term that is kept on one line; a line may break inside the parentheses of a longer one."""
 
 SPACE = '<mspace width="0.17em"></mspace>'
 
@@ -169,7 +169,7 @@ class _Writer:
         """A product in pieces: a long one parted inside the longest parentheses that it has above the line."""
         whole = self._fraction(factor, powers)
         fences = {(node, n): fence for node, n in powers if n > 0 and (fence := self._fence(node, n)) is not None}
-        if len(whole.text) <= WIDE or not fences:
+        if len(whole.text.replace("\u0307", "")) <= WIDE or not fences:
             return [whole]
         longest = max(fences, key=lambda power: len(self._power(*power).text))
         opening, inside, closing = fences[longest]
