@@ -42,9 +42,9 @@ def animate(
     """Write the motion of a solution, or of several side by side, as a moving picture, and return its path.
 
     The ending of `path` says how: .gif and .webp go round for ever, .mp4 is for lectures and needs the program ffmpeg, installed
-    or in the package imageio-ffmpeg, .html is the report without verdicts, to be turned about and stopped. `scene` is a `dx.scene.Scene` or a list of its parts, by
-    default that of the gallery's system. The whole run takes `seconds`; for a part of it, animate `sol[t0:t1]`. `size` is in
-    inches of 100 dots. The first trajectories of a batch move together.
+    or in the package imageio-ffmpeg, .html is the report without verdicts, to be turned about and stopped. `scene` is a
+    `dx.scene.Scene` or a list of its parts, by default that of the gallery's system. The whole run takes `seconds`; for a part
+    of it, animate `sol[t0:t1]`. `size` is in inches of 100 dots. The first trajectories of a batch move together.
 
     Raises `ValueError` for another ending, `RuntimeError` where ffmpeg is missing or fails, and what `sol.report` raises.
     """
