@@ -73,6 +73,24 @@ def dask_worker(address):
     main(["--scheduler-file", str(address), "--nthreads", "2", "--no-dashboard", "--no-nanny"])
 
 
+def on_two_devices(path):
+    """A study of the xla engine where it has two devices: prints how many there are, how many tasks ran on, whether all ended."""
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    import jax
+
+    from dirax.sweeps import arrange, executors
+
+    arrange.DEVICE_BATCH, used, plain = 8, set(), executors.run_task
+
+    def noting(*given):
+        used.add(jax.config.jax_default_device)
+        return plain(*given)
+
+    executors.run_task = noting
+    data = study(path, {name: values[:6] for name, values in OVER.items()}, engine="xla", steps=20, task_seconds=1e-6)
+    print(len(jax.local_devices()), len(used), bool((data.status == 1).all()), flush=True)
+
+
 def called(words, function, *arguments):
     """Call a function with everything that is said on standard error in a file."""
     with open(words, "w") as file:

@@ -1,7 +1,6 @@
 """What is killed loses nothing: the caller, a worker, the scheduler, at three moments each; at twenty in `make soak`."""
 
 import json
-import multiprocessing
 import os
 import random
 import signal
@@ -18,33 +17,16 @@ import swept_pendulums
 from swept_pendulums import LONG, files, same, study
 
 
-@pytest.fixture(scope="module", autouse=True)
-def nursery():
-    """Processes are forked from one that has imported everything and started nothing: each is there at once."""
-    context = multiprocessing.get_context("forkserver")
-    used = ("xarray", "zarr", "dask.array", "distributed.cli.dask_scheduler", "distributed.cli.dask_worker")
-    context.set_forkserver_preload(["swept_pendulums", *used])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
-        yield context
-
-
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
     path = tmp_path_factory.mktemp("uninterrupted") / "study.zarr"
     return study(path, **LONG), files(path)
 
 
-def started(path, how):
+@pytest.fixture(scope="module")
+def started(forked):
     """The study in a process of its own, which says its last words in a file beside the store."""
-    return forked(swept_pendulums.main, path, how, words=path.with_name("words.txt"))
-
-
-def forked(function, *arguments, words=os.devnull):
-    """A process that calls a function of the study's module."""
-    process = multiprocessing.get_context("forkserver").Process(target=swept_pendulums.called, args=(words, function, *arguments))
-    process.start()
-    return process
+    return lambda path, how: forked(swept_pendulums.main, path, how, words=path.with_name("words.txt"))
 
 
 def ended(process):
@@ -85,7 +67,7 @@ def finished(path, uninterrupted):
     assert same(data, uninterrupted[0]) and names == there and not list(path.parent.glob(".*"))
 
 
-def kill_callers(tmp_path, uninterrupted, moments):
+def kill_callers(tmp_path, uninterrupted, started, moments):
     path = tmp_path / "study.zarr"
     for moment in moments:
         process = started(path, "here")
@@ -97,7 +79,7 @@ def kill_callers(tmp_path, uninterrupted, moments):
     finished(path, uninterrupted)
 
 
-def kill_workers(tmp_path, uninterrupted, moments):
+def kill_workers(tmp_path, uninterrupted, started, moments):
     """One of the processes of a caller's own, found by their parent, again and again in one run."""
     tmp_path.mkdir(exist_ok=True)
     path = tmp_path / "study.zarr"
@@ -112,29 +94,29 @@ def kill_workers(tmp_path, uninterrupted, moments):
     finished(path, uninterrupted)
 
 
-def test_the_caller_is_killed(tmp_path, uninterrupted):
-    kill_callers(tmp_path, uninterrupted, (0, 3, 9))
+def test_the_caller_is_killed(tmp_path, uninterrupted, started):
+    kill_callers(tmp_path, uninterrupted, started, (0, 3, 9))
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
-def test_a_worker_is_killed(tmp_path, uninterrupted):
-    kill_workers(tmp_path, uninterrupted, (1, 4, 8))
+def test_a_worker_is_killed(tmp_path, uninterrupted, started):
+    kill_workers(tmp_path, uninterrupted, started, (1, 4, 8))
 
 
 @pytest.mark.skipif(find_spec("distributed") is None, reason="dask.distributed is not installed: pip install dirax[dask]")
-def test_a_scheduler_and_its_workers_are_killed(tmp_path, uninterrupted):
-    kill_schedulers(tmp_path, uninterrupted, (1, 4, 8))
+def test_a_scheduler_and_its_workers_are_killed(tmp_path, uninterrupted, started, forked):
+    kill_schedulers(tmp_path, uninterrupted, started, forked, (1, 4, 8))
 
 
 @pytest.mark.soak
-def test_everything_is_killed_at_twenty_moments(tmp_path, uninterrupted):
+def test_everything_is_killed_at_twenty_moments(tmp_path, uninterrupted, started, forked):
     moments = random.Random(0)
-    kill_callers(tmp_path, uninterrupted, sorted(moments.randrange(12) for _ in range(20)))
-    kill_workers(tmp_path / "workers", uninterrupted, sorted(moments.randrange(1, 10) for _ in range(20)))
-    kill_schedulers(tmp_path / "schedulers", uninterrupted, [moments.randrange(1, 10) for _ in range(20)])
+    kill_callers(tmp_path, uninterrupted, started, sorted(moments.randrange(12) for _ in range(20)))
+    kill_workers(tmp_path / "workers", uninterrupted, started, sorted(moments.randrange(1, 10) for _ in range(20)))
+    kill_schedulers(tmp_path / "schedulers", uninterrupted, started, forked, [moments.randrange(1, 10) for _ in range(20)])
 
 
-def kill_schedulers(tmp_path, uninterrupted, moments):
+def kill_schedulers(tmp_path, uninterrupted, started, forked, moments):
     """The caller ends with one sentence, and the same call again, without a cluster here, goes on."""
     tmp_path.mkdir(exist_ok=True)
     path = tmp_path / "study.zarr"
@@ -157,7 +139,7 @@ def kill_schedulers(tmp_path, uninterrupted, moments):
     finished(path, uninterrupted)
 
 
-def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(tmp_path, uninterrupted):
+def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(tmp_path, uninterrupted, started):
     path = tmp_path / "study.zarr"
     process = started(path, "here")
     wait_for(path, process, 3)
