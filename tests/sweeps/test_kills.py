@@ -125,7 +125,7 @@ def kill_schedulers(tmp_path, uninterrupted, started, forked, moments):
         scheduler = forked(swept_pendulums.scheduler, address)
         worker = forked(swept_pendulums.dask_worker, address)
         try:
-            while not address.exists():
+            while not address.exists() or not address.read_text().endswith("\n}"):
                 time.sleep(0.05)
             process = started(path, json.loads(address.read_text())["address"])
             wait_for(path, process, marks(path) + moment)
