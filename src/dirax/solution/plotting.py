@@ -107,7 +107,7 @@ def plot_energy(sol: Any, *, figure: "Figure | None" = None, ax: Any = None, **l
     left.set(xlabel=time_label(sol), ylabel=label("energy $E$", unit))
     if right is not None:
         right.set(xlabel=time_label(sol), ylabel=ENERGY_ERROR if relative else label("$|E - E_0|$", unit))
-    return left.figure
+    return left.figure  # type: ignore[return-value]
 
 
 @style()
