@@ -16,6 +16,8 @@ REPORT := src/dirax/show/assets
 
 # Compiled JAX functions, shared by the test workers and kept between runs.
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
+# Byte code is kept, whatever the shell says: without it every process compiles the packages anew, which takes most of its time.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
