@@ -14,7 +14,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
 from dirax.program.evaluation.in_numpy import Values, in_parts
-from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_ends
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
 from dirax.program.primitives import plain_primitive
@@ -89,19 +89,21 @@ class ScalarProgram:
         return [known.read(nodes, next(orders)) for nodes in self.results]
 
     @functools.cached_property
-    def _orders(self) -> list[list[int]]:
-        """What is left to compute, in order, for the operands of each opaque computation, and then for each result."""
+    def _orders(self) -> list[Order]:
+        """How to compute what is left for the operands of each opaque computation, and then for each result."""
         flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
-        known, orders = set(flat(self.inputs)), []
+        known, parts = set(flat(self.inputs)), []
         for step in self.opaque:
-            orders += [self._next(nodes, known) for nodes in step.operands]
+            parts += [self._next(nodes, known) for nodes in step.operands]
             known.update(flat(step.results))
-        return orders + [self._next(nodes, known) for nodes in self.results]
+        parts += [self._next(nodes, known) for nodes in self.results]
+        return with_ends(self.graph, parts)
 
-    def _next(self, nodes: Nodes, known: set[int]) -> list[int]:
-        order = self.graph.reachable(nodes.ravel().tolist(), known)
+    def _next(self, nodes: Nodes, known: set[int]) -> tuple[list[int], list[int]]:
+        read = nodes.ravel().tolist()
+        order = self.graph.reachable(read, known)
         known.update(order)
-        return order
+        return order, read
 
     @functools.cached_property
     def in_floats(self) -> Floats | None:

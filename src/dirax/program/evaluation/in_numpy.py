@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dirax.program.graph import Graph
+from dirax.program.graph import Graph, Order
 from dirax.program.graph_derivatives import partials
 from dirax.program.interpreter import Nodes
 
@@ -36,7 +36,7 @@ class Values:
         other._known = {n: v[entries] if isinstance(v, np.ndarray) and v.ndim else v for n, v in self._known.items()}
         return other
 
-    def read(self, nodes: Nodes, order: list[int] | None = None) -> np.ndarray:
+    def read(self, nodes: Nodes, order: Order | None = None) -> np.ndarray:
         """The values of nodes (…), an array (entries, …); `order` as in `Graph.evaluate`."""
         table = np.empty((nodes.size, self.entries))
         with np.errstate(all="ignore"):
@@ -83,7 +83,7 @@ class Slopes:
                 moving.add(node)
                 self.terms.append((node, terms))
         self.needed = [*nodes, *(factor for _, terms in self.terms for _, factor in terms or ())]
-        self.order = graph.reachable(self.needed)
+        self.order = Order(graph.reachable(self.needed))
 
 
 def in_parts(function: Callable, leaves: list[np.ndarray]) -> list[np.ndarray]:
