@@ -45,13 +45,15 @@ class ScalarProgram:
     inputs: list[Nodes]
     results: list[Nodes] = field(default_factory=list)
     opaque: list[Opaque] = field(default_factory=list)
+    for_few: bool = False
+    """Whether it is to be evaluated once, at a handful of entries: then more of it is found in numbers."""
 
     @classmethod
-    def of(cls, jaxpr: ClosedJaxpr, by_numpy: bool = False) -> "ScalarProgram":
+    def of(cls, jaxpr: ClosedJaxpr, by_numpy: bool = False, for_few: bool = False) -> "ScalarProgram":
         """The program of a jaxpr, `by_numpy` with decompositions, roots and loops that are no expressions.
 
         Raises `UnsupportedPrimitive` and `GraphTooLarge`."""
-        made = cls(Graph(NODE_LIMIT), [])
+        made = cls(Graph(NODE_LIMIT), [], for_few=for_few)
         made.inputs = [made.fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
         made.run(jaxpr, {name: functools.partial(rule, made) for name, rule in NUMPY_RULES.items()} if by_numpy else {})
         return made
