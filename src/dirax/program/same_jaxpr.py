@@ -7,8 +7,8 @@ above all, is kept by the jaxpr; so the first of those that are alike stands for
 
 from typing import Any
 
-import jax
 import numpy as np
+from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from dirax.program.memo import Memo, Same
@@ -48,11 +48,11 @@ def _equations(jaxpr: Jaxpr) -> tuple:
 
 
 def _kind(aval: Any) -> Any:
-    return (aval.shape, aval.dtype, aval.weak_type) if isinstance(aval, jax.core.ShapedArray) else aval
+    return (aval.shape, aval.dtype, aval.weak_type) if isinstance(aval, ShapedArray) else aval
 
 
 def _constant(value: Any) -> Any:
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return Same(value)
     array = np.asarray(value)
     return type(value).__name__, array.dtype, array.shape, array.tobytes()
