@@ -1,5 +1,6 @@
 """ScalarProgram: a function of a few numbers, traced once into scalar expressions; values of it in NumPy and in JAX."""
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable
@@ -18,6 +19,9 @@ from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_en
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
 from dirax.program.primitives import plain_primitive
+
+OFTEN = 32
+"""Times that a program is evaluated for one entry until Python's floats are worth their compiling."""
 
 NUMPY_RULES: dict[str, Callable] = {}
 """Primitive name → rule(made, interpreter, equation, *operands), which may add computations in NumPy to the program `made`."""
@@ -47,6 +51,7 @@ class ScalarProgram:
     opaque: list[Opaque] = field(default_factory=list)
     for_few: bool = False
     """Whether it is to be evaluated once, at a handful of entries: then more of it is found in numbers."""
+    _asked: int = 0
 
     @classmethod
     def of(cls, jaxpr: ClosedJaxpr, by_numpy: bool = False, for_few: bool = False) -> "ScalarProgram":
@@ -76,8 +81,22 @@ class ScalarProgram:
         return self.opaque[-1].results
 
     def in_numpy(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
-        """The results for arguments (entries, …), with that leading axis."""
+        """The results for arguments (entries, …), with that leading axis; for one entry again and again by Python's floats, which
+        have the same bits."""
+        if len(leaves[0]) == 1:
+            self._asked += 1
+            if self._asked > OFTEN and self.in_floats is not None:
+                with contextlib.suppress(ArithmeticError, ValueError):  # what Python's floats do not have
+                    return self._by_floats(leaves)
         return in_parts(self._part, leaves)
+
+    def _by_floats(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
+        assert self.in_floats is not None
+        found, results, at = self.in_floats([x for leaf in leaves for x in np.asarray(leaf, float).ravel().tolist()]), [], 0
+        for nodes in self.results:
+            results.append(np.array(found[at : at + nodes.size], float).reshape(1, *nodes.shape))
+            at += nodes.size
+        return results
 
     def _part(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
         known = Values(self.graph, len(leaves[0]))
