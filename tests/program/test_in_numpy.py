@@ -10,8 +10,9 @@ import pytest
 import dirax as dx
 from dirax.engines import step_program
 from dirax.engines.step_program import linearized
+from dirax.program import scalar_program
 from dirax.program.evaluation import in_numpy as module
-from dirax.program.evaluation.functions import in_numpy
+from dirax.program.evaluation.functions import in_numpy, program_of
 from dirax.program.linear_solves import scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.schemes.step import Shape, make_step_equation
@@ -51,6 +52,19 @@ def test_entries_of_a_batch_are_what_jax_computes(name, monkeypatch):
     found, expected = in_numpy(CASES[name], [a, x], name), jax.jit(jax.vmap(CASES[name]))(a, x)
     for mine, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["a root", "linear equations", "a derivative through a root"])
+def test_one_entry_again_and_again_has_the_same_bits(name, monkeypatch):
+    monkeypatch.setattr(scalar_program, "OFTEN", 2)
+    rng = np.random.default_rng(4)
+    a, x = rng.normal(size=(1, 3, 3)), rng.normal(size=(1, 3))
+    first, *later = (jax.tree.leaves(in_numpy(CASES[name], [a, x], ("again", name))) for _ in range(4))
+    found = program_of(CASES[name], [jax.ShapeDtypeStruct(y.shape[1:], y.dtype) for y in (a, x)], ("again", name))
+    assert found is not None and "in_floats" in vars(found[0])
+    for other in later:
+        for one, two in zip(first, other, strict=True):
+            assert one.tobytes() == two.tobytes() and one.shape == two.shape
 
 
 def test_what_has_no_rule_is_left_to_the_compiler():

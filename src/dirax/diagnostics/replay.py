@@ -16,8 +16,8 @@ from dirax.program.memo import Same
 from dirax.solution.solution import Solution
 from dirax.solution.trajectory import SavedRow, last_rows
 
-MOST_OPERATIONS = 1e8
-"""Scalar operations of the steps that are taken again, a second or so: of longer runs as many rows, evenly spread."""
+MOST_OPERATIONS = 4e7
+"""Scalar operations of the steps that are taken again, a few tenths of a second: of longer runs as many rows, evenly spread."""
 
 
 APART = 16

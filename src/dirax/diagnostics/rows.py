@@ -19,19 +19,20 @@ CHUNK = 4096
 """Rows that go through a compiled function at once."""
 
 
-def over_rows(function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray:
+def over_rows(function: eqx.Partial, sol: Solution, items: tuple, few: bool = False) -> np.ndarray:
     """function(*item, params) for every row of `items`, whose leaves have the shape (rows, …) or (B, rows, …).
 
     The result is (B, rows, …), with B = 1 for one trajectory. Nothing is compiled where the scalar graph can say the function;
     else rows go through in pieces, so that memory stays bounded. A function of a module, with what it is of, is traced once.
+    `few`: it is asked for at these rows alone, a handful.
     """
     if sol.batch is None:
         items = jax.tree.map(lambda a: np.asarray(a)[None], items)
-    found = _by_graph(function, sol, items)
+    found = _by_graph(function, sol, items, few)
     return _compiled(function, sol, items) if found is None else found
 
 
-def _by_graph(function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray | None:
+def _by_graph(function: eqx.Partial, sol: Solution, items: tuple, few: bool) -> np.ndarray | None:
     """The values by the scalar graph, without a compiler; None where it cannot say them."""
     leaves, structure = jax.tree.flatten(items)
     lanes, rows = np.shape(leaves[0])[:2]
@@ -51,7 +52,7 @@ def _by_graph(function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray 
         item = jax.tree.unflatten(structure, values[: len(leaves)])
         return function(*item, jax.tree.unflatten(params_structure, values[len(leaves) :]))
 
-    found = in_numpy(flat, arrays, (function.func, function.args, structure, params_structure))
+    found = in_numpy(flat, arrays, (function.func, function.args, structure, params_structure), few)
     return None if found is None else found.reshape(lanes, rows, *found.shape[1:])
 
 

@@ -91,11 +91,11 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     if reason := form.refusal(sol.equation, one, sol.params_of_one):
         return Line(name, None, None, NOT_CHECKED, reason)
     same = Same(sol.equation)
-    begun = over_rows(eqx.Partial(_begun, form, same), sol, (items,))
+    begun = over_rows(eqx.Partial(_begun, form, same), sol, (items,), few=True)
     size, t = sol.equation.stages[0][0].state_size, np.atleast_2d(items["t"][..., -1])
     step = differentiated_steps(sol, begun[..., :size], begun[..., size:], t)
     taken = step if sol.batch is not None else jax.tree.map(lambda a: a[0], step)
-    values = over_rows(eqx.Partial(_changed, form, same), sol, (items, taken))
+    values = over_rows(eqx.Partial(_changed, form, same), sol, (items, taken), few=True)
     defect, condition = values[..., 0], float(np.max(values[..., -1], where=np.isfinite(values[..., -1]), initial=1.0))
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")

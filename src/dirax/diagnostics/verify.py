@@ -31,8 +31,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     (absolute Jacobian times |q|). The tolerances are roundoff's:
 
     - steps replayed: every saved number of every row, of any scheme and of compositions, against the step from the row before,
-      taken again in NumPy: 32 ε of what it would be off if every operation were; of long runs as many rows as a second or two
-      are enough for, and the line says so;
+      taken again in NumPy: 32 ε of what it would be off if every operation were; of long runs as many rows as a few tenths of
+      a second are enough for, and the line says so;
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
     - steps solved: the largest residual of a run, relative to the terms of its equations, which Newton's method brings to

@@ -23,6 +23,9 @@ LARGE_DERIVATIVE = 30_000
 """Nodes of a function times numbers by which it is differentiated from which on a graph of the derivative takes longer than its
 values at a few entries."""
 
+LARGE_FOR_FEW = 2000
+"""The same of programs that are evaluated once, at a handful of entries."""
+
 LARGE_PRODUCT = 256
 """Multiplications of a product of arrays from which on it is no graph of them."""
 
@@ -52,7 +55,8 @@ def derivative_in_numbers(made: ScalarProgram, interpreter: Interpreter, equatio
     """Derivatives of large functions by many numbers are found in numbers, with no graph of their own."""
     jaxpr, wanted = equation.params["jaxpr"], equation.params["wanted"]
     inner = _inner.get(Same(jaxpr), lambda: _plain(jaxpr))
-    if inner is None or len(inner.graph) * sum(operands[k].size for k in wanted) < LARGE_DERIVATIVE:
+    large = LARGE_FOR_FEW if made.for_few else LARGE_DERIVATIVE
+    if inner is None or len(inner.graph) * sum(operands[k].size for k in wanted) < large:
         return list(RULES["dirax_derivative"](interpreter, equation, *operands))
     (result,), inputs = inner.results, [node for k in wanted for node in inner.inputs[k].ravel().tolist()]
     ends, outputs, plans = np.cumsum([operands[k].size for k in wanted])[:-1], result.ravel().tolist(), []
