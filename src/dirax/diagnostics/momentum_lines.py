@@ -78,7 +78,8 @@ def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
     quotient = None if sol.system is None else sol.system.quotient_form()
     if quotient is None:
         return []
-    title, mu = "momentum map μ", np.asarray(sol.fields["mu"]).reshape(-1, *np.shape(sol.fields["mu"])[-2:])
+    rows = {name: np.asarray(sol.fields[name]) for name in quotient.own_fields}
+    title, mu = "momentum map μ", over_rows(eqx.Partial(_momentum_of_row, quotient), sol, (rows,))
     w = np.asarray(sol.fields["w"]).reshape(*mu.shape[:2], -1)
     scale = np.nanmax(np.abs(np.concatenate([mu, w], axis=2)), axis=(1, 2))
     change, relative = relative_changes(mu, scale)
@@ -87,6 +88,10 @@ def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
     if quotient.moves_momentum(initial_of_one(sol), sol.params_of_one):
         return [Line(title, float(change[lane]), None, NOT_CHECKED, f"forces with a part along the group move it; {text}")]
     return [judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)]
+
+
+def _momentum_of_row(quotient: Any, row: dict, params: Any):
+    return quotient.momentum_map(row)
 
 
 def _momentum_terms(generator: Callable, q, p, params: Any):
