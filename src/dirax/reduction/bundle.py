@@ -23,7 +23,7 @@ class GroupConnection(eqx.Module):
     """A discrete principal connection on Q = Σ × G, where G acts on its factor of a product of manifolds from the left.
 
     `lift(x0, x1)` is h⁰_d(x0, x1) ∈ G of two points of Σ, an element (N_G,), e where x0 = x1: the horizontal point over x1 from
-    (x0, g) is (x1, g h⁰_d(x0, x1)), and the vertical part of a pair is (h⁰_d)⁻¹ g0⁻¹ g1 ([RL] Definition 2.1, for abelian groups).
+    (x0, g) is (x1, g h⁰_d(x0, x1)), and the vertical part of a pair is (h⁰_d)⁻¹ g0⁻¹ g1 ([RL] Definition 2.1, abelian).
     By default e, the product connection. `group` is the factor of the system's manifold, a `dx.SO3()` and others, or a
     `dx.Euclidean` or `dx.Torus`; `factor` its number, where several are equal.
 
@@ -37,9 +37,7 @@ class GroupConnection(eqx.Module):
     lift: UserFunction | None
     factor: int | None = eqx.field(static=True)
 
-    def __init__(
-        self, group: AbstractLieGroup | AbstractFlat, lift: Callable | None = None, factor: int | None = None
-    ):
+    def __init__(self, group: AbstractLieGroup | AbstractFlat, lift: Callable | None = None, factor: int | None = None):
         if not isinstance(group, AbstractLieGroup | AbstractFlat):
             raise TypeError(f"group must be one such as dx.SO3() or dx.Torus(2), but {group!r} was given.")
         self.group, self.factor = group, factor
@@ -54,12 +52,13 @@ class GroupConnection(eqx.Module):
         if self.factor is not None:
             equal = [number for number in equal if number == self.factor]
         if len(equal) != 1 or len(factors) == 1:
-            which = f"factor={self.factor} of " if self.factor is not None else ""
-            found = "the only factor" if len(factors) == 1 and equal else f"{len(equal)} factors" if equal else "no factor"
-            way = {0: "take a factor of it", 1: "reduce by the group alone, dx.reduce(system, group)"}
+            name, whole = type(self.group).__name__, " × ".join(type(factor).__name__ for factor in factors)
+            if len(equal) > 1:
+                raise ValueError(f"{name} is {len(equal)} factors of {whole}, numbers {equal}: say which, factor=….")
+            found = "all" if equal else "no factor" if self.factor is None else f"not factor number {self.factor}"
             raise ValueError(
-                f"dx.reduce takes Q = Σ × G, but {self.group} is {found} of {which}{manifold}: "
-                f"{way.get(len(equal), 'say which, factor=…')}."
+                f"dx.reduce by a factor G takes a manifold Q = Σ × G, but {name} is {found} of {whole}: take a factor of it, or "
+                "where it is all reduce by the Lie group, dx.reduce(system, group)."
             )
         number = equal[0]
         first = sum(factor.ambient_dimension for factor in factors[:number])

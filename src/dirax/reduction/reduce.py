@@ -29,7 +29,7 @@ def reduce(system: Any, connection: Any, params: Any = None) -> AbstractReducedS
 
     With a connection, the quotient of a `dx.LagrangeDirac` or `dx.NonholonomicMechanics` system, or of a
     `dx.ManifoldLagrangian`, by the translations of `connection.fibre` ([RL] §4, §6); that these leave it alone is checked at the
-    start of a run. On a manifold the fibre names coordinates of its flat factors, R^n or a torus, and connections are functions of
+    start of a run. On a manifold the fibre names coordinates of its flat factors, R^n or a torus; connections are functions of
     points of R^N; where a translation is one of other coordinates, `dx.in_coordinates` makes it one.
 
         reduced = dx.reduce(system, dx.LinearConnection(fibre=[0]))
@@ -60,21 +60,21 @@ def reduce(system: Any, connection: Any, params: Any = None) -> AbstractReducedS
     """
     if isinstance(system, ReducedLagrangeDirac) and isinstance(connection, AbstractConnection | AbstractLieGroup):
         return reduced_again(system, connection, params)
+    if isinstance(system, ReducedManifoldLagrangian):
+        raise TypeError("this system on a manifold is reduced already: name the whole symmetry at once, in one dx.reduce.")
     on_manifold = system.manifold_form() if isinstance(system, AbstractSystem) else None
     curved = on_manifold is not None and on_manifold.flat_form() is None
     if isinstance(connection, AbstractLieGroup):
-        if not (curved and isinstance(on_manifold.manifold, Product)):
+        if not (on_manifold is not None and curved and isinstance(on_manifold.manifold, Product)):
             return reduced_by_left_translations(system, connection, params)
         connection = GroupConnection(connection)
     if on_manifold is not None and (curved or isinstance(connection, GroupConnection)):
         return ReducedManifoldLagrangian(on_manifold, _bundle_of(on_manifold, connection))
+    _refuse_other_symmetries(connection)
     lagrangian = system.lagrangian_form() if isinstance(system, AbstractSystem) else None
     lagrangian = on_manifold.flat_form() if on_manifold is not None else lagrangian
     if lagrangian is None:
-        again = isinstance(system, AbstractSystem) and system.quotient_form() is not None
-        way = ": name the whole symmetry at once, in one dx.reduce." if again else "."
-        raise TypeError(f"dx.reduce takes a dx.LagrangeDirac system, but one of type {type(system).__name__} was given{way}")
-    _refuse_other_symmetries(connection)
+        raise TypeError(f"dx.reduce takes a dx.LagrangeDirac system, but one of type {type(system).__name__} was given.")
     return ReducedLagrangeDirac(lagrangian, connection)
 
 
@@ -94,7 +94,8 @@ def _refuse_other_symmetries(connection: Any) -> None:
     if not isinstance(connection, AbstractConnection):
         way = f": dx.LinearConnection(fibre={list(connection.fibre)})." if isinstance(connection, Translations) else "."
         way = ": add parentheses." if isinstance(connection, type) else way
-        way = ": it is for a dx.ManifoldLagrangian on a product with that group." if isinstance(connection, GroupConnection) else way
+        if isinstance(connection, GroupConnection):
+            raise TypeError("dx.GroupConnection is for a dx.ManifoldLagrangian on a product with that group.")
         raise TypeError(
             "the symmetry must be a connection such as dx.LinearConnection(fibre=[…]), or a Lie group such as dx.SO3(), but "
             f"{connection!r} was given{way}"

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import INERTIA_RANK, SYMMETRY_DEFECT
+from dirax.program.memo import Memo
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.actions import AbstractAction, Translations
 from dirax.reduction.connection import AbstractConnection
@@ -21,6 +22,9 @@ from dirax.systems.system import AbstractSystem
 
 NEARBY, SAMPLES = 0.3, 8
 """Invariance is looked at in the initial data and at so many random points within this distance of them."""
+
+
+_symmetric: Memo[None] = Memo(256)
 
 
 class AbstractReducedSystem(AbstractSystem):
@@ -114,7 +118,9 @@ class AbstractReducedSystem(AbstractSystem):
             return ""
         forces = row == parts.shape[1] - 1
         what = "the forces f(t, q, v) move" if forces else "the forces of the constraints move"
-        part = f"{'f' if forces else f'one-form {row}'} has the part {parts[where, row, column]:.3g} along {self.named(column)}"
+        part = (
+            f"{'f' if forces else f'one-form {row}'} has the part {parts[where, row, column]:.3g} along {self.named(int(column))}"
+        )
         at = f"q = {np.asarray(q[where])}" + f", v = {np.asarray(v[where])}" * bool(forces)
         return f"{what}: {part} at {at}, at or near the initial data"
 
@@ -129,7 +135,22 @@ class AbstractReducedSystem(AbstractSystem):
 
         return jax.vmap(at)(t, q, v)
 
+    @abstractmethod
+    def refuse_asymmetry(self, data: Data, params: Any) -> None:
+        """Raise `ValueError` where the group is no symmetry of the system, at or near initial data, which must be concrete."""
+
+    def refuse_asymmetry_once(self, data: Data, params: Any) -> None:
+        """The same of values that were not looked at before; of traced ones nothing is asked."""
+        if not is_traced(data, params):
+            values = [(str(name), np.asarray(a).tobytes()) for name, a in sorted(data.items())]
+            leaves = [(str(where), np.asarray(a).tobytes()) for where, a in jax.tree_util.tree_leaves_with_path(params)]
+            _symmetric.get((self, *values, *leaves), lambda: self.refuse_asymmetry(data, params))
+
     def complete(self, data: Data, params: Any, project: bool) -> Data:
+        """Those of the unreduced system, of a saved row too."""
+        if "x" in data:
+            whole = self.unreduced_row({name: data[name] for name in self.own_fields})
+            data = {"q": whole["q"], "p": whole["p"]} | ({"t": data["t"]} if "t" in data else {})
         return self.system.complete(data, params, project)
 
     def initial_defect(self, data: Data, params: Any) -> Float[Array, " m"]:
@@ -196,8 +217,7 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
     def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
         sizes = self.system.sizes(data, params)
         self.connection.check(sizes[0])
-        if not is_traced(data, params):
-            self._refuse_asymmetry(data, params)
+        self.refuse_asymmetry_once(data, params)
         return sizes
 
     def refuse_asymmetric(self, functions: dict[str, UserFunction], data: Data, h: float, params: Any) -> None:
@@ -212,7 +232,7 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
                 f"q1[{worst}] − q0[{worst}] alone, or take that coordinate out of fibre."
             )
 
-    def _refuse_asymmetry(self, data, params) -> None:
+    def refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]
         found = invariance(self.system, self.action, *sampled(data), params)
         if not found.ok:

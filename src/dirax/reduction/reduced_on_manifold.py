@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data
-from dirax.program.user_functions import UserFunction, evaluated, is_traced
+from dirax.program.user_functions import UserFunction, evaluated
 from dirax.reduction.bundle import FactorTranslation, TrivialBundle
 from dirax.reduction.reduced import NEARBY, SAMPLES, AbstractReducedSystem
 from dirax.reduction.symmetry import discrete_invariance, invariance, times
@@ -17,7 +17,8 @@ from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 
 class ReducedManifoldLagrangian(AbstractReducedSystem):
     """A Lagrangian system on the quotient (Q × Q)/G of Q = Σ × G, a product of manifolds in R^N, by the translations of G from
-    the left, in charts of Σ ([RL] §6; of a group that is not abelian the discrete Lagrange–Poincaré equations). Made by `dx.reduce`.
+    the left, in charts of Σ ([RL] §6; of a group that is not abelian the discrete Lagrange–Poincaré equations). Made by
+    `dx.reduce`.
 
     Rows of a trajectory hold the point x of Σ and the covector w there (N_Σ,), w = p_x + A(x)ᵀμ with the connection's A;
     `mu` (k,), the body momentum of the group's part, which an abelian group conserves; `g` (N_G,), its element, a quadrature;
@@ -44,14 +45,16 @@ class ReducedManifoldLagrangian(AbstractReducedSystem):
         manifold, random = self.system.manifold, np.random.default_rng(0)
         q = jnp.asarray(data["q"] if "q" in data else data["q0"])
         v = jnp.asarray(data["v"]) if "v" in data else manifold.frame(q) @ jnp.ones(manifold.dimension)
-        away = np.concatenate([np.zeros((1, 2, manifold.dimension)), NEARBY * random.uniform(-1, 1, (SAMPLES, 2, manifold.dimension))])
+        away = np.concatenate(
+            [np.zeros((1, 2, manifold.dimension)), NEARBY * random.uniform(-1, 1, (SAMPLES, 2, manifold.dimension))]
+        )
 
         def near(q, v, by):
             point = manifold.local_parametrization(q)(by[0])
             return point, manifold.frame(point) @ (manifold.coordinates(q, v) + by[1])
 
-        found = evaluated(lambda q, v, away: jax.vmap(near, in_axes=(None, None, 0))(q, v, away), q, v, away)
-        return times(1 + SAMPLES), *(np.asarray(a) for a in found)
+        points, velocities = evaluated(lambda q, v, away: jax.vmap(near, in_axes=(None, None, 0))(q, v, away), q, v, away)
+        return times(1 + SAMPLES), np.asarray(points), np.asarray(velocities)
 
     def named(self, generator: int) -> str:
         return f"generator {generator} of {self.connection.group}"
@@ -81,11 +84,10 @@ class ReducedManifoldLagrangian(AbstractReducedSystem):
 
     def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
         sizes = self.system.sizes(data, params)
-        if not is_traced(data, params):
-            self._refuse_asymmetry(data, params)
+        self.refuse_asymmetry_once(data, params)
         return sizes
 
-    def _refuse_asymmetry(self, data: Data, params: Any) -> None:
+    def refuse_asymmetry(self, data: Data, params: Any) -> None:
         found = invariance(self.system, self.action, *self.sampled(data), params)
         if not found.ok:
             raise ValueError(
@@ -97,7 +99,7 @@ class ReducedManifoldLagrangian(AbstractReducedSystem):
     def refuse_asymmetric(self, functions: dict[str, UserFunction], data: Data, h: float, params: Any) -> None:
         """Raise `ValueError` where functions of ([t, ]q0, q1, h[, params]) are not invariant, at data that must be concrete."""
         t, q, v = self.sampled(data)
-        ends = lambda q, v: jax.vmap(self.system.manifold.retraction)(q, h * v)
+        ends = lambda q, v: jax.vmap(self.connection.manifold.retraction)(q, h * v)
         found = discrete_invariance(functions, self.action, t, q, np.asarray(evaluated(ends, q, v)), h, params)
         if not found.ok:
             raise ValueError(

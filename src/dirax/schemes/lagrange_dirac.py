@@ -48,7 +48,7 @@ class LagrangeDAlembert(AbstractScheme):
     Of a `dx.ManifoldLagrangian` L_d and w_d are on its manifold, functions being of points of R^N, and the equations those of
     T*_{q_k}Q, solved in charts ([RL] §6): R⁻¹_{q0}(q1)/h at q0 ("left") and −R⁻¹_{q1}(q0)/h at q1 ("right") take the place of
     Δq/h, with the retraction R of the manifold, and "midpoint" is the middle of the geodesic with the velocity there.
-    Raises `TypeError` for a manifold without a retraction.
+    Raises `TypeError` for a manifold without a retraction. A run starts from two points of the manifold, q0= and q1=, too.
     """
 
     discrete_lagrangian: str | UserFunction

@@ -21,8 +21,8 @@ class ReducedStepInCharts(AbstractStep):
     """The step on (Q × Q)/G of a step in charts of Q = Σ × G, whose equations the group leaves alone.
 
     State (m, r, w, μ, g, …): the centre of the chart of Σ, coordinates and momentum in it, the body momentum, and g; unknowns
-    (ṙ, γ, …) with the vertical part hγ. Every step begins at (x, e), in the chart at (m, e), with p = (w − A(x)ᵀμ, μ), and ends at
-    (x', f): w' and μ' are those of its momentum there, seen from f, in which the charts of G are left-invariant, and g' = g f.
+    (ṙ, γ, …) with the vertical part hγ. Every step begins at (x, e), in the chart at (m, e), with p = (w − A(x)ᵀμ, μ), ends at
+    (x', f): w' and μ' are those of its momentum, seen from f, as the charts of G are left-invariant, and g' = g f.
     So an atlas of Σ alone is met, and no coordinates of G but those of a step.
     """
 

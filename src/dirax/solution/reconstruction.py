@@ -10,6 +10,7 @@ import numpy as np
 from dirax.geometry.group_retractions import coadjoint
 from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.numerics.tolerances import GROUP_DEFECT
+from dirax.program.evaluation.functions import in_numpy
 from dirax.program.user_functions import is_traced
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.routh import DiscreteRouth
@@ -129,9 +130,17 @@ def _element(group: AbstractLieGroup, g0: Any, batch: int | None) -> jax.Array:
 
 
 def _each_row(solution: Solution, function: Callable, names: tuple[str, ...]) -> dict[str, Any]:
-    for _ in range(np.ndim(solution.fields["x"]) - 1):
+    """`function(row)` of every row, in NumPy where it has a scalar program."""
+    rows = {name: solution.fields[name] for name in names}
+    lead = np.shape(solution.fields["x"])[:-1]
+    if not is_traced(rows):
+        entries = [np.asarray(a).reshape(-1, *np.shape(a)[len(lead) :]) for a in rows.values()]
+        found = in_numpy(lambda *values: function(dict(zip(names, values, strict=True))), entries, (function, names))
+        if found is not None:
+            return {name: a.reshape(*lead, *a.shape[1:]) for name, a in found.items()}
+    for _ in lead:
         function = jax.vmap(function)
-    return _plain(function({name: solution.fields[name] for name in names}))
+    return _plain(function(rows))
 
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:

@@ -33,8 +33,8 @@ class ManifoldLagrangian(AbstractSystem):
 
     Stepped by `dx.DiscreteDirac` with a discretization map on Q, and where Q has a retraction by `dx.PlusLagrangeDirac`,
     `dx.MinusLagrangeDirac` and `dx.LagrangeDAlembert`, in charts, with a discrete Lagrangian of one's own too; by `dx.InCharts`
-    with that of a map. Reduced by `dx.reduce`: on a group by it, on a flat manifold by a connection, on others where
-    translations of coordinates are symmetries, as the system that `dx.in_coordinates` gives.
+    with that of a map. Reduced by `dx.reduce`: by translations of flat factors or a Lie group that is a factor, in charts of the
+    others, on a group alone by it, and where a symmetry is a translation of other coordinates after `dx.in_coordinates`.
     Holonomic constraints are kept at the nodes by `dx.DiscreteDirac` with constraints="resolve".
 
         ball = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - q[2], dx.Sphere(3), one_forms=lambda q: a(q)[None])
