@@ -246,7 +246,7 @@ class AbstractScheme(eqx.Module):
     def step_form(self, system: Any, shape: Shape, step: Any) -> AbstractStepForm | str:
         """The form on its states whose change in one step is known; or why none is."""
         equation = make_step_equation(self, system, shape)
-        return form_of_steps(system, step, equation, self.discrete_structure(system, shape, step))
+        return form_of_steps(system, shape, step, equation, self.discrete_structure(system, shape, step))
 
     @property
     def constraints_at_rows(self) -> bool:
