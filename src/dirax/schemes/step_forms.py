@@ -236,13 +236,12 @@ def form_of_steps(
 def _form_of_points(system: Any, shape: Shape, step: Any, equation: Any, theta: float | None) -> AbstractStepForm | str:
     """That of the points x of a relation, whose D is the graph of one."""
     relation = system.final_relation(shape) or system.relation_form(shape)
-    points = relation is not None and set(relation.names) <= set(equation.fields)
-    if points and relation.two_form is not None:
+    if relation is None or not set(relation.names) <= set(equation.fields):
+        return f"the state of this scheme is {equation.state_layout!r}, not (q, p) on T*Q"
+    if relation.two_form is not None:
         return TwoFormOfPoints(system, step, relation.two_form, relation.names, theta)
-    if points and relation.bivector is not None:
+    if relation.bivector is not None:
         return BivectorOfPoints(system, step, relation.bivector, relation.names, theta)
-    if points and not relation.dirac:
+    if not relation.dirac:
         return "an implicit system states no two-form or bivector that a step could preserve"
-    if points:
-        return "D is the graph neither of a two-form nor of a bivector, which a step could preserve"
-    return f"the state of this scheme is {equation.state_layout!r}, not (q, p) on T*Q"
+    return "D is the graph neither of a two-form nor of a bivector, which a step could preserve"
