@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.rows import over_rows, times_at
-from dirax.engines.steps_in_numbers import Noise, StepsInNumbers
+from dirax.engines.steps_in_numbers import StepsInNumbers
+from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same

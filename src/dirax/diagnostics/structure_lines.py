@@ -8,6 +8,7 @@ import numpy as np
 from dirax.diagnostics.one_step import differentiated_steps
 from dirax.diagnostics.power_balance import keeps_books
 from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
+from dirax.diagnostics.rounding import beyond_rounding
 from dirax.diagnostics.rows import consecutive, over_rows, shape_of
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
 from dirax.program.memo import Same
@@ -50,6 +51,8 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     parts, middle, lines, first = [part for claim in structure.claims for part in claim.parts], (points - 1) // 2, [], 0
     if "q0" in sol.initial:
         values[:, 0, [parts.index(part) for part in structure.given]] = 0.0  # the first pair was given, not computed
+    limit = roundoff_limit(tolerance, 1)
+    values = beyond_rounding(values, limit, eqx.Partial(_missed, structure), sol, (items,))
     for claim in structure.claims:
         of_claim = values[..., first : first + len(claim.parts)]
         first += len(claim.parts)
@@ -58,7 +61,7 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         if len(claim.parts) > 1:
             each = zip(claim.parts, of_claim[lane, row], strict=True)
             text += ": " + ", ".join(f"{part} {value:.2g}" for part, value in each)
-        lines.append(judged(sol, claim.quantity, np.max(of_claim, axis=(1, 2)), roundoff_limit(tolerance, 1), text))
+        lines.append(judged(sol, claim.quantity, np.max(of_claim, axis=(1, 2)), limit, text))
     return lines
 
 

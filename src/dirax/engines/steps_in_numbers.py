@@ -1,6 +1,6 @@
 """Steps of many states at once in NumPy, by the scalar program of the step: nothing is compiled, and no engine is asked."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,8 +10,8 @@ from dirax.engines.step_program import StepProgram, step_program
 from dirax.numerics.equilibration import condition_number
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Values
+from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import Order, with_ends
-from dirax.program.operations import BOOLEAN, NUMPY
 from dirax.schemes.step import StepEquation, StepSequence, needs_every_part
 
 UPDATES = 40
@@ -83,7 +83,7 @@ class StepsInNumbers:
         t: np.ndarray,
         h: float | np.ndarray,
         params: np.ndarray,
-        noise: "Noise | None" = None,
+        noise: Noise | None = None,
     ) -> Attempts:
         """A step of each state (states, s), with one guess (states, k) a stage; h is one number, or one a state."""
         parts, h = [], np.broadcast_to(h, t.shape)
@@ -144,7 +144,7 @@ class StepsInNumbers:
         return jacobians, conditions
 
     def rows(
-        self, made: Attempts, t: np.ndarray, h: float | np.ndarray, params: np.ndarray, noise: "Noise | None" = None
+        self, made: Attempts, t: np.ndarray, h: float | np.ndarray, params: np.ndarray, noise: Noise | None = None
     ) -> dict[str, np.ndarray]:
         """The named arrays of the rows that the steps leave."""
         parts, h = [], np.broadcast_to(h, t.shape)
@@ -210,7 +210,7 @@ class StepsInNumbers:
             u = u - np.einsum("rij,rj->ri", inverse, self._read(known, e.residual))
         return u, last < LEFT
 
-    def _values(self, index: int, u, states, at, noise: "Noise | None" = None) -> Values:
+    def _values(self, index: int, u, states, at, noise: Noise | None = None) -> Values:
         e, shared = self.program.equations[index], self.program.shared
         known = Values(self.program.graph, len(states), noise.table if noise else None)
         pairs = [(e.unknowns, u), (e.state, states), (shared.t, at[0]), (shared.h, at[1]), (shared.params, at[2])]
@@ -252,26 +252,6 @@ class StepsInNumbers:
             if node not in moving and any(a in moving for a in args[node]):
                 moving.add(node)
         return moving
-
-
-class Noise:
-    """Arithmetic in which the result of every operation is off at random, by up to `size` of itself (Vignes 1978): what
-    happens to the numbers that come out is what rounding does to them, ε/2 in place of `size`."""
-
-    def __init__(self, size: float, seed: int):
-        self.size, self._draw = size, np.random.default_rng(seed)
-        self.table = {name: function if name in EXACT else self._off(function) for name, function in NUMPY.items()}
-
-    def off(self, values: np.ndarray) -> np.ndarray:
-        """Numbers as they would be if they had been rounded."""
-        return values * (1.0 + self.size * self._draw.uniform(-1.0, 1.0, np.shape(values)))
-
-    def _off(self, function: Callable) -> Callable:
-        return lambda *operands: self.off(function(*operands))
-
-
-EXACT = BOOLEAN | {"select", "neg", "abs", "sign", "max", "min", "floor", "ceil"}
-"""The operations that do not round."""
 
 
 def _inverses(matrices: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
 from dirax.program.evaluation.in_numpy import Values, in_parts
+from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_ends
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
@@ -80,15 +81,15 @@ class ScalarProgram:
         self.opaque.append(Opaque(operands, [self.fresh(shape) for shape in shapes], function))
         return self.opaque[-1].results
 
-    def in_numpy(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
+    def in_numpy(self, leaves: list[np.ndarray], noise: Noise | None = None) -> list[np.ndarray]:
         """The results for arguments (entries, …), with that leading axis; for one entry again and again by Python's floats, which
-        have the same bits."""
-        if len(leaves[0]) == 1:
+        have the same bits. `noise`: of the operations, in place of NumPy's; opaque computations have that of their operands."""
+        if len(leaves[0]) == 1 and noise is None:
             self._asked += 1
             if self._asked > OFTEN and self.in_floats is not None:
                 with contextlib.suppress(ArithmeticError, ValueError):  # what Python's floats do not have
                     return self._by_floats(leaves)
-        return in_parts(self._part, leaves)
+        return in_parts(functools.partial(self._part, noise=noise), leaves)
 
     def _by_floats(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
         assert self.in_floats is not None
@@ -98,10 +99,10 @@ class ScalarProgram:
             at += nodes.size
         return results
 
-    def _part(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
-        known = Values(self.graph, len(leaves[0]))
+    def _part(self, leaves: list[np.ndarray], noise: Noise | None) -> list[np.ndarray]:
+        known = Values(self.graph, len(leaves[0]), noise.table if noise else None)
         for nodes, leaf in zip(self.inputs, leaves, strict=True):
-            known.bind(nodes, leaf)
+            known.bind(nodes, noise.off(leaf) if noise else leaf)
         orders = iter(self._orders)
         for step in self.opaque:
             operands = [known.read(nodes, next(orders)) for nodes in step.operands]

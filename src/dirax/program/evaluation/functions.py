@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
+from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo
@@ -28,14 +29,17 @@ _programs: Memo[tuple[ScalarProgram, Any] | None] = Memo(KEPT)
 _jaxprs: Memo[tuple[ClosedJaxpr, Any]] = Memo(KEPT)
 
 
-def in_numpy(function: Callable, leaves: list[np.ndarray], key: Hashable, for_few: bool = False) -> Any:
+def in_numpy(
+    function: Callable, leaves: list[np.ndarray], key: Hashable, for_few: bool = False, noise: Noise | None = None
+) -> Any:
     """`function(*arguments)` for each entry of `leaves`, arguments (entries, …): a pytree of arrays with that leading axis.
 
     None where the function has a primitive for which there is no rule, or closes over values that JAX traces. `key` is
-    equal for functions that are, and has everything in it on which `function` depends; `for_few` as a `ScalarProgram` has it.
+    equal for functions that are, and has everything in it on which `function` depends; `for_few` and `noise` as a `ScalarProgram`
+    has them.
     """
     found = program_of(function, [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves], key, for_few)
-    return None if found is None else jax.tree.unflatten(found[1], found[0].in_numpy(leaves))
+    return None if found is None else jax.tree.unflatten(found[1], found[0].in_numpy(leaves, noise))
 
 
 def program_of(
