@@ -213,11 +213,13 @@ class _Comparison:
         return moved[0], moved[1]
 
     def _try_from_neighbours(self, entries: np.ndarray) -> None:
-        """Steps again from the unknowns of the steps before them, as the run had it: an equation may have several solutions."""
-        one = np.where(self.previous[entries] >= 0, self.previous[entries], entries)
-        two = np.where(self.previous[one] >= 0, self.previous[one], one)
-        for guesses in ([u[one] for u in self.again.unknowns], [2 * u[one] - u[two] for u in self.again.unknowns]):
-            self._expect(entries, *self._said(self.replay.again(self.at[entries], guesses=guesses)), if_nearer=True)
+        """Steps again from the unknowns of the steps before them, as the run had it, and after them: an equation may have several
+        solutions."""
+        for neighbour in (self.previous, self.next):
+            one = np.where(neighbour[entries] >= 0, neighbour[entries], entries)
+            two = np.where(neighbour[one] >= 0, neighbour[one], one)
+            for guesses in ([u[one] for u in self.again.unknowns], [2 * u[one] - u[two] for u in self.again.unknowns]):
+                self._expect(entries, *self._said(self.replay.again(self.at[entries], guesses=guesses)), if_nearer=True)
 
 
 def _ratio(missed: np.ndarray, scale: np.ndarray) -> np.ndarray:
