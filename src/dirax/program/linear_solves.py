@@ -86,16 +86,17 @@ def _of_full_rank(matrices: np.ndarray) -> np.ndarray:
 def _rows_inverted(matrices: np.ndarray) -> np.ndarray:
     """(W⁺)ᵀ of matrices W (B, k, l) with independent rows, from W = RQ with R triangular, the rows of Q orthonormal: by
     Gram and Schmidt for all of them side by side, each row twice, after which Q is orthonormal to roundoff."""
-    q, r = np.array(matrices), np.zeros((*matrices.shape[:2], matrices.shape[1]))
+    q, r = np.array(matrices, order="C"), np.zeros((*matrices.shape[:2], matrices.shape[1]))
+    combined = lambda factors, rows: (factors[:, None] @ rows)[:, 0]
     for i in range(matrices.shape[1]):
         for _ in range(2):
-            along = np.einsum("bjl,bl->bj", q[:, :i], q[:, i])
-            q[:, i] -= np.einsum("bj,bjl->bl", along, q[:, :i])
+            along = combined(q[:, i], np.swapaxes(q[:, :i], 1, 2))
+            q[:, i] -= combined(along, q[:, :i])
             r[:, i, :i] += along
         r[:, i, i] = np.sqrt(np.einsum("bl,bl->b", q[:, i], q[:, i]))
         q[:, i] /= r[:, i, i, None]
     for i in reversed(range(matrices.shape[1])):
-        q[:, i] -= np.einsum("bj,bjl->bl", r[:, i + 1 :, i], q[:, i + 1 :])
+        q[:, i] -= combined(r[:, i + 1 :, i], q[:, i + 1 :])
         q[:, i] /= r[:, i, i, None]
     return q
 
