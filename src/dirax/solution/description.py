@@ -59,7 +59,7 @@ def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinate
 
     Raises `ValueError` for unknown, repeated or too few names, and for a solution inside `jax.grad`, `jit` or `vmap`.
     """
-    if is_traced(sol.t, sol.fields, sol.step, sol.given_params, sol.stats):
+    if is_traced(sol.t, sol.fields, sol.step, sol.params, sol.stats):
         raise ValueError(
             "this solution holds traced values, not numbers: convert or save it outside of jax.grad, jit and vmap, or return "
             "its arrays from the transformed function."
@@ -222,7 +222,7 @@ def _attributes(sol: Trajectory, layout, derived: list[str], metadata: dict[str,
     if events := {kind: record_of(found) for kind in KINDS if (found := getattr(sol, kind)) is not None}:
         attributes["events"] = json.dumps(events)
     try:
-        attributes["params"] = json.dumps(encode_params(sol.given_params))
+        attributes["params"] = json.dumps(encode_params(sol.params))
     except NotPlain as value:
         attributes["params_not_stored"] = str(value)
     return attributes
