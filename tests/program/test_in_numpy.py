@@ -13,7 +13,7 @@ from dirax.engines.step_program import linearized
 from dirax.program import scalar_program
 from dirax.program.evaluation import in_numpy as module
 from dirax.program.evaluation.functions import in_numpy, program_of
-from dirax.program.linear_solves import scaled_pseudo_inverse, solve
+from dirax.program.linear_solves import pseudo_inverses, scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.schemes.step import Shape, make_step_equation
 
@@ -89,3 +89,15 @@ def test_the_first_step_is_linearized_as_jax_does_it(limit, monkeypatch):
     slopes = jax.vmap(lambda u, x, g: jax.jacfwd(lambda u: equation.residual(u, x, 0.0, 0.1, g))(u))(u, state, g)
     np.testing.assert_allclose(found[0], expected, rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(found[1], slopes, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(2, 4), (4, 2), (3, 3), (1, 3), (0, 3)])
+def test_pseudo_inverses_side_by_side_are_those_of_each(shape):
+    matrices = np.random.default_rng(5).normal(size=(300, *shape))
+    if 0 not in shape:
+        matrices[1], matrices[2], matrices[3] = 0.0, 1e-200 * matrices[2], 1e200 * matrices[3]
+        matrices[4], matrices[5, 1:] = 1.0, 1e-9 * matrices[5, 1:]
+    for mine, matrix in zip(pseudo_inverses(matrices, 1e-12), matrices, strict=True):
+        size = np.max(np.abs(matrix), initial=0.0) or 1.0
+        assert mine.shape == shape[::-1]
+        np.testing.assert_allclose(size * mine, np.linalg.pinv(matrix / size, 1e-12), rtol=1e-9, atol=1e-12)

@@ -13,7 +13,7 @@ from dirax.numerics.newton import damped_step
 from dirax.program.evaluation.in_numpy import Slopes, Values
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
-from dirax.program.linear_solves import equilibrated_inverse
+from dirax.program.linear_solves import equilibrated_inverse, pseudo_inverses
 from dirax.program.memo import Memo, Same
 from dirax.program.rules.reductions import factors_of_product
 from dirax.program.scalar_program import ScalarProgram, numpy_rule
@@ -152,7 +152,7 @@ def _solved(matrices: np.ndarray, sides: np.ndarray) -> np.ndarray:
 
 @numpy_rule("dirax_pseudo_inverse")
 def pseudo_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
-    inverse = functools.partial(np.linalg.pinv, rcond=equation.params["tolerance"])
+    inverse = functools.partial(pseudo_inverses, tolerance=equation.params["tolerance"])
     return made.between(
         [matrix], [equation.outvars[0].aval.shape], lambda operands: _of_finite(lambda a: [inverse(a)], *operands)
     )
