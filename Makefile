@@ -16,6 +16,8 @@ REPORT := src/dirax/show/assets
 
 # Compiled JAX functions, shared by the test workers and kept between runs.
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
+# Byte code is kept, whatever the shell says: without it every process compiles the packages anew, which takes most of its time.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -71,7 +73,7 @@ clean:  ## Remove everything that the other targets made
 	find src tests docs benchmarks -name __pycache__ -prune -exec rm -rf {} +
 
 # The lock names every package, pip itself included, with its exact version and hashes, so pip resolves nothing.
-# Byte code is left to the first import: most of what is installed is never imported by a test run.
+# Byte code is left to the first import: most of what is installed is never imported.
 $(LOCKED): requirements.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "dirax needs Python 3.11 or later: make PYTHON=/path/to/python3.11" >&2; exit 1; }
@@ -82,4 +84,5 @@ $(LOCKED): requirements.lock
 
 $(READY): $(LOCKED) pyproject.toml
 	$(INSTALL) --no-build-isolation --editable .
+	@$(BIN)/dirax run kepler > /dev/null  # what a run imports is byte code from here on
 	@touch $@

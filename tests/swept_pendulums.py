@@ -1,6 +1,6 @@
-"""A small study for the tests, also as a program of its own: `python pendulums.py STORE EXECUTOR`."""
+"""A small study for the tests, and what is run in processes of its own: the study, a scheduler of dask, its worker."""
 
-import sys
+import os
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -13,6 +13,9 @@ SYSTEM = dx.LagrangeDirac(
         v[0] ** 2 + v[1] ** 2 / 2 + v[0] * v[1] * jnp.cos(q[0] - q[1]) + params["g"] * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
     )
 )
+LONG = {"steps": 20_000, "save_every": 5000, "task_seconds": 0.05}
+"""With these, 240 points take about half a second of one processor, in some thirty tasks."""
+
 OVER = {"g": np.linspace(0.5, 2.0, 12), "angle": np.linspace(0.0, 3.0, 20)}
 
 
@@ -46,15 +49,51 @@ def files(path):
 
 
 def main(to, how):
-    long = {"steps": 40_000, "save_every": 10_000, "task_seconds": 0.1}
+    """The long study: here, in so many processes, or in the cluster of an address."""
     if how.startswith("tcp"):
         from distributed import Client
 
         with Client(how, timeout=30) as client:
-            study(to, executor=client, **long)
+            study(to, executor=client, **LONG)
     else:
-        study(to, executor=None if how == "here" else int(how), **long)
+        study(to, executor=None if how == "here" else int(how), **LONG)
 
 
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+def scheduler(address):
+    """A scheduler of dask, which writes where it is into a file."""
+    from distributed.cli.dask_scheduler import main
+
+    main(["--port", "0", "--no-dashboard", "--scheduler-file", str(address)])
+
+
+def dask_worker(address):
+    """A worker of two threads for the scheduler that writes, or has written, such a file."""
+    from distributed.cli.dask_worker import main
+
+    main(["--scheduler-file", str(address), "--nthreads", "2", "--no-dashboard", "--no-nanny"])
+
+
+def on_two_devices(path):
+    """A study of the xla engine where it has two devices: prints how many there are, how many tasks ran on, whether all ended."""
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    import jax
+
+    from dirax.sweeps import arrange, executors
+
+    arrange.DEVICE_BATCH, used, plain = 8, set(), executors.run_task
+
+    def noting(*given):
+        used.add(jax.config.jax_default_device)
+        return plain(*given)
+
+    executors.run_task = noting
+    data = study(path, {name: values[:6] for name, values in OVER.items()}, engine="xla", steps=20, task_seconds=1e-6)
+    print(len(jax.local_devices()), len(used), bool((data.status == 1).all()), flush=True)
+
+
+def called(words, function, *arguments):
+    """Call a function with everything that is said on standard error in a file."""
+    with open(words, "w") as file:
+        os.dup2(file.fileno(), 2)
+    os.dup2(2, 1)
+    function(*arguments)

@@ -20,6 +20,9 @@ CARDS = "::: cards"
 FOLDER = "made"
 """Where the pictures lie in the site."""
 
+QUICK = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""What is compiled for a page runs once: less optimization, as in the tests, takes half the time."""
+
 outcomes: dict[str, list[pages.Outcome]] = {}
 cards: list[str] = []
 WORKERS = min(4, os.cpu_count() or 1)
@@ -35,6 +38,7 @@ def on_files(files: Any, config: Any) -> Any:
     names = gallery.names() if any(CARDS in text for text in sources.values()) else ()
     if HERE not in sys.path:  # MkDocs takes it back; the processes need it
         sys.path.insert(0, HERE)
+    os.environ.setdefault("XLA_FLAGS", QUICK)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(WORKERS, mp_context=context) as pool:
         longest_first = sorted(programs, key=lambda uri: -len(programs[uri]))

@@ -7,8 +7,11 @@ engines, solution, run, diagnostics, sweeps, show, bodies, gallery, cli. The pub
 JAX with them, are imported where the first of them is used.
 """
 
+import ast
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
+from pkgutil import get_data
 from typing import TYPE_CHECKING, Any
 
 from dirax.float64 import turn_on_in_jax
@@ -23,16 +26,34 @@ turn_on_in_jax()
 
 
 def __getattr__(name: str) -> Any:
-    """A room of the package, a public name, or the list of these."""
-    if not name.startswith("_") and find_spec(f"dirax.{name}"):
+    """A public name, a room of the package, or the list of the public names."""
+    if name == "__all__":
+        globals()[name] = import_module("dirax.public").__all__
+    elif home := _homes().get(name):
+        import_module("dirax.show")  # puts into solutions how they show themselves, for whatever the name leads to
+        globals()[name] = _imported(home, name)
+    elif not name.startswith("_") and find_spec(f"dirax.{name}"):
         return import_module(f"dirax.{name}")
-    if not name.startswith("_") or name == "__all__":
-        public = import_module("dirax.public")
-        if name == "__all__" or name in public.__all__:
-            globals()[name] = getattr(public, name)
-            return globals()[name]
-    raise AttributeError(f"module 'dirax' has no attribute {name!r}")
+    else:
+        raise AttributeError(f"module 'dirax' has no attribute {name!r}")
+    return globals()[name]
+
+
+def _imported(home: str, name: str) -> Any:
+    """What `from home import name` binds: a room and a module of one too."""
+    module = import_module(home)
+    if hasattr(module, "__path__") and find_spec(f"{home}.{name}"):
+        return import_module(f"{home}.{name}")
+    return getattr(module, name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *import_module("dirax.public").__all__})
+    return sorted({*globals(), *_homes()})
+
+
+@cache
+def _homes() -> dict[str, str]:
+    """The module of every public name: what `dirax.public` says, read without its imports, of which a program needs few."""
+    source = get_data(__name__, "public.py") or b""
+    said = (statement for statement in ast.parse(source).body if isinstance(statement, ast.ImportFrom))
+    return {name.name: str(statement.module) for statement in said for name in statement.names}

@@ -52,6 +52,7 @@ from dirax.geometry.tulczyjew import (
 from dirax.numerics.ranks import UndecidableRank
 from dirax.program.memo import clear_caches
 from dirax.reduction.actions import GroupAction, Translations
+from dirax.reduction.bundle import GroupConnection
 from dirax.reduction.connection import DiscreteConnection, LinearConnection
 from dirax.reduction.coordinates import adapted_basis, in_coordinates
 from dirax.reduction.dirac import ReducedGeneratingFunctionDirac
@@ -60,6 +61,7 @@ from dirax.reduction.left_translation import LeftTranslation
 from dirax.reduction.lie_poisson import LiePoisson
 from dirax.reduction.reduce import reduce
 from dirax.reduction.reduced import ReducedLagrangeDirac
+from dirax.reduction.reduced_on_manifold import ReducedManifoldLagrangian
 from dirax.reduction.symmetry import check_invariance, cyclic_coordinates, translation_symmetries
 from dirax.reduction.trivializations import CovectorTrivialization, PairTrivialization, PontryaginTrivialization
 from dirax.run.event import Event
@@ -131,6 +133,7 @@ __all__ += [
     "DiscreteConnection",
     "EulerPoincare",
     "GroupAction",
+    "GroupConnection",
     "LeftTranslation",
     "LiePoisson",
     "LinearConnection",
@@ -138,6 +141,7 @@ __all__ += [
     "PontryaginTrivialization",
     "ReducedGeneratingFunctionDirac",
     "ReducedLagrangeDirac",
+    "ReducedManifoldLagrangian",
     "Translations",
     "adapted_basis",
     "check_invariance",

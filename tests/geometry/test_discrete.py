@@ -13,7 +13,7 @@ from dirax.geometry.discrete import (
     GeneratingFunctionDirac,
     InducedFiniteDifferenceDirac,
 )
-from dirax.geometry.finite_difference import annihilator_projector
+from dirax.geometry.finite_difference import annihilator_projector, projector_slope
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.maps import Midpoint, SphereProjection, Theta
 from dirax.geometry.structures import DiracStructure
@@ -310,3 +310,20 @@ def test_discretization_map_structures_refuse_other_objects():
         DiscretizationMapDirac(euler_top, Midpoint())
     with pytest.raises(TypeError, match="map must be a discretization map"):
         DiscretizationMapDirac(structure, Midpoint)
+
+
+@pytest.mark.parametrize("rank", [0, 1, 2, "dependent"])
+def test_the_slope_of_a_projected_covector(rank):
+    """∂(P(q)α)/∂q by the formula of Golub and Pereyra against central differences of P(q)α, by singular values."""
+    w = np.random.default_rng(5).normal(size=(2, 4, 4))
+
+    def one_forms(q):
+        rows = jnp.stack([jnp.sin(w[i] @ q) + i for i in range(2)])
+        return {0: rows[:0], 1: rows[:1], 2: rows, "dependent": jnp.concatenate([rows, q[0] * rows[:1]])}[rank]
+
+    q, covector = np.array([0.3, -0.7, 1.1, 0.4]), np.array([1.0, 0.5, -2.0, 0.3])
+    found = projector_slope(one_forms, jnp.asarray(q), jnp.asarray(covector))
+    at = lambda q: np.asarray(annihilator_projector(one_forms(jnp.asarray(q)))) @ covector
+    differences = [(at(q + 1e-6 * e) - at(q - 1e-6 * e)) / 2e-6 for e in np.eye(4)]
+    assert np.asarray(found) == pytest.approx(np.stack(differences, axis=1), abs=1e-8)
+    assert rank == 0 or np.abs(found).max() > 0.1

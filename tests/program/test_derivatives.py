@@ -10,9 +10,10 @@ from jax.extend.core import jaxpr_as_fun
 
 import dirax as dx
 from dirax.geometry.squared_angles import arc_over_sine, norm, radial
-from dirax.program.evaluation.functions import in_numpy
+from dirax.program.evaluation.functions import in_numpy, program_of
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import along, gradient, jacobian, once
+from dirax.program.rules import by_numpy
+from dirax.program.tracing import along, closed_over, gradient, jacobian, once
 
 POINT = np.array([0.3, 0.9, -0.4])
 SCALARS = {
@@ -68,6 +69,39 @@ def test_jacobians_and_directions_are_those_of_jax(name, reverse):
     expected = by_jax(jax.jacfwd(f))
     assert on_graph(jacobian(f, reverse=reverse), POINT) == pytest.approx(expected, rel=1e-14, abs=1e-14)
     assert on_graph(lambda q, v: along(f, (q,), (v,)), POINT, v) == pytest.approx(expected @ v, rel=1e-14, abs=1e-14)
+
+
+IN_NUMBERS = [*list(SCALARS)[:8], *VECTORS]
+
+
+@pytest.mark.parametrize("few", [False, True])
+@pytest.mark.parametrize("name", IN_NUMBERS)
+def test_derivatives_in_numbers_are_those_of_jax(name, few, monkeypatch):
+    """Of large functions no graph of the derivative is made: forward, or backward from fewer results than there are numbers."""
+    monkeypatch.setattr(by_numpy, "LARGE_FOR_FEW" if few else "LARGE_DERIVATIVE", 0)
+    f, points = (SCALARS | VECTORS)[name], np.stack([POINT, 1.1 * POINT])
+    found = program_of(jacobian(f), [jax.ShapeDtypeStruct((3,), np.float64)], ("in numbers", name), few)
+    assert found is not None and found[0].opaque
+    expected = np.stack([np.asarray(jax.jacfwd(f)(point)) for point in points])
+    assert found[0].in_numpy([points])[0] == pytest.approx(expected, rel=1e-14, abs=1e-14)
+
+
+def test_an_infinite_derivative_of_a_branch_that_is_not_taken_counts_for_nothing(monkeypatch):
+    monkeypatch.setattr(by_numpy, "LARGE_DERIVATIVE", 0)
+    f = lambda q: jnp.where(q[0] > 0.0, jnp.sqrt(q[0]), q[1]) + q[2]
+    assert on_graph(jacobian(f), np.zeros(3)) == pytest.approx([0.0, 1.0, 1.0], abs=0)
+
+
+def test_functions_that_say_the_same_have_one_jaxpr():
+    def traced(factor, power=2, inner=jnp.sin):
+        again = lambda q: jnp.sum(jnp.asarray(factor) * inner(q) ** power)
+        return closed_over(lambda q: jax.jit(again)(q) + again(q[:2]), [POINT])[0]
+
+    first = traced(np.array([2.0]))
+    assert traced(np.array([2.0])) is first
+    assert traced(np.array([-2.0])) is not first and traced(np.array([2.0]), 3) is not first
+    assert traced(np.array([0.0])) is not traced(np.array([-0.0]))
+    assert traced(np.array([2.0]), inner=jnp.cos) is not first
 
 
 def test_a_function_of_several_arguments_and_of_what_it_captured():

@@ -10,9 +10,10 @@ import pytest
 import dirax as dx
 from dirax.engines import step_program
 from dirax.engines.step_program import linearized
+from dirax.program import scalar_program
 from dirax.program.evaluation import in_numpy as module
-from dirax.program.evaluation.functions import in_numpy
-from dirax.program.linear_solves import scaled_pseudo_inverse, solve
+from dirax.program.evaluation.functions import in_numpy, program_of
+from dirax.program.linear_solves import pseudo_inverses, scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.schemes.step import Shape, make_step_equation
 
@@ -53,6 +54,19 @@ def test_entries_of_a_batch_are_what_jax_computes(name, monkeypatch):
         np.testing.assert_allclose(mine, theirs, rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["a root", "linear equations", "a derivative through a root"])
+def test_one_entry_again_and_again_has_the_same_bits(name, monkeypatch):
+    monkeypatch.setattr(scalar_program, "OFTEN", 2)
+    rng = np.random.default_rng(4)
+    a, x = rng.normal(size=(1, 3, 3)), rng.normal(size=(1, 3))
+    first, *later = (jax.tree.leaves(in_numpy(CASES[name], [a, x], ("again", name))) for _ in range(4))
+    found = program_of(CASES[name], [jax.ShapeDtypeStruct(y.shape[1:], y.dtype) for y in (a, x)], ("again", name))
+    assert found is not None and "in_floats" in vars(found[0])
+    for other in later:
+        for one, two in zip(first, other, strict=True):
+            assert one.tobytes() == two.tobytes() and one.shape == two.shape
+
+
 def test_what_has_no_rule_is_left_to_the_compiler():
     x = np.ones((2, 3))
     assert in_numpy(jnp.sort, [x], "sort") is None
@@ -75,3 +89,15 @@ def test_the_first_step_is_linearized_as_jax_does_it(limit, monkeypatch):
     slopes = jax.vmap(lambda u, x, g: jax.jacfwd(lambda u: equation.residual(u, x, 0.0, 0.1, g))(u))(u, state, g)
     np.testing.assert_allclose(found[0], expected, rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(found[1], slopes, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(2, 4), (4, 2), (3, 3), (1, 3), (0, 3)])
+def test_pseudo_inverses_side_by_side_are_those_of_each(shape):
+    matrices = np.random.default_rng(5).normal(size=(300, *shape))
+    if 0 not in shape:
+        matrices[1], matrices[2], matrices[3] = 0.0, 1e-200 * matrices[2], 1e200 * matrices[3]
+        matrices[4], matrices[5, 1:] = 1.0, 1e-9 * matrices[5, 1:]
+    for mine, matrix in zip(pseudo_inverses(matrices, 1e-12), matrices, strict=True):
+        size = np.max(np.abs(matrix), initial=0.0) or 1.0
+        assert mine.shape == shape[::-1]
+        np.testing.assert_allclose(size * mine, np.linalg.pinv(matrix / size, 1e-12), rtol=1e-9, atol=1e-12)

@@ -178,7 +178,7 @@ def test_gradients_and_both_engines():
 def test_what_moves_the_momentum_is_refused_with_its_size_and_place():
     start = {"step": 0.1, "steps": 3}
     disk: Any = gallery.get("rolling-disk")
-    message = r"constraints move: one-form 0 has 1 dq\[0\] at q = \[.*\], at or near .*use dx.LagrangeDAlembert on the reduced"
+    message = r"constraints move: one-form 0 has the part 1 along q\[0\] at q = .*, at or near .*use dx.LagrangeDAlembert on"
     with pytest.raises(ValueError, match=message):
         dx.simulate(dx.reduce(disk.system, dx.LinearConnection([0, 1])), dx.DiscreteRouth(), params=disk.params,
                     **disk.initial, **start)  # fmt: skip

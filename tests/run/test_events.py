@@ -6,6 +6,7 @@ import pytest
 
 import dirax as dx
 from dirax.gallery import poincare_section
+from dirax.run import event_search
 
 OSCILLATOR = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
 START = {"q": [1.0], "v": [0.0], "step": 0.1, "steps": 300}
@@ -107,9 +108,19 @@ def test_bad_arguments_of_an_event_are_refused():
         dx.Event(lambda angle: angle)
     with pytest.raises(TypeError, match="but 3 was given"):
         dx.Event(3)
-    with pytest.raises(ValueError, match=r"use sol.at\(t\)"):
-        jax.grad(
-            lambda x: dx.simulate(OSCILLATOR, dx.Collocation(2), q=x, v=x, step=0.1, steps=3, events=[dx.Event(position)]).q[
-                -1, 0
-            ]
-        )(jax.numpy.ones(1))
+
+
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(3)], ids=lambda s: type(s).__name__)
+def test_many_steps_are_looked_through_as_few_are(scheme, monkeypatch):
+    system = dx.LagrangeDirac(
+        lambda t, q, v: v @ v / 2 - q @ q / 2 - q[0] ** 2 * q[1] + q[1] ** 3 / 3 + 0.01 * jax.numpy.cos(t) * q[0]
+    )
+    events = [dx.Event(lambda q: q[0]), dx.Event(lambda t, q, v: v[1] - 0.35 + 0.0 * t), dx.Event(lambda q: q[1] + 9.0)]
+    start = {"q": [[0.0, 0.1], [0.1, 0.0]], "v": [[0.4, 0.1], [0.3, 0.2]], "step": 0.3, "steps": 1000, "events": events}
+    found = []
+    for fewest in (1, 10**9):
+        monkeypatch.setattr(event_search, "FEWEST", fewest)
+        found.append(dx.simulate(system, scheme, **start).events)
+    few, many = found
+    assert len(few) > 200 and np.array_equal(few.t, many.t) and np.array_equal(few.q, many.q)
+    assert np.array_equal(few.index, many.index) and np.array_equal(few.lane, many.lane)

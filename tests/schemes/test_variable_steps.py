@@ -207,8 +207,6 @@ def test_bad_input(scheme, error, words):
 def test_more_bad_input():
     with pytest.raises(ValueError, match="not from two points"):
         dx.simulate(EXAMPLE.system, SCHEME, q0=Q, q1=Q, params=EXAMPLE.params, step=0.1, steps=5)
-    with pytest.raises(TypeError, match="state of q, p, work, step_density"):
-        dx.simulate(EXAMPLE.system, SCHEME, step=0.1, steps=5, events=[dx.Impact(lambda q: q[0])], **RUN)
     with pytest.raises(ValueError, match="common times"):
         dx.convergence(EXAMPLE.system, SCHEME, step_sizes=[0.1, 0.05, 0.025], time=0.1, **RUN)
     falls = dx.VariableSteps(dx.Collocation(2), lambda q: 0.3 - q @ q)

@@ -1,6 +1,10 @@
 """Moving pictures in files, and the camera and the bodies that they are drawn with."""
 
 import itertools
+import re
+import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -8,7 +12,7 @@ from PIL import Image
 
 import dirax as dx
 from dirax import gallery
-from dirax.show import bodies, frames
+from dirax.show import animation, bodies, frames
 from dirax.show.animation import calm_end
 from dirax.show.camera import Camera
 from dirax.show.drawing import Drawing
@@ -39,9 +43,26 @@ def test_html_is_a_report_and_other_endings_are_refused(tmp_path, monkeypatch):
         PENDULUM.animate(tmp_path / "swing.avi")
     with pytest.raises(ValueError, match="must be positive"):
         PENDULUM.animate(tmp_path / "swing.gif", seconds=0)
+
+
+def test_a_film_for_lectures(tmp_path):
+    pytest.importorskip("imageio_ffmpeg") if shutil.which("ffmpeg") is None else None
+    path = PENDULUM.animate(tmp_path / "swing.mp4", seconds=1, frames_per_second=5, size=(1.21, 1.0))
+    said = subprocess.run([animation._ffmpeg(), "-i", path, "-f", "null", "-"], capture_output=True, text=True).stderr
+    assert "Video: h264" in said and "120x100" in said and re.search(r"frame= *5\b", said)
+
+
+def test_without_ffmpeg_or_where_it_fails_there_is_one_error(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(RuntimeError, match="needs the program ffmpeg"):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(RuntimeError, match=r"needs the program ffmpeg.*write a \.webp"):
         PENDULUM.animate(tmp_path / "swing.mp4")
+    broken = tmp_path / "ffmpeg"
+    broken.write_text("#!/bin/sh\nexit 3\n")
+    broken.chmod(0o755)
+    with pytest.raises(RuntimeError, match=r"ffmpeg \(.*\) failed.*\.gif instead"):
+        PENDULUM.animate(tmp_path / "swing.mp4", seconds=1, frames_per_second=5, size=(1.2, 1.0))
+    assert list(tmp_path.iterdir()) == [broken]
 
 
 def test_a_fast_run_is_shown_in_part():

@@ -23,6 +23,8 @@ def text(function, names="xy", params=None):
         (lambda q, p: -q[0] * q[1] ** 3, "−x y³"),
         (lambda q, p: (q[0] + q[1]) ** 2, "(x + y)²"),
         (lambda q, p: 1 / jnp.sqrt(q @ q), "1/√(x² + y²)"),
+        (lambda q, p: q @ q / jnp.sqrt(q @ q), "√(x² + y²)"),
+        (lambda q, p: jnp.sqrt(q[1]) / q[1], "√(y)/y"),
         (lambda q, p: q[0] / (q[1] * (1 + q[0])), "x/(y (x + 1))"),
         (lambda q, p: jnp.sin(q[0]) ** 2 + jnp.cos(2 * q[1]), "sin² x + cos(2 y)"),
         (lambda q, p: q[0] * q[1] - q[1] * q[0] + q[0], "x"),
@@ -52,9 +54,15 @@ def test_names_from_a_user_are_escaped():
     assert "<b>" not in name.mathml and "&lt;b&gt;&amp;" in name.mathml
 
 
+def test_long_terms_break_inside_their_parentheses():
+    long = lambda q, p: 3 * (q[0] * jnp.sin(q[1]) + q[1] * jnp.sin(q[0]) + q[0] ** 2 * q[1]) ** 2 / 2 + jnp.sqrt(2 * q[0])
+    (pieces,) = formulas(long, [np.ones(2), {}], [symbols(["x", "y"]), {}])
+    assert [one.text for one in pieces] == ["√(2 x)", " + 3/2 (x sin y", " + y sin x", " + x² y)²"]
+
+
 def test_the_disk_of_the_gallery():
     sol = gallery.get("rolling-disk").simulate(steps=2)
-    lines = [f"{joined([e.left]).text} = {joined(e.right).text}" for e in statement.equations(sol)]
+    lines = [f"{joined(e.left).text} = {joined(e.right).text}" for e in statement.equations(sol)]
     assert lines == [
         "L = (m (x\u0307² + y\u0307²) + I θ\u0307² + J φ\u0307²)/2 − V sin θ",
         "x\u0307 − R θ\u0307 cos φ = 0",

@@ -97,6 +97,9 @@ def test_no_global_state_is_touched(tmp_path):
 
 def test_methods_of_the_solution_are_these_functions():
     assert np.array_equal(lines(DISK.plot_trajectory("θ", "φ"))[0], DISK.q[:, [2, 3]].T)
+    alone, pair = Figure().subplots(), Figure().subplots(1, 2)
+    assert DISK.plot_energy(ax=alone).axes == [alone] and DISK.plot_energy(ax=pair).axes == list(pair)
+    assert alone.get_ylabel().startswith("energy") and pair[1].get_yscale() == "log"
     assert len(DISK.plot_energy().axes) == 2 and DISK.plot_constraint().get_yscale() == "log"
 
 

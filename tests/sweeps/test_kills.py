@@ -4,20 +4,17 @@ import json
 import os
 import random
 import signal
-import subprocess
 import sys
 import time
 import warnings
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import xarray as xr
 
-from swept_pendulums import files, same, study
-
-PROGRAM = Path(__file__).parents[1] / "swept_pendulums.py"
-LONG = {"steps": 40_000, "save_every": 10_000, "task_seconds": 0.1}
-"""About 240 points × 40 000 steps, two seconds of one processor."""
+import swept_pendulums
+from swept_pendulums import LONG, files, same, study
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +23,22 @@ def uninterrupted(tmp_path_factory):
     return study(path, **LONG), files(path)
 
 
-def started(path, how):
-    """The study in a process of its own."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, str(PROGRAM), str(path), how]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+@pytest.fixture(scope="module")
+def started(forked):
+    """The study in a process of its own, which says its last words in a file beside the store."""
+    return lambda path, how: forked(swept_pendulums.main, path, how, words=path.with_name("words.txt"))
+
+
+def ended(process):
+    """Wait for a process; its exit status."""
+    process.join(200.0)
+    assert process.exitcode is not None
+    return process.exitcode
+
+
+def words_beside(path):
+    """The last words of a study."""
+    return path.with_name("words.txt").read_text()
 
 
 def marks(path):
@@ -45,7 +53,7 @@ def marks(path):
 def wait_for(path, process, count, patience=120.0):
     """Until so many tasks are done, or the process has ended."""
     end = time.monotonic() + patience
-    while process.poll() is None and (not path.exists() or len(list(path.glob("status/c.*"))) < count):
+    while process.is_alive() and (not path.exists() or len(list(path.glob("status/c.*"))) < count):
         assert time.monotonic() < end
         time.sleep(0.01)
 
@@ -59,19 +67,19 @@ def finished(path, uninterrupted):
     assert same(data, uninterrupted[0]) and names == there and not list(path.parent.glob(".*"))
 
 
-def kill_callers(tmp_path, uninterrupted, moments):
+def kill_callers(tmp_path, uninterrupted, started, moments):
     path = tmp_path / "study.zarr"
     for moment in moments:
         process = started(path, "here")
         wait_for(path, process, moment)
         process.kill()
-        process.communicate()
+        ended(process)
         before = marks(path)
         assert before >= min(moment, 1)
     finished(path, uninterrupted)
 
 
-def kill_workers(tmp_path, uninterrupted, moments):
+def kill_workers(tmp_path, uninterrupted, started, moments):
     """One of the processes of a caller's own, found by their parent, again and again in one run."""
     tmp_path.mkdir(exist_ok=True)
     path = tmp_path / "study.zarr"
@@ -82,66 +90,61 @@ def kill_workers(tmp_path, uninterrupted, moments):
         workers = [int(pid) for listing in children for pid in listing.read_text().split()]
         for worker in workers[:1]:
             os.kill(worker, signal.SIGKILL)
-    _, error = process.communicate(timeout=200)
-    assert process.returncode == 0, error.decode()
+    assert ended(process) == 0, words_beside(path)
     finished(path, uninterrupted)
 
 
-def test_the_caller_is_killed(tmp_path, uninterrupted):
-    kill_callers(tmp_path, uninterrupted, (0, 3, 9))
+def test_the_caller_is_killed(tmp_path, uninterrupted, started):
+    kill_callers(tmp_path, uninterrupted, started, (0, 3, 9))
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
-def test_a_worker_is_killed(tmp_path, uninterrupted):
-    kill_workers(tmp_path, uninterrupted, (1, 4, 8))
+def test_a_worker_is_killed(tmp_path, uninterrupted, started):
+    kill_workers(tmp_path, uninterrupted, started, (1, 4, 8))
+
+
+@pytest.mark.skipif(find_spec("distributed") is None, reason="dask.distributed is not installed: pip install dirax[dask]")
+def test_a_scheduler_and_its_workers_are_killed(tmp_path, uninterrupted, started, forked):
+    kill_schedulers(tmp_path, uninterrupted, started, forked, (1, 4, 8))
 
 
 @pytest.mark.soak
-def test_a_scheduler_and_its_workers_are_killed(tmp_path, uninterrupted):
-    kill_schedulers(tmp_path, uninterrupted, (1, 4, 8))
-
-
-@pytest.mark.soak
-def test_everything_is_killed_at_twenty_moments(tmp_path, uninterrupted):
+def test_everything_is_killed_at_twenty_moments(tmp_path, uninterrupted, started, forked):
     moments = random.Random(0)
-    kill_callers(tmp_path, uninterrupted, sorted(moments.randrange(12) for _ in range(20)))
-    kill_workers(tmp_path / "workers", uninterrupted, sorted(moments.randrange(1, 10) for _ in range(20)))
-    kill_schedulers(tmp_path / "schedulers", uninterrupted, [moments.randrange(1, 10) for _ in range(20)])
+    kill_callers(tmp_path, uninterrupted, started, sorted(moments.randrange(12) for _ in range(20)))
+    kill_workers(tmp_path / "workers", uninterrupted, started, sorted(moments.randrange(1, 10) for _ in range(20)))
+    kill_schedulers(tmp_path / "schedulers", uninterrupted, started, forked, [moments.randrange(1, 10) for _ in range(20)])
 
 
-def kill_schedulers(tmp_path, uninterrupted, moments):
+def kill_schedulers(tmp_path, uninterrupted, started, forked, moments):
     """The caller ends with one sentence, and the same call again, without a cluster here, goes on."""
     tmp_path.mkdir(exist_ok=True)
     path = tmp_path / "study.zarr"
     for number, moment in enumerate(moments):
         address = tmp_path / f"scheduler{number}.json"
-        run = lambda module, *rest: subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.{module}", *rest], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        scheduler = run("dask_scheduler", "--port", "0", "--no-dashboard", "--scheduler-file", str(address))
-        worker = run("dask_worker", "--scheduler-file", str(address), "--nthreads", "2", "--no-dashboard", "--no-nanny")
+        scheduler = forked(swept_pendulums.scheduler, address)
+        worker = forked(swept_pendulums.dask_worker, address)
         try:
-            while not address.exists():
+            while not address.exists() or not address.read_text().endswith("\n}"):
                 time.sleep(0.05)
             process = started(path, json.loads(address.read_text())["address"])
             wait_for(path, process, marks(path) + moment)
             scheduler.kill()
-            _, error = process.communicate(timeout=120)
+            code = ended(process)
         finally:
-            for ended in (scheduler, worker):
-                ended.kill()
-                ended.wait()
-        assert process.returncode == 0 or "the same call again goes on from there" in error.decode()
+            for one in (scheduler, worker):
+                one.kill()
+                ended(one)
+        assert code == 0 or "the same call again goes on from there" in words_beside(path)
     finished(path, uninterrupted)
 
 
-def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(tmp_path, uninterrupted):
+def test_ctrl_c_ends_cleanly_and_says_how_to_go_on(tmp_path, uninterrupted, started):
     path = tmp_path / "study.zarr"
     process = started(path, "here")
     wait_for(path, process, 3)
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=60)
-    assert process.returncode != 0 and "of 240 points done, kept in" in error.decode()
+    os.kill(process.pid, signal.SIGINT)
+    assert ended(process) != 0 and "of 240 points done, kept in" in words_beside(path)
     assert not any("unfinished" in name for name in files(path))
     finished(path, uninterrupted)
 
@@ -156,7 +159,7 @@ def test_a_task_that_kills_its_worker_three_times_is_left_open_and_the_rest_goes
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        data = study(tmp_path / "deadly.zarr", case=deadly, executor=2)
+        data = study(tmp_path / "deadly.zarr", case=deadly, executor=1)
     assert any("failed three times" in str(one.message) and "signal 9" in str(one.message) for one in caught)
     left = int((data.status == 0).sum())
     assert 0 < left < 120 and data.status.values[-1, -1] == 0

@@ -3,10 +3,7 @@
 import errno
 import json
 import os
-import subprocess
-import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -16,6 +13,7 @@ import pytest
 import xarray as xr
 
 import dirax as dx
+import swept_pendulums
 from dirax.sweeps import arrange, commit, executors, store, sweep, task
 from dirax.sweeps.case import Case
 from dirax.sweeps.grid import cut
@@ -156,31 +154,23 @@ def test_a_system_of_the_xla_engine_one_batch_a_device(tmp_path):
     )
 
 
-TWO_DEVICES = """
-import sys, jax, numpy as np
-from pathlib import Path
-sys.path.insert(0, {folder!r})
-from swept_pendulums import study, SYSTEM
-from dirax.sweeps import executors
-import dirax.sweeps.arrange as arrange
-arrange.DEVICE_BATCH = 8
-used = set()
-plain = executors.run_task
-def noting(*given):
-    used.add(jax.config.jax_default_device)
-    return plain(*given)
-executors.run_task = noting
-data = study({path!r}, engine="xla", steps=20, task_seconds=1e-6)
-print(len(jax.local_devices()), len(used), bool((data.status == 1).all()))
-"""
+def test_on_two_devices_a_task_runs_on_one_of_them(tmp_path, forked):
+    process = forked(swept_pendulums.on_two_devices, tmp_path / "two.zarr", words=tmp_path / "words.txt")
+    process.join(120)
+    assert process.exitcode == 0 and (tmp_path / "words.txt").read_text().split()[-3:] == ["2", "2", "True"]
 
 
-@pytest.mark.soak
-def test_on_two_devices_a_task_runs_on_one_of_them(tmp_path):
-    environment = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"}
-    program = TWO_DEVICES.format(folder=str(Path(__file__).parents[1]), path=str(tmp_path / "two.zarr"))
-    ended = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-    assert ended.stdout.split() == ["2", "2", "True"], ended.stderr
+def test_slurm_is_asked_for_workers_by_a_script_and_its_cluster_is_an_executor():
+    jobqueue = pytest.importorskip("dask_jobqueue", reason="dask-jobqueue is not installed: pip install dirax[dask]")
+    from distributed import Client
+
+    options = {"scheduler_options": {"dashboard_address": None, "host": "127.0.0.1"}, "interface": None}
+    with jobqueue.SLURMCluster(cores=4, processes=4, memory="8GB", walltime="02:00:00", **options) as cluster:
+        script = cluster.job_script()
+        assert "#SBATCH --cpus-per-task=4" in script and "#SBATCH -t 02:00:00" in script
+        assert "distributed.cli.dask_worker" in script and cluster.scheduler_address in script
+        with Client(cluster) as client:
+            assert executors.checked(client) is client and executors.parallel(client, False) == 1  # no worker yet
 
 
 # ------------------------------------------------------------------ going on, growing

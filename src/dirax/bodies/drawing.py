@@ -9,31 +9,32 @@ import numpy as np
 from dirax.bodies.contacts import Ellipsoid, Round
 from dirax.bodies.forces import Spring
 from dirax.bodies.frames import scalar, turn_matrix, unit, vector
-from dirax.show.scene import Part, Scene, ball, disk, plane, point, rod, spring
+from dirax.show.scene import Part, Reading, Scene, ball, disk, plane, point, rod, spring
 
 
 def scene_of(model: Any, view: str = "oblique", trail: str = "") -> Scene:
     """Rods from where a body hangs to its mass centre and to the bodies that hang on it; `trail` names a body whose mass centre
     leaves one."""
+    frames = _frames(model)
     parts: list[Part] = [plane()] if model.contacts else []
     drawn = {contact.body for contact in model.contacts if _is_round(contact.shape)}
     for contact in model.contacts:
-        parts += _contact(model, contact)
+        parts += _contact(model, frames, contact)
     for body in model.bodies:
-        centre = _place(model, body.name, body.centre)
+        centre = _place(frames, body.name, body.centre)
         if body.name not in drawn or np.any(np.asarray(body.centre) != 0):
             parts.append(point(centre, trail=body.name == trail))
         if np.any(np.asarray(body.centre) != 0):
-            parts.append(rod(_place(model, body.name, (0.0, 0.0, 0.0)), centre))
+            parts.append(rod(_place(frames, body.name, (0.0, 0.0, 0.0)), centre))
     for joint in model.joints:
         if joint.parent != "ground" and np.any(np.asarray(joint.at) != 0):
-            parts.append(rod(_place(model, joint.parent, (0.0, 0.0, 0.0)), _place(model, joint.parent, joint.at)))
+            parts.append(rod(_place(frames, joint.parent, (0.0, 0.0, 0.0)), _place(frames, joint.parent, joint.at)))
         if np.any(np.asarray(joint.on) != 0):
-            parts.append(rod(_place(model, joint.body, (0.0, 0.0, 0.0)), _place(model, joint.body, joint.on)))
+            parts.append(rod(_place(frames, joint.body, (0.0, 0.0, 0.0)), _place(frames, joint.body, joint.on)))
     for force in model.forces:
         if isinstance(force, Spring) and force.between is not None:
             first, second = force.between
-            parts.append(spring(_place(model, *first), _place(model, *second)))
+            parts.append(spring(_place(frames, *first), _place(frames, *second)))
     return Scene(tuple(parts), view=view)
 
 
@@ -41,11 +42,11 @@ def _is_round(shape: Any) -> bool:
     return isinstance(shape, Ellipsoid) or shape.radius != 0 or shape.tube != 0
 
 
-def _contact(model: Any, contact: Any) -> list[Part]:
+def _contact(model: Any, frames: Callable, contact: Any) -> list[Part]:
     if not _is_round(contact.shape):
         return []
-    centre, number = _place(model, contact.body, contact.centre), lambda x: float(scalar(x, model.parameters))
-    turn = _turn(model, contact.body)
+    centre, number = _place(frames, contact.body, contact.centre), lambda x: float(scalar(x, model.parameters))
+    turn = _turn(frames, contact.body)
     if isinstance(contact.shape, Ellipsoid):
         return [ball(centre, turn, radius=float(np.mean(np.asarray(vector(contact.shape.semi_axes, model.parameters)))))]
     shape: Round = contact.shape
@@ -53,19 +54,20 @@ def _contact(model: Any, contact: Any) -> list[Part]:
         return [ball(centre, turn, radius=number(shape.tube))]
     upright = _from_z(unit(shape.axis))
     thick = 2 * number(shape.tube) or None
-    return [disk(centre, lambda q, params: turn(q, params) @ upright, number(shape.radius) + number(shape.tube), thick)]
+    turned = Reading(frames, lambda found, params: turn.read(found, params) @ upright)
+    return [disk(centre, turned, number(shape.radius) + number(shape.tube), thick)]
 
 
-def _frame(model: Any, body: str, q: Any, params: Any) -> Any:
-    return model.frames(q, jnp.zeros_like(q), params or None)[body]
+def _frames(model: Any) -> Callable:
+    return lambda q, params: model.frames(q, jnp.zeros_like(q), params or None)
 
 
-def _place(model: Any, body: str, x: Any) -> Callable:
-    return lambda q, params: _frame(model, body, q, params).point(vector(x, params))
+def _place(frames: Callable, body: str, x: Any) -> Reading:
+    return Reading(frames, lambda found, params: found[body].point(vector(x, params)))
 
 
-def _turn(model: Any, body: str) -> Callable:
-    return lambda q, params: _frame(model, body, q, params).turn
+def _turn(frames: Callable, body: str) -> Reading:
+    return Reading(frames, lambda found, params: found[body].turn)
 
 
 def _from_z(axis: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import ast
 import difflib
+from functools import cache
 from typing import Any
 
 import dirax
@@ -30,12 +31,6 @@ ROOMS = (
     "dirax.geometry.lie_groups",
     "dirax.geometry.cotangent",
 )
-MAKERS = {
-    name: thing
-    for name in dirax.__all__
-    if callable(thing := getattr(dirax, name)) and thing.__module__.startswith(ROOMS) and not name.startswith("Abstract")
-}
-"""What may be called: public schemes, and the maps and manifolds that some of them take."""
 
 
 def scheme_from_text(text: str) -> AbstractScheme:
@@ -77,10 +72,18 @@ def _value(node: ast.expr, text: str) -> Any:
 
 
 def _maker(name: str) -> Any:
-    if name in MAKERS:
-        return MAKERS[name]
-    near = difflib.get_close_matches(name, [*SHORT_NAMES, *MAKERS], n=1)
+    makers = _makers()
+    if name in makers:
+        return makers[name]
+    near = difflib.get_close_matches(name, [*SHORT_NAMES, *makers], n=1)
     raise ValueError(f"no scheme {shortened(name)}: {f'did you mean {near[0]!r}?' if near else _choices()}")
+
+
+@cache
+def _makers() -> dict[str, Any]:
+    """What may be called: public schemes, and the maps and manifolds that some of them take."""
+    public = {name: getattr(dirax, name) for name in dirax.__all__ if not name.startswith("Abstract")}
+    return {name: thing for name, thing in public.items() if callable(thing) and thing.__module__.startswith(ROOMS)}
 
 
 def _choices() -> str:

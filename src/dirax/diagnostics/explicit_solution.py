@@ -28,6 +28,9 @@ COLUMNS = 9
 MOST_EVALUATIONS = 3_000_000
 """Of the derivative, a few seconds. Equations that need more are stiff, or go on for long."""
 
+FIRST_EVALUATIONS = 20_000
+"""After so many it is foreseen how many the whole takes."""
+
 GIVEN = ("q", "v", "p", "x")
 
 
@@ -77,7 +80,8 @@ def explicit_solution(system: AbstractSystem, run: Mapping[str, Any]) -> Explici
 
 
 def extrapolated(field: Callable, t0: float, start: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """The solution (times, d) of y' = field(t, y). Raises `Skipped` after MOST_EVALUATIONS."""
+    """The solution (times, d) of y' = field(t, y). Raises `Skipped` after MOST_EVALUATIONS, or once they are foreseen: where the
+    rounding of the field is above TOLERANCE, no step is short enough for it."""
     t, y, found, evaluations = float(t0), np.array(start, float), [], 0
     largest = np.abs(y)
     step = _first_step(field(t, y), largest, float(times[-1]) - t0)
@@ -86,7 +90,8 @@ def extrapolated(field: Callable, t0: float, start: np.ndarray, times: np.ndarra
             h = left if step > left / 1.01 else min(step, left / 2)
             new, error, count = _step(field, t, y, h, largest)
             evaluations += count
-            if evaluations > MOST_EVALUATIONS or h < 1e-14 * max(abs(t), abs(float(times[-1]))):
+            share = max((t - t0) / (float(times[-1]) - t0), 1e-300) if evaluations > FIRST_EVALUATIONS else 1.0
+            if evaluations > MOST_EVALUATIONS * share or h < 1e-14 * max(abs(t), abs(float(times[-1]))):
                 raise Skipped("its explicit equations are stiff, or run into a singularity")
             step = h * min(4.0, max(0.1, 0.9 * (TOLERANCE / max(error, 1e-300)) ** (1 / (2 * COLUMNS - 1))))
             if error <= TOLERANCE:

@@ -10,12 +10,11 @@ def longest_flight(sol: Solution) -> tuple[Solution, Line | None]:
     """The rows of the longest flight of any trajectory, with a line that says so; the solution itself without impacts."""
     if sol.impacts is None or not len(sol.impacts) or sol.save_every != 1:
         return sol, None
-    t, hits, best = np.asarray(sol.t), sol.impacts, (0, 0, 0)
+    hits, best = sol.impacts, (0, 0, 0)
     for lane in range(sol.batch or 1):
         own = sol if sol.batch is None else sol[lane]
-        ends = np.searchsorted(t, hits.t[hits.lane == lane], side="right")  # the first rows after the impacts
-        starts = np.concatenate([[0], ends])
-        stops = np.concatenate([np.searchsorted(t, hits.t[hits.lane == lane], side="right"), [own.rows]])
+        ends = np.searchsorted(sol.times[lane], hits.t[hits.lane == lane], side="right")  # the first rows after the impacts
+        starts, stops = np.concatenate([[0], ends]), np.concatenate([ends, [own.rows]])
         longest = int(np.argmax(stops - starts))
         best = max(best, (int((stops - starts)[longest]), lane, int(starts[longest])))
     count, lane, start = best

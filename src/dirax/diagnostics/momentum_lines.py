@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.diagnostics.replay_lines import moved_numbers
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import initial_of_one, over_rows
 from dirax.diagnostics.verdicts import judged, of_lane, relative_changes, roundoff_limit, steps_of
@@ -66,11 +67,17 @@ def momentum(sol: Solution, name: str, generator: Callable, tolerance: float | N
     title = f"momentum map {name}"
     if "p" not in sol.fields or "q" not in sol.fields:
         return Line(title, None, None, NOT_CHECKED, "the solution has no q and p")
-    values = over_rows(eqx.Partial(_momentum_terms, generator), sol, (np.asarray(sol.q), np.asarray(sol.p)))
-    change, relative = relative_changes(values[..., :1], np.nanmax(values[..., 1], axis=1))
+    terms, limit = eqx.Partial(_momentum_terms, generator), roundoff_limit(tolerance, steps_of(sol))
+    values = over_rows(terms, sol, (np.asarray(sol.q), np.asarray(sol.p)))
+    scale = np.nanmax(values[..., 1], axis=1)
+    change, relative = relative_changes(values[..., :1], scale)
+    if np.any(relative > limit):  # a momentum near zero is a sum of terms that may be large
+        moved = np.broadcast_to(moved_numbers(sol, "p"), np.shape(sol.p))
+        moved = np.nanmax(over_rows(terms, sol, (np.asarray(sol.q), moved))[..., 1], axis=1)
+        change, relative = relative_changes(values[..., :1], np.maximum(scale, moved))
     lane = int(np.argmax(relative))
     text = f"⟨p, ξ⟩ = {values[lane, 0, 0]:.6g} changed by at most {change[lane]:.2g}{of_lane(sol, lane)}"
-    return judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)
+    return judged(sol, title, relative, limit, text)
 
 
 def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
@@ -78,7 +85,8 @@ def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
     quotient = None if sol.system is None else sol.system.quotient_form()
     if quotient is None:
         return []
-    title, mu = "momentum map μ", np.asarray(sol.fields["mu"]).reshape(-1, *np.shape(sol.fields["mu"])[-2:])
+    rows = {name: np.asarray(sol.fields[name]) for name in quotient.own_fields}
+    title, mu = "momentum map μ", over_rows(eqx.Partial(_momentum_of_row, quotient), sol, (rows,))
     w = np.asarray(sol.fields["w"]).reshape(*mu.shape[:2], -1)
     scale = np.nanmax(np.abs(np.concatenate([mu, w], axis=2)), axis=(1, 2))
     change, relative = relative_changes(mu, scale)
@@ -87,6 +95,10 @@ def quotient_momentum(sol: Solution, tolerance: float | None) -> list[Line]:
     if quotient.moves_momentum(initial_of_one(sol), sol.params_of_one):
         return [Line(title, float(change[lane]), None, NOT_CHECKED, f"forces with a part along the group move it; {text}")]
     return [judged(sol, title, relative, roundoff_limit(tolerance, steps_of(sol)), text)]
+
+
+def _momentum_of_row(quotient: Any, row: dict, params: Any):
+    return quotient.momentum_map(row)
 
 
 def _momentum_terms(generator: Callable, q, p, params: Any):

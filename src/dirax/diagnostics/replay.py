@@ -9,15 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.rows import over_rows, times_at
-from dirax.engines.steps_in_numbers import Noise, StepsInNumbers
+from dirax.engines.steps_in_numbers import StepsInNumbers
+from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
 from dirax.solution.solution import Solution
 from dirax.solution.trajectory import SavedRow, last_rows
 
-MOST_OPERATIONS = 1e8
-"""Scalar operations of the steps that are taken again, a second or so: of longer runs as many rows, evenly spread."""
+MOST_OPERATIONS = 4e7
+"""Scalar operations of the steps that are taken again, a few tenths of a second: of longer runs as many rows, evenly spread."""
 
 
 APART = 16

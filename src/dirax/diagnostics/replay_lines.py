@@ -5,7 +5,8 @@ import numpy as np
 from dirax.diagnostics.replay import Again, CannotReplay, Replay, Rows
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread
-from dirax.engines.steps_in_numbers import SMALLEST, Noise
+from dirax.engines.steps_in_numbers import SMALLEST
+from dirax.program.evaluation.noise import Noise
 from dirax.solution.solution import Solution
 
 NAME = "steps replayed"
@@ -46,6 +47,19 @@ def replayed(sol: Solution, tolerance: float | None) -> Line:
     return judged(sol, NAME, per_trajectory, limit, f"{found.told()}; worst {where}, off by {found.missed[entry, number]:.2g}")
 
 
+def moved_numbers(sol: Solution, name: str) -> np.ndarray:
+    """How far the numbers (…) of a saved field move in a typical step, in units of what every operation is off; 0 where steps
+    cannot be taken again."""
+    shape = sol.field_info[name].shape
+    try:
+        replay = Replay.of(sol)
+        found = _Comparison(replay, replay.begun(*replay.chosen()))
+    except CannotReplay:
+        return np.zeros(shape)
+    first = found.starts[name]
+    return found.usual()[first : first + found.sizes[name]].reshape(shape)
+
+
 class _Comparison:
     """What was saved of some rows beside what their steps make of it, and how far rounding may move each number.
 
@@ -55,8 +69,8 @@ class _Comparison:
     def __init__(self, replay: Replay, at: Rows):
         self.replay, self.at = replay, at
         self.sizes = {name: int(np.prod(a.shape[2:])) for name, a in replay.saved.items()}
-        starts = dict(zip(self.sizes, np.cumsum([0, *self.sizes.values()]).tolist(), strict=False))
-        self.held = {i: starts[name] + place for i, (name, place) in replay.held.items()}
+        self.starts = dict(zip(self.sizes, np.cumsum([0, *self.sizes.values()]).tolist(), strict=False))
+        self.held = {i: self.starts[name] + place for i, (name, place) in replay.held.items()}
         self.next, self.previous = self._neighbours()
         self.saved = self._saved()
         self.again = replay.again(at)
@@ -154,12 +168,17 @@ class _Comparison:
 
     # ------------------------------------------------------------------------------------------ how far rounding moves it
 
-    def ratios(self, limit: float) -> np.ndarray:
-        """`missed`, relative to the terms of each number: those of a typical row, and in a row in doubt its own."""
+    def usual(self) -> np.ndarray:
+        """How far each number moves in a typical row."""
         several = np.flatnonzero(self.next >= 0)
         scale = np.maximum(*self._scales_at(several[spread(len(several), SAMPLED)]))
         usual = np.quantile(scale, TYPICAL, axis=0)
         usual[-1] = np.max(np.abs(self.saved[:, -1])) + float(self.replay.sol.step)
+        return usual
+
+    def ratios(self, limit: float) -> np.ndarray:
+        """`missed`, relative to the terms of each number: those of a typical row, and in a row in doubt its own."""
+        usual = self.usual()
         ratio = _ratio(self.missed, usual)
         doubted = self._worst(ratio, limit)
         if not len(doubted):
@@ -185,19 +204,22 @@ class _Comparison:
         every operation is off."""
         at, guesses = self.at[entries], [u[entries] for u in self.again.unknowns]
         said = self._said(self.replay.again(at, guesses=guesses))
-        moved = [np.zeros_like(part) for part in said]
-        for seed in range(OFTEN):
-            off = self._said(self.replay.again(at, Noise(DISTURBANCE, seed), guesses))
-            for most, one, other in zip(moved, said, off, strict=True):
-                np.maximum(most, np.nan_to_num(np.abs(one - other), posinf=0.0), out=most)
-        return moved[0] / DISTURBANCE, moved[1] / DISTURBANCE
+        often = np.tile(np.arange(len(entries)), OFTEN)  # all disturbances at once: few entries take as long as one
+        many = self.replay.again(at[often], Noise(DISTURBANCE, 0), [u[often] for u in guesses])
+        moved = []
+        for one, off in zip(said, self._said(many), strict=True):
+            off = np.abs(off.reshape(OFTEN, *one.shape) - one)
+            moved.append(np.max(np.nan_to_num(off, posinf=0.0), axis=0) / DISTURBANCE)
+        return moved[0], moved[1]
 
     def _try_from_neighbours(self, entries: np.ndarray) -> None:
-        """Steps again from the unknowns of the steps before them, as the run had it: an equation may have several solutions."""
-        one = np.where(self.previous[entries] >= 0, self.previous[entries], entries)
-        two = np.where(self.previous[one] >= 0, self.previous[one], one)
-        for guesses in ([u[one] for u in self.again.unknowns], [2 * u[one] - u[two] for u in self.again.unknowns]):
-            self._expect(entries, *self._said(self.replay.again(self.at[entries], guesses=guesses)), if_nearer=True)
+        """Steps again from the unknowns of the steps before them, as the run had it, and after them: an equation may have several
+        solutions."""
+        for neighbour in (self.previous, self.next):
+            one = np.where(neighbour[entries] >= 0, neighbour[entries], entries)
+            two = np.where(neighbour[one] >= 0, neighbour[one], one)
+            for guesses in ([u[one] for u in self.again.unknowns], [2 * u[one] - u[two] for u in self.again.unknowns]):
+                self._expect(entries, *self._said(self.replay.again(self.at[entries], guesses=guesses)), if_nearer=True)
 
 
 def _ratio(missed: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -6,7 +6,8 @@ from dirax.diagnostics.replay import CannotReplay, Replay
 from dirax.diagnostics.replay_lines import DISTURBANCE, OFTEN
 from dirax.diagnostics.report import NOT_CHECKED, OK, Line
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread
-from dirax.engines.steps_in_numbers import SMALLEST, Noise
+from dirax.engines.steps_in_numbers import SMALLEST
+from dirax.program.evaluation.noise import Noise
 from dirax.solution.solution import Solution
 
 NAME = "steps taken back"

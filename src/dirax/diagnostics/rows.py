@@ -10,6 +10,7 @@ import numpy as np
 
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
+from dirax.program.evaluation.noise import Noise
 from dirax.schemes.step import Shape
 from dirax.solution.solution import Solution
 from dirax.solution.trajectory import SavedRow
@@ -19,19 +20,23 @@ CHUNK = 4096
 """Rows that go through a compiled function at once."""
 
 
-def over_rows(function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray:
+def over_rows(function: eqx.Partial, sol: Solution, items: tuple, few: bool = False, noise: Noise | None = None) -> np.ndarray:
     """function(*item, params) for every row of `items`, whose leaves have the shape (rows, …) or (B, rows, …).
 
     The result is (B, rows, …), with B = 1 for one trajectory. Nothing is compiled where the scalar graph can say the function;
     else rows go through in pieces, so that memory stays bounded. A function of a module, with what it is of, is traced once.
+    `few`: it is asked for at these rows alone, a handful. `noise`: of the arithmetic; of the numbers of the rows alone, where the
+    function is compiled.
     """
     if sol.batch is None:
         items = jax.tree.map(lambda a: np.asarray(a)[None], items)
-    found = _by_graph(function, sol, items)
-    return _compiled(function, sol, items) if found is None else found
+    found = _by_graph(function, sol, items, few, noise)
+    if found is not None:
+        return found
+    return _compiled(function, sol, jax.tree.map(noise.off, items) if noise else items)
 
 
-def _by_graph(function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray | None:
+def _by_graph(function: eqx.Partial, sol: Solution, items: tuple, few: bool, noise: Noise | None) -> np.ndarray | None:
     """The values by the scalar graph, without a compiler; None where it cannot say them."""
     leaves, structure = jax.tree.flatten(items)
     lanes, rows = np.shape(leaves[0])[:2]
@@ -51,7 +56,7 @@ def _by_graph(function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray 
         item = jax.tree.unflatten(structure, values[: len(leaves)])
         return function(*item, jax.tree.unflatten(params_structure, values[len(leaves) :]))
 
-    found = in_numpy(flat, arrays, (function.func, function.args, structure, params_structure))
+    found = in_numpy(flat, arrays, (function.func, function.args, structure, params_structure), few, noise)
     return None if found is None else found.reshape(lanes, rows, *found.shape[1:])
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from dirax.diagnostics.one_step import differentiated_steps
 from dirax.diagnostics.power_balance import keeps_books
 from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
+from dirax.diagnostics.rounding import with_rounding
 from dirax.diagnostics.rows import consecutive, over_rows, shape_of
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
 from dirax.program.memo import Same
@@ -45,7 +46,11 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     if sol.rows < points:
         return [Line(name, None, None, NOT_CHECKED, f"needs {WORDS[points]} points, but only {sol.rows} were saved")]
     items = consecutive(sol, structure.reads, points, np.arange(sol.rows - points + 1))
-    values = _relative(where_reached(over_rows(eqx.Partial(_terms, structure), sol, (items,)), items), structure.counts)
+    of_rows, limit = eqx.Partial(_terms, structure), roundoff_limit(tolerance, 1)
+    terms = where_reached(over_rows(of_rows, sol, (items,)), items)
+    values = _relative(terms, structure.counts)
+    if np.any(values > limit):
+        values = _relative(with_rounding(terms, np.max(values, axis=(0, 2)), of_rows, sol, (items,)), structure.counts)
     parts, middle, lines, first = [part for claim in structure.claims for part in claim.parts], (points - 1) // 2, [], 0
     if "q0" in sol.initial:
         values[:, 0, [parts.index(part) for part in structure.given]] = 0.0  # the first pair was given, not computed
@@ -57,7 +62,7 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         if len(claim.parts) > 1:
             each = zip(claim.parts, of_claim[lane, row], strict=True)
             text += ": " + ", ".join(f"{part} {value:.2g}" for part, value in each)
-        lines.append(judged(sol, claim.quantity, np.max(of_claim, axis=(1, 2)), roundoff_limit(tolerance, 1), text))
+        lines.append(judged(sol, claim.quantity, np.max(of_claim, axis=(1, 2)), limit, text))
     return lines
 
 
@@ -100,11 +105,11 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     if reason := form.refusal(sol.equation, one, sol.params_of_one):
         return Line(name, None, None, NOT_CHECKED, reason)
     same = Same(sol.equation)
-    begun = over_rows(eqx.Partial(_begun, form, same), sol, (items,))
+    begun = over_rows(eqx.Partial(_begun, form, same), sol, (items,), few=True)
     size, t = sol.equation.stages[0][0].state_size, np.atleast_2d(items["t"][..., -1])
     step = differentiated_steps(sol, begun[..., :size], begun[..., size:], t)
     taken = step if sol.batch is not None else jax.tree.map(lambda a: a[0], step)
-    values = over_rows(eqx.Partial(_changed, form, same), sol, (items, taken))
+    values = over_rows(eqx.Partial(_changed, form, same), sol, (items, taken), few=True)
     defect, condition = values[..., 0], float(np.max(values[..., -1], where=np.isfinite(values[..., -1]), initial=1.0))
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")

@@ -10,7 +10,7 @@ from dirax.diagnostics.final_manifold_lines import final_manifold
 from dirax.diagnostics.flights import longest_flight
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.replay_lines import replayed
-from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line, Report
+from dirax.diagnostics.report import OK, VIOLATED, Line, Report
 from dirax.diagnostics.residuals import residual_size
 from dirax.diagnostics.reversal_line import taken_back
 from dirax.diagnostics.structure_lines import membership, structure_of, symplecticity
@@ -31,8 +31,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     (absolute Jacobian times |q|). The tolerances are roundoff's:
 
     - steps replayed: every saved number of every row, of any scheme and of compositions, against the step from the row before,
-      taken again in NumPy: 32 ε of what it would be off if every operation were; of long runs as many rows as a second or two
-      are enough for, and the line says so;
+      taken again in NumPy: 32 ε of what it would be off if every operation were; of long runs as many rows as a few tenths of
+      a second are enough for, and the line says so;
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
     - steps solved: the largest residual of a run, relative to the terms of its equations, which Newton's method brings to
@@ -75,7 +75,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     lines = [
         _completion(sol),
         impacts,
-        _replayed(flight, whole, tolerance),
+        replayed(flight, tolerance),
         *membership(whole, structure, tolerance),
         stationary_action(whole, structure, tolerance),
         constraint(whole, structure, tolerance),
@@ -90,12 +90,6 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         taken_back(sol, tolerance),
     ]
     return Report(_title(sol), tuple(line for line in lines if line is not None))
-
-
-def _replayed(sol: Solution, whole: Solution, tolerance: float | None) -> Line:
-    """The line of the run; of the motion that is reconstructed, where the rows on a quotient do not say where a step begins."""
-    line = replayed(sol, tolerance)
-    return line if line.verdict != NOT_CHECKED or whole is sol else replayed(whole, tolerance)
 
 
 def _completion(sol: Solution) -> Line:

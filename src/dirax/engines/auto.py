@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dirax.engines import policy
 from dirax.engines.contract import Outcome, Problem, Progress
 from dirax.engines.engine import AbstractEngine
+from dirax.engines.walk import AbstractWalk, WalkByRuns
 from dirax.engines.xla import Xla
 from dirax.program.interpreter import UnsupportedPrimitive
 
@@ -25,6 +26,28 @@ class Auto(AbstractEngine):
 
     def prepared(self, problem: Problem) -> Callable[[Problem, Progress | None], Outcome]:
         """`run` of the engine that takes the problem."""
+        native, reason = self._native(problem)
+        if native is not None:
+            return native.prepared(problem)
+        engine, notes = self._by_arrays(problem)
+
+        def by_arrays(problem: Problem, progress: Progress | None = None) -> Outcome:
+            outcome = engine.run(problem, progress)
+            outcome.notes |= {"not_native": reason, **notes}
+            return outcome
+
+        return by_arrays
+
+    def walks(self, problem: Problem) -> Callable[[Problem], AbstractWalk]:
+        """By the native engine, or that which `prepared` takes."""
+        native, _ = self._native(problem)
+        if native is not None:
+            return native.walks(problem)
+        run = self.prepared(problem)
+        return lambda problem: WalkByRuns(problem, run)
+
+    def _native(self, problem: Problem) -> tuple[AbstractEngine | None, str | None]:
+        """The native engine, or why it does not take the problem."""
         reason = policy.kept_from_native(problem)
         if reason is None:
             try:
@@ -34,15 +57,8 @@ class Auto(AbstractEngine):
                 reason = str(error)
             else:
                 if reason is None:
-                    return native.prepared(problem)
-        engine, notes = self._by_arrays(problem)
-
-        def by_arrays(problem: Problem, progress: Progress | None = None) -> Outcome:
-            outcome = engine.run(problem, progress)
-            outcome.notes |= {"not_native": reason, **notes}
-            return outcome
-
-        return by_arrays
+                    return native, None
+        return None, reason
 
     def run_traced(self, problem: Problem) -> Outcome:
         """The same, for smaller systems: their derivatives are compiled, too."""

@@ -7,6 +7,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from dirax.engines.contract import Outcome, Problem, Progress
+from dirax.engines.walk import AbstractWalk, WalkByRuns
 
 
 class AbstractEngine(eqx.Module):
@@ -40,6 +41,12 @@ class AbstractEngine(eqx.Module):
         An engine that finds something once for all of them overrides it.
         """
         return self.run
+
+    def walks(self, problem: Problem) -> Callable[[Problem], AbstractWalk]:
+        """What makes walks of this problem of one trajectory and one part, and of others that differ from it in numbers alone.
+        Raises as `run`, at once or when one of them goes."""
+        run = self.prepared(problem)
+        return lambda problem: WalkByRuns(problem, run)
 
     @abstractmethod
     def run_traced(self, problem: Problem) -> Outcome:

@@ -63,8 +63,12 @@ LARGEST_NESTED = 96
 tension as a coordinate has 500 000 operations and took XLA 160 s to compile, its graph has 1 263."""
 
 NESTED = 4
-"""Derivatives of derivatives from which on a step is nested: each more takes the array program times 2.6, and the graph
+"""Derivatives of derivatives from which on a step is nested: each more takes the array program times MORE_FOR_XLA, and the graph
 hardly any."""
+
+MORE_FOR_XLA = 2.6
+"""So many times more operations "auto" gives to the native engine for each derivative of derivatives: Andrews' squeezer by
+Method 2, with 14 224, takes it some four seconds to compile, and XLA a hundred."""
 
 MOST_FOR_XLA = 6000
 """Scalar operations of a residual with its Jacobian up to which XLA is given them: it takes some milliseconds to compile each."""

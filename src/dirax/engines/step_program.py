@@ -153,7 +153,12 @@ class StepProgram:
     @property
     def nested(self) -> bool:
         """Whether derivatives lie in one another so deep that an array program is far larger than the graph."""
-        return any(e.nesting >= policy.NESTED for e in self.equations)
+        return self.nesting >= policy.NESTED
+
+    @property
+    def nesting(self) -> int:
+        """How deep derivatives of derivatives go in it."""
+        return max(e.nesting for e in self.equations)
 
     @cached_property
     def jacobians(self) -> list[list[dict[int, int]]]:

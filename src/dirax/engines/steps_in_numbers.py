@@ -1,6 +1,6 @@
 """Steps of many states at once in NumPy, by the scalar program of the step: nothing is compiled, and no engine is asked."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +10,8 @@ from dirax.engines.step_program import StepProgram, step_program
 from dirax.numerics.equilibration import condition_number
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Values
-from dirax.program.operations import BOOLEAN, NUMPY
+from dirax.program.evaluation.noise import Noise
+from dirax.program.graph import Order, with_ends
 from dirax.schemes.step import StepEquation, StepSequence, needs_every_part
 
 UPDATES = 40
@@ -54,7 +55,7 @@ class StepsInNumbers:
     equation: StepEquation | StepSequence
     program: StepProgram
     _depends: list[set[int]] = field(init=False)
-    _orders: dict[bytes, list[int]] = field(init=False, default_factory=dict)
+    _orders: dict[tuple[bytes, int | None], Order] = field(init=False, default_factory=dict)
 
     def __post_init__(self):
         _ = self.program.jacobians  # with which the graph has all its nodes
@@ -82,7 +83,7 @@ class StepsInNumbers:
         t: np.ndarray,
         h: float | np.ndarray,
         params: np.ndarray,
-        noise: "Noise | None" = None,
+        noise: Noise | None = None,
     ) -> Attempts:
         """A step of each state (states, s), with one guess (states, k) a stage; h is one number, or one a state."""
         parts, h = [], np.broadcast_to(h, t.shape)
@@ -114,6 +115,16 @@ class StepsInNumbers:
         after = self._read(known, self.program.equations[self.program.stages[0][0]].advance)
         return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
 
+    def sizes(self, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, h: float, params: np.ndarray) -> np.ndarray:
+        """The size (states,) of the terms of the first stage's equations at their solutions: the largest Σ |∂r/∂u_j| |u_j|; NaN
+        where there is none."""
+        index, fraction = self.program.stages[0]
+        at = t, np.full(len(t), fraction * h), params
+        u, solved = self._solved(index, guesses[0], states, at, None)
+        slopes, _ = self._linearized(index, self._values(index, u, states, at))
+        terms = np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u))
+        return np.where(solved, np.max(terms, axis=1, initial=0.0), np.nan)
+
     def differentiated(self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The derivatives (states, s, s) of the states after steps by those before, and the largest condition number of the
         equations of each. With r(u, x) = 0 and x' = a(u, x), ∂x'/∂x = ∂_x a − ∂_u a (∂_u r)⁻¹ ∂_x r."""
@@ -133,7 +144,7 @@ class StepsInNumbers:
         return jacobians, conditions
 
     def rows(
-        self, made: Attempts, t: np.ndarray, h: float | np.ndarray, params: np.ndarray, noise: "Noise | None" = None
+        self, made: Attempts, t: np.ndarray, h: float | np.ndarray, params: np.ndarray, noise: Noise | None = None
     ) -> dict[str, np.ndarray]:
         """The named arrays of the rows that the steps leave."""
         parts, h = [], np.broadcast_to(h, t.shape)
@@ -144,8 +155,8 @@ class StepsInNumbers:
                 some = slice(low, low + LANES)
                 at = (t[some], fraction * h[some], params[some])
                 known = self._values(index, made.unknowns[i][some], made.states[i][some], at, noise)
-                for name, nodes in rows.items():
-                    pieces.setdefault(name, []).append(self._read(known, nodes))
+                for name, values in self._read_each(known, rows).items():
+                    pieces.setdefault(name, []).append(values)
             parts.append({name: np.concatenate(a) for name, a in pieces.items()})
             t = t + fraction * h
         if len(parts) == 1:
@@ -174,13 +185,18 @@ class StepsInNumbers:
         for _ in range(UPDATES):
             some = known if fixed is None else fixed.at(left) if len(left) < count else fixed.without(set())
             some.bind(_nodes(e.unknowns), u[left])
+            residual = None
             if np.any(renewed := last[left] > KEPT):
-                slopes = self._slopes(index, some if np.all(renewed) else some.at(np.flatnonzero(renewed)))
+                if np.all(renewed):
+                    slopes, residual = self._linearized(index, some)
+                else:
+                    slopes, _ = self._linearized(index, some.at(np.flatnonzero(renewed)))
                 new = left[renewed]
                 inverse[new] = _inverses(slopes)
                 terms = np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u[new]))
                 size[new] = np.einsum("rij,rj->ri", np.abs(inverse[new]), terms)
-            change = np.einsum("rij,rj->ri", inverse[left], self._read(some, e.residual))
+            residual = self._read(some, e.residual, index) if residual is None else residual
+            change = np.einsum("rij,rj->ri", inverse[left], residual)
             fixed = known.without(self._depends[index]) if fixed is None else fixed
             u[left] -= change
             moved = _largest_ratio(change, np.maximum(np.abs(u[left]), size[left]))
@@ -194,7 +210,7 @@ class StepsInNumbers:
             u = u - np.einsum("rij,rj->ri", inverse, self._read(known, e.residual))
         return u, last < LEFT
 
-    def _values(self, index: int, u, states, at, noise: "Noise | None" = None) -> Values:
+    def _values(self, index: int, u, states, at, noise: Noise | None = None) -> Values:
         e, shared = self.program.equations[index], self.program.shared
         known = Values(self.program.graph, len(states), noise.table if noise else None)
         pairs = [(e.unknowns, u), (e.state, states), (shared.t, at[0]), (shared.h, at[1]), (shared.params, at[2])]
@@ -202,23 +218,32 @@ class StepsInNumbers:
             known.bind(_nodes(nodes), noise.off(array) if noise else array)
         return known
 
-    def _slopes(self, index: int, known: Values) -> np.ndarray:
-        """The Jacobians (states, k, k) of a residual."""
-        rows = self.program.jacobians[index]
+    def _linearized(self, index: int, known: Values) -> tuple[np.ndarray, np.ndarray]:
+        """The Jacobians (states, k, k) of a residual, and the residuals."""
+        rows, residual = self.program.jacobians[index], self.program.equations[index].residual
         places = [(i, j, node) for i, row in enumerate(rows) for j, node in row.items()]
+        found = self._read(known, [*(node for _, _, node in places), *residual], index)
         out = np.zeros((known.entries, len(rows), len(rows)))
-        if places:
-            i, j, nodes = zip(*places, strict=True)
-            out[:, list(i), list(j)] = self._read(known, nodes)
-        return out
+        out[:, [i for i, _, _ in places], [j for _, j, _ in places]] = found[:, : len(places)]
+        return out, found[:, len(places) :]
 
-    def _read(self, known: Values, nodes: Any) -> np.ndarray:
-        """The values of nodes, in an order that is found once."""
+    def _read(self, known: Values, nodes: Any, index: int | None = None) -> np.ndarray:
+        """The values of nodes, in an order that is found once; what does not depend on the unknowns of an equation stays known,
+        if its `index` is given."""
         nodes = _nodes(nodes)
-        key = nodes.tobytes()
+        key = nodes.tobytes(), index
         if key not in self._orders:
-            self._orders[key] = self.program.graph.reachable(nodes.ravel().tolist())
+            graph, read = self.program.graph, nodes.ravel().tolist()
+            order = graph.reachable(read)
+            kept = () if index is None else set(order) - self._depends[index]
+            (self._orders[key],) = with_ends(graph, [(order, read)], kept)
         return known.read(nodes, self._orders[key])
+
+    def _read_each(self, known: Values, named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The values of arrays of nodes by their names, all at once."""
+        flat = self._read(known, np.concatenate([nodes.ravel() for nodes in named.values()]))
+        parts = np.split(flat, np.cumsum([nodes.size for nodes in named.values()])[:-1], axis=1)
+        return {name: part.reshape(len(flat), *nodes.shape) for part, (name, nodes) in zip(parts, named.items(), strict=True)}
 
     def _moving(self, inputs: list[int]) -> set[int]:
         """The nodes that depend on these."""
@@ -227,26 +252,6 @@ class StepsInNumbers:
             if node not in moving and any(a in moving for a in args[node]):
                 moving.add(node)
         return moving
-
-
-class Noise:
-    """Arithmetic in which the result of every operation is off at random, by up to `size` of itself (Vignes 1978): what
-    happens to the numbers that come out is what rounding does to them, ε/2 in place of `size`."""
-
-    def __init__(self, size: float, seed: int):
-        self.size, self._draw = size, np.random.default_rng(seed)
-        self.table = {name: function if name in EXACT else self._off(function) for name, function in NUMPY.items()}
-
-    def off(self, values: np.ndarray) -> np.ndarray:
-        """Numbers as they would be if they had been rounded."""
-        return values * (1.0 + self.size * self._draw.uniform(-1.0, 1.0, np.shape(values)))
-
-    def _off(self, function: Callable) -> Callable:
-        return lambda *operands: self.off(function(*operands))
-
-
-EXACT = BOOLEAN | {"select", "neg", "abs", "sign", "max", "min", "floor", "ceil"}
-"""The operations that do not round."""
 
 
 def _inverses(matrices: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ SECONDS, RATE, SIZE = 4.0, 15, (3.6, 2.4)
 
 MOST_STEPS = 6000
 
-LONGEST = 6000
+LONGEST = 6500
 """Letters of MathML from which on the formula is the one that its author wrote."""
 
 LOOK = {

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from dirax.geometry.maps import AbstractDiscretizationMap
-from dirax.program.user_functions import UserFunction
+from dirax.program.user_functions import UserFunction, evaluated
 
 Form = Float[Array, "k k"]
 
@@ -18,8 +19,12 @@ def complete_lift(two_form: Callable, x: ArrayLike, v: ArrayLike) -> Form:
     `two_form(x)` is the matrix (n, n) with ω_ij = ω(e_i, e_j), such as `two_form` of a `dx.PhaseSpaceLagrangian`; then
     d_T ω = [[ẋ·∂ω, ω], [ω, 0]] ([BLM] (19) for ω = dα). Raises `ValueError` for shapes that do not belong together.
     """
-    x, v, form = _checked(two_form, x, v)
-    value, along = jax.jvp(form, (x,), (v,))
+    x, v = _checked(two_form, x, v)
+    return jnp.asarray(evaluated(eqx.Partial(_lift, two_form), x, v))
+
+
+def _lift(two_form: Callable, x: Array, v: Array) -> Form:
+    value, along = jax.jvp(_form(two_form, x), (x,), (v,))
     return jnp.block([[along, value], [value, jnp.zeros_like(value)]])
 
 
@@ -32,19 +37,27 @@ def symplectic_equations(map: AbstractDiscretizationMap, two_form: Callable, x: 
 
         dx.symplectic_equations(dx.Midpoint(), vortices.two_form, q, v)     # zeros where dα is constant
     """
-    x, v, form = _checked(two_form, x, v)
-    n = x.shape[0]
+    x, v = _checked(two_form, x, v)
+    return tuple(jnp.asarray(block) for block in evaluated(eqx.Partial(_equations, map, two_form), x, v))
+
+
+def _equations(map: AbstractDiscretizationMap, two_form: Callable, x: Array, v: Array) -> tuple[Array, ...]:
+    form, n = _form(two_form, x), x.shape[0]
     pair = lambda z: jnp.concatenate(map.forward(z[:n], z[n:]))
     (x0, x1), slopes = map.forward(x, v), jax.jacfwd(pair)(jnp.concatenate([x, v]))
     first, last = slopes[:n], slopes[n:]
-    missed = last.T @ form(x1) @ last - first.T @ form(x0) @ first - complete_lift(two_form, x, v)
+    missed = last.T @ form(x1) @ last - first.T @ form(x0) @ first - _lift(two_form, x, v)
     return missed[:n, :n], missed[:n, n:], missed[n:, n:]
 
 
-def _checked(two_form: Callable, x: ArrayLike, v: ArrayLike) -> tuple[Array, Array, Callable]:
+def _checked(two_form: Callable, x: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
     x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
     if x.ndim != 1 or v.shape != x.shape:
         raise ValueError(f"x and v must be a point and a vector of one length, but their shapes are {x.shape} and {v.shape}.")
-    function = UserFunction(two_form, "two_form", ("x",))
-    form = function.returning((x.shape[0], x.shape[0]))
-    return x, v, lambda x: form(x, None)
+    _form(two_form, x)
+    return x, v
+
+
+def _form(two_form: Callable, x: Array) -> Callable:
+    form = UserFunction(two_form, "two_form", ("x",)).returning((x.shape[0], x.shape[0]))
+    return lambda x: form(x, None)

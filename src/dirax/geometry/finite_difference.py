@@ -33,7 +33,7 @@ def annihilator_projector(one_forms: Float[Array, "m n"]) -> Float[Array, "n n"]
     """
     if one_forms.shape[0] == 0:
         return jnp.zeros((one_forms.shape[1], one_forms.shape[1]))
-    return jnp.linalg.pinv(one_forms, rtol=ONE_FORM_RANK) @ one_forms
+    return pseudo_inverse(one_forms, ONE_FORM_RANK) @ one_forms
 
 
 def projector_slope(one_forms: Callable, q: Float[Array, " n"], covector: Float[Array, " n"]) -> Float[Array, "n n"]:

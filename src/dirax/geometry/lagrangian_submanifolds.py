@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.structures import canonical_two_form
 from dirax.program.tracing import gradient
-from dirax.program.user_functions import UserFunction
+from dirax.program.user_functions import UserFunction, evaluated
 
 
 class LagrangianSubmanifold(eqx.Module):
@@ -78,5 +78,8 @@ class LagrangianSubmanifold(eqx.Module):
 
     def lagrangian_defect(self, x: Float[Array, " N"], s: Float[Array, " k"], params: Any = None) -> Float[Array, ""]:
         """The largest value of the canonical two-form of T*M on the basis `tangent`: 0 up to roundoff."""
+        return jnp.asarray(evaluated(self._defect, jnp.asarray(x, float), jnp.asarray(s, float), params))
+
+    def _defect(self, x: Array, s: Array, params: Any) -> Array:
         basis = self.tangent(x, s, params)
         return jnp.max(jnp.abs(basis.T @ canonical_two_form(basis.shape[0] // 2) @ basis))

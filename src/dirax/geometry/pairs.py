@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.tulczyjew import slot_derivatives
 from dirax.program.roots import regular_root
-from dirax.program.user_functions import UserFunction
+from dirax.program.user_functions import UserFunction, evaluated
 
 Vector = Float[Array, " n"]
 Form = Float[Array, " 2*n"]
@@ -83,6 +83,9 @@ class DiscreteLagrangianSystem(eqx.Module):
         """φ: (q0, q1) ↦ (q1, q2) with D_DEL L_d ∈ Δ°_Q(q1) and w_d(q1, q2) = 0 ([PY] (19)–(21)); NaN where Newton's method,
         from the velocity of the pair, does not converge."""
         q0, q1 = _points(q0, q1)
+        return q1, jnp.asarray(evaluated(self._next, q0, q1, params))
+
+    def _next(self, q0: Vector, q1: Vector, params: Any) -> Vector:
         arriving, rows, n = self._slots(q0, q1, params)[1], self._matrix(q1, params), q1.shape[0]
 
         def residual(u):
@@ -90,7 +93,7 @@ class DiscreteLagrangianSystem(eqx.Module):
             balance = arriving + self._slots(q1, q2, params)[0] - rows.T @ u[n:]
             return jnp.concatenate([balance, self.constraint(q1, q2, params)])
 
-        return q1, regular_root(residual, jnp.concatenate([2.0 * q1 - q0, jnp.zeros(rows.shape[0])]))[:n]
+        return regular_root(residual, jnp.concatenate([2.0 * q1 - q0, jnp.zeros(rows.shape[0])]))[:n]
 
     def _slots(self, q0: Vector, q1: Vector, params: Any) -> tuple[Vector, Vector]:
         return slot_derivatives(lambda a, b: self.discrete_lagrangian(a, b, params), q0, q1)

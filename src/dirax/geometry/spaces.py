@@ -14,7 +14,22 @@ from dirax.program.tracing import once
 
 
 class AbstractFlat(AbstractGeodesicManifold):
-    """R^n, or R^n modulo a lattice: geodesics are the straight lines x + tv, and every vector is tangent everywhere."""
+    """R^n, or R^n modulo a lattice: geodesics are the straight lines x + tv, and every vector is tangent everywhere.
+
+    It is an abelian group by addition, with the names that Lie groups have for theirs.
+    """
+
+    def identity(self):
+        """0."""
+        return jnp.zeros(self.dimension)
+
+    def multiply(self, g, h):
+        """g + h."""
+        return g + h
+
+    def group_exp(self, xi):
+        """ξ."""
+        return xi
 
     def defect(self, x):
         """0."""

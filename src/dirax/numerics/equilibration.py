@@ -3,6 +3,7 @@
 `xp` is NumPy or `jax.numpy` throughout, and matrices may have leading axes.
 """
 
+import functools
 from types import ModuleType
 from typing import Any
 
@@ -10,6 +11,10 @@ import numpy as np
 
 ROUNDS = 3
 """Scaling the columns unbalances the rows again, less each time; after three rounds by no more than a factor of two or so."""
+
+
+MANY = 32
+"""Matrices side by side that are many."""
 
 
 def equilibrated(matrix: Any, xp: ModuleType = np, rounds: int = ROUNDS) -> tuple[Any, Any]:
@@ -34,8 +39,8 @@ def balancing_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     rows, columns = xp.ones((*lead, k, 1)), xp.ones((*lead, 1, l))
     for _ in range(ROUNDS):
         left = sizes / rows / columns
-        rows = rows * xp.sqrt(_nonzero(xp, xp.max(left, axis=-1, keepdims=True)))
-        columns = columns * xp.sqrt(_nonzero(xp, xp.max(left, axis=-2, keepdims=True)))
+        rows = rows * xp.sqrt(_nonzero(xp, _maximum(xp, left, -1)))
+        columns = columns * xp.sqrt(_nonzero(xp, _maximum(xp, left, -2)))
     return rows, columns
 
 
@@ -109,7 +114,15 @@ def condition_number(matrix: Any, xp: ModuleType = np) -> Any:
 
 
 def _largest(xp: ModuleType, matrix: Any, axis: int) -> Any:
-    return xp.max(xp.abs(matrix), axis=axis, keepdims=True, initial=0.0)
+    return _maximum(xp, xp.abs(matrix), axis)
+
+
+def _maximum(xp: ModuleType, sizes: Any, axis: int) -> Any:
+    """The largest of sizes that are not negative, along an axis; of many small matrices NumPy finds it far quicker column by
+    column."""
+    if xp is np and sizes.ndim > 2 and len(sizes) > MANY and sizes.shape[axis]:
+        return np.expand_dims(functools.reduce(np.maximum, np.moveaxis(sizes, axis, 0)), axis)
+    return xp.max(sizes, axis=axis, keepdims=True, initial=0.0)
 
 
 def _nonzero(xp: ModuleType, sizes: Any) -> Any:

@@ -1,8 +1,10 @@
 """Scalar expressions, each built once: constants folded, zeros and ones simplified away, equal expressions shared."""
 
+import itertools
 import math
 import struct
 from collections.abc import Callable, Container, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -293,16 +295,20 @@ class Graph:
         inputs: dict[str, Any],
         table: dict | None = None,
         values: dict | None = None,
-        order: Sequence[int] | None = None,
+        order: "Order | None" = None,
     ):
         """The list of the outputs for given inputs; NumPy by default, any array library whose functions are in `table`.
 
-        `values` holds nodes that are known from before, and then those that were needed; `order` is what is reachable from the
-        outputs, where that has been found before.
+        `values` holds nodes that are known from before, and then those that were needed; `order` is how to compute the outputs,
+        where that has been found before.
         """
         functions = table or NUMPY
         values = {} if values is None else values
-        for node in self.reachable(outputs, values) if order is None else [n for n in order if n not in values]:
+        if order is None:
+            order = Order(self.reachable(outputs, values))
+        for node, ended in zip(order.nodes, order.ended or itertools.repeat(()), strict=False):
+            if node in values:
+                continue
             op, args = self.op[node], self.args[node]
             if len(args) == 2:
                 values[node] = functions[op](values[args[0]], values[args[1]])
@@ -310,7 +316,38 @@ class Graph:
                 values[node] = functions[op](*[values[a] for a in args])
             else:
                 values[node] = inputs[str(self.value[node])] if op == "input" else self.value[node]
-        return [values[node] for node in outputs]
+            for a in ended:
+                values.pop(a, None)
+        found = [values[node] for node in outputs]
+        for node in order.last:
+            values.pop(node, None)
+        return found
+
+
+@dataclass
+class Order:
+    """Nodes in an order in which they can be computed; after each of them those that nothing needs any more, whose values
+    give their memory to the next ones; and those that nothing needs after the whole."""
+
+    nodes: list[int]
+    ended: list[list[int]] | None = None
+    last: tuple[int, ...] = ()
+
+
+def with_ends(graph: Graph, parts: Sequence[tuple[list[int], list[int]]], kept: Container[int] = ()) -> list[Order]:
+    """The orders of parts (nodes to compute, nodes to read) that are computed one after the other; `kept` stay known, and what
+    has no operands."""
+    args, needed, found = graph.args, set(), []
+    for nodes, read in reversed(parts):
+        last = tuple([node for node in read if args[node] and node not in needed and node not in kept])
+        needed.update(read)
+        ended = []
+        for node in reversed(nodes):
+            over = [a for a in args[node] if a not in needed]
+            needed.update(over)
+            ended.append([a for a in over if args[a] and a not in kept])
+        found.append(Order(nodes, ended[::-1], last))
+    return found[::-1]
 
 
 def _plain_number(x: float) -> bool:

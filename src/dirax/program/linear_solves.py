@@ -1,5 +1,6 @@
 """Linear equations of a few unknowns: with one solution, and with the smallest of many."""
 
+import math
 from types import ModuleType
 from typing import Any
 
@@ -47,27 +48,57 @@ def equilibrated_inverse(xp: ModuleType, matrix: Any) -> tuple[Any, Any]:
     sizes = xp.abs(lax.stop_gradient(matrix) if xp is jnp else matrix)  # units have no derivative, which would be ∞ at zero
     rows, columns = balancing_scales(sizes, xp)
     scaled = matrix / rows / columns
-    inverse = xp.linalg.pinv(scaled, EQUATION_RANK) if xp is jnp else _pseudo_inverses(scaled)
+    inverse = xp.linalg.pinv(scaled, EQUATION_RANK) if xp is jnp else pseudo_inverses(scaled, EQUATION_RANK)
     turned = lambda a: xp.swapaxes(a, -1, -2)
     return inverse / turned(columns) / turned(rows), 1.0 / columns[..., 0, :]
 
 
-def _pseudo_inverses(matrices: np.ndarray) -> np.ndarray:
-    """Pseudo-inverses in NumPy with leading axes; of a matrix that is surely regular its inverse, which is found much faster."""
-    flat = matrices.reshape(-1, *matrices.shape[-2:])
-    found, doubtful = np.empty((len(flat), *flat.shape[:0:-1])), np.ones(len(flat), bool)
-    if flat.shape[1] == flat.shape[2]:
-        try:
-            found = np.linalg.inv(flat)
-        except np.linalg.LinAlgError:  # one of them is singular
-            pass
-        else:
-            size = lambda a: np.max(np.sum(np.abs(a), axis=-1), axis=-1, initial=0.0)
-            with np.errstate(all="ignore"):
-                doubtful = ~(size(flat) * size(found) <= SURELY_REGULAR)
+def pseudo_inverses(matrices: np.ndarray, tolerance: float) -> np.ndarray:
+    """Pseudo-inverses in NumPy with leading axes; singular values below `tolerance`, relative to the largest, count as zero.
+
+    Where surely none does, they are found without them, which is much faster.
+    """
+    flat = matrices.reshape(math.prod(matrices.shape[:-2]), *matrices.shape[-2:])
+    size = lambda a: np.max(np.sum(np.abs(a), axis=-1), axis=-1, initial=0.0)
+    with np.errstate(all="ignore"):
+        sizes = size(flat)
+        unit = sizes[:, None, None]
+        found = _of_full_rank(flat / unit) / unit  # no square overflows, or is lost
+        doubtful = ~(sizes * size(found) <= SURELY_REGULAR)
     if np.any(doubtful):
-        found[doubtful] = np.linalg.pinv(flat[doubtful], EQUATION_RANK)
+        found[doubtful] = np.linalg.pinv(flat[doubtful], tolerance)
     return found.reshape(*matrices.shape[:-2], *found.shape[1:])
+
+
+def _of_full_rank(matrices: np.ndarray) -> np.ndarray:
+    """The pseudo-inverses of matrices (B, k, l) of full rank, (B, l, k); of others something that is large or not finite."""
+    *_, k, l = matrices.shape
+    if k > l:
+        return np.swapaxes(_of_full_rank(np.swapaxes(matrices, 1, 2)), 1, 2)
+    if k == l:
+        try:
+            return np.linalg.inv(matrices)
+        except np.linalg.LinAlgError:  # one of them is singular
+            return np.full(matrices.shape, np.inf)
+    return np.swapaxes(_rows_inverted(matrices), 1, 2)
+
+
+def _rows_inverted(matrices: np.ndarray) -> np.ndarray:
+    """(W⁺)ᵀ of matrices W (B, k, l) with independent rows, from W = RQ with R triangular, the rows of Q orthonormal: by
+    Gram and Schmidt for all of them side by side, each row twice, after which Q is orthonormal to roundoff."""
+    q, r = np.array(matrices, order="C"), np.zeros((*matrices.shape[:2], matrices.shape[1]))
+    combined = lambda factors, rows: (factors[:, None] @ rows)[:, 0]
+    for i in range(matrices.shape[1]):
+        for _ in range(2):
+            along = combined(q[:, i], np.swapaxes(q[:, :i], 1, 2))
+            q[:, i] -= combined(along, q[:, :i])
+            r[:, i, :i] += along
+        r[:, i, i] = np.sqrt(np.einsum("bl,bl->b", q[:, i], q[:, i]))
+        q[:, i] /= r[:, i, i, None]
+    for i in reversed(range(matrices.shape[1])):
+        q[:, i] -= combined(r[:, i + 1 :, i], q[:, i + 1 :])
+        q[:, i] /= r[:, i, i, None]
+    return q
 
 
 def _turned(matrix):

@@ -1,5 +1,6 @@
 """ScalarProgram: a function of a few numbers, traced once into scalar expressions; values of it in NumPy and in JAX."""
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable
@@ -14,10 +15,14 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
 from dirax.program.evaluation.in_numpy import Values, in_parts
-from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.evaluation.noise import Noise
+from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_ends
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
 from dirax.program.primitives import plain_primitive
+
+OFTEN = 32
+"""Times that a program is evaluated for one entry until Python's floats are worth their compiling."""
 
 NUMPY_RULES: dict[str, Callable] = {}
 """Primitive name → rule(made, interpreter, equation, *operands), which may add computations in NumPy to the program `made`."""
@@ -45,13 +50,16 @@ class ScalarProgram:
     inputs: list[Nodes]
     results: list[Nodes] = field(default_factory=list)
     opaque: list[Opaque] = field(default_factory=list)
+    for_few: bool = False
+    """Whether it is to be evaluated once, at a handful of entries: then more of it is found in numbers."""
+    _asked: int = 0
 
     @classmethod
-    def of(cls, jaxpr: ClosedJaxpr, by_numpy: bool = False) -> "ScalarProgram":
+    def of(cls, jaxpr: ClosedJaxpr, by_numpy: bool = False, for_few: bool = False) -> "ScalarProgram":
         """The program of a jaxpr, `by_numpy` with decompositions, roots and loops that are no expressions.
 
         Raises `UnsupportedPrimitive` and `GraphTooLarge`."""
-        made = cls(Graph(NODE_LIMIT), [])
+        made = cls(Graph(NODE_LIMIT), [], for_few=for_few)
         made.inputs = [made.fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
         made.run(jaxpr, {name: functools.partial(rule, made) for name, rule in NUMPY_RULES.items()} if by_numpy else {})
         return made
@@ -73,14 +81,28 @@ class ScalarProgram:
         self.opaque.append(Opaque(operands, [self.fresh(shape) for shape in shapes], function))
         return self.opaque[-1].results
 
-    def in_numpy(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
-        """The results for arguments (entries, …), with that leading axis."""
-        return in_parts(self._part, leaves)
+    def in_numpy(self, leaves: list[np.ndarray], noise: Noise | None = None) -> list[np.ndarray]:
+        """The results for arguments (entries, …), with that leading axis; for one entry again and again by Python's floats, which
+        have the same bits. `noise`: of the operations, in place of NumPy's; opaque computations have that of their operands."""
+        if len(leaves[0]) == 1 and noise is None:
+            self._asked += 1
+            if self._asked > OFTEN and self.in_floats is not None:
+                with contextlib.suppress(ArithmeticError, ValueError):  # what Python's floats do not have
+                    return self._by_floats(leaves)
+        return in_parts(functools.partial(self._part, noise=noise), leaves)
 
-    def _part(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
-        known = Values(self.graph, len(leaves[0]))
+    def _by_floats(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
+        assert self.in_floats is not None
+        found, results, at = self.in_floats([x for leaf in leaves for x in np.asarray(leaf, float).ravel().tolist()]), [], 0
+        for nodes in self.results:
+            results.append(np.array(found[at : at + nodes.size], float).reshape(1, *nodes.shape))
+            at += nodes.size
+        return results
+
+    def _part(self, leaves: list[np.ndarray], noise: Noise | None) -> list[np.ndarray]:
+        known = Values(self.graph, len(leaves[0]), noise.table if noise else None)
         for nodes, leaf in zip(self.inputs, leaves, strict=True):
-            known.bind(nodes, leaf)
+            known.bind(nodes, noise.off(leaf) if noise else leaf)
         orders = iter(self._orders)
         for step in self.opaque:
             operands = [known.read(nodes, next(orders)) for nodes in step.operands]
@@ -89,19 +111,21 @@ class ScalarProgram:
         return [known.read(nodes, next(orders)) for nodes in self.results]
 
     @functools.cached_property
-    def _orders(self) -> list[list[int]]:
-        """What is left to compute, in order, for the operands of each opaque computation, and then for each result."""
+    def _orders(self) -> list[Order]:
+        """How to compute what is left for the operands of each opaque computation, and then for each result."""
         flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
-        known, orders = set(flat(self.inputs)), []
+        known, parts = set(flat(self.inputs)), []
         for step in self.opaque:
-            orders += [self._next(nodes, known) for nodes in step.operands]
+            parts += [self._next(nodes, known) for nodes in step.operands]
             known.update(flat(step.results))
-        return orders + [self._next(nodes, known) for nodes in self.results]
+        parts += [self._next(nodes, known) for nodes in self.results]
+        return with_ends(self.graph, parts)
 
-    def _next(self, nodes: Nodes, known: set[int]) -> list[int]:
-        order = self.graph.reachable(nodes.ravel().tolist(), known)
+    def _next(self, nodes: Nodes, known: set[int]) -> tuple[list[int], list[int]]:
+        read = nodes.ravel().tolist()
+        order = self.graph.reachable(read, known)
         known.update(order)
-        return order
+        return order, read
 
     @functools.cached_property
     def in_floats(self) -> Floats | None:

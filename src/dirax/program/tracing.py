@@ -11,6 +11,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, jaxprs_in_params
 
 from dirax.program.memo import Memo
 from dirax.program.primitives import binds, is_tracing, plain_primitive
+from dirax.program.same_jaxpr import shared
 
 KEPT = 512
 """Traced functions kept in memory."""
@@ -142,7 +143,8 @@ class _Traced:
 
 
 def closed_over(function: Callable, values: list) -> tuple[ClosedJaxpr, list, Any]:
-    """The jaxpr of a function, with the traced values that it captures as its first arguments; these; what it returns."""
+    """The jaxpr of a function, with the traced values that it captures as its first arguments, the same object for functions that
+    say the same; these values; what it returns."""
     closed, result = jax.make_jaxpr(function, return_shape=True)(*values)
     moves = [isinstance(value, Tracer) for value in closed.consts]
     pairs = list(zip(closed.jaxpr.constvars, closed.consts, moves, strict=True))
@@ -151,7 +153,7 @@ def closed_over(function: Callable, values: list) -> tuple[ClosedJaxpr, list, An
         constvars=[variable for variable, _, traced in pairs if not traced], invars=[*free, *closed.jaxpr.invars]
     )
     fixed = [value for _, value, traced in pairs if not traced]
-    return ClosedJaxpr(jaxpr, fixed), [value for _, value, traced in pairs if traced], result
+    return shared(ClosedJaxpr(jaxpr, fixed)), [value for _, value, traced in pairs if traced], result
 
 
 def _plain(jaxpr: Any) -> bool:

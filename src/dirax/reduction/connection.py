@@ -26,8 +26,9 @@ class AbstractConnection(eqx.Module):
     fibre: eqx.AbstractVar[tuple[int, ...]]
 
     @abstractmethod
-    def check(self, n: int) -> None:
-        """Raise `ValueError` where the connection does not fit n coordinates, or is none."""
+    def check(self, n: int, nearest: Callable | None = None) -> None:
+        """Raise `ValueError` where the connection does not fit n coordinates, or is none; looked at where points are random
+        ones, or `nearest(q)` on a manifold."""
 
     @abstractmethod
     def lift_of_shapes(self, x0: Float[Array, " r"], x1: Float[Array, " r"]) -> Float[Array, " k"]:
@@ -120,7 +121,7 @@ class LinearConnection(AbstractConnection):
                 )
             self.horizontal = tuple(map(tuple, matrix.tolist()))
 
-    def check(self, n: int) -> None:
+    def check(self, n: int, nearest: Callable | None = None) -> None:
         """Raise `ValueError` where the indices or A do not fit n coordinates."""
         check_fibre(self.fibre, n)
         if self.horizontal is not None and len(self.horizontal[0]) != n - len(self.fibre):
@@ -179,7 +180,7 @@ class DiscreteConnection(AbstractConnection):
             raise TypeError("one_form takes (q0, q1) alone: a connection has no parameters.")
         self.fibre = fibre_indices(fibre)
 
-    def check(self, n: int) -> None:
+    def check(self, n: int, nearest: Callable | None = None) -> None:
         """Raise `ValueError` where the axioms fail, with the defect and where."""
         check_fibre(self.fibre, n)
         k, random = len(self.fibre), np.random.default_rng(0)
@@ -190,6 +191,8 @@ class DiscreteConnection(AbstractConnection):
         with jax.ensure_compile_time_eval():
             for _ in range(SAMPLES):
                 q0, q1 = random.normal(size=n), random.normal(size=n)
+                if nearest is not None:
+                    q0, q1 = nearest(q0), nearest(q1)
                 move = np.zeros((2, n))
                 move[:, list(self.fibre)] = random.normal(size=(2, k))
                 expected = form(q0, q1) + (move[1] - move[0])[list(self.fibre)]

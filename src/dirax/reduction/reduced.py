@@ -1,7 +1,9 @@
 """Systems on the quotient by an abelian symmetry, and the way back."""
 
+from abc import abstractmethod
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +11,9 @@ from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import INERTIA_RANK, SYMMETRY_DEFECT
+from dirax.program.memo import Memo
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
-from dirax.reduction.actions import Translations
+from dirax.reduction.actions import AbstractAction, Translations
 from dirax.reduction.connection import AbstractConnection
 from dirax.reduction.symmetry import discrete_invariance, invariance, times
 from dirax.systems.constraints import Constraints
@@ -21,20 +24,67 @@ NEARBY, SAMPLES = 0.3, 8
 """Invariance is looked at in the initial data and at so many random points within this distance of them."""
 
 
-class ReducedLagrangeDirac(AbstractSystem):
-    """A Lagrangian system on the quotient (Q × Q)/G ≅ Σ × Σ × G by translations in the fibre ([RL] §4). Made by `dx.reduce`.
+_symmetric: Memo[None] = Memo(256)
 
-    Rows of a trajectory hold x (n − k,), w (n − k,) and mu (k,), the trivialized momentum λ̂_d(q, p) = (x, w, μ), and the
-    group coordinate g (k,), a quadrature that `dx.reconstruct` uses.
+
+class AbstractReducedSystem(AbstractSystem):
+    """A Lagrangian system on the quotient by a symmetry: what those on flat and on curved shape spaces have in common.
+
+    Rows of a trajectory hold the shape x, the momenta w and μ of λ̂_d(q, p) = (x, w, μ), and the group's g, a quadrature.
     """
 
-    system: LagrangeDirac
-    connection: AbstractConnection
+    system: eqx.AbstractVar[Any]
+    connection: eqx.AbstractVar[Any]
 
-    def quotient_form(self) -> "ReducedLagrangeDirac":
+    @property
+    @abstractmethod
+    def action(self) -> AbstractAction:
+        """The action of the group on Q."""
+
+    @property
+    @abstractmethod
+    def own_fields(self) -> tuple[str, ...]:
+        """The names of the saved arrays from which `unreduced_row` makes those on T*Q."""
+
+    @property
+    @abstractmethod
+    def conserves_momentum(self) -> bool:
+        """Whether μ is a constant of the motion whatever the functions."""
+
+    @abstractmethod
+    def sampled(self, data: Data) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times, points and velocities, (1 + SAMPLES, …) each: the initial data, at t = 0, and random ones near them."""
+
+    @abstractmethod
+    def named(self, generator: int) -> str:
+        """What moves along a generator, in words."""
+
+    @abstractmethod
+    def along(self, q: Array, covectors: Float[Array, "m n"]) -> Float[Array, "m k"]:
+        """The parts of covectors at q along the group, as μ is that of the momentum."""
+
+    @abstractmethod
+    def at_identity(self, q: Array, covectors: Float[Array, "m n"]) -> Float[Array, "m d"]:
+        """Covectors at q moved along its orbit to where what is invariant is computed, in components."""
+
+    @abstractmethod
+    def origin_of(self, q: Array) -> Array:
+        """The point of the orbit of q at which what is invariant is computed."""
+
+    @abstractmethod
+    def unreduced_row(self, row: Data) -> dict[str, Array]:
+        """The row (q, p, …) on T*Q over a reduced row."""
+
+    @abstractmethod
+    def momentum_map(self, row: Data) -> Float[Array, " k"]:
+        """J at a row, which is conserved where nothing acts along the group: of an abelian one μ itself."""
+
+    # ------------------------------------------------------------------ what follows from these
+
+    def quotient_form(self) -> "AbstractReducedSystem":
         return self
 
-    def unreduced(self) -> LagrangeDirac:
+    def unreduced(self) -> Any:
         """The system on Q that this one is the quotient of."""
         return self.system
 
@@ -54,51 +104,126 @@ class ReducedLagrangeDirac(AbstractSystem):
         """Whether nothing acts but L."""
         return self.system.forces is None and not self.constraints.any
 
-    @property
-    def conserves_momentum(self) -> bool:
-        """Whether μ is a constant of the motion whatever the functions: G = ∂g/∂q of invariant holonomic constraints has no
-        part along the group."""
-        return self.system.forces is None and self.system.one_forms is None
-
-    def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
-        sizes = self.system.sizes(data, params)
-        self.connection.check(sizes[0])
-        if not is_traced(data, params):
-            self._refuse_asymmetry(data, params)
-        return sizes
-
     def moves_momentum(self, data: Data, params: Any) -> str:
         """What has a part along the group and moves μ, with the part and where, at initial data and near them, which must be
         concrete; empty where nothing does."""
-        if self.conserves_momentum:
+        if self.system.forces is None and self.system.one_forms is None:
             return ""
-        t, q, v = sampled(data)
+        t, q, v = self.sampled(data)
         parts, sizes = (np.asarray(a) for a in evaluated(self._parts_along, t, q, v, params))
         largest = np.max(np.where(np.isfinite(sizes), sizes, 0.0), axis=0)
         defects = np.abs(parts) / np.where(largest > 0, largest, 1.0)[:, None]
         where, row, column = np.unravel_index(int(np.argmax(np.where(np.isfinite(defects), defects, 0.0))), defects.shape)
         if not defects[where, row, column] > SYMMETRY_DEFECT:
             return ""
-        forces, coordinate = row == parts.shape[1] - 1, f"q[{self.connection.fibre[column]}]"
+        forces = row == parts.shape[1] - 1
         what = "the forces f(t, q, v) move" if forces else "the forces of the constraints move"
-        part = f"f has the part {{:.3g}} along {coordinate}" if forces else f"one-form {row} has {{:.3g}} d{coordinate}"
+        part = (
+            f"{'f' if forces else f'one-form {row}'} has the part {parts[where, row, column]:.3g} along {self.named(int(column))}"
+        )
         at = f"q = {np.asarray(q[where])}" + f", v = {np.asarray(v[where])}" * bool(forces)
-        return f"{what}: {part.format(parts[where, row, column])} at {at}, at or near the initial data"
+        return f"{what}: {part} at {at}, at or near the initial data"
 
     def _parts_along(self, t, q, v, params):
-        """The entries of the rows of W and of f along the group, (samples, m + 1, k), and the sizes of the rows."""
-        system, fibre = self.system, np.array(self.connection.fibre)
+        """The parts of the rows of W and of f along the group, (samples, m + 1, k), and the sizes of the rows."""
+        system = self.system
 
         def at(t, q, v):
             forces = jnp.zeros_like(q) if system.forces is None else system.forces(t, q, v, params)
             rows = jnp.concatenate([self.constraints.one_forms_at(t, q, params), forces[None]])
-            return rows[:, fibre], jnp.max(jnp.abs(rows), axis=1)
+            return self.along(q, rows), jnp.max(jnp.abs(rows), axis=1)
 
         return jax.vmap(at)(t, q, v)
 
+    @abstractmethod
+    def refuse_asymmetry(self, data: Data, params: Any) -> None:
+        """Raise `ValueError` where the group is no symmetry of the system, at or near initial data, which must be concrete."""
+
+    def refuse_asymmetry_once(self, data: Data, params: Any) -> None:
+        """The same of values that were not looked at before; of traced ones nothing is asked."""
+        if not is_traced(data, params):
+            values = [(str(name), np.asarray(a).tobytes()) for name, a in sorted(data.items())]
+            leaves = [(str(where), np.asarray(a).tobytes()) for where, a in jax.tree_util.tree_leaves_with_path(params)]
+            _symmetric.get((self, *values, *leaves), lambda: self.refuse_asymmetry(data, params))
+
+    def complete(self, data: Data, params: Any, project: bool) -> Data:
+        """Those of the unreduced system, of a saved row too."""
+        if "x" in data:
+            whole = self.unreduced_row({name: data[name] for name in self.own_fields})
+            data = {"q": whole["q"], "p": whole["p"]} | ({"t": data["t"]} if "t" in data else {})
+        return self.system.complete(data, params, project)
+
+    def initial_defect(self, data: Data, params: Any) -> Float[Array, " m"]:
+        return self.system.initial_defect(data, params)
+
+    def energy_at(self, row: Data, params: Any) -> Float[Array, ""]:
+        """The energy of the unreduced system, which the group coordinate does not change."""
+        return self.system.energy_at(self.unreduced_row(row), params)
+
+    def constraint_at(self, row: Data, params: Any) -> Float[Array, " m"]:
+        return self.system.constraint_at(self.unreduced_row(row), params)
+
+    @property
+    def energy_changes(self) -> str:
+        return self.system.energy_changes
+
+
+class ReducedLagrangeDirac(AbstractReducedSystem):
+    """A Lagrangian system on the quotient (Q × Q)/G ≅ Σ × Σ × G by translations in the fibre ([RL] §4). Made by `dx.reduce`.
+
+    Rows of a trajectory hold x (n − k,), w (n − k,) and mu (k,), the trivialized momentum λ̂_d(q, p) = (x, w, μ), and the
+    group coordinate g (k,), a quadrature that `dx.reconstruct` uses.
+    """
+
+    system: LagrangeDirac
+    connection: AbstractConnection
+
+    @property
+    def action(self) -> Translations:
+        return Translations(self.connection.fibre)
+
+    @property
+    def own_fields(self) -> tuple[str, ...]:
+        return ("x", "w", "mu", "g")
+
+    @property
+    def conserves_momentum(self) -> bool:
+        """G = ∂g/∂q of invariant holonomic constraints has no part along the group."""
+        return self.system.forces is None and self.system.one_forms is None
+
+    def sampled(self, data: Data) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return sampled(data)
+
+    def named(self, generator: int) -> str:
+        return f"q[{self.connection.fibre[generator]}]"
+
+    def along(self, q: Array, covectors: Float[Array, "m n"]) -> Float[Array, "m k"]:
+        return covectors[:, np.array(self.connection.fibre)]
+
+    def at_identity(self, q: Array, covectors: Float[Array, "m n"]) -> Float[Array, "m n"]:
+        return covectors
+
+    def origin_of(self, q: Array) -> Array:
+        return self.connection.join(self.connection.split(q)[0], jnp.zeros(len(self.connection.fibre)))
+
+    def unreduced_row(self, row: Data) -> dict[str, Array]:
+        q = self.connection.join(row["x"], row["g"])
+        p = self.connection.untrivialize_covector(row["x"], row["w"], row["mu"])
+        return {"q": q, "p": p} | {name: value for name, value in row.items() if name not in self.own_fields}
+
+    def momentum_map(self, row: Data) -> Float[Array, " k"]:
+        return row["mu"]
+
+    def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
+        sizes = self.system.sizes(data, params)
+        self.connection.check(sizes[0])
+        self.refuse_asymmetry_once(data, params)
+        return sizes
+
     def refuse_asymmetric(self, functions: dict[str, UserFunction], data: Data, h: float, params: Any) -> None:
         """Raise `ValueError` where functions of ([t, ]q0, q1, h[, params]) are not invariant, at data that must be concrete."""
-        found = discrete_invariance(functions, Translations(self.connection.fibre), *sampled(data), h, params)
+        t, q, v = sampled(data)
+        found = discrete_invariance(functions, self.action, t, q, q + h * v, h, params)
         if not found.ok:
             worst = self.connection.fibre[found.generator]
             raise ValueError(
@@ -107,9 +232,9 @@ class ReducedLagrangeDirac(AbstractSystem):
                 f"q1[{worst}] − q0[{worst}] alone, or take that coordinate out of fibre."
             )
 
-    def _refuse_asymmetry(self, data, params) -> None:
+    def refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]
-        found = invariance(self.system, Translations(self.connection.fibre), *sampled(data), params)
+        found = invariance(self.system, self.action, *sampled(data), params)
         if not found.ok:
             worst = self.connection.fibre[found.generator]
             what = {"lagrangian": f"∂L/∂q[{worst}]", "one_forms": "the motion of its one-forms out of their span"}
@@ -124,29 +249,6 @@ class ReducedLagrangeDirac(AbstractSystem):
                 f"the orbits of the group are not free at the initial point q = {np.asarray(q)}: the group inertia has rank "
                 f"{inertia} there and {nearby} nearby. Start elsewhere, or use coordinates that do not end there."
             )
-
-    def complete(self, data: Data, params: Any, project: bool) -> Data:
-        return self.system.complete(data, params, project)
-
-    def initial_defect(self, data: Data, params: Any) -> Float[Array, " m"]:
-        return self.system.initial_defect(data, params)
-
-    def unreduced_row(self, row: Data) -> dict[str, Array]:
-        """The row (q, p, …) on T*Q over a reduced row."""
-        q = self.connection.join(row["x"], row["g"])
-        p = self.connection.untrivialize_covector(row["x"], row["w"], row["mu"])
-        return {"q": q, "p": p} | {name: value for name, value in row.items() if name not in ("x", "w", "mu", "g")}
-
-    def energy_at(self, row: Data, params: Any) -> Float[Array, ""]:
-        """The energy of the unreduced system, which the group coordinate does not change."""
-        return self.system.energy_at(self.unreduced_row(row), params)
-
-    def constraint_at(self, row: Data, params: Any) -> Float[Array, " m"]:
-        return self.system.constraint_at(self.unreduced_row(row), params)
-
-    @property
-    def energy_changes(self) -> str:
-        return self.system.energy_changes
 
 
 def sampled(data: Data) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,6 +1,6 @@
 """Reduction by stages: the quotient of a quotient is the quotient by the product of the groups."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -73,7 +73,7 @@ class StagedConnection(AbstractConnection):
     def __init__(self, first: AbstractConnection, second: AbstractConnection):
         self.first, self.second, self.fibre = first, second, _joined_fibre(first, second)
 
-    def check(self, n: int) -> None:
+    def check(self, n: int, nearest: Callable | None = None) -> None:
         self.first.check(n)
         shapes, random = n - len(self.first.fibre), np.random.default_rng(0)
         self.second.check(shapes)

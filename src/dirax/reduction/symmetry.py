@@ -79,7 +79,8 @@ def check_invariance(
     if step is None:
         raise ValueError("discrete_lagrangian needs step=, the h that it is called with.")
     ld = UserFunction(discrete_lagrangian, "discrete_lagrangian", ("q0", "q1", "h"), timed=True)
-    return discrete_invariance({"discrete_lagrangian": ld}, action, times(1 + samples), near(q), near(v), step, params)
+    q0, v = near(q), near(v)
+    return discrete_invariance({"discrete_lagrangian": ld}, action, times(1 + samples), q0, q0 + step * v, step, params)
 
 
 def times(count: int) -> np.ndarray:
@@ -116,14 +117,14 @@ def check_lagrangian(system: Any, q: np.ndarray, v: np.ndarray, params: Any) -> 
 
 
 def discrete_invariance(
-    functions: dict[str, UserFunction], action: AbstractAction, t: Any, q: Any, v: Any, h: float, params: Any
+    functions: dict[str, UserFunction], action: AbstractAction, t: Any, q0: Any, q1: Any, h: float, params: Any
 ) -> Invariance:
-    """Whether functions of ([t, ]q0, q1, h[, params]) by name are invariant, at given t, q0 = q and q1 = q + hv (samples, …)."""
+    """Whether functions of ([t, ]q0, q1, h[, params]) by name are invariant, at given t, q0 and q1 (samples, …)."""
 
     def moving(function):
         return lambda g, t, q0, q1: function(*function.given(t, action(g, q0), action(g, q1), h, params))
 
-    return _worst({name: moving(function) for name, function in functions.items()}, action, t, q, q + h * v)
+    return _worst({name: moving(function) for name, function in functions.items()}, action, t, q0, q1)
 
 
 def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, params: Any) -> Invariance:
@@ -180,7 +181,8 @@ def _sees_multipliers(system: Any) -> bool:
 def forces_at(system: Any, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], params: Any) -> Float[Array, "k n"]:
     """The forces, as one row; where they see the multipliers, one row for random ones and one for their opposites."""
     if not _sees_multipliers(system):
-        return system.forces(t, q, v, params)[None]
+        force, manifold = system.forces(t, q, v, params), getattr(system, "manifold", None)
+        return (force if manifold is None else manifold.projection(q, force))[None]
     random = np.random.default_rng(2).uniform(0.2, 1.0, sum(system.constraints.sizes(q, params)))
     return jnp.stack([system.forces_at(jnp.asarray(sign * random))(t, q, v, params) for sign in (1, -1)])
 

@@ -34,13 +34,48 @@ MANY_BYTES = 2**26
 """Saved bytes from which on it is asked whether the memory has room for them."""
 
 
+QUICK = 1e-4
+"""Seconds that a start takes at least to be kept for a run from the same numbers."""
+
+STARTS = 16
+"""Starts of runs of one kind that are kept, of the last ones that were found."""
+
+LARGEST_START = 2**16
+"""Numbers of a state up to which they are."""
+
+
 @dataclass
 class Kind:
-    """Runs of one kind: the plan for them, once there is one, and the engine that has found what it needs for them."""
+    """Runs of one kind: the plan for them, once there is one, the engine that has found what it needs for them, and where runs
+    from the same numbers began."""
 
     runs: int = 0
     plan: Plan | None = None
     engine: Callable | None = None
+    starts: dict[tuple, "Begun"] = field(default_factory=dict)
+
+    def again(self, case: Case, steps: int, save_every: int, asked: int) -> "Begun | None":
+        """The start of a run from the same numbers, of so many steps."""
+        found = self.starts.get(_numbers(case))
+        if found is None:
+            return None
+        steps -= int(case.two_points)
+        problem = found.problem.with_numbers(steps=steps, save_every=save_every, params=case.params)
+        refuse_more_than_memory(problem)
+        return replace(found, case=case, problem=problem, save_every=asked)
+
+    def keep(self, case: Case, found: "Begun", seconds: float) -> None:
+        """Keep a start that took a while."""
+        if seconds < QUICK or found.case is not case or np.size(found.problem.state) > LARGEST_START:
+            return
+        for oldest in list(self.starts)[: max(0, len(self.starts) - STARTS + 1)]:
+            self.starts.pop(oldest, None)
+        self.starts[_numbers(case)] = found
+
+
+def _numbers(case: Case) -> tuple:
+    """Equal for cases of one kind with the same numbers, bit by bit."""
+    return *[a.tobytes() for a in case.data.values()], *bytes_of(case.params), case.h, case.t0
 
 
 _kinds: Memo[Kind] = Memo(128)
@@ -69,6 +104,8 @@ class Begun:
     """What was asked for, which may be more steps than there are."""
     plan: Callable[[], Plan | None]
     """Makes the plan for others of its kind."""
+    engine: Callable | None = field(default=None, kw_only=True)
+    """The engine that ran it, where it is not that of its kind."""
 
 
 def carried_out(
@@ -80,15 +117,19 @@ def carried_out(
     began = time.perf_counter()
     every = _checked_times(case, steps, save_every)
     kind = kind or kind_for(settings, case)
+    if kind is not None and kind.starts and (again := kind.again(case, steps, every, save_every)):
+        return _run(settings, kind, again, steps, progress, entered, began)
     if kind is not None and kind.plan is not None:
         problem = kind.plan.problem(case, steps, every)
         if problem is not None:
             if problem.rows * kind.plan.row_bytes > MANY_BYTES:
                 refuse_more_than_memory(problem)
             found = Begun(case, problem, (), None, False, _no_plan, save_every=save_every)
+            kind.keep(case, found, time.perf_counter() - began)
             return _run(settings, kind, found, steps, progress, entered, began)
     found = _begun(settings, case, steps, every, save_every)
     if kind is not None and not found.traced:
+        kind.keep(case, found, time.perf_counter() - began)
         if kind.plan is not None and not found.redundant:
             kind.plan.learn(bytes_of(case.params))
         kind.runs += 1
@@ -183,10 +224,8 @@ def _run(
         outcome = on.run_traced(problem)
         ready = started
     else:
-        of_kind = None if found.redundant else kind
-        run = (of_kind and of_kind.engine) or on.prepared(problem)
-        if of_kind is not None:
-            of_kind.engine = run
+        holder = found if found.redundant or kind is None else kind
+        run = holder.engine = holder.engine or on.prepared(problem)
         ready = time.perf_counter()
         outcome = _outcome(run, problem, steps, progress)
     for name, rows in (found.rows or {}).items():

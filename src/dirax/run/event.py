@@ -4,7 +4,9 @@ import inspect
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from dirax.text.representation import value_text
 
@@ -12,8 +14,8 @@ KNOWN = ("t", "q", "v", "p", "x", "params")
 """What a function of an event may be given, by the names of its arguments."""
 
 TRACED = (
-    "dx.Event is not looked for under jax.grad, jit and vmap, where how many there are cannot depend on values: run without "
-    "it, and use sol.at(t); dx.Impact is."
+    "dx.Event is not looked for beside dx.Impact under jax.grad, jit and vmap, between the rows of steps that walls divide: give "
+    "one kind of them."
 )
 
 
@@ -29,7 +31,13 @@ class Event:
     Zeros are found inside the steps, on what `sol.at` is there, to a float's precision of the step. The function is looked at in
     rows, at points between them, and at more where it comes near to zero. What is found is each change of sign: a function that
     touches zero and goes back, and one that dips below it for less than 10⁻⁴ of a step, may count as two zeros or as none. At the
-    first row nothing is found, if the function is zero there.
+    first row nothing is found, if the function is zero there. Where steps have neither a polynomial nor the cubic, and in runs of
+    many steps, dips are looked for where a cubic through rows and velocities shows them.
+
+    Under `jax.grad`, `jit` and `vmap` the times and places of events are differentiated: those that are seen by the sign of the
+    function at four points of a step, or one more than a polynomial has stages. `sol.events` then has a place for each of them in
+    the order of time in each trajectory, NaN where there is no event; after a terminal one rows are NaN as well.
+
     Raises `TypeError` for something that is no function of such arguments, `ValueError` for another direction.
     """
 
@@ -105,3 +113,9 @@ def evaluated(event: Event, number: int, known: dict[str, Any], params: Any) -> 
     if not jnp.issubdtype(found.dtype, jnp.floating):
         raise TypeError(f"the function of events[{number}] must return a real number (float64), but its dtype is {found.dtype}.")
     return found
+
+
+def captures_traced(function: Callable, *arguments: Any) -> tuple[Any, bool]:
+    """The shape of what a function returns, and whether it closes over values that JAX traces."""
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    return shape, any(isinstance(value, Tracer) for value in closed.consts)

@@ -4,11 +4,13 @@ import time
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from dirax.program.user_functions import is_traced
-from dirax.run.event import TRACED, Event
-from dirax.run.event_search import EventSearch
+from dirax.run.event import TRACED, Event, captures_traced, evaluated, refuse_unknown
+from dirax.run.event_search import EventSearch, places_for
+from dirax.run.event_traced import with_traced_events
 from dirax.run.impact import Impact
 from dirax.run.impact_run import check_walls, fly_all
 from dirax.run.impact_traced import fly_traced
@@ -26,12 +28,16 @@ def with_events(run: Any, events: tuple[Any, ...], steps: int, save_every: int, 
     Raises `ValueError` under JAX's transformations and for functions that are not finite, `TypeError` for those that return no
     number.
     """
-    if traced:
-        raise ValueError(TRACED)
     watch = any(event.terminal for event in events) and not any(isinstance(event, Impact) for event in events)
-    sol = run(min(steps, FIRST_STRETCH) if watch else steps)
-    if is_traced(sol.t, sol.fields):
-        raise ValueError(TRACED)
+    sol = run(min(steps, FIRST_STRETCH) if watch and not traced else steps)
+    if traced or is_traced(sol.t, sol.fields) or _capture_traced(sol, events):
+        if any(isinstance(event, Impact) for event in events):
+            raise ValueError(TRACED)
+        sol = run(steps) if int(sol.rows) <= steps else sol
+        found = with_traced_events(sol, events, places_for(sol.equation))
+        kept = thinned(found, save_every)
+        kept.events = found.events
+        return kept
     searched = Searched(sol, events)
     searched.go_on(sol)
     while watch and not searched.over and int(sol.stats["steps"]) < steps:
@@ -39,6 +45,19 @@ def with_events(run: Any, events: tuple[Any, ...], steps: int, save_every: int, 
         sol = sol.extend(min(done, steps - done), progress)
         searched.go_on(sol)
     return searched.solution(save_every, steps)
+
+
+def _capture_traced(sol: Solution, events: tuple[Any, ...]) -> bool:
+    """Whether the function of an event closes over values that JAX traces."""
+    nodes = {name: jax.ShapeDtypeStruct(f.shape, float) for name, f in sol.field_info.items() if f.place == "node"}
+    known = nodes | {"t": jax.ShapeDtypeStruct((), float)} | ({"v": nodes["q"]} if "q" in nodes else {})
+    for number, event in enumerate(events):
+        if isinstance(event, Event):
+            refuse_unknown(event, number, nodes)
+            own = {name: known[name] for name in event.arguments if name in known}
+            if captures_traced(lambda own, number=number, event=event: evaluated(event, number, own, sol.params_of_one), own)[1]:
+                return True
+    return False
 
 
 class Searched:
@@ -164,8 +183,12 @@ def run_with_events(
             return carry_out(plain, case, count, 1, progress, kind, entered)
         begun = begin(plain, case, count, 1, 1)
         own = tuple(settings.events[i] for i in walls)
-        check_walls(plain.system, begun.problem, own, tuple(walls))
-        return (fly_traced if begun.traced else fly_all)(plain, begun, own, tuple(walls))
+        captured = check_walls(plain.system, begun.problem, own, tuple(walls))
+        if begun.traced or captured:
+            return fly_traced(plain, begun, own, tuple(walls))
+        sol = fly_all(plain, begun, own, tuple(walls))
+        sol.continuation = lambda _, more, progress: run(count + more)
+        return sol
 
     traced = case.traced or is_traced(case.data, case.params)
     if len(walls) == len(settings.events):

@@ -6,18 +6,23 @@ import numpy as np
 
 from dirax.numerics.brackets import bracketed_roots
 from dirax.program.memo import Same
+from dirax.run.dips import changes, changes_beside_dips, dips
 from dirax.run.event import Event, evaluated, refuse_unknown
+from dirax.run.event_scan import FEWEST, EventScan
 from dirax.solution.dense import Dense
-from dirax.solution.events import Events, joined
+from dirax.solution.events import Events
 
 FEWEST_POINTS = 4
 """Points of a step at which a function is looked at, its beginning among them."""
 
-BLOCK = 2**16
-"""Points that are looked at together."""
+TOGETHER = 1024
+"""Steps that are looked into together: fewer than `StepsAgain` takes machine code for, which has other last digits."""
 
-FINER, LEVELS = 8, 4
-"""Around a place where a function comes near to zero, the points are as many times closer, again and again."""
+
+def places_for(equation: Any) -> int:
+    """Points of a step at which functions are looked at, more of them for a polynomial of high degree."""
+    tableau = getattr(getattr(equation.stages[0][0], "collocation", None), "tableau", None)
+    return max(FEWEST_POINTS, 0 if tableau is None else tableau.stages + 1)
 
 
 class Brackets(NamedTuple):
@@ -37,8 +42,7 @@ class EventSearch:
     def __init__(self, dense: Dense, event: Event, number: int):
         self.dense, self.event, self.number = dense, event, number
         refuse_unknown(event, number, dense.nodes)
-        tableau = getattr(getattr(dense.equation.stages[0][0], "collocation", None), "tableau", None)
-        self.points = max(FEWEST_POINTS, 0 if tableau is None else tableau.stages + 1)
+        self.points = places_for(dense.equation)
 
     def value(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> np.ndarray:
         """The function at base + x, in steps. Raises `ValueError` where it is not finite."""
@@ -55,7 +59,7 @@ class EventSearch:
         """The function at saved rows."""
         fields = {name: self.dense.saved[name][lanes, numbers] for name in self.dense.nodes}
         if "v" in self.event.arguments:
-            fields["v"] = self.dense.velocities[lanes, numbers]
+            fields["v"] = self.dense.velocities(lanes, numbers)
         return self._of(lanes, fields, self.dense.time_at(lanes, numbers, np.zeros(len(numbers))))
 
     def _of(self, lanes: np.ndarray, fields: dict[str, np.ndarray], t: np.ndarray) -> np.ndarray:
@@ -78,34 +82,31 @@ class EventSearch:
 
     def found(self, first: int, last: int) -> Events:
         """The events in the steps from number `first` to before `last`."""
-        size = max(1, BLOCK // (self.points * len(self.dense.ends)))
-        parts = [self._located(self._brackets(at, min(at + size, last))) for at in range(first, last, size)]
-        return joined(parts or [self._located(_none())])
+        lanes, numbers = self._steps(first, last)
+        blocks = [slice(i, i + TOGETHER) for i in range(0, len(lanes), TOGETHER)]
+        parts = [self._brackets(lanes[block], numbers[block]) for block in blocks]
+        return self._located(Brackets(*map(np.concatenate, zip(*parts, strict=True))) if parts else _none())
 
-    def _brackets(self, first: int, last: int) -> Brackets:
-        """The changes of sign in the steps from number `first` to before `last`, and their surroundings where the function comes
-        near to zero."""
+    def _steps(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
+        """(trajectories, numbers) of the steps to be looked into: of many, those in which the scan sees something."""
+        if (last - first) * len(self.dense.ends) >= FEWEST:
+            scan = EventScan(self.dense, self.event, self.number, self.points)
+            if (run := scan.run()) is not None and (found := scan.steps(run, first, last)) is not None:
+                return found
         lanes, numbers = np.nonzero(np.arange(first, last)[None] < self.dense.ends[:, None])
-        if not len(lanes):
-            return _none()
-        numbers = numbers + first
-        values = self._at_points(lanes, numbers)
-        x = np.arange(self.points + 1) / self.points
-        some, at = np.nonzero(_changes(values[:, :-1], values[:, 1:]))
+        return lanes, numbers + first
+
+    def _brackets(self, lanes: np.ndarray, numbers: np.ndarray) -> Brackets:
+        """The changes of sign in these steps, and their surroundings where the function comes near to zero."""
+        values, x = self._at_points(lanes, numbers), np.arange(self.points + 1) / self.points
+        some, at = np.nonzero(changes(values[:, :-1], values[:, 1:]))
         found = [Brackets(lanes[some], numbers[some], x[at], x[at + 1], values[some, at], values[some, at + 1])]
         # dips between points: inside the step, and around its beginning with the last point of the step before
         some, at = np.nonzero(dips(values[:, :-2], values[:, 1:-1], values[:, 2:]))
-        found.append(self._dipped(lanes[some], numbers[some], x[at], x[at + 2]))
-        follows = np.flatnonzero((numbers[1:] == numbers[:-1] + 1) & (lanes[1:] == lanes[:-1])) + 1
-        around = follows[dips(values[follows - 1, -2], values[follows, 0], values[follows, 1])]
-        step = np.full(len(around), 1 / self.points)
-        found.append(self._dipped(lanes[around], numbers[around], -step, step))
-        if first > 0:  # around the first row of the block
-            starts = np.flatnonzero(numbers == first)
-            before = self._at_points(lanes[starts], numbers[starts] - 1)[:, -2]
-            starts = starts[dips(before, values[starts, 0], values[starts, 1])]
-            step = np.full(len(starts), 1 / self.points)
-            found.append(self._dipped(lanes[starts], numbers[starts], -step, step))
+        found.append(self._beside(lanes[some], numbers[some], x[at], x[at + 2]))
+        near = np.flatnonzero((numbers > 0) & dips(self._before(lanes, numbers, values), values[:, 0], values[:, 1]))
+        step = np.full(len(near), 1 / self.points)
+        found.append(self._beside(lanes[near], numbers[near], -step, step))
         return Brackets(*map(np.concatenate, zip(*found, strict=True)))
 
     def _at_points(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
@@ -117,24 +118,19 @@ class EventSearch:
         values[:, -1] = self.at_rows(lanes, numbers + 1)
         return values
 
-    def _dipped(self, lanes: np.ndarray, base: np.ndarray, low: np.ndarray, high: np.ndarray) -> Brackets:
+    def _before(self, lanes: np.ndarray, numbers: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """The function at the last point of the step before each of these, NaN where there is none."""
+        before = np.full(len(lanes), np.nan)
+        follows = np.flatnonzero((numbers[1:] == numbers[:-1] + 1) & (lanes[1:] == lanes[:-1])) + 1
+        before[follows] = values[follows - 1, -2]
+        others = np.flatnonzero(np.isnan(before) & (numbers > 0))
+        before[others] = self.value(lanes[others], numbers[others] - 1, np.full(len(others), 1.0 - 1 / self.points))
+        return before
+
+    def _beside(self, lanes: np.ndarray, base: np.ndarray, low: np.ndarray, high: np.ndarray) -> Brackets:
         """The changes of sign between two places around the one where the function is nearest to zero."""
-        found, parts = [], np.arange(2 * FINER + 1) / (2 * FINER)
-        for _ in range(LEVELS):
-            if not len(lanes):
-                break
-            x = low[:, None] + (high - low)[:, None] * parts
-            count = x.shape[1]
-            values = self.value(np.repeat(lanes, count), np.repeat(base, count), x.ravel()).reshape(x.shape)
-            change = _changes(values[:, :-1], values[:, 1:])
-            some, at = np.nonzero(change)
-            found.append(Brackets(lanes[some], base[some], x[some, at], x[some, at + 1], values[some, at], values[some, at + 1]))
-            left = np.flatnonzero(~change.any(axis=1))
-            lowest = np.clip(np.argmin(np.abs(values[left]), axis=1), 1, count - 2)
-            near = dips(*(values[left, lowest + i] for i in (-1, 0, 1)))
-            left, lowest = left[near], lowest[near]
-            lanes, base, low, high = lanes[left], base[left], x[left, lowest - 1], x[left, lowest + 1]
-        return Brackets(*map(np.concatenate, zip(*found, strict=True))) if found else _none()
+        which, *found = changes_beside_dips(lambda x, which: self.value(lanes[which], base[which], x), low, high)
+        return Brackets(lanes[which], base[which], *found)
 
     def _located(self, brackets: Brackets) -> Events:
         """The events in brackets, of the direction that is asked for."""
@@ -156,17 +152,3 @@ class EventSearch:
 def _none() -> Brackets:
     whole, real = np.zeros(0, np.int64), np.zeros(0)
     return Brackets(whole, whole, real, real, real, real)
-
-
-def _changes(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Where the sign changes; a zero belongs to what comes before it."""
-    return ((before < 0.0) & (after >= 0.0)) | ((before > 0.0) & (after <= 0.0))
-
-
-def dips(before: np.ndarray, middle: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Where a function of one sign is nearest to zero in the middle, and bends so much that it may reach zero beside it, four
-    times as much as a parabola has to."""
-    sign = np.sign(middle)
-    before, middle, after = sign * before, sign * middle, sign * after
-    bend = before - 2.0 * middle + after
-    return (middle > 0.0) & (middle <= before) & (middle <= after) & (middle <= bend / 2.0)

@@ -1,6 +1,7 @@
 """Impact: a wall that the motion bounces off, and what happens to the momentum there."""
 
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import jax
@@ -8,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.program.evaluation.functions import program_of
-from dirax.program.linear_solves import scaled_pseudo_inverse, solve
-from dirax.program.tracing import gradient
+from dirax.program.linear_solves import solve
 from dirax.run.event import names_of
+from dirax.schemes.collision_step import bounced, least_squares
+from dirax.schemes.step import StepEquation
 
 KNOWN = ("t", "q", "params")
 """What the gap may be given, by the names of its arguments."""
@@ -25,8 +27,8 @@ class Impact:
     The step in which a wall is hit is divided (Fetecau, Marsden, Ortiz, West 2003): a step of the scheme of length αh that ends
     on the wall, α found with it; a jump of the momentum along ∂gap/∂q, and along the forces of constraints, so that these hold
     after it too (Rodríguez Abella, Colombo 2025); and a step of (1 − α)h, so that the rows stand at their times. With e = 1 the
-    jump keeps the energy of Lagrangians that are quadratic in v, at walls at rest, and with constraints that are
-    linear in v; and the momentum along every symmetry of the wall.
+    jump keeps the energy at walls at rest and with constraints that are linear in v; and always the momentum along every symmetry
+    of the wall.
 
         ball = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1])
         sol = dx.simulate(ball, dx.LagrangeDAlembert(), events=[dx.Impact(lambda q: q[1])], q=…, v=…, step=0.01, steps=1000)
@@ -62,44 +64,42 @@ class Impact:
         return f"Impact({own}({', '.join(self.arguments)}), restitution={self.restitution:g})"
 
 
-def jump(system: Any, impact: Impact, q: Any, p: Any, t: Any, params: Any) -> Any:
-    """(p⁺, v⁺, speed, share): the momentum and the velocity after an impact; how fast the gap grew before it; and the part
-    of the wall's normal that constraints leave, relative to all of it.
-
-    With M = ∂²L/∂v² and the constraints C v + b = 0: v⁻ on the constraints, and v⁺ = v⁻ − (1 + e)(n·v⁻ + ∂gap/∂t)/(n·d) d with
-    d the projection of M⁻¹n onto ker C, in the metric M.
-    """
-    v = system.complete({"q": q, "p": p, "t": t}, params, False)["v"]
-    metric = system.velocity_hessian(t, q, v, params)
-    normal, rate = gradient(lambda q, t: impact(t, q, params), (0, 1))(q, jnp.asarray(t, float))
-    lifted = free = solve(metric, normal)
-    if system.constraints.any:
-        rows = system.constraints.matrix(t, q, params)
-        forces = solve(metric, rows.T)
-        inverse = scaled_pseudo_inverse(rows @ forces)[0]
-        v = v - forces @ (inverse @ system.constraints.velocity_defect(t, q, v, params))
-        lifted = free - forces @ (inverse @ (rows @ free))
-    speed, size = normal @ v + rate, normal @ lifted
-    after = v - ((1.0 + impact.restitution) * speed / size) * lifted
-    return system.lagrangian_form().legendre(q, after, params, t), after, speed, size / (normal @ free)
+def jump(system: Any, stage: StepEquation, impact: Impact, state: Any, t: Any, h: Any, params: Any) -> Any:
+    """`bounced` off one wall, of constraints that may depend on each other."""
+    now, constraints = stage.state_layout.split(state), system.constraints
+    v = system.complete({"q": now.q, "p": now.p, "t": t}, params, False)["v"]
+    if constraints.any:
+        rows = constraints.matrix(t, now.q, params)
+        forces = solve(system.velocity_hessian(t, now.q, v, params), rows.T)
+        v = v - forces @ least_squares(rows @ forces, constraints.velocity_defect(t, now.q, v, params))
+    return bounced(system, stage, lambda t, q: impact(t, q, params), impact.restitution, state, v, t, h, params)
 
 
 class Numbers:
     """A function of arrays and params, by its scalar program: of one place in floats, of many in NumPy; else compiled."""
 
     def __init__(self, function: Callable, values: list[np.ndarray], params: Any, *key: Any):
-        self.leaves, structure = jax.tree.flatten(params)
-        self.leaves = [np.asarray(leaf, float) for leaf in self.leaves]
+        leaves, structure = jax.tree.flatten(params)
         count = len(values)
 
         def flat(*numbers):
             return function(*numbers[:count], jax.tree.unflatten(structure, numbers[count:]))
 
-        shapes = [jax.ShapeDtypeStruct(np.shape(a), jnp.float64) for a in [*values, *self.leaves]]
+        shapes = [jax.ShapeDtypeStruct(np.shape(a), jnp.float64) for a in [*values, *leaves]]
         found = program_of(flat, shapes, (*key, structure))
         self.program = found[0] if found else None
+        self.of_many = jax.jit(jax.vmap(flat, in_axes=(0,) * count + (None,) * len(leaves)))
+        self._set(params)
+
+    def _set(self, params: Any) -> None:
+        self.leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(params)]
         self.fixed = [x for leaf in self.leaves for x in leaf.ravel().tolist()]
-        self.of_many = jax.jit(jax.vmap(flat, in_axes=(0,) * count + (None,) * len(self.leaves)))
+
+    def of(self, params: Any) -> "Numbers":
+        """The same with other params."""
+        other = copy(self)
+        other._set(params)
+        return other
 
     def one(self, *values: Any) -> np.ndarray:
         """The numbers of the results at one place."""

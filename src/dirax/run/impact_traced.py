@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem
 from dirax.program.given_tangents import implicit
 from dirax.run.impact import Impact, jump
-from dirax.run.impact_run import ON_WALL, PARTS
 from dirax.run.result import solution_of
-from dirax.schemes.step import StepEquation
+from dirax.schemes.step import CLOCK, StepEquation
+from dirax.schemes.watched_step import ON_WALL, PARTS
 from dirax.solution.events import Events
 from dirax.solution.solution import Solution
 from dirax.solution.steps_again import stepped
@@ -40,9 +40,14 @@ class TracedFlight:
         """That of the only part of a step."""
         return self.problem.equation.stages[0][0]
 
+    def time(self, state, t):
+        """The time at a state: t, but where steps have lengths of their own."""
+        layout = self.equation.state_layout
+        return state[layout.place(CLOCK)][0] if CLOCK in layout else t
+
     def gaps(self, t, state, params):
         """Of every wall, (walls,)."""
-        q = state[self.equation.state_layout.place("q")]
+        t, q = self.time(state, t), state[self.equation.state_layout.place("q")]
         return jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in self.walls])
 
     def moved(self, state, u, t, h, params):
@@ -73,7 +78,7 @@ class TracedFlight:
             bounced, guess = self._bounced(there, of_part, wall, t + at * h, h, params)
             state, u = jnp.where(hit, bounced, there), jnp.where(hit, guess, of_part)
             place = self.equation.state_layout.place
-            here = t + at * h, self.number(wall), state[place("q")], state[place("p")]
+            here = self.time(state, t + at * h), self.number(wall), state[place("q")], state[place("p")]
             record = jax.tree.map(lambda a: jnp.where(hit, a, jnp.nan), here)
             return (state, u, at, ~hit), (record, of_part, length * h)
 
@@ -93,19 +98,15 @@ class TracedFlight:
 
     def _bounced(self, state, u, wall, t, h, params):
         """The state after an impact, and a guess of the unknowns after it."""
-        layout = self.equation.state_layout
-        q, p = state[layout.place("q")], state[layout.place("p")]
 
         def off(one: Impact):
             def function():
-                after, v, _, _ = jump(self.system, one, q, p, t, params)
-                _, guess = self.equation.resume({"q": q, "p": after, "v": v, "t": t}, h, params)
+                after, guess, _, _ = jump(self.system, self.equation, one, state, self.time(state, t), h, params)
                 return after, jax.lax.stop_gradient(guess)
 
             return function
 
-        after, guess = jax.lax.switch(wall, [off(one) for one in self.walls])
-        return state.at[layout.place("p")].set(after), guess
+        return jax.lax.switch(wall, [off(one) for one in self.walls])
 
     def _next(self, state, u, t, at, h, params):
         """(θ, wall, whether there is one) of the next impact in what is left of a step."""
@@ -128,7 +129,7 @@ class TracedFlight:
             found = jnp.any(below[:, wall])
             roots.append(jax.lax.cond(
                 found,
-                lambda i=first[wall], f=of_wall, g=values[:, wall]: _bracketed(f, places[i - 1], g[i - 1], places[i], g[i]),
+                lambda i=first[wall], f=of_wall, g=values[:, wall]: bracketed_fall(f, places[i - 1], g[i - 1], places[i], g[i]),
                 lambda: jnp.zeros(()),
             ))  # fmt: skip
             finds.append(found)
@@ -143,7 +144,7 @@ class TracedFlight:
         return jax.lax.cond(hit, theta, lambda: jnp.zeros(())), wall, hit
 
 
-def _bracketed(function, a, fa, b, fb):
+def bracketed_fall(function, a, fa, b, fb):
     """The place between a, where a function is not negative, and b, where it is, through which it falls: by the rule of false
     position that halves the value of an end that stays (Illinois), off a place at which it begins with zero."""
 

@@ -44,9 +44,9 @@ class MethodOneStep(LagrangianStep):
         if "q0" not in data:
             guess = self.unknowns.join(velocity=self.lift.components(data["q"], data["v"]))
             return self.book.start(data["q"], data["p"]), guess
-        if self.rows.count or not self.lift.flat:
+        if self.rows.count:
             raise ValueError("with constraints this scheme starts from q= with v= or p=, not from two points.")
-        q0, u = data["q0"], (data["q1"] - data["q0"]) / h
+        q0, u = data["q0"], self.lift.change(data["q0"], data["q1"]) / h
         at, rate, momentum = self._at_base(u, q0, data.get("t", 0.0), h, params)
         return self.book.start(q0, self.lift.first_momentum(at, rate, momentum, h)), u
 

@@ -1,5 +1,7 @@
 """Collocation: steps of high order whose unknowns are the rates at s nodes, coupled by constant matrices."""
 
+from typing import Any
+
 from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.schemes.collocation_step import LagrangianCollocation, RelationCollocation
 from dirax.schemes.collocation_tables import MOST_STAGES, Tableau, gauss, lobatto
@@ -62,6 +64,9 @@ class Collocation(AbstractScheme):
     def adjoint(self, system: AbstractSystem) -> "Collocation":
         """The scheme itself, for nodes that lie symmetrically."""
         return self
+
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
+        return "the equations of collocation join its stages, which are not saved; what the step preserves is measured instead"
 
     def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         if shape.m + shape.c:

@@ -5,6 +5,7 @@ from typing import Any
 
 from dirax.schemes.adjoint_step import AdjointStep
 from dirax.schemes.composition_coefficients import COEFFICIENTS
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation, StepSequence, make_step_equation
 
 
@@ -69,6 +70,13 @@ class Adjoint(AbstractScheme):
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         return _adjoint_of(self.scheme, system, shape, "Adjoint takes a one-stage scheme: compose the parts' adjoints instead.")
+
+    def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
+        adjoint = self.scheme.adjoint(system)
+        if adjoint is None:
+            name = type(self.scheme).__name__
+            return f"the inverse of a step of {name} has its structure from the last row to the first, which is not measured"
+        return adjoint.discrete_structure(system, shape, step)
 
     @property
     def constraints_at_rows(self) -> bool:

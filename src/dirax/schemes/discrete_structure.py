@@ -5,7 +5,6 @@ states whose change in one step is known.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -77,10 +76,13 @@ class AbstractDiscreteStructure(eqx.Module):
         return f"no relation between the two-forms before and after a step is known for the {self.claims[0].quantity}"
 
     @property
-    def two_form(self) -> tuple[Callable, tuple[str, ...], float] | None:
-        """The two-form (x, params) ↦ (n, n) of the symplectic manifold whose points x the states are, where they are those; with
-        the names of what is saved of a point, and the fraction of a step at which the map has its base point."""
+    def theta(self) -> float | None:
+        """The fraction of a step at which a map that the steps are made by has its base point; None where none does."""
         return None
+
+    def curved(self, n: int) -> bool:
+        """Whether points x (n,) are those of a curved submanifold."""
+        return False
 
     @property
     def own_states(self) -> bool:

@@ -1,6 +1,5 @@
 """The discrete Dirac structures of discretization maps ([BLM] Definition 5.1), on points x and on T*Q of a Lagrangian."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +10,7 @@ from jaxtyping import Array, Float
 from dirax.geometry.cotangent_lift import CotangentLift, cotangent_lift
 from dirax.geometry.finite_difference import annihilator_projector
 from dirax.geometry.maps import AbstractDiscretizationMap
+from dirax.geometry.spaces import AbstractFlat
 from dirax.program.tracing import gradient
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Claim
 from dirax.systems.forms import RelationForm
@@ -47,9 +47,11 @@ class RelationPairs(AbstractDiscreteStructure):
         return (self._name, "multipliers") if self.relation.saved else (self._name,)
 
     @property
-    def two_form(self) -> tuple[Callable, tuple[str, ...], float] | None:
-        form = self.relation.two_form
-        return None if form is None else (form, self.relation.names, self.map.base_fraction)
+    def theta(self) -> float | None:
+        return self.map.base_fraction
+
+    def curved(self, n: int) -> bool:
+        return not isinstance(self.map.manifold(n), AbstractFlat)
 
     @property
     def _name(self) -> str:

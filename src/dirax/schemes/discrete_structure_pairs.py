@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, annihilator_projector
 from dirax.geometry.tulczyjew import FiniteDifferenceTriple, slot_derivatives
 from dirax.numerics.arrays import Data
+from dirax.numerics.tolerances import ONE_FORM_RANK
+from dirax.program.linear_solves import pseudo_inverse
 from dirax.program.tracing import jacobian, once
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian
@@ -173,7 +175,7 @@ class LagrangianPairs(AbstractPairs):
             constraint = constraint if plain else self.constraint(first, *pair, params)
 
         jump = p1 + before1
-        of_jump = jnp.linalg.pinv(matrix).T @ jump if matrix.shape[0] else jnp.zeros(0)
+        of_jump = pseudo_inverse(matrix, ONE_FORM_RANK).T @ jump if matrix.shape[0] else jnp.zeros(0)
         taken = p - p1 + self.share * jump
         if self.system.holonomic is not None:
             m = self.shape.m

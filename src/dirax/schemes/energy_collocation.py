@@ -62,6 +62,9 @@ class EnergyCollocation(AbstractScheme):
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
         return "energy-preserving collocation is no discrete Dirac structure; its energy is measured instead"
 
+    def step_form(self, system: Any, shape: Shape, step: Any) -> str:
+        return "energy-preserving collocation keeps the energy, and no two-form or bivector"
+
     def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         if shape.c:
             raise TypeError(

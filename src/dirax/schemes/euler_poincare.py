@@ -46,6 +46,8 @@ class DiscreteEulerPoincare(AbstractScheme):
         self.map = map
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
+        if shape.m:
+            return "the forces of the constraints are those of the algebra's equations: the steps replayed are these themselves"
         return "D is the graph of a Lie–Poisson bivector: whether a step is a Poisson map is measured instead"
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:

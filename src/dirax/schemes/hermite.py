@@ -6,6 +6,12 @@ from typing import Any
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 
+def cubic(theta: Any, q: Any, after: Any, v: Any, v_after: Any, h: Any) -> Any:
+    """q(θ) of degree 3 with these places and velocities at θ = 0 and 1."""
+    rest, change = 1.0 - theta, after - q
+    return q + theta * (change + rest * ((rest * (h * v - change)) + theta * (change - h * v_after)))
+
+
 def hermite(system: LagrangeDirac) -> Callable:
     """`between` of a StepEquation: q(θ) of degree 3 with q and v of both rows, v = q̇ and p = ∂L/∂v(q, q̇).
 
@@ -16,7 +22,7 @@ def hermite(system: LagrangeDirac) -> Callable:
     def between(theta: Any, row: dict, after: dict, h: Any, params: Any) -> dict:
         rest, change = 1.0 - theta, after["q"] - row["q"]
         bend = (rest * (h * row["v"] - change)) + theta * (change - h * after["v"])
-        q = row["q"] + theta * (change + rest * bend)
+        q = cubic(theta, row["q"], after["q"], row["v"], after["v"], h)
         slope = (change - h * after["v"]) - (h * row["v"] - change)
         v = (change + (rest - theta) * bend + theta * rest * slope) / h
         missed = [end["p"] - system.legendre(end["q"], end["v"], params, end["t"]) for end in (row, after)]

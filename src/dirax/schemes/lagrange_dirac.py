@@ -12,6 +12,7 @@ from dirax.schemes.discrete_structure_pairs import structure_on_pairs
 from dirax.schemes.lagrange_dalembert_part import LagrangeDAlembertPart
 from dirax.schemes.lagrange_dalembert_step import MOMENTA, LagrangeDAlembertStep
 from dirax.schemes.lagrange_poincare_dirac import LagrangePoincareDiracStep
+from dirax.schemes.reduced_step_in_charts import ReducedStepInCharts
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.schemes.step_in_charts import StepInCharts, lagrangian_in_charts
 from dirax.systems.system import AbstractSystem
@@ -47,7 +48,7 @@ class LagrangeDAlembert(AbstractScheme):
     Of a `dx.ManifoldLagrangian` L_d and w_d are on its manifold, functions being of points of R^N, and the equations those of
     T*_{q_k}Q, solved in charts ([RL] §6): R⁻¹_{q0}(q1)/h at q0 ("left") and −R⁻¹_{q1}(q0)/h at q1 ("right") take the place of
     Δq/h, with the retraction R of the manifold, and "midpoint" is the middle of the geodesic with the velocity there.
-    Raises `TypeError` for a manifold without a retraction.
+    Raises `TypeError` for a manifold without a retraction. A run starts from two points of the manifold, q0= and q1=, too.
     """
 
     discrete_lagrangian: str | UserFunction
@@ -177,7 +178,7 @@ class _Part(AbstractScheme):
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         if system.manifold_form() is not None:
-            return _in_charts(self.scheme, system, shape, part=True)
+            return _in_charts(self.scheme, system, shape, part=True).equation()
         return LagrangeDAlembertPart(self.scheme.step_on_q(system, shape)).equation()
 
 
@@ -189,8 +190,10 @@ def _part(scheme: AbstractScheme, general: LagrangeDAlembert, system: AbstractSy
 def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, sign: int = +1) -> StepEquation:
     """The discrete Lagrange–d'Alembert equations of a system on Q, in charts of Q, or on the quotient by its symmetry."""
     if system.manifold_form() is not None:
-        return _in_charts(scheme, system, shape)
+        return _in_charts(scheme, system, shape).equation()
     quotient = system.quotient_form()
+    if quotient is not None and quotient.unreduced().manifold_form() is not None:
+        return ReducedStepInCharts(quotient, _in_charts(scheme, quotient.unreduced(), shape)).equation()
     if quotient is None:
         step = scheme.step_on_q(system, shape)
         # forces that see the multipliers are given those of both ends, which are of the order of the step
@@ -198,9 +201,9 @@ def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, s
     return LagrangePoincareDiracStep(quotient, scheme.step_on_q(quotient.unreduced(), shape), sign).equation()
 
 
-def _in_charts(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, part: bool = False) -> StepEquation:
+def _in_charts(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, part: bool = False) -> StepInCharts:
     local = lagrangian_in_charts(system, scheme.discrete_lagrangian, scheme.constraint)
-    return StepInCharts(local, Atlas(local.manifold), shape, scheme.momentum, part).equation()
+    return StepInCharts(local, Atlas(local.manifold), shape, scheme.momentum, part)
 
 
 def _structure(

@@ -97,7 +97,14 @@ class LagrangePoincareDiracStep(AbstractStep):
         return {"x": here.x, "w": w, "mu": mu, "g": here.g, "vertical": vertical} | row
 
     def start(self, data, h, params):
-        state, u = self.unreduced.start(data, h, params)
+        return self._begun(self.unreduced.start(data, h, params), h)
+
+    def resume(self, data, h, params):
+        return self._begun(self.unreduced.resume(data, h, params), h)
+
+    def _begun(self, on_q, h):
+        """The state and the unknowns of those on Q."""
+        state, u = on_q
         connection, layout = self.system.connection, self.unreduced.unknowns
         x, g = connection.split(self.unreduced.state.split(state).q)
         rate, along = connection.split(layout.split(u).v)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.geometry.manifolds import AbstractManifold
+from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.program.tracing import along, gradient
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -46,6 +46,14 @@ class Lift(NamedTuple):
     def end(self, q0: Array, change: Float[Array, " d"]) -> Float[Array, " N"]:
         """The point that is `change` away from q0 in a local parametrization there, on the manifold to roundoff."""
         return q0 + change if self.flat else self.manifold.local_parametrization(q0)(change)
+
+    def change(self, q0: Array, q1: Array) -> Float[Array, " d"]:
+        """The inverse of `end`; raises `ValueError` for a manifold without a retraction."""
+        if self.flat:
+            return q1 - q0
+        if not isinstance(self.manifold, AbstractGeodesicManifold):
+            raise ValueError(f"{self.manifold!r} has no retraction that joins two points: give q= with v= or p=.")
+        return self.manifold.coordinates(q0, self.manifold.inverse_retraction(q0, q1))
 
     def step(self, q0: Array, u: Float[Array, " d"], t: Any, h: Any) -> Base:
         """The base point of the step whose end is h u away from q0."""
@@ -133,6 +141,9 @@ class ThetaLift(NamedTuple):
 
     def components(self, q: Array, v: Array) -> Float[Array, " n"]:
         return v
+
+    def change(self, q0: Array, q1: Array) -> Float[Array, " n"]:
+        return q1 - q0
 
     def step(self, q0: Array, u: Float[Array, " n"], t: Any, h: Any) -> Base:
         return Base(t + self.theta * h, q0 + self.theta * h * u, u, q0, q0 + h * u)

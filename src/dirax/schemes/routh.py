@@ -51,6 +51,11 @@ class DiscreteRouth(AbstractScheme):
                 f"dx.DiscreteRouth steps a system made by dx.reduce, but a {type(system).__name__} was given: name its "
                 "symmetry, dx.reduce(system, dx.LinearConnection(fibre=[…]))."
             )
+        if quotient.unreduced().manifold_form() is not None:
+            raise TypeError(
+                "dx.DiscreteRouth steps quotients in coordinates, but this one is of a system on a manifold, in charts: step it "
+                "by dx.LagrangeDAlembert, whose trajectory that of Routh's equations is."
+            )
         unreduced = self.lagrange_dalembert.step_on_q(quotient.unreduced(), shape)
         return RouthStep(LagrangePoincareDiracStep(quotient, unreduced)).equation()
 

@@ -20,12 +20,14 @@ from dirax.text.representation import counted, fields_html, module_html, module_
 COMPOSED = ("first", "sum", "mean", "each")
 """How the row of a composed step is made of those of its parts."""
 
-
 CLOCK = "clock"
 """The field of nodes and the part of the state that are the time, where steps have lengths of their own."""
 
 STEP_DENSITY = "step_density"
 """Those that are the step density z, of which the value in the middle of a step sets its length, step/z."""
+
+PART = "part_of_step"
+"""The field of an impact that says where in its step it is, by `step`, of steps that have lengths of their own."""
 
 SHOWN = 200
 """Equations that are named where a step is shown."""
@@ -244,7 +246,7 @@ class AbstractScheme(eqx.Module):
     def step_form(self, system: Any, shape: Shape, step: Any) -> AbstractStepForm | str:
         """The form on its states whose change in one step is known; or why none is."""
         equation = make_step_equation(self, system, shape)
-        return form_of_steps(system, step, equation, self.discrete_structure(system, shape, step))
+        return form_of_steps(system, shape, step, equation, self.discrete_structure(system, shape, step))
 
     @property
     def constraints_at_rows(self) -> bool:

@@ -8,9 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.geometry.charts import RetractionChart
+from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.geometry.structures import canonical_two_form
 from dirax.numerics.arrays import Data
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm, DifferentiatedStep, nonzero
+from dirax.systems.shape import Shape
 
 CONSTANT = 1e-13
 """Relative change of a two-form in one step up to which it is constant."""
@@ -84,59 +87,68 @@ class CanonicalPoints(CanonicalForm):
         return ("x",)
 
 
-class TwoFormOfPoints(RowForm):
-    """Jᵀω(Φ(x))J = ω(x) for a two-form ω on the points x of a final manifold: of a phase-space Lagrangian dα, which the
-    midpoint rule preserves where dα is constant ([BLM] Proposition 6.3, printed: iff α is linear), and no other θ map
-    (Remark 6.4). Relative to ‖|J|ᵀ|ω||J|‖. The state is x.
-    """
+class FormOfPoints(RowForm):
+    """A form on the points x with which the states begin, that D is the graph of. A base class."""
 
-    two_form: Callable = eqx.field(static=True)
+    form: Callable = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
-    theta: float = eqx.field(static=True)
+    theta: float | None = eqx.field(static=True, default=None)
 
     @property
     def reads(self) -> tuple[str, ...]:
         return self.names
 
-    def told(self, numbers: Any, place: str) -> str:
-        return f"‖Jᵀ(ω∘Φ)J − ω‖/‖JᵀωJ‖ of the two-form ω of the final manifold, {place}"
-
     def excuse(self, numbers: Any) -> str:
         if numbers[1] > CONSTANT:
-            return "; ω changes from point to point, and the midpoint rule preserves constant ones ([BLM] Proposition 6.3)"
-        return "" if self.theta == 0.5 else f"; the map with θ = {self.theta} is not symplectic ([BLM] Remark 6.4)"
+            return "; it changes from point to point, and such methods preserve constant ones ([BLM] Proposition 6.3)"
+        return "" if self.theta in (0.5, None) else f"; the map with θ = {self.theta} is not symplectic ([BLM] Remark 6.4)"
+
+    def at_both_ends(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> tuple[Array, Array, Array, Array]:
+        """(the form at x, that at Φ(x), ∂Φ/∂x, how much the form changes relative to its size)."""
+        (state, _), (after, jacobian, _) = self.begins(equation, rows, params), step
+        n = rows[self.names[0]].shape[-1]
+        before, there = self.form(state[:n], params), self.form(after[:n], params)
+        moved = jnp.max(jnp.abs(there - before)) / nonzero(jnp.max(jnp.abs(there)))
+        return before, there, jacobian[:n, :n], moved
+
+
+class TwoFormOfPoints(FormOfPoints):
+    """Jᵀω(Φ(x))J = ω(x) for a two-form ω on points x: of a phase-space Lagrangian dα on its final manifold, which the
+    midpoint rule preserves where dα is constant ([BLM] Proposition 6.3, printed: iff α is linear), and no other θ map
+    (Remark 6.4). Relative to ‖|J|ᵀ|ω||J|‖.
+    """
+
+    def told(self, numbers: Any, place: str) -> str:
+        return f"‖Jᵀ(ω∘Φ)J − ω‖/‖JᵀωJ‖ of the two-form ω whose graph D is, {place}"
 
     def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "3"]:
         """(‖Jᵀ(ω∘Φ)J − ω‖/‖JᵀωJ‖, ‖ω∘Φ − ω‖/‖ω‖, condition number)."""
-        (state, _), (after, jacobian, condition) = self.begins(equation, rows, params), step
-        before, there = self.two_form(state, params), self.two_form(after, params)
+        before, there, jacobian, moved = self.at_both_ends(step, equation, rows, params)
         size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(there) @ jnp.abs(jacobian))
-        moved = jnp.max(jnp.abs(there - before)) / nonzero(jnp.max(jnp.abs(there)))
-        return jnp.stack([jnp.max(jnp.abs(jacobian.T @ there @ jacobian - before)) / nonzero(size), moved, condition])
+        return jnp.stack([jnp.max(jnp.abs(jacobian.T @ there @ jacobian - before)) / nonzero(size), moved, step.condition])
 
 
-class LiePoissonForm(RowForm):
-    """JΛJᵀ = Λ∘Φ for the bivector Λ of a dual: the step Φ is a Poisson map. The state begins with the point x.
+class BivectorOfPoints(FormOfPoints):
+    """JΛ(x)Jᵀ = Λ(Φ(x)) for the bivector Λ whose graph D is: a Poisson map, of a Poisson Λ. Relative to ‖|J||Λ||J|ᵀ‖."""
 
-    Relative to ‖|J||Λ||J|ᵀ‖.
-    """
+    def told(self, numbers: Any, place: str) -> str:
+        return f"‖JΛJᵀ − Λ∘Φ‖/‖JΛJᵀ‖ of the bivector Λ whose graph D is, {place}"
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return ("x",)
+    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "3"]:
+        """(‖JΛJᵀ − Λ∘Φ‖/‖JΛJᵀ‖, ‖Λ∘Φ − Λ‖/‖Λ‖, condition number)."""
+        before, there, jacobian, moved = self.at_both_ends(step, equation, rows, params)
+        size = jnp.max(jnp.abs(jacobian) @ jnp.abs(before) @ jnp.abs(jacobian).T)
+        return jnp.stack([jnp.max(jnp.abs(jacobian @ before @ jacobian.T - there)) / nonzero(size), moved, step.condition])
+
+
+class LiePoissonForm(BivectorOfPoints):
+    """The same for a Lie–Poisson bivector and steps of the group, which preserve it though it is not constant."""
 
     def told(self, numbers: Any, place: str) -> str:
         return f"‖JΛJᵀ − Λ‖/‖JΛJᵀ‖ of the Lie–Poisson bivector, {place}"
 
-    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2"]:
-        """(‖JΛJᵀ − Λ∘Φ‖/‖JΛJᵀ‖, condition number)."""
-        (state, _), (after, jacobian, condition) = self.begins(equation, rows, params), step
-        bivector = self.system.dual.bivector
-        n = self.system.dual.size
-        jacobian, before = jacobian[:n, :n], bivector(state[:n])
-        defect = jnp.max(jnp.abs(jacobian @ before @ jacobian.T - bivector(after[:n])))
-        size = jnp.max(jnp.abs(jacobian) @ jnp.abs(before) @ jnp.abs(jacobian).T)
-        return jnp.stack([defect / nonzero(size), condition])
+    def excuse(self, numbers: Any) -> str:
+        return ""
 
 
 class ChartedForm(RowForm):
@@ -170,19 +182,66 @@ class ChartedForm(RowForm):
         return jnp.stack([jnp.max(jnp.abs(change)) / jnp.max(jnp.abs(last).T @ jnp.abs(form) @ jnp.abs(last)), condition])
 
 
-def form_of_steps(system: Any, step: Any, equation: Any, structure: AbstractDiscreteStructure | str) -> AbstractStepForm | str:
+class AmbientForm(RowForm):
+    """The canonical two-form of T*Q of a manifold Q in R^N whose states begin with (q, p): K'ᵀΩK' = KᵀΩK with the derivative K
+    of (q, p) by coordinates (r, p_r) in the chart at q, and K' = JK. Relative to ‖|K'|ᵀ|Ω||K'|‖."""
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return ("q", "p")
+
+    def told(self, numbers: Any, place: str) -> str:
+        return f"‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖ of (q, p) by the coordinates of a chart, {place}"
+
+    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2"]:
+        """(‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖, condition number)."""
+        manifold, q, p = self.system.manifold_form().manifold, rows["q"][0], rows["p"][0]
+        chart, size = RetractionChart(manifold, q, manifold.frame(q)), 2 * q.shape[0]
+        local = jnp.concatenate(chart.momentum_to_local(q, p))
+        first = jax.jacfwd(lambda z: jnp.concatenate(chart.momentum_to_manifold(*jnp.split(z, 2))))(local)
+        last, form = step.jacobian[:size, :size] @ first, canonical_two_form(size // 2)
+        change = last.T @ form @ last - first.T @ form @ first
+        return jnp.stack([jnp.max(jnp.abs(change)) / jnp.max(jnp.abs(last).T @ jnp.abs(form) @ jnp.abs(last)), step.condition])
+
+
+def form_of_steps(
+    system: Any, shape: Shape, step: Any, equation: Any, structure: AbstractDiscreteStructure | str
+) -> AbstractStepForm | str:
     """The form of the steps of an equation by what the system and the equation say of themselves, or why none is known."""
-    if not isinstance(structure, str):
-        if structure.own_states:
-            return structure.step_form
-        if structure.two_form is not None:
-            return TwoFormOfPoints(system, step, *structure.two_form)
-    fields = equation.stages[0][0].fields
-    constrained = "multipliers" in fields
-    if system.dual is not None and not constrained:
-        return LiePoissonForm(system, step)
-    if not all(stage.canonical for stage, _ in equation.stages):
-        return "the state of this scheme is not (q, p) on T*Q"
+    if not isinstance(structure, str) and structure.own_states:
+        return structure.step_form
+    first = equation.stages[0][0]
+    fields, constrained = first.fields, "multipliers" in first.fields
+    canonical = all(stage.canonical for stage, _ in equation.stages)
+    if system.dual is not None:
+        if constrained:
+            return "the forces of the constraints change the Lie–Poisson bivector"
+        # steps of the group are Poisson maps, others preserve bivectors that are constant
+        kind = LiePoissonForm if "g" in fields else BivectorOfPoints
+        return kind(system, step, lambda x, params: system.dual.bivector(x), ("x",))
     if constrained:
         return structure if isinstance(structure, str) else structure.step_form
-    return (CanonicalPoints if "x" in fields else CanonicalForm)(system, step)
+    if canonical:
+        return (CanonicalPoints if "x" in fields else CanonicalForm)(system, step)
+    if (on_manifold := system.manifold_form()) is not None:
+        if "chart" in fields:
+            return ChartedForm(system, step)
+        if isinstance(on_manifold.manifold, AbstractGeodesicManifold) and list(first.state_layout)[:2] == ["q", "p"]:
+            return AmbientForm(system, step)
+    if not isinstance(structure, str) and structure.curved(shape.n):
+        return "the points x are on a curved submanifold of R^N, and the derivative of a step is one by all of R^N"
+    return _form_of_points(system, shape, step, first, None if isinstance(structure, str) else structure.theta)
+
+
+def _form_of_points(system: Any, shape: Shape, step: Any, equation: Any, theta: float | None) -> AbstractStepForm | str:
+    """That of the points x of a relation, whose D is the graph of one."""
+    relation = system.final_relation(shape) or system.relation_form(shape)
+    if relation is None or not set(relation.names) <= set(equation.fields):
+        return f"the state of this scheme is {equation.state_layout!r}, not (q, p) on T*Q"
+    if relation.two_form is not None:
+        return TwoFormOfPoints(system, step, relation.two_form, relation.names, theta)
+    if relation.bivector is not None:
+        return BivectorOfPoints(system, step, relation.bivector, relation.names, theta)
+    if not relation.dirac:
+        return "an implicit system states no two-form or bivector that a step could preserve"
+    return "D is the graph neither of a two-form nor of a bivector, which a step could preserve"

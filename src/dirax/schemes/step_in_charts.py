@@ -145,6 +145,11 @@ class StepInCharts(AbstractStep):
     # ---------------------------------------------------------------------------------------------------- the start
 
     def start(self, data, h, params):
+        if "q0" in data:
+            here = self.atlas.chart_at(data["q0"])
+            ends = {name: here.to_local(data[name]) for name in ("q0", "q1")}
+            state, u = self.inner.start(data | ends, h, (params, here.base))
+            return self.lifted(here.base, state), u
         here, r, p = self.atlas.enter(data["q"], data["p"])
         inner = {"q": r, "p": p, "v": here.velocity_to_local(data["q"], data["v"])[1], "t": data.get("t", 0.0)}
         state, u = self.inner.start(inner, h, (params, here.base))

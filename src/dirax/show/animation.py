@@ -4,6 +4,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from subprocess import CalledProcessError
 from typing import Any
 
 import numpy as np
@@ -40,26 +41,27 @@ def animate(
 ) -> Path:
     """Write the motion of a solution, or of several side by side, as a moving picture, and return its path.
 
-    The ending of `path` says how: .gif and .webp go round for ever, .mp4 is for lectures and needs the program ffmpeg, .html
-    is the report without verdicts, to be turned about and stopped. `scene` is a `dx.scene.Scene` or a list of its parts, by
-    default that of the gallery's system. The whole run takes `seconds`; for a part of it, animate `sol[t0:t1]`. `size` is in
-    inches of 100 dots. The first trajectories of a batch move together.
+    The ending of `path` says how: .gif and .webp go round for ever, .mp4 is for lectures and needs the program ffmpeg, installed
+    or in the package imageio-ffmpeg, .html is the report without verdicts, to be turned about and stopped. `scene` is a
+    `dx.scene.Scene` or a list of its parts, by default that of the gallery's system. The whole run takes `seconds`; for a part
+    of it, animate `sol[t0:t1]`. `size` is in inches of 100 dots. The first trajectories of a batch move together.
 
-    Raises `ValueError` for another ending, `RuntimeError` where ffmpeg is missing, and what `sol.report` raises.
+    Raises `ValueError` for another ending, `RuntimeError` where ffmpeg is missing or fails, and what `sol.report` raises.
     """
     path = Path(path)
     checked_path(path, ENDINGS, overwrite)
     if path.suffix in (".html", ".htm"):
         return report(solutions, path, scene=scene, verdicts=False)
-    if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
-        raise RuntimeError("an .mp4 needs the program ffmpeg, which is not installed: install it, or write a .webp or .gif.")
+    encoder = _ffmpeg() if path.suffix == ".mp4" else ""
     if not seconds > 0 or not frames_per_second > 0:
         raise ValueError(f"seconds and frames_per_second must be positive, but {seconds!r} and {frames_per_second!r} were given.")
     several = checked_solutions(solutions)
+    from matplotlib import rc_context
+
     count = max(2, round(seconds * frames_per_second))
     beside = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
-        with style():
+        with style(), rc_context({"animation.ffmpeg_path": encoder} if encoder else {}):
             drawing, times = drawn(several, scene, count, size)
             _write(beside, drawing, times, str(several[0].metadata.get("units", {}).get("t", "")), frames_per_second)
         os.replace(beside, path)
@@ -77,6 +79,21 @@ def drawn(several: Sequence[Solution], scene: Any, count: int, size: tuple[float
     motions = frames.motions(chosen, [(run.rows, run.params) for run in runs], count)
     ghosts = [run.ghost and len(runs) > 6 for run in runs]
     return Drawing(chosen, motions, ghosts, size), max((m.t for m in motions), key=len)
+
+
+def _ffmpeg() -> str:
+    """The program that encodes an .mp4. Raises `RuntimeError` where there is none."""
+    if found := shutil.which("ffmpeg"):
+        return found
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe  # type: ignore[import-not-found]
+
+        return get_ffmpeg_exe()
+    except (ImportError, RuntimeError):
+        raise RuntimeError(
+            "an .mp4 needs the program ffmpeg, which is not installed: install it, or `pip install imageio-ffmpeg`, or write a "
+            ".webp or .gif."
+        ) from None
 
 
 def _write(path: Path, drawing: Drawing, times: np.ndarray, unit: str, rate: int) -> None:
@@ -97,9 +114,12 @@ def _write(path: Path, drawing: Drawing, times: np.ndarray, unit: str, rate: int
 
     if path.suffix == ".mp4":
         writer = FFMpegWriter(fps=rate)
-        with writer.saving(drawing.figure, str(path), DOTS):
-            for _ in each():
-                writer.grab_frame(facecolor=drawing.figure.get_facecolor())
+        try:
+            with writer.saving(drawing.figure, str(path), DOTS):
+                for _ in each():
+                    writer.grab_frame(facecolor=drawing.figure.get_facecolor())
+        except (OSError, CalledProcessError) as error:
+            raise RuntimeError(f"ffmpeg ({writer.bin_path()}) failed: {error}; write a .webp or .gif instead.") from error
         return
     if path.suffix == ".gif":  # the last frame has all colours, those of the trails too
         drawing.at(len(times) - 1)

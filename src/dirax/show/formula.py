@@ -19,6 +19,9 @@ LONGEST = 420
 
 NODES = 4000
 
+WIDE = 29
+"""Most letters of a term that is kept on one line; a line may break inside the parentheses of a longer one."""
+
 SPACE = '<mspace width="0.17em"></mspace>'
 
 GREEK = {
@@ -95,8 +98,9 @@ def of_params(params: Any) -> Any:
 
 
 def formulas(function: Callable, values: Sequence[Any], names: Sequence[Any]) -> list["list[Written]"] | None:
-    """Every entry of function(*values), raveled, as the list of its terms, with the symbols `names` for the entries of the
-    values (arrays of Written, in trees alike; the last value are the parameters); None where it is not readable."""
+    """Every entry of function(*values), raveled, as the list of its pieces, between which a line can break, with the symbols
+    `names` for the entries of the values (arrays of Written, in trees alike; the last value are the parameters); None where it
+    is not readable."""
     leaves, structure = jax.tree.flatten(tuple(values))
     marks = jax.tree.leaves(tuple(names), is_leaf=lambda x: isinstance(x, np.ndarray))
     try:
@@ -117,14 +121,14 @@ def formulas(function: Callable, values: Sequence[Any], names: Sequence[Any]) ->
     parameters = sum(np.size(mark) for mark in marks) - sum(np.size(name) for name in names[:-1])
     writer = _Writer(graph, table, parameters)
     try:
-        return [writer.terms(int(node)) for node in np.ravel(result)]
+        return [writer.pieces(int(node)) for node in np.ravel(result)]
     except (NotReadable, RecursionError):
         return None
 
 
-def joined(terms: Sequence[Written]) -> Written:
-    """Terms, each with its sign, as one formula."""
-    return Written("".join(term.text for term in terms), "".join(term.mathml for term in terms), tight=len(terms) < 2)
+def joined(pieces: Sequence[Written]) -> Written:
+    """Pieces as one formula."""
+    return Written("".join(one.text for one in pieces), "".join(one.mathml for one in pieces), tight=len(pieces) < 2)
 
 
 class _Writer:
@@ -137,22 +141,60 @@ class _Writer:
 
     def terms(self, node: int) -> list[Written]:
         """The terms of a sum, each with its sign, positive ones first."""
+        parts = self._parts(node)
+        written = [_signed(k, factor, self._fraction(abs(factor), powers)) for k, (factor, powers) in enumerate(parts)]
+        if sum(len(part.text) for part in written) > LONGEST:
+            raise NotReadable
+        return written
+
+    def pieces(self, node: int) -> list[Written]:
+        """The same, with long terms in pieces."""
+        self.terms(node)  # of a length that can be read
+        found = []
+        for k, (factor, powers) in enumerate(self._parts(node)):
+            first, *rest = self._broken(abs(factor), powers)
+            found += [_signed(k, factor, first), *rest]
+        return found
+
+    def _parts(self, node: int) -> list[tuple[float, tuple[tuple[int, int], ...]]]:
+        """The terms of a sum as numbers and powers."""
         like: dict[tuple, float] = {}
         for sign, one in self._summands(node, 1.0):
             factor, powers = self._product(sign, one)
             like[powers] = like.get(powers, 0.0) + factor
         parts = [(factor, powers) for powers, factor in like.items() if factor] or [(0.0, ())]
-        parts.sort(key=lambda part: (part[0] < 0, self._place(part[1])))
-        written = []
-        for k, (factor, powers) in enumerate(parts):
-            body = self._fraction(abs(factor), powers)
-            minus, plus = ("−", "") if k == 0 else (" − ", " + ")
-            sign = minus if factor < 0 else plus
-            mark = f'<mo form="{"prefix" if k == 0 else "infix"}">{sign.strip()}</mo>' if sign else ""
-            written.append(Written(sign + body.text, mark + body.mathml, tight=k == 0 and factor > 0 and body.tight))
-        if sum(len(part.text) for part in written) > LONGEST:
-            raise NotReadable
-        return written
+        return sorted(parts, key=lambda part: (part[0] < 0, self._place(part[1])))
+
+    def _broken(self, factor: float, powers: tuple[tuple[int, int], ...]) -> list[Written]:
+        """A product in pieces: a long one parted inside the longest parentheses that it has above the line."""
+        whole = self._fraction(factor, powers)
+        fences = {(node, n): fence for node, n in powers if n > 0 and (fence := self._fence(node, n)) is not None}
+        if len(whole.text.replace("\u0307", "")) <= WIDE or not fences:
+            return [whole]
+        longest = max(fences, key=lambda power: len(self._power(*power).text))
+        opening, inside, closing = fences[longest]
+        rest = tuple(power for power in powers if power != longest)
+        first, *others = [piece for argument in inside for piece in self.pieces(argument)]
+        pieces = [joined([opening, first]), *others]
+        pieces[-1] = joined([pieces[-1], closing])
+        if factor == 1 and not rest:
+            return pieces
+        *front, last = self._broken(factor, rest)
+        return [*front, joined([last, Written(" ", SPACE), pieces[0]]), *pieces[1:]]
+
+    def _fence(self, node: int, n: int) -> tuple[Written, list[int], Written] | None:
+        """What opens and closes the parentheses of a power, and the nodes of what is inside; None where it has none."""
+        op, args = self.graph.op[node], self.graph.args[node]
+        bracket = lambda mark: f'<mo stretchy="false">{mark}</mo>'
+        raised, exponent = (f"<msup>{bracket(')')}<mn>{n}</mn></msup>", _exponent(n)) if n != 1 else (bracket(")"), "")
+        if op in ("add", "sub"):
+            return Written("(", bracket("(")), [node], Written(f"){exponent}", raised)
+        if op == "sqrt" and n == 1:
+            return Written("√(", f"<mo>√</mo>{bracket('(')}"), [args[0]], Written(")", raised)
+        if op in FUNCTIONS and len(args) == 1 and args[0] not in self.table and n == 1:
+            name = FUNCTIONS[op]
+            return Written(f"{name}(", f"<mi>{name}</mi>{bracket('(')}"), [args[0]], Written(")", raised)
+        return None
 
     def written(self, node: int) -> Written:
         if node not in self.known:
@@ -188,6 +230,9 @@ class _Writer:
                 factor = factor * value**n if value or n > 0 else math.inf
             else:
                 powers[node] = powers.get(node, 0) + n
+        for base, n in list(powers.items()):  # x/√x = √x
+            if self.graph.op[base] == "sqrt" and n * powers.get(inside := self.graph.args[base][0], 0) < 0:
+                powers[inside], powers[base] = divmod(2 * powers[inside] + n, 2)
         for base, n in powers.items():
             if n and self.graph.op[base] in ("add", "sub") and self.written(base).text == "0":  # terms that cancel
                 factor = 0.0 if n > 0 else math.inf
@@ -229,7 +274,7 @@ class _Writer:
 
     def _power(self, node: int, n: int) -> Written:
         op, args = self.graph.op[node], self.graph.args[node]
-        exponent = (f"^{n}" if n > 9 else "⁰¹²³⁴⁵⁶⁷⁸⁹"[n]) if n != 1 else ""
+        exponent = _exponent(n) if n != 1 else ""
         raised = lambda m: f"<msup><mrow>{m}</mrow><mn>{n}</mn></msup>" if n != 1 else m
         if node in self.table:
             name = self.table[node][1]
@@ -262,6 +307,18 @@ class _Writer:
             group = inner.grouped()
             return Written(group.text + exponent, raised(group.mathml))
         raise NotReadable
+
+
+def _signed(place: int, factor: float, body: Written) -> Written:
+    """A term of a sum with its sign."""
+    minus, plus = ("−", "") if place == 0 else (" − ", " + ")
+    sign = minus if factor < 0 else plus
+    mark = f'<mo form="{"prefix" if place == 0 else "infix"}">{sign.strip()}</mo>' if sign else ""
+    return Written(sign + body.text, mark + body.mathml, tight=place == 0 and factor > 0 and body.tight)
+
+
+def _exponent(n: int) -> str:
+    return f"^{n}" if n > 9 else "⁰¹²³⁴⁵⁶⁷⁸⁹"[n]
 
 
 def _texts(terms: Sequence[Written]) -> tuple[str, str]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.show.arrays import Arrays
-from dirax.show.scene import Part, Scene, axes, path, point
+from dirax.show.scene import Part, Reading, Scene, axes, path, point
 from dirax.show.turns import quaternions
 
 FRAMES = 10_000
@@ -135,8 +135,16 @@ def _along(places: list[tuple[Callable, tuple[str, ...]]], frames: dict[str, np.
     rows = {name: np.asarray(frames[name], float) for name in sorted(needed)}
 
     def at(row: dict[str, Any], params: Any) -> list[Any]:
-        known = {**row, "params": params}
-        return [place(*(known[name] for name in names)) for place, names in places]
+        known, found = {**row, "params": params}, dict[int, Any]()
+
+        def value(place: Callable, names: tuple[str, ...]) -> Any:
+            if id(place) not in found:
+                given = [known[name] for name in names]
+                whole = place.read(value(place.whole, names), params) if isinstance(place, Reading) else place(*given)
+                found[id(place)] = whole
+            return found[id(place)]
+
+        return [value(place, names) for place, names in places]
 
     if not places:
         return []

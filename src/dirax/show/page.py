@@ -165,8 +165,7 @@ def equations_html(sol: Solution) -> str:
     """The system in formulas, empty where there are no short ones."""
     equal = Written("=", "<mo>=</mo>")
     rows = [
-        f'<div class="equation">{math([equation.left])} {math([equal, *equation.right])}</div>'
-        for equation in statement.equations(sol)
+        f'<div class="equation">{math([*equation.left, equal, *equation.right])}</div>' for equation in statement.equations(sol)
     ]
     return f'<div class="equations" role="group" aria-label="The system">{"".join(rows)}</div>' if rows else ""
 

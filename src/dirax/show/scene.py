@@ -45,6 +45,18 @@ VIEWS = {"oblique": (0.55, -0.75, 0.45), "front": (0.0, -1.0, 0.0), "above": (0.
 
 
 @dataclass(frozen=True)
+class Reading:
+    """A place that is read from what many have in common, such as the frames of all bodies, which is computed once for all of
+    them: read(whole(q, params), params)."""
+
+    whole: Callable
+    read: Callable
+
+    def __call__(self, q: Any, params: Any) -> Any:
+        return self.read(self.whole(q, params), params)
+
+
+@dataclass(frozen=True)
 class Part:
     """One body: its kind, its places by name, and plain settings (lengths, None for one that suits the picture)."""
 

@@ -20,9 +20,9 @@ MATRICES = {"J": "J", "R": "R", "B": "B", "metric": "g"}
 
 @dataclass(frozen=True)
 class Equation:
-    """left = right, with the terms of the right side one by one so that a line can break between them."""
+    """left = right, each side in pieces between which a line can break."""
 
-    left: Written
+    left: tuple[Written, ...]
     right: tuple[Written, ...]
 
 
@@ -151,7 +151,7 @@ class _Formulas:
 
     def scalar(self, left: str, function: Callable | None, arguments: Sequence[str]) -> Equation | None:
         found = self.of(function, arguments)
-        return Equation(symbol(left), tuple(found[0])) if found and len(found) == 1 else None
+        return Equation((symbol(left),), tuple(found[0])) if found and len(found) == 1 else None
 
     def entries(self, left: str, function: Callable, arguments: Sequence[str]) -> list[Equation]:
         found = self.of(function, arguments) or []
@@ -159,13 +159,15 @@ class _Formulas:
         if len(found) != len(names):
             return []
         labels = [f"{left}_{name.text}" for name in names]
-        return [Equation(symbol(label), tuple(terms)) for label, terms in zip(labels, found, strict=True) if terms[0].text != "0"]
+        return [
+            Equation((symbol(label),), tuple(terms)) for label, terms in zip(labels, found, strict=True) if terms[0].text != "0"
+        ]
 
     def vanishing(self, function: Callable, arguments: Sequence[str]) -> list[Equation]:
         """left = 0 for every entry."""
         found = self.of(function, arguments) or []
         zero = Written("0", "<mn>0</mn>")
-        return [Equation(joined(terms), (zero,)) for terms in found[:8]]
+        return [Equation(tuple(terms), (zero,)) for terms in found[:8]]
 
     def matrix(self, left: str, function: Callable, arguments: Sequence[str]) -> list[Equation]:
         found = self.of(function, arguments)
@@ -177,4 +179,4 @@ class _Formulas:
         rows = [whole[i : i + columns] for i in range(0, len(whole), columns)]
         table = "".join("<mtr>" + "".join(f"<mtd>{w.mathml}</mtd>" for w in row) + "</mtr>" for row in rows)
         text = "; ".join(", ".join(w.text for w in row) for row in rows)
-        return [Equation(symbol(left), (Written(f"[{text}]", f"<mo>(</mo><mtable>{table}</mtable><mo>)</mo>"),))]
+        return [Equation((symbol(left),), (Written(f"[{text}]", f"<mo>(</mo><mtable>{table}</mtable><mo>)</mo>"),))]

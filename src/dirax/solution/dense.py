@@ -1,5 +1,6 @@
 """Between the rows of a run: the fields at any time, by what the scheme says of the inside of a step."""
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -10,11 +11,9 @@ import numpy as np
 from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
 from dirax.schemes.step import CLOCK, STEP_DENSITY
+from dirax.solution.divided_steps import AT_ROW, DividedSteps, step_for
 from dirax.solution.steps_again import Entries, Keyed, StepsAgain, begun, compiled_call, row_of, stepped
 from dirax.solution.trajectory import Trajectory, last_rows
-
-AT_ROW = 1e-12
-"""Part of a step by which a time may lie off a saved row and still be at it, where steps of a part are taken."""
 
 SHORT = 1e-3
 """Part of a step from which on there is no doubt that it can be solved."""
@@ -112,25 +111,37 @@ class Dense:
         return compiled_call(whole, rows, steps, jax.tree.map(jnp.asarray, sol.params), times, numbers, t0, h)
 
     def _at_one(self, row, after, of_step, time, t, h, params) -> dict[str, Any]:
-        theta, system, end = (time - t) / h, self.sol.system, t + h
-        if CLOCK in row:
-            t, end = row[CLOCK], after[CLOCK]
-            theta = (time - t) / (end - t)
-        if self.interpolate is None and self.between is not None:
-            row, after = ({**a, "t": s, "v": _velocity(system, a, s, params)} for a, s in ((row, t), (after, end)))
-            return {name: a for name, a in self.between(theta, row, after, h, params).items() if name in self.nodes}
-        state, guess = begun(self.equation, system, row | of_step, t, h, params)
-        if self.interpolate is not None:
-            _, (u,), _ = stepped(self.equation, state, guess, t, h, params)
-            found = self.interpolate(theta, u, state, t, h, params)
-            return {name: found.get(name, row[name]) for name in row}
-        part = jnp.maximum(theta, AT_ROW) * h
-        if CLOCK in row:
-            part = _step_for(part / h, row[STEP_DENSITY], end - t, h)
-        state, u, _ = stepped(self.equation, state, guess, t, part, params)
-        _, unknowns, states = stepped(self.equation, state, u, t + part, h, params)
-        made = row_of(self.equation, unknowns, states, t + part, h, params)
-        return {name: jnp.where(theta > AT_ROW, made[name], row[name]) for name in row}
+        begins, ends = row.get(CLOCK, t), after.get(CLOCK, t + h)
+        length = ends - begins if CLOCK in row else h
+        return self.inside_one(row, after, of_step, t, h, params)((time - begins) / length)
+
+    def inside_one(self, row, after, of_step, t, h, params) -> Callable:
+        """θ ↦ the fields of nodes at a part θ of the step between two rows, with the fields of the step, as JAX traces them."""
+        system, begins, ends = self.sol.system, row.get(CLOCK, t), after.get(CLOCK, t + h)
+        if self.interpolate is None and (between := self.between) is not None:
+            both = ({**a, "t": s, "v": _velocity(system, a, s, params)} for a, s in ((row, begins), (after, ends)))
+            first, last = both
+            return lambda theta: {n: a for n, a in between(theta, first, last, h, params).items() if n in self.nodes}
+        state, guess = begun(self.equation, system, row | of_step, begins, h, params)
+        if (interpolate := self.interpolate) is not None:
+            _, (u,), _ = stepped(self.equation, state, guess, begins, h, params)
+
+            def by_polynomial(theta):
+                found = interpolate(theta, u, state, begins, h, params)
+                return {name: found.get(name, row[name]) for name in row}
+
+            return by_polynomial
+
+        def by_step(theta):
+            part = jnp.maximum(theta, AT_ROW) * h
+            if CLOCK in row:
+                part = step_for(part / h, row[STEP_DENSITY], ends - begins, h)
+            there, u, _ = stepped(self.equation, state, guess, begins, part, params)
+            _, unknowns, states = stepped(self.equation, there, u, begins + part, h, params)
+            made = row_of(self.equation, unknowns, states, begins + part, h, params)
+            return {name: jnp.where(theta > AT_ROW, made[name], row[name]) for name in row}
+
+        return by_step
 
     # ------------------------------------------------------------------------------------------ of numbers
 
@@ -161,14 +172,15 @@ class Dense:
         """The number of the last step + 1 that each trajectory reached, (B,)."""
         return self.counts[np.maximum(last_rows([self.saved[name] for name in self.nodes]), 0)]
 
-    @cached_property
-    def velocities(self) -> np.ndarray:
-        """v at every saved row, (B, rows, n)."""
-        batch, rows = self.saved["q"].shape[:2]
-        lanes = np.repeat(np.arange(batch), rows)
-        flat = {name: a.reshape(batch * rows, *a.shape[2:]) for name, a in self.saved.items() if name in self.nodes}
-        v = self.velocity(lanes, flat, np.broadcast_to(np.asarray(self.sol.t), (batch, rows)).ravel())
-        return v.reshape(batch, rows, -1)
+    def velocities(self, lanes: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """v at saved rows, (entries, n)."""
+        size = self.saved["q"].shape[1]
+        own, which = np.unique(lanes * size + rows, return_inverse=True)
+        lanes, rows = own // size, own % size
+        fields = {name: self.saved[name][lanes, rows] for name in self.nodes}
+        return self.velocity(lanes, fields, np.broadcast_to(np.asarray(self.sol.t), self.saved["q"].shape[:2])[lanes, rows])[
+            which
+        ]
 
     def velocity(self, lanes: np.ndarray, fields: dict[str, np.ndarray], t: np.ndarray) -> np.ndarray:
         """The velocities that belong to q and p."""
@@ -197,15 +209,15 @@ class Dense:
         sol, again = self.sol, self.again
         h = np.full(len(theta), float(sol.step))
         t = self.time_at(lanes, numbers, 0.0)
-        if sol.impacts is not None and np.any(hit := self._is_divided(lanes, numbers)):
-            return self._with_impacts(lanes, numbers, theta, hit)
+        if sol.impacts is not None and np.any(hit := self.divided.among(lanes, numbers)):
+            return self.divided.inside(lanes, numbers, theta, hit)
         if self.interpolate is not None:
             states, u = again.at(lanes, numbers)
             interpolate = self.interpolate
             function = lambda values, params: interpolate(*values, params)
             return self.entries(function, lanes, (theta, u, states, t, h), "interpolate", *again.key)
         if self.between is not None:
-            pick = lambda at: {name: self.saved[name][lanes, at] for name in self.nodes} | {"v": self.velocities[lanes, at]}
+            pick = lambda at: {name: self.saved[name][lanes, at] for name in self.nodes} | {"v": self.velocities(lanes, at)}
             rows = [pick(numbers + i) | {"t": self.time_at(lanes, numbers + i, 0.0)} for i in (0, 1)]
             between = self.between
             function = lambda values, params: between(*values, params)
@@ -213,45 +225,9 @@ class Dense:
         return self._by_steps(lanes, numbers, theta, t, h)
 
     @cached_property
-    def _divided(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of every impact: trajectory, number of the step, and where in it."""
-        hits = self.sol.impacts
-        at = (hits.t - float(self.sol.axis[0])) / float(self.sol.step)
-        return hits.lane, np.floor(at).astype(np.int64), at - np.floor(at)
-
-    def _is_divided(self, lanes: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        """Which of these steps have an impact in them."""
-        of_lanes, of_steps, _ = self._divided
-        size = int(self.counts[-1]) + 1
-        return np.isin(lanes * size + numbers, of_lanes * size + of_steps)
-
-    def _with_impacts(self, lanes: np.ndarray, numbers: np.ndarray, theta: np.ndarray, hit: np.ndarray) -> dict[str, np.ndarray]:
-        """The fields inside steps, some of which walls divide: by the scheme's own step from the last impact before."""
-        sol, layout = self.sol, self.equation.stages[0][0].state_layout
-        found = {name: a[lanes, numbers].astype(float) for name, a in self.saved.items() if name in self.nodes}
-        if not np.all(hit):
-            for name, values in self.inside(lanes[~hit], numbers[~hit], theta[~hit]).items():
-                if name in found:
-                    found[name][~hit] = values
-        some = np.flatnonzero(hit)
-        of_lanes, of_steps, places = self._divided
-        row, begins = {name: a[some] for name, a in found.items()}, np.zeros(len(some))
-        for i, at in enumerate(some):
-            before = np.flatnonzero((of_lanes == lanes[at]) & (of_steps == numbers[at]) & (places <= theta[at]))
-            if len(before):
-                begins[i] = places[before[-1]]
-                for name in ("q", "p"):
-                    row[name][i] = sol.impacts.fields[name][before[-1]]
-        t, part = self.time_at(lanes[some], numbers[some], begins), theta[some] - begins
-        states, u = self.again.begin(lanes[some], row, t)
-        moved = part > AT_ROW
-        if np.any(moved):
-            h = part[moved] * float(sol.step)
-            states[moved] = self.again.step(lanes[some][moved], states[moved], u[moved], t[moved], h)[0]
-        for name in ("q", "p", "work"):
-            if name in found:
-                found[name][some] = states[:, layout.place(name)].reshape(found[name][some].shape)
-        return found
+    def divided(self) -> DividedSteps:
+        """The steps that walls divide."""
+        return DividedSteps(self)
 
     def _by_steps(self, lanes, numbers, theta, t, h) -> dict[str, np.ndarray]:
         nearest = numbers + (theta > 0.5)
@@ -264,7 +240,7 @@ class Dense:
             if self.sol.has_own_times:
                 at = numbers[off]
                 length = self.time_at(lanes, at + 1, 0.0) - t
-                part = _step_for(part / h[off], self.saved[STEP_DENSITY][lanes, at], length, h[off])
+                part = step_for(part / h[off], self.saved[STEP_DENSITY][lanes, at], length, h[off])
             states, u = self.again.at(lanes, numbers[off])
             states, u = self.again.step(lanes, states, u, t, part)
             made = self.again.row(lanes, states, u, t + part)
@@ -329,11 +305,6 @@ class Dense:
                 f"sol.at takes times inside the run, from {first:.6g} to {last:.6g}, but {times[outside].flat[0]!r} is not among "
                 "them: run more steps, or go on with sol.extend(steps)."
             )
-
-
-def _step_for(theta: Any, density: Any, length: Any, h: Any) -> Any:
-    """The step of variable steps that lasts θ of the `length` that the step of h from a place of this density lasts."""
-    return theta * length * density * h / (h - theta * (h - density * length))
 
 
 def _velocity(system: Any, row: dict, t: Any, params: Any) -> Any:

@@ -1,6 +1,7 @@
 """What was run, as plain data that goes into a file: parameters and schemes. Reading it back executes nothing but dirax."""
 
 import dataclasses
+from importlib import import_module
 from typing import Any
 
 import jax
@@ -76,6 +77,7 @@ def decode_scheme(record: Any) -> AbstractScheme | None:
     if record is None:
         return None
     try:
+        import_module("dirax.public")  # every class that a file may name is known then, whatever was used before
         scheme = _decode_setting(record, _classes(RECORDS))
     except NotPlain:
         return None

@@ -84,21 +84,30 @@ def plot_coordinate(sol: Any, i: int | str = 0, *, field: str = "q", ax: "Axes |
 
 
 @style()
-def plot_energy(sol: Any, *, figure: "Figure | None" = None, **line: Any) -> "Figure":
-    """The energy against time, and beside it its error |E − E(0)| / |E(0)| on a logarithmic scale (absolute if E(0) = 0)."""
-    if figure is None:
-        figure, (left, right) = new_figure(1, 2, size=(9.2, 3.4))
+def plot_energy(sol: Any, *, figure: "Figure | None" = None, ax: Any = None, **line: Any) -> "Figure":
+    """The energy against time, and beside it its error |E − E(0)| / |E(0)| on a logarithmic scale (absolute if E(0) = 0).
+
+    `ax`: an Axes for the energy alone, or two for both.
+    """
+    if ax is not None:
+        axes = list(np.ravel(ax))
+    elif figure is not None:
+        axes = list(figure.axes if figure.axes else figure.subplots(1, 2))
     else:
-        left, right = figure.axes if figure.axes else figure.subplots(1, 2)
+        axes = list(new_figure(1, 2, size=(9.2, 3.4))[1])
+    left, *others = axes
+    right = others[0] if others else None
     energies = np.atleast_2d(np.asarray(sol.energy()))
     for t, values, kwargs in zip(sol.times, energies, _lines(len(energies), line), strict=True):
         left.plot(t, values, **kwargs)
-        plot_error(right, t, values, **kwargs)
+        if right is not None:
+            plot_error(right, t, values, **kwargs)
     relative = bool(np.all(energies[:, 0] != 0))
     unit = sol.metadata.get("units", {}).get("energy", "")
     left.set(xlabel=time_label(sol), ylabel=label("energy $E$", unit))
-    right.set(xlabel=time_label(sol), ylabel=ENERGY_ERROR if relative else label("$|E - E_0|$", unit))
-    return figure
+    if right is not None:
+        right.set(xlabel=time_label(sol), ylabel=ENERGY_ERROR if relative else label("$|E - E_0|$", unit))
+    return left.figure  # type: ignore[return-value]
 
 
 @style()

@@ -10,6 +10,7 @@ import numpy as np
 from dirax.geometry.group_retractions import coadjoint
 from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.numerics.tolerances import GROUP_DEFECT
+from dirax.program.evaluation.functions import in_numpy
 from dirax.program.user_functions import is_traced
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.routh import DiscreteRouth
@@ -23,7 +24,8 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     equations on Q × Q it satisfies (of Routh's, `dx.LagrangeDAlembert`).
 
     Of a system made by `dx.reduce`: q = (x, g) with g_{k+1} = g_k + ω_d + A(x_{k+1} − x_k), p = (w − h*_{d,Σ}(μ), μ)
-    ([RL] §4), multipliers those of the one-forms at q, work as it was. Of a `dx.EulerPoincare` or `dx.LiePoisson` system: q
+    ([RL] §4), multipliers those of the one-forms at q, work as it was; on Σ × G with a group that is not abelian
+    g_{k+1} = g_k h⁰_d v, with the vertical part v. Of a `dx.EulerPoincare` or `dx.LiePoisson` system: q
     the group element g_k = g0 f_0 ⋯ f_{k−1} (N,), p the covector at it with the body momentum μ, `spatial_momentum`
     Ad*_{g⁻¹} μ (d,), and the reduced fields as they were; `g0` is an element (N,), a matrix (k, k), in a batch also (B, N),
     or the identity, as for a run that started from q=.
@@ -41,13 +43,13 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
         )
     if g0 is not None:
         raise ValueError("g0 is for systems on a Lie group: here the initial data name the group coordinate already.")
-    reduced = ("x", "w", "mu", "g", "vertical")
-    lifted = _each_row(solution, system.unreduced_row, reduced[:-1])
+    reduced = (*system.own_fields, "vertical")
+    lifted = _each_row(solution, system.unreduced_row, system.own_fields)
     lifted |= {name: a for name, a in solution.fields.items() if name not in reduced}
     if system.system.one_forms is not None:
         lifted["multipliers"] = _multipliers_at(solution, lifted["q"])
     n = lifted["q"].shape[-1]
-    info = {"q": Field((n,)), "p": Field((n,))}
+    info = {"q": Field((n,)), "p": Field((n,)), "chart": Field((n,))}
     about = {name: info.get(name) or solution.field_info[name] for name in lifted}
     whole = _lifted(solution, system.system, lifted, about)
     whole.scheme = jax.tree.map(_on_q, solution.scheme, is_leaf=lambda part: isinstance(part, DiscreteRouth))
@@ -70,8 +72,8 @@ def _multipliers_at(solution: Solution, q: Any) -> Any:
 
     def at(t, q, given, params):
         fixed, moved = (
-            system.constraints.one_forms_at(t, point, params)[kept]
-            for point in (system.connection.join(system.connection.split(q)[0], jnp.zeros(len(system.connection.fibre))), q)
+            system.at_identity(point, system.constraints.one_forms_at(t, point, params)[kept])
+            for point in (system.origin_of(q), q)
         )
         force = moved @ (fixed.T @ given[kept])
         return given.at[kept].set(jnp.linalg.solve(moved @ moved.T, force))
@@ -128,9 +130,17 @@ def _element(group: AbstractLieGroup, g0: Any, batch: int | None) -> jax.Array:
 
 
 def _each_row(solution: Solution, function: Callable, names: tuple[str, ...]) -> dict[str, Any]:
-    for _ in range(np.ndim(solution.fields["x"]) - 1):
+    """`function(row)` of every row, in NumPy where it has a scalar program."""
+    rows = {name: solution.fields[name] for name in names}
+    lead = np.shape(solution.fields["x"])[:-1]
+    if not is_traced(rows):
+        entries = [np.asarray(a).reshape(-1, *np.shape(a)[len(lead) :]) for a in rows.values()]
+        found = in_numpy(lambda *values: function(dict(zip(names, values, strict=True))), entries, (function, names))
+        if found is not None:
+            return {name: a.reshape(*lead, *a.shape[1:]) for name, a in found.items()}
+    for _ in lead:
         function = jax.vmap(function)
-    return _plain(function({name: solution.fields[name] for name in names}))
+    return _plain(function(rows))
 
 
 def _plain(fields: dict[str, Any]) -> dict[str, Any]:

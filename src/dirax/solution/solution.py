@@ -12,7 +12,9 @@ class Solution(Trajectory):
     """A trajectory, or a batch of them, with what is needed to judge it.
 
     - `t` (rows,); `q`, `p`, `x`: (…, rows, n) where the method has them; `multipliers` (…, rows − 1, m): those of the step
-      leaving each row. `fields` holds all saved arrays by name, `field_info` their shapes and meaning.
+      leaving each row. `fields` holds all saved arrays by name, `field_info` their shapes and meaning. Where a constraint
+      force jumps at a row, p is the momentum that the scheme's `momentum` names: the one before the force, which (53) of [PY]
+      has for p_k, by default for (+) and (−); the one after it, p_k of (54), with `momentum="outgoing"`; or their mean.
     - `ok` (bool, or (B,) in a batch) and `message` (str, or a list): whether every step was solved, and otherwise which
       step failed and why. What was computed is kept: one trajectory ends at its last good row, in a batch the rows after
       it are NaN.

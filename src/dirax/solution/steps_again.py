@@ -174,7 +174,7 @@ class StepsAgain:
         np.maximum.at(left, (lanes, rows), numbers - self.counts[rows])
         lanes, rows = np.nonzero(left >= 0)  # steps from every row that is begun with
         left, number = left[lanes, rows], self.counts[rows]
-        state, u = self._begun(lanes, rows, self.time(number))
+        state, u = self.begun_at(lanes, rows, self.time(number))
         while len(lanes):
             after, u = self._whole(lanes, state, u, self.time(number))
             self.states[lanes, number], self.unknowns[lanes, number] = state, u
@@ -182,7 +182,8 @@ class StepsAgain:
             on = left > 0
             lanes, left, number, state, u = lanes[on], left[on] - 1, number[on] + 1, after[on], u[on]
 
-    def _begun(self, lanes: np.ndarray, rows: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def begun_at(self, lanes: np.ndarray, rows: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`begin` at saved rows of these numbers."""
         sol = self.sol
         take = lambda a, at: np.asarray(a)[at] if sol.batch is None else np.asarray(a)[lanes, at]
         row = {name: take(a, rows) for name, a in sol.fields.items() if sol.field_info[name].place == "node"}

@@ -126,7 +126,7 @@ class Trajectory:
     def params(self) -> Any:
         """The params of a run, as JAX's arrays."""
         with jax.ensure_compile_time_eval():  # asked for first in a trace, they are kept for what comes after it
-            return jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, self._params)
+            return jax.tree.map(lambda leaf: jax.device_put(leaf) if isinstance(leaf, np.ndarray) else leaf, self._params)
 
     @property
     def params_of_one(self) -> Any:

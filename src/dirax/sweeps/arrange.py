@@ -16,7 +16,7 @@ from dirax.sweeps.trial import Trial
 TASK_BYTES = 2**26
 """Most bytes of a task, several of which are in memory at a time."""
 
-TASKS_PER_SLOT = 4
+TASKS_PER_SLOT = 16
 """Tasks that there are at least for everything that runs at a time, so that all end together."""
 
 LANES = 8

@@ -95,7 +95,10 @@ class DiracSystem(AbstractSystem):
         labels = tuple(f"rate of constraint {a}" for a in range(len(shape.kept)))
         saved = shape.m + shape.c
         relation = self.independent(shape).relation
-        return RelationForm(relation, len(shape.kept), labels, saved, shape.spread, canonical=self.canonical, dirac="(ẋ, dH) ∈ D")
+        form = RelationForm(relation, len(shape.kept), labels, saved, shape.spread, canonical=self.canonical, dirac="(ẋ, dH) ∈ D")
+        if self.holonomic is None and self.is_graph:
+            return form._replace(**{self.structure.representation: lambda x, params: self.structure.evaluate(x, params)[0]})
+        return form
 
     def energy_form(self, shape: Shape) -> EnergyForm:
         return EnergyForm(self.hamiltonian, self.differential, self.independent(shape).relation)

@@ -39,8 +39,8 @@ class RelationForm(NamedTuple):
     paired with the tangent space where M is a submanifold of R^N, and k more, named by `labels`. `spread(u)` puts the
     multipliers among all `saved` ones, whose axis is called `axis`. `observed` is what else is saved.
     `canonical`: x is (q, p) on T*Q. `dirac` tells the relation where it is one of a Dirac structure. A node is saved as
-    `node(x, params)`, a dict with the keys `names`, arrays (N,) each. `two_form(x, params)` (N, N) is the closed two-form whose
-    graph D is, up to its sign, where the system is one on a symplectic manifold.
+    `node(x, params)`, a dict with the keys `names`, arrays (N,) each. `two_form(x, params)` (N, N) is the two-form whose graph D
+    is, up to its sign, `bivector(x, params)` (N, N) the bivector, where D is one or the other.
     """
 
     residual: Callable
@@ -55,6 +55,7 @@ class RelationForm(NamedTuple):
     names: tuple[str, ...] = ("x",)
     node: Callable = lambda x, params: {"x": x}
     two_form: Callable | None = None
+    bivector: Callable | None = None
 
 
 class EnergyForm(NamedTuple):

@@ -5,16 +5,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
-from dirax.geometry.manifolds import AbstractManifold
+from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold
 from dirax.geometry.spaces import AbstractFlat, Product
 from dirax.numerics.arrays import Data, Numbers
+from dirax.numerics.tolerances import POINT_DEFECT
 from dirax.program.linear_solves import solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian
-from dirax.program.user_functions import UserFunction
-from dirax.systems.constraints import Constraints
+from dirax.program.user_functions import UserFunction, evaluated, is_traced
+from dirax.systems.constraints import Constraints, no_constraint
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem, refuse_start
 
@@ -31,8 +33,8 @@ class ManifoldLagrangian(AbstractSystem):
 
     Stepped by `dx.DiscreteDirac` with a discretization map on Q, and where Q has a retraction by `dx.PlusLagrangeDirac`,
     `dx.MinusLagrangeDirac` and `dx.LagrangeDAlembert`, in charts, with a discrete Lagrangian of one's own too; by `dx.InCharts`
-    with that of a map. Reduced by `dx.reduce`: on a group by it, on a flat manifold by a connection, on others where
-    translations of coordinates are symmetries, as the system that `dx.in_coordinates` gives.
+    with that of a map. Reduced by `dx.reduce`: by translations of flat factors or a Lie group that is a factor, in charts of the
+    others, on a group alone by it, and where a symmetry is a translation of other coordinates after `dx.in_coordinates`.
     Holonomic constraints are kept at the nodes by `dx.DiscreteDirac` with constraints="resolve".
 
         ball = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - q[2], dx.Sphere(3), one_forms=lambda q: a(q)[None])
@@ -144,14 +146,13 @@ class ManifoldLagrangian(AbstractSystem):
 
     def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
         """(N, m), or (N, m, c) with holonomic constraints."""
-        if set(data) - {"t"} == {"q"}:
-            refuse_start(self, data, "q, v", "q, p")
-        if "q" not in data:
-            raise ValueError(f"a system on a manifold starts from q= with v= or p=, but {', '.join(data)} were given.")
-        q = data["q"]
-        vectors = [name for name in ("v", "p") if name in data]
-        for name in vectors:
-            self.manifold.check_tangent(q, data[name], name, point="q")
+        refuse_start(self, data, "q, v", "q, p", "q0, q1")
+        q = self.point(data)
+        for name in ("v", "p"):
+            if name in data:
+                self.manifold.check_tangent(q, data[name], name, point="q")
+        if "q0" in data:
+            self._check_pair(q, data["q1"])
         if self.lagrangian.shape(q, q, params).shape != ():
             raise ValueError(f"lagrangian must return a scalar, not shape {self.lagrangian.shape(q, q, params).shape}.")
         if self.forces is not None:
@@ -161,7 +162,27 @@ class ManifoldLagrangian(AbstractSystem):
         m, c = Constraints(self.one_forms, self.affine, self.holonomic).sizes(q, params)
         return (q.shape[0], m) if self.holonomic is None else (q.shape[0], m, c)
 
+    def _check_pair(self, q0: Float[Numbers, " N"], q1: Float[Numbers, " N"]) -> None:
+        """Raise `ValueError` for points off the manifold, and for a q1 outside the domain of the retraction at q0."""
+        manifold = self.manifold
+        for name, point in (("q0", q0), ("q1", q1)):
+            manifold.check_point(point, name)
+        if not isinstance(manifold, AbstractGeodesicManifold) or is_traced(q0, q1):
+            return
+
+        def missed(q0, q1):
+            back = manifold.retraction(q0, manifold.inverse_retraction(q0, q1))
+            return jnp.max(jnp.abs(manifold.representative(back, q1) - q1))
+
+        if not (defect := float(evaluated(missed, q0, q1))) <= POINT_DEFECT * (1.0 + float(np.max(np.abs(q1)))):
+            raise ValueError(
+                f"q1 must be near q0, in the domain of the inverse retraction of {manifold} at q0, but it is outside: back and "
+                f"forth q1 is missed by {defect:.3g}."
+            )
+
     def complete(self, data: Data, params: Any, project: bool) -> Data:
+        if "q0" in data:
+            return dict(data)
         q, t = data["q"], data.get("t", 0.0)
         v = data["v"] if "v" in data else self.inverse_legendre(q, data["p"], params)
         if project and self.constraints.any:
@@ -171,8 +192,11 @@ class ManifoldLagrangian(AbstractSystem):
         return {"q": q, "v": v, "p": data["p"] if keep else self.legendre(q, v, params)}
 
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " m"]:
-        """(W v + b, g, G v + ∂g/∂t)."""
-        return self.constraints.defect(data.get("t", 0.0), data["q"], data["v"], params)
+        """(W v + b, g, G v + ∂g/∂t); g(q0) for two points, whose step has the other constraints."""
+        t = data.get("t", 0.0)
+        if "q0" in data:
+            return no_constraint() if self.holonomic is None else self.constraints.position_defect(t, data["q0"], params)
+        return self.constraints.defect(t, data["q"], data["v"], params)
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy at the saved point and momentum."""

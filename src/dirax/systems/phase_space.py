@@ -47,7 +47,7 @@ class PhaseSpaceLagrangian(AbstractSystem):
         """The Dirac system (dα, H) on M_f = graph α ≅ Q ([BLM] (14)); p = α(q) is saved beside q."""
         form = self.dirac_system().relation_form(Shape(shape.n))
         node = lambda q, params: {"q": q, "p": self.one_form(q, params)}
-        return form._replace(names=("q", "p"), node=node, dirac="(ẋ, dH) ∈ graph dα", two_form=self.two_form)
+        return form._replace(names=("q", "p"), node=node, dirac="(ẋ, dH) ∈ graph dα")
 
     def energy_form(self, shape: Shape) -> EnergyForm:
         """That of the Dirac system on M_f."""

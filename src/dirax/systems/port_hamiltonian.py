@@ -134,7 +134,10 @@ class PortHamiltonian(AbstractSystem):
         about = "power stored ⟨dH, ẋ⟩, supplied and dissipated at the base point"
         observed = (Observed("power", self.power, (3,), ("power",), about),)
         dirac = "ẋ = (J − R) dH + B u" + ", Bᵀ dH = 0 at the closed ports" * bool(shape.m)
-        return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port", observed=observed, dirac=dirac)
+        alone = None if self.R is not None or self.B is not None else lambda x, params: self.J(x, params)
+        return RelationForm(
+            self.relation, shape.m, labels, shape.m, axis="closed_port", observed=observed, dirac=dirac, bivector=alone
+        )
 
     def ports(
         self, t: Any, x: Float[Numbers, " N"], gradient: Float[Numbers, " N"], params: Any = None

@@ -2,18 +2,22 @@
 
 from collections.abc import Callable
 
+from dirax.engines import policy
 from dirax.engines.contract import Outcome, Problem, Progress
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.native.collocation_kernels import collocation_kernels
 from dirax.engines.native.kernels import kernels
 from dirax.engines.native.run import Ready
+from dirax.engines.native.walk import KernelWalk
+from dirax.engines.walk import AbstractWalk
 from dirax.program.interpreter import UnsupportedPrimitive
 
 
 class Native(AbstractEngine):
     """Small systems on a CPU: the step traced to scalars, compiled by LLVM, run on vectors of trajectories and several threads.
 
-    `most_operations` bounds the scalar operations of a step, except of one that is nested; None: as many as can be traced.
+    `most_operations` bounds the scalar operations of a step, more of them the deeper derivatives lie in one another, except of
+    one that is nested; None: as many as can be traced.
     """
 
     most_operations: int | None = None
@@ -28,8 +32,9 @@ class Native(AbstractEngine):
             made = kernels(problem.equation, problem.params, problem.batch_params, problem.compensated)
             if self.most_operations is not None and not made.step.nested:
                 made.check()
-                if made.operations > self.most_operations:
-                    return f"{made.operations} scalar operations a step, more than {self.most_operations}"
+                most = int(self.most_operations * policy.MORE_FOR_XLA ** max(0, made.step.nesting - 1))
+                if made.operations > most:
+                    return f"{made.operations} scalar operations a step, more than {most}"
         except UnsupportedPrimitive as error:
             return str(error)
         return None
@@ -44,6 +49,10 @@ class Native(AbstractEngine):
     def prepared(self, problem: Problem) -> Callable[[Problem, Progress | None], Outcome]:
         """`run` with the kernel at hand."""
         return Ready(problem)
+
+    def walks(self, problem: Problem) -> Callable[[Problem], AbstractWalk]:
+        """Walks by a kernel."""
+        return KernelWalk
 
     def run_traced(self, problem: Problem) -> Outcome:
         """The same as one primitive of JAX, with derivatives by loops over the steps; those of the second order and higher are

@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
+from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo
@@ -28,19 +29,32 @@ _programs: Memo[tuple[ScalarProgram, Any] | None] = Memo(KEPT)
 _jaxprs: Memo[tuple[ClosedJaxpr, Any]] = Memo(KEPT)
 
 
-def in_numpy(function: Callable, leaves: list[np.ndarray], key: Hashable) -> Any:
+def in_numpy(
+    function: Callable, leaves: list[np.ndarray], key: Hashable, for_few: bool = False, noise: Noise | None = None
+) -> Any:
     """`function(*arguments)` for each entry of `leaves`, arguments (entries, …): a pytree of arrays with that leading axis.
 
     None where the function has a primitive for which there is no rule, or closes over values that JAX traces. `key` is
-    equal for functions that are, and has everything in it on which `function` depends.
+    equal for functions that are, and has everything in it on which `function` depends; `for_few` and `noise` as a `ScalarProgram`
+    has them.
     """
-    found = program_of(function, [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves], key)
-    return None if found is None else jax.tree.unflatten(found[1], found[0].in_numpy(leaves))
+    found = program_of(function, [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves], key, for_few)
+    return None if found is None else jax.tree.unflatten(found[1], found[0].in_numpy(leaves, noise))
 
 
-def program_of(function: Callable, shapes: list[jax.ShapeDtypeStruct], key: Hashable) -> tuple[ScalarProgram, Any] | None:
+def program_of(
+    function: Callable, shapes: list[jax.ShapeDtypeStruct], key: Hashable, for_few: bool = False
+) -> tuple[ScalarProgram, Any] | None:
     """The program by which `in_numpy` evaluates arguments of these shapes, and the structure of what the function returns."""
-    return _programs.get((key, *((s.shape, s.dtype.str) for s in shapes)), lambda: _traced(function, shapes, True))
+    kinds = [(s.shape, s.dtype.str) for s in shapes]
+    return _programs.get((key, *kinds, for_few), lambda: _traced(function, shapes, True, for_few))
+
+
+def graph_program_of(function: Callable, shapes: list[jax.ShapeDtypeStruct], key: Hashable) -> ScalarProgram | None:
+    """The same as operations of the graph alone, which can be compiled; None where it has no such program."""
+    key = ("graph", key, *((s.shape, s.dtype.str) for s in shapes))
+    found = _programs.get(key, lambda: _traced(function, shapes, False))
+    return found and found[0]
 
 
 def at_values(function: Callable, values: tuple) -> tuple | None:
@@ -90,7 +104,9 @@ def _flat(function: Callable, structure: Any) -> Callable:
     return lambda *leaves: function(*jax.tree.unflatten(structure, leaves))
 
 
-def _traced(function: Callable, shapes: list[jax.ShapeDtypeStruct], by_numpy: bool) -> tuple[ScalarProgram, Any] | None:
+def _traced(
+    function: Callable, shapes: list[jax.ShapeDtypeStruct], by_numpy: bool, for_few: bool = False
+) -> tuple[ScalarProgram, Any] | None:
     """The program of a function, and the structure of its result; None where it has none, or one of too many numbers."""
     if sum(math.prod(shape.shape) for shape in shapes) > MOST_NUMBERS:
         return None
@@ -98,6 +114,6 @@ def _traced(function: Callable, shapes: list[jax.ShapeDtypeStruct], by_numpy: bo
     if any(isinstance(c, Tracer) for c in closed.consts):
         return None
     try:
-        return ScalarProgram.of(closed, by_numpy), jax.tree.structure(result)
+        return ScalarProgram.of(closed, by_numpy, for_few), jax.tree.structure(result)
     except (UnsupportedPrimitive, GraphTooLarge):
         return None

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dirax.program.graph import Graph
+from dirax.program.graph import Graph, Order
 from dirax.program.graph_derivatives import partials
 from dirax.program.interpreter import Nodes
 
@@ -36,7 +36,7 @@ class Values:
         other._known = {n: v[entries] if isinstance(v, np.ndarray) and v.ndim else v for n, v in self._known.items()}
         return other
 
-    def read(self, nodes: Nodes, order: list[int] | None = None) -> np.ndarray:
+    def read(self, nodes: Nodes, order: Order | None = None) -> np.ndarray:
         """The values of nodes (…), an array (entries, …); `order` as in `Graph.evaluate`."""
         table = np.empty((nodes.size, self.entries))
         with np.errstate(all="ignore"):
@@ -45,24 +45,48 @@ class Values:
         return table.T.reshape(self.entries, *nodes.shape)
 
     def slopes(self, nodes: list[int], inputs: list[int], plan: "Slopes | None" = None) -> np.ndarray:
-        """The derivatives of nodes by inputs, (entries, nodes, inputs): forward over the graph, which only gains the
-        derivatives of single operations; `plan` where it has been made before."""
+        """The derivatives of nodes by inputs, (entries, nodes, inputs): over the graph, which only gains the derivatives of
+        single operations, backward from fewer nodes than inputs, else forward, and so past branches: of one that is not taken
+        infinite derivatives count for nothing then; `plan` where it has been made before."""
         plan, values = plan or Slopes(self.graph, nodes, inputs), self._known
         with np.errstate(all="ignore"):
             self.graph.evaluate(plan.needed, {}, values=values, order=plan.order)
-            none = np.zeros((len(inputs), self.entries))
-            rows = dict(zip(inputs, np.eye(len(inputs))[:, :, None] * np.ones(self.entries), strict=True))
-            for node, terms in plan.terms:
-                if terms is None:
-                    condition, yes, no = self.graph.args[node]
-                    rows[node] = np.where(values[condition], rows.get(yes, none), rows.get(no, none))
-                    continue
-                first, *others = terms
-                total = values[first[1]] * rows[first[0]]
-                for operand, factor in others:
-                    total += values[factor] * rows[operand]
-                rows[node] = total
-        return np.stack([rows.get(node, none) for node in nodes]).transpose(2, 0, 1)
+            if len(nodes) < len(inputs) and not plan.branches:
+                return self._backward(nodes, inputs, plan).transpose(2, 1, 0)
+            return self._forward(nodes, inputs, plan).transpose(2, 0, 1)
+
+    def _forward(self, nodes: list[int], inputs: list[int], plan: "Slopes") -> np.ndarray:
+        """(nodes, inputs, entries)."""
+        values, none = self._known, np.zeros((len(inputs), self.entries))
+        rows = dict(zip(inputs, np.eye(len(inputs))[:, :, None] * np.ones(self.entries), strict=True))
+        for node, terms in plan.terms:
+            if terms is None:
+                condition, yes, no = self.graph.args[node]
+                rows[node] = np.where(values[condition], rows.get(yes, none), rows.get(no, none))
+                continue
+            first, *others = terms
+            total = values[first[1]] * rows[first[0]]
+            for operand, factor in others:
+                total += values[factor] * rows[operand]
+            rows[node] = total
+        return np.stack([rows.get(node, none) for node in nodes])
+
+    def _backward(self, nodes: list[int], inputs: list[int], plan: "Slopes") -> np.ndarray:
+        """(inputs, nodes, entries)."""
+        values, none, flow = self._known, np.zeros((len(nodes), self.entries)), {}
+
+        def flows(into: int, more: np.ndarray) -> None:
+            flow[into] = flow[into] + more if into in flow else more
+
+        for one, node in zip(np.eye(len(nodes)), nodes, strict=True):
+            flows(node, one[:, None] * np.ones(self.entries))
+        kept = set(inputs)
+        for node, terms in reversed(plan.terms):
+            if (here := flow.get(node) if node in kept else flow.pop(node, None)) is None:
+                continue
+            for operand, factor in terms or ():
+                flows(operand, values[factor] * here)
+        return np.stack([flow.get(node, none) for node in inputs])
 
 
 class Slopes:
@@ -82,8 +106,9 @@ class Slopes:
             elif terms := [(a, f) for a, f in zip(args, partials(graph, node), strict=True) if f is not None and a in moving]:
                 moving.add(node)
                 self.terms.append((node, terms))
+        self.branches = any(terms is None for _, terms in self.terms)
         self.needed = [*nodes, *(factor for _, terms in self.terms for _, factor in terms or ())]
-        self.order = graph.reachable(self.needed)
+        self.order = Order(graph.reachable(self.needed))
 
 
 def in_parts(function: Callable, leaves: list[np.ndarray]) -> list[np.ndarray]:

@@ -13,7 +13,7 @@ from dirax.numerics.newton import damped_step
 from dirax.program.evaluation.in_numpy import Slopes, Values
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
-from dirax.program.linear_solves import equilibrated_inverse
+from dirax.program.linear_solves import equilibrated_inverse, pseudo_inverses
 from dirax.program.memo import Memo, Same
 from dirax.program.rules.reductions import factors_of_product
 from dirax.program.scalar_program import ScalarProgram, numpy_rule
@@ -22,6 +22,9 @@ from dirax.program.tracing import jacobian, of_one_result
 LARGE_DERIVATIVE = 30_000
 """Nodes of a function times numbers by which it is differentiated from which on a graph of the derivative takes longer than its
 values at a few entries."""
+
+LARGE_FOR_FEW = 2000
+"""The same of programs that are evaluated once, at a handful of entries."""
 
 LARGE_PRODUCT = 256
 """Multiplications of a product of arrays from which on it is no graph of them."""
@@ -52,7 +55,8 @@ def derivative_in_numbers(made: ScalarProgram, interpreter: Interpreter, equatio
     """Derivatives of large functions by many numbers are found in numbers, with no graph of their own."""
     jaxpr, wanted = equation.params["jaxpr"], equation.params["wanted"]
     inner = _inner.get(Same(jaxpr), lambda: _plain(jaxpr))
-    if inner is None or len(inner.graph) * sum(operands[k].size for k in wanted) < LARGE_DERIVATIVE:
+    large = LARGE_FOR_FEW if made.for_few else LARGE_DERIVATIVE
+    if inner is None or len(inner.graph) * sum(operands[k].size for k in wanted) < large:
         return list(RULES["dirax_derivative"](interpreter, equation, *operands))
     (result,), inputs = inner.results, [node for k in wanted for node in inner.inputs[k].ravel().tolist()]
     ends, outputs, plans = np.cumsum([operands[k].size for k in wanted])[:-1], result.ravel().tolist(), []
@@ -148,7 +152,7 @@ def _solved(matrices: np.ndarray, sides: np.ndarray) -> np.ndarray:
 
 @numpy_rule("dirax_pseudo_inverse")
 def pseudo_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
-    inverse = functools.partial(np.linalg.pinv, rcond=equation.params["tolerance"])
+    inverse = functools.partial(pseudo_inverses, tolerance=equation.params["tolerance"])
     return made.between(
         [matrix], [equation.outvars[0].aval.shape], lambda operands: _of_finite(lambda a: [inverse(a)], *operands)
     )

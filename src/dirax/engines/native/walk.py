@@ -1,0 +1,36 @@
+"""A walk by a kernel: its record stays where it is in memory, and the kernel writes every row where it belongs."""
+
+import numpy as np
+
+from dirax.engines.contract import Problem
+from dirax.engines.native.kernels import kernels
+from dirax.engines.native.lanes import arrays_saved
+from dirax.engines.walk import AbstractWalk, rows_of
+
+
+class KernelWalk(AbstractWalk):
+    """Raises `UnsupportedPrimitive` for a step that cannot be compiled."""
+
+    def __init__(self, p: Problem):
+        self.problem, self.rows = p, rows_of(p)
+        self.state, self.unknowns = np.asarray(p.state), np.asarray(p.guess[0])
+        self.iterations, self.max_residual = 0, 0.0
+        made = kernels(p.equation, p.params, p.batch_params, p.compensated)
+        self.kernel, self.record = made.kernel(1)[0], made.record
+        self._memory = np.zeros(self.record.size)
+        self._params = np.array(made.step.parameters.flatten(p.params, None), float).ravel()
+        self._outs = np.array([self.rows[saved.name].ctypes.data for saved in arrays_saved(p, made)], np.int64)
+        self._at = tuple(array.ctypes.data for array in (self._memory, self._params, self._outs))
+        self._unknowns = self.record.unknowns(0, p.equation.stages[0][0].unknowns)
+
+    def go(self, state: np.ndarray, unknowns: np.ndarray, first: int, stop: int, t: float, h: float) -> int:
+        memory, record = self._memory, self.record
+        memory[record.state_size :] = 0.0
+        memory[record.state] = state
+        memory[self._unknowns] = unknowns
+        self.kernel(*self._at, 1, t, h, 0, first, stop, 1, self.problem.max_iterations)
+        self.state, self.unknowns = memory[record.state].copy(), memory[self._unknowns].copy()
+        completed, _, iterations, residual = memory[record.completed :].tolist()
+        self.iterations += int(iterations)
+        self.max_residual = max(self.max_residual, residual)
+        return int(completed)

@@ -1,0 +1,71 @@
+"""Jaxprs that say the same are one object, so that what is made of one is made once.
+
+JAX traces a function anew wherever another function calls it, and each time makes another jaxpr of it: the Lagrangian in the
+residual of a step, in the energy of a row and in the start of a run. What a scalar program makes of a jaxpr, its derivatives
+above all, is kept by the jaxpr; so the first of those that are alike stands for all.
+"""
+
+from typing import Any
+
+import numpy as np
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from dirax.program.memo import Memo, Same
+
+KEPT = 2048
+"""Jaxprs kept in memory, those of the functions that others call among them."""
+
+_first: Memo[ClosedJaxpr] = Memo(KEPT)
+_seen: Memo[ClosedJaxpr] = Memo(KEPT)
+
+
+def shared(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """The first jaxpr that has the same equations and constants; itself where they cannot be compared."""
+    return _seen.get(Same(closed), lambda: _first.get(_said_by(closed), lambda: closed))
+
+
+def _said_by(closed: ClosedJaxpr) -> Any:
+    """Equal for jaxprs that say the same."""
+    return _equations(closed.jaxpr), tuple([_constant(c) for c in closed.consts])
+
+
+def _equations(jaxpr: Jaxpr) -> tuple:
+    """Inputs, equations and outputs, variables by their numbers."""
+    numbers: dict[Any, int] = {}
+
+    def new(variables: Any) -> tuple:
+        for v in variables:
+            numbers[v] = len(numbers)
+        return tuple([_kind(v.aval) for v in variables])
+
+    def read(atoms: Any) -> tuple:
+        return tuple([_constant(a.val) if isinstance(a, Literal) else numbers[a] for a in atoms])
+
+    inputs = new([*jaxpr.constvars, *jaxpr.invars])
+    equations = [(e.primitive, read(e.invars), _value(e.params), new(e.outvars)) for e in jaxpr.eqns]
+    return len(jaxpr.constvars), inputs, tuple(equations), read(jaxpr.outvars)
+
+
+def _kind(aval: Any) -> Any:
+    return (aval.shape, aval.dtype, aval.weak_type) if isinstance(aval, ShapedArray) else aval
+
+
+def _constant(value: Any) -> Any:
+    if isinstance(value, Tracer):
+        return Same(value)
+    array = np.asarray(value)
+    return type(value).__name__, array.dtype, array.shape, array.tobytes()
+
+
+def _value(value: Any) -> Any:
+    """A parameter of an equation, with the first of jaxprs that are alike; one that has no hash is like no other."""
+    if isinstance(value, ClosedJaxpr):
+        return Same(shared(value))
+    if isinstance(value, Jaxpr):
+        return _equations(value)
+    if isinstance(value, dict):
+        return tuple([(name, _value(one)) for name, one in value.items()])
+    if isinstance(value, tuple | list):
+        return tuple([_value(one) for one in value])
+    return _constant(value) if isinstance(value, np.ndarray | float) else (type(value), value)

@@ -1,0 +1,82 @@
+"""Derivatives of events by data and params: against the closed form of a fall, and against differences of plain runs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+
+BALL = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["g"] * q[1])
+EVENTS = [
+    dx.Event(lambda q, params: q[1] - params["height"]),
+    dx.Event(lambda q: q[1], direction=-1, terminal=True),
+]
+
+
+def run(given, **more):
+    """A ball thrown upwards, through a height on its way up and down, to the ground."""
+    y, speed, g, height = given
+    xp = jnp if isinstance(given, jax.core.Tracer) else np
+    q, v = xp.stack([0.0 * y, y]), xp.stack([0.3 + 0.0 * speed, speed])
+    params = {"g": g, "height": height}
+    return dx.simulate(BALL, dx.LagrangeDAlembert(), q=q, v=v, params=params, step=0.07, steps=40, events=EVENTS, **more)
+
+
+def measured(given):
+    """Times, places and momenta of the three events, and a row before the end; and all there is to look at."""
+    sol = run(given)
+    xp = jnp if isinstance(given, jax.core.Tracer) else np
+    numbers = xp.concatenate([sol.events.t[:3], sol.events.q[:3].ravel(), sol.events.p[:3].ravel(), sol.q[20]])
+    return numbers, (numbers, sol.events.t, sol.events.index, sol.events.direction, sol.q)
+
+
+def exact(given):
+    """The times."""
+    y, speed, g, height = given
+    falls = lambda to: (speed + jnp.array([-1.0, 1.0]) * jnp.sqrt(speed**2 + 2 * g * (y - to))) / g
+    up, down = falls(height)
+    return jnp.stack([up, down, falls(0.0)[1]])
+
+
+def test_times_and_places_of_events():
+    at = np.array([0.5, 1.0, 1.0, 0.8])
+    jacobian, (values, *whole) = jax.jit(jax.jacfwd(measured, has_aux=True))(at)
+    np.testing.assert_allclose(values, measured(at)[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(values[:3], exact(at), rtol=1e-13)
+    np.testing.assert_allclose(jacobian[:3], jax.jacfwd(exact)(at), rtol=0, atol=1e-11)
+    d = 1e-3
+    for i, unit in enumerate(np.eye(4)):
+        change = lambda step, unit=unit: measured(at + step * unit)[0] - measured(at - step * unit)[0]
+        np.testing.assert_allclose(jacobian[:, i], (8 * change(d) - change(2 * d)) / (12 * d), rtol=0, atol=1e-8)
+    # what comes after the end is not there
+    t, index, direction, q = map(np.asarray, whole)
+    assert np.array_equal(index[:3], [0, 0, 1]) and np.array_equal(direction[:3], [1, -1, -1]) and np.all(np.isnan(t[3:]))
+    assert np.array_equal(np.isfinite(q).all(axis=1), np.arange(41) * 0.07 <= t[2])
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        dx.Collocation(4),
+        dx.Composition(dx.LagrangeDAlembert(), "suzuki4"),
+        dx.VariableSteps(dx.Collocation(3), lambda q: 1 + q @ q / 3),
+    ],
+    ids=lambda s: type(s).__name__,
+)
+def test_every_kind_of_dense_output(scheme):
+    swing = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["k"] * q @ q / 2)
+    event = dx.Event(lambda t, q, v, params: q[0] - params["c"] * (1 + t / 50) + v[0] / 30, direction=-1)
+
+    def found(a):
+        xp = jnp if isinstance(a, jax.core.Tracer) else np
+        given = {"q": xp.stack([a[0]]), "v": xp.stack([a[1]]), "params": {"k": a[2], "c": a[3]}}
+        events = dx.simulate(swing, scheme, step=0.1, steps=90, events=[event], **given).events
+        return xp.stack([events.t[1], events.q[1, 0], events.p[1, 0]])
+
+    at, d = np.array([1.0, 0.3, 1.2, 0.2]), 1e-3
+    gradient = jax.jit(jax.jacrev(found))(at)
+    for i, unit in enumerate(np.eye(4)):
+        change = lambda step, unit=unit: found(at + step * unit) - found(at - step * unit)
+        np.testing.assert_allclose(gradient[:, i], (8 * change(d) - change(2 * d)) / (12 * d), rtol=0, atol=1e-8)
