@@ -152,7 +152,7 @@ def test_engines_batches_and_gradients_agree():
     np.testing.assert_array_equal(alone.work, native.work[0])
 
     end = lambda drag: dx.simulate(NONLINEAR, scheme, params=drag, **START, **run).work[-1]
-    slope = jax.grad(end)(0.3)
+    slope = jax.jit(jax.grad(end))(0.3)
     assert slope == pytest.approx((float(end(0.3 + 1e-5)) - float(end(0.3 - 1e-5))) / 2e-5, rel=1e-8)
 
 

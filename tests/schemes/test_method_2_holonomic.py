@@ -122,7 +122,7 @@ def test_a_gradient_against_finite_differences():
         sol = dx.simulate(FLAT, METHOD_2, q=FLAT_START["q"], v=scale * FLAT_START["v"], step=0.1, steps=10)
         return sol.q[-1, 1] + sol.p[-1, 0]
 
-    slope = jax.grad(end)(1.0)
+    slope = jax.jit(jax.grad(end))(1.0)
     assert slope == pytest.approx((float(end(1 + 1e-5)) - float(end(1 - 1e-5))) / 2e-5, rel=1e-7)
 
 

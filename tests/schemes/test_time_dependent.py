@@ -99,7 +99,7 @@ def test_a_nonlinear_parametric_pendulum_on_both_engines_and_in_a_batch():
     )
     np.testing.assert_allclose(later.q[-1], sol.q[200], atol=1e-12)
     end = lambda eps: dx.simulate(system, dx.LagrangeDAlembert(), **{**run, "params": eps, "steps": 40}).q[-1, 0]
-    assert jax.grad(end)(0.4) == pytest.approx((float(end(0.4 + 1e-5)) - float(end(0.4 - 1e-5))) / 2e-5, rel=1e-7)
+    assert jax.jit(jax.grad(end))(0.4) == pytest.approx((float(end(0.4 + 1e-5)) - float(end(0.4 - 1e-5))) / 2e-5, rel=1e-7)
 
 
 # ----------------------------------------------------------------------------------------------- time in the constraints

@@ -246,7 +246,7 @@ def test_a_gradient_against_finite_differences():
         sol = dx.simulate(PENDULUM, MIDPOINT, q=q, v=jnp.stack([-q[1], q[0]]) * (0.5 - turn), step=0.1, steps=12)
         return sol.q[-1, 0] + sol.p[-1, 1] + sol.multipliers[5, 0]
 
-    slope = jax.grad(end)(0.0)
+    slope = jax.jit(jax.grad(end))(0.0)
     assert slope == pytest.approx((float(end(1e-5)) - float(end(-1e-5))) / 2e-5, rel=1e-7)
 
 

@@ -9,35 +9,29 @@ from dirax.engines.contract import Outcome, Problem, Progress
 
 
 class AbstractWalk(ABC):
-    """Steps of a problem of one trajectory and one part, of which every one is saved."""
+    """Steps of a problem of one trajectory and one part, of which every one is saved.
 
-    problem: Problem
-    rows: dict[str, np.ndarray]
-    """The saved arrays, (steps, …) of every field: without the closing row."""
-    state: np.ndarray
-    unknowns: np.ndarray
-    """Those after the last `go`."""
-    iterations: int
-    max_residual: float
-    """Of all steps."""
+    `rows` are the saved arrays, (steps, …) of every field, without the closing row; `state` and `unknowns` those after the last
+    `go`; `iterations` and `max_residual` those of all steps.
+    """
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+        self.rows = {name: np.full((problem.steps, *field.shape), np.nan) for name, field in problem.fields.items()}
+        self.state, self.unknowns = np.asarray(problem.state), np.asarray(problem.guess[0])
+        self.iterations, self.max_residual = 0, 0.0
 
     @abstractmethod
     def go(self, state: np.ndarray, unknowns: np.ndarray, first: int, stop: int, t: float, h: float) -> int:
         """Steps `first` to `stop` − 1, of length h and from this state at the time t on; how many of them have a solution."""
 
 
-def rows_of(problem: Problem) -> dict[str, np.ndarray]:
-    """Room for the rows of a walk."""
-    return {name: np.full((problem.steps, *field.shape), np.nan) for name, field in problem.fields.items()}
-
-
 class WalkByRuns(AbstractWalk):
     """Every `go` is a run of an engine."""
 
     def __init__(self, problem: Problem, run: Callable[[Problem, Progress | None], Outcome]):
-        self.problem, self.run, self.rows = problem, run, rows_of(problem)
-        self.state, self.unknowns = np.asarray(problem.state), np.asarray(problem.guess[0])
-        self.iterations, self.max_residual = 0, 0.0
+        super().__init__(problem)
+        self.run = run
 
     def go(self, state: np.ndarray, unknowns: np.ndarray, first: int, stop: int, t: float, h: float) -> int:
         count = stop - first

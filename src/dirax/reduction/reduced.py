@@ -192,7 +192,11 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
         return self.system.forces is None and self.system.one_forms is None
 
     def sampled(self, data: Data) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return sampled(data)
+        q = np.asarray(data["q"] if "q" in data else data["q0"])
+        v = np.asarray(data["v"]) if "v" in data else np.ones_like(q)
+        random = np.random.default_rng(0)
+        nearby = lambda a: np.concatenate([a[None], a + NEARBY * random.uniform(-1, 1, (SAMPLES, a.size))])
+        return times(1 + SAMPLES), nearby(q), nearby(v)
 
     def named(self, generator: int) -> str:
         return f"q[{self.connection.fibre[generator]}]"
@@ -222,7 +226,7 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
 
     def refuse_asymmetric(self, functions: dict[str, UserFunction], data: Data, h: float, params: Any) -> None:
         """Raise `ValueError` where functions of ([t, ]q0, q1, h[, params]) are not invariant, at data that must be concrete."""
-        t, q, v = sampled(data)
+        t, q, v = self.sampled(data)
         found = discrete_invariance(functions, self.action, t, q, q + h * v, h, params)
         if not found.ok:
             worst = self.connection.fibre[found.generator]
@@ -234,7 +238,7 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
 
     def refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]
-        found = invariance(self.system, self.action, *sampled(data), params)
+        found = invariance(self.system, self.action, *self.sampled(data), params)
         if not found.ok:
             worst = self.connection.fibre[found.generator]
             what = {"lagrangian": f"∂L/∂q[{worst}]", "one_forms": "the motion of its one-forms out of their span"}
@@ -249,15 +253,6 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
                 f"the orbits of the group are not free at the initial point q = {np.asarray(q)}: the group inertia has rank "
                 f"{inertia} there and {nearby} nearby. Start elsewhere, or use coordinates that do not end there."
             )
-
-
-def sampled(data: Data) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times, points and velocities, (1 + SAMPLES, …) each: the initial data, at t = 0, and random ones near them."""
-    q = np.asarray(data["q"] if "q" in data else data["q0"])
-    v = np.asarray(data["v"]) if "v" in data else np.ones_like(q)
-    random = np.random.default_rng(0)
-    nearby = lambda a: np.concatenate([a[None], a + NEARBY * random.uniform(-1, 1, (SAMPLES, a.size))])
-    return times(1 + SAMPLES), nearby(q), nearby(v)
 
 
 def group_inertia_ranks(system: LagrangeDirac, connection: AbstractConnection, q: Numbers, params: Any) -> tuple[int, int]:

@@ -112,15 +112,12 @@ class TracedSearch:
         return jax.lax.map(one, (places[:-1], places[1:], a, b, asked))
 
     def _fields(self, theta: Any, step: tuple) -> tuple[Any, dict]:
-        row, after, _, t, h, _ = step
-        begins = row.get(CLOCK, t)
-        return begins + theta * (after[CLOCK] - begins if CLOCK in row else h), self.dense.inside_one(*step)(theta)
+        begins, length = _clock(step)
+        return begins + theta * length, self.dense.inside_one(*step)(theta)
 
     def _along(self, number: int, event: Event, step: tuple) -> Any:
         """θ ↦ the function of an event in a step."""
-        row, after, _, t, h, params = step
-        inside, begins = self.dense.inside_one(*step), row.get(CLOCK, t)
-        length = after[CLOCK] - begins if CLOCK in row else h
+        inside, params, (begins, length) = self.dense.inside_one(*step), step[-1], _clock(step)
 
         def value(theta):
             time, fields = begins + theta * length, inside(theta)
@@ -132,3 +129,10 @@ class TracedSearch:
             return evaluated(event, number, known, params)
 
         return value
+
+
+def _clock(step: tuple) -> tuple[Any, Any]:
+    """When a step begins, and how long it lasts."""
+    row, after, _, t, h, _ = step
+    begins = row.get(CLOCK, t)
+    return begins, after[CLOCK] - begins if CLOCK in row else h

@@ -19,13 +19,6 @@ CONSTANT = 1e-13
 """Relative change of a two-form in one step up to which it is constant."""
 
 
-def started(system: Any, step: Any, equation: Any, rows: Data, params: Any) -> tuple[Array, Array]:
-    """(state, first guess) of the first part of a step that starts from a saved row, the only one of `rows`."""
-    row = {name: values[0] for name, values in rows.items()}
-    stage, fraction = equation.stages[0]
-    return stage.start({**system.complete(row, params, False), "t": row["t"]}, fraction * step, params)
-
-
 class RowForm(AbstractStepForm):
     """A form at the state that a step starts from at a saved row. A base class."""
 
@@ -41,7 +34,9 @@ class RowForm(AbstractStepForm):
         return 1
 
     def begins(self, equation: Any, rows: Data, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
-        return started(self.system, self.step, equation, rows, params)
+        row = {name: values[0] for name, values in rows.items()}
+        stage, fraction = equation.stages[0]
+        return stage.start({**self.system.complete(row, params, False), "t": row["t"]}, fraction * self.step, params)
 
     def refusal(self, equation: Any, row: Data, params: Any) -> str:
         try:
@@ -165,9 +160,9 @@ class ChartedForm(RowForm):
     def told(self, numbers: Any, place: str) -> str:
         return f"‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖ of (q, p) by the coordinates of a chart, {place}"
 
-    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2"]:
-        """(‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖, condition number)."""
-        (state, guess), (after, jacobian, condition) = self.begins(equation, rows, params), step
+    def ends(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> tuple[Array, Array]:
+        """K at the state that the step starts from, and K'."""
+        state, guess = self.begins(equation, rows, params)
         t, size = rows["t"][0], rows["q"].shape[1]
         stage, fraction = equation.stages[0]
 
@@ -175,33 +170,26 @@ class ChartedForm(RowForm):
             row = stage.unpack(state, guess, t, fraction * self.step, params)
             return jnp.concatenate([row["q"], row["p"]])
 
-        first = jax.jacfwd(saved)(state)[:, size:]
-        last = (jax.jacfwd(saved)(after) @ jacobian)[:, size:]
-        form = canonical_two_form(size)
-        change = last.T @ form @ last - first.T @ form @ first
-        return jnp.stack([jnp.max(jnp.abs(change)) / jnp.max(jnp.abs(last).T @ jnp.abs(form) @ jnp.abs(last)), condition])
-
-
-class AmbientForm(RowForm):
-    """The canonical two-form of T*Q of a manifold Q in R^N whose states begin with (q, p): K'ᵀΩK' = KᵀΩK with the derivative K
-    of (q, p) by coordinates (r, p_r) in the chart at q, and K' = JK. Relative to ‖|K'|ᵀ|Ω||K'|‖."""
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        return ("q", "p")
-
-    def told(self, numbers: Any, place: str) -> str:
-        return f"‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖ of (q, p) by the coordinates of a chart, {place}"
+        return jax.jacfwd(saved)(state)[:, size:], (jax.jacfwd(saved)(step.state) @ step.jacobian)[:, size:]
 
     def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2"]:
         """(‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖, condition number)."""
+        first, last = self.ends(step, equation, rows, params)
+        form = canonical_two_form(rows["q"].shape[1])
+        change = last.T @ form @ last - first.T @ form @ first
+        return jnp.stack([jnp.max(jnp.abs(change)) / jnp.max(jnp.abs(last).T @ jnp.abs(form) @ jnp.abs(last)), step.condition])
+
+
+class AmbientForm(ChartedForm):
+    """The same where states begin with (q, p) themselves: K is the derivative of (q, p) by coordinates in the chart at q, and
+    K' = JK."""
+
+    def ends(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> tuple[Array, Array]:
         manifold, q, p = self.system.manifold_form().manifold, rows["q"][0], rows["p"][0]
         chart, size = RetractionChart(manifold, q, manifold.frame(q)), 2 * q.shape[0]
         local = jnp.concatenate(chart.momentum_to_local(q, p))
         first = jax.jacfwd(lambda z: jnp.concatenate(chart.momentum_to_manifold(*jnp.split(z, 2))))(local)
-        last, form = step.jacobian[:size, :size] @ first, canonical_two_form(size // 2)
-        change = last.T @ form @ last - first.T @ form @ first
-        return jnp.stack([jnp.max(jnp.abs(change)) / jnp.max(jnp.abs(last).T @ jnp.abs(form) @ jnp.abs(last)), step.condition])
+        return first, step.jacobian[:size, :size] @ first
 
 
 def form_of_steps(

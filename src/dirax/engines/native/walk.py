@@ -5,16 +5,14 @@ import numpy as np
 from dirax.engines.contract import Problem
 from dirax.engines.native.kernels import kernels
 from dirax.engines.native.lanes import arrays_saved
-from dirax.engines.walk import AbstractWalk, rows_of
+from dirax.engines.walk import AbstractWalk
 
 
 class KernelWalk(AbstractWalk):
     """Raises `UnsupportedPrimitive` for a step that cannot be compiled."""
 
     def __init__(self, p: Problem):
-        self.problem, self.rows = p, rows_of(p)
-        self.state, self.unknowns = np.asarray(p.state), np.asarray(p.guess[0])
-        self.iterations, self.max_residual = 0, 0.0
+        super().__init__(p)
         made = kernels(p.equation, p.params, p.batch_params, p.compensated)
         self.kernel, self.record = made.kernel(1)[0], made.record
         self._memory = np.zeros(self.record.size)
