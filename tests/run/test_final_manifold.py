@@ -36,6 +36,18 @@ def test_each_trajectory_of_a_batch():
     np.testing.assert_allclose(sol.q[0], sol.q[1], atol=1e-14)
 
 
+def test_each_of_two_points():
+    """Two points give no momentum: each is on the manifold if a point of it lies over it."""
+    for q0, q1, wrong in (((1.0, 0.7), (1.0, -0.7), "q0="), ((1.0, 0.0), (0.99, 0.1), "q1=")):
+        with pytest.raises(ValueError, match=rf"{wrong} is off its final constraint manifold"):
+            dx.simulate(FLAT, dx.LagrangeDAlembert(), q0=q0, q1=q1, step=0.1, steps=3)
+    sol = dx.simulate(FLAT, dx.LagrangeDAlembert(), q0=[1.0, 0.0], q1=[0.995, 0.0], step=0.1, steps=50)
+    assert np.abs(sol.q[:, 1]).max() < 1e-15
+    magnetic = dx.LagrangeDirac(lambda q, v: q[1] * v[0] - q @ q / 2)  # q turns at the rate 1: any q is on M_f
+    turned = [np.cos(0.1), -np.sin(0.1)]
+    assert dx.simulate(magnetic, dx.LagrangeDAlembert(), q0=[1.0, 0.0], q1=turned, step=0.1, steps=5).ok
+
+
 def test_an_inconsistent_system():
     empty = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 + q[1] ** 3 + q[1])
     with pytest.raises(ValueError, match="no motion passes through"):

@@ -1,5 +1,6 @@
 """The final constraint manifold of a singular Lagrangian, as a premise: initial data on it, and steps that stay on it."""
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -48,10 +49,19 @@ def is_singular(system: AbstractSystem, shape: Shape, case: Case, initial: Initi
     leaves a doubt. What is regular once is not asked again. Of a batch SEVERAL trajectories are asked, the first and the last
     among them.
     """
-    if case.two_points or "q" not in case.data or len(case.data) < 2:
+    if len(case.data) < 2 or not case.data.keys() & {"q", "q0"}:
         return False
     given = tuple(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(case.params))
-    return _singular.get((Same(system), given, case.batch, *case.data), lambda: _is_singular(system, shape, case, initial))
+    ask = lambda: _is_singular(system, shape, *(_at_either_point(system, case)[0] if case.two_points else (case, initial)))
+    return _singular.get((Same(system), given, case.batch, *case.data), ask)
+
+
+def _at_either_point(system: AbstractSystem, case: Case) -> list[tuple[Case, Initial]]:
+    """What starts at each of two points with the velocity between them, and its initial data."""
+    v = (case.data["q1"] - case.data["q0"]) / case.h
+    times = case.t0, case.t0 + case.h
+    cases = [dataclasses.replace(case, data={"q": q, "v": v}, t0=t) for q, t in zip(case.data.values(), times, strict=True)]
+    return [(near, completed(system, near, False)) for near in cases]
 
 
 _singular: Memo[bool] = Memo(256)
@@ -101,18 +111,19 @@ def chain_at(system: AbstractSystem, q: Any, v: Any, t: float, params: Any) -> C
     return _chains.get((Same(system), given, jax.tree.structure(params)), found)
 
 
-def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any) -> Any:
-    """The point x of the chain with these q and p; where v is among its coordinates, the nearest one that the chain admits."""
+def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any, q_alone: bool = False) -> Any:
+    """The point x of the chain with these q and p; where v is among its coordinates, the nearest one that the chain admits.
+    With `q_alone` the nearest p that it admits as well."""
     q, p, v = map(np.asarray, (q, p, v))
-    time = [float(t)] if chain.clock else []
-    if len(chain.coordinates) - chain.clock == 2 * len(q):
-        return np.concatenate([q, p, time])
-    n, x = len(q), np.concatenate([q, v, p, time])
-    for _ in range(UPDATES):
+    n, time = len(q), [float(t)] if chain.clock else []
+    without_v = len(chain.coordinates) - chain.clock == 2 * n
+    x = np.concatenate([q, p, time] if without_v else [q, v, p, time])
+    moved = slice(n, len(x) - chain.clock if q_alone else n if without_v else 2 * n)
+    for _ in range(UPDATES if moved.stop > n else 0):
         value = np.asarray(chain.constraints(jnp.asarray(x), params))
-        slope = np.asarray(evaluated(_slope_of(chain), x, params))[:, n : 2 * n]
+        slope = np.asarray(evaluated(_slope_of(chain), x, params))[:, moved]
         change = np.linalg.lstsq(slope, value, rcond=1e-10)[0]
-        x[n : 2 * n] -= change
+        x[moved] -= change
         if np.max(np.abs(change), initial=0.0) <= 1e-15 * (1 + np.max(np.abs(x))):
             break
     return x
@@ -143,9 +154,16 @@ def projected_onto_manifold(system: AbstractSystem, case: Case, initial: Initial
 
 def refuse_off_final_manifold(system: AbstractSystem, case: Case, initial: Initial) -> None:
     """Raise `ValueError` for data of a singular Lagrangian that are off its final manifold, which the scheme would not find:
-    its steps would jump between solutions of the discrete equations that belong to no motion."""
-    if case.two_points:
-        return
+    its steps would jump between solutions of the discrete equations that belong to no motion. Of two points each needs a point
+    of the manifold over it."""
+    if not case.two_points:
+        return _refuse_off(system, case, initial, "they are", "pass project=True to project them")
+    for name, (near, complete) in zip(case.data, _at_either_point(system, case), strict=True):
+        _refuse_off(system, near, complete, f"{name}= is", "start from q= and v= with project=True")
+
+
+def _refuse_off(system: AbstractSystem, case: Case, initial: Initial, are: str, way: str) -> None:
+    q_alone = are != "they are"
     for lane, (q, p, v, params) in enumerate(_lanes_of(case, initial)):
         if _on_known_manifold(system, q, p, v, case.t0, params):
             continue
@@ -156,10 +174,10 @@ def refuse_off_final_manifold(system: AbstractSystem, case: Case, initial: Initi
         singular = f"the Lagrangian is singular at the initial data{which} (∂²L/∂v²), and"
         if chain.verdict == EMPTY:
             raise ValueError(f"{singular} no motion passes through them: {chain.explanation[:-1].split(': ')[0]}.")
-        if off := chain.off(on_chain(chain, q, p, v, case.t0, params), params):
+        if off := chain.off(on_chain(chain, q, p, v, case.t0, params, q_alone), params):
             raise ValueError(
-                f"{singular} they are off its final constraint manifold: {off.split('. ')[0]}; pass project=True to project "
-                "them, or check_initial=False to take them as they are."
+                f"{singular} {are} off its final constraint manifold: {off.split('. ')[0]}; {way}, or check_initial=False to "
+                "take them as they are."
             )
 
 
