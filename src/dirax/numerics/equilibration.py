@@ -4,6 +4,7 @@
 """
 
 import functools
+import math
 from types import ModuleType
 from typing import Any
 
@@ -34,9 +35,9 @@ def equilibrated(matrix: Any, xp: ModuleType = np, rounds: int = ROUNDS) -> tupl
 def balancing_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """Scales (…, k, 1) and (…, 1, l) by which the rows and the columns of a matrix with entries of these `sizes` are to be
     divided: by square roots from both sides at once (Ruiz 2001), which treats equations and unknowns alike, so that a
-    pseudo-inverse in these units does not depend on which of them were called rows."""
-    *lead, k, l = sizes.shape
-    rows, columns = xp.ones((*lead, k, 1)), xp.ones((*lead, 1, l))
+    pseudo-inverse in these units does not depend on which of them were called rows. They begin at the geometric means, which
+    makes the divided matrix the same in any units."""
+    rows, columns = geometric_scales(sizes, xp)
     for _ in range(ROUNDS):
         left = sizes / rows / columns
         rows = rows * xp.sqrt(_nonzero(xp, _maximum(xp, left, -1)))
@@ -44,27 +45,65 @@ def balancing_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     return rows, columns
 
 
-BALANCED = 8
-"""Rounds after which geometric means of rows and columns no longer change by a factor of two."""
-
-
 def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """Powers of two (…, k, 1) and (…, 1, l) by which rows and columns of a matrix with entries of these `sizes` are to be
     divided so that the geometric mean of those that are not zero is about 1 in each (Curtis and Reid 1972).
 
-    It does for a saddle point [M, Wᵀ; W, 0] what largest entries cannot: M and W come out of one size, however small M is."""
-    there = sizes > 0.0
-    logs = xp.where(there, xp.log2(xp.where(there, sizes, 1.0)), 0.0)
-    mean = lambda a, axis: (
-        xp.sum(xp.where(there, a, 0.0), axis=axis, keepdims=True)
-        / xp.maximum(xp.sum(there.astype(float), axis=axis, keepdims=True), 1.0)
-    )
-    columns = xp.zeros((*sizes.shape[:-2], 1, sizes.shape[-1]))
-    rows = mean(logs, -1)
-    for _ in range(BALANCED):
-        columns = mean(logs - rows, -2)
-        rows = mean(logs - columns, -1)
-    return xp.exp2(xp.round(rows)), xp.exp2(xp.round(columns))
+    It does for a saddle point [M, Wᵀ; W, 0] what largest entries cannot: M and W come out of one size, however small M is. The
+    logarithms are those of least squares, found at once and not by iteration: with other units of rows and columns, by powers
+    of two, the divided matrix is the same to the last bit.
+    """
+    *lead, k, l = sizes.shape
+    exponents = xp.where(sizes > 0.0, xp.frexp(sizes)[1], NOTHING)
+    if not k * l:
+        rows, columns = xp.zeros((*lead, k, 1), int), xp.zeros((*lead, 1, l), int)
+    elif xp is np and math.prod(lead) == 1:
+        rows, columns = (a.reshape(*lead, *a.shape) for a in _remembered(exponents.astype(np.int32).tobytes(), k, l))
+    else:
+        rows, columns = _mean_exponents(exponents, xp)
+    power = lambda exponents: xp.ldexp(xp.ones(exponents.shape), exponents)  # XLA's exp2 is not exact
+    return power(rows), power(columns)
+
+
+NOTHING = -(2**20)
+"""Stands for the exponent of zero."""
+
+
+@functools.lru_cache(256)
+def _remembered(exponents: bytes, k: int, l: int) -> tuple[np.ndarray, np.ndarray]:
+    """Those of one matrix: the next one of an iteration, or of a run, mostly has the same exponents."""
+    return _mean_exponents(np.frombuffer(exponents, np.int32).reshape(k, l), np)
+
+
+def _mean_exponents(exponents: Any, xp: ModuleType) -> tuple[Any, Any]:
+    """The exponents of `geometric_scales` from those of the entries (…, k, l)."""
+    there = (exponents > NOTHING).astype(float)
+    logs = xp.where(exponents > NOTHING, exponents, 0).astype(float)
+    turned, sums = (lambda a: xp.swapaxes(a, -1, -2)), (lambda a, axis: xp.sum(a, axis=axis, keepdims=True))
+    in_rows, in_columns = (xp.maximum(sums(there, axis), 1.0) for axis in (-1, -2))
+    means, one = sums(logs, -2) / in_columns, xp.eye(logs.shape[-2])
+    coupled = (there / in_columns) @ turned(there)
+    connected = _connected(coupled + one, xp)
+    # the scales of rows that are connected may have a common factor: with the sum of their logarithms zero the equations have
+    # one solution, and with that of the first of them zero it moves with the units by whole numbers
+    rows = xp.linalg.solve(one * in_rows - coupled + connected, sums(there * (logs - means), -1))
+    rows = rows - xp.take_along_axis(rows, xp.argmax(connected, axis=-1)[..., None], axis=-2)
+    columns = sums(there * (logs - rows), -2) / in_columns
+    return tuple(xp.round(a - ODD).astype(int) for a in (rows, columns))
+
+
+ODD = 0.07
+"""Logarithms are rounded where roundoff does not decide: means of whole numbers are not at a half of one after this."""
+
+
+def _connected(adjacent: Any, xp: ModuleType) -> Any:
+    """1 for rows (…, k, k) that are connected over others, with themselves too, and 0 for those that are not."""
+    found = (adjacent > 0.0).astype(float)
+    for _ in range((found.shape[-1] - 1).bit_length()):
+        if xp is np and np.all(found):
+            break
+        found = (found @ found > 0.0).astype(float)
+    return found
 
 
 LEAST_SIZE, BETWEEN = 2.0**-400, 0.7310585786300049

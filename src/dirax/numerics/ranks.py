@@ -37,7 +37,8 @@ def rank_of_equations(matrices: np.ndarray, tolerance: float = EQUATION_RANK) ->
     directions = vt[:, -1] * units[:, 0]
     if np.any(low := ranks < matrices.shape[2]):  # largest entries cannot balance a saddle point with small masses
         rows, columns = geometric_scales(np.abs(matrices[low]))
-        ranks[low] = np.maximum(ranks[low], numerical_rank(np.linalg.svd(matrices[low] / rows / columns)[1], tolerance))
+        balanced, _ = equilibrated(matrices[low] / rows / columns)
+        ranks[low] = np.maximum(ranks[low], numerical_rank(np.linalg.svd(balanced)[1], tolerance))
     directions /= np.max(np.abs(directions), axis=1, keepdims=True)
     return ranks, directions
 
