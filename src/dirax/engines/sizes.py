@@ -12,8 +12,8 @@ masses and times: nothing in an engine is compared with 1. An equation is as lar
 Newton's method stands.
 
 A velocity under constraints, whose size is |q|/h in short steps, is known to ε|q|/h. Where that is more than 4·STALLED of what it
-comes to, v, or √(a|q|) where motion begins with the acceleration a, and where nothing that it is coupled to is known better, the
-step is too short for double precision, and the unknowns have that size instead: Newton's method will not converge.
+comes to, v, or √(a|q|) where motion begins with the acceleration a, and where no other unknown is known better, the step is too
+short for double precision, and the unknowns have that size instead: Newton's method will not converge.
 
 All this is for data that are special, and takes milliseconds. `first_sizes.py` has the sizes from one linearization alone, and
 says where they leave no doubt: they are those of most runs, and a kernel of the native engine finds them itself in no time. Steps
@@ -183,9 +183,6 @@ NEAR = 1.0 / 16.0
 """How much, relative, the data are changed to see what derivatives are near them."""
 
 
-COUPLED = 1e-3
-"""Unknowns that change others by less than this of their sizes are not coupled."""
-
 ZERO = 2.0**20 * LEAST_SIZE
 """Sizes below this are those of nothing."""
 
@@ -224,11 +221,8 @@ def _sizes(
         moved = finite(applied(xp.abs(inverse), xp.abs(h * slopes[..., -1])))
         reached = solution + xp.sqrt(moved * blurred / EPSILON)
         known = blurred <= 4.0 * STALLED * reached
-        coupling = (finite(i @ xp.abs(d[..., :k])) for i, d in zip((xp.abs(inverse), inverses[1]), both, strict=True))
-        coupled = xp.maximum(*coupling) * blurred[..., None, :] > COUPLED * blurred[..., None]
-        coupled = coupled & xp.swapaxes(coupled, -1, -2)
-        hidden = ~known & (solution > ROUNDINGS * blurred) & ~xp.any(coupled & known[..., None, :], axis=-1)
-        too_short = xp.any(hidden, axis=-1, keepdims=True)
+        hidden = ~known & (solution > ROUNDINGS * blurred)
+        too_short = xp.any(hidden, axis=-1, keepdims=True) & ~xp.any(known, axis=-1, keepdims=True)
         unknowns = xp.maximum(xp.where(too_short, reached, sizes), xp.abs(u))
         rounded = again(unknowns)
         more, matters = of_terms(rounded)[1], _matters(slopes[..., :k], rounded[0], xp)

@@ -7,6 +7,9 @@ first two updates: what an update leaves is at most 2·ratio·update. The iterat
 
     update ≤ FLOOR   or   2·ratio·update ≤ NEGLIGIBLE   or   ratio ≥ ½ and update < STALLED.
 
+A size is a bound, which can be far too large: the first of these counts only where what is left, 2·ratio·|change_i|, is below
+FLOOR·(|u_i| + OWN·size_i) for every unknown, or where there is no ratio yet.
+
 Roots around a run, of initial data say, stop as `dirax/numerics/newton.py` says. The test is
 written out in array operations in `xla/newton.py` and in machine code in `native/loops/newton_loop.py`.
 """
@@ -15,6 +18,9 @@ from dirax.numerics.tolerances import EPSILON
 
 FLOOR = 8 * EPSILON
 """A relative update of this size is roundoff: the unknowns cannot be known better."""
+
+OWN = 2.0**-20
+"""What is surely roundoff of a size that is a bound: an iteration that contracts goes on to it."""
 
 NEGLIGIBLE = 1e-5 * EPSILON
 """Error left by the last update that even 10¹⁰ steps do not add up to more than their roundoff."""

@@ -81,8 +81,8 @@ def _mean_exponents(exponents: Any, xp: ModuleType) -> tuple[Any, Any]:
     logs = xp.where(exponents > NOTHING, exponents, 0).astype(float)
     turned, sums = (lambda a: xp.swapaxes(a, -1, -2)), (lambda a, axis: xp.sum(a, axis=axis, keepdims=True))
     in_rows, in_columns = (xp.maximum(sums(there, axis), 1.0) for axis in (-1, -2))
-    means, one = sums(logs, -2) / in_columns, xp.eye(logs.shape[-2])
-    coupled = (there / in_columns) @ turned(there)
+    means, coupled = sums(logs, -2) / in_columns, (there / in_columns) @ turned(there)
+    one = xp.broadcast_to(xp.eye(logs.shape[-2]), coupled.shape)
     connected = _connected(coupled + one, xp)
     # the scales of rows that are connected may have a common factor: with the sum of their logarithms zero the equations have
     # one solution, and with that of the first of them zero it moves with the units by whole numbers

@@ -85,7 +85,7 @@ class OneLane:
     @property
     def stuck(self) -> bool:
         """Whether Newton's method has not converged."""
-        return self.memory[self.record.status] == NOT_CONVERGED
+        return bool(self.memory[self.record.status] == NOT_CONVERGED)
 
     def left(self) -> list[int]:
         """The trajectories that have not converged."""

@@ -8,17 +8,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from dirax.engines.linear_solver import AbstractLinearSolver
-from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, STALLED
+from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, OWN, STALLED
 from dirax.engines.xla.dense import Dense
 from dirax.program.given_tangents import implicit
 
 
 class Search(NamedTuple):
     """Where the iteration stands: the unknowns, and (the last update relative to |u_i| + size_i, its ratio to the
-    update before, the number of updates) as one array, which costs XLA one kernel and not three."""
+    update before, the number of updates, the update relative to |u_i| + OWN·size_i) as one array, which costs XLA one kernel and
+    not four."""
 
     u: Float[Array, " k"]
-    measures: Float[Array, "3"]
+    measures: Float[Array, "4"]
 
     @property
     def update(self) -> Float[Array, ""]:
@@ -34,6 +35,11 @@ class Search(NamedTuple):
     def updates(self) -> Float[Array, ""]:
         """A whole number."""
         return self.measures[2]
+
+    @property
+    def own(self) -> Float[Array, ""]:
+        """inf before the first update."""
+        return self.measures[3]
 
 
 def newton_root(
@@ -108,7 +114,8 @@ def newton(
         u = s.u - change
         update = jnp.max(jnp.abs(change) / (jnp.abs(u) + size))
         ratio = jnp.where(s.updates > 0, update / s.update, jnp.nan)
-        return Search(u, jnp.stack([update, ratio, s.updates + 1]))
+        own = jnp.max(jnp.abs(change) / (jnp.abs(u) + OWN * size))
+        return Search(u, jnp.stack([update, ratio, s.updates + 1, own]))
 
     def unfinished(s: Search):
         return running & ~at_floor(s) & ~jnp.isnan(s.update) & (s.updates < max_iterations)
@@ -124,7 +131,7 @@ def newton(
         factors = linear_solver.factorise(matrix)
         return jax.lax.while_loop(contracting, lambda s: updated(s, factors, unit), updated(s, factors, unit))
 
-    start = Search(guess, jnp.array([jnp.inf, jnp.nan, 0.0]))
+    start = Search(guess, jnp.array([jnp.inf, jnp.nan, 0.0, jnp.inf]))
     return jax.lax.while_loop(unfinished, with_new_jacobian, start)
 
 
@@ -132,4 +139,5 @@ def at_floor(s: Search) -> Bool[Array, ""]:
     """Whether another update would gain nothing: `dirax/engines/stopping.py`."""
     left = 2 * s.ratio * s.update
     stalled = (s.ratio >= 0.5) & (s.update < STALLED)
-    return (s.update <= FLOOR) | (left <= NEGLIGIBLE) | stalled
+    rounded = (s.update <= FLOOR) & ~(2 * s.ratio * s.own > FLOOR)
+    return rounded | (left <= NEGLIGIBLE) | stalled

@@ -11,7 +11,7 @@ from dirax.engines.native.ir.emitter import Body, Emitter
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.newton_step import Correction
 from dirax.engines.step_program import TracedEquation
-from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, STALLED
+from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, OWN, STALLED
 
 
 class NewtonLoop:
@@ -83,8 +83,9 @@ class NewtonLoop:
         b, e = self.body, self.e
         new = [e.sub(a, d) for a, d in zip(old, change, strict=True)]
         update, total = e.const(0.0), e.const(0.0)
-        for a, d, size in zip(new, change, self.sizes, strict=True):
-            update = e.max(e.div(e.abs(d), e.add(e.abs(a), b.load(e.real, size))), update)
+        sizes = [b.load(e.real, size) for size in self.sizes]
+        for a, d, size in zip(new, change, sizes, strict=True):
+            update = e.max(e.div(e.abs(d), e.add(e.abs(a), size)), update)
             total = e.add(total, d)
         update = e.select(e.compare("uno", total, total), e.const(float("nan")), update)
         count = b.load(e.real, self._number)
@@ -95,7 +96,11 @@ class NewtonLoop:
         b.store(e.real, e.select(now, update, b.load(e.real, self._update)), self._update)
         count = e.select(now, e.add(count, e.const(1.0)), count)
         b.store(e.real, count, self._number)
-        floor = self._at_floor(update, ratio)
+        known = e.true
+        for a, d, size in zip(new, change, sizes, strict=True):
+            own = e.add(e.abs(a), e.mul(e.const(OWN), size))
+            known = e.both(known, e.compare("ole", e.mul(ratio, e.abs(d)), e.mul(e.const(FLOOR / 2.0), own)))
+        floor = self._at_floor(update, ratio, e.either(first, known))
         b.store(e.bool, e.body.put(f"select {e.bool} {now}, {e.bool} {floor}, {e.bool} {b.load(e.bool, self._floor, 1)}"),
                 self._floor, 1)  # fmt: skip
         cap = e.splat(b.put("sitofp i64 %cap to double"))
@@ -108,12 +113,14 @@ class NewtonLoop:
         quick = e.either(near, e.compare("olt", ratio, e.const(CONTRACTING)))
         b.store(e.bool, e.both(e.both(now, unfinished), e.both(quick, stable)), self._contracting, 1)
 
-    def _at_floor(self, update: str, ratio: str) -> str:
-        """Whether another update would gain nothing: `dirax/engines/stopping.py`."""
+    def _at_floor(self, update: str, ratio: str, known: str) -> str:
+        """Whether another update would gain nothing: `dirax/engines/stopping.py`; `known`, whether what is left is roundoff of
+        the unknowns themselves."""
         e = self.e
         left = e.mul(e.mul(e.const(2.0), ratio), update)
         stalled = e.both(e.compare("oge", ratio, e.const(0.5)), e.compare("olt", update, e.const(STALLED)))
-        small = e.either(e.compare("ole", update, e.const(FLOOR)), e.compare("ole", left, e.const(NEGLIGIBLE)))
+        rounded = e.both(e.compare("ole", update, e.const(FLOOR)), known)
+        small = e.either(rounded, e.compare("ole", left, e.const(NEGLIGIBLE)))
         return e.either(small, stalled)
 
 
