@@ -19,7 +19,7 @@ from dirax.schemes.step import Shape, make_step_equation
 
 symmetric = lambda a: a + a.T
 CASES = {
-    "singular values": lambda a, x: (scaled_pseudo_inverse(a @ a.T)[0] @ x, jnp.linalg.svd(a, compute_uv=False)),
+    "singular values": lambda a, x: (scaled_pseudo_inverse(a @ a.T) @ x, jnp.linalg.svd(a, compute_uv=False)),
     "eigenvalues": lambda a, x: jnp.linalg.eigh(symmetric(a))[0] + jnp.linalg.pinv(symmetric(a)) @ x,
     "a root": lambda a, x: nearest_root(lambda u: jnp.sinh(u) + 0.1 * jnp.sin(a @ u) - x, jnp.zeros(3)),
     "a root by halved steps": lambda a, x: nearest_root(lambda u: jnp.arctan(9.0 * (u - x)) + a[0, 0] ** 2 * (u - x), x + 2.0),

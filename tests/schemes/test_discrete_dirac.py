@@ -200,6 +200,7 @@ def test_theta_maps_of_a_lagrangian_are_the_lifted_ones():
 
 
 FORMS = lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
+TURNED = np.arctan2(0.6, 0.8) + 0.005
 HIDDEN = {
     "a Lagrangian": (
         dx.LagrangeDirac(lambda q, v: v[:2] @ v[:2] / 2 - q[1] + q[2] * (q[:2] @ q[:2] - 1.0)),
@@ -208,7 +209,7 @@ HIDDEN = {
     ),
     "its two points": (
         dx.LagrangeDirac(lambda q, v: v[:2] @ v[:2] / 2 - q[1] + q[2] * (q[:2] @ q[:2] - 1.0)),
-        {"q0": [0.6, -0.8, 0.1], "q1": [0.604, -0.797, 0.1]},
+        {"q0": [0.6, -0.8, -0.525], "q1": [np.sin(TURNED), -np.cos(TURNED), -0.525]},
         "∂²L/∂v² has rank 2 of 3",
     ),
     "an implicit system": (

@@ -153,3 +153,24 @@ def test_it_is_self_adjoint(kind):
     back = dx.simulate(dx.PortHamiltonian(hamiltonian, J=-np.array(J)), scheme, x=START, step=0.05, steps=1)
     ahead = dx.simulate(dx.PortHamiltonian(hamiltonian, J=J), scheme, x=back.x[-1], step=0.05, steps=1)
     np.testing.assert_allclose(ahead.x[-1], START, rtol=1e-14)
+
+
+@pytest.mark.parametrize("kind", ["gonzalez", "mean-value"])
+def test_units_of_charge_and_flux_do_not_mix(kind):
+    """A nonlinear resonant circuit in other units of either, by powers of two: the same to the last bit."""
+
+    def hamiltonian(x, params):
+        charge, flux = x[0] / params["Q"], x[1] / params["F"]
+        return params["U"] * (charge**2 / 2 + charge**4 / 4 + jnp.cosh(flux / 1.7) - 1.0)
+
+    def run(Q, F, U):
+        circuit = dx.PortHamiltonian(hamiltonian, jnp.array([[0.0, 1.0], [-1.0, 0.0]]))
+        start, params = np.array([0.8 * Q, 0.5 * F]), {"Q": Q, "F": F, "U": U}
+        return dx.simulate(circuit, dx.DiscreteGradient(kind), x=start, params=params, step=0.3 * Q * F / U, steps=50)
+
+    plain = run(1.0, 1.0, 1.0)
+    assert plain.ok and np.ptp(plain.energy()) < 3e-15
+    for units in ((2.0**-40, 2.0**-30, 2.0**-33), (2.0**-20, 2.0**-50, 2.0**-33), (2.0**30, 2.0**-30, 2.0**7)):
+        scaled = run(*units)
+        assert scaled.ok and scaled.stats["newton_iterations"] == plain.stats["newton_iterations"]
+        np.testing.assert_array_equal(np.asarray(scaled.x) / units[:2], plain.x)

@@ -12,8 +12,9 @@ masses and times: nothing in an engine is compared with 1. An equation is as lar
 Newton's method stands.
 
 A velocity under constraints, whose size is |q|/h in short steps, is known to ε|q|/h. Where that is more than 4·STALLED of what it
-comes to, v, or √(a|q|) where motion begins with the acceleration a, and where no other unknown is known better, the step is too
-short for double precision, and the unknowns have that size instead: Newton's method will not converge.
+comes to, v, or √(a|q|) where motion begins with the acceleration a, and where nothing that it is coupled to is known better and
+the state after the step is lost with it, the step is too short for double precision, and the unknowns have that size instead:
+Newton's method will not converge.
 
 All this is for data that are special, and takes milliseconds. `first_sizes.py` has the sizes from one linearization alone, and
 says where they leave no doubt: they are those of most runs, and a kernel of the native engine finds them itself in no time. Steps
@@ -122,7 +123,8 @@ def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
                 there, both = [(x, part) for part in (1.0, SHORT) for x in (state, end)], ((state, 1.0), (end, 1.0))
                 (residual, slopes, terms), (*_, other), (_, short, _), (_, near, _) = look(i, u, *there, only=OF_SIZES)
                 again = lambda s, i=i, u=u, both=both: [a for (a,) in look(i, u, *both, sizes=s, only=(TERMS,))]
-                found.append(_sizes(residual, slopes, short, near, u, (terms, other), again, h[i][:, None], np))
+                after = lambda u, i=i: next(look(i, u, (state, 1.0), only=(END,)))[0]
+                found.append(_sizes(residual, slopes, short, near, u, (terms, other), again, after, h[i][:, None], np))
             else:
                 found.append(found[same])
     except (UnsupportedPrimitive, GraphTooLarge):
@@ -183,6 +185,9 @@ NEAR = 1.0 / 16.0
 """How much, relative, the data are changed to see what derivatives are near them."""
 
 
+COUPLED = 1e-3
+"""Unknowns that change others by less than this of their sizes are not coupled."""
+
 ZERO = 2.0**20 * LEAST_SIZE
 """Sizes below this are those of nothing."""
 
@@ -196,10 +201,20 @@ def _nearby(count: int) -> np.ndarray:
 
 
 def _sizes(
-    residual: Any, slopes: Any, short: Any, near: Any, u: Any, rounded: Sequence, again: Callable, h: Any, xp: ModuleType
+    residual: Any,
+    slopes: Any,
+    short: Any,
+    near: Any,
+    u: Any,
+    rounded: Sequence,
+    again: Callable,
+    after: Callable,
+    h: Any,
+    xp: ModuleType,
 ) -> Any:
     """(…, k) from r (…, k) and its derivatives by (u, h) at the state, and those of a short step there and near its end,
-    (…, k, k + 1); `rounded` are the sizes of the terms (…, k) at either place, and `again` those with unknowns of given sizes."""
+    (…, k, k + 1); `rounded` are the sizes of the terms (…, k) at either place, and `again` those with unknowns of given sizes;
+    `after` is the state after the step with given unknowns."""
     if not u.shape[-1]:
         return xp.ones(u.shape)
     k, applied = u.shape[-1], lambda matrix, vector: (matrix @ vector[..., None])[..., 0]
@@ -221,8 +236,13 @@ def _sizes(
         moved = finite(applied(xp.abs(inverse), xp.abs(h * slopes[..., -1])))
         reached = solution + xp.sqrt(moved * blurred / EPSILON)
         known = blurred <= 4.0 * STALLED * reached
-        hidden = ~known & (solution > ROUNDINGS * blurred)
-        too_short = xp.any(hidden, axis=-1, keepdims=True) & ~xp.any(known, axis=-1, keepdims=True)
+        coupling = (finite(i @ xp.abs(d[..., :k])) for i, d in zip((xp.abs(inverse), inverses[1]), both, strict=True))
+        coupled = xp.maximum(*coupling) * blurred[..., None, :] > COUPLED * blurred[..., None]
+        coupled = coupled & xp.swapaxes(coupled, -1, -2)
+        hidden = ~known & (solution > ROUNDINGS * blurred) & ~xp.any(coupled & known[..., None, :], axis=-1)
+        end, moved_end = xp.abs(after(u)), xp.abs(after(u + xp.where(hidden, blurred, 0.0)) - after(u))
+        lost = (moved_end > 4.0 * STALLED * end) & (end > ROUNDINGS * moved_end)
+        too_short = xp.any(hidden, axis=-1, keepdims=True) & xp.any(lost, axis=-1, keepdims=True)
         unknowns = xp.maximum(xp.where(too_short, reached, sizes), xp.abs(u))
         rounded = again(unknowns)
         more, matters = of_terms(rounded)[1], _matters(slopes[..., :k], rounded[0], xp)
@@ -268,8 +288,9 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
         for i, u in enumerate(guess):
             short, near = linear(i, u, state, SHORT)[1], linear(i, u, end, SHORT)[1]
             again = lambda sizes, i=i, u=u: [terms(i, u, x, sizes) for x in (state, end)]
-            part = equation.stages[i][1] * h
-            found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, again(jnp.abs(u)), again, part, jnp))
+            part, stage = equation.stages[i][1] * h, equation.stages[i][0]
+            after = lambda u, stage=stage, part=part: stage.advance(u, state, t, part, params)
+            found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, again(jnp.abs(u)), again, after, part, jnp))
         return tuple(found)
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params

@@ -35,9 +35,9 @@ def equilibrated(matrix: Any, xp: ModuleType = np, rounds: int = ROUNDS) -> tupl
 def balancing_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """Scales (…, k, 1) and (…, 1, l) by which the rows and the columns of a matrix with entries of these `sizes` are to be
     divided: by square roots from both sides at once (Ruiz 2001), which treats equations and unknowns alike, so that a
-    pseudo-inverse in these units does not depend on which of them were called rows. They begin at the geometric means, which
-    makes the divided matrix the same in any units."""
-    rows, columns = geometric_scales(sizes, xp)
+    pseudo-inverse in these units does not depend on which of them were called rows."""
+    *lead, k, l = sizes.shape
+    rows, columns = xp.ones((*lead, k, 1)), xp.ones((*lead, 1, l))
     for _ in range(ROUNDS):
         left = sizes / rows / columns
         rows = rows * xp.sqrt(_nonzero(xp, _maximum(xp, left, -1)))
@@ -54,11 +54,11 @@ def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     of two, the divided matrix is the same to the last bit.
     """
     *lead, k, l = sizes.shape
-    exponents = xp.where(sizes > 0.0, xp.frexp(sizes)[1], NOTHING)
+    exponents = xp.where(sizes > 0.0, xp.frexp(sizes)[1].astype(int), NOTHING)
     if not k * l:
         rows, columns = xp.zeros((*lead, k, 1), int), xp.zeros((*lead, 1, l), int)
     elif xp is np and math.prod(lead) == 1:
-        rows, columns = (a.reshape(*lead, *a.shape) for a in _remembered(exponents.astype(np.int32).tobytes(), k, l))
+        rows, columns = (a.reshape(*lead, *a.shape) for a in _remembered(exponents.tobytes(), k, l))
     else:
         rows, columns = _mean_exponents(exponents, xp)
     power = lambda exponents: xp.ldexp(xp.ones(exponents.shape), exponents)  # XLA's exp2 is not exact
@@ -72,11 +72,27 @@ NOTHING = -(2**20)
 @functools.lru_cache(256)
 def _remembered(exponents: bytes, k: int, l: int) -> tuple[np.ndarray, np.ndarray]:
     """Those of one matrix: the next one of an iteration, or of a run, mostly has the same exponents."""
-    return _mean_exponents(np.frombuffer(exponents, np.int32).reshape(k, l), np)
+    return _mean_exponents(np.frombuffer(exponents, int).reshape(k, l), np)
+
+
+NOISE = 20
+"""An entry that is smaller than others of its row, and of its column, by so many powers of two does not count: it may be the
+roundoff of zero."""
 
 
 def _mean_exponents(exponents: Any, xp: ModuleType) -> tuple[Any, Any]:
     """The exponents of `geometric_scales` from those of the entries (…, k, l)."""
+    rows, columns = _least_squares(exponents, xp)
+    scaled = xp.where(exponents > NOTHING, exponents - rows - columns, NOTHING)
+    largest = lambda axis: xp.max(scaled, axis=axis, keepdims=True)
+    noise = (scaled < largest(-1) - NOISE) & (scaled < largest(-2) - NOISE)
+    if xp is np and not np.any(noise & (exponents > NOTHING)):
+        return rows, columns
+    return _least_squares(xp.where(noise, NOTHING, exponents), xp)
+
+
+def _least_squares(exponents: Any, xp: ModuleType) -> tuple[Any, Any]:
+    """Whole numbers near the r_i and c_j for which Σ (e_ij − r_i − c_j)² is least."""
     there = (exponents > NOTHING).astype(float)
     logs = xp.where(exponents > NOTHING, exponents, 0).astype(float)
     turned, sums = (lambda a: xp.swapaxes(a, -1, -2)), (lambda a, axis: xp.sum(a, axis=axis, keepdims=True))

@@ -20,38 +20,53 @@ SHORTEST = 2.0**-30
 AT_FLOOR = 4.0 * EPSILON
 """A step of this size relative to the point is roundoff."""
 
+NEAR = 1e-6
+"""A step of this size relative to each unknown is in the domain, and one that contracts."""
+
 FAR = 1e3
 """A zero at this distance, relative to 1 + |start|, is none near the start."""
 
 
-def damped_step(update: Callable, u: Any, units: Any, xp: ModuleType = np) -> tuple[Any, Any]:
+def damped_step(update: Callable, u: Any, units: Any, sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """(u, whether to go on) after a Newton step that is halved until the next one would be shorter: so neither the units of the
     equations nor those of the unknowns matter, and the domain of the equations is not left.
 
-    `update(u)` (…, k) is A⁻¹ r(u), with one A for all u; `units` (…, k) those of the unknowns. With NumPy, leading axes hold
-    equations side by side; where no shorter step above the roundoff of u is an improvement, u stays.
+    `update(u)` (…, k) is A⁻¹ r(u), with one A for all u; `units` (…, k) are what steps are measured in, and `sizes` (…, k) how
+    large the unknowns are: a step that is NEAR zero in each of these is taken whole, up to the roundoff of every one. With NumPy,
+    leading axes hold equations side by side; where no shorter step above the roundoff of u is an improvement, u stays.
     """
     size = lambda v: xp.max(xp.abs(v) / units, axis=-1)
+    of_each = lambda v: xp.max(xp.abs(v) / sizes, axis=-1)
     change = update(u)
-    here, floor = size(change), AT_FLOOR * size(u)
-    at_floor = here <= floor
+    here, floor, near = size(change), AT_FLOOR * size(u), of_each(change)
+    at_floor = near <= AT_FLOOR
 
     def improves(fraction):
         following = update(u - fraction[..., None] * change)
+        better = size(following) <= (1.0 - fraction / 4.0) * here
+        better = xp.where(near <= NEAR, of_each(following) <= near / 2.0, better)
         # not left to the comparison: XLA's vectorized maximum of NaNs can be −∞ on a CPU
-        return xp.all(xp.isfinite(following), axis=-1) & (size(following) <= (1.0 - fraction / 4.0) * here)
+        return xp.all(xp.isfinite(following), axis=-1) & better
 
     def halve(carry):
         searching, (fraction, better) = unfinished(carry), carry
         fraction = xp.where(searching, fraction / 2.0, fraction)
         return fraction, better | searching & improves(fraction)
 
-    unfinished = lambda carry: ~carry[1] & (carry[0] > SHORTEST) & (carry[0] * here > floor)
+    unfinished = lambda carry: ~carry[1] & (carry[0] > SHORTEST) & (carry[0] * here > floor) & (near > NEAR)
     whole = xp.ones(here.shape)
     with np.errstate(all="ignore"):
         better = at_floor if xp is np and np.all(at_floor) else at_floor | improves(whole)
         fraction, better = _repeated(xp, lambda carry: xp.any(unfinished(carry)), halve, (whole, better))
         return xp.where(better[..., None], u - fraction[..., None] * change, u), better & ~at_floor
+
+
+def sizes_of_unknowns(matrix: Any, inverse: Any, u: Any, residual: Any, xp: ModuleType = np) -> Any:
+    """How large the unknowns (…, l) of r(u) = 0 with the derivative A (…, k, l) and its inverse (…, l, k) are,
+    |A⁻¹|(|A||u| + |r|): the ε-th part of it is their roundoff (Skeel 1979), in whatever units. 1 where it is zero."""
+    applied = lambda matrix, vector: xp.sum(xp.abs(matrix) * vector[..., None, :], axis=-1)
+    sizes = applied(inverse, applied(matrix, xp.abs(u)) + xp.abs(residual))
+    return xp.where(sizes > 0.0, sizes, 1.0)
 
 
 def _repeated(xp: ModuleType, unfinished: Callable, step: Callable, carry: Any) -> Any:

@@ -11,7 +11,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, batching
 from jaxtyping import Array, Float
 
-from dirax.numerics.equilibration import balancing_scales
+from dirax.numerics.equilibration import geometric_scales
 from dirax.numerics.tolerances import EQUATION_RANK
 from dirax.program.primitives import binds, each, plain_primitive
 
@@ -37,20 +37,20 @@ def pseudo_inverse(matrix: Float[Array, "k l"], tolerance: float) -> Float[Array
     return pseudo_inverse_p.bind(matrix, tolerance=tolerance)[0]
 
 
-def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> tuple[Float[Array, "l k"], Float[Array, " l"]]:
-    """The pseudo-inverse of a matrix with rows and columns scaled to unit size, and the units that this gives the columns."""
-    inverse, units = scaled_inverse_p.bind(matrix) if binds(matrix) else equilibrated_inverse(jnp, matrix)
-    return inverse, units
+def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> Float[Array, "l k"]:
+    """The pseudo-inverse of a matrix with rows and columns scaled to unit size: to the last bit the same in other units of its
+    equations and unknowns, by powers of two."""
+    return scaled_inverse_p.bind(matrix)[0] if binds(matrix) else equilibrated_inverse(jnp, matrix)
 
 
-def equilibrated_inverse(xp: ModuleType, matrix: Any) -> tuple[Any, Any]:
+def equilibrated_inverse(xp: ModuleType, matrix: Any) -> Any:
     """The same by JAX, or by NumPy with leading axes."""
     sizes = xp.abs(lax.stop_gradient(matrix) if xp is jnp else matrix)  # units have no derivative, which would be ∞ at zero
-    rows, columns = balancing_scales(sizes, xp)
+    rows, columns = geometric_scales(sizes, xp)
     scaled = matrix / rows / columns
     inverse = xp.linalg.pinv(scaled, EQUATION_RANK) if xp is jnp else pseudo_inverses(scaled, EQUATION_RANK)
     turned = lambda a: xp.swapaxes(a, -1, -2)
-    return inverse / turned(columns) / turned(rows), 1.0 / columns[..., 0, :]
+    return inverse / turned(columns) / turned(rows)
 
 
 def pseudo_inverses(matrices: np.ndarray, tolerance: float) -> np.ndarray:
@@ -101,8 +101,8 @@ def _rows_inverted(matrices: np.ndarray) -> np.ndarray:
     return q
 
 
-def _turned(matrix):
-    return [ShapedArray(matrix.shape[::-1], matrix.dtype), ShapedArray(matrix.shape[1:], matrix.dtype)]
+def _turned(matrix, **_):
+    return [ShapedArray(matrix.shape[::-1], matrix.dtype)]
 
 
 def _solve_tangents(primals, tangents, **p):
@@ -137,6 +137,6 @@ batching.primitive_batchers[solve_p] = _solve_batched
 pseudo_inverse_p = plain_primitive(
     "dirax_pseudo_inverse",
     lambda matrix, tolerance: [jnp.linalg.pinv(matrix, tolerance)],
-    lambda matrix, **_: _turned(matrix)[:1],
+    _turned,
 )
-scaled_inverse_p = plain_primitive("dirax_scaled_inverse", lambda matrix: equilibrated_inverse(jnp, matrix), _turned)
+scaled_inverse_p = plain_primitive("dirax_scaled_inverse", lambda matrix: [equilibrated_inverse(jnp, matrix)], _turned)

@@ -11,7 +11,9 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import ad
 from jaxtyping import Array, Float
 
-from dirax.numerics.newton import damped_step
+from dirax.numerics.equilibration import balancing_scales
+from dirax.numerics.newton import damped_step, sizes_of_unknowns
+from dirax.numerics.tolerances import TINY
 from dirax.program.given_tangents import implicit, implicit_tangent
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.primitives import binds, plain_primitive
@@ -47,8 +49,8 @@ def _root(residual: Callable, max_steps: int, guess, *captured):
 
     def step(carry):
         u, _, count = carry
-        inverse, units = inverse_at(u)
-        u, going = damped_step(lambda u: inverse(of_unknowns(u)), u, units, jnp)
+        inverse, units, sizes = inverse_at(u)
+        u, going = damped_step(lambda u: inverse(of_unknowns(u)), u, units, sizes, jnp)
         return u, going, count + 1
 
     unfinished = lambda carry: carry[1] & (carry[2] < max_steps)
@@ -60,15 +62,17 @@ def _root(residual: Callable, max_steps: int, guess, *captured):
 
 def _least_change(matrix, right):
     """The solution of a linear system, regular or not, in the units of its equations and unknowns."""
-    return scaled_pseudo_inverse(matrix)[0] @ right
+    return scaled_pseudo_inverse(matrix) @ right
 
 
 def _least_changes(equations: Callable) -> Callable:
-    """u ↦ (right-hand side ↦ solution of least size with the Jacobian of `equations` at u, units of the unknowns)."""
+    """u ↦ (right-hand side ↦ solution of least size with the Jacobian of `equations` at u, units and sizes of the unknowns)."""
 
     def at(u):
-        inverse, units = scaled_pseudo_inverse(jacobian(equations)(u))
-        return (lambda right: inverse @ right), units
+        matrix = jacobian(equations)(u)
+        inverse = scaled_pseudo_inverse(matrix)
+        units = 1.0 / balancing_scales(jnp.abs(matrix), jnp)[1][0]
+        return (lambda right: inverse @ right), units, sizes_of_unknowns(matrix, inverse, u, equations(u), jnp)
 
     return at
 
@@ -78,7 +82,8 @@ def _by_elimination(equations: Callable, sparse: Any) -> Callable:
 
     def at(u):
         factors = sparse.factorise(sparse.values(equations, u))
-        return (lambda right: sparse.solve(factors, right)), jnp.ones(u.shape)
+        size = jnp.full(u.shape, jnp.max(jnp.abs(u), initial=TINY))
+        return (lambda right: sparse.solve(factors, right)), jnp.ones(u.shape), size
 
     return at
 

@@ -105,7 +105,7 @@ class CollisionStep(AbstractStep):
 
 def least_squares(matrix: Any, right: Any) -> Any:
     """The smallest x for which matrix x is nearest to the right-hand side, of constraints that may depend on each other."""
-    return scaled_pseudo_inverse(matrix)[0] @ right
+    return scaled_pseudo_inverse(matrix) @ right
 
 
 def bounced(

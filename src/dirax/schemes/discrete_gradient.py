@@ -19,9 +19,10 @@ class DiscreteGradient(AbstractScheme):
     ⟨dH(x̄), ẋ_d⟩ is not the change of H. On a DiracSystem (ẋ_d, ∇̄H) ∈ D(x̄), and H is conserved; with holonomic constraints
     (ẋ_d, ∇̄H − Gᵀλ) ∈ D(x̄) and G(x̄) ẋ_d = 0, as in Method 1. Second order.
 
-    `kind`: "gonzalez", dH(x̄) corrected along the step, or "mean-value", the mean of dH over the step by Gauss–Legendre
-    quadrature with `nodes` points, corrected in the same way by what the quadrature leaves. What roundoff takes from the
-    balance in one step is given back in the next, so that it does not add up over many.
+    `kind`: "gonzalez", dH(x̄) corrected along the step, in the metric |∂²H/∂x_i²|, in which charges
+    and fluxes do not mix whatever their units (the Euclidean one from 128 coordinates on); or "mean-value", the mean of dH over
+    the step by Gauss–Legendre quadrature with `nodes` points, corrected in the same way by what the quadrature leaves. What
+    roundoff takes from the balance in one step is given back in the next, so that it does not add up over many.
 
     Saved with x: `work` (2,), the energy supplied through the ports and the energy dissipated since the start; per step
     `power` (3,), the rates at which energy is stored, supplied and dissipated.

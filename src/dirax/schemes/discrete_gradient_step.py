@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 
 from dirax.numerics.tolerances import EPSILON
-from dirax.program.tracing import once
+from dirax.program.roots import FEWEST_SPARSE
+from dirax.program.tracing import jacobian, once
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 from dirax.systems.forms import EnergyForm, RelationForm
 
-NOISE = 1e-11
+NOISE = 5e-12
 """How much of dH the correction may be, relative, where it is roundoff of H only. It fades out for steps so short that it
 would be more: dividing roundoff by such a step would push a system that comes to rest."""
 FADED = 1e-6
@@ -25,7 +26,8 @@ class DiscreteGradientStep(AbstractStep):
     """ẋ_d = (J − R)(x̄) ∇̄H + B(x̄) ū: state (x, supplied, dissipated, their lost digits, H(x_0)), unknowns ẋ_d and the inputs
     of closed ports, or the multipliers of constraints.
 
-    ∇̄H is the mean of dH at the `points` of the step (0 to 1) with these `weights`, corrected along the step.
+    ∇̄H is the mean of dH at the `points` of the step (0 to 1) with these `weights`, corrected along the step in the metric of the
+    second derivatives of H.
     """
 
     relation: RelationForm
@@ -73,7 +75,17 @@ class DiscreteGradientStep(AbstractStep):
         gained = (state.supplied - state.dissipated) + (state.lost_supplied - state.lost_dissipated)
         stored = (self.energy.hamiltonian(state.x + change, params) - state.first) - gained
         blurred = EPSILON * (jnp.abs(state.first) + jnp.abs(gained)) / NOISE
-        return gradient + _along(change, gradient, stored - gradient @ change, blurred), state.x + change / 2
+        middle = state.x + change / 2
+        missing = stored - gradient @ change
+        along, share = _along(change, self._metric(middle, params), gradient, blurred)
+        instead, _ = _along(change, jnp.ones(self.n), gradient, blurred)
+        return gradient + missing * (along + (1.0 - share) * instead), middle
+
+    def _metric(self, x, params):
+        """|∂²H/∂x_i²|, shape (n,): in this metric charges and fluxes do not mix, whatever their units."""
+        if self.n >= FEWEST_SPARSE:  # a diagonal costs as many gradients as there are coordinates
+            return jnp.ones(self.n)
+        return jnp.abs(jnp.diagonal(jacobian(lambda x: self.energy.differential(x, params))(x)))
 
     @once
     def ports(self, u, state, t, h, params):
@@ -127,18 +139,21 @@ class DiscreteGradientStep(AbstractStep):
         return state, self.unknowns.join(velocity=data["velocity"])
 
 
-def _along(change, gradient, missing, blurred):
-    """The multiple a Δx of the step with ⟨a Δx, Δx⟩ = `missing`, faded out where |∇̄H||Δx| is lost in what is `blurred`.
+def _along(change, metric, gradient, blurred):
+    """(a G Δx with ⟨a G Δx, Δx⟩ = φ in a diagonal metric G, φ): φ is 1, and fades out where |∇̄H||Δx| in this metric is lost in
+    what is `blurred`, or G does not see Δx.
 
-    Its limit for Δx → 0 is zero, for `missing` is of higher order than |Δx|: a system at rest has the discrete gradient dH.
+    Zero for Δx → 0, where what is missing is of higher order than |Δx|: a system at rest has the discrete gradient dH.
     """
-    squared, steep = change @ change, gradient @ gradient
+    seen = metric > TINY
+    squared = metric @ (change * change)
+    steep = (gradient * gradient) @ jnp.where(seen, 1.0 / jnp.where(seen, metric, 1.0), 0.0)
     on = (squared > TINY) & (steep > TINY)
     length, slope = jnp.sqrt(jnp.where(on, squared, 1.0)), jnp.sqrt(jnp.where(on, steep, 1.0))
     on = on & (length * slope > FADED * blurred)
     hidden = jnp.where(on, blurred / length / slope, 0.0)
-    factor = jnp.where(on, missing / length, 0.0) / jnp.sqrt(1.0 + (hidden * hidden) ** 2)
-    return factor * (change / length)
+    share = jnp.where(on, 1.0, 0.0) / jnp.sqrt(1.0 + (hidden * hidden) ** 2)
+    return share / length * (metric * change / length), share
 
 
 def _add(total, lost, term):

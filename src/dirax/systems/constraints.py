@@ -146,7 +146,7 @@ class Constraints(eqx.Module):
         self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], lifted: Float[Numbers, "n k"], params: Any
     ) -> Float[Numbers, " n"]:
         """The velocity with W v + b = 0 and G v + ∂g/∂t = 0 that differs from v by a combination of the columns of `lifted`."""
-        inverse, _ = scaled_pseudo_inverse(self.matrix(t, q, params) @ lifted)
+        inverse = scaled_pseudo_inverse(self.matrix(t, q, params) @ lifted)
         return v - lifted @ (inverse @ self.velocity_defect(t, q, v, params))
 
     def nearest_position(

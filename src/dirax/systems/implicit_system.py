@@ -81,7 +81,7 @@ class ImplicitSystem(AbstractSystem):
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         x = data["x"]
         matrix, f = self.equations(x, params)
-        velocity = scaled_pseudo_inverse(matrix)[0] @ f
+        velocity = scaled_pseudo_inverse(matrix) @ f
         return {"x": x, "velocity": velocity[: x.size], "defect": matrix @ velocity - f}
 
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " r"]:

@@ -188,10 +188,10 @@ class LagrangeDirac(AbstractSystem):
     def _undetermined_part(self, q, v, params, t):
         """What to take from v to satisfy the constraints without changing ∂L/∂v: nothing where L is regular."""
         hessian = jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v)
-        kernel = jnp.eye(q.shape[0]) - scaled_pseudo_inverse(hessian)[0] @ hessian
+        kernel = jnp.eye(q.shape[0]) - scaled_pseudo_inverse(hessian) @ hessian
         kernel = jnp.where(jnp.trace(kernel) > 0.5, kernel, 0.0)  # its trace is the number of undetermined directions
         rows, defect = self.constraints.matrix(t, q, params), self.constraints.velocity_defect(t, q, v, params)
-        return kernel @ (scaled_pseudo_inverse(rows @ kernel)[0] @ defect)
+        return kernel @ (scaled_pseudo_inverse(rows @ kernel) @ defect)
 
     def _lifted(self, q, v, rows, params, t):
         """metric⁻¹ rowsᵀ in the metric ∂²L/∂v² where it is positive definite and the Euclidean one elsewhere."""

@@ -80,7 +80,7 @@ class OneLane:
     @property
     def doubtful(self) -> bool:
         """Whether the sizes are in doubt."""
-        return self.memory[self.record.status] == DOUBTFUL
+        return bool(self.memory[self.record.status] == DOUBTFUL)
 
     @property
     def stuck(self) -> bool:
