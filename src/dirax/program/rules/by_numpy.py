@@ -207,7 +207,7 @@ def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands
             inverse = _inverted(slope)
             units = 1.0 / balancing_scales(np.abs(slope))[1][..., 0, :]
             sizes = sizes_of_unknowns(slope, inverse, found[going], value)
-            update = lambda u, known=known, inverse=inverse: np.einsum("blk,bk->bl", inverse, residual([*known, u])[0])
+            update = lambda u, known=known, inverse=inverse: (inverse @ residual([*known, u])[0][..., None])[..., 0]
             found[going], more = damped_step(update, found[going], units, sizes)
             going = going[more]
         return [found]
