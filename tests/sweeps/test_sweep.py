@@ -15,7 +15,7 @@ import xarray as xr
 
 import dirax as dx
 import swept_pendulums
-from dirax.sweeps import arrange, commit, executors, store, sweep, task
+from dirax.sweeps import arrange, commit, executors, store, sweep, task, trial
 from dirax.sweeps.case import Case
 from dirax.sweeps.grid import cut
 from dirax.sweeps.layout import decoded_texts, encoded_texts
@@ -161,7 +161,8 @@ def test_processes_of_jax_distributed_share_the_tasks_of_one_store(done, tmp_pat
         port = free.getsockname()[1]
     words = [tmp_path / f"words{number}.txt" for number in (0, 1)]
     both = [forked(swept_pendulums.one_of_two, n, port, tmp_path, words=file) for n, file in enumerate(words)]
-    monkeypatch.setattr(arrange, "DEVICE_BATCH", 8)
+    monkeypatch.setattr(arrange, "DEVICE_BATCH", 6)
+    monkeypatch.setattr(trial, "POINTS", 6)
     alone = study(tmp_path / "alone.zarr", swept_pendulums.FEW, **swept_pendulums.BY_XLA)
     for process in both:
         process.join(120)
