@@ -24,7 +24,7 @@ class BatchPlan:
     """What `Plan` is for one trajectory, for a batch: by the programs of the general way in NumPy, which give its bits."""
 
     def __init__(self, settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem):
-        self.settings, self.template = settings, problem
+        self.settings, self.template = settings, problem.with_numbers(state=None, guess=None, params=None)
         equation = problem.equation
         self.checks = checks_of(equation)
         self.complete: Any = program_of_completion(settings.system, case, settings.project)
