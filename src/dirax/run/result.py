@@ -68,7 +68,7 @@ def _messages(p: Problem, outcome: Outcome, numbers: np.ndarray, said: list[str]
     kept = good if p.batch is None else numbers[np.searchsorted(numbers, good, side="right") - 1]
     found = [""] * len(good)
     for lane in np.flatnonzero(good < p.steps).tolist():
-        found[lane] = (said and said[lane]) or explain(p, outcome, lane, kept=int(kept[lane]))
+        found[lane] = (said[lane] if said else "") or explain(p, outcome, lane, kept=int(kept[lane]))
     return found
 
 
