@@ -108,9 +108,10 @@ def test_every_premise_is_checked(system, data, params, changes, message, planne
 def test_batches_begin_by_a_plan_with_the_bits_of_a_first_run(batch_params, planned):
     random = np.random.default_rng(0)
 
-    def drawn():
-        masses = random.uniform(1.0, 2.0, (9, 2) if batch_params else 2)
-        return {"q": random.normal(size=(9, 2)), "v": random.normal(size=(9, 2)), "params": {"m": masses}}
+    def drawn():  # the batch is that of the data, or of the params alone
+        points, masses = ((2, 2), (9, 2)) if batch_params else ((2, 9, 2), (2,))
+        q, v = random.normal(size=points)
+        return {"q": q, "v": v, "params": {"m": random.uniform(1.0, 2.0, masses)}}
 
     given = {"batch_params": batch_params, "save_every": 2}
     changes = {**drawn(), "step": 0.05, "steps": 5, "t0": 1.0}

@@ -52,7 +52,7 @@ class BatchPlan:
         last = [*(leaves if case.batch_params else map(repeated, leaves)), repeated(case.h), repeated(case.t0)]
         data = [np.broadcast_to(case.data[name], (size, case.data[name].shape[-1])) for name in sorted(case.data)]
         initial: Initial = _evaluated(self.complete, [*data, *last])
-        start: Start = _evaluated(self.begun, [*(initial.data[name] for name in sorted(initial.data)), *last])
+        start: Start = _evaluated(self.begun, [*jax.tree.leaves(initial.data), *last])
         if not (self._holds(initial) and self._steps(start, case) and self._has_regular_hessian(initial, case, last[:-2])):
             return None
         first, own = case.first if self.checks else ({}, None)

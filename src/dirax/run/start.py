@@ -58,10 +58,12 @@ def completed(system: Any, case: Case, project: bool, by_jax: bool = False) -> I
     They are found in NumPy from the scalar program of the system's functions, for a compiler takes longer than all that has to
     be computed; by JAX where values are traced, where there is no such program, and with `by_jax`.
     """
-    data: dict[str, Any] = dict(case.data)
-    if case.batch is not None:  # the batch axis can be that of the parameters alone
-        data = {name: spread(a, case.batch) for name, a in data.items()}
-    return _of_every(_Completion(system, case.two_points, project), (system,), case, data, by_jax)
+    return _of_every(_Completion(system, case.two_points, project), (system,), case, _data_of(case), by_jax)
+
+
+def _data_of(case: Case) -> dict[str, Any]:
+    """The data of every trajectory: the batch axis can be that of the parameters alone."""
+    return {name: a if case.batch is None else spread(a, case.batch) for name, a in case.data.items()}
 
 
 def begun(equation: Any, case: Case, initial: Initial, by_jax: bool = False) -> Start:
@@ -221,7 +223,7 @@ def _program(one: Any, kept: tuple, case: Case, given: Any) -> tuple[list[np.nda
 def program_of_completion(system: Any, case: Case, project: bool) -> tuple[ScalarProgram, Any] | None:
     """The program (data by their names, params, h, t0) ↦ Initial, of one trajectory, and the structure of its results; None
     where there is none."""
-    return _program(_Completion(system, case.two_points, project), (system,), case, dict(case.data))[1]
+    return _program(_Completion(system, case.two_points, project), (system,), case, _data_of(case))[1]
 
 
 def program_of_beginning(equation: Any, case: Case, complete: dict[str, Any]) -> tuple[ScalarProgram, Any] | None:
