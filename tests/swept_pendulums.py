@@ -1,5 +1,6 @@
 """A small study for the tests, and what is run in processes of its own: the study, a scheduler of dask, its worker."""
 
+import json
 import os
 from pathlib import Path
 
@@ -17,6 +18,11 @@ LONG = {"steps": 20_000, "save_every": 5000, "task_seconds": 0.05}
 """With these, 240 points take about half a second of one processor, in some thirty tasks."""
 
 OVER = {"g": np.linspace(0.5, 2.0, 12), "angle": np.linspace(0.0, 3.0, 20)}
+
+
+FEW = {name: values[:6] for name, values in OVER.items()}
+BY_XLA = {"engine": "xla", "steps": 20, "task_seconds": 1e-6}
+"""A study of 36 points in six tasks, if `DEVICE_BATCH` is 6."""
 
 
 def case(g, angle):
@@ -73,22 +79,31 @@ def dask_worker(address):
     main(["--scheduler-file", str(address), "--nthreads", "2", "--no-dashboard", "--no-nanny"])
 
 
-def on_two_devices(path):
-    """A study of the xla engine where it has two devices: prints how many there are, how many tasks ran on, whether all ended."""
+def one_of_two(number, port, folder):
+    """The process of this number of two of `jax.distributed`, each with two devices: a study by either engine, and one that the
+    first process refuses. Prints on which devices it ran which blocks."""
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     import jax
 
-    from dirax.sweeps import arrange, executors
+    from dirax.sweeps import arrange, executors, trial
 
-    arrange.DEVICE_BATCH, used, plain = 8, set(), executors.run_task
+    jax.distributed.initialize(f"127.0.0.1:{port}", num_processes=2, process_id=number)
+    arrange.DEVICE_BATCH = trial.POINTS = 6  # one shape, which is compiled once a device
+    ran, plain = [], executors.run_task
 
-    def noting(*given):
-        used.add(jax.config.jax_default_device)
-        return plain(*given)
+    def noting(plan, task, *given):
+        ran.append((plan.folder.stem, str(jax.config.jax_default_device), task.index))
+        return plain(plan, task, *given)
 
     executors.run_task = noting
-    data = study(path, {name: values[:6] for name, values in OVER.items()}, engine="xla", steps=20, task_seconds=1e-6)
-    print(len(jax.local_devices()), len(used), bool((data.status == 1).all()), flush=True)
+    study(folder / "xla.zarr", FEW, **BY_XLA)
+    data = study(folder / "native.zarr")
+    assert (data.status == 1).all()  # when it returns the others are done, too
+    print(json.dumps(ran), flush=True)
+    try:
+        study(folder / "native.zarr", step=0.02)
+    except (OSError, ValueError) as error:
+        print(error, flush=True)
 
 
 def called(words, function, *arguments):

@@ -8,6 +8,7 @@ import pytest
 
 import dirax as dx
 from dirax import gallery
+from dirax.run.batch_plan import BatchPlan
 from dirax.run.plan import Plan
 
 STEP = {"step": 0.1, "steps": 3}
@@ -20,14 +21,18 @@ MIDPOINT = dx.LagrangeDAlembert()
 @pytest.fixture
 def planned(monkeypatch):
     """How many runs began by a plan."""
-    found, problem = [], Plan.problem
+    found = []
 
-    def counted(*arguments):
-        made = problem(*arguments)
-        found.extend([made] * (made is not None))
-        return made
+    def counting(problem):
+        def counted(*arguments):
+            made = problem(*arguments)
+            found.extend([made] * (made is not None))
+            return made
 
-    monkeypatch.setattr(Plan, "problem", counted)
+        return counted
+
+    for kind in (Plan, BatchPlan):
+        monkeypatch.setattr(kind, "problem", counting(kind.problem))
     return found
 
 
@@ -97,6 +102,60 @@ def test_every_premise_is_checked(system, data, params, changes, message, planne
     assert planned
     with pytest.raises(ValueError, match=message):
         run(**changes)
+
+
+@pytest.mark.parametrize("batch_params", [False, True])
+def test_batches_begin_by_a_plan_with_the_bits_of_a_first_run(batch_params, planned):
+    random = np.random.default_rng(0)
+
+    def drawn():  # the batch is that of the data, or of the params alone
+        points, masses = ((2, 2), (9, 2)) if batch_params else ((2, 9, 2), (2,))
+        q, v = random.normal(size=points)
+        return {"q": q, "v": v, "params": {"m": random.uniform(1.0, 2.0, masses)}}
+
+    given = {"batch_params": batch_params, "save_every": 2}
+    changes = {**drawn(), "step": 0.05, "steps": 5, "t0": 1.0}
+    run = dx.prepare(MASS, MIDPOINT, **drawn(), **given, **STEP)
+    found, at_once = run(**changes), dx.simulate(MASS, MIDPOINT, **changes, **given)
+    assert len(planned) == 2 and found.rows == 4 and found.t[0] == 1.0
+    assert_equal_batches(found, at_once)
+    if not batch_params:
+        run(**{**changes, "params": {"m": np.array([3.0, 4.0])}})
+        assert len(planned) == 3
+    assert_equal_batches(found, fresh(MASS, MIDPOINT, **changes, **given))
+
+
+@pytest.mark.parametrize(
+    "system, data, params, changes, message",
+    [
+        (
+            MASS, {"q": [[0.3, 0.1]] * 3, "v": [0.2, 0.3]}, {"m": np.ones(3)}, {"params": {"m": np.array([1.0, 2.0, 0.0])}},
+            "singular",
+        ),
+        (
+            SKATE, {"q": np.zeros((3, 3)), "v": [1.0, 0, 1]}, None, {"v": [[1.0, 0, 1], [1, 0.5, 1], [1, 0, 1]]},
+            "of trajectory 1 are off",
+        ),
+        (
+            dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.sum(jnp.sqrt(q))),
+            {"q": np.ones((3, 1)), "v": [1.0]}, None, {"q": [[1.0], [1.0], [-1.0]]}, "lagrangian is nan .* of trajectory 2",
+        ),
+    ],
+)  # fmt: skip
+def test_every_premise_of_a_batch_is_checked(system, data, params, changes, message, planned):
+    run = dx.prepare(system, MIDPOINT, **data, params=params, batch_params=params is not None, **STEP)
+    assert run().ok.all() and planned
+    with pytest.raises(ValueError, match=message):
+        run(**changes)
+
+
+def test_a_singular_lagrangian_is_asked_again_for_its_final_manifold(planned):
+    """∂²L/∂v² is singular for m₁ = 0, and then sin q₁ = 0: what was accepted there once says nothing of another point."""
+    run = dx.prepare(MASS, MIDPOINT, q=[0.3, 0.0], v=[0.2, 0.0], params={"m": np.ones(2)}, **STEP)
+    singular = {"m": np.array([1.0, 0.0])}
+    assert run(params=singular).ok and not planned
+    with pytest.raises(ValueError, match="off its final constraint manifold"):
+        run(q=[0.3, 0.1], params=singular)
 
 
 def test_what_is_no_number_is_not_taken():

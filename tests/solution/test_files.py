@@ -294,6 +294,7 @@ def test_an_interrupted_save_leaves_the_old_file(moment, ending, tmp_path, batch
 
         monkeypatch.setitem(saving.FORMATS, ending, (interrupted, is_one))
     else:
+        monkeypatch.setattr(atomic_files, "_exchanged", lambda *_: False)  # as where the system cannot
         replace = atomic_files.os.rename if ending == ".zarr" else atomic_files.os.replace
 
         def stopped(source, target):
@@ -306,6 +307,14 @@ def test_an_interrupted_save_leaves_the_old_file(moment, ending, tmp_path, batch
         batch.save(path, overwrite=True)
     monkeypatch.undo()
     assert_same(dx.load(path), two_points)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems have no such call")
+def test_a_folder_is_replaced_in_one_action(tmp_path, batch, two_points, monkeypatch):
+    path = two_points.save(tmp_path / "run.zarr")
+    monkeypatch.setattr(atomic_files.os, "rename", None)  # it is never out of its place
+    assert_same(dx.load(batch.save(path, overwrite=True)), batch)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import socket
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ import xarray as xr
 
 import dirax as dx
 import swept_pendulums
-from dirax.sweeps import arrange, commit, executors, store, sweep, task
+from dirax.sweeps import arrange, commit, executors, store, sweep, task, trial
 from dirax.sweeps.case import Case
 from dirax.sweeps.grid import cut
 from dirax.sweeps.layout import decoded_texts, encoded_texts
@@ -154,10 +155,29 @@ def test_a_system_of_the_xla_engine_one_batch_a_device(tmp_path):
     )
 
 
-def test_on_two_devices_a_task_runs_on_one_of_them(tmp_path, forked):
-    process = forked(swept_pendulums.on_two_devices, tmp_path / "two.zarr", words=tmp_path / "words.txt")
-    process.join(120)
-    assert process.exitcode == 0 and (tmp_path / "words.txt").read_text().split()[-3:] == ["2", "2", "True"]
+def test_processes_of_jax_distributed_share_the_tasks_of_one_store(done, tmp_path, forked, monkeypatch):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    words = [tmp_path / f"words{number}.txt" for number in (0, 1)]
+    both = [forked(swept_pendulums.one_of_two, n, port, tmp_path, words=file) for n, file in enumerate(words)]
+    monkeypatch.setattr(arrange, "DEVICE_BATCH", 6)
+    monkeypatch.setattr(trial, "POINTS", 6)
+    alone = study(tmp_path / "alone.zarr", swept_pendulums.FEW, **swept_pendulums.BY_XLA)
+    for process in both:
+        process.join(120)
+        assert process.exitcode == 0
+    assert same(dx.load(tmp_path / "xla.zarr"), alone) and same(dx.load(tmp_path / "native.zarr"), done[0])
+    said = [file.read_text().splitlines() for file in words]
+    shares = [json.loads(next(line for line in lines if line.startswith("[["))) for lines in said]
+    for name in ("xla", "native"):
+        first, second = ([tuple(block) for study_of, _, block in share if study_of == name] for share in shares)
+        assert sorted(first + second) == sorted(store.layout_of(tmp_path / f"{name}.zarr").grid)
+        assert abs(len(first) - len(second)) <= 1
+    devices = [{device for study_of, device, _ in share if study_of == "xla"} for share in shares]
+    assert len(devices[0]) == len(devices[1]) == 2 and not devices[0] & devices[1]
+    assert all("differs in step" in lines[-1] for lines in said)
+    assert not list(tmp_path.glob("*.zarr/.unfinished")) and not list(tmp_path.glob(".*"))
 
 
 def test_slurm_is_asked_for_workers_by_a_script_and_its_cluster_is_an_executor():
@@ -245,6 +265,7 @@ def test_one_caller_at_a_time(done):
     try:
         with pytest.raises(OSError, match="another call is filling the store"):
             study(path)
+        assert (path / ".unfinished" / "lock").exists()  # what belongs to the other call is left alone
     finally:
         hold.release(path)
     assert same(study(path), done[0])

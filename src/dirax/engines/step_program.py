@@ -15,7 +15,7 @@ from dirax.engines import policy
 from dirax.engines.parameters import Parameters, parameters
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
-from dirax.program.evaluation.in_numpy import Values, in_parts
+from dirax.program.evaluation.in_numpy import Slopes, Values, in_parts
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.interpreter import Nodes, UnsupportedPrimitive
@@ -207,15 +207,21 @@ class StepProgram:
         e = self.equations[index]
         k, few = len(e.unknowns), len(u) * len(e.unknowns) * len(graph) <= IN_NUMBERS
         entries = [] if few else [row.get(j, graph.zero) for row in self.jacobians[index] for j in range(k)]
-        graph = graph.copy() if few else graph
+        graph, plan = self._first_slopes if few else (graph, None)
 
         def read(known: Values) -> list[np.ndarray]:
-            slopes = known.slopes(e.residual, e.unknowns) if few else known.read(nodes_array(entries).reshape(k, k))
+            slopes = known.slopes(e.residual, e.unknowns, plan) if few else known.read(nodes_array(entries).reshape(k, k))
             return [known.read(nodes_array(e.residual)), slopes]
 
         leaves = self.parameters.flatten(params, len(u) if batch_params else None)
         residual, slopes = self.in_numbers(read, graph, e, u, state, t, h, leaves)
         return residual, slopes
+
+    @cached_property
+    def _first_slopes(self) -> tuple[Graph, Slopes]:
+        """How the Jacobian of the first stage is found in numbers, over a copy of the graph."""
+        graph, first = self.graph.copy(), self.equations[self.stages[0][0]]
+        return graph, Slopes(graph, first.residual, first.unknowns)
 
     def in_numbers(
         self, read: Callable[[Values], list[np.ndarray]], graph: Graph, e: TracedEquation, *arguments, more: Sequence = ()

@@ -70,6 +70,32 @@ def surely_independent(rows: Sequence[Sequence[float]], most: float = SURE) -> b
         return bool(norm * math.sqrt(k * inverse_norm) < most * most)
 
 
+def all_surely_independent(matrices: np.ndarray, most: float = SURE) -> bool:
+    """The same of every one of the matrices (B, k, l)."""
+    k = matrices.shape[1]
+    with np.errstate(all="ignore"):
+        norm = np.einsum("bkl,bkl->b", matrices, matrices)
+        if k == 1:
+            return bool(np.all((norm > 0.0) & (norm < math.inf)))
+        square = k == matrices.shape[2]
+        try:
+            inverse_norm = _inverse_norms(matrices if square else matrices @ matrices.swapaxes(1, 2))
+        except np.linalg.LinAlgError:
+            return False
+        condition = norm * inverse_norm if square else norm * np.sqrt(k * inverse_norm)
+        return bool(np.all(condition < most * most))
+
+
+def _inverse_norms(matrices: np.ndarray) -> np.ndarray:
+    """The sums (B,) of the squares of the entries of the inverses."""
+    if matrices.shape[1] == 2:
+        (a, b), (c, d) = matrices.transpose(1, 2, 0)
+        determinant = a * d - b * c
+        return (a * a + b * b + c * c + d * d) / determinant / determinant
+    inverses = np.linalg.inv(matrices)
+    return np.einsum("bkl,bkl->b", inverses, inverses)
+
+
 def _inverse_norm(rows: Sequence[Sequence[float]]) -> float:
     """The sum of the squares of the entries of the inverse of a square matrix; infinite where it has none."""
     k = len(rows)

@@ -19,7 +19,8 @@ from dirax.run.final_manifold import (
     refuse_leaving_final_manifold,
     refuse_off_final_manifold,
 )
-from dirax.run.plan import Plan, bytes_of, planned
+from dirax.run.plan import AnyPlan, planned
+from dirax.run.premises import bytes_of
 from dirax.run.progress import reporting
 from dirax.run.redundancy import redundant_constraints
 from dirax.run.refused_start import refuse_bad_start
@@ -50,7 +51,7 @@ class Kind:
     from the same numbers began."""
 
     runs: int = 0
-    plan: Plan | None = None
+    plan: AnyPlan | None = None
     engine: Callable | None = None
     starts: dict[tuple, "Begun"] = field(default_factory=dict)
 
@@ -65,8 +66,8 @@ class Kind:
         return replace(found, case=case, problem=problem, save_every=asked)
 
     def keep(self, case: Case, found: "Begun", seconds: float) -> None:
-        """Keep a start that took a while."""
-        if seconds < QUICK or found.case is not case or np.size(found.problem.state) > LARGEST_START:
+        """Keep a start that took a while; those of batches are large, and a plan finds them in a small part of their steps."""
+        if seconds < QUICK or case.batch is not None or found.case is not case or np.size(found.problem.state) > LARGEST_START:
             return
         for oldest in list(self.starts)[: max(0, len(self.starts) - STARTS + 1)]:
             self.starts.pop(oldest, None)
@@ -82,9 +83,9 @@ _kinds: Memo[Kind] = Memo(128)
 
 
 def kind_for(settings: Settings, case: Case) -> Kind | None:
-    """The kind that a case belongs to, the same object for equal settings, a new one where they have no hash; None for a batch
-    and where values are traced."""
-    if case.batch is not None or not case.plain:
+    """The kind that a case belongs to, the same object for equal settings, a new one where they have no hash; None where
+    values are traced."""
+    if not case.plain:
         return None
     return _kinds.get((settings.key, kind_of(case)), Kind)
 
@@ -98,11 +99,13 @@ class Begun:
     redundant: tuple[int, ...]
     row0: dict | None
     traced: bool
+    plain: bool = field(default=False, kw_only=True)
+    """Whether nothing of it needs the general way: no constraint is redundant, and no Lagrangian singular."""
     rows: dict[str, np.ndarray] | None = field(default=None, kw_only=True)
     """Rows that were saved by the run that this one goes on with."""
     save_every: int = field(default=1, kw_only=True)
     """What was asked for, which may be more steps than there are."""
-    plan: Callable[[], Plan | None]
+    plan: Callable[[], AnyPlan | None]
     """Makes the plan for others of its kind."""
     engine: Callable | None = field(default=None, kw_only=True)
     """The engine that ran it, where it is not that of its kind."""
@@ -130,8 +133,8 @@ def carried_out(
     found = _begun(settings, case, steps, every, save_every)
     if kind is not None and not found.traced:
         kind.keep(case, found, time.perf_counter() - began)
-        if kind.plan is not None and not found.redundant:
-            kind.plan.learn(bytes_of(case.params))
+        if kind.plan is not None and found.plain:
+            kind.plan.learn(case.params)
         kind.runs += 1
         if kind.runs == 2:
             kind.plan = found.plan()
@@ -207,12 +210,12 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
         compensated=settings.compensated,
     )
     refuse_more_than_memory(problem)
-    special = redundant or singular or by_values or by_jax
+    plain = not (redundant or singular or by_values or by_jax)
 
-    def plan() -> Plan | None:
-        return None if special else planned(settings, given, shape, initial, start, problem)
+    def plan() -> AnyPlan | None:
+        return planned(settings, given, shape, initial, start, problem) if plain else None
 
-    return Begun(case, problem, redundant, start.row0, traced, plan, save_every=asked)
+    return Begun(case, problem, redundant, start.row0, traced, plan, plain=plain, save_every=asked)
 
 
 def _run(

@@ -70,7 +70,7 @@ _singular: Memo[bool] = Memo(256)
 def _is_singular(system: AbstractSystem, shape: Shape, case: Case, initial: Initial) -> bool:
     if system.metric_form() is not None or system.lagrangian_form() is None or system.final_relation(shape) is not None:
         return False
-    lanes = np.unique(np.linspace(0, (case.batch or 1) - 1, SEVERAL).astype(int))
+    lanes = lanes_asked(case.batch or 1)
     arrays = {name: np.atleast_2d(np.asarray(a, float)) for name, a in case.data.items()}
     data = {name: np.broadcast_to(a, (case.batch or 1, a.shape[1]))[lanes] for name, a in arrays.items()}
     count, n = data["q"].shape
@@ -95,6 +95,11 @@ def _is_singular(system: AbstractSystem, shape: Shape, case: Case, initial: Init
         if np.all(np.isfinite(hessian)) and rank_of(hessian) < n:
             return True
     return False
+
+
+def lanes_asked(batch: int) -> np.ndarray:
+    """The trajectories of a batch that are asked for their Hessian."""
+    return np.unique(np.linspace(0, batch - 1, SEVERAL).astype(int))
 
 
 def chain_at(system: AbstractSystem, q: Any, v: Any, t: float, params: Any) -> ConstraintChain | None:

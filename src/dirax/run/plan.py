@@ -2,26 +2,29 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
 
 from dirax.engines.contract import Problem
-from dirax.numerics.equilibration import equilibrated
 from dirax.numerics.ranks import surely_independent
 from dirax.numerics.tolerances import CONSTRAINT_DEFECT
 from dirax.program.evaluation.functions import program_at
 from dirax.program.evaluation.in_floats import Floats
-from dirax.run.final_manifold import MOST
+from dirax.run.batch_plan import BatchPlan
+from dirax.run.premises import SURELY_REGULAR, Regular, asks_hessian, checks_of, scales_of
 from dirax.run.settings import Settings
-from dirax.run.start import Initial, Start, program_of_beginning, program_of_completion, program_of_first_step
+from dirax.run.start import (
+    Initial,
+    Start,
+    begins_by_arrays,
+    program_of_beginning,
+    program_of_completion,
+    program_of_first_step,
+)
 from dirax.run.validate import Case
-from dirax.schemes.abstract_step import AbstractStep
-from dirax.schemes.step import Shape, nothing_to_check
-
-SURELY_REGULAR = 1e6
-"""Condition number of ∂²L/∂v², and of the matrix of the constraints, up to which there is no doubt of their rank."""
+from dirax.schemes.step import Shape
 
 
 class Plan:
@@ -34,26 +37,26 @@ class Plan:
     def __init__(self, settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem):
         self.settings, self.template = settings, problem
         equation = problem.equation
-        self.checks = [check for check in dict.fromkeys(stage.check for stage, _ in equation.stages) if not _is_trivial(check)]
-        self.complete: Any = program_of_completion(settings.system, case, settings.project)
-        self.begun: Any = program_of_beginning(equation, case, initial.data)
+        self.checks = checks_of(equation)
+        complete = program_of_completion(settings.system, case, settings.project)
+        begun = program_of_beginning(equation, case, initial.data)
+        self.complete: Any = complete and complete[0].in_floats
+        self.begun: Any = begun and begun[0].in_floats
         self.first_step: Any = None
         self.data_size = sum(np.size(a) for a in jax.tree.leaves(initial.data))
         self.defects, self.has_lagrangian = np.size(initial.defect), initial.lagrangian is not None
         self.matrix = None
         if initial.constraints is not None and np.size(initial.constraints):
-            self.matrix = _scales(np.asarray(initial.constraints))
+            self.matrix = scales_of(np.asarray(initial.constraints)).tolist()
         self.state_size, self.guesses = len(start.state), [len(guess) for guess in start.guess]
         self.fraction, self.unknowns = equation.stages[0][1], equation.stages[0][0].unknowns
         if self.unknowns:
             self.first_step, self.moving = program_of_first_step(equation, case)
-            self.jacobian = _scales(np.asarray(start.jacobian))
-        system = settings.system
-        never = system.metric_form() is not None or system.lagrangian_form() is None or system.final_relation(shape) is not None
-        self.asks_hessian = not never and len(case.data) > 1 and "q" in case.data and len(case.data["q"]) <= MOST
+            self.jacobian = scales_of(np.asarray(start.jacobian)).tolist()
+        self.asks_hessian = asks_hessian(settings.system, shape, case)
         self.hessian: Floats | None = None
         self.places = _places(initial.data)
-        self.regular = {bytes_of(case.params)}
+        self.regular = Regular(case.params)
         self.row_bytes = 8 * (1 + sum(math.prod(field.shape) for field in problem.fields.values()))
 
     @property
@@ -116,7 +119,7 @@ class Plan:
 
     def _has_regular_hessian(self, complete: Sequence[float], case: Case, last: Sequence[float]) -> bool:
         """Whether ∂²L/∂v² is regular; what is so once is not asked again for the same params."""
-        if not self.asks_hessian or (given := bytes_of(case.params)) in self.regular:
+        if not self.asks_hessian or case.params in self.regular:
             return True
         q, v = (complete[self.places[name]] for name in ("q", "v"))
         if self.hessian is None:
@@ -128,51 +131,36 @@ class Plan:
         entries, n = self.hessian((case.t0, *q, *v, *last[:-2])), len(q)
         regular = surely_independent([entries[i * n : i * n + n] for i in range(n)], SURELY_REGULAR)
         if regular:
-            self.learn(given)
+            self.learn(case.params)
         return regular
 
-    def learn(self, given: tuple) -> None:
-        """Note that the Lagrangian is regular for params of these bytes."""
-        if len(self.regular) > 256:
-            self.regular.clear()
-        self.regular.add(given)
+    def learn(self, params: Any) -> None:
+        """Note that the Lagrangian is regular for these params."""
+        self.regular.learn(params)
 
 
-def bytes_of(params: Any) -> tuple:
-    """Equal for equal params of one kind."""
-    return tuple([leaf.tobytes() for leaf in jax.tree.leaves(params)])
+AnyPlan: TypeAlias = Plan | BatchPlan
 
 
-def planned(settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem) -> Plan | None:
-    """The plan for cases like one that the general way took; None for those that always need it: batches, two points, steps
-    whose functions have no program or a large one, and compositions that might leave a final manifold."""
+def planned(settings: Settings, case: Case, shape: Shape, initial: Initial, start: Start, problem: Problem) -> AnyPlan | None:
+    """The plan for cases like one that the general way took; None for those that always need it: two points, steps whose
+    functions have no program or a large one, and compositions that might leave a final manifold."""
     equation, system = problem.equation, settings.system
     stages = equation.stages
-    if case.batch is not None or case.two_points or (stages[0][0].unknowns and not isinstance(start.jacobian, np.ndarray)):
+    if case.two_points or begins_by_arrays(case) or (stages[0][0].unknowns and not isinstance(start.jacobian, np.ndarray)):
         return None
     fields = stages[0][0].fields
     if len(stages) > 1 and not system.constraints.any and "p" in fields and system.final_relation(shape) is not None:
         return None
-    plan = Plan(settings, case, shape, initial, start, problem)
+    made = Plan if case.batch is None else BatchPlan
+    plan = made(settings, case, shape, initial, start, problem)
     return plan if plan.whole else None
-
-
-def _is_trivial(check: Any) -> bool:
-    return check is nothing_to_check or getattr(check, "__func__", None) is AbstractStep.check
 
 
 def _scaled(entries: Sequence[float], scales: list[list[float]]) -> list[list[float]]:
     """The rows of a matrix with these entries, each times its scale."""
     width = len(scales[0])
     return [[x * y for x, y in zip(entries[i * width :], row, strict=False)] for i, row in enumerate(scales)]
-
-
-def _scales(matrix: np.ndarray) -> list[list[float]]:
-    """What the entries of a matrix are to be multiplied by to be those of the equilibrated one."""
-    scaled, units = equilibrated(matrix)
-    row, column = np.arange(len(matrix)), np.argmax(np.abs(scaled), axis=1)
-    with np.errstate(all="ignore"):
-        return (units * (scaled[row, column] / matrix[row, column] / units[0, column])[:, None]).tolist()
 
 
 def _places(data: dict[str, Any]) -> dict[str, slice]:

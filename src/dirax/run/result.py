@@ -66,9 +66,10 @@ def _messages(p: Problem, outcome: Outcome, numbers: np.ndarray, said: list[str]
     """Why each trajectory ended, "" where it did not."""
     good = np.asarray(outcome.completed)
     kept = good if p.batch is None else numbers[np.searchsorted(numbers, good, side="right") - 1]
-    lanes = range(len(good))
-    known = said or [""] * len(good)
-    return [(known[lane] or explain(p, outcome, lane, kept=int(kept[lane]))) if good[lane] < p.steps else "" for lane in lanes]
+    found = [""] * len(good)
+    for lane in np.flatnonzero(good < p.steps).tolist():
+        found[lane] = (said[lane] if said else "") or explain(p, outcome, lane, kept=int(kept[lane]))
+    return found
 
 
 def _times(p: Problem, numbers: np.ndarray, traced: bool):

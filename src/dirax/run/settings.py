@@ -60,7 +60,8 @@ def stated(
 
 def kind_of(case: Case) -> tuple:
     """What a plan for a case depends on: which data are given and their shapes, and the kinds of the params; and the values of
-    those params that are no floats."""
+    those params that are no floats, where they are part of the step's program."""
     leaves, structure = jax.tree.flatten(case.params)
-    kinds = tuple([(a.shape,) if a.dtype.char == "d" else (a.shape, a.dtype.char, a.tobytes()) for a in leaves])
+    part = lambda leaf: b"" if case.batch_params else leaf.tobytes()
+    kinds = tuple([(a.shape,) if a.dtype.char == "d" else (a.shape, a.dtype.char, part(a)) for a in leaves])
     return tuple([(name, a.shape) for name, a in case.data.items()]), structure, kinds, case.batch_params

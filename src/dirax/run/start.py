@@ -12,6 +12,7 @@ from dirax.program.evaluation.in_floats import Floats
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
 from dirax.program.roots import FEWEST_SPARSE
+from dirax.program.scalar_program import ScalarProgram
 from dirax.program.user_functions import is_traced
 from dirax.run.validate import Case, spread
 
@@ -57,10 +58,12 @@ def completed(system: Any, case: Case, project: bool, by_jax: bool = False) -> I
     They are found in NumPy from the scalar program of the system's functions, for a compiler takes longer than all that has to
     be computed; by JAX where values are traced, where there is no such program, and with `by_jax`.
     """
-    data: dict[str, Any] = dict(case.data)
-    if case.batch is not None:  # the batch axis can be that of the parameters alone
-        data = {name: spread(a, case.batch) for name, a in data.items()}
-    return _of_every(_Completion(system, case.two_points, project), (system,), case, data, by_jax)
+    return _of_every(_Completion(system, case.two_points, project), (system,), case, _data_of(case), by_jax)
+
+
+def _data_of(case: Case) -> dict[str, Any]:
+    """The data of every trajectory: the batch axis can be that of the parameters alone."""
+    return {name: a if case.batch is None else spread(a, case.batch) for name, a in case.data.items()}
 
 
 def begun(equation: Any, case: Case, initial: Initial, by_jax: bool = False) -> Start:
@@ -175,13 +178,17 @@ class _FirstStep(eqx.Module):
 
 def _of_every(one: Any, kept: tuple, case: Case, given: Any, by_jax: bool) -> Any:
     """`one(given, params, h, t0)` of every trajectory; what is traced for NumPy is remembered by the objects `kept`."""
-    by_jax = by_jax or max(np.shape(leaf)[-1] for leaf in case.data.values()) >= FEWEST_ARRAYS
-    if not by_jax and not is_traced(given, case.params, case.h, case.t0):
+    if not by_jax and not begins_by_arrays(case) and not is_traced(given, case.params, case.h, case.t0):
         found = _in_numpy(one, kept, case, given)
         if found is not None:
             return found
     axes = None if case.batch is None else (0, 0 if case.batch_params else None, None, None)
     return _compiled(one, (given, case.params, jnp.asarray(case.h, float), jnp.asarray(case.t0, float)), axes)
+
+
+def begins_by_arrays(case: Case) -> bool:
+    """Whether a case has so many numbers that JAX finds its start."""
+    return max(np.shape(leaf)[-1] for leaf in case.data.values()) >= FEWEST_ARRAYS
 
 
 @compiled
@@ -213,16 +220,15 @@ def _program(one: Any, kept: tuple, case: Case, given: Any) -> tuple[list[np.nda
     return leaves, program_of(function, shapes, (*map(Same, kept), options))
 
 
-def program_of_completion(system: Any, case: Case, project: bool) -> Floats | None:
-    """(data by their names, params, h, t0) ↦ the numbers of an Initial, for one trajectory; None where there is none."""
-    _, found = _program(_Completion(system, case.two_points, project), (system,), case, dict(case.data))
-    return found and found[0].in_floats
+def program_of_completion(system: Any, case: Case, project: bool) -> tuple[ScalarProgram, Any] | None:
+    """The program (data by their names, params, h, t0) ↦ Initial, of one trajectory, and the structure of its results; None
+    where there is none."""
+    return _program(_Completion(system, case.two_points, project), (system,), case, _data_of(case))[1]
 
 
-def program_of_beginning(equation: Any, case: Case, complete: dict[str, Any]) -> Floats | None:
-    """(complete data by their names, params, h, t0) ↦ the numbers of a Start without the first step; None as above."""
-    _, found = _program(_Beginning(equation, case.two_points), (equation,), case, complete)
-    return found and found[0].in_floats
+def program_of_beginning(equation: Any, case: Case, complete: dict[str, Any]) -> tuple[ScalarProgram, Any] | None:
+    """The same of (complete data by their names, params, h, t0) ↦ Start without the first step."""
+    return _program(_Beginning(equation, case.two_points), (equation,), case, complete)[1]
 
 
 def program_of_first_step(equation: Any, case: Case) -> tuple[Floats | None, tuple[bool, ...]]:

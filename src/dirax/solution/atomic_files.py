@@ -1,7 +1,9 @@
 """Files that appear complete or not at all: written beside their place, then moved there."""
 
+import ctypes
 import os
 import shutil
+import sys
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +17,9 @@ except ImportError:  # Windows: leftovers of killed processes stay there
 
 LONGEST_NAME = 255
 """Bytes of a file's name."""
+
+AT_FDCWD, RENAME_EXCHANGE = -100, 2
+"""Of Linux's renameat2: paths count from the folder of the process, and both names stay."""
 
 
 def checked_place(path: Path, overwrite: bool, replaceable: Callable[[Path], bool] = Path.is_file) -> None:
@@ -57,9 +62,12 @@ def placed(path: str | os.PathLike, overwrite: bool, replaceable: Callable[[Path
 
 
 def _move_into_place(new: Path, path: Path, old: Path, overwrite: bool) -> None:
-    """Files are replaced in one action; a folder is first moved aside, and back if its successor cannot be moved in."""
+    """Files are replaced in one action, and folders where the system can; else a folder is first moved aside, and back if its
+    successor cannot be moved in."""
     if not (path.is_dir() and overwrite):
         os.replace(new, path)
+        return
+    if _exchanged(new, path):
         return
     os.rename(path, old)
     try:
@@ -67,6 +75,14 @@ def _move_into_place(new: Path, path: Path, old: Path, overwrite: bool) -> None:
     except BaseException:
         os.rename(old, path)
         raise
+
+
+def _exchanged(a: Path, b: Path) -> bool:
+    """Have two names change places in one action (Linux, most file systems); False where that cannot be."""
+    if not sys.platform.startswith("linux"):
+        return False
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    return rename is not None and rename(AT_FDCWD, os.fsencode(a), AT_FDCWD, os.fsencode(b), RENAME_EXCHANGE) == 0
 
 
 def _locked(folder: Path) -> int | None:

@@ -18,7 +18,7 @@ from dirax.sweeps.task import Done, Plan, Task, run_task
 AHEAD = 2
 """Calls that an executor which is not here is given for each of its workers, so that none waits for the next."""
 
-CALL_SECONDS = 1.0
+CALL_SECONDS = 2.0
 """How long a call to such an executor takes, of several tasks where these are short: what a scheduler does costs some ten
 milliseconds a call."""
 

@@ -54,6 +54,13 @@ def settled(
     return layout, axes
 
 
+def joined(path: Path, axes: Axes, marks: dict) -> tuple[Layout, Axes]:
+    """The store that another process of the same call has settled. Raises `ValueError` where the calls differ."""
+    if _compared(path, axes, marks) is not None:
+        raise ValueError(f"the processes of jax.distributed have other points for {path} each: give all of them the same.")
+    return layout_of(path), axes_of(path)
+
+
 def _take(path: Path, hold: Hold) -> None:
     if not os.access(path, os.W_OK):
         raise StoreError(f"the store {path} cannot be written (it is read-only here): make it writable, or choose another path.")

@@ -112,8 +112,9 @@ class Hold:
                     return True
 
     def release(self, folder: Path) -> None:
-        """Let others fill the store, with no unfinished file in it."""
-        shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
+        """Let others fill the store, with no unfinished file in it; nothing where it is not held."""
+        if self._descriptors:
+            shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
         while self._descriptors:
             os.close(self._descriptors.pop())
 

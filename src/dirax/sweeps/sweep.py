@@ -24,7 +24,8 @@ from dirax.sweeps.grid import Grid
 from dirax.sweeps.keep import Keep
 from dirax.sweeps.layout import Layout
 from dirax.sweeps.progress import State, reporting
-from dirax.sweeps.settle import attributes_for, fingerprint_of, settled
+from dirax.sweeps.ranks import ranks
+from dirax.sweeps.settle import attributes_for, fingerprint_of, joined, settled
 from dirax.sweeps.store import Hold, counts, open_points, refuse_place
 from dirax.sweeps.task import Plan, Task
 from dirax.sweeps.trial import check_points, tried
@@ -90,7 +91,8 @@ def sweep(
 
     `executor`: None for batches on all processors here, a number of processes, an executor of `concurrent.futures` (one that
     would fork is replaced by as many new processes), a client of `dask.distributed`, or "dask". Tasks are sized to about
-    `task_seconds`; one whose worker dies is run again, and after the third time left open and reported by a `RuntimeWarning`.
+    `task_seconds`; where `jax.distributed` is initialized all its processes make the same call, and each runs its share of
+    them. A task whose worker dies is run again, and after the third time left open and reported by a `RuntimeWarning`.
     `progress`: None for a bar in a terminal, True, False, or a function of (points done, points in all).
 
     Raises `TypeError` and `ValueError` for wrong arguments; where `case` or `keep` is wrong, naming the point; and `OSError`
@@ -124,14 +126,16 @@ def sweep(
     layout, named = arranged(axes, trial, units, coordinates)
     marks = fingerprint_of(whole, scheme, axes, trial, options, params, int(seed))
     slots = executors.parallel(executor, trial.engine == "xla") if executor != "dask" else executors.parallel(None, False)
-    grid = sized(axes, layout, trial, task_seconds, slots)
+    group = ranks()
+    grid = sized(axes, layout, trial, task_seconds, slots * group.count)
     layout = Layout(grid, layout.dims, layout.arrays)
     attributes = attributes_for(system, scheme, axes, layout, options, marks)
     check_points(axes, trial.case)
 
     hold = Hold()
     try:
-        layout, axes = settled(path, hold, layout, axes, named, attributes, marks, overwrite)
+        make = lambda: settled(path, hold, layout, axes, named, attributes, marks, overwrite)
+        layout, axes = group.agreed(make, lambda: joined(path, axes, marks))
         plan = Plan(
             folder=path,
             layout=layout,
@@ -144,12 +148,14 @@ def sweep(
             filled=trial.engine == "xla",
         )
         left = open_points(path, layout)
-        tasks = [_task(axes, layout.grid, index, mask) for index, mask in left.items()]
         before = counts(path)
-        missing = sum(task.points for task in tasks)
-        state = State(axes.size, axes.size - missing, before[2] + before[3])
-        with reporting(progress, state, path.name) as changed, _going_on(path, state):
+        missing = [_task(axes, layout.grid, index, mask) for index, mask in left.items()]
+        done = axes.size - sum(task.points for task in missing)
+        tasks = group.share(missing)
+        state = State(done + sum(task.points for task in tasks), done, before[2] + before[3])
+        with reporting(progress if group.number == 0 else False, state, path.name) as changed, _going_on(path, state):
             given_up = _run(tasks, executor, plan, state, changed)
+            group.wait("done")
     finally:
         hold.release(path)
     if given_up:
