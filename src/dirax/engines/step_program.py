@@ -15,7 +15,7 @@ from dirax.engines import policy
 from dirax.engines.parameters import Parameters, parameters
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
-from dirax.program.evaluation.in_numpy import Values, in_parts
+from dirax.program.evaluation.in_numpy import Slopes, Values, in_parts
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.interpreter import Nodes, UnsupportedPrimitive
@@ -171,19 +171,25 @@ class StepProgram:
         return max(len(e.unknowns) for e in self.equations) * self.size <= WRITTEN
 
     @cached_property
-    def first_in_floats(self) -> Floats | None:
-        """(unknowns, state, t, h, params) ↦ residual and Jacobian of the first stage, for one entry, all of them in one row;
-        None for a large step."""
+    def first_slopes(self) -> Slopes:
+        """How the derivatives of the first stage's residual by the unknowns are found in numbers, in a graph of their own."""
+        first = self.equations[self.stages[0][0]]
+        return Slopes(self.graph.copy(), first.residual, first.unknowns)
+
+    @cached_property
+    def first_in_floats(self) -> Floats:
+        """(unknowns, state, t, h, params) ↦ residual and Jacobian of the first stage, for one entry, all of them in one row."""
         first, shared = self.equations[self.stages[0][0]], self.shared
-        k = len(first.unknowns)
-        if k * self.size > WRITTEN:
-            return None
-        try:
-            rows = self.jacobians[self.stages[0][0]]
-        except GraphTooLarge:
-            return None
-        entries = [row.get(j, self.graph.zero) for row in rows for j in range(k)]
         inputs = [*first.unknowns, *first.state, shared.t, shared.h, *shared.params]
+        if (tape := self.first_slopes.tape) is not None:
+            places = [inputs.index(node) for node in tape.numbers.inputs]
+
+            def function(given: Sequence[float]) -> tuple[float, ...]:
+                residual, slopes = tape(np.array([given], float)[:, places])
+                return *residual[0].tolist(), *slopes.ravel().tolist()
+
+            return function
+        entries = [row.get(j, self.graph.zero) for row in self.jacobians[self.stages[0][0]] for j in range(len(first.unknowns))]
         return in_floats(self.graph, inputs, [*first.residual, *entries])
 
     def in_jax(self, index: int, outputs: list[int], graph: Graph | None = None) -> Callable:
@@ -207,14 +213,14 @@ class StepProgram:
         e = self.equations[index]
         k, few = len(e.unknowns), len(u) * len(e.unknowns) * len(graph) <= IN_NUMBERS
         entries = [] if few else [row.get(j, graph.zero) for row in self.jacobians[index] for j in range(k)]
-        graph = graph.copy() if few else graph
+        plan = self.first_slopes if few else None
 
         def read(known: Values) -> list[np.ndarray]:
-            slopes = known.slopes(e.residual, e.unknowns) if few else known.read(nodes_array(entries).reshape(k, k))
+            slopes = known.slopes(e.residual, e.unknowns, plan) if plan else known.read(nodes_array(entries).reshape(k, k))
             return [known.read(nodes_array(e.residual)), slopes]
 
         leaves = self.parameters.flatten(params, len(u) if batch_params else None)
-        residual, slopes = self.in_numbers(read, graph, e, u, state, t, h, leaves)
+        residual, slopes = self.in_numbers(read, plan.graph if plan else graph, e, u, state, t, h, leaves)
         return residual, slopes
 
     def in_numbers(

@@ -165,7 +165,7 @@ _compiled: Memo[Any] = Memo(64)
 def _machine_code(program: ScalarProgram) -> Any:
     """(columns, count) ↦ the results of so many entries; None without the compiler."""
     try:
-        from dirax.engines.native import compile as llvm
+        from dirax.program import machine_code as llvm
         from dirax.engines.native.ir.compiled_function import loaded
     except ImportError:
         return None

@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.engines.contract import OK, Outcome, Problem, Progress
 from dirax.engines.engine import AbstractEngine
-from dirax.engines.native import compile as llvm
+from dirax.program import machine_code as llvm
 from dirax.engines.native.c_code import c_code
 from dirax.engines.native.collocation_kernels import collocation_kernels
 from dirax.engines.native.engine import Native

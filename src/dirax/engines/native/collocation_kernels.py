@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.native import compile as llvm
+from dirax.program import machine_code as llvm
 from dirax.engines.native.kernels import SIGNATURE, linked, source_digest, too_large
 from dirax.engines.native.loops.collocation_loop import collocation_module
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan, TracedMean, TracedRelation, depends

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dirax.engines.compensation import increments
-from dirax.engines.native import compile as llvm
+from dirax.program import machine_code as llvm
 from dirax.engines.native import kernel_cache
 from dirax.engines.native.gradients.linearized_loop import LinearizedLoop, backward, forward
 from dirax.engines.native.loops.plan import Plan

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from dirax.engines.contract import NOT_CONVERGED, OK, Problem
-from dirax.engines.native import compile as llvm
+from dirax.program import machine_code as llvm
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.loops.record import DOUBTFUL
