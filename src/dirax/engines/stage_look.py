@@ -8,7 +8,6 @@ import numpy as np
 from dirax.engines.step_program import KEPT, StepProgram, nodes_array
 from dirax.program.evaluation.in_floats import Floats, in_floats
 from dirax.program.evaluation.in_numpy import Slopes, Values
-from dirax.program.evaluation.tape import Tape
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.memo import Memo, Same
 from dirax.program.rounding import rounding_nodes
@@ -40,7 +39,6 @@ class StageLook:
         self.runs = 0
         """In how many runs it was looked at: it is compiled for the second one."""
         self._floats: Floats | None = None
-        self._tapes: dict[tuple[int, ...], Tape] = {}
 
     def __call__(self, u, state, t, h, leaves: np.ndarray, sizes: np.ndarray, only: tuple[int, ...]) -> list[np.ndarray]:
         k = len(self.equation.unknowns)
@@ -68,20 +66,17 @@ class StageLook:
 
     def _swept(self, known: Values, only: tuple[int, ...]) -> list[np.ndarray]:
         """The same of a large step, whose derivatives are not written as nodes."""
-        others = tuple(what for what in only if what != SLOPES)
-        if others not in self._tapes:
-            self._tapes[others] = Tape.of_leaves(self.graph, [n for what in others for n in self._nodes(what)])
-        tape = self._tapes[others]
-        ends = np.cumsum([len(self._nodes(what)) for what in others])[:-1]
-        found = dict(zip(others, np.split(tape(known.given(tape)), ends, axis=1), strict=True))
-        if SLOPES in only:
-            found[SLOPES] = known.slopes(self.equation.residual, self.inputs, self._plan)
-        return [found[what] for what in only]
+        e, tape = self.equation, self._plan.tape
+        slopes = known.slopes(e.residual, self.inputs, self._plan) if SLOPES in only else None
+        if slopes is None and tape is not None:
+            values = tape.numbers(known.given(tape.numbers))
+            known.bind(nodes_array([*e.residual, *self.terms, *e.advance]), values)
+        return [slopes if what == SLOPES else known.read(nodes_array(self._nodes(what))) for what in only]
 
     @functools.cached_property
     def _plan(self) -> Slopes:
-        """How the derivatives are found in numbers."""
-        return Slopes(self.graph, self.equation.residual, self.inputs)
+        """How the derivatives are found in numbers, and all else with them."""
+        return Slopes(self.graph, self.equation.residual, self.inputs, [*self.terms, *self.equation.advance])
 
     def _in_floats(self, given: Sequence[float]) -> Sequence[float]:
         """All of it by floats."""

@@ -1,7 +1,7 @@
 """Values of nodes in NumPy, for many entries side by side, and their derivatives in numbers."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -61,7 +61,7 @@ class Values:
         plan, values = plan or Slopes(self.graph, nodes, inputs), self._known
         if self.table is None and plan.tape is not None:
             found, slopes = plan.tape(self.given(plan.tape.numbers))
-            values.update(zip(nodes, found.T, strict=True))
+            values.update(zip([*nodes, *plan.more], found.T, strict=True))
             return slopes
         with np.errstate(all="ignore"):
             self.graph.evaluate(plan.needed, {}, values=values, order=plan.order)
@@ -106,7 +106,8 @@ class Values:
 class Slopes:
     """What it takes to find the derivatives of nodes by inputs in numbers, found once."""
 
-    def __init__(self, graph: Graph, nodes: list[int], inputs: list[int]):
+    def __init__(self, graph: Graph, nodes: list[int], inputs: list[int], more: Sequence[int] = ()):
+        """`more`: nodes whose values will be asked for as well."""
         moving = set(inputs)
         self.terms: list[tuple[int, list[tuple[int, int]] | None]] = []
         """Nodes that depend on the inputs, with (operand that does, node of the derivative by it); None for a selection."""
@@ -120,7 +121,7 @@ class Slopes:
             elif terms := [(a, f) for a, f in zip(args, partials(graph, node), strict=True) if f is not None and a in moving]:
                 moving.add(node)
                 self.terms.append((node, terms))
-        self.nodes, self.inputs, self.graph = nodes, inputs, graph
+        self.nodes, self.inputs, self.more, self.graph = nodes, inputs, list(more), graph
         self.backward = len(nodes) < len(inputs) and all(terms is not None for _, terms in self.terms)
         self.needed = [*nodes, *(factor for _, terms in self.terms for _, factor in terms or ())]
         self.order = Order(graph.reachable(self.needed))
@@ -130,7 +131,7 @@ class Slopes:
         """The derivatives by a compiled loop; None for few nodes."""
         if len(self.order.nodes) < FEWEST_NODES:
             return None
-        return RowTape(self.graph, self.nodes, self.inputs, self.terms, self.needed, self.backward)
+        return RowTape(self.graph, self.nodes, self.inputs, self.more, self.terms, self.needed, self.backward)
 
 
 def in_parts(function: Callable, leaves: list[np.ndarray]) -> list[np.ndarray]:

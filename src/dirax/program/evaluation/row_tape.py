@@ -14,12 +14,14 @@ Terms = Sequence[tuple[int, list[tuple[int, int]] | None]]
 
 
 class RowTape:
-    """(values of the leaves) ↦ values of nodes, and their derivatives by inputs; `backward` from the nodes, else forward."""
+    """(values of the leaves) ↦ values of nodes and of `more` of them, and the derivatives of the first by inputs; `backward` from
+    the nodes, else forward."""
 
-    def __init__(self, graph: Graph, nodes: list[int], inputs: list[int], terms: Terms, needed: list[int], backward: bool):
+    def __init__(
+        self, graph: Graph, nodes: list[int], inputs: list[int], more: list[int], terms: Terms, needed: list[int], backward: bool
+    ):
         conditions = [graph.args[node][0] for node, of in terms if of is None]
-        self.numbers = Tape.of_leaves(graph, [*needed, *conditions])
-        self.values, self.backward = self.numbers.slot[nodes], backward
+        self.numbers, self.backward = Tape.of_leaves(graph, [*nodes, *more], [*needed, *conditions]), backward
         self._free: list[int] = []
         self._rows = 1  # the first one is zero
         self._lines: list[tuple[int, int, int, int, int]] = []
@@ -72,16 +74,16 @@ class RowTape:
                 self._free.append(at.pop(node))
 
     def __call__(self, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(entries, leaves) ↦ (entries, nodes), (entries, nodes, inputs)."""
+        """(entries, leaves) ↦ (entries, nodes and more), (entries, nodes, inputs)."""
         columns, entries = self._seeds.shape[1], len(given)
-        rows, found = np.empty((self._rows, columns, LANES)), np.empty((-(-entries // LANES), LANES, len(self._wanted), columns))
-        table = self.numbers.table(given)
+        rows = np.empty((self._rows, columns, LANES))
+        values, slopes = np.empty((entries, len(self.numbers.outputs))), np.empty((entries, len(self._wanted), columns))
         run, at, count = loops()[1], self._table.ctypes.data, len(self._table)
-        for block, into in zip(table, found, strict=True):
-            rows[: len(self._seeds)] = self._seeds
-            run(at, count, block.ctypes.data, rows.ctypes.data, columns)
-            into[:] = np.moveaxis(rows[self._wanted], 2, 0)
-        values = read(table, self.values, entries)
-        self.numbers.give_back(table)
-        slopes = found.reshape(-1, *found.shape[2:])[:entries]
+        for some, table in self.numbers.tables(given):
+            values[some] = read(table, self.numbers.outputs, some.stop - some.start)
+            for block, first in zip(table, range(some.start, some.stop, LANES), strict=True):
+                rows[: len(self._seeds)] = self._seeds
+                run(at, count, block.ctypes.data, rows.ctypes.data, columns)
+                into = slopes[first : min(first + LANES, some.stop)]
+                into[:] = np.moveaxis(rows[self._wanted], 2, 0)[: len(into)]
         return values, slopes.swapaxes(1, 2) if self.backward else slopes

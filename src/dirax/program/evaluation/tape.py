@@ -6,7 +6,8 @@ are NumPy's: the bits are those of `in_numpy`.
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from dirax.program.evaluation.tape_code import CODE, LANES, NUMBER, loops
 from dirax.program.graph import Graph
 from dirax.program.operations import NUMPY
 
-MOST_VALUES = 2**23
+MOST_VALUES = 2**20
 """Values that are held at a time; entries are taken in parts."""
 
 FEWEST_NODES = 400
@@ -24,7 +25,15 @@ FEWEST_NODES = 400
 class Tape:
     """(values of the inputs) ↦ values of the outputs, for many entries; with the opaque computations `between` of a program."""
 
-    def __init__(self, graph: Graph, inputs: Sequence[int], outputs: Sequence[int], between: Sequence[Any] = ()):
+    def __init__(
+        self,
+        graph: Graph,
+        inputs: Sequence[int],
+        outputs: Sequence[int],
+        between: Sequence[Any] = (),
+        also: Sequence[int] = (),
+    ):
+        """`also`: nodes that are computed too."""
         self.graph, self.inputs, self.size = graph, list(inputs), 0
         self.slot = np.zeros(len(graph), np.int32)
         self._known: set[int] = set()
@@ -35,45 +44,41 @@ class Tape:
         for step in between:
             self._need([n for operand in step.operands for n in operand.ravel().tolist()])
             self._insert(step)
-        self._need(outputs)
+        self._need([*outputs, *also])
         self.outputs = self.slot[list(outputs)] if len(outputs) else np.zeros(0, np.int32)
         self._spare: list[np.ndarray] = []
 
     @classmethod
-    def of_leaves(cls, graph: Graph, outputs: Sequence[int]) -> "Tape":
+    def of_leaves(cls, graph: Graph, outputs: Sequence[int], also: Sequence[int] = ()) -> "Tape":
         """The tape of nodes whose inputs are all that they depend on."""
-        return cls(graph, [node for node in graph.reachable(outputs) if graph.op[node] == "input"], outputs)
+        return cls(graph, [node for node in graph.reachable([*outputs, *also]) if graph.op[node] == "input"], outputs, (), also)
 
     def __call__(self, given: np.ndarray) -> np.ndarray:
         """(entries, inputs) ↦ (entries, outputs)."""
-        entries = len(given)
-        step = LANES * max(1, MOST_VALUES // (LANES * max(1, self.size)))
-        parts = [self._part(given[low : low + step]) for low in range(0, max(entries, 1), step)]
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-    def _part(self, given: np.ndarray) -> np.ndarray:
-        table = self.table(given)
-        found = read(table, self.outputs, len(given))
-        self.give_back(table)
+        found = np.empty((len(given), len(self.outputs)))
+        for some, table in self.tables(given):
+            found[some] = read(table, self.outputs, some.stop - some.start)
         return found
 
-    def table(self, given: np.ndarray) -> np.ndarray:
-        """The values (blocks, slots, LANES) of all nodes."""
-        entries = len(given)
+    def tables(self, given: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+        """The values (blocks, slots, LANES) of all nodes for some of the entries, and which; the memory is used again."""
+        entries, most = len(given), LANES * max(1, MOST_VALUES // (LANES * max(1, self.size)))
+        blocks = -(-min(entries, most) // LANES)
         try:
-            table = self._spare.pop() if entries <= LANES else self._empty(-(-entries // LANES))
+            whole = self._spare.pop() if blocks == 1 else self._empty(blocks)
         except IndexError:
-            table = self._empty(1)
-        write(table, self.places, given)
-        with np.errstate(all="ignore"):
-            for act in self._acts:
-                act(table, entries)
-        return table
-
-    def give_back(self, table: np.ndarray) -> None:
-        """Keep the memory of a table that is no longer needed."""
-        if len(table) == 1:
-            self._spare.append(table)
+            whole = self._empty(1)
+        for low in range(0, entries, most):
+            some = slice(low, min(low + most, entries))
+            count = some.stop - low
+            table = whole[: -(-count // LANES)]
+            write(table, self.places, given[some])
+            with np.errstate(all="ignore"):
+                for act in self._acts:
+                    act(table, count)
+            yield some, table
+        if blocks == 1:
+            self._spare.append(whole)
 
     def _empty(self, blocks: int) -> np.ndarray:
         table = np.empty((blocks, self.size, LANES))
@@ -91,21 +96,19 @@ class Tape:
 
     def _need(self, outputs: Sequence[int]) -> None:
         """Have nodes computed: between calls of NumPy, all that can be."""
-        graph, waves = self.graph, {}
-        depth: dict[int, int] = {}
-        ops, args = graph.op, graph.args
+        graph, ops, args = self.graph, self.graph.op, self.graph.args
+        depth, waves = [0] * len(ops), defaultdict(list)
         for node in graph.reachable(outputs, self._known):
-            op = ops[node]
-            below = max([depth.get(a, 0) for a in args[node]], default=0)
-            if op in CODE:
-                place = 2 * below
-            elif args[node]:
-                place, below = 2 * below + 1, below + 1
-            else:
-                place = -1
-            if below:
-                depth[node] = below
-            waves.setdefault(place, []).append(node)
+            operands = args[node]
+            if not operands:
+                waves[-1].append(node)
+                continue
+            below = depth[operands[0]]
+            for a in operands[1:]:
+                below = max(below, depth[a])
+            by_numpy = ops[node] not in CODE
+            waves[2 * below + by_numpy].append(node)
+            depth[node] = below + by_numpy
         for place in sorted(waves):
             nodes = waves[place]
             if place < 0:
@@ -120,12 +123,11 @@ class Tape:
     def _loop(self, nodes: list[int]) -> None:
         """Have the compiled loop compute these, operands first."""
         first, slot = self._place(nodes), self.slot
-        operands = [self.graph.args[node] for node in nodes]
-        table = np.zeros((len(nodes), 4), np.int32)
-        table[:, 0] = [NUMBER[self.graph.op[node]] for node in nodes]
-        table[:, 1] = slot[[o[0] for o in operands]]
-        table[:, 2] = slot[[o[min(1, len(o) - 1)] for o in operands]]
-        table[:, 3] = slot[[o[-1] for o in operands]]
+        ops, args = self.graph.op, self.graph.args
+        operands = [args[node] for node in nodes]
+        table = np.empty((len(nodes), 4), np.int32)
+        table[:, 0] = [NUMBER[ops[node]] for node in nodes]
+        table[:, 1:] = slot[np.array([o if len(o) == 3 else (o[0], o[-1], o[0]) for o in operands])]
         run, at, count = loops()[0], table.ctypes.data, len(table)
 
         def act(values: np.ndarray, entries: int, keep: np.ndarray = table) -> None:
