@@ -10,6 +10,7 @@ from dirax.engines.step_program import StepProgram, step_program
 from dirax.program.evaluation.in_numpy import Values
 from dirax.program.interpreter import UnsupportedPrimitive
 
+
 class InNumbers:
     """By the scalar program of the step; `params` are those of one trajectory."""
 

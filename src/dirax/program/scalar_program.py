@@ -88,10 +88,9 @@ class ScalarProgram:
         self._asked += 1
         if noise is None and self.tape_pays(len(leaves[0])):
             return self._by_tape(leaves)
-        if len(leaves[0]) == 1 and noise is None:
-            if self._asked > OFTEN:
-                with contextlib.suppress(ArithmeticError, ValueError):  # what Python's floats do not have
-                    return self._by_floats(leaves)
+        if len(leaves[0]) == 1 and noise is None and self._asked > OFTEN:
+            with contextlib.suppress(ArithmeticError, ValueError):  # what Python's floats do not have
+                return self._by_floats(leaves)
         return in_parts(functools.partial(self._part, noise=noise), leaves)
 
     def _by_floats(self, leaves: list[np.ndarray]) -> list[np.ndarray]:

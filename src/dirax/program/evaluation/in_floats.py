@@ -28,9 +28,7 @@ TEXTS = {
 Floats = Callable[[Sequence[float]], tuple[float, ...]]
 
 
-def in_floats(
-    graph: Graph, inputs: Sequence[int], outputs: Sequence[int], between: Sequence[Any] = ()
-) -> Floats:
+def in_floats(graph: Graph, inputs: Sequence[int], outputs: Sequence[int], between: Sequence[Any] = ()) -> Floats:
     """(values of the inputs) ↦ values of the outputs, with the opaque computations `between` of a scalar program; for a
     large one by a tape. The function raises `ArithmeticError` or `ValueError` where a float has no such operation."""
     needed = set(graph.reachable([*outputs, *(n for step in between for operand in step.operands for n in _flat(operand))]))

@@ -57,7 +57,8 @@ class Values:
     def slopes(self, nodes: list[int], inputs: list[int], plan: "Slopes | None" = None) -> np.ndarray:
         """The derivatives of nodes by inputs, (entries, nodes, inputs): over the graph, which only gains the derivatives of
         single operations, backward from fewer nodes than inputs, else forward, and so past branches: of one that is not taken
-        infinite derivatives count for nothing then; `plan` where it has been made before. The values of the nodes are known then."""
+        infinite derivatives count for nothing then; `plan` where it has been made before. The nodes' own values are known
+        after it."""
         plan, values = plan or Slopes(self.graph, nodes, inputs), self._known
         if self.table is None and plan.tape is not None:
             found, slopes = plan.tape(self.given(plan.tape.numbers))

@@ -1,8 +1,8 @@
 """Tape: nodes of a graph evaluated by one small compiled loop that goes through a table of their operations.
 
-Nothing is compiled for a graph, and an operation on eight entries takes some seven nanoseconds, a hundredth of what NumPy takes to
-call it: this is for large graphs at few entries. The loop has the operations that IEEE 754 rounds in one way only, and all others
-are NumPy's: the bits are those of `in_numpy`.
+Nothing is compiled for a graph, and an operation on eight entries takes some seven nanoseconds, a hundredth of what NumPy takes
+to call it: this is for large graphs at few entries. The loop has the operations that IEEE 754 rounds in one way only, and all
+others are NumPy's: the bits are those of `in_numpy`.
 """
 
 import itertools
@@ -21,6 +21,7 @@ MOST_VALUES = 2**20
 
 FEWEST_NODES = 400
 """Nodes from which on a tape is quicker than Python's floats, and than NumPy at a few entries."""
+
 
 class Tape:
     """(values of the inputs) ↦ values of the outputs, for many entries; with the opaque computations `between` of a program."""

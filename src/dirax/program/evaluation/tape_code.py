@@ -96,15 +96,19 @@ done:
 
 
 def _rows() -> str:
-    row = lambda name, place: f"""
+    row = lambda name, place: (
+        f"""
   %{name}.of = getelementptr i32, ptr %entry.at, i64 {place}
   %{name}.row = load i32, ptr %{name}.of
   %{name}.wide = sext i32 %{name}.row to i64
   %{name}.first = mul i64 %{name}.wide, %columns"""
-    column = lambda name: f"""
+    )
+    column = lambda name: (
+        f"""
   %{name}.slot = add i64 %{name}.first, %j
   %{name}.at = getelementptr {_DOUBLES}, ptr %rows, i64 %{name}.slot
   %{name} = load {_DOUBLES}, ptr %{name}.at, align 8"""
+    )
     return f"""
 define void @rows(ptr %table, i64 %count, ptr %v, ptr %rows, i64 %columns) {{
 entry:
