@@ -66,12 +66,13 @@ class StageLook:
 
     def _swept(self, known: Values, only: tuple[int, ...]) -> list[np.ndarray]:
         """The same of a large step, whose derivatives are not written as nodes."""
-        e, tape = self.equation, self._plan.tape
-        slopes = known.slopes(e.residual, self.inputs, self._plan) if SLOPES in only else None
-        if slopes is None and tape is not None:
+        e, tape, found = self.equation, self._plan.tape, {}
+        if SLOPES in only:
+            found[SLOPES] = known.slopes(e.residual, self.inputs, self._plan)
+        elif tape is not None:
             values = tape.numbers(known.given(tape.numbers))
             known.bind(nodes_array([*e.residual, *self.terms, *e.advance]), values)
-        return [slopes if what == SLOPES else known.read(nodes_array(self._nodes(what))) for what in only]
+        return [found[what] if what in found else known.read(nodes_array(self._nodes(what))) for what in only]
 
     @functools.cached_property
     def _plan(self) -> Slopes:

@@ -50,7 +50,8 @@ class RowTape:
             row = self._row()
             if of is None:
                 condition, *operands = graph.args[node]
-                self._lines.append((NUMBER["choice"], row, *(at.get(x, 0) for x in operands), slot[condition]))
+                yes, no = (at.get(x, 0) for x in operands)
+                self._lines.append((NUMBER["choice"], row, yes, no, slot[condition]))
             else:
                 operands = [operand for operand, _ in of]
                 for number, (operand, factor) in enumerate(of):
