@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import dirax as dx
 from dirax import gallery
 from dirax.cli.commands import app
-from dirax.engines.native import compile as llvm
+from dirax.program import machine_code as llvm
 
 COMPILER = shutil.which("cc")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 import dirax as dx
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem
 from dirax.engines.native import Native
-from dirax.engines.native import compile as llvm
 from dirax.engines.native import run as driver
 from dirax.engines.native.kernels import kernels
 from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.xla import Xla
+from dirax.program import machine_code as llvm
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.schemes.step import Field, Shape, StepEquation, StepSequence, make_step_equation
 

@@ -1,8 +1,15 @@
 """The program `dirax`: `main` prepares the terminal and hands over to the commands."""
 
+import gc
+
+ALLOCATED = 200_000
+"""Objects that are made until Python looks for cycles among them: a run makes a million that are in none, and to look at all
+that JAX has loaded takes a tenth of a second each time."""
+
 
 def main() -> None:
     """The entry point of the program `dirax`."""
+    gc.set_threshold(ALLOCATED)
     from dirax.cli.terminal import interruptible, prepared, written
 
     with interruptible():

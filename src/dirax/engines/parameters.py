@@ -42,7 +42,9 @@ class Parameters:
 
     def flatten(self, params: Any, batch: int | None) -> np.ndarray:
         """The floating leaves as (size,), or (B, size) with their batch axis."""
-        leaves = [leaf for leaf, d in zip(jax.tree.leaves(params), self.dynamic, strict=True) if d]
+        leaves = jax.tree.leaves(params)
+        if len(self.shapes) < len(self.dynamic):
+            leaves = [leaf for leaf, d in zip(leaves, self.dynamic, strict=True) if d]
         lead = () if batch is None else (batch,)
         columns = [np.asarray(leaf, dtype=np.float64).reshape(*lead, -1) for leaf in leaves]
         return np.concatenate(columns, axis=-1) if columns else np.zeros((*lead, 0))

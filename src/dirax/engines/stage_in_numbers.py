@@ -7,13 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.step_program import StepProgram, step_program
-from dirax.program.evaluation.in_floats import in_floats
 from dirax.program.evaluation.in_numpy import Values
-from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
-
-MOST_NODES = 20_000
-"""Nodes of residual and Jacobian up to which they are evaluated in floats: 20 µs a node to write, and .05 µs to evaluate."""
 
 
 class InNumbers:
@@ -23,7 +18,6 @@ class InNumbers:
         self.step, (self.index, _) = step, step.stages[0]
         self.equation = step.equations[self.index]
         self.params = step.parameters.flatten(params, None)
-        self._floats: Any = None
 
     def _known(self, u: np.ndarray | None, previous: np.ndarray | None, state: np.ndarray, t: float, h: float) -> Values:
         known, shared, e = Values(self.step.graph, 1), self.step.shared, self.equation
@@ -45,23 +39,13 @@ class InNumbers:
 
     def linearized(self, u, state, t, h) -> tuple[np.ndarray, np.ndarray]:
         """(residual, ∂residual/∂u)."""
-        e, shared, k = self.equation, self.step.shared, len(u)
-        if self._floats is None:
-            try:
-                rows = self.step.jacobians[self.index]
-                outputs = [*e.residual, *(row.get(j, self.step.graph.zero) for row in rows for j in range(k))]
-                inputs = [*e.unknowns, *e.state, shared.t, shared.h, *shared.params]
-                self._floats = in_floats(self.step.graph, inputs, outputs, most=MOST_NODES) or False
-            except GraphTooLarge:
-                self._floats = False
+        e, k = self.equation, len(u)
         try:
-            if self._floats:
-                found = np.array(self._floats((*u.tolist(), *state.tolist(), float(t), float(h), *self.params.tolist())))
-                return found[:k], found[k:].reshape(k, k)
+            found = np.array(self.step.first_in_floats((*u.tolist(), *state.tolist(), float(t), float(h), *self.params.tolist())))
+            return found[:k], found[k:].reshape(k, k)
         except (ArithmeticError, ValueError):  # where Python's floats have no such operation, NumPy's have a NaN
-            pass
-        known = self._known(u, None, state, t, h)
-        return known.read(np.asarray(e.residual, np.int64))[0], known.slopes(e.residual, e.unknowns)[0]
+            known = self._known(u, None, state, t, h)
+            return known.read(np.asarray(e.residual, np.int64))[0], known.slopes(e.residual, e.unknowns)[0]
 
     def slopes(self, u, state, t, h) -> tuple[np.ndarray, np.ndarray]:
         """The derivatives of the residual by u and by the state."""

@@ -1,10 +1,13 @@
 """A stage of a step looked at in numbers: all that sizes are found of."""
 
+import functools
+from collections.abc import Sequence
+
 import numpy as np
 
-from dirax.engines.step_program import KEPT, WRITTEN, StepProgram, nodes_array
+from dirax.engines.step_program import KEPT, StepProgram, nodes_array
 from dirax.program.evaluation.in_floats import Floats, in_floats
-from dirax.program.evaluation.in_numpy import Values
+from dirax.program.evaluation.in_numpy import Slopes, Values
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.memo import Memo, Same
 from dirax.program.rounding import rounding_nodes
@@ -39,34 +42,50 @@ class StageLook:
 
     def __call__(self, u, state, t, h, leaves: np.ndarray, sizes: np.ndarray, only: tuple[int, ...]) -> list[np.ndarray]:
         k = len(self.equation.unknowns)
-        if len(u) <= FEW and self.runs > 1 and (function := self._in_floats()):
+        if len(u) <= FEW and self.runs > 1 and self.slopes:
             try:
                 given = np.concatenate([u, state, t[:, None], h[:, None], leaves, sizes], axis=1).tolist()
-                values = np.array([function(one) for one in given])
+                values = np.array([self._in_floats(one) for one in given])
                 residual, slopes, terms, end = np.split(values, np.cumsum([k, k * (k + 1), k]), axis=1)
                 found = residual, slopes.reshape(-1, k, k + 1), terms, end
                 return [found[i] for i in only]
             except (ArithmeticError, ValueError):  # NumPy goes on with infinities
                 pass
-        graph = self.graph if self.slopes else self.graph.copy()  # to which derivatives in numbers are added
-        read = lambda known: [self._read(known, i) for i in only]
-        return self.program.in_numbers(read, graph, self.equation, u, state, t, h, leaves, more=[(self.sizes, sizes)])
+        read = self._read if self.slopes else self._swept
+        return self.program.in_numbers(
+            lambda known: read(known, only), self.graph, self.equation, u, state, t, h, leaves, more=[(self.sizes, sizes)]
+        )
 
-    def _read(self, known: Values, what: int) -> np.ndarray:
-        e, k = self.equation, len(self.equation.unknowns)
-        if what == SLOPES and k and not self.slopes:
-            return known.slopes(e.residual, self.inputs)
-        if what == SLOPES:
-            return known.read(nodes_array(self.slopes).reshape(k, k + 1))
-        return known.read(nodes_array((e.residual, (), self.terms, e.advance)[what]))
+    def _nodes(self, what: int) -> list[int]:
+        return (self.equation.residual, self.slopes, self.terms, self.equation.advance)[what]
 
-    def _in_floats(self) -> Floats | None:
-        """As a function of floats."""
-        if self._floats is None and self.slopes:
+    def _read(self, known: Values, only: tuple[int, ...]) -> list[np.ndarray]:
+        k = len(self.equation.unknowns)
+        found = [known.read(nodes_array(self._nodes(what))) for what in only]
+        return [a.reshape(-1, k, k + 1) if what == SLOPES else a for what, a in zip(only, found, strict=True)]
+
+    def _swept(self, known: Values, only: tuple[int, ...]) -> list[np.ndarray]:
+        """The same of a large step, whose derivatives are not written as nodes."""
+        e, tape, found = self.equation, self._plan.tape, {}
+        if SLOPES in only:
+            found[SLOPES] = known.slopes(e.residual, self.inputs, self._plan)
+        elif tape is not None:
+            values = tape.numbers(known.given(tape.numbers))
+            known.bind(nodes_array([*e.residual, *self.terms, *e.advance]), values)
+        return [found[what] if what in found else known.read(nodes_array(self._nodes(what))) for what in only]
+
+    @functools.cached_property
+    def _plan(self) -> Slopes:
+        """How the derivatives are found in numbers, and all else with them."""
+        return Slopes(self.graph, self.equation.residual, self.inputs, [*self.terms, *self.equation.advance])
+
+    def _in_floats(self, given: Sequence[float]) -> Sequence[float]:
+        """All of it by floats."""
+        if self._floats is None:
             e, shared = self.equation, self.program.shared
-            given = [*e.unknowns, *e.state, shared.t, shared.h, *shared.params, *self.sizes]
-            self._floats = in_floats(self.graph, given, [*e.residual, *self.slopes, *self.terms, *e.advance], most=WRITTEN)
-        return self._floats
+            inputs = [*e.unknowns, *e.state, shared.t, shared.h, *shared.params, *self.sizes]
+            self._floats = in_floats(self.graph, inputs, [*e.residual, *self.slopes, *self.terms, *e.advance])
+        return self._floats(given)
 
 
 _known: Memo[StageLook] = Memo(KEPT)

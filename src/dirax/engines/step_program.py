@@ -170,20 +170,31 @@ class StepProgram:
         """Whether the step is small enough for its sizes to be written as nodes."""
         return max(len(e.unknowns) for e in self.equations) * self.size <= WRITTEN
 
+    @property
+    def sizes_are_compiled(self) -> bool:
+        """Whether that is so of all stages one after the other, as machine code has them."""
+        return sum(len(self.equations[index].unknowns) for index, _ in self.stages) * self.size <= WRITTEN
+
     @cached_property
-    def first_in_floats(self) -> Floats | None:
-        """(unknowns, state, t, h, params) ↦ residual and Jacobian of the first stage, for one entry, all of them in one row;
-        None for a large step."""
+    def first_slopes(self) -> Slopes:
+        """How the derivatives of the first stage's residual by the unknowns are found in numbers, in a graph of their own."""
+        first = self.equations[self.stages[0][0]]
+        return Slopes(self.graph.copy(), first.residual, first.unknowns)
+
+    @cached_property
+    def first_in_floats(self) -> Floats:
+        """(unknowns, state, t, h, params) ↦ residual and Jacobian of the first stage, for one entry, all of them in one row."""
         first, shared = self.equations[self.stages[0][0]], self.shared
-        k = len(first.unknowns)
-        if k * self.size > WRITTEN:
-            return None
-        try:
-            rows = self.jacobians[self.stages[0][0]]
-        except GraphTooLarge:
-            return None
-        entries = [row.get(j, self.graph.zero) for row in rows for j in range(k)]
         inputs = [*first.unknowns, *first.state, shared.t, shared.h, *shared.params]
+        if (tape := self.first_slopes.tape) is not None:
+            places = [inputs.index(node) for node in tape.numbers.inputs]
+
+            def function(given: Sequence[float]) -> tuple[float, ...]:
+                residual, slopes = tape(np.array([given], float)[:, places])
+                return *residual[0].tolist(), *slopes.ravel().tolist()
+
+            return function
+        entries = [row.get(j, self.graph.zero) for row in self.jacobians[self.stages[0][0]] for j in range(len(first.unknowns))]
         return in_floats(self.graph, inputs, [*first.residual, *entries])
 
     def in_jax(self, index: int, outputs: list[int], graph: Graph | None = None) -> Callable:
@@ -207,21 +218,15 @@ class StepProgram:
         e = self.equations[index]
         k, few = len(e.unknowns), len(u) * len(e.unknowns) * len(graph) <= IN_NUMBERS
         entries = [] if few else [row.get(j, graph.zero) for row in self.jacobians[index] for j in range(k)]
-        graph, plan = self._first_slopes if few else (graph, None)
+        plan = self.first_slopes if few else None
 
         def read(known: Values) -> list[np.ndarray]:
-            slopes = known.slopes(e.residual, e.unknowns, plan) if few else known.read(nodes_array(entries).reshape(k, k))
+            slopes = known.slopes(e.residual, e.unknowns, plan) if plan else known.read(nodes_array(entries).reshape(k, k))
             return [known.read(nodes_array(e.residual)), slopes]
 
         leaves = self.parameters.flatten(params, len(u) if batch_params else None)
-        residual, slopes = self.in_numbers(read, graph, e, u, state, t, h, leaves)
+        residual, slopes = self.in_numbers(read, plan.graph if plan else graph, e, u, state, t, h, leaves)
         return residual, slopes
-
-    @cached_property
-    def _first_slopes(self) -> tuple[Graph, Slopes]:
-        """How the Jacobian of the first stage is found in numbers, over a copy of the graph."""
-        graph, first = self.graph.copy(), self.equations[self.stages[0][0]]
-        return graph, Slopes(graph, first.residual, first.unknowns)
 
     def in_numbers(
         self, read: Callable[[Values], list[np.ndarray]], graph: Graph, e: TracedEquation, *arguments, more: Sequence = ()

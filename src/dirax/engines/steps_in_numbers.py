@@ -68,8 +68,9 @@ class StepsInNumbers:
 
     @property
     def operations(self) -> int:
-        """About how many scalar operations a step takes."""
-        return 4 * len(self.program.graph) * len(self.program.stages)
+        """About how many scalar operations a step takes: its functions a few times, and a matrix or two inverted."""
+        unknowns = [len(self.program.equations[index].unknowns) for index, _ in self.program.stages]
+        return 4 * sum(len(self.program.graph) + k**3 for k in unknowns)
 
     def parameters(self, params: Any, batch: int | None, lanes: np.ndarray) -> np.ndarray:
         """The numbers of `params` of these trajectories, (states, numbers); `batch` is None for params that all of them share."""

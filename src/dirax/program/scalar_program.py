@@ -14,8 +14,9 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
-from dirax.program.evaluation.in_numpy import Values, in_parts
+from dirax.program.evaluation.in_numpy import LANES, Values, in_parts
 from dirax.program.evaluation.noise import Noise
+from dirax.program.evaluation.tape import FEWEST_NODES, Tape
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_ends
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
@@ -84,20 +85,39 @@ class ScalarProgram:
     def in_numpy(self, leaves: list[np.ndarray], noise: Noise | None = None) -> list[np.ndarray]:
         """The results for arguments (entries, …), with that leading axis; for one entry again and again by Python's floats, which
         have the same bits. `noise`: of the operations, in place of NumPy's; opaque computations have that of their operands."""
-        if len(leaves[0]) == 1 and noise is None:
-            self._asked += 1
-            if self._asked > OFTEN and self.in_floats is not None:
-                with contextlib.suppress(ArithmeticError, ValueError):  # what Python's floats do not have
-                    return self._by_floats(leaves)
+        self._asked += 1
+        if noise is None and self.tape_pays(len(leaves[0])):
+            return self._by_tape(leaves)
+        if len(leaves[0]) == 1 and noise is None and self._asked > OFTEN:
+            with contextlib.suppress(ArithmeticError, ValueError):  # what Python's floats do not have
+                return self._by_floats(leaves)
         return in_parts(functools.partial(self._part, noise=noise), leaves)
 
     def _by_floats(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
-        assert self.in_floats is not None
         found, results, at = self.in_floats([x for leaf in leaves for x in np.asarray(leaf, float).ravel().tolist()]), [], 0
         for nodes in self.results:
             results.append(np.array(found[at : at + nodes.size], float).reshape(1, *nodes.shape))
             at += nodes.size
         return results
+
+    def _by_tape(self, leaves: list[np.ndarray]) -> list[np.ndarray]:
+        entries, results, at = len(leaves[0]), [], 0
+        given = np.concatenate([np.asarray(leaf, float).reshape(entries, -1) for leaf in leaves], axis=1)
+        found = self.tape(given)
+        for nodes in self.results:
+            results.append(found[:, at : at + nodes.size].reshape(entries, *nodes.shape))
+            at += nodes.size
+        return results
+
+    def tape_pays(self, entries: int) -> bool:
+        """Whether a tape is quicker than arrays from now on."""
+        return (self._asked > 1 or entries > LANES) and len(self.graph) >= FEWEST_NODES
+
+    @functools.cached_property
+    def tape(self) -> Tape:
+        """The program as a table for a compiled loop."""
+        flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
+        return Tape(self.graph, flat(self.inputs), flat(self.results), self.opaque)
 
     def _part(self, leaves: list[np.ndarray], noise: Noise | None) -> list[np.ndarray]:
         known = Values(self.graph, len(leaves[0]), noise.table if noise else None)
@@ -128,8 +148,8 @@ class ScalarProgram:
         return order, read
 
     @functools.cached_property
-    def in_floats(self) -> Floats | None:
-        """The results for one entry, as floats in order of floats in order; None for a program that is too large."""
+    def in_floats(self) -> Floats:
+        """The results for one entry, as floats in order of floats in order."""
         flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
         return in_floats(self.graph, flat(self.inputs), flat(self.results), self.opaque)
 

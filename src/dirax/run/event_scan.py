@@ -165,8 +165,8 @@ _compiled: Memo[Any] = Memo(64)
 def _machine_code(program: ScalarProgram) -> Any:
     """(columns, count) ↦ the results of so many entries; None without the compiler."""
     try:
-        from dirax.engines.native import compile as llvm
         from dirax.engines.native.ir.compiled_function import loaded
+        from dirax.program import machine_code as llvm
     except ImportError:
         return None
     inputs, width = [node for nodes in program.inputs for node in nodes.ravel().tolist()], llvm.vector_width()

@@ -109,8 +109,10 @@ class Plan:
         return surely_independent(_scaled(initial[at + self.has_lagrangian :], self.matrix), SURELY_REGULAR)
 
     def _steps(self, start: Sequence[float], case: Case, leaves: list[Any]) -> bool:
-        """Whether the first step has a unique solution."""
+        """Whether the start is finite, and the first step has a unique solution."""
         k, s = self.unknowns, self.state_size
+        if not math.isfinite(sum(start)):
+            return False
         if not k:
             return True
         params = [x for leaf, moves in zip(leaves, self.moving, strict=True) if moves for x in leaf.ravel().tolist()]

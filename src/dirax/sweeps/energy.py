@@ -80,8 +80,8 @@ def _function(one: Callable, given: list[Any]) -> Callable | None:
     except (UnsupportedPrimitive, GraphTooLarge):
         return None
     inputs = [node for nodes in made.inputs for node in nodes.ravel().tolist()]
-    from dirax.engines.native import compile as llvm  # imported when they are used
     from dirax.engines.native.ir.compiled_function import compiled
+    from dirax.program import machine_code as llvm  # imported when they are used
 
     return compiled(made.graph, inputs, made.results[0].ravel().tolist(), llvm.vector_width())
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from dirax.engines.contract import OK, Outcome, Problem, Progress
 from dirax.engines.engine import AbstractEngine
-from dirax.engines.native import compile as llvm
 from dirax.engines.native.c_code import c_code
 from dirax.engines.native.collocation_kernels import collocation_kernels
 from dirax.engines.native.engine import Native
@@ -16,6 +15,7 @@ from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import arrays_saved
 from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.sizes import sizes_of
+from dirax.program import machine_code as llvm
 from dirax.program.interpreter import UnsupportedPrimitive
 
 PROGRAM = """\

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.native import compile as llvm
 from dirax.engines.native.kernels import SIGNATURE, linked, source_digest, too_large
 from dirax.engines.native.loops.collocation_loop import collocation_module
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan, TracedMean, TracedRelation, depends
 from dirax.engines.native.loops.record import Record
 from dirax.engines.step_program import KEPT, StepProgram, step_program
+from dirax.program import machine_code as llvm
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.memo import Memo, Same
 from dirax.program.scalar_program import ScalarProgram

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from dirax.engines.compensation import increments
-from dirax.engines.native import compile as llvm
 from dirax.engines.native import kernel_cache
 from dirax.engines.native.gradients.linearized_loop import LinearizedLoop, backward, forward
 from dirax.engines.native.loops.plan import Plan
@@ -19,6 +18,7 @@ from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.newton_step import newton_correction
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program import graph as graph_module
+from dirax.program import machine_code as llvm
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
@@ -63,8 +63,8 @@ class Kernels:
         return self._runs[width], cached
 
     def of_sizes(self, width: int) -> Any:
-        """The compiled `run` that finds the sizes; None where they are not written as nodes."""
-        if width not in self._of_sizes and self.step.sizes_are_written:
+        """The compiled `run` that finds the sizes; None where they are not written as nodes, or of too many stages."""
+        if width not in self._of_sizes and self.step.sizes_are_compiled:
             text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
             library, _ = self._library("run", width, text, "sizes", level=0)
             self._of_sizes[width] = llvm.function(library, "run", SIGNATURE)

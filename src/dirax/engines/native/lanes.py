@@ -10,11 +10,11 @@ import jax
 import numpy as np
 
 from dirax.engines.contract import NOT_CONVERGED, OK, Problem
-from dirax.engines.native import compile as llvm
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.loops.record import DOUBTFUL
 from dirax.engines.threads import thread_count
+from dirax.program import machine_code as llvm
 
 SHARES = 4
 """Parts of a batch per thread, so that a thread that is held up holds up little."""

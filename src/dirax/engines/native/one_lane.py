@@ -1,7 +1,6 @@
 """A single short trajectory in memory: its record, its parameters and all that it saves in one array, with few calls of NumPy."""
 
 import math
-from functools import cached_property
 
 import numpy as np
 
@@ -57,14 +56,16 @@ class OneLane:
             memory[: places.record] = p.record[0]
         if places.outs > places.params:
             memory[places.params : places.outs] = made.step.parameters.flatten(p.params, None)
-        self.address = memory.ctypes.data
+        self.address, self._words = memory.__array_interface__["data"][0], memory.view(np.int64)
         self._point(places.ended)
         self.numbers = p.t0, p.h, p.first_step
+        self.fields = {name: memory[a:b].reshape(shape) for name, a, b, shape in places.fields}
+        """The saved arrays."""
 
     def _point(self, addresses: np.ndarray) -> None:
         """Have the kernel write there."""
         places = self.places
-        np.add(addresses, self.address, out=self.memory[places.outs : places.outs + len(addresses)].view(np.int64))
+        np.add(addresses, self.address, out=self._words[places.outs : places.outs + len(addresses)])
 
     def advance(self, kernel, first: int, stop: int, threads: int = 1) -> None:
         """Steps `first` to `stop` − 1."""
@@ -108,11 +109,6 @@ class OneLane:
     def put(self, numbers: np.ndarray, table: np.ndarray) -> None:
         """Have it go on from a record."""
         self.memory[: self.places.record] = table[0]
-
-    @cached_property
-    def fields(self) -> dict[str, np.ndarray]:
-        """The saved arrays."""
-        return {name: self.memory[a:b].reshape(shape) for name, a, b, shape in self.places.fields}
 
     def close(self, kernel) -> dict[str, np.ndarray]:
         """The row of the last state, which is the last one saved where the trajectory did not end early."""

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from dirax.program.evaluation.tape import by_tape
 from dirax.program.graph import Graph
 from dirax.program.interpreter import Nodes
 from dirax.program.operations import BOOLEAN, NUMPY
 
-MOST_NODES = 4000
+MOST_NODES = 400
 """Nodes up to which it is worth while: Python takes some 30 ns for each, and 20 µs to compile it."""
 
 LONGEST = 150
@@ -27,14 +28,13 @@ TEXTS = {
 Floats = Callable[[Sequence[float]], tuple[float, ...]]
 
 
-def in_floats(
-    graph: Graph, inputs: Sequence[int], outputs: Sequence[int], between: Sequence[Any] = (), most: int = MOST_NODES
-) -> Floats | None:
-    """(values of the inputs) ↦ values of the outputs, with the opaque computations `between` of a scalar program; None for a
-    program of more than `most` nodes. The function raises `ArithmeticError` or `ValueError` where a float has no such
-    operation."""
+def in_floats(graph: Graph, inputs: Sequence[int], outputs: Sequence[int], between: Sequence[Any] = ()) -> Floats:
+    """(values of the inputs) ↦ values of the outputs, with the opaque computations `between` of a scalar program; for a
+    large one by a tape. The function raises `ArithmeticError` or `ValueError` where a float has no such operation."""
     needed = set(graph.reachable([*outputs, *(n for step in between for operand in step.operands for n in _flat(operand))]))
-    return None if len(needed) > most else _Writer(graph, needed, inputs, outputs, between).function()
+    if len(needed) > MOST_NODES:
+        return by_tape(graph, inputs, outputs, between)
+    return _Writer(graph, needed, inputs, outputs, between).function()
 
 
 class _Writer:

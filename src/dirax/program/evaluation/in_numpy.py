@@ -1,9 +1,12 @@
 """Values of nodes in NumPy, for many entries side by side, and their derivatives in numbers."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from dirax.program.evaluation.row_tape import RowTape
+from dirax.program.evaluation.tape import FEWEST_NODES, Tape
 from dirax.program.graph import Graph, Order
 from dirax.program.graph_derivatives import partials
 from dirax.program.interpreter import Nodes
@@ -44,14 +47,26 @@ class Values:
                 table[row] = value
         return table.T.reshape(self.entries, *nodes.shape)
 
+    def given(self, tape: Tape) -> np.ndarray:
+        """The values (entries, inputs) of the inputs of a tape."""
+        table = np.empty((len(tape.inputs), self.entries))
+        for row, node in zip(table, tape.inputs, strict=True):
+            row[:] = self._known[node]
+        return table.T
+
     def slopes(self, nodes: list[int], inputs: list[int], plan: "Slopes | None" = None) -> np.ndarray:
         """The derivatives of nodes by inputs, (entries, nodes, inputs): over the graph, which only gains the derivatives of
         single operations, backward from fewer nodes than inputs, else forward, and so past branches: of one that is not taken
-        infinite derivatives count for nothing then; `plan` where it has been made before."""
+        infinite derivatives count for nothing then; `plan` where it has been made before. The nodes' own values are known
+        after it."""
         plan, values = plan or Slopes(self.graph, nodes, inputs), self._known
+        if self.table is None and plan.tape is not None:
+            found, slopes = plan.tape(self.given(plan.tape.numbers))
+            values.update(zip([*nodes, *plan.more], found.T, strict=True))
+            return slopes
         with np.errstate(all="ignore"):
             self.graph.evaluate(plan.needed, {}, values=values, order=plan.order)
-            if len(nodes) < len(inputs) and not plan.branches:
+            if plan.backward:
                 return self._backward(nodes, inputs, plan).transpose(2, 1, 0)
             return self._forward(nodes, inputs, plan).transpose(2, 0, 1)
 
@@ -92,7 +107,8 @@ class Values:
 class Slopes:
     """What it takes to find the derivatives of nodes by inputs in numbers, found once."""
 
-    def __init__(self, graph: Graph, nodes: list[int], inputs: list[int]):
+    def __init__(self, graph: Graph, nodes: list[int], inputs: list[int], more: Sequence[int] = ()):
+        """`more`: nodes whose values will be asked for as well."""
         moving = set(inputs)
         self.terms: list[tuple[int, list[tuple[int, int]] | None]] = []
         """Nodes that depend on the inputs, with (operand that does, node of the derivative by it); None for a selection."""
@@ -106,9 +122,17 @@ class Slopes:
             elif terms := [(a, f) for a, f in zip(args, partials(graph, node), strict=True) if f is not None and a in moving]:
                 moving.add(node)
                 self.terms.append((node, terms))
-        self.branches = any(terms is None for _, terms in self.terms)
+        self.nodes, self.inputs, self.more, self.graph = nodes, inputs, list(more), graph
+        self.backward = len(nodes) < len(inputs) and all(terms is not None for _, terms in self.terms)
         self.needed = [*nodes, *(factor for _, terms in self.terms for _, factor in terms or ())]
         self.order = Order(graph.reachable(self.needed))
+
+    @functools.cached_property
+    def tape(self) -> RowTape | None:
+        """The derivatives by a compiled loop; None for few nodes."""
+        if len(self.order.nodes) < FEWEST_NODES:
+            return None
+        return RowTape(self.graph, self.nodes, self.inputs, self.more, self.terms, self.needed, self.backward)
 
 
 def in_parts(function: Callable, leaves: list[np.ndarray]) -> list[np.ndarray]:

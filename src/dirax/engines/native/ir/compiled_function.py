@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dirax.engines.native import compile as llvm
 from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
+from dirax.program import machine_code as llvm
 from dirax.program.graph import Graph
 
 
