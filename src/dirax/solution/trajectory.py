@@ -146,7 +146,7 @@ class Trajectory:
     @property
     def nbytes(self) -> int:
         """Bytes of the saved arrays, `t` included."""
-        return int(self.axis.nbytes + sum(np.asarray(a).nbytes for a in self.fields.values()))
+        return int(self.axis.nbytes + sum(a.nbytes for a in self.fields.values()))
 
     def energy(self):
         """The energy at every saved row, (…, rows): E = ⟨p, v⟩ − L for Lagrangian systems, H for Hamiltonian ones.
