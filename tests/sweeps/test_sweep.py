@@ -14,6 +14,7 @@ import xarray as xr
 
 import dirax as dx
 import swept_pendulums
+from dirax.solution.flushed_files import Hold
 from dirax.sweeps import arrange, commit, executors, store, sweep, task
 from dirax.sweeps.case import Case
 from dirax.sweeps.grid import cut

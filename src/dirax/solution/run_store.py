@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dirax.solution.description import Variable
-from dirax.solution.flushed_files import UNFINISHED, flush_folder, flushed, writing
+from dirax.solution.flushed_files import UNFINISHED, flushed, writing
 from dirax.solution.saving import SEAL, seal
 from dirax.solution.stored import Stored, Unreadable, checksum, reading
 from dirax.solution.stored_rows import StoredRows, read_block
@@ -148,6 +148,7 @@ class RunStore:
 
     def mark(self) -> None:
         """Have the file that says how far the run got say `reached`."""
+        # a file system with a journal has the names of the files before it on the disk when this one is
         self._place(self.path / REACHED, self.reached.to_bytes())
 
     def finish(self) -> None:
@@ -168,7 +169,6 @@ class RunStore:
             except BaseException:
                 beside.unlink(missing_ok=True)
                 raise
-            flush_folder(file.parent)
 
     def _block(self, name: str, index: int) -> np.ndarray:
         """The rows of a chunk, the last one from memory."""

@@ -28,7 +28,7 @@ class Stored:
 
 def checksum(values: np.ndarray) -> int:
     """The CRC-32 of the bytes of an array."""
-    return zlib.crc32(np.ascontiguousarray(values))
+    return zlib.crc32(np.ascontiguousarray(values).data)
 
 
 def reading(problem: str, read: Callable, *arguments: Any) -> Any:

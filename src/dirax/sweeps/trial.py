@@ -10,6 +10,7 @@ import numpy as np
 
 from dirax.engines.threads import at_most
 from dirax.run.simulate import simulate
+from dirax.solution.fingerprint import of_steps
 from dirax.solution.solution import Solution
 from dirax.sweeps.axes import Axes, described
 from dirax.sweeps.case import Case, Values
