@@ -4,8 +4,8 @@
 
 Maxwell's equations for E_z in a plane, with F = H_y and G = −H_x, or waves of shallow water. Inputs are F along the left side and
 E along the right one (A. J. van der Schaft, B. M. Maschke, J. Geom. Phys. 42 (2002) 166); through the other two sides nothing
-flows. E lives in the middle of cells, F on the right edge of each, G on the edges between cells above each other, as in the grid of
-K. S. Yee (IEEE Trans. Antennas Propag. 14 (1966) 302). The state is x = (E, F, G), E and F column by column of cells.
+flows. E lives in the middle of cells, F on the right edge of each, G on the edges between cells above each other, as in the grid
+of K. S. Yee (IEEE Trans. Antennas Propag. 14 (1966) 302). The state is x = (E, F, G), E and F column by column of cells.
 
 With both inputs zero E = cos κ(i + ½) cos λ(j + ½) is a mode for κ = π(a + ½)/(columns + ½), λ = πb/rows, of the frequency
 2 √(sin²(κ/2) + sin²(λ/2)) / Δ.
