@@ -78,6 +78,7 @@ def test_power_balances_on_a_hundred_thousand_cells():
     assert np.max(np.abs(supplied)) > 0.1
 
 
+@pytest.mark.soak
 def test_waves_go_as_d_alembert_says():
     errors = []
     for cells in (400, 800):
