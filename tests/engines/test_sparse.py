@@ -92,6 +92,7 @@ def test_derivatives_are_those_of_the_dense_engine(system):
     np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.soak
 def test_a_thousand_links_start_and_conserve_their_energy():
     count = 1000
 

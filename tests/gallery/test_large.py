@@ -2,9 +2,10 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import dirax as dx
-from dirax.gallery import hanging_chain, oscillator_chain, sine_gordon, wave_line
+from dirax.gallery import hanging_chain, oscillator_chain, sine_gordon, wave_line, wave_sheet
 
 
 def test_toda_keeps_its_eigenvalues_and_is_the_limit_of_small_amplitudes():
@@ -77,6 +78,7 @@ def test_power_balances_on_a_hundred_thousand_cells():
     assert np.max(np.abs(supplied)) > 0.1
 
 
+@pytest.mark.soak
 def test_waves_go_as_d_alembert_says():
     errors = []
     for cells in (400, 800):
@@ -85,3 +87,60 @@ def test_waves_go_as_d_alembert_says():
         )
         errors.append(np.max(np.abs(sol.x[-1] - wave_line.pulse(cells, 0.3 + 0.25))))
     assert errors[1] < 1e-3 and 3.5 < errors[0] / errors[1] < 4.5
+
+
+def test_a_sheet_swings_in_its_modes():
+    columns, rows, h, steps = 20, 12, 0.3, 10
+    x, frequency = wave_sheet.mode(columns, rows, 1, 2)
+    sol = dx.simulate(wave_sheet.sheet(columns, rows), dx.DiscreteDirac(), x=x, step=h, steps=steps)
+    phase = 2 * np.arctan(frequency * h / 2) * np.arange(steps + 1)  # of the midpoint rule
+    cells = columns * rows
+    assert sol.stats["engine"] == "sparse" and np.ptp(sol.energy()) < 1e-14 * sol.energy()[0]
+    np.testing.assert_allclose(sol.x[:, :cells], np.cos(phase)[:, None] * x[:cells], rtol=0, atol=1e-13)
+
+
+def test_two_sheets_joined_along_a_side_are_one():
+    def with_ports(columns, rows):
+        """The structure on (x, ports): v = Λα with α = (dH, u) and v = (ẋ, −y)."""
+        J, B = (matrix.toarray() for matrix in wave_sheet.structure(columns, rows))
+        return np.block([[J, B], [-B.T, np.zeros((2 * rows, 2 * rows))]])
+
+    rows, first, second = 2, with_ports(2, 2), with_ports(3, 2)
+    n, m = len(first) - 2 * rows, len(second) - 2 * rows
+    left = m + np.arange(rows)  # the side of the second sheet that E is given along, and F comes out of
+    swapped_v, swapped_a = second.copy(), np.eye(len(second))
+    swapped_v[left], swapped_a[left] = np.eye(len(second))[left], second[left]
+    joined = dx.LinearDirac.from_bivector(first).compose(
+        dx.LinearDirac.from_image(swapped_v, swapped_a), (n + rows + np.arange(rows)).tolist(), left.tolist()
+    )
+    whole, (E, F, G) = with_ports(5, 2), (10, 10, 5)
+    part = lambda a, b: [*range(2 * a, 2 * b), *range(E + 2 * a, E + 2 * b), *range(E + F + a, E + F + b)]
+    ports = E + F + G + np.arange(2 * rows)
+    order = [*part(0, 2), *ports[:rows], *part(2, 5), *ports[rows:]]
+    assert joined.equals(dx.LinearDirac.from_bivector(whole[np.ix_(order, order)]), 1e-12)
+
+
+@pytest.mark.soak
+def test_power_balances_on_a_sheet_of_a_hundred_thousand_cells():
+    columns, rows = 400, 250
+    drive = lambda t, x: jnp.concatenate([jnp.sin(t) * jnp.ones(rows), jnp.zeros(rows)])
+    x, _ = wave_sheet.mode(columns, rows, 3, 5)
+    sol = dx.simulate(wave_sheet.sheet(columns, rows), dx.DiscreteDirac(), x=x, inputs=drive, step=0.3, steps=6)
+    energy, supplied = sol.energy(), sol.power[:, 1]
+    assert np.max(np.abs(np.diff(energy) - 0.3 * supplied)) <= 1e-12 * np.max(energy) and np.max(np.abs(supplied)) > 1.0
+
+
+@pytest.mark.soak
+def test_a_lattice_swings_in_its_modes():
+    size, h, steps = 200, 0.2, 10
+
+    def lagrangian(q, v):
+        q = jnp.pad(q.reshape(size, size), 1)
+        springs = jnp.sum(jnp.diff(q[:, 1:-1], axis=0) ** 2) + jnp.sum(jnp.diff(q[1:-1], axis=1) ** 2)
+        return (v @ v - springs) / 2
+
+    angles = np.pi * np.array([3, 5]) / (size + 1)
+    q = np.outer(*(np.sin(angle * np.arange(1, size + 1)) for angle in angles)).ravel()
+    sol = dx.simulate(dx.LagrangeDirac(lagrangian), dx.LagrangeDAlembert(), q=q, v=0 * q, step=h, steps=steps)
+    phase = 2 * np.arctan(np.hypot(*np.sin(angles / 2)) * h) * np.arange(steps + 1)
+    np.testing.assert_allclose(sol.q, np.cos(phase)[:, None] * q, rtol=0, atol=1e-12)

@@ -103,6 +103,7 @@ WITHOUT = {
     "dc-motor": "ports, not a Lagrangian system on Q",
     "mass-spring-damper": "ports, not a Lagrangian system on Q",
     "wave-line": "ports, not a Lagrangian system on Q",
+    "wave-sheet": "ports, not a Lagrangian system on Q",
     "oscillator-chain": "a large system: the momentum of the ring is one of a thousand coordinates",
     "sine-gordon": "a large system held at its ends",
     "hanging-chain": "a large system held at one end, with holonomic constraints",

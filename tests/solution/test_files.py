@@ -499,7 +499,7 @@ def rewritten(path, sol, **arrays):
     variables = {**said.variables, **said.axes}
     for name, values in arrays.items():
         variables[name] = Variable(variables[name].dims, values)
-    variables, attributes = saving._file_form(Description(variables, {}, said.attributes))
+    variables, attributes = saving.file_form(Description(variables, {}, said.attributes))
     saving.FORMATS[path.suffix][0](path, variables, attributes)
     return path
 

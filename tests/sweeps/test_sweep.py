@@ -15,6 +15,7 @@ import xarray as xr
 
 import dirax as dx
 import swept_pendulums
+from dirax.solution.flushed_files import Hold
 from dirax.sweeps import arrange, commit, executors, store, sweep, task, trial
 from dirax.sweeps.case import Case
 from dirax.sweeps.grid import cut
@@ -260,7 +261,7 @@ def test_a_later_dirax_and_other_stores_are_refused(done, tmp_path):
 
 def test_one_caller_at_a_time(done):
     _, path = done
-    hold = store.Hold()
+    hold = Hold()
     assert hold.take(path)
     try:
         with pytest.raises(OSError, match="another call is filling the store"):
@@ -495,7 +496,7 @@ def test_texts_as_an_axis(tmp_path):
 
 
 def test_the_system_is_read_by_its_program(tmp_path):
-    from dirax.sweeps import fingerprint
+    from dirax.solution import fingerprint
 
     a = lambda q, g: g * jnp.sin(q) + 1.0
     b = lambda position, field: field * jnp.sin(position) + 1.0

@@ -7,14 +7,17 @@ import numpy as np
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.power_balance import balances, has_power, keeps_books
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Line
-from dirax.diagnostics.rows import at_rows, energy_at, energy_of
-from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled_terms, steps_of
+from dirax.diagnostics.rows import LARGE, at_rows, energy_at, energy_of, row_numbers
+from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled_terms, spread, steps_of
 from dirax.numerics.tolerances import EPSILON
 from dirax.schemes.step import CLOCK
 from dirax.solution.solution import Solution
 
 JUMP = 1000.0
 """A change in one step that is so many times those of two steps before and after it is a jump."""
+
+SITES = 64
+"""Numbers of each field that show how fast a large system moves."""
 
 NOTICED = 1e-9
 """Changes below this, relative to the energy, are none."""
@@ -93,10 +96,12 @@ def port_lines(sol: Solution, tolerance: float | None) -> list[Line]:
 
 
 def _motion(sol: Solution, lane: int) -> np.ndarray:
-    """All node fields of one trajectory side by side, (rows, d)."""
-    nodes = [np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node" and k != CLOCK]
+    """All node fields of one trajectory side by side, (rows, d); of a large system some numbers of each."""
+    nodes = [a for k, a in sol.fields.items() if sol.field_info[k].place == "node" and k != CLOCK]
     rows = [a if sol.batch is None else a[lane] for a in nodes]
-    return np.concatenate([a.reshape(len(a), -1) for a in rows], axis=1)
+    if row_numbers(sol) > LARGE:  # some of the sites
+        return np.concatenate([np.asarray(a[:, spread(a.shape[1], SITES)]).reshape(len(a), -1) for a in rows], axis=1)
+    return np.concatenate([np.asarray(a).reshape(len(a), -1) for a in rows], axis=1)
 
 
 def energy_scale(sol: Solution, energy: np.ndarray) -> float:

@@ -11,7 +11,7 @@ from dirax.diagnostics.rows import initial_of_one, over_rows, shape_of, times_at
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, worst_place
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
-from dirax.run.final_manifold import KEPT, chain_at
+from dirax.run.final_manifold import KEPT, MOST, chain_at
 from dirax.solution.solution import Solution
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.constraint_search import rank_of
@@ -22,7 +22,7 @@ NOTICED = 1e-6
 
 def final_manifold(sol: Solution, tolerance: float | None) -> Line | None:
     """The constraints of M_f at every row of a run with a singular Lagrangian; None for others."""
-    if sol.system is None or not {"q", "p"} <= sol.fields.keys():
+    if sol.system is None or not {"q", "p"} <= sol.fields.keys() or sol.q.shape[-1] > MOST:
         return None
     chain = _chain_of(sol)
     if chain is None or chain.empty or len(chain.coordinates) - chain.clock != 2 * sol.q.shape[-1]:

@@ -3,7 +3,9 @@
 import numpy as np
 
 from dirax.diagnostics.replay import Again, CannotReplay, Replay, Rows
+from dirax.diagnostics.replay_of_many import replayed_of_many
 from dirax.diagnostics.report import NOT_CHECKED, Line
+from dirax.diagnostics.rows import LARGE, row_numbers
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread
 from dirax.engines.steps_in_numbers import SMALLEST
 from dirax.program.evaluation.noise import Noise
@@ -31,6 +33,8 @@ DOUBTED = 2000
 
 def replayed(sol: Solution, tolerance: float | None) -> Line:
     """The line: the difference of a saved number from what it should be, relative to its terms, the largest of all."""
+    if row_numbers(sol) > LARGE and sol.system is not None and sol.equation is not None and sol.rows > 2:
+        return replayed_of_many(sol, NAME, tolerance)
     try:
         replay = Replay.of(sol)
         at = replay.begun(*replay.chosen())

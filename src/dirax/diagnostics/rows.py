@@ -1,5 +1,6 @@
 """Functions of the saved rows of a solution, evaluated at many of them: by their scalar graph in NumPy, else compiled."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -16,8 +17,14 @@ from dirax.solution.solution import Solution
 from dirax.solution.trajectory import SavedRow
 from dirax.systems.system import AbstractSystem
 
-CHUNK = 4096
-"""Rows that go through a compiled function at once."""
+CHUNK, CHUNK_NUMBERS = 4096, 2**22
+"""Rows that go through a compiled function at once, and the numbers in them, at most."""
+
+LARGE = 1000
+"""Numbers of a row above which it is one of a large system: no matrix of all of them is formed, and rows are sampled."""
+
+SAMPLED_NUMBERS = 2**21
+"""Numbers of the rows that are sampled of a large system, unless four rows are more."""
 
 
 def over_rows(function: eqx.Partial, sol: Solution, items: tuple, few: bool = False, noise: Noise | None = None) -> np.ndarray:
@@ -62,7 +69,9 @@ def _by_graph(function: eqx.Partial, sol: Solution, items: tuple, few: bool, noi
 
 def _compiled(function: Callable, sol: Solution, items: tuple) -> np.ndarray:
     rows = jax.tree.leaves(items)[0].shape[1]
-    size = max(1, CHUNK // (sol.batch or 1)) if rows * (sol.batch or 1) > CHUNK else rows
+    width = 1 + sum(math.prod(np.shape(a)[2:]) for a in jax.tree.leaves(items))
+    most = max(1, min(CHUNK, CHUNK_NUMBERS // width) // (sol.batch or 1))
+    size = min(most, rows)
     axis = 0 if sol.batch_params and sol.given_params is not None else None
     found = []
     for start in range(0, rows, size):
@@ -78,14 +87,29 @@ def _piece(function, items, params, axis):
     return jax.vmap(lane, in_axes=(0, axis))(items, params)
 
 
+def row_numbers(sol: Solution) -> int:
+    """The numbers of a row of one trajectory."""
+    return sum(math.prod(info.shape) for info in sol.field_info.values() if info.place == "node")
+
+
+def sampled_rows(sol: Solution, count: int) -> np.ndarray:
+    """Numbers below `count` of the rows that are looked at: all of them, or of a large system some, evenly spread."""
+    size = row_numbers(sol)
+    if size <= LARGE:
+        return np.arange(count)
+    most = max(4, SAMPLED_NUMBERS // (size * (sol.batch or 1)))
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int))
+
+
 def energy_of(sol: Solution) -> np.ndarray:
     """`sol.energy()`, found here where it was not before. Raises as it does."""
-    return _of_nodes(sol, "energy", energy_at) if sol.system is not None else np.asarray(sol.energy())
+    own = sol.system is not None and row_numbers(sol) <= LARGE
+    return _of_nodes(sol, "energy", energy_at) if own else np.asarray(sol.energy())
 
 
 def constraint_of(sol: Solution) -> np.ndarray:
     """`sol.constraint_residual()`, found here where it was not before. Raises as it does."""
-    if sol.system is None or "constraint" in sol.fields:
+    if sol.system is None or "constraint" in sol.fields or row_numbers(sol) > LARGE:
         return np.asarray(sol.constraint_residual())
     return _of_nodes(sol, "constraint_residual", constraint_at)
 
@@ -130,9 +154,9 @@ def consecutive(sol: Solution, names: tuple[str, ...], points: int, rows: np.nda
     found = {"t": np.stack([times_at(sol, rows + i) for i in range(points)], axis=-1)}
     axis = int(sol.batch is not None)
     for name in names:
-        values = np.asarray(sol.fields[name])
+        values, lead = sol.fields[name], (slice(None),) * axis
         count = points if sol.field_info[name].place == "node" else points - 1
-        found[name] = np.stack([np.take(values, rows + i, axis=axis) for i in range(count)], axis=axis + 1)
+        found[name] = np.stack([np.asarray(values[(*lead, rows + i)]) for i in range(count)], axis=axis + 1)
     return found
 
 

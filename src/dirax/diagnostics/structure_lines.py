@@ -9,7 +9,7 @@ from dirax.diagnostics.one_step import differentiated_steps
 from dirax.diagnostics.power_balance import keeps_books
 from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
 from dirax.diagnostics.rounding import with_rounding
-from dirax.diagnostics.rows import consecutive, over_rows, shape_of
+from dirax.diagnostics.rows import consecutive, over_rows, sampled_rows, shape_of
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
 from dirax.program.memo import Same
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
@@ -39,13 +39,15 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     name, points = structure.claims[0].quantity, structure.points
     if unsaved := _unsaved(structure.reads, sol):
         return [Line(name, None, None, NOT_CHECKED, unsaved)]
-    if (size := sum(int(np.prod(sol.field_info[key].shape)) for key in structure.reads)) > LARGEST_STATE:
+    size = sum(int(np.prod(sol.field_info[key].shape)) for key in structure.reads)
+    if size > LARGEST_STATE and not structure.without_matrix:
         return [Line(name, None, None, NOT_CHECKED, f"its distribution is a matrix, and a row has {size} numbers")]
     if sol.save_every != 1:
         return [Line(name, None, None, NOT_CHECKED, f"needs every step, but save_every = {sol.save_every}")]
     if sol.rows < points:
         return [Line(name, None, None, NOT_CHECKED, f"needs {WORDS[points]} points, but only {sol.rows} were saved")]
-    items = consecutive(sol, structure.reads, points, np.arange(sol.rows - points + 1))
+    rows = sampled_rows(sol, sol.rows - points + 1)
+    items = consecutive(sol, structure.reads, points, rows)
     of_rows, limit = eqx.Partial(_terms, structure), roundoff_limit(tolerance, 1)
     terms = where_reached(over_rows(of_rows, sol, (items,)), items)
     values = _relative(terms, structure.counts)
@@ -58,7 +60,9 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         of_claim = values[..., first : first + len(claim.parts)]
         first += len(claim.parts)
         lane, row = worst_place(np.max(of_claim, axis=-1))
-        text = f"{claim.statement}; worst at t = {sol.time_of(row + middle, lane):.6g}{of_lane(sol, lane)}"
+        text = f"{claim.statement}; worst at t = {sol.time_of(rows[row] + middle, lane):.6g}{of_lane(sol, lane)}"
+        if len(rows) < sol.rows - points + 1:
+            text += f", of {len(rows)} of {sol.rows - points + 1} steps"
         if len(claim.parts) > 1:
             each = zip(claim.parts, of_claim[lane, row], strict=True)
             text += ": " + ", ".join(f"{part} {value:.2g}" for part, value in each)

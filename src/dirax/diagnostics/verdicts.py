@@ -1,12 +1,15 @@
 """How a measured value becomes a line with a verdict, and the places in a solution at which values are taken."""
 
 import math
+from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.report import OK, VIOLATED, Line
-from dirax.diagnostics.rows import over_rows, times_at
+from dirax.diagnostics.rows import LARGE, over_rows, row_numbers, sampled_rows, times_at
 from dirax.numerics.tolerances import EPSILON
 from dirax.solution.solution import Solution
 
@@ -21,6 +24,9 @@ SAMPLED_ENTRIES = 2**13
 
 DISTURBANCE = 2.0**-26
 """By how much, relatively, a number is changed for a scale."""
+
+PROBES = 32
+"""Times that all numbers of a row are changed."""
 
 
 def where_reached(values: np.ndarray, items: dict[str, np.ndarray]) -> np.ndarray:
@@ -73,7 +79,9 @@ def steps_of(sol: Solution) -> int:
 def sampled(sol: Solution, function: eqx.Partial) -> np.ndarray:
     """`function`(row, params) at a few rows, (B, rows, …)."""
     rows = spread(sol.rows, SAMPLED_ROWS)
-    items = {k: np.take(np.asarray(a), rows, axis=int(sol.batch is not None)) for k, a in _nodes(sol).items()}
+    rows = np.intersect1d(rows, sampled_rows(sol, sol.rows))
+    lead = (slice(None),) * int(sol.batch is not None)
+    items = {k: np.asarray(a[(*lead, rows)]) for k, a in _nodes(sol).items()}
     return over_rows(function, sol, ({**items, "t": times_at(sol, rows)},))
 
 
@@ -81,9 +89,13 @@ def sampled_terms(sol: Solution, function: eqx.Partial) -> np.ndarray:
     """Σ |∂f/∂x_i| |x_i| of each entry of f = `function`(row, params) over the numbers x_i of a row, at a few rows (B, rows, …):
     what roundings of the rows do to f, in units of ε.
 
-    By differences, which a scale is content with: f needs no derivative, and what is known of f at all rows is enough.
+    By differences, which a scale is content with: f needs no derivative, and what is known of f at all rows is enough. In rows of
+    a large system all numbers are changed at once, each up or down at random, PROBES times: the largest change of an entry that
+    few numbers have to do with is that sum; of one that all have to do with, it is from derivatives.
     """
     nodes = _nodes(sol)
+    if row_numbers(sol) > LARGE:
+        return _terms_of_many(sol, nodes, function)
     axis, count = int(sol.batch is not None), 1 + sum(math.prod(sol.field_info[k].shape) for k in nodes)
     rows = spread(sol.rows, min(SAMPLED_ROWS, max(4, SAMPLED_ENTRIES // (count * (sol.batch or 1)))))
     items, first = {"t": np.repeat(times_at(sol, rows), count, axis=axis)}, 1
@@ -99,5 +111,30 @@ def sampled_terms(sol: Solution, function: eqx.Partial) -> np.ndarray:
     return np.sum(np.abs(found[:, :, 1:] - found[:, :, :1]), axis=2) / DISTURBANCE
 
 
-def _nodes(sol: Solution) -> dict[str, np.ndarray]:
-    return {k: np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"}
+def _terms_of_many(sol: Solution, nodes: dict[str, Any], function: eqx.Partial) -> np.ndarray:
+    rows, axis, rng = sampled_rows(sol, sol.rows)[:SAMPLED_ROWS], int(sol.batch is not None), np.random.default_rng(0)
+    plain = {k: np.asarray(a[(*(slice(None),) * axis, rows)], float) for k, a in nodes.items()} | {"t": times_at(sol, rows)}
+    whole = over_rows(eqx.Partial(_with_slope, function), sol, (plain,))
+    if whole.shape[2:] == (2,):
+        return whole[..., 1:]
+    found = np.zeros_like(whole)
+    for _ in range(PROBES):
+        moved = {k: a * (1.0 + DISTURBANCE * rng.choice([-1.0, 1.0], np.shape(a))) if k != "t" else a for k, a in plain.items()}
+        found = np.maximum(found, np.abs(over_rows(eqx.Partial(_with_slope, function), sol, (moved,)) - whole) / DISTURBANCE)
+    return found
+
+
+def _with_slope(function: eqx.Partial, row: dict, params: Any):
+    """The value; of a single number also Σ |∂f/∂x_i| |x_i|."""
+    if math.prod(jax.eval_shape(function, row, params).shape) != 1:
+        return jnp.ravel(function(row, params))
+    t = {"t": row["t"]}
+    x = {name: a for name, a in row.items() if name != "t"}
+    value, slope = jax.value_and_grad(lambda x: jnp.sum(function({**x, **t}, params)))(x)
+    return jnp.stack([value, sum(jnp.sum(jnp.abs(slope[name] * x[name])) for name in x)])
+
+
+def _nodes(sol: Solution) -> dict[str, Any]:
+    return {
+        k: a if row_numbers(sol) > LARGE else np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"
+    }

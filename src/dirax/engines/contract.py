@@ -42,7 +42,8 @@ class Problem:
     `first_step` (1 after a two-point start), so the first state is at time t0 + first_step·h.
 
     A run that goes on has the `record` that the engine gave after its first `after` steps: rows of these need not be computed
-    again, and whatever stands in them is written over. An engine may run all of it instead, since the bits are the same.
+    again, and whatever stands in them is written over. An engine may run all of it instead, since the bits are the same, unless
+    rows before `first_row` are not wanted: then the saved arrays begin with that one, at step `after` or before it.
     """
 
     equation: Any
@@ -60,6 +61,7 @@ class Problem:
     compensated: bool = False
     after: int = 0
     record: Any = None
+    first_row: int = 0
 
     @property
     def size(self) -> int:
@@ -69,7 +71,7 @@ class Problem:
     @property
     def rows(self) -> int:
         """Number of saved rows, the first and the last included."""
-        return -(-self.steps // self.save_every) + 1
+        return -(-self.steps // self.save_every) + 1 - self.first_row
 
     def with_numbers(self, **numbers: Any) -> "Problem":
         """The same problem with other numbers, steps or rows; what was found of its equation is kept."""
@@ -96,7 +98,7 @@ class Outcome:
     `closing` is the row at each trajectory's last good step; `last_state` and `last_unknowns` are the state there and the
     unknowns before it, for the message. `iterations` (B,) are updates of Newton's method, `max_residual` (B,) the largest
     entry of the residual that any good step left. `notes` go to `Solution.stats`. `record` is what the engine needs to go on
-    after the last step, None where it would begin anew.
+    after the last step, a tuple of NumPy arrays; None where it would begin anew.
     """
 
     fields: dict[str, Any]
@@ -117,7 +119,8 @@ class Outcome:
 
 def saved_steps(problem: Problem) -> np.ndarray:
     """The step number of each saved row, counted from the problem's first state: 0, s, 2s, …, steps, as exact floats."""
-    numbers = np.arange(problem.rows, dtype=float)  # in place from here on: a long run has no memory to waste
+    first = problem.first_row
+    numbers = np.arange(first, first + problem.rows, dtype=float)  # in place from here on: a long run has no memory to waste
     numbers *= problem.save_every
     numbers[-1] = problem.steps
     return numbers

@@ -48,6 +48,7 @@ _MODULES = {
     "sine-gordon": "sine_gordon",
     "hanging-chain": "hanging_chain",
     "wave-line": "wave_line",
+    "wave-sheet": "wave_sheet",
     "bicycle": "bicycle",
     "andrews-squeezer": "andrews_squeezer",
     "four-bar": "four_bar",

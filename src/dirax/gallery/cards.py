@@ -74,6 +74,7 @@ LOOK = {
     "sine-gordon": "A kink runs along without changing its shape.",
     "hanging-chain": "As many rods as links, all of constant length.",
     "wave-line": "A pulse runs along a line with ports at both ends.",
+    "wave-sheet": "A sheet swings to and fro; what flows through its sides is what its energy changes by.",
 }
 """What to look at, by the name of the system."""
 

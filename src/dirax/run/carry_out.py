@@ -27,6 +27,7 @@ from dirax.run.refused_start import refuse_bad_start
 from dirax.run.result import solution_of
 from dirax.run.settings import Settings, kind_of
 from dirax.run.start import begun, completed
+from dirax.run.streaming import Stream
 from dirax.run.validate import Case, refuse_clock_that_stands, refuse_more_than_memory
 from dirax.schemes.step import Shape, make_step_equation
 from dirax.solution.solution import Solution
@@ -119,7 +120,7 @@ def carried_out(
         return run_with_events(carried_out, _begun, settings, case, steps, save_every, progress, kind, entered)
     began = time.perf_counter()
     every = _checked_times(case, steps, save_every)
-    kind = kind or kind_for(settings, case)
+    kind = None if settings.to is not None else kind or kind_for(settings, case)
     if kind is not None and kind.starts and (again := kind.again(case, steps, every, save_every)):
         return _run(settings, kind, again, steps, progress, entered, began)
     if kind is not None and kind.plan is not None:
@@ -209,7 +210,8 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
         max_iterations=settings.max_iterations,
         compensated=settings.compensated,
     )
-    refuse_more_than_memory(problem)
+    if settings.to is None:
+        refuse_more_than_memory(problem)
     plain = not (redundant or singular or by_values or by_jax)
 
     def plan() -> AnyPlan | None:
@@ -223,6 +225,11 @@ def _run(
 ) -> Solution:
     problem, traced, on = found.problem, found.traced, settings.engine
     started = time.perf_counter()
+    if settings.to is not None and not traced:
+        stream = Stream(settings, found.case, problem, found.row0, on.prepared(problem), settings.to, steps, found.save_every)
+        solution = stream.solution(progress)
+        solution.continuation = StreamedOn(settings, found.case, steps, found.save_every)
+        return solution
     if traced:
         outcome = on.run_traced(problem)
         ready = started
@@ -274,6 +281,20 @@ class Continuation:
         longer = _run(self.settings, self.kind, found, self.steps + more, progress, 0.0, began)
         longer.metadata, longer.example = sol.metadata, sol.example
         return longer
+
+
+@dataclass(frozen=True)
+class StreamedOn:
+    """What goes on with a run whose rows are in a store."""
+
+    settings: Settings
+    case: Case
+    steps: int
+    save_every: int
+
+    def __call__(self, sol: Solution, more: int, progress: Any) -> Solution:
+        """The solution of the whole run of so many more steps, from where the store ends."""
+        return carried_out(self.settings, self.case, self.steps + more, self.save_every, progress)
 
 
 def _rows_before(sol: Solution, problem: Problem) -> dict[str, np.ndarray]:

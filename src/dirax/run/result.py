@@ -31,7 +31,7 @@ def solution_of(
     elif traced:
         ok = ok if p.batch is not None else ok[0]
     else:
-        message = _messages(p, outcome, numbers, said)
+        message = messages(p, outcome, numbers, said)
         if p.batch is None:
             ok, message = bool(ok[0]), message[0]
             numbers, fields = cut(p, outcome)
@@ -45,12 +45,12 @@ def solution_of(
     if p.batch is None:
         fields = {name: a[0] for name, a in fields.items()}
     return Solution(
-        t=_times(p, numbers, traced),
+        t=times_of(p, numbers, traced),
         fields={name: fields[name] for name in p.fields},
         field_info=p.fields,
         step=p.h,
         save_every=p.save_every,
-        stats=_stats(p, outcome, traced) | ({} if traced else p.equation.stages[0][0].review(fields)),
+        stats=stats_of(p, outcome, traced) | ({} if traced else p.equation.stages[0][0].review(fields)),
         ok=ok,
         message=message,
         system=system,
@@ -62,7 +62,7 @@ def solution_of(
     )
 
 
-def _messages(p: Problem, outcome: Outcome, numbers: np.ndarray, said: list[str] | None) -> list[str]:
+def messages(p: Problem, outcome: Outcome, numbers: np.ndarray, said: list[str] | None) -> list[str]:
     """Why each trajectory ended, "" where it did not."""
     good = np.asarray(outcome.completed)
     kept = good if p.batch is None else numbers[np.searchsorted(numbers, good, side="right") - 1]
@@ -72,7 +72,7 @@ def _messages(p: Problem, outcome: Outcome, numbers: np.ndarray, said: list[str]
     return found
 
 
-def _times(p: Problem, numbers: np.ndarray, traced: bool):
+def times_of(p: Problem, numbers: np.ndarray, traced: bool):
     """The times of the steps of the given numbers, in the same array where nothing that is traced can hold it."""
     if traced:
         return p.t0 + (numbers + p.first_step) * p.h
@@ -82,7 +82,8 @@ def _times(p: Problem, numbers: np.ndarray, traced: bool):
     return numbers
 
 
-def _stats(p: Problem, outcome: Outcome, traced: bool) -> dict[str, Any]:
+def stats_of(p: Problem, outcome: Outcome, traced: bool) -> dict[str, Any]:
+    """What `Solution.stats` say of what an engine gave back."""
     one = len(outcome.iterations) == 1
     total = outcome.iterations[0] if one else outcome.iterations.sum()
     worst = outcome.max_residual[0] if one else outcome.max_residual.max()

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ from dirax.run.validate import (
     MOST_ITERATIONS,
     Case,
     check_kinds,
+    checked_store,
     count,
     engine_from,
     validated_case,
@@ -33,6 +35,8 @@ class Settings:
     max_iterations: int
     compensated: bool
     events: tuple = ()
+    to: Path | None = None
+    """The store that the rows go to."""
 
     @cached_property
     def key(self) -> tuple:
@@ -45,7 +49,7 @@ class Settings:
 def stated(
     system: Any, scheme: Any, step: Any, steps: Any, data: dict[str, Any], inputs: Any, params: Any, batch_params: bool,
     save_every: Any, engine: Any, project: bool, check_initial: bool, t0: Any, max_iterations: Any, compensated: bool,
-    events: Any = (),
+    events: Any = (), to: Any = None,
 ) -> tuple[Settings, Case, int, int]:  # fmt: skip
     """The settings and the case that the arguments of `simulate` state, steps and save_every; raises as it does."""
     check_kinds(system, scheme)
@@ -54,7 +58,8 @@ def stated(
     events = checked_events(events, (Event, Impact))
     case = validated_case(data, params, batch_params, step, t0)
     system = system if inputs is None else system.with_inputs(inputs)
-    settings = Settings(system, scheme, on, project, check_initial, max_iterations, bool(compensated), events)
+    path = checked_store(to, events, case.traced)
+    settings = Settings(system, scheme, on, project, check_initial, max_iterations, bool(compensated), events, path)
     return settings, case, steps, save_every
 
 

@@ -38,6 +38,7 @@ def simulate(
     max_iterations: int = 50,
     compensated: bool = False,
     events: Any = (),
+    to: Any = None,
 ) -> Solution:
     """Run `scheme` on `system` for `steps` steps of size `step` and return the Solution.
 
@@ -57,6 +58,10 @@ def simulate(
     `events`: a list of `dx.Event`, whose zeros are found inside the steps and stand in `sol.events`; a terminal one ends the
     trajectory there, which is no failure: `sol.ok` stays true, and `sol.message` says so. Every row is held while they are
     looked for.
+    `to`: the path of a zarr store ("run.zarr") that rows are written to while the run goes on, so that memory does not grow with
+    their number. Fields of the Solution are arrays there, of which what is indexed is read. Whatever ends the run, the store
+    keeps it up to the last five seconds, `dx.load` opens it, and the same call, or one of more steps, goes on with the bits of
+    one run; one that is complete is opened. `sol.extend` goes on, too.
 
     Under `jax.grad`, `jit` or `vmap` the run is differentiable on both engines, and values are not checked.
 
@@ -68,6 +73,7 @@ def simulate(
     finite, `step` ≤ 0, `step` and `tolerance` both or neither, `steps` < 1, data off the constraints, constraints that
     contradict each other, that are dependent at the initial point alone, a Lagrangian singular together with its constraints
     ([PY] (21)), data off the final manifold of a singular Lagrangian, and compositions of steps that leave it.
+    With `to`, `OSError` where the store cannot be written, `ValueError` for that of another run, and with `events`.
     A run that fails midway, or is stopped by Ctrl-C, raises nothing: what was computed is
     kept, and `Solution.ok` and `.message` say what happened.
     """
@@ -79,7 +85,7 @@ def simulate(
         )
     settings, case, steps, save_every = stated(
         system, scheme, 1.0 if step is None else step, steps, {"q": q, "v": v, "p": p, "q0": q0, "q1": q1, "x": x}, inputs,
-        params, batch_params, save_every, engine, project, check_initial, t0, max_iterations, compensated, events,
+        params, batch_params, save_every, engine, project, check_initial, t0, max_iterations, compensated, events, to,
     )  # fmt: skip
     if tolerance is not None:
         h, found = step_for(carried_out, settings, case, tolerable(tolerance))

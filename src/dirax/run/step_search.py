@@ -46,7 +46,7 @@ def step_for(run: Callable[..., Solution], settings: Settings, case: Case, toler
     if case.traced or case.two_points:
         what = "JAX traces its values" if case.traced else "q0= and q1= belong to one step"
         raise ValueError(f"tolerance= finds a step by running, which it cannot where {what}: give step=.")
-    plain, trials = replace(settings, events=()), 0
+    plain, trials = replace(settings, events=(), to=None), 0
 
     def error(h: float) -> float:
         """The largest difference of a row after steps of h from that after pairs of half the length, relative to the largest

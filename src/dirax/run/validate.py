@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -202,6 +203,24 @@ def refuse_more_than_memory(problem: Any) -> None:
             f"the {problem.rows} rows of this run would take {problem.rows * row / 2**30:.3g} GiB, and this machine has "
             f"{there / 2**30:.3g} GiB: save fewer of them, with save_every={max(every, 2)} for instance."
         )
+
+
+def checked_store(to: Any, events: Any, traced: bool) -> Path | None:
+    """The path of a store to write, None where there is to be none. Raises `ValueError` for another ending, and with events and
+    values that JAX traces."""
+    if to is None:
+        return None
+    path = Path(to)
+    if path.suffix != ".zarr":
+        raise ValueError(f"to must be the path of a zarr store that ends in .zarr, but {str(to)!r} was given.")
+    if events:
+        raise ValueError(
+            "events= need every row in memory while they are looked for, and to= keeps none: leave one of them out, and save a "
+            "run with events by sol.save."
+        )
+    if traced:
+        raise ValueError("under jax.grad, jit and vmap nothing can be written to the disk: leave to= out.")
+    return path
 
 
 def _memory() -> int:

@@ -45,6 +45,11 @@ class AbstractDiscreteStructure(eqx.Module):
     def claims(self) -> tuple[Claim, ...]:
         """What it says; the first claim has the structure's name."""
 
+    @property
+    def without_matrix(self) -> bool:
+        """Whether membership is found without a matrix of all coordinates, as large systems need it."""
+        return False
+
     @abstractmethod
     def membership_terms(self, rows: dict[str, Array], params: Any) -> Float[Array, "2 numbers"]:
         """By how much rows miss it, and the sizes of the terms of that: of what cancels, and of what it changes when every

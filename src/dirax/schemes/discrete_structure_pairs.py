@@ -23,6 +23,9 @@ from dirax.systems.shape import Shape
 Vector = Float[Array, " n"]
 Scalar = Float[Array, ""]
 
+MANY = 400
+"""Coordinates above which sizes are those of terms alone where there are no constraints."""
+
 SIGNS = {"+": "(+)-", "-": "(−)-", None: ""}
 
 
@@ -108,6 +111,10 @@ class LagrangianPairs(AbstractPairs):
         """The projector onto Δ°_Q(q)."""
         return annihilator_projector(self.matrix(t, q, params))
 
+    def outside(self, t: Any, q: Vector, vector: Vector, params: Any) -> Vector:
+        """The part of a vector or covector in Δ°_Q(q)."""
+        return self.annihilator(t, q, params) @ vector if self._constrained else jnp.zeros_like(vector)
+
     # ------------------------------------------------------------------ AbstractDiscreteStructure
 
     @property
@@ -117,6 +124,10 @@ class LagrangianPairs(AbstractPairs):
     @property
     def _constrained(self) -> bool:
         return self.shape.m + self.shape.c > 0
+
+    @property
+    def without_matrix(self) -> bool:
+        return not self._constrained and self.shape.n > MANY
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -156,7 +167,18 @@ class LagrangianPairs(AbstractPairs):
     def membership_terms(self, rows: Data, params: Any) -> Float[Array, "2 numbers"]:
         """(constraints, force, saved): the third is by how much the p and the multipliers saved at the middle point miss the
         Legendre momenta and the force of the three points."""
+        if self.without_matrix:
+            return self._of_terms(rows, params)
         return self.defects(rows, params, jnp.abs(jnp.ravel(rows["q"])))
+
+    def _of_terms(self, rows: Data, params: Any) -> Float[Array, "2 numbers"]:
+        """The same without constraints, by the sizes of the terms alone, which takes no matrix."""
+        t, (q0, q1, q2), p = rows["t"][0], rows["q"], rows["p"][1]
+        (before0, p1), (before1, p2) = self.slots(t, q0, q1, params), self.slots(t + self.step, q1, q2, params)
+        jump = p1 + before1
+        largest = jnp.max(jnp.abs(p1) + jnp.abs(p2) + jnp.abs(before0) + jnp.abs(before1))
+        missed = jnp.stack([jnp.max(jnp.abs(jump)), jnp.max(jnp.abs(p - p1 + self.share * jump))])
+        return jnp.stack([missed, jnp.stack([largest, largest])])
 
     def defects(self, rows: dict[str, Array], params: Any, sizes: Float[Array, " k"]) -> Float[Array, "2 numbers"]:
         """The same in roundings of numbers of these sizes, of which the coordinates of the three points are made."""
@@ -168,7 +190,7 @@ class LagrangianPairs(AbstractPairs):
         first, pair = (t, (q0, q1)) if self.sign == "+" else (here, (q1, q2))
         if self.sign is None:
             constraint, force = self.constraint(first, *pair, params), (p1 + before1) / h
-            force = force - self.annihilator(here, q1, params) @ force
+            force = force - self.outside(here, q1, force, params)
         else:
             constraint, force = self._of_induced_structure(t, (q0, q1, q2), pair, (before0, p1, before1, p2), params)
             plain = self.system.holonomic is None and self.system.affine is None

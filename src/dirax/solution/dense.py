@@ -12,7 +12,9 @@ from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
 from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.solution.divided_steps import AT_ROW, DividedSteps, step_for
+from dirax.solution.selection import rows_of
 from dirax.solution.steps_again import Entries, Keyed, StepsAgain, begun, compiled_call, row_of, stepped
+from dirax.solution.stored_rows import StoredRows
 from dirax.solution.trajectory import Trajectory, last_rows
 
 SHORT = 1e-3
@@ -333,12 +335,20 @@ def at(sol: Trajectory, t: Any) -> Moments:
         one = (lambda a: a[0]) if sol.batch is None else (lambda a: a[:, 0])
         return Moments(times, found if times.ndim else {name: one(a) for name, a in found.items()})
     times = _times(t, sol.batch)
+    if any(isinstance(a, StoredRows) for a in sol.fields.values()) and not sol.has_own_times:
+        sol = _around(sol, times)
     if "_dense" not in sol.__dict__:
         sol.__dict__["_dense"] = Dense(sol)
     found = sol.__dict__["_dense"].at(np.atleast_1d(times))
     if not times.ndim:
         found = {name: a[:, 0] for name, a in found.items()}
     return Moments(times, found if sol.batch is not None else {name: a[0] for name, a in found.items()})
+
+
+def _around(sol: Trajectory, times: np.ndarray) -> Trajectory:
+    """The rows that these times lie between, with one before them, read from the disk."""
+    first, last = np.searchsorted(np.asarray(sol.axis), [np.nanmin(times), np.nanmax(times)])
+    return rows_of(sol, range(max(0, int(first) - 2), min(int(last) + 2, sol.rows)))
 
 
 def _times(t: Any, batch: int | None) -> np.ndarray:

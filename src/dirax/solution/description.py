@@ -49,13 +49,15 @@ class Description:
     attributes: dict[str, Any]
 
 
-def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinates: Sequence[str] | None = None) -> Description:
+def describe(
+    sol: Trajectory, units: Mapping[str, Any] | None = None, coordinates: Sequence[str] | None = None, derived: bool = True
+) -> Description:
     """The solution in full.
 
     Dimensions: `trajectory` (in a batch), `time` (saved rows), `interval` (the step leaving a row), `coordinate`,
     `constraint`, `events`, `impacts`. Variables: every saved field, `energy`, `constraint_residual`, the initial data, what
     `sol.events` holds, and `ok` in a batch. `units` and `coordinates` default to what `sol.metadata` says. Attributes record
-    what was run, as text and as JSON.
+    what was run, as text and as JSON. Without `derived` nothing is computed.
 
     Raises `ValueError` for unknown, repeated or too few names, and for a solution inside `jax.grad`, `jit` or `vmap`.
     """
@@ -64,7 +66,7 @@ def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinate
             "this solution holds traced values, not numbers: convert or save it outside of jax.grad, jit and vmap, or return "
             "its arrays from the transformed function."
         )
-    layout = _layout(sol)
+    layout = layout_of(sol.field_info)
     units = _checked_units(sol, units)
     lead = () if sol.batch is None else ("trajectory",)
     sizes = dict.fromkeys((entry["variable"] for entry in layout), -1)  # no dimension may have the name of a variable
@@ -74,8 +76,8 @@ def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinate
         dims = _dimensions(entry["name"], entry["dims"], entry["shape"], sizes)
         about = {"long_name": entry["description"] or entry["name"], "units": _unit(units, entry["name"])}
         variables[entry["variable"]] = Variable((*lead, rows, *dims), np.asarray(sol.fields[entry["name"]]), about)
-    derived = _derived(sol, variables)
-    for name, values in derived.items():
+    quantities = _derived(sol, variables) if derived else {}
+    for name, values in quantities.items():
         inner = values.shape[len(lead) + 1 :]
         dims = _dimensions(name, ["constraint"] * len(inner), inner, sizes)
         about = {"long_name": name.replace("_", " "), "units": _unit(units, name)}
@@ -108,16 +110,16 @@ def describe(sol: Trajectory, units: Mapping[str, Any] | None = None, coordinate
             if "coordinate" in variable.dims:
                 variable.about["coordinate_names"] = ", ".join(names)
     metadata = {**sol.metadata, **({"units": units} if units else {}), **({"coordinates": names} if names else {})}
-    return Description(variables, axes, _attributes(sol, layout, list(derived), metadata))
+    return Description(variables, axes, _attributes(sol, layout, list(quantities), metadata))
 
 
 # ------------------------------------------------------------------------------------------------------------------ parts
 
 
-def _layout(sol: Trajectory) -> list[dict[str, Any]]:
+def layout_of(fields: Mapping[str, Field]) -> list[dict[str, Any]]:
     """Name, name in the description, shape, place, dimensions and description of every field."""
     layout = []
-    for name, info in sol.field_info.items():
+    for name, info in fields.items():
         variable = RENAMED.get(name, f"{name}_field" if name in TAKEN else name)
         layout.append({"name": name, "variable": variable, **vars_of(info)})
     return layout

@@ -13,9 +13,10 @@ from dirax.schemes.step import Field, Shape, make_step_equation
 from dirax.solution.file_record import FileRecord, file_record
 from dirax.solution.netcdf import open_netcdf
 from dirax.solution.plain_forms import decode_params, decode_scheme
-from dirax.solution.saving import MOVED, SEAL, checked_ending, checksum, seal
+from dirax.solution.run_store import is_growing, open_growing
+from dirax.solution.saving import MOVED, SEAL, checked_ending, seal
 from dirax.solution.solution import Solution
-from dirax.solution.stored import Stored, Unreadable, reading
+from dirax.solution.stored import Stored, Unreadable, checksum, reading
 from dirax.solution.stored_events import events_in
 from dirax.solution.sweep_store import is_sweep, opened
 from dirax.solution.zarr_store import open_store
@@ -27,7 +28,8 @@ NOT_OURS = "its description is not one that dirax wrote"
 
 
 def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params: Any = None) -> Any:
-    """The Solution in a file that `Solution.save` wrote, bit for bit; the `xarray.Dataset` of a store that `dx.sweep` fills.
+    """The Solution in a file that `Solution.save` wrote, bit for bit; the `xarray.Dataset` of a store that `dx.sweep` fills; the
+    rows that are whole of a run that `dx.simulate(…, to=path)` writes or wrote, which are read where they are indexed.
 
     Code is not stored: `system` (and `scheme`, if it is not one of dirax with plain settings) supply it where it is needed,
     as for `dx.verify`; energies and constraint residuals are in the file. `params` replaces the stored parameters.
@@ -76,12 +78,17 @@ def with_code(sol: Solution, system: Any, scheme: Any) -> Solution:
 @contextmanager
 def _opened(path: Path, ending: str) -> Iterator[Stored]:
     if ending == ".zarr":
-        yield open_store(path)
+        yield open_growing(path) if is_growing(path) else open_store(path)
     elif not path.is_file():
         raise Unreadable("it is a folder, not a netCDF file")
     else:
         with open_netcdf(path) as stored:
             yield stored
+
+
+def stored_run(path: Path) -> Solution:
+    """The Solution of the store of a run, as far as it got. Raises `Unreadable`."""
+    return reading("it cannot be read, being damaged or incomplete", _read, path, ".zarr", None)
 
 
 def _read(path: Path, ending: str, params: Any) -> Solution:
@@ -95,7 +102,7 @@ def _read(path: Path, ending: str, params: Any) -> Solution:
         arrays = {}
         for name in sorted(stored.kinds, key=lambda name: name != "time"):
             values = stored.read(name)
-            if sums.get(name) != checksum(values):
+            if name not in stored.later and sums.get(name) != checksum(values):
                 raise Unreadable(f"its variable {name} is not what was saved: the file is damaged, incomplete or was edited")
             arrays[name] = values
     _check_times(arrays)

@@ -12,6 +12,7 @@ import numpy as np
 from dirax.solution.atomic_files import checked_place, placed
 from dirax.solution.description import Description, Variable, describe
 from dirax.solution.netcdf import write_netcdf
+from dirax.solution.stored import checksum
 from dirax.solution.trajectory import Trajectory
 from dirax.solution.zarr_store import is_store, write_store
 
@@ -45,7 +46,7 @@ def save(
     path = Path(path)
     write, is_one = FORMATS[checked_ending(path)]
     checked_place(path, overwrite, is_one)
-    variables, attributes = _file_form(describe(sol, units, coordinates))
+    variables, attributes = file_form(describe(sol, units, coordinates))
     with placed(path, overwrite, is_one) as beside:
         write(beside, variables, attributes)
     return path
@@ -58,18 +59,13 @@ def checked_ending(path: Path) -> str:
     return path.suffix
 
 
-def checksum(values: np.ndarray) -> int:
-    """The CRC-32 of the bytes of an array."""
-    return zlib.crc32(np.ascontiguousarray(values).tobytes())
-
-
 def seal(attributes: Mapping[str, Any]) -> int:
     """The CRC-32 of the attributes of a file, but for `SEAL` itself and those that netCDF adds."""
     ours = {name: value for name, value in attributes.items() if name != SEAL and not name.startswith("_")}
     return zlib.crc32(json.dumps(ours, sort_keys=True).encode())
 
 
-def _file_form(said: Description) -> tuple[dict[str, Variable], dict[str, Any]]:
+def file_form(said: Description) -> tuple[dict[str, Variable], dict[str, Any]]:
     """Numbers only: names of coordinates stay in the attributes, long attributes become bytes; with checksums."""
     variables = {**said.variables, **{name: axis for name, axis in said.axes.items() if name != "coordinate"}}
     variables = {name: _numbers(variable) for name, variable in variables.items()}

@@ -31,13 +31,13 @@ def select(sol: Some, which: Any) -> Some:
     if isinstance(which, slice):
         bounds = (which.start, which.stop)
         if any(isinstance(bound, float | np.floating) for bound in bounds):
-            return _rows(sol, _between(sol, which))
+            return rows_of(sol, _between(sol, which))
         if any(bound is not None and not isinstance(bound, int | np.integer) for bound in bounds):
             raise TypeError(f"a slice of a solution takes two floats (times) or two whole numbers, but {which!r} was given.")
         if sol.batch is None:
             if which.step not in (None, 1):
                 raise TypeError("rows of one trajectory are taken without a stride: simulate with save_every= for fewer rows.")
-            return _rows(sol, range(*which.indices(sol.rows)))
+            return rows_of(sol, range(*which.indices(sol.rows)))
     if sol.batch is None:
         raise TypeError(
             f"this solution is one trajectory, but sol[{shortened(which)}] was asked for: sol[t0:t1] with floats is a stretch of "
@@ -76,7 +76,7 @@ def _between(sol: Trajectory, stretch: slice) -> range:
     return range(first, last)
 
 
-def _rows(sol: Some, rows: range) -> Some:
+def rows_of(sol: Some, rows: range) -> Some:
     """Some rows, with the steps between them."""
     if not rows:
         raise ValueError(f"no row is left: the solution has rows 0 to {sol.rows - 1}.")
@@ -117,4 +117,4 @@ def _trajectory(sol: Some, lane: int) -> Some:
     part.ok, part.message = bool(part.ok), part.message[0] if part.message else ""
     nodes = [a.reshape(len(a), -1) for k, a in part.fields.items() if part.field_info[k].place == "node"]
     good = np.flatnonzero(~np.all(np.isnan(np.concatenate(nodes, axis=1)), axis=1))
-    return part if not len(good) or good[-1] == part.rows - 1 else _rows(part, range(int(good[-1]) + 1))
+    return part if not len(good) or good[-1] == part.rows - 1 else rows_of(part, range(int(good[-1]) + 1))

@@ -1,5 +1,6 @@
 """What a file of dirax holds, before its arrays are read: attributes, sizes, and a way to each array."""
 
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,14 @@ class Stored:
 
     attributes: dict[str, Any]
     kinds: dict[str, tuple[tuple[int, ...], np.dtype]]
-    read: Callable[[str], np.ndarray]
+    read: Callable[[str], Any]
+    later: frozenset[str] = frozenset()
+    """Arrays that are read, and checked, where they are used."""
+
+
+def checksum(values: np.ndarray) -> int:
+    """The CRC-32 of the bytes of an array."""
+    return zlib.crc32(np.ascontiguousarray(values).data)
 
 
 def reading(problem: str, read: Callable, *arguments: Any) -> Any:

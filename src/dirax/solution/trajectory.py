@@ -1,5 +1,6 @@
 """Trajectory: the numbers of a run or of a batch of runs, and the quantities that its system derives from them."""
 
+import math
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, TypeVar
@@ -18,8 +19,11 @@ from dirax.text.representation import counted, fields_html
 BLOCK = 2**16
 """Rows that a quantity is computed for at a time, which bounds the memory that it takes."""
 
-BY_NUMPY = 2**18
-"""Rows up to which NumPy is quicker than to compile for them."""
+BLOCK_NUMBERS = 2**22
+"""Numbers that such rows hold, at most."""
+
+BY_NUMPY, NUMBERS_BY_NUMPY = 2**18, 2**24
+"""Rows, and numbers in them, up to which NumPy is quicker than to compile for them."""
 
 GIVEN = (
     *("t", "fields", "field_info", "step", "save_every", "stats", "ok", "message", "system", "scheme", "equation"),
@@ -146,7 +150,7 @@ class Trajectory:
     @property
     def nbytes(self) -> int:
         """Bytes of the saved arrays, `t` included."""
-        return int(self.axis.nbytes + sum(np.asarray(a).nbytes for a in self.fields.values()))
+        return int(self.axis.nbytes + sum(a.nbytes for a in self.fields.values()))
 
     def energy(self):
         """The energy at every saved row, (…, rows): E = ⟨p, v⟩ − L for Lagrangian systems, H for Hamiltonian ones.
@@ -170,20 +174,31 @@ class Trajectory:
     def map_rows(self, function: Callable):
         """`function(row, params)` for every saved row, stacked; `row` is the dict of node fields of one trajectory and of
         the time `t`."""
-        nodes = {k: jnp.asarray(a) for k, a in self.fields.items() if self.field_info[k].place == "node"}
+        nodes = {k: a for k, a in self.fields.items() if self.field_info[k].place == "node"}
         batched = self.batch is not None
-        nodes["t"] = jnp.broadcast_to(jnp.asarray(self.t), (self.batch, self.rows) if batched else (self.rows,))
+        xp = jnp if is_traced(self.t) else np
+        nodes["t"] = xp.broadcast_to(self.t, (self.rows,) if self.batch is None else (self.batch, self.rows))
         axes = (0, 0 if self.batch_params and self.params is not None else None) if batched else None
-        if is_traced(nodes, self.params) or self.rows * (self.batch or 1) <= BLOCK:
-            return _along(function, nodes, self.params, axes)
-        size = max(1, BLOCK // (self.batch or 1))
-        blocks = []
-        for first in range(0, self.rows, size):
-            at = np.minimum(np.arange(first, first + size), self.rows - 1)  # full blocks only: one compilation
-            block = {k: jnp.take(a, at, axis=int(batched)) for k, a in nodes.items()}
-            blocks.append(jax.tree.map(np.asarray, _along(function, block, self.params, axes)))
-        rows = (slice(None),) * batched + (slice(self.rows),)
-        return jax.tree.map(lambda *parts: np.concatenate(parts, axis=int(batched))[rows], *blocks)
+        size = self.rows if is_traced(nodes, self.params) else self.rows_at_a_time
+        if size >= self.rows:
+            return _along(function, {k: jnp.asarray(a) for k, a in nodes.items()}, self.params, axes)
+        blocks, lead = [], (slice(None),) * batched
+        for begin in range(0, self.rows, size):
+            first = min(begin, self.rows - size)  # full blocks only: one compilation
+            block = {k: jnp.asarray(a[(*lead, slice(first, first + size))]) for k, a in nodes.items()}
+            found, new = _along(function, block, self.params, axes), (*lead, slice(begin - first, None))
+            blocks.append(jax.tree.map(lambda a, new=new: np.asarray(a)[new], found))
+        return jax.tree.map(lambda *parts: np.concatenate(parts, axis=int(batched)), *blocks)
+
+    @property
+    def rows_at_a_time(self) -> int:
+        """Rows that a quantity is computed for at a time."""
+        return max(1, min(BLOCK, BLOCK_NUMBERS // self._width) // (self.batch or 1))
+
+    @property
+    def _width(self) -> int:
+        """Numbers of a row of one trajectory."""
+        return 1 + sum(math.prod(info.shape) for info in self.field_info.values() if info.place == "node")
 
     def _per_row(self, name: str, method: str):
         if name not in self.derived:
@@ -203,7 +218,8 @@ class Trajectory:
         nodes = {k: a for k, a in self.fields.items() if self.field_info[k].place == "node"}
         leaves, structure = jax.tree.flatten(self._params)
         count = self.batch or 1
-        if is_traced(self.t, nodes, leaves) or self.rows * count > BY_NUMPY or not all(map(_is_numeric, leaves)):
+        many = self.rows * count > BY_NUMPY or self.rows * count * self._width > NUMBERS_BY_NUMPY
+        if many or is_traced(self.t, nodes, leaves) or not all(map(_is_numeric, leaves)):
             return None
         lead = (self.rows,) if self.batch is None else (self.batch, self.rows)
         rows = {k: np.asarray(a).reshape(self.rows * count, *np.shape(a)[len(lead) :]) for k, a in nodes.items()}

@@ -5,7 +5,7 @@ library does, and so that the sizes of arrays are known, and nothing but numbers
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from itertools import product
 from math import ceil, prod
@@ -23,6 +23,9 @@ CHUNK = 2**23
 SMALL = 2**20
 """Arrays of fewer bytes are not compressed."""
 
+NODE = "zarr.json"
+"""The file that describes an array or a group."""
+
 LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
 BYTES = {"name": "bytes"}
 ZSTD = {"name": "zstd", "configuration": {"level": 0, "checksum": False}}
@@ -39,40 +42,44 @@ def write_store(path: Path, variables: Mapping[str, Variable], attributes: Mappi
     """A new zarr store with these arrays, whose axes are named, and attributes."""
     path.mkdir()
     for name, variable in variables.items():
-        _write_array(path / name, variable)
-    _write_node(path, {"node_type": "group", "attributes": dict(attributes)})
+        write_array(path / name, variable)
+    write_node(path, {"node_type": "group", "attributes": dict(attributes)})
 
 
-def _write_node(folder: Path, node: dict[str, Any]) -> None:
-    (folder / "zarr.json").write_text(json.dumps({"zarr_format": 3, **node}, indent=1), "utf-8")
+def write_node(folder: Path, node: dict[str, Any]) -> None:
+    """The description of an array or a group."""
+    (folder / NODE).write_text(json.dumps({"zarr_format": 3, **node}, indent=1), "utf-8")
 
 
-def _write_array(folder: Path, variable: Variable) -> None:
+def array_node(variable: Variable, shape: Sequence[int], chunk: Sequence[int], fill: Any, compressed: bool) -> dict[str, Any]:
+    """What is said of an array of this shape with the axes and the type of a variable."""
+    first = BYTES if variable.values.itemsize == 1 else LITTLE
+    return {
+        "node_type": "array",
+        "shape": list(shape),
+        "data_type": variable.values.dtype.name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(chunk)}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": fill,
+        "codecs": [first, ZSTD] if compressed else [first],
+        "attributes": dict(variable.about),
+        "dimension_names": list(variable.dims),
+    }
+
+
+def write_array(folder: Path, variable: Variable) -> None:
+    """A whole array, in a new folder."""
     values = np.asarray(variable.values)
     chunk = _chunk_shape(values)
     compressed = values.nbytes >= SMALL
-    first = BYTES if values.itemsize == 1 else LITTLE
     folder.mkdir()
-    _write_node(
-        folder,
-        {
-            "node_type": "array",
-            "shape": list(values.shape),
-            "data_type": values.dtype.name,
-            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(chunk)}},
-            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-            "fill_value": False if values.dtype == bool else 0,
-            "codecs": [first, ZSTD] if compressed else [first],
-            "attributes": dict(variable.about),
-            "dimension_names": list(variable.dims),
-        },
-    )
+    write_node(folder, array_node(variable, values.shape, chunk, False if values.dtype == bool else 0, compressed))
     for index in _chunks(values.shape, chunk):
         part = values[tuple(slice(i * size, (i + 1) * size) for i, size in zip(index, chunk, strict=True))]
         if part.shape != chunk:
             part = np.pad(part, [(0, size - length) for size, length in zip(chunk, part.shape, strict=True)])
         data = np.ascontiguousarray(part, part.dtype.newbyteorder("<")).tobytes()
-        file = _chunk_file(folder, index)
+        file = chunk_file(folder, index)
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(_compress(data) if compressed else data)
 
@@ -90,7 +97,8 @@ def _chunks(shape: tuple[int, ...], chunk: tuple[int, ...]) -> product:
     return product(*(range(ceil(size / part)) for size, part in zip(shape, chunk, strict=True)))
 
 
-def _chunk_file(folder: Path, index: tuple[int, ...]) -> Path:
+def chunk_file(folder: Path, index: tuple[int, ...]) -> Path:
+    """Where a chunk of an array is."""
     return folder.joinpath("c", *map(str, index))
 
 
@@ -159,7 +167,7 @@ def _read_array(folder: Path, node: dict[str, Any]) -> np.ndarray:
     compressed, size = len(node["codecs"]) - 1, prod(chunk) * dtype.itemsize
     parts = {}
     for index in _chunks(shape, chunk):
-        file = _chunk_file(folder, index)
+        file = chunk_file(folder, index)
         if not file.is_file():
             raise Unreadable(f"a part of its variable {folder.name} is missing: the file is incomplete")
         data = file.read_bytes()

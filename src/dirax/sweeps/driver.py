@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from typing import Any
 
+from dirax.solution.flushed_files import StoreError
 from dirax.sweeps.axes import PointError, described
 from dirax.sweeps.case import in_words
-from dirax.sweeps.commit import StoreError
 from dirax.sweeps.executors import Place, PlaceLost, own_processes, parallel
 from dirax.sweeps.progress import State
 from dirax.sweeps.queue import Queue

@@ -1,9 +1,7 @@
 """The store of a call: made, gone on with, grown by more points, or refused; and what says whose it is."""
 
 import json
-import os
 import re
-import shutil
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -11,14 +9,18 @@ from typing import Any
 import jax
 import numpy as np
 
+from dirax.solution import fingerprint
 from dirax.solution.atomic_files import clear_leftovers
+from dirax.solution.flushed_files import Hold, StoreError, refuse_more_than_disk, taken
 from dirax.solution.sweep_store import FORMAT, SWEEP, attributes_of
-from dirax.sweeps import fingerprint
 from dirax.sweeps.axes import Axes
-from dirax.sweeps.commit import StoreError
+from dirax.sweeps.fingerprint import of_case, of_keep
 from dirax.sweeps.layout import Layout
-from dirax.sweeps.store import Hold, axes_of, copy_points, layout_of, made, write_description
+from dirax.sweeps.store import axes_of, copy_points, layout_of, made, write_description
 from dirax.sweeps.trial import Trial, program_of
+
+FEWER = "save fewer rows with save_every=, keep less with keep="
+"""How a sweep takes less room."""
 
 
 def settled(
@@ -29,27 +31,27 @@ def settled(
         clear_leftovers(path)
     if path.exists():
         attributes_of(path) if not overwrite else None
-        _take(path, hold)
+        taken(path, hold)
         clear_leftovers(path)
         if not overwrite:
             there = _compared(path, axes, marks)
             if there is None:
                 return layout_of(path), axes_of(path)
             old, places = layout_of(path), there
-            _refuse_more_than_disk(path, layout, axes.size)
+            refuse_more_than_disk(path, axes.size * layout.point_bytes, FEWER)
             with made(path, True) as beside:
                 write_description(beside, layout, named, attributes)
                 copy_points(path, old, beside, layout, places)
                 hold.take(beside)
             return layout, axes
-    _refuse_more_than_disk(path, layout, axes.size)
+    refuse_more_than_disk(path, axes.size * layout.point_bytes, FEWER)
     try:
         with made(path, overwrite) as beside:
             write_description(beside, layout, named, attributes)
             hold.take(beside)
     except StoreError:
         if path.exists() and not overwrite:  # another call was quicker
-            _take(path, hold)
+            taken(path, hold)
         raise
     return layout, axes
 
@@ -59,20 +61,6 @@ def joined(path: Path, axes: Axes, marks: dict) -> tuple[Layout, Axes]:
     if _compared(path, axes, marks) is not None:
         raise ValueError(f"the processes of jax.distributed have other points for {path} each: give all of them the same.")
     return layout_of(path), axes_of(path)
-
-
-def _take(path: Path, hold: Hold) -> None:
-    if not os.access(path, os.W_OK):
-        raise StoreError(f"the store {path} cannot be written (it is read-only here): make it writable, or choose another path.")
-    try:
-        mine = hold.take(path)
-    except OSError as error:
-        raise StoreError(f"the store {path} cannot be written ({error.strerror}): choose another path.") from error
-    if not mine:
-        raise StoreError(
-            f"another call is filling the store {path} at this moment: wait until it has ended, or stop it; then the same call "
-            "again goes on from there."
-        )
 
 
 def _compared(path: Path, axes: Axes, marks: dict[str, Any]) -> tuple[np.ndarray, ...] | None:
@@ -100,15 +88,6 @@ def _compared(path: Path, axes: Axes, marks: dict[str, Any]) -> tuple[np.ndarray
     return None if same else places
 
 
-def _refuse_more_than_disk(path: Path, layout: Layout, points: int) -> None:
-    wanted, free = points * layout.point_bytes, shutil.disk_usage(path.parent).free
-    if wanted > free:
-        raise StoreError(
-            f"the store {path} would take {wanted / 2**30:.3g} GiB, and {free / 2**30:.3g} GiB of the disk are free: save fewer "
-            "rows with save_every=, keep less with keep=, or choose another disk for to=."
-        )
-
-
 def fingerprint_of(
     system: Any, scheme: Any, axes: Axes, trial: Trial, options: dict[str, Any], params: Any, seed: int
 ) -> dict[str, Any]:
@@ -122,8 +101,8 @@ def fingerprint_of(
         "zip": axes.zipped,
         "system": program_of(trial.sol, options),
         "scheme": fingerprint.of_scheme(scheme),
-        "case": fingerprint.of_case(trial.case, axes.at(np.array([0]))),
-        "keep": fingerprint.of_keep(trial.keep),
+        "case": of_case(trial.case, axes.at(np.array([0]))),
+        "keep": of_keep(trial.keep),
         "params": fingerprint.of_value(jax.tree.leaves(params)) if params is not None else "of case",
         "seed": seed,
         "engine": engine,

@@ -3,30 +3,21 @@
 import contextlib
 import json
 import os
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-try:
-    import fcntl
-except ImportError:  # Windows: nothing is locked
-    fcntl = None
-
 from dirax.solution.atomic_files import checked_place, placed
+from dirax.solution.flushed_files import flush_folder, flushed, writing
 from dirax.solution.sweep_store import attributes_of, group_of
 from dirax.solution.zarr_store import is_store
 from dirax.sweeps.axes import Axes
-from dirax.sweeps.commit import UNFINISHED, flush_folder, flushed, writing
 from dirax.sweeps.grid import Grid, Index
 from dirax.sweeps.layout import OPEN, STATUS, TEXT, Array, Layout, decoded_texts, encoded_texts
 
 NODE = "zarr.json"
-
-LOCK = "lock"
-"""The file, among the unfinished ones, that the caller holds who fills a store."""
 
 
 @contextlib.contextmanager
@@ -85,56 +76,6 @@ def axes_of(path: Path) -> Axes:
             else np.frombuffer(data, np.dtype(kind).newbyteorder("<")).astype(kind)
         )
     return Axes(values, bool(about["zip"]))
-
-
-class Hold:
-    """The lock of a store: held from its making, or from the first look at it, until the end of the call or of the process."""
-
-    def __init__(self) -> None:
-        self._descriptors: list[int] = []
-
-    def take(self, folder: Path) -> bool:
-        """Lock a store, and remove what processes left there that were killed; False where another caller holds it."""
-        lock = folder / UNFINISHED / LOCK
-        while True:
-            lock.parent.mkdir(exist_ok=True)
-            try:
-                descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
-            except FileNotFoundError:  # a caller that has ended took the folder away
-                continue
-            if not _locked(descriptor):
-                os.close(descriptor)
-                return False
-            self._descriptors.append(descriptor)
-            with contextlib.suppress(FileNotFoundError):
-                if os.fstat(descriptor).st_ino == lock.stat().st_ino:
-                    _clear(folder)
-                    return True
-
-    def release(self, folder: Path) -> None:
-        """Let others fill the store, with no unfinished file in it; nothing where it is not held."""
-        if self._descriptors:
-            shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-        while self._descriptors:
-            os.close(self._descriptors.pop())
-
-
-def _locked(descriptor: int) -> bool:
-    if fcntl is None:
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # a file system without locks
-        return True
-    return True
-
-
-def _clear(folder: Path) -> None:
-    for left in (folder / UNFINISHED).iterdir():
-        if left.name != LOCK:
-            left.unlink(missing_ok=True)
 
 
 def open_points(path: Path, layout: Layout) -> dict[Index, np.ndarray | None]:

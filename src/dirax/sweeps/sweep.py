@@ -13,12 +13,12 @@ import numpy as np
 from dirax.engines.engine import AbstractEngine
 from dirax.run.validate import check_kinds, count, engine_from, finite, positive
 from dirax.schemes.step import AbstractScheme
+from dirax.solution.flushed_files import Hold, StoreError
 from dirax.solution.sweep_store import opened
 from dirax.sweeps import executors
 from dirax.sweeps.arrange import arranged, sized
 from dirax.sweeps.axes import Axes
 from dirax.sweeps.case import Case
-from dirax.sweeps.commit import StoreError
 from dirax.sweeps.driver import drive
 from dirax.sweeps.grid import Grid
 from dirax.sweeps.keep import Keep
@@ -26,7 +26,7 @@ from dirax.sweeps.layout import Layout
 from dirax.sweeps.progress import State, reporting
 from dirax.sweeps.ranks import ranks
 from dirax.sweeps.settle import attributes_for, fingerprint_of, joined, settled
-from dirax.sweeps.store import Hold, counts, open_points, refuse_place
+from dirax.sweeps.store import counts, open_points, refuse_place
 from dirax.sweeps.task import Plan, Task
 from dirax.sweeps.trial import check_points, tried
 from dirax.systems.system import AbstractSystem

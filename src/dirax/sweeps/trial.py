@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
 
 from dirax.engines.threads import at_most
 from dirax.run.simulate import simulate
+from dirax.solution.fingerprint import of_steps
 from dirax.solution.solution import Solution
-from dirax.sweeps import fingerprint
 from dirax.sweeps.axes import Axes, described
 from dirax.sweeps.case import Case, Values
 from dirax.sweeps.keep import Keep
@@ -79,23 +78,9 @@ def check_points(axes: Axes, case: Case) -> None:
 
 
 def program_of(sol: Solution, options: dict[str, Any]) -> str:
-    """The digest of the system's functions as the scheme uses them: the completion of the initial data and every step."""
-    equation, params, h, t = sol.equation, sol.params_of_one, np.float64(options["step"]), np.float64(options["t0"])
+    """The digest of the system's functions as the scheme uses them."""
     data = {name: np.asarray(a[0] if a.ndim == 2 else a) for name, a in sol.initial.items()}
-    complete = lambda data, t, params: sol.system.complete({**data, "t": t}, params, options["project"])
-    completed = jax.eval_shape(complete, data, t, params)
-    functions: list[tuple[Callable, tuple]] = [(complete, (data, t, params))]
-    for stage, fraction in equation.stages:
-        state, u = jax.ShapeDtypeStruct((stage.state_size,), np.float64), jax.ShapeDtypeStruct((stage.unknowns,), np.float64)
-        step = np.float64(fraction)
-        functions += [
-            (lambda data, h, params, stage=stage: stage.start(data, h, params), ({**completed, "t": t}, h * step, params)),
-            (stage.residual, (u, state, t, h * step, params)),
-            (stage.advance, (u, state, t, h * step, params)),
-            (stage.unpack, (state, u, t, h * step, params)),
-            (stage.guess, (state, u, h * step, params)),
-        ]
-    return fingerprint.of_functions(functions)
+    return of_steps(sol.system, sol.equation, data, sol.params_of_one, options["step"], options["t0"], options["project"])
 
 
 def _spread(size: int, most: int) -> np.ndarray:

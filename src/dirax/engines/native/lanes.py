@@ -71,7 +71,7 @@ class Lanes:
             for stage, guess in enumerate(p.guess):
                 table[:, self.record.unknowns(stage, np.shape(guess)[-1])] = guess
         else:
-            table = np.array(p.record)
+            table = np.array(p.record[0])
         self.records = self._blocked(table)
         leaves = made.step.parameters.flatten(p.params, p.batch if p.batch_params else None)
         self.params = self._blocked(np.broadcast_to(leaves, (self.lanes, leaves.shape[-1])))
@@ -89,7 +89,9 @@ class Lanes:
     @cached_property
     def fields(self) -> dict[str, np.ndarray]:
         """The saved arrays of the run."""
-        made, self.outs = self.arrays(self.problem.rows)
+        made, outs = self.arrays(self.problem.rows)
+        before = [8 * self.problem.first_row * saved.size for saved in self.saved]  # where row 0 would be
+        self.outs = outs - np.array(before)[:, None]
         return made
 
     def advance(self, kernel, first: int, stop: int, threads: int = 1) -> None:
@@ -129,7 +131,7 @@ class Lanes:
         each is at another step, and with the bits that it has alone."""
         p, kernel = self.problem, made.kernel(1)[0]
         params = jax.tree.map(lambda a: np.asarray(a)[numbers], p.params) if p.batch_params else p.params
-        alone = Lanes(p.with_numbers(params=params, batch=len(numbers), record=table), made, 1)
+        alone = Lanes(p.with_numbers(params=params, batch=len(numbers), record=(table,)), made, 1)
         blocks, places = np.divmod(numbers, self.width)
         outs = np.ascontiguousarray(self.outs[blocks, :, places][:, :, None])
         for i, done in enumerate(table[:, self.record.completed].astype(int).tolist()):

@@ -53,7 +53,7 @@ class OneLane:
             for stage, guess in enumerate(p.guess):
                 memory[self.record.unknowns(stage, np.shape(guess)[-1])] = guess
         else:
-            memory[: places.record] = p.record[0]
+            memory[: places.record] = p.record[0][0]
         if places.outs > places.params:
             memory[places.params : places.outs] = made.step.parameters.flatten(p.params, None)
         self.address, self._words = memory.__array_interface__["data"][0], memory.view(np.int64)
@@ -128,8 +128,9 @@ class OneLane:
 
 
 def places_of(p: Problem, made: Kernels | CollocationKernels) -> Places | None:
-    """Where things stand in a run; None for one that is not short, and for a batch."""
-    if p.batch is not None:
+    """Where things stand in a run; None for one that is not short or begins with a later
+    row, and for a batch."""
+    if p.batch is not None or p.first_row:
         return None
     rows = p.rows
     if made.places is None or made.places.rows != rows:

@@ -92,7 +92,7 @@ class Ready:
             interrupted=interrupted,
             compile_seconds=compile_seconds,
             run_seconds=run_seconds,
-            record=None if interrupted or by_newton is not None else table,
+            record=None if interrupted or by_newton is not None else (table,),
             engine="native",
             notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
         )

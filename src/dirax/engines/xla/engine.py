@@ -55,9 +55,10 @@ class Xla(AbstractEngine):
         p, numerics, notes = self._planned(problem)
         chunk = compiled_chunk(jax.default_backend())
         axes, capacity, params = axes_of(p), row_capacity(p), jax.device_put(p.params)
-        lanes, sizes = p.record, _sizes(p, numerics, sizes_of)
-        if lanes is None:
-            lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, numerics.increments is not None)
+        sizes = _sizes(p, numerics, sizes_of)
+        lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, numerics.increments is not None)
+        if p.record is not None:
+            lanes = jax.tree.unflatten(jax.tree.structure(lanes), p.record)
 
         def call(lanes, start, stop, closing=False):
             t0, h, first_step = map(np.float64, (p.t0, p.h, p.first_step))
@@ -77,9 +78,9 @@ class Xla(AbstractEngine):
                 stop = min(done + count, (first + capacity) * p.save_every, p.steps)
                 tick = time.perf_counter()
                 after, rows = call(lanes, done, stop)
-                last = next_row(stop, p.save_every)
+                last, before = next_row(stop, p.save_every), p.first_row
                 for name, values in rows.items():
-                    fields[name][:, first:last] = values[:, : last - first]
+                    fields[name][:, first - before : last - before] = values[:, : last - first]
                 rate = (stop - done) / max(time.perf_counter() - tick, 1e-9)
                 lanes, done = after, stop
                 count = max(1, int(rate * CHUNK_SECONDS))
@@ -88,11 +89,10 @@ class Xla(AbstractEngine):
         except KeyboardInterrupt:
             interrupted = True
         _, rows = call(lanes, 0, 1, closing=True)
-        outcome = _outcome(
-            p, jax.tree.map(np.asarray, lanes), fields, {name: values[:, 0] for name, values in rows.items()}, notes, self.name
-        )
+        lanes = jax.tree.map(np.asarray, lanes)
+        outcome = _outcome(p, lanes, fields, {name: values[:, 0] for name, values in rows.items()}, notes, self.name)
         outcome.interrupted, outcome.compile_seconds = interrupted, compile_seconds
-        outcome.record = None if interrupted else lanes
+        outcome.record = None if interrupted else tuple(jax.tree.leaves(lanes))
         outcome.run_seconds = time.perf_counter() - started
         return finished(p, outcome)
 

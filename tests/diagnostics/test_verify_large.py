@@ -1,0 +1,55 @@
+"""verify on systems of which no matrix of all coordinates can be formed: right runs pass, changed numbers are found."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.diagnostics import rows
+from dirax.diagnostics.report import VIOLATED
+from dirax.gallery import hanging_chain
+
+SITES = 600
+Q = np.sin(np.pi * np.arange(1, SITES + 1) / (SITES + 1))
+
+
+def chain(q, v):
+    d = jnp.diff(jnp.concatenate([jnp.zeros(1), q, jnp.zeros(1)]))
+    return v @ v / 2 - jnp.sum(d**2 / 2 + d**4 / 5)
+
+
+@pytest.fixture(scope="module")
+def sol():
+    return dx.simulate(dx.LagrangeDirac(chain), dx.LagrangeDAlembert(), q=Q, v=0 * Q, step=0.05, steps=12)
+
+
+JUDGED = "steps replayed", "discrete Dirac structure", "saved p", "action sum stationary"
+
+
+def verdicts(sol):
+    return {line.quantity: line for line in dx.verify(sol).lines}
+
+
+def test_a_right_run_passes(sol, monkeypatch):
+    monkeypatch.setattr(rows, "SAMPLED_NUMBERS", 5 * 2 * SITES)
+    lines = verdicts(sol)
+    assert {lines[name].verdict for name in JUDGED} == {"ok"}
+    assert lines["energy"].verdict == "bounded" and "6 of 12 rows" in lines["steps replayed"].explanation
+    assert "5 of 11 steps" in lines["saved p"].explanation
+    assert "derivative of a step" in lines["symplecticity of one step"].explanation
+
+
+def test_changed_numbers_are_found(sol):
+    q, p = sol.q.copy(), sol.p.copy()
+    q[6, 345] *= 1.0 + 1e-11
+    p[-1, 345] += 1e-12
+    lines = verdicts(sol.replace(fields={"q": q, "p": p}))
+    assert {lines[name].verdict for name in JUDGED} == {VIOLATED}
+
+
+@pytest.mark.soak
+def test_a_chain_of_links_passes():
+    q = hanging_chain.straight(400)
+    sol = dx.simulate(hanging_chain.SYSTEM, dx.LagrangeDAlembert(), q=q, v=0 * q, step=1e-3, steps=6)
+    lines = verdicts(sol)
+    assert all(line.verdict != VIOLATED for line in lines.values()) and lines["steps replayed"].verdict == "ok"
