@@ -7,36 +7,51 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dirax.program.graph import Graph
 from dirax.program.operations import JAX
 
+Place = tuple[int, int]
+"""Of a node's value: the number of an array, and the place in it."""
+
 
 def in_levels(graph: Graph, inputs: Sequence[int], outputs: Sequence[int]) -> Callable[[Any], Any]:
-    """(values of the inputs (n,)) ↦ values of the outputs, in order. Truth values are 0 and 1 in between."""
+    """(values of the inputs (n,)) ↦ values of the outputs, in order."""
     constants, groups = _groups(graph, graph.reachable(outputs, set(inputs)))
-    place = {node: k for k, node in enumerate((*inputs, *constants))}
-    known, planned = len(place), []
-    for (_, op), nodes in groups:
-        operands = [np.array([place[graph.args[node][k]] for node in nodes], np.int32) for k in range(len(graph.args[nodes[0]]))]
-        planned.append((op, len(place), operands, [graph.is_boolean(a) for a in graph.args[nodes[0]]]))
-        place.update({node: len(place) + k for k, node in enumerate(nodes)})
-    read = np.array([place[node] for node in outputs], np.int32)
     fixed = np.array([float(graph.value[node]) for node in constants])
-    size = len(place)
+    places: dict[int, Place] = {node: (0, k) for k, node in enumerate((*inputs, *constants))}
+    sizes, planned = [len(places)], []
+    for number, ((_, op), nodes) in enumerate(groups, start=1):
+        operands = zip(*(graph.args[node] for node in nodes), strict=True)
+        truths = [graph.is_boolean(a) for a in graph.args[nodes[0]]]
+        planned.append((op, [(_read(places, sizes, of), truth) for of, truth in zip(operands, truths, strict=True)]))
+        places.update({node: (number, k) for k, node in enumerate(nodes)})
+        sizes.append(len(nodes))
+    last = _read(places, sizes, outputs)
 
     def function(given: Any) -> Any:
-        values = jnp.concatenate([jnp.asarray(given, float), fixed, jnp.zeros(size - known)])
-        for op, start, operands, truths in planned:
-            taken = [values[a] != 0.0 if truth else values[a] for a, truth in zip(operands, truths, strict=True)]
-            found = jnp.asarray(JAX[op](*taken), float)
-            values = jax.lax.dynamic_update_slice(values, found, (start,))
-        return values[read]
+        arrays = [jnp.concatenate([jnp.asarray(given, float), fixed])]
+        for op, operands in planned:
+            taken = [(read(arrays) != 0.0) if truth else read(arrays) for read, truth in operands]
+            arrays.append(jnp.asarray(JAX[op](*taken), float))  # truth values are 0 and 1 in between
+        return last(arrays)
 
     return function
+
+
+def _read(places: dict[int, Place], sizes: list[int], nodes: Sequence[int]) -> Callable[[list[Any]], Any]:
+    """(arrays) ↦ the values of these nodes."""
+    used = sorted({places[node][0] for node in nodes})
+    starts = dict(zip(used, np.cumsum([0, *(sizes[number] for number in used)]).tolist(), strict=False))
+    indices = np.array([starts[number] + k for number, k in map(places.__getitem__, nodes)], np.int32)
+
+    def read(arrays: list[Any]) -> Any:
+        whole = jnp.concatenate([arrays[number] for number in used])
+        return whole.at[indices].get(mode="promise_in_bounds")
+
+    return read
 
 
 def _groups(graph: Graph, nodes: Sequence[int]) -> tuple[list[int], list[tuple[tuple[int, str], list[int]]]]:
