@@ -23,6 +23,7 @@ from dirax.engines.native.run import run
 from dirax.engines.parameters import parameters
 from dirax.engines.xla import Xla
 from dirax.engines.xla.loop import unpacked_rows
+from dirax.program.compact import compact
 
 # ----------------------------------------------------------------------------------------------------- the primitives
 
@@ -166,7 +167,7 @@ def run_traced(problem: Problem) -> Outcome:
         at = i * task.unknowns
         pieces += [states[..., i * task.state_size : (i + 1) * task.state_size], unknowns[..., at : at + part.unknowns]]
     packed = jnp.concatenate([*pieces, completed], axis=2)
-    rows = unpacked_rows(p, packed)
+    rows = unpacked_rows(p, packed, compact)
     outcome = Outcome(
         fields={name: a if p.is_node(name) else a[:, :-1] for name, a in rows.items()},
         closing={name: a[:, -1] for name, a in rows.items()},
