@@ -44,5 +44,6 @@ def machine(
         time_unit="s" if units else "",
         energy_unit="J" if units else "",
         scene=model.scene(view=view, trail=trail),
+        model=model,
         **more,
     )
