@@ -13,7 +13,6 @@ from jax.extend.core import jaxprs_in_params
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines import policy
 from dirax.engines.parameters import Parameters, parameters
-from dirax.program.compact import DERIVATIVES
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
 from dirax.program.evaluation.in_levels import in_levels
@@ -103,6 +102,9 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
         state, unknowns, previous, guess.tolist(), residual.tolist(), advance.tolist(),
         dict(zip(names, rows, strict=True)), nesting(closed.jaxpr),
     )  # fmt: skip
+
+
+DERIVATIVES = ("dirax_derivative", "dirax_directional", "dirax_pullback")
 
 
 def nesting(jaxpr: Any) -> int:

@@ -14,7 +14,6 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
-from dirax.program.evaluation.in_levels import in_levels
 from dirax.program.evaluation.in_numpy import Values, in_parts
 from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_ends
@@ -27,9 +26,6 @@ OFTEN = 32
 
 IN_NUMPY = 4 * NODE_LIMIT
 """Nodes up to which a program is evaluated in NumPy: some µs each to make and to evaluate, where XLA takes a millisecond."""
-
-BY_LEVELS = 1000
-"""Nodes from which on a program is given to JAX level by level: XLA takes a millisecond to compile each operation."""
 
 NUMPY_RULES: dict[str, Callable] = {}
 """Primitive name → rule(made, interpreter, equation, *operands), which may add computations in NumPy to the program `made`."""
@@ -142,25 +138,16 @@ class ScalarProgram:
 
     @functools.cached_property
     def in_jax(self) -> Callable[..., list[Any]]:
-        """The program, without opaque computations, as a function of its arguments in JAX: operation by operation, or level by
-        level if it is large."""
-        flat = lambda arrays: [node for nodes in arrays for node in nodes.ravel().tolist()]
-        inputs, outputs = flat(self.inputs), flat(self.results)
+        """The program, without opaque computations, as a function of its arguments in JAX, operation by operation."""
+        outputs = [node for nodes in self.results for node in nodes.ravel().tolist()]
         ends = np.cumsum([nodes.size for nodes in self.results])[:-1].tolist()
-        large = len(self.graph.reachable(outputs)) > BY_LEVELS
-        by_level = in_levels(self.graph, inputs, outputs) if large else None
 
         @jax.jit
         def program(*leaves):
-            if not outputs:
-                parts = [jnp.zeros(0)] * len(self.results)
-            elif by_level is not None:
-                parts = jnp.split(by_level(jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])), ends)
-            else:
-                values: dict[int, Any] = {}
-                for nodes, leaf in zip(self.inputs, leaves, strict=True):
-                    values.update(zip(nodes.ravel().tolist(), jnp.ravel(leaf), strict=True))
-                parts = jnp.split(by_jax(self.graph, outputs, values), ends)
+            values: dict[int, Any] = {}
+            for nodes, leaf in zip(self.inputs, leaves, strict=True):
+                values.update(zip(nodes.ravel().tolist(), jnp.ravel(leaf), strict=True))
+            parts = jnp.split(by_jax(self.graph, outputs, values), ends) if outputs else [jnp.zeros(0)] * len(self.results)
             return [part.reshape(nodes.shape) for part, nodes in zip(parts, self.results, strict=True)]
 
         return program

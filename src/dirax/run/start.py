@@ -176,22 +176,18 @@ class _FirstStep(eqx.Module):
 
 def _of_every(one: Any, kept: tuple, case: Case, given: Any, by_jax: bool) -> Any:
     """`one(given, params, h, t0)` of every trajectory; what is traced for NumPy is remembered by the objects `kept`."""
-    large = max(np.shape(leaf)[-1] for leaf in case.data.values()) >= FEWEST_ARRAYS
-    if not (by_jax or large) and not is_traced(given, case.params, case.h, case.t0):
+    by_jax = by_jax or max(np.shape(leaf)[-1] for leaf in case.data.values()) >= FEWEST_ARRAYS
+    if not by_jax and not is_traced(given, case.params, case.h, case.t0):
         found = _in_numpy(one, kept, case, given)
         if found is not None:
             return found
     axes = None if case.batch is None else (0, 0 if case.batch_params else None, None, None)
-    return _compiled(one, (given, case.params, jnp.asarray(case.h, float), jnp.asarray(case.t0, float)), axes, by_jax)
+    return _compiled(one, (given, case.params, jnp.asarray(case.h, float), jnp.asarray(case.t0, float)), axes)
 
 
 @compiled
-def _compiled(one: Any, arguments: tuple, axes: tuple | None, by_jax: bool) -> Any:
+def _compiled(one: Any, arguments: tuple, axes: tuple | None) -> Any:
     """One compiled function for all of it, reused by later runs of equal systems and schemes."""
-    if not by_jax:
-        from dirax.program.compact import compact  # imported when it is used
-
-        one = compact(one)
     return (one if axes is None else jax.vmap(one, in_axes=axes))(*arguments)
 
 

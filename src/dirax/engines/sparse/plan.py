@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend.core import jaxprs_in_params
 
 from dirax.engines import policy
 from dirax.engines.in_jax import joined, replaced
 from dirax.engines.sparse.solver import SparseSolver
 from dirax.engines.step_program import step_program
 from dirax.numerics.sparse.elimination import StructurallySingular
-from dirax.program.compact import operations
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
@@ -21,7 +21,6 @@ from dirax.program.sparsity import Dense
 
 KEPT = 64
 """Plans kept in memory."""
-
 
 class SparsePlan(NamedTuple):
     """The equation as it is run, and a solver for each of its stages."""
@@ -89,3 +88,16 @@ def _by_levels(equation: Any, stage: Any, shapes: tuple, params: Any, batch_para
     places, size = equations.places(rows, columns), equations.count * stage.unknowns
     values = jax.jit(lambda *args: jnp.zeros(size).at[places].set(entries(*args)))
     return replaced(stage, made, index, made.in_levels), SparseSolver(equations, values)
+
+
+def operations(jaxpr: Any) -> int:
+    """How many operations on arrays a jaxpr has, those inside of them counted once for each time that they stand there."""
+    known: dict[int, int] = {}
+
+    def counted(jaxpr: Any) -> int:
+        if id(jaxpr) not in known:
+            inner = (counted(getattr(j, "jaxpr", j)) for e in jaxpr.eqns for j in jaxprs_in_params(e.params))
+            known[id(jaxpr)] = len(jaxpr.eqns) + sum(inner)
+        return known[id(jaxpr)]
+
+    return counted(jaxpr)

@@ -1,7 +1,6 @@
 """The loop over the steps of a run as a function that XLA compiles: a chunk of steps, and the rows saved on the way."""
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -54,9 +53,9 @@ def make_step(equation, axes, max_iterations: int, differentiable: bool, numeric
     return one if axes is None else jax.vmap(one, in_axes=(*axes, 0, None))
 
 
-def unpack_rows(equation, axes, packed, params, clock: Clock, written: Callable = lambda one: one) -> dict:
-    """The named arrays of packed rows (rows, …), of one row by the function that is `written` for it."""
-    one = written(lambda row, params: unpacked_row(equation, row, clock.t0, clock.h, clock.first_step, params))
+def unpack_rows(equation, axes, packed, params, clock: Clock) -> dict:
+    """The named arrays of packed rows (rows, …)."""
+    one = lambda row, params: unpacked_row(equation, row, clock.t0, clock.h, clock.first_step, params)
     lanes = one if axes is None else jax.vmap(one, in_axes=axes)
     return jax.vmap(lanes, in_axes=(0, None))(packed, params)
 
@@ -113,13 +112,12 @@ def _unpack_written(equation, axes, packed, params, clock: Clock, count) -> dict
     return jax.lax.while_loop(lambda carry: carry[0] < count, body, (jnp.zeros((), int), empty))[1]
 
 
-def unpacked_rows(problem: Problem, packed, written: Callable) -> dict:
-    """The named arrays (B, rows, …) of packed rows (B, rows, …), B = 1 for one trajectory; `written` as above."""
+def unpacked_rows(problem: Problem, packed) -> dict:
+    """The named arrays (B, rows, …) of packed rows (B, rows, …), B = 1 for one trajectory."""
     p = problem
     clock = Clock.of(p)
     rows = packed[0] if p.batch is None else jnp.moveaxis(packed, 1, 0)
-    found = unpack_rows(p.equation, axes_of(p), rows, p.params, clock, written)
-    return {name: by_lane(a, p.batch, jnp) for name, a in found.items()}
+    return {name: by_lane(a, p.batch, jnp) for name, a in unpack_rows(p.equation, axes_of(p), rows, p.params, clock).items()}
 
 
 def next_row(step, every):

@@ -23,7 +23,6 @@ from dirax.engines.native.run import run
 from dirax.engines.parameters import parameters
 from dirax.engines.xla import Xla
 from dirax.engines.xla.loop import unpacked_rows
-from dirax.program.compact import compact
 
 # ----------------------------------------------------------------------------------------------------- the primitives
 
@@ -167,7 +166,7 @@ def run_traced(problem: Problem) -> Outcome:
         at = i * task.unknowns
         pieces += [states[..., i * task.state_size : (i + 1) * task.state_size], unknowns[..., at : at + part.unknowns]]
     packed = jnp.concatenate([*pieces, completed], axis=2)
-    rows = unpacked_rows(p, packed, compact)
+    rows = unpacked_rows(p, packed)
     outcome = Outcome(
         fields={name: a if p.is_node(name) else a[:, :-1] for name, a in rows.items()},
         closing={name: a[:, -1] for name, a in rows.items()},
