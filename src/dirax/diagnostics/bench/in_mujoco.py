@@ -68,7 +68,7 @@ def measured(example: Any, steps: int, end: np.ndarray, repeats: int) -> str:
         data.qpos[places], data.qvel[places] = example.initial["q"], example.initial["v"]
         return data
 
-    seconds = []
+    seconds, data = [], started()
     for _ in range(repeats):
         data, before = started(), time.process_time()
         mujoco.mj_step(model, data, nstep=steps)

@@ -20,7 +20,6 @@ class Sparse(Xla):
     """
 
     only_quicker: bool = False
-    compiles_start = False
     name = "sparse"
 
     def supports(self, problem: Problem) -> str | None:
