@@ -13,7 +13,7 @@ THIN = 1e-9
 """Of the largest moment of inertia: the smallest that a body there may have."""
 
 STIFF = "2e-3 1"
-"""Time constant (s) and damping of loops, the stiffest that a step of .001 s allows (`solref`)."""
+"""Time constant (s) and damping of loops (`solref`); MuJoCo takes two steps where that is longer."""
 
 
 def is_stated(model: Any) -> bool:
