@@ -22,6 +22,7 @@ from dirax.program.sparsity import Dense
 KEPT = 64
 """Plans kept in memory."""
 
+
 class SparsePlan(NamedTuple):
     """The equation as it is run, and a solver for each of its stages."""
 
