@@ -239,3 +239,20 @@ def test_machines_are_measured_and_other_programs_are_columns_where_they_are_ins
     assert [line[-1] for line in shown.cells()] == [machines.NO_ROLLING, machines.NO_TIME]
     refused = call("bench", "--machines", "kepler")
     assert refused.exit_code and "'kepler' is no machine" in refused.output
+
+
+def test_the_same_machine_is_stated_for_mujoco():
+    """Its joints, its places and its loops; where the program is installed, the motion is the same but for its soft loops."""
+    from xml.etree import ElementTree
+
+    from dirax.diagnostics.bench import in_mujoco
+
+    example = gallery.get("four-bar")
+    root = ElementTree.fromstring(in_mujoco.mjcf(example.model, 0.01))
+    names = [joint.get("name") for joint in root.iter("joint")]
+    (loop,) = root.iter("connect")
+    assert sorted(names) == sorted(example.model.coordinates) and (loop.get("body1"), loop.get("body2")) == ("coupler", "right")
+    assert in_mujoco.is_stated(example.model) and not in_mujoco.is_stated(gallery.get("bicycle").model)
+    pytest.importorskip("mujoco")
+    cell = in_mujoco.measured(example, 100, example.simulate(step=0.001, steps=1000).q[-1], 1)
+    assert float(cell.split("error ")[1].split(",")[0]) < 0.01

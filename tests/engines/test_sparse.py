@@ -159,3 +159,40 @@ def test_it_says_why_it_does_not_take_a_step():
     problem = Problem(equation, state, (state[:size],), 0.1, 0.0, 2)
     assert "depend on too many unknowns" in (Sparse().supports(problem) or "")
     assert isinstance(Auto()._by_arrays(dataclasses.replace(problem))[1]["not_sparse"], str)
+
+
+def test_machines_of_many_bodies_are_run_by_the_levels_of_their_program():
+    """Against the nodes one by one in NumPy: residual and Jacobian of a row of windows, whatever their number as many levels."""
+    from dirax.engines.sparse.plan import sparse_plan
+    from dirax.engines.step_program import step_program
+    from dirax.gallery import n_four_bar
+
+    system, windows = n_four_bar.model(6).system, 6
+    n, c = 2 * windows + 1, 2 * windows
+    equation = make_step_equation(dx.LagrangeDAlembert(), system, Shape(n, c=c))
+    plan = sparse_plan(equation, {}, False)
+    program, (stage, _) = step_program(equation, {}, False), plan.equation.stages[0]
+    u, state = np.random.default_rng(4).normal(size=(2, max(equation.unknowns, equation.state_size)))
+    given = u[: equation.unknowns], state[: equation.state_size], 0.3, 0.01
+    residual, slopes = program.linearized({}, False, *(np.asarray(x)[None] for x in given))
+    assert stage.residual is not equation.residual
+    np.testing.assert_allclose(stage.residual(*given, {}), residual[0], rtol=1e-11, atol=1e-11)
+    solver = plan.solvers[0]
+    matrix = solver.equations.matrix(np.asarray(solver.jacobian_of(stage.residual)(*given, {})))
+    np.testing.assert_allclose(matrix.toarray(), slopes[0], rtol=1e-11, atol=1e-11)
+
+
+def test_levels_of_a_program_with_choices():
+    from dirax.program.evaluation.in_levels import in_levels
+    from dirax.program.graph import Graph
+
+    g = Graph()
+    a, b, c = map(g.input, "abc")
+    less = g.make("and", g.make("lt", a, b), g.make("lt", b, g.constant(2.0)))
+    outputs = [g.select(less, g.make("sin", c), g.mul(a, c)), g.add(g.make("cos", b), g.constant(1.0)), c, g.one]
+    f = in_levels(g, [a, b, c], outputs)
+    for values in ([0.3, 0.7, 0.9], [0.9, 0.7, 0.4], [0.3, 2.5, 0.1]):
+        expected = g.evaluate(outputs, dict(zip("abc", values, strict=True)))
+        np.testing.assert_allclose(f(np.array(values)), np.array(expected, float), rtol=1e-15)
+    slope = jax.jacfwd(f)(np.array([0.3, 0.7, 0.9]))
+    np.testing.assert_allclose(slope[0], [0.0, 0.0, np.cos(0.9)], atol=1e-15)

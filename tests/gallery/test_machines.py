@@ -57,6 +57,21 @@ def test_a_row_of_windows_folds_through_its_singular_position_as_one_pendulum():
     assert energy[0] == pytest.approx(n_four_bar.energy(windows), rel=1e-14) and np.ptp(energy) < 1e-4 * energy[0]
 
 
+@pytest.mark.soak
+def test_forty_windows_fall_as_one_pendulum():
+    """The benchmark's size: 81 coordinates and 80 constraints, by sparse elimination."""
+    windows, model = 40, n_four_bar.model(40)
+    ratio = ((windows + 1) / 2 + windows) / ((windows + 1) / 3 + windows)
+    field = lambda t, y: [y[1], ratio * 9.81 * np.sin(y[0])]
+    exact = solve_ivp(field, (0, 0.25), [0.0, 1.0], rtol=1e-12, atol=1e-12).y[0, -1]
+    start = model.state({}, {"upright 0": 1.0})
+    sol = dx.simulate(model.system, dx.LagrangeDAlembert(), **start, step=0.005, steps=50)
+    energy = sol.energy()
+    assert sol.ok and sol.stats["engine"] == "sparse" and np.abs(sol.constraint_residual()).max() < 1e-11
+    assert energy[0] == pytest.approx(n_four_bar.energy(windows), rel=1e-14) and np.ptp(energy) < 1e-4 * energy[0]
+    assert sol.q[-1] == pytest.approx(exact * np.sign(sol.q[-1]), abs=2e-3)
+
+
 def test_trailers_follow_and_settle_on_their_circles():
     """θ̇_k = v_{k−1} sin(θ_{k−1} − θ_k)/d_k at the start, and R_k² = R_{k−1}² − d_k² in the end."""
     model, example = n_trailer.MODEL, n_trailer.EXAMPLE

@@ -12,7 +12,7 @@ engines and diagnostics know nothing of it.
 
 model.py              Model: names, energy, observables; model_constraints.py its constraints, statement.py the systems,
                       assembly.py its initial data, checks.py its mistakes
-parts.py              Body; joints.py, contacts.py, forces.py what is between bodies
+parts.py              Body, rod; joints.py, contacts.py, forces.py what is between bodies
 motion.py, frames.py  how a joint moves a frame, with its velocity
 drawing.py            the scene of a report
 
@@ -23,7 +23,7 @@ from dirax.bodies.contacts import Contact, ball_contact, blade, ellipsoid, tip, 
 from dirax.bodies.forces import Damper, Motor, Spring
 from dirax.bodies.joints import Joint, ball, fixed, free, gliding, planar, prismatic, revolute, rolling_wheel, universal
 from dirax.bodies.model import Model
-from dirax.bodies.parts import Body
+from dirax.bodies.parts import Body, rod
 
 __all__ = [
     "Body",
@@ -43,6 +43,7 @@ __all__ = [
     "planar",
     "prismatic",
     "revolute",
+    "rod",
     "rolling_wheel",
     "tip",
     "universal",

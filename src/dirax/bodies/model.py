@@ -72,6 +72,12 @@ class Model:
         """The names of the coordinates, in the order of the joints."""
         return tuple(name for joint in self.joints for name in joint.coordinates)
 
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What each coordinate is: "length", "angle", or "" for a part of a quaternion."""
+        moved = [motion for joint in self.joints if not joint.closes for motion in joint.motions]
+        return tuple(motion.measures for motion in moved for _ in motion.names)
+
     @cached_property
     def places(self) -> dict[str, slice]:
         """Where the coordinates of each joint are."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import jax.numpy as jnp
 
@@ -14,6 +14,7 @@ from dirax.program.tracing import along, gradient
 class Shift:
     """By a vector (3,) of the frame, once and for all."""
 
+    measures: ClassVar[str] = ""
     by: Vector
     names: tuple[str, ...] = ()
 
@@ -27,6 +28,7 @@ class Shift:
 class TurnBy:
     """By a fixed angle (rad) about an axis (3,), once and for all."""
 
+    measures: ClassVar[str] = ""
     axis: Vector
     angle: float
     names: tuple[str, ...] = ()
@@ -40,6 +42,7 @@ class TurnBy:
 class Slide:
     """Along an axis (3,) of the frame, by a length that is the coordinate."""
 
+    measures: ClassVar[str] = "length"
     axis: Vector
     names: tuple[str, ...]
 
@@ -54,6 +57,7 @@ class Slide:
 class Turn:
     """About an axis (3,) of the frame, by an angle (rad) that is the coordinate."""
 
+    measures: ClassVar[str] = "angle"
     axis: Vector
     names: tuple[str, ...]
 
@@ -67,6 +71,7 @@ class Turn:
 class Quaternion:
     """By a unit quaternion (w, x, y, z), whose four numbers are coordinates, with |Q| = 1 as a holonomic constraint."""
 
+    measures: ClassVar[str] = ""
     names: tuple[str, ...]
 
     def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
@@ -80,6 +85,7 @@ class Glide:
     """Over the surface z = height(x, y) of the frame, at a distance from it along its normal; x and y of the point below are
     the coordinates. The frame does not turn, or where it `leans` its z turns to the normal and its x stays over the x axis."""
 
+    measures: ClassVar[str] = "length"
     height: Callable
     distance: float
     names: tuple[str, ...]

@@ -48,3 +48,12 @@ class Body:
         arm = frame.point(vector(self.centre, params)) - about
         own = frame.turn @ (self.inertia_matrix(params) @ (frame.turn.T @ frame.spin))
         return jnp.cross(arm, self.momentum(frame, params)) + own
+
+
+def rod(name: str, end: Vector, mass: Number = 1.0) -> Body:
+    """A thin uniform rod from the origin of the body's frame to `end` (3,): I = m (|e|² − e eᵀ)/12. A `mass` that is a parameter
+    is no number to multiply with, hence raises `TypeError`."""
+    if isinstance(mass, str):
+        raise TypeError(f"the mass of rod {name!r} must be a number, but it is {mass!r}: state a Body with its inertia.")
+    along = np.asarray(end, float)
+    return Body(name, mass, mass * (along @ along * np.eye(3) - np.outer(along, along)) / 12, along / 2)

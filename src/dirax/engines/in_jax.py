@@ -67,11 +67,10 @@ def _in_scalars(equation: Any, made: StepProgram) -> tuple[Any, tuple[Callable, 
     if large and not made.nested:
         return equation, None
     distinct = {index: stage for (index, _), (stage, _) in zip(made.stages, equation.stages, strict=True)}
-    new = {i: _replaced(stage, made, i) for i, stage in distinct.items()}
+    new = {i: replaced(stage, made, i, made.in_jax) for i, stage in distinct.items()}
     jacobians = {i: _dense(made, i) for i in distinct}
-    single = len(equation.stages) == 1 and equation.stages[0][1] == 1.0
     stages = tuple((new[i], fraction) for i, fraction in made.stages)
-    return stages[0][0] if single else StepSequence(stages), tuple(jacobians[i] for i, _ in made.stages)
+    return joined(equation, stages), tuple(jacobians[i] for i, _ in made.stages)
 
 
 def _dense(made: StepProgram, index: int) -> Callable:
@@ -82,10 +81,10 @@ def _dense(made: StepProgram, index: int) -> Callable:
     return lambda *args: entries(*args).reshape(k, k)
 
 
-def _unpacked(made: StepProgram, index: int) -> Callable:
+def _unpacked(made: StepProgram, index: int, written: Callable) -> Callable:
     rows = made.equations[index].rows
     sizes = np.cumsum([nodes.size for nodes in rows.values()])[:-1].tolist()
-    flat = made.in_jax(index, [node for nodes in rows.values() for node in nodes.ravel().tolist()])
+    flat = written(index, [node for nodes in rows.values() for node in nodes.ravel().tolist()])
 
     def unpack(state, u, t, h, params):
         parts = jnp.split(flat(u, state, t, h, params), sizes)
@@ -94,11 +93,18 @@ def _unpacked(made: StepProgram, index: int) -> Callable:
     return unpack
 
 
-def _replaced(stage: StepEquation, made: StepProgram, index: int) -> StepEquation:
+def replaced(stage: StepEquation, made: StepProgram, index: int, written: Callable) -> StepEquation:
+    """The equation with its functions as nodes; `written(index, nodes)` gives nodes as a function in JAX."""
     traced = made.equations[index]
     return dataclasses.replace(
         stage,
-        residual=made.in_jax(index, traced.residual) if stage.unknowns else stage.residual,
-        advance=made.in_jax(index, traced.advance),
-        unpack=_unpacked(made, index),
+        residual=written(index, traced.residual) if stage.unknowns else stage.residual,
+        advance=written(index, traced.advance),
+        unpack=_unpacked(made, index, written),
     )
+
+
+def joined(equation: Any, stages: tuple[tuple[StepEquation, float], ...]) -> Any:
+    """These stages in place of those of the equation."""
+    single = len(equation.stages) == 1 and equation.stages[0][1] == 1.0
+    return stages[0][0] if single else StepSequence(stages)

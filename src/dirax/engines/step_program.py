@@ -15,6 +15,7 @@ from dirax.engines import policy
 from dirax.engines.parameters import Parameters, parameters
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
+from dirax.program.evaluation.in_levels import in_levels
 from dirax.program.evaluation.in_numpy import Slopes, Values, in_parts
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.graph_derivatives import jacobian
@@ -202,14 +203,30 @@ class StepProgram:
         equation, g, shared = self.equations[index], graph or self.graph, self.shared
 
         def function(u, state, t, h, params):
-            leaves = [leaf for leaf, moves in zip(jax.tree.leaves(params), self.parameters.dynamic, strict=True) if moves]
-            numbers = [x for leaf in leaves for x in jnp.ravel(jnp.asarray(leaf, float))]
+            numbers = [x for leaf in self._moving(params) for x in leaf]
             values: dict[int, Any] = {shared.t: jnp.asarray(t, float), shared.h: jnp.asarray(h, float)}
             values.update(zip(shared.params, numbers, strict=True))
             values.update(zip([*equation.unknowns, *equation.state], [*u, *state], strict=True))
             return by_jax(g, outputs, values)
 
         return jax.jit(function)  # so that JAX traces it once for all the places that a loop has it in
+
+    def in_levels(self, index: int, outputs: list[int]) -> Callable:
+        """The same, equal operations of one depth at once."""
+        equation, shared = self.equations[index], self.shared
+        inputs = [*equation.unknowns, *equation.state, shared.t, shared.h, *shared.params]
+        by_level = in_levels(self.graph, inputs, outputs)
+
+        def function(u, state, t, h, params):
+            clock = jnp.stack([jnp.asarray(t, float), jnp.asarray(h, float)])
+            return by_level(jnp.concatenate([u, state, clock, *self._moving(params)]))
+
+        return jax.jit(function)
+
+    def _moving(self, params: Any) -> list[Any]:
+        """The floating leaves, flat."""
+        leaves = zip(jax.tree.leaves(params), self.parameters.dynamic, strict=True)
+        return [jnp.ravel(jnp.asarray(leaf, float)) for leaf, moves in leaves if moves]
 
     def linearized(self, params: Any, batch_params: bool, u, state, t, h) -> tuple[np.ndarray, np.ndarray]:
         """(residual, Jacobian) of the first stage in numbers, (entries, k) and (entries, k, k); arguments have an axis of

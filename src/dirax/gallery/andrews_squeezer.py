@@ -6,8 +6,7 @@ Data and names of the angles: the IVP test set (Mazzia, Magherini), and Hairer a
 import numpy as np
 
 from dirax.bodies import Body, Model, Motor, Spring, revolute
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.gallery.machine import machine
 
 A, B, C = (-0.06934, -0.00227, 0.0), (-0.03635, 0.03273, 0.0), (0.014, 0.072, 0.0)
 MASSES = (0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498)
@@ -56,18 +55,14 @@ REFERENCE = np.array(
 )
 """The angles at t = .03 s."""
 
-EXAMPLE = Example(
-    name="andrews-squeezer",
-    title="Andrews' squeezing mechanism",
-    source="IVP test set, problem Andrews; Hairer & Wanner II, VII.7",
-    system=MODEL.system,
-    initial=MODEL.state(START),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "andrews-squeezer",
+    "Andrews' squeezing mechanism",
+    "IVP test set, problem Andrews; Hairer & Wanner II, VII.7",
+    MODEL,
+    MODEL.state(START),
     step=1e-5,
     steps=3000,
-    coordinates=tuple(Coordinate(name, "rad") for name in MODEL.coordinates),
     plane=(2, 4),
-    time_unit="s",
-    energy_unit="J",
-    scene=MODEL.scene(view="above"),
+    view="above",
 )

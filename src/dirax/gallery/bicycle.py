@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.bodies import Body, Model, free, revolute, wheel
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.gallery.machine import machine
 
 WHEELBASE, TRAIL, TILT, REAR, FRONT = 1.02, 0.08, math.pi / 10, 0.3, 0.35
 STEER = np.array([WHEELBASE + TRAIL, 0.0, -REAR])
@@ -70,19 +69,14 @@ def turned(q):
 SYMMETRIES = {"x": moved(0), "y": moved(1), "yaw": turned, "rear wheel": moved(6), "front wheel": moved(8)}
 """Infinitesimal generators; rolling does not conserve their momenta."""
 
-EXAMPLE = Example(
-    name="bicycle",
-    title="Benchmark bicycle with a rigid rider",
-    source="Meijaard, Papadopoulos, Ruina, Schwab, Proc. R. Soc. A 463 (2007) 1955–1982",
-    system=MODEL.system,
-    initial=MODEL.state({"frame.z": REAR}, {"frame.x": 4.6, "frame.roll": 0.5, "frame.yaw": 0.0}),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "bicycle",
+    "Benchmark bicycle with a rigid rider",
+    "Meijaard, Papadopoulos, Ruina, Schwab, Proc. R. Soc. A 463 (2007) 1955–1982",
+    MODEL,
+    MODEL.state({"frame.z": REAR}, {"frame.x": 4.6, "frame.roll": 0.5, "frame.yaw": 0.0}),
     step=0.005,
     steps=1000,
-    coordinates=tuple(
-        Coordinate(name.removeprefix("frame."), "m" if k < 3 else "rad") for k, name in enumerate(MODEL.coordinates)
-    ),
-    time_unit="s",
-    energy_unit="J",
-    scene=MODEL.scene(view=(-0.5, -1.0, 0.4), trail="frame"),
+    view=(-0.5, -1.0, 0.4),
+    trail="frame",
 )

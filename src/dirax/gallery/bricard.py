@@ -6,16 +6,15 @@ five things that the last hinge demands one follows from the others. SI units.
 
 import numpy as np
 
-from dirax.bodies import Body, Model, revolute
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.bodies import Model, revolute, rod
+from dirax.gallery.machine import machine
 
 EDGES = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [-1.0, 0, 0], [0, 1.0, 0]])
 AXES = ((0, 1, 0), (0, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1))
 RODS = [f"rod {k}" for k in range(1, 6)]
 
 MODEL = Model(
-    bodies=[Body(rod, 1.0, (1.0 - np.abs(edge)) / 12, centre=edge / 2) for rod, edge in zip(RODS, EDGES, strict=True)],
+    bodies=[rod(name, edge) for name, edge in zip(RODS, EDGES, strict=True)],
     joints=[
         revolute("ground", "rod 1", AXES[0]),
         *(revolute(RODS[k - 1], RODS[k], AXES[k], at=EDGES[k - 1]) for k in range(1, 5)),
@@ -24,17 +23,12 @@ MODEL = Model(
     gravity=(0.0, -9.81, 0.0),
 )
 
-EXAMPLE = Example(
-    name="bricard",
-    title="Bricard's mechanism",
-    source="IFToMM library of computational benchmark problems: Bricard's mechanism",
-    system=MODEL.system,
-    initial=MODEL.state(),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "bricard",
+    "Bricard's mechanism",
+    "IFToMM library of computational benchmark problems: Bricard's mechanism",
+    MODEL,
+    MODEL.state(),
     step=0.01,
     steps=1000,
-    coordinates=tuple(Coordinate(name, "rad") for name in MODEL.coordinates),
-    time_unit="s",
-    energy_unit="J",
-    scene=MODEL.scene(),
 )

@@ -7,8 +7,7 @@ energy (Chaplygin 1903; Borisov and Mamaev 2001). No potential, no friction. Uni
 import numpy as np
 
 from dirax.bodies import Body, Model, ball_contact, free
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.gallery.machine import machine
 
 MODEL = Model(
     bodies=[Body("ball", 1.0, (0.2, 0.35, 0.5))],
@@ -23,15 +22,14 @@ def about_contact(q, v):
     return MODEL.angular_momentum(q, v, about=q[:3] - np.array([0.0, 0.0, 1.0]))
 
 
-EXAMPLE = Example(
-    name="chaplygin-sphere",
-    title="Chaplygin's sphere",
-    source="Chaplygin 1903; Borisov & Mamaev, Nelin. Dinam. 2001: its integrals",
-    system=MODEL.system,
-    initial=MODEL.state({"ball.z": 1.0, "ball.qx": 0.3, "ball.qy": 0.1}, {"ball.x": 0.5, "ball.y": 0.2, "ball.qz": 0.6}),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "chaplygin-sphere",
+    "Chaplygin's sphere",
+    "Chaplygin 1903; Borisov & Mamaev, Nelin. Dinam. 2001: its integrals",
+    MODEL,
+    MODEL.state({"ball.z": 1.0, "ball.qx": 0.3, "ball.qy": 0.1}, {"ball.x": 0.5, "ball.y": 0.2, "ball.qz": 0.6}),
     step=0.01,
     steps=2000,
-    coordinates=tuple(Coordinate(name.removeprefix("ball.")) for name in MODEL.coordinates),
-    scene=MODEL.scene(trail="ball"),
+    units=False,
+    trail="ball",
 )

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.bodies import Body, Model, rolling_wheel, wheel
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.gallery.machine import machine
 
 RADIUS, MASS, GRAVITY = 0.0375, 0.4499, 9.81
 MODEL = Model(
@@ -37,19 +36,12 @@ SYMMETRIES = {
 }
 """Infinitesimal generators."""
 
-EXAMPLE = Example(
-    name="euler-disk",
-    title="Euler's disk, rolling without slipping",
-    source="Moffatt, Nature 404 (2000): Ω² sin α = 4 g/R",
-    system=MODEL.system,
-    initial=MODEL.state({"disc.roll": 1.2}, {"disc.yaw": 30.0, "disc.roll": 1.0, "disc.spin": -25.0}),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "euler-disk",
+    "Euler's disk, rolling without slipping",
+    "Moffatt, Nature 404 (2000): Ω² sin α = 4 g/R",
+    MODEL,
+    MODEL.state({"disc.roll": 1.2}, {"disc.yaw": 30.0, "disc.roll": 1.0, "disc.spin": -25.0}),
     step=5e-4,
     steps=2000,
-    coordinates=tuple(
-        Coordinate(name.removeprefix("disc."), "m" if k < 2 else "rad") for k, name in enumerate(MODEL.coordinates)
-    ),
-    time_unit="s",
-    energy_unit="J",
-    scene=MODEL.scene(),
 )

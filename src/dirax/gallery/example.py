@@ -34,6 +34,7 @@ class Example:
     - `exact(t, params=…, **initial) -> (rows, n)`: the solution at times `t` (rows,) from a closed form or a quadrature.
     - `symmetries`: infinitesimal generators `ξ(q) -> (n,)` by name, whose momentum ⟨p, ξ(q)⟩ is conserved.
     - `scene`: what a report draws of it, a `dx.scene.Scene`.
+    - `model`: the `dx.bodies.Model` that states it, if one does.
 
         sol = dirax.gallery.get("kepler").simulate(step=0.05)
     """
@@ -54,6 +55,7 @@ class Example:
     exact: Callable[..., np.ndarray] | None = None
     symmetries: Mapping[str, Callable] = field(default_factory=dict)
     scene: Scene | None = None
+    model: Any = None
 
     @property
     def labels(self) -> dict[str, Any]:

@@ -7,8 +7,7 @@ momentum about it is constant. After the IFToMM library's benchmark, with rods i
 import numpy as np
 
 from dirax.bodies import Body, Damper, Model, Spring, prismatic, revolute
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.gallery.machine import machine
 
 ARM, HALF, THIN = 1.0, 0.5, 0.02
 Y = (0.0, 1.0, 0.0)
@@ -39,21 +38,16 @@ MODEL = Model(
     ],
 )
 
-EXAMPLE = Example(
-    name="flyball-governor",
-    title="Flyball governor",
-    source="after the IFToMM library of computational benchmark problems",
-    system=MODEL.system,
-    initial=MODEL.state(
+EXAMPLE = machine(
+    "flyball-governor",
+    "Flyball governor",
+    "after the IFToMM library of computational benchmark problems",
+    MODEL,
+    MODEL.state(
         {"right arm": np.pi / 6, "left arm": -np.pi / 6, "right rod": -np.pi / 3, "left rod": np.pi / 3},
         {"spindle": 2 * np.pi},
     ),
-    scheme=LagrangeDAlembert(),
     step=1e-3,
     steps=5000,
-    coordinates=tuple(Coordinate(name, "m" if name == "collar" else "rad") for name in MODEL.coordinates),
     plane=(1, 2),
-    time_unit="s",
-    energy_unit="J",
-    scene=MODEL.scene(),
 )

@@ -5,12 +5,10 @@ it fails. A benchmark of the IFToMM library with N = 40, a speed of 1 m/s of the
 row is a pendulum: ((N + 1)/3 + N) θ̈ = ((N + 1)/2 + N) g sin θ. SI units.
 """
 
-from dirax.bodies import Body, Model, revolute
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.bodies import Model, revolute, rod
+from dirax.gallery.machine import machine
 
-ACROSS, AXIS = 1.0 / 12, (0.0, 1.0, 0.0)
-TOP, ALONG = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+AXIS, TOP, ALONG = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
 
 
 def model(windows: int) -> Model:
@@ -21,10 +19,7 @@ def model(windows: int) -> Model:
     for k, beam in enumerate(beams):
         joints.append(revolute(uprights[k], beam, AXIS, at=TOP))
         joints.append(revolute(beam, uprights[k + 1], AXIS, f"corner {k + 1}", at=ALONG, on=TOP, closes=True))
-    standing, lying = {"centre": (0.0, 0.0, 0.5)}, {"centre": (0.5, 0.0, 0.0)}
-    bodies = [Body(name, 1.0, (ACROSS, ACROSS, 0.0), **standing) for name in uprights]
-    bodies += [Body(name, 1.0, (0.0, ACROSS, ACROSS), **lying) for name in beams]
-    return Model(bodies, joints)
+    return Model([*(rod(name, TOP) for name in uprights), *(rod(name, ALONG) for name in beams)], joints)
 
 
 def energy(windows: int) -> float:
@@ -33,17 +28,13 @@ def energy(windows: int) -> float:
 
 
 MODEL = model(4)
-EXAMPLE = Example(
-    name="n-four-bar",
-    title="A row of four-bar linkages",
-    source="IFToMM library of computational benchmark problems: N-four-bar mechanism",
-    system=MODEL.system,
-    initial=MODEL.state({}, {"upright 0": 1.0}),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "n-four-bar",
+    "A row of four-bar linkages",
+    "IFToMM library of computational benchmark problems: N-four-bar mechanism",
+    MODEL,
+    MODEL.state({}, {"upright 0": 1.0}),
     step=0.01,
     steps=1000,
-    coordinates=tuple(Coordinate(name, "rad") for name in MODEL.coordinates),
-    time_unit="s",
-    energy_unit="J",
-    scene=MODEL.scene(view="front"),
+    view="front",
 )

@@ -6,8 +6,7 @@ radii are R_k² = R_{k−1}² − d_k². A motor holds the steering; the car rol
 """
 
 from dirax.bodies import Body, Model, Spring, blade, planar, revolute
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.gallery.machine import machine
 
 WHEELBASE, LENGTHS = 2.5, (2.0, 2.0, 1.5)
 TRAILERS = tuple(f"trailer {k}" for k in range(1, len(LENGTHS) + 1))
@@ -32,17 +31,14 @@ MODEL = Model(
     forces=[Spring(2e4, coordinate="steer", length=STEERED, name="steering")],
 )
 
-EXAMPLE = Example(
-    name="n-trailer",
-    title="Car with three trailers",
-    source="Murray & Sastry, IEEE Trans. Autom. Control 38 (1993)",
-    system=MODEL.system,
-    initial=MODEL.state({"steer": STEERED}, {"car.x": 3.0, "steer": 0.0}),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "n-trailer",
+    "Car with three trailers",
+    "Murray & Sastry, IEEE Trans. Autom. Control 38 (1993)",
+    MODEL,
+    MODEL.state({"steer": STEERED}, {"car.x": 3.0, "steer": 0.0}),
     step=0.01,
     steps=2000,
-    coordinates=tuple(Coordinate(name.removeprefix("car."), "m" if k < 2 else "rad") for k, name in enumerate(MODEL.coordinates)),
-    time_unit="s",
-    energy_unit="J",
-    scene=MODEL.scene(view="above", trail="trailer 3"),
+    view="above",
+    trail="trailer 3",
 )

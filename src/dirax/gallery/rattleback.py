@@ -4,8 +4,7 @@ Spun one way it begins to rattle and turns round. Data: Kane and Levinson, Int. 
 """
 
 from dirax.bodies import Body, Model, ellipsoid, free
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.gallery.machine import machine
 
 CENTRE = (0.0, 0.0, -0.01)
 """The mass centre, below the middle of the ellipsoid."""
@@ -17,20 +16,13 @@ MODEL = Model(
     gravity=(0.0, 0.0, -9.81),
 )
 
-EXAMPLE = Example(
-    name="rattleback",
-    title="Rattleback",
-    source="Kane & Levinson, Int. J. Non-Linear Mech. 17 (1982) 175–186",
-    system=MODEL.system,
-    initial=MODEL.state({"stone.roll": 0.01, "stone.pitch": 0.01}, {"stone.yaw": -5.0}),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "rattleback",
+    "Rattleback",
+    "Kane & Levinson, Int. J. Non-Linear Mech. 17 (1982) 175–186",
+    MODEL,
+    MODEL.state({"stone.roll": 0.01, "stone.pitch": 0.01}, {"stone.yaw": -5.0}),
     step=1e-3,
     steps=20_000,
-    coordinates=tuple(
-        Coordinate(name.removeprefix("stone."), "m" if k < 3 else "rad") for k, name in enumerate(MODEL.coordinates)
-    ),
     plane=(3, 4),
-    time_unit="s",
-    energy_unit="J",
-    scene=MODEL.scene(),
 )

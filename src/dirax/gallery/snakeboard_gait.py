@@ -7,8 +7,7 @@ but the skates, and the board gathers speed: Lewis, Ostrowski, Murray and Burdic
 import jax.numpy as jnp
 
 from dirax.bodies import Body, Model, Motor, blade, planar, revolute
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.gallery.machine import machine
 
 HALF, FREQUENCY, STIFF, DAMPED = 0.2, 1.0, 20.0, 3.0
 
@@ -39,17 +38,15 @@ MODEL = Model(
     forces=[follows("rotor", 0.7), follows("back axle", 0.3, -1.0), follows("front axle", 0.3)],
 )
 
-EXAMPLE = Example(
-    name="snakeboard-gait",
-    title="Snakeboard in its drive gait",
-    source="Lewis, Ostrowski, Murray, Burdick, ICRA 1994",
-    system=MODEL.system,
-    initial=MODEL.state(),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "snakeboard-gait",
+    "Snakeboard in its drive gait",
+    "Lewis, Ostrowski, Murray, Burdick, ICRA 1994",
+    MODEL,
+    MODEL.state(),
     step=0.02,
     steps=2000,
-    coordinates=tuple(
-        Coordinate(name.removeprefix("board."), "" if k < 2 else "rad") for k, name in enumerate(MODEL.coordinates)
-    ),
-    scene=MODEL.scene(view="above", trail="board"),
+    units=False,
+    view="above",
+    trail="board",
 )

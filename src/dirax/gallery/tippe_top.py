@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.bodies import Body, Model, ball_contact, free
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.gallery.machine import machine
 
 RADIUS, BELOW, MASS = 0.02, 0.002, 0.015
 MODEL = Model(
@@ -26,18 +25,13 @@ def jellett(q, v):
     return -MODEL.angular_momentum(q, v, about=centre) @ (contact - centre)
 
 
-EXAMPLE = Example(
-    name="tippe-top",
-    title="Tippe-top with Coulomb friction",
-    source="Cohen, Am. J. Phys. 45 (1977); Jellett 1872 for its integral",
-    system=MODEL.system,
-    initial=MODEL.state({"top.z": RADIUS, "top.qx": 0.05}, {"top.qz": 75.0, "top.qx": 0.0, "top.x": 0.0, "top.y": 0.0}),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "tippe-top",
+    "Tippe-top with Coulomb friction",
+    "Cohen, Am. J. Phys. 45 (1977); Jellett 1872 for its integral",
+    MODEL,
+    MODEL.state({"top.z": RADIUS, "top.qx": 0.05}, {"top.qz": 75.0, "top.qx": 0.0, "top.x": 0.0, "top.y": 0.0}),
     step=2e-4,
     steps=20_000,
-    coordinates=tuple(Coordinate(name.removeprefix("top."), "m" if k < 3 else "") for k, name in enumerate(MODEL.coordinates)),
     plane=(4, 5),
-    time_unit="s",
-    energy_unit="J",
-    scene=MODEL.scene(),
 )

@@ -8,8 +8,7 @@ RoboTrikke (ICRA 2005), in the plane. SI units.
 import jax.numpy as jnp
 
 from dirax.bodies import Body, Model, Motor, blade, planar, revolute
-from dirax.gallery.example import Coordinate, Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
+from dirax.gallery.machine import machine
 
 AHEAD, ARM, FREQUENCY, STIFF, DAMPED = 0.5, 0.7, 4.0, 40.0, 8.0
 
@@ -41,19 +40,14 @@ MODEL = Model(
     forces=[gait("steer", 0.4, 0.0), gait("left arm", 0.25, 1.2), gait("right arm", 0.25, 1.2)],
 )
 
-EXAMPLE = Example(
-    name="trikke",
-    title="Trikke",
-    source="after Chitta, Cheng, Frazzoli, Kumar, RoboTrikke, ICRA 2005",
-    system=MODEL.system,
-    initial=MODEL.state({"left arm": -0.25, "right arm": 0.25}),
-    scheme=LagrangeDAlembert(),
+EXAMPLE = machine(
+    "trikke",
+    "Trikke",
+    "after Chitta, Cheng, Frazzoli, Kumar, RoboTrikke, ICRA 2005",
+    MODEL,
+    MODEL.state({"left arm": -0.25, "right arm": 0.25}),
     step=0.01,
     steps=2000,
-    coordinates=tuple(
-        Coordinate(name.removeprefix("deck."), "m" if k < 2 else "rad") for k, name in enumerate(MODEL.coordinates)
-    ),
-    time_unit="s",
-    energy_unit="J",
-    scene=MODEL.scene(view="above", trail="deck"),
+    view="above",
+    trail="deck",
 )

@@ -25,6 +25,9 @@ from dirax.program.primitives import plain_primitive
 OFTEN = 32
 """Times that a program is evaluated for one entry until Python's floats are worth their compiling."""
 
+IN_NUMPY = 4 * NODE_LIMIT
+"""Nodes up to which a program is evaluated in NumPy: some µs each to make and to evaluate, where XLA takes a millisecond."""
+
 NUMPY_RULES: dict[str, Callable] = {}
 """Primitive name → rule(made, interpreter, equation, *operands), which may add computations in NumPy to the program `made`."""
 
@@ -60,7 +63,7 @@ class ScalarProgram:
         """The program of a jaxpr, `by_numpy` with decompositions, roots and loops that are no expressions.
 
         Raises `UnsupportedPrimitive` and `GraphTooLarge`."""
-        made = cls(Graph(NODE_LIMIT), [], for_few=for_few)
+        made = cls(Graph(IN_NUMPY if by_numpy else NODE_LIMIT), [], for_few=for_few)
         made.inputs = [made.fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
         made.run(jaxpr, {name: functools.partial(rule, made) for name, rule in NUMPY_RULES.items()} if by_numpy else {})
         return made

@@ -44,6 +44,17 @@ class SparseEquations(eqx.Module):
         return cls._of_pattern(pattern)
 
     @classmethod
+    def of_entries(cls, size: int, rows: np.ndarray, columns: np.ndarray) -> "SparseEquations":
+        """Those of a Jacobian (size, size) with entries at these rows and columns. Raises `StructurallySingular`."""
+        pattern = sp.csr_matrix((np.ones(len(rows), bool), (rows, columns)), (size, size))
+        pattern.sort_indices()
+        return cls._of_pattern(pattern)
+
+    def places(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Where the entries at these rows and columns are among the `values`."""
+        return np.asarray(self.colours)[columns].astype(np.int64) * self.elimination.size + rows
+
+    @classmethod
     def _of_pattern(cls, pattern: Any) -> "SparseEquations":
         size = pattern.shape[0]
         colours = column_colours(pattern)
@@ -86,15 +97,15 @@ class SparseEquations(eqx.Module):
     def matrix(self, values: np.ndarray) -> Any:
         """The Jacobian with these values."""
         pattern = self.pattern.value
-        entries, size = pattern.tocoo(), pattern.shape[0]
-        data = np.asarray(values)[np.asarray(self.colours)[entries.col].astype(np.int64) * size + entries.row]
+        entries = pattern.tocoo()
+        data = np.asarray(values)[self.places(entries.row, entries.col)]
         return sp.csr_matrix((data, pattern.indices, pattern.indptr), pattern.shape)
 
     def values_of(self, matrix: Any) -> np.ndarray:
         """The values of a matrix of this pattern."""
         entries = matrix.tocoo()
         values = np.zeros(self.count * matrix.shape[0])
-        values[np.asarray(self.colours)[entries.col].astype(np.int64) * matrix.shape[0] + entries.row] = entries.data
+        values[self.places(entries.row, entries.col)] = entries.data
         return values
 
     def factorise(self, values: Float[Array, " colours*k"]) -> Any:

@@ -86,10 +86,11 @@ def _with_sparse_first_step(equation: Any, case: Case, start: Start) -> Start:
     from dirax.engines.sparse.plan import sparse_plan  # imported when it is used
 
     plan = sparse_plan(equation, case.params, case.batch_params)
-    known = None if isinstance(plan, str) or plan[0].equations.slower else plan[0].equations
+    known = None if isinstance(plan, str) or plan.solvers[0].equations.slower else plan.solvers[0].equations
     if known is None and equation.stages[0][0].unknowns ** 2 > LARGEST_MATRIX:
         return start
-    first = _of_every(_FirstStep(equation, case.two_points, known), (equation,), case, start._replace(row0=None), True)
+    written = equation if isinstance(plan, str) else plan.equation
+    first = _of_every(_FirstStep(written, case.two_points, known), (equation,), case, start._replace(row0=None), True)
     if known is None:
         return start._replace(residual=first[0], jacobian=first[1])
     residual, values, product = (np.asarray(a) if case.batch is not None else np.asarray(a)[None] for a in first)

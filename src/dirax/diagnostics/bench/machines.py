@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dirax.diagnostics.bench import in_mujoco
 from dirax.diagnostics.bench.timing import machine
 from dirax.text.tables import number, plain, text_table
 
@@ -20,12 +21,14 @@ NOT_HERE = "not stated here"
 FINER = 4
 
 
-def _others_on(example: Any, program: str) -> str:
-    """Whether a program can state the machine, as far as its kinds of constraints go."""
+def _others_on(example: Any, program: str, steps: int, end: np.ndarray, repeats: int) -> str:
+    """What a program does on the machine, or why it cannot state it, as far as its kinds of constraints go."""
     if example.system.one_forms is not None and program in ("MuJoCo", "pinocchio"):
         return NO_ROLLING
     if example.system.depends_on_time and program in ("MuJoCo", "pinocchio"):
         return NO_TIME
+    if program == "MuJoCo" and in_mujoco.is_stated(example.model):
+        return in_mujoco.measured(example, steps, end, repeats)
     return NOT_HERE
 
 
@@ -124,5 +127,5 @@ def _measured(example: Any, repeats: int, steps: int, installed: Sequence[str]) 
         float(np.abs(sol.q[-1] - fine.q[-1]).max()),
         float("nan") if example.system.energy_changes else float(drift),
         float(np.abs(sol.constraint_residual()).max(initial=0.0)),
-        {program: _others_on(example, program) for program in installed},
+        {program: _others_on(example, program, steps, fine.q[-1], repeats) for program in installed},
     )

@@ -1,5 +1,6 @@
 """The engine "sparse": steps on arrays by XLA, their linear equations by sparse elimination."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -28,13 +29,13 @@ class Sparse(Xla):
         plan = sparse_plan(problem.equation, problem.params, problem.batch_params)
         if isinstance(plan, str) or not self.only_quicker:
             return plan if isinstance(plan, str) else None
-        return next(filter(None, (solver.equations.slower for solver in plan)), None)
+        return next(filter(None, (solver.equations.slower for solver in plan.solvers)), None)
 
     def _planned(self, p: Problem) -> tuple[Problem, Numerics, dict[str, Any]]:
         plan = sparse_plan(p.equation, p.params, p.batch_params)
         if isinstance(plan, str):
             raise UnsupportedPrimitive("the step as a whole", f"is not sparse: {plan}", "engine='sparse'")
-        notes: dict[str, Any] = dict(plan[0].equations.stats)
+        notes: dict[str, Any] = dict(plan.solvers[0].equations.stats)
         if p.compensated:
             notes["not_compensated"] = "the engine 'sparse' does not know the increments of the step"
-        return p, Numerics(sparse=plan), notes
+        return dataclasses.replace(p, equation=plan.equation), Numerics(sparse=plan.solvers), notes

@@ -1,14 +1,20 @@
 """What is known of the Jacobians of a step before it is run: a solver for each of its stages, or why there is none."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend.core import jaxprs_in_params
 
+from dirax.engines import policy
+from dirax.engines.in_jax import joined, replaced
 from dirax.engines.sparse.solver import SparseSolver
+from dirax.engines.step_program import step_program
 from dirax.numerics.sparse.elimination import StructurallySingular
+from dirax.program.graph import GraphTooLarge
+from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
 from dirax.program.sparse_equations import SparseEquations
 from dirax.program.sparsity import Dense
@@ -16,12 +22,20 @@ from dirax.program.sparsity import Dense
 KEPT = 64
 """Plans kept in memory."""
 
-_plans: Memo[tuple[SparseSolver, ...] | str] = Memo(KEPT)
+
+class SparsePlan(NamedTuple):
+    """The equation as it is run, and a solver for each of its stages."""
+
+    equation: Any
+    solvers: tuple[SparseSolver, ...]
 
 
-def sparse_plan(equation: Any, params: Any, batch_params: bool) -> tuple[SparseSolver, ...] | str:
-    """A solver for each stage of the step, the same objects for the same equation and parameters of one kind; or why the step
-    is not one for sparse elimination, in words that go on after "because"."""
+_plans: Memo[SparsePlan | str] = Memo(KEPT)
+
+
+def sparse_plan(equation: Any, params: Any, batch_params: bool) -> SparsePlan | str:
+    """How the step is run, the same objects for the same equation and parameters of one kind; or why the step is not one for
+    sparse elimination, in words that go on after "because"."""
     leaves, structure = jax.tree.flatten(params)
     whole = [leaf for leaf in leaves if not _is_float(leaf) and not isinstance(leaf, Tracer)]
     key = Same(equation), structure, batch_params, *map(np.shape, leaves), *(np.asarray(leaf).tobytes() for leaf in whole)
@@ -32,24 +46,59 @@ def _is_float(leaf: Any) -> bool:
     return bool(jnp.issubdtype(jnp.result_type(leaf), jnp.floating))
 
 
-def _planned(equation: Any, params: Any, batch_params: bool) -> tuple[SparseSolver, ...] | str:
+def _planned(equation: Any, params: Any, batch_params: bool) -> SparsePlan | str:
     def shaped(leaf: Any) -> Any:
         if batch_params or _is_float(leaf) or isinstance(leaf, Tracer):
             return jax.ShapeDtypeStruct(np.shape(leaf)[batch_params:], jnp.result_type(leaf))
         return leaf
 
     numbers, scalar = lambda n: jax.ShapeDtypeStruct((n,), jnp.float64), jax.ShapeDtypeStruct((), jnp.float64)
-    params, found = jax.tree.map(shaped, params), {}
+    given, found = jax.tree.map(shaped, params), {}
     for stage, _ in equation.stages:
         if not stage.unknowns:
             return "a stage of the step has nothing to solve"
         if id(stage) in found:
             continue
-        shapes = numbers(stage.unknowns), numbers(stage.state_size), scalar, scalar, params
+        shapes = numbers(stage.unknowns), numbers(stage.state_size), scalar, scalar, given
         try:
-            found[id(stage)] = SparseSolver(SparseEquations.of(stage.residual, *shapes))
+            if (made := _by_levels(equation, stage, shapes, params, batch_params)) is None:
+                made = stage, SparseSolver(SparseEquations.of(stage.residual, *shapes))
         except Dense as error:
             return str(error)
         except StructurallySingular as error:
             return f"the equations {', '.join(stage.labels[int(row)] for row in error.rows[:4])} have too few unknowns"
-    return tuple(found[id(stage)] for stage, _ in equation.stages)
+        found[id(stage)] = made
+    stages = tuple((found[id(stage)][0], fraction) for stage, fraction in equation.stages)
+    return SparsePlan(joined(equation, stages), tuple(found[id(stage)][1] for stage, _ in equation.stages))
+
+
+def _by_levels(equation: Any, stage: Any, shapes: tuple, params: Any, batch_params: bool) -> tuple[Any, SparseSolver] | None:
+    """A stage of many operations on small arrays, as one of machines of many bodies is, by the levels of its scalar program, and
+    a solver with the entries of its Jacobian; None where it is better left in arrays, or has no such program."""
+    if operations(jax.make_jaxpr(stage.residual)(*shapes).jaxpr) <= policy.MOST_ARRAY_OPERATIONS:
+        return None
+    try:
+        made = step_program(equation, params, batch_params)
+        index = next(index for (index, _), (other, _) in zip(made.stages, equation.stages, strict=True) if other is stage)
+        jacobian = made.jacobians[index]
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return None
+    rows, columns = np.array([(i, j) for i, row in enumerate(jacobian) for j in row], np.int64).reshape(-1, 2).T
+    equations = SparseEquations.of_entries(stage.unknowns, rows, columns)
+    entries = made.in_levels(index, [node for row in jacobian for node in row.values()])
+    places, size = equations.places(rows, columns), equations.count * stage.unknowns
+    values = jax.jit(lambda *args: jnp.zeros(size).at[places].set(entries(*args)))
+    return replaced(stage, made, index, made.in_levels), SparseSolver(equations, values)
+
+
+def operations(jaxpr: Any) -> int:
+    """How many operations on arrays a jaxpr has, those inside of them counted once for each time that they stand there."""
+    known: dict[int, int] = {}
+
+    def counted(jaxpr: Any) -> int:
+        if id(jaxpr) not in known:
+            inner = (counted(getattr(j, "jaxpr", j)) for e in jaxpr.eqns for j in jaxprs_in_params(e.params))
+            known[id(jaxpr)] = len(jaxpr.eqns) + sum(inner)
+        return known[id(jaxpr)]
+
+    return counted(jaxpr)

@@ -8,13 +8,15 @@ from dirax.program.sparse_equations import SparseEquations
 
 
 class SparseSolver(AbstractLinearSolver):
-    """Solves with the sparse Jacobian of one equation, whose matrices are the values that `jacobian_of` gives."""
+    """Solves with the sparse Jacobian of one equation, whose matrices are the values that `jacobian_of` gives; `values` is that
+    function of (u, state, t, h, params) where it is known."""
 
     equations: SparseEquations
+    values: Callable | None = None
 
     def jacobian_of(self, residual: Callable) -> Callable:
         """(u, *args) ↦ the values of the Jacobian of `residual(u, *args)`."""
-        return lambda u, *args: self.equations.values(lambda u: residual(u, *args), u)
+        return self.values or (lambda u, *args: self.equations.values(lambda u: residual(u, *args), u))
 
     def factorise(self, matrix: Any) -> Any:
         return self.equations.factorise(matrix)
