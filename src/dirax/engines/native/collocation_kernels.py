@@ -61,9 +61,6 @@ class CollocationKernels:
         self._run = llvm.function(library, "run", SIGNATURE)
         return self._run, cached
 
-    def of_sizes(self, width: int) -> None:
-        """No kernel: sizes are found by NumPy."""
-
 
 _kernels: Memo[CollocationKernels | None] = Memo(KEPT)
 
