@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from dirax.engines.contract import Outcome, Problem, Progress, finished
+from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem, Progress, finished
 from dirax.engines.native.collocation_kernels import CollocationKernels, collocation_kernels
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
@@ -36,7 +36,7 @@ class Ready:
         nodes = collocation_kernels(p.equation, p.params, p.batch_params)
         made = nodes or kernels(p.equation, p.params, p.batch_params, p.compensated)
         self.made = made
-        self.width = width_for(p.batch or 1) if nodes is None else 1
+        self.width = width_for(p.batch or 1) if nodes is None or nodes.wide else 1
         self.kernel, cached = made.kernel(self.width)
         self.first_unknowns = made.record.unknowns(0, p.equation.stages[0][0].unknowns)
         self.notes = {
@@ -106,14 +106,16 @@ class Ready:
 def _by_newton(lanes: Lanes | OneLane) -> Kernels | None:
     """Go on with trajectories whose fixed-point iteration has not converged, by Newton's method for all nodes together, with
     these kernels; None where there are no such trajectories."""
-    left, p = lanes.left(), lanes.problem
-    if not left:
+    p, record, table = lanes.problem, lanes.record, lanes.table()
+    left = np.flatnonzero(table[:, record.status] == NOT_CONVERGED)
+    if not len(left):
         return None
     try:
         made = kernels(p.equation, p.params, p.batch_params, True)
-        newton, _ = made.kernel(1)
+        made.kernel(1)
     except UnsupportedPrimitive:  # too large to be written out: they end where they are
         return None
-    for lane in left:
-        lanes.again(newton, lane)
+    own = table[left]
+    own[:, record.status], own[:, record.differences] = OK, 0.0
+    lanes.put(left, lanes.attempt(left, made, own))
     return made

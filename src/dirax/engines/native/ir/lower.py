@@ -28,6 +28,11 @@ class Region:
     def bind(self, node: int, value: str) -> None:
         self._values[node] = value
 
+    @property
+    def values(self) -> dict[int, str]:
+        """What was bound or emitted in this region itself."""
+        return self._values
+
     def known(self, node: int) -> str | None:
         """The value of a node, if this region or one around it has it."""
         region: Region | None = self
