@@ -1,6 +1,5 @@
 """The kernel of collocation steps as LLVM IR: of one trajectory, with the nodes of a step in lanes, or of trajectories in lanes."""
 
-import functools
 from collections.abc import Callable
 
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
@@ -10,7 +9,6 @@ from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.collocation_nodes import Nodes
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
 from dirax.engines.native.loops.collocation_sweeps import FirstOrder, Means, SecondOrder, Sweep
-from dirax.engines.native.loops.over_nodes import Over
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
 from dirax.engines.stopping import EPSILON, STALLED
 
@@ -39,7 +37,8 @@ class _Kernel:
         room = lambda: b.alloca(one.real)
         self.state = [room() for _ in range(record.state_size)]
         self.lost = [room() for _ in range(record.state_size)]
-        self.iterates = [self.all.room() for _ in plan.relation.first]
+        n = len(plan.relation.first)
+        self.iterates, self.fresh, self.before, self.least = (self.all.rooms(n) for _ in range(4))
         self.completed, self.status, self.iterations, self.worst = numbers = [room() for _ in range(4)]
         first_lost = record.size - 4 - record.lost
         scalars = [*self.state, *self.lost, *numbers]
@@ -47,17 +46,16 @@ class _Kernel:
         for value, place in zip(scalars, spots, strict=True):
             b.store(one.real, b.load(one.real, place), value)
         first = record.state_size if plan.gain is None else record.state_size + record.kept
-        n = len(self.iterates)
         kept = [places[first + j : first + record.kept : n] for j in range(n)]
         for iterate, of_nodes in zip(self.iterates, kept, strict=True):
-            self.all.store(self.all.read(of_nodes), iterate)
+            self.all.read(of_nodes, iterate)
         self.sizes = self._sizes(places)
 
         def give_back() -> None:
             for value, place in zip(scalars, spots, strict=True):
                 b.store(one.real, b.load(one.real, value), place)
             for iterate, of_nodes in zip(self.iterates, kept, strict=True):
-                self.all.write(self.all.load(iterate), of_nodes)
+                self.all.write(iterate, of_nodes)
             if plan.gain is not None:
                 self._give_rates(places[record.state_size : record.state_size + record.kept])
             b.line("ret void")
@@ -67,13 +65,13 @@ class _Kernel:
         pointers = "ptr noalias %lanes, ptr noalias %params, ptr noalias %outs"
         b.module.define(f"define internal void @block({pointers}, {NUMBERS}) noinline", b)
 
-    def _sizes(self, places: list[str]) -> list[Over]:
+    def _sizes(self, places: list[str]) -> list[str]:
         """How large iterates are, those of all nodes of a kind alike: as the unknowns, rates; accelerations as rates by h."""
         b, one, found = self.body, self.one, []
         first = self.plan.record.sizes(0, len(self.iterates)).start
         for place in places[first : first + len(self.iterates)]:
             size = b.load(one.real, place)
-            found.append(self.all.splat(size if self.plan.gain is None else one.div(size, one.abs(self.nodes.h))))
+            found.append(size if self.plan.gain is None else one.div(size, one.abs(self.nodes.h)))
         return found
 
     def _give_rates(self, places: list[str]) -> None:
@@ -120,110 +118,138 @@ class _Kernel:
         with b.when(saves):
             self._save(here, number)
         kind = Means if isinstance(plan, MeanPlan) else FirstOrder if plan.gain is None else SecondOrder
-        sweep = kind(self.nodes, here, state, time)
-        before = [over.load(pointer) for pointer in self.iterates]
-        converged, change, count = self._attempts(sweep, before, one.compare("ogt", done, one.const(0.0)), running)
-        iterates = [over.load(pointer) for pointer in self.iterates]
-        increments, found = sweep.increments(iterates)
-        if sweep.later:
-            changes = [over.abs(over.sub(a, b)) for a, b in zip(found, iterates, strict=True)]
-            change = functools.reduce(over.max, changes, over.const(0.0))
+        sweep = kind(self.nodes, here, state, time, self.iterates)
+        with over.at() as node:
+            over.filled(self.before, [over.load(room, node) for room in self.iterates], node)
+        converged, change, count = self._attempts(sweep, one.compare("ogt", done, one.const(0.0)), running)
+        increments, change = self._increments(sweep, change)
         new, lost = [], []
         finite = one.true
         for old, pointer, increment in zip(state, self.lost, increments, strict=True):
             total, error = one.two_sum(old, one.add(increment, b.load(one.real, pointer)))
             new.append(total)
             lost.append(error)
-        for i, more in enumerate(sweep.settled(found, new)):
+        for i, more in enumerate(sweep.settled(self.fresh, new)):
             new[i], error = one.two_sum(new[i], more)
             lost[i] = one.add(lost[i], error)
         for total in new:
             finite = one.both(finite, one.compare("olt", one.abs(total), one.const(float("inf"))))
         good = one.both(running, one.both(finite, converged))
-        failure = one.select(finite, one.const(float(NOT_CONVERGED)), one.const(float(NOT_FINITE)))
+        failure = one.select(converged, one.const(float(NOT_FINITE)), one.const(float(NOT_CONVERGED)))
         keep = lambda new, pointer: b.store(one.real, one.select(good, new, b.load(one.real, pointer)), pointer)
         for value, pointer in zip([*new, *lost], [*self.state, *self.lost], strict=True):
             keep(value, pointer)
-        for value, old, pointer in zip(found, before, self.iterates, strict=True):
-            over.store(over.chosen(good, value, old), pointer)
+        with over.at() as node:
+            found = zip(self.fresh, self.before, strict=True)
+            chosen = [over.chosen(good, over.load(new, node), over.load(old, node)) for new, old in found]
+            over.filled(self.iterates, chosen, node)
         keep(one.add(done, one.const(1.0)), self.completed)
-        keep(one.max(over.largest(change), b.load(one.real, self.worst)), self.worst)
+        keep(one.max(change, b.load(one.real, self.worst)), self.worst)
         outcome = one.select(good, one.const(float(OK)), failure)
         b.store(one.real, one.select(running, outcome, b.load(one.real, self.status)), self.status)
         more = one.select(running, one.add(count, one.const(float(sweep.later))), one.const(0.0))
         b.store(one.real, one.add(b.load(one.real, self.iterations), more), self.iterations)
 
-    def _attempts(self, sweep: Sweep, before: list[Over], later: str, running: str) -> tuple[str, Over, str]:
+    def _increments(self, sweep: Sweep, change: str) -> tuple[list[str], str]:
+        """What is added to the state, and the largest last change; the iterates after all sweeps are in `fresh` then."""
+        over, peak = self.all, self.all.peak()
+
+        def last(node: str, new: list[str], stable: str) -> None:
+            for value, room, fresh in zip(new, self.iterates, self.fresh, strict=True):
+                over.raised(peak, over.emitter.abs(over.emitter.sub(value, over.load(room, node))))
+                over.store(value, fresh, node)
+
+        increments = sweep.increments(last)
+        return increments, over.highest(peak) if sweep.later else change
+
+    def _attempts(self, sweep: Sweep, later: str, running: str) -> tuple[str, str, str]:
         """The iteration from the polynomial of the step before, where that fails from constants: (converged, the last change,
         sweeps) of those that are running."""
         b, over, one = self.body, self.all, self.one
-        self.trying, self.change, self.sweeps = b.alloca(one.bool), over.room(), b.alloca(one.real)
+        self.trying, self.change, self.sweeps = b.alloca(one.bool), b.alloca(one.real), b.alloca(one.real)
         b.store(one.bool, running, self.trying)
         b.store(one.real, one.const(0.0), self.sweeps)
+        b.store(one.real, one.const(0.0), self.change)
         with b.loop(0, 2) as attempt, b.when(one.any(b.load(one.bool, self.trying))):
             first = b.put(f"icmp eq i64 {attempt}, 0")
-            for polynomial, condition in ((True, first), (False, b.put(f"xor i1 {first}, true"))):
-                with b.when(condition):
-                    trying = b.load(one.bool, self.trying)
-                    for pointer, value in zip(self.iterates, sweep.guess(before, later, polynomial), strict=True):
-                        over.store(value if polynomial else over.chosen(trying, value, over.load(pointer)), pointer)
+            trying = b.load(one.bool, self.trying)
+            with b.when(first), over.at() as node:
+                over.filled(self.iterates, sweep.guess(self.before, later, True, node), node)
+            with b.when(b.put(f"xor i1 {first}, true")), over.at() as node:
+                guess = zip(sweep.guess(self.before, later, False, node), self.iterates, strict=True)
+                over.filled(self.iterates, [over.chosen(trying, a, over.load(room, node)) for a, room in guess], node)
             self._iterate(sweep)
         converged = one.both(running, one.invert(b.load(one.bool, self.trying)))
-        return converged, over.load(self.change), b.load(one.real, self.sweeps)
+        return converged, b.load(one.real, self.change), b.load(one.real, self.sweeps)
 
     def _iterate(self, sweep: Sweep) -> None:
         """Sweeps until what the next one would leave to change of every entry of an iterate is below its roundoff, or until changes
         shrink no more; those `trying` that have come to a root then try no longer."""
         b, over, one = self.body, self.all, self.one
-        least, count_here, active = [over.room() for _ in self.iterates], b.alloca("i64"), b.alloca(one.bool)
-        for pointer in least:
-            over.store(over.const(float("inf")), pointer)
+        count_here, active = b.alloca("i64"), b.alloca(one.bool)
+        with over.at() as node:
+            over.filled(self.least, [over.emitter.const(float("inf"))] * len(self.least), node)
         b.store("i64", "0", count_here)
         b.store(one.bool, b.load(one.bool, self.trying), active)
         head, out = b.fresh(), b.fresh()
         b.branch(head)
         b.label(head)
-        old, now = [over.load(pointer) for pointer in self.iterates], b.load(one.bool, active)
-        new, stable = sweep.sweep(old)
-        going, changes = over.splat_of(over.emitter.false), []
-        for pointer, before, a, least_of in zip(self.iterates, old, new, least, strict=True):
-            over.store(a if one.width == 1 else over.chosen(now, a, before), pointer)
-            moved, size, smallest = over.abs(over.sub(a, before)), over.abs(a), over.load(least_of)
-            changes.append((moved, size))
-            closer = over.compare("olt", moved, smallest)
-            shrinks = over.both(closer, over.compare("ogt", moved, over.mul(size, over.const(EPSILON))))
-            # the next change will be moved²/smallest, and so on; before the second, nothing is known
-            known = over.compare("olt", smallest, over.const(float("inf")))
-            left, floor = over.mul(moved, moved), over.mul(over.mul(size, over.const(EPSILON / 2.0)), smallest)
-            for _ in range(sweep.later):
-                left, floor = over.mul(left, moved), over.mul(floor, smallest)
-            enough = over.both(known, over.compare("olt", left, floor))
-            going = over.either(going, over.both(shrinks, over.invert(enough)))
-            over.store(over.each(self.all.emitter.select, closer, moved, smallest), least_of)
+        now, going, unstable = b.load(one.bool, active), over.flag(), over.flag()
+        sweep.sweep(lambda node, new, stable: self._compared(sweep, node, new, stable, now, going, unstable))
         b.store(one.real, one.add(b.load(one.real, self.sweeps), one.select(now, one.const(1.0), one.const(0.0))), self.sweeps)
         count = b.put(f"add i64 {b.load('i64', count_here)}, 1")
         b.store("i64", count, count_here)
         allowed = b.put(f"icmp slt i64 {count}, %cap")
-        still = one.both(now, over.any(going))
+        still = one.both(now, over.marked(going))
         still = b.put(f"select i1 {allowed}, {one.bool} {still}, {one.bool} {one.false}")
         b.store(one.bool, still, active)
         ended = one.both(now, one.invert(still))
         with b.when(one.any(ended)):
-            self._judge(changes, stable, ended)
+            self._judge(sweep, unstable, ended)
+        with over.at() as node:
+            over.filled(self.iterates, [over.load(room, node) for room in self.fresh], node)
         b.branch_if(one.any(still), head, out)
         b.label(out)
 
-    def _judge(self, changes: list[tuple[Over, Over]], stable: Over, ended: str) -> None:
+    def _compared(self, sweep: Sweep, node: str, new: list[str], stable: str, now: str, going: str, unstable: str) -> None:
+        """The new iterates at a node are those of trajectories that go on `now`; and whether they have to go on from there."""
+        over, e = self.all, self.all.emitter
+        further = e.false
+        for iterate, fresh, a, least in zip(self.iterates, self.fresh, new, self.least, strict=True):
+            before, smallest = over.load(iterate, node), over.load(least, node)
+            over.store(a if self.one.width == 1 else over.chosen(now, a, before), fresh, node)
+            moved, size = e.abs(e.sub(a, before)), e.abs(a)
+            closer = e.compare("olt", moved, smallest)
+            shrinks = e.both(closer, e.compare("ogt", moved, e.mul(size, e.const(EPSILON))))
+            # the next change will be moved²/smallest, and so on; before the second, nothing is known
+            known = e.compare("olt", smallest, e.const(float("inf")))
+            left, floor = e.mul(moved, moved), e.mul(e.mul(size, e.const(EPSILON / 2.0)), smallest)
+            for _ in range(sweep.later):
+                left, floor = e.mul(left, moved), e.mul(floor, smallest)
+            enough = e.both(known, e.compare("olt", left, floor))
+            further = e.either(further, e.both(shrinks, e.invert(enough)))
+            over.store(e.select(closer, moved, smallest), least, node)
+        over.mark(going, further)
+        if stable != e.true:
+            over.mark(unstable, e.invert(stable))
+
+    def _judge(self, sweep: Sweep, unstable: str, ended: str) -> None:
         """Whether these, whose iteration has ended, are at a root: their last changes are small."""
-        b, over, one = self.body, self.all, self.one
-        worst = missed = over.const(0.0)
-        for (moved, size), unit in zip(changes, self.sizes, strict=True):
-            worst = over.max(moved, worst)
-            missed = over.max(over.sub(moved, over.mul(over.add(size, unit), over.const(STALLED))), missed)
-        good = over.all(over.both(over.compare("ole", missed, over.const(0.0)), stable))
-        over.store(over.chosen(ended, worst, over.load(self.change)), self.change)
-        left = one.both(b.load(one.bool, self.trying), one.invert(one.both(ended, good)))
-        b.store(one.bool, left, self.trying)
+        b, over, one, e = self.body, self.all, self.one, self.all.emitter
+        peak, missed = over.peak(), over.flag()
+        with over.at() as node:
+            off = e.false
+            for iterate, fresh, unit in zip(self.iterates, self.fresh, self.sizes, strict=True):
+                new = over.load(fresh, node)
+                moved = e.abs(e.sub(new, over.load(iterate, node)))
+                most = e.mul(e.add(e.abs(new), over.splat(unit)), e.const(STALLED))
+                off = e.either(off, e.compare("ugt", moved, most))
+                if not sweep.later:
+                    over.raised(peak, moved)
+            over.mark(missed, off)
+        good = one.invert(one.either(over.marked(missed), over.marked(unstable)))
+        b.store(one.real, one.select(ended, over.highest(peak), b.load(one.real, self.change)), self.change)
+        b.store(one.bool, one.both(b.load(one.bool, self.trying), one.invert(one.both(ended, good))), self.trying)
 
     def _save(self, here: Region, number: str) -> None:
         b, e, plan = self.body, self.one, self.plan

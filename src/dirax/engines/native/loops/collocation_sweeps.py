@@ -1,74 +1,80 @@
 """The fixed-point iterations of a collocation step in IR: for the rates at the nodes, for the accelerations, or by means."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.collocation_nodes import Nodes
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
-from dirax.engines.native.loops.over_nodes import Over, Regions
+from dirax.engines.native.loops.over_nodes import OverNodes
+
+Found = Callable[[str, list[str], str], None]
+"""What is done with the new iterates at a node, and whether they are stable."""
 
 
 @dataclass
 class Sweep(ABC):
-    """What both kinds of iteration share: the state of a step as numbers and over the nodes."""
+    """What the kinds of iteration share: the state of a step in numbers, and rooms for the `iterates`."""
 
     nodes: Nodes
     here: Region
     state: list[str]
     time: str
+    iterates: list[str]
 
     later = 0
     """Sweeps that `increments` does besides."""
 
     def __post_init__(self):
-        k = self.nodes
-        e, n = k.all, len(k.plan.relation.first)
-        self.first = [e.splat(value) for value in self.state[:n]]
-        self.second = [e.splat(value) for value in self.state[n:]]
-        self.clock = e.add(e.splat(self.time), k.times)
+        n = len(self.nodes.plan.relation.first)
+        self.first, self.second = self.state[:n], self.state[n:]
 
-    def region(self, points: list[Over], rates: list[Over] | None) -> Region | Regions:
-        """The relation's inputs a and y at the nodes."""
+    def region(self, points: list[str], rates: list[str], node: str) -> Region:
+        """The relation's inputs a and y at a node."""
         k, r = self.nodes, self.nodes.plan.relation
-        region = k.all.region(k.plan.graph, k.known)
-        region.bind(k.plan.shared.t, self.clock)
-        for node, value in zip(r.first, points, strict=True):
-            region.bind(node, value)
-        for node, value in zip(r.unknowns, rates or [], strict=False):
-            region.bind(node, value)
+        return self._region(k.all, k.known, k.times, points, node, [*r.unknowns[: len(rates)]], rates)
+
+    def _region(self, over: OverNodes, known: Region, times, points, node, more: list[int], values: list[str]) -> Region:
+        k, r, region = self.nodes, self.nodes.plan.relation, Region(over.emitter, self.nodes.plan.graph, known)
+        region.bind(k.plan.shared.t, over.emitter.add(over.splat(self.time), over.of(times, node)))
+        for input_, value in zip([*r.first, *more], [*points, *values], strict=True):
+            region.bind(input_, value)
         return region
 
     @abstractmethod
-    def start(self, before: list[Over]) -> list[Over]:
-        """The iterates with which the first step begins; `before` is what the record holds."""
+    def start(self, before: str, node: str) -> str:
+        """The iterate at a node with which the first step begins; the room `before` has what the record holds."""
 
-    def guess(self, before: list[Over], later: str, polynomial: bool) -> list[Over]:
-        """The iterates at the nodes of this step: those of the step before continued where there is one, as a polynomial or as
+    def guess(self, before: list[str], later: str, polynomial: bool, node: str) -> list[str]:
+        """The iterates at a node of this step: those of the step before continued where there is one, as a polynomial or as
         constants."""
-        k, e, out = self.nodes, self.nodes.all, []
-        for vector, start in zip(before, self.start(before), strict=True):
-            on = e.product(k.extrapolation, vector) if polynomial else e.entry(vector, e.count - 1, e)
-            out.append(e.chosen(later, on, start))
-        return out
+        k, e = self.nodes, self.nodes.all
+        if polynomial:
+            on = e.product(k.extrapolation, before, node, [None] * len(before), e)
+        else:
+            on = [e.last(room) for room in before]
+        return [e.chosen(later, value, self.start(room, node)) for value, room in zip(on, before, strict=True)]
 
     @abstractmethod
-    def sweep(self, old: list[Over]) -> tuple[list[Over], Over]:
-        """The iterates after one more sweep, and whether it was stable, node by node."""
+    def sweep(self, found: Found) -> None:
+        """One more sweep: new iterates from those in the rooms, which `found` is called with at every node."""
 
     @abstractmethod
-    def increments(self, iterates: list[Over]) -> tuple[list[str], list[Over]]:
-        """What the step adds to the state by sums over the nodes, and the iterates after the last sweep."""
+    def increments(self, found: Found) -> list[str]:
+        """What the step adds to the state by sums over the nodes; `found` is called with the iterates of a last sweep, if there
+        is one."""
 
-    def settled(self, iterates: list[Over], after: list[str]) -> list[str]:
-        """What is added at the end, to the state after these sums: nothing."""
+    def settled(self, iterates: list[str], after: list[str]) -> list[str]:
+        """What is added at the end, with the last iterates, to the state after these sums: nothing."""
         return []
 
-    def _ends(self, region: Region | Regions) -> list[str]:
-        """h Σ b_i ḃ_i."""
-        k, r = self.nodes, self.nodes.plan.relation
-        region.require(r.rates)
-        return [k.all.total(k.all.mul(k.weights, region.value(node))) for node in r.rates]
+    def _weighted_iterates(self) -> list[str]:
+        """Rooms with h b times the iterates."""
+        k, rooms = self.nodes, self.nodes.all.rooms(len(self.iterates))
+        with k.all.at() as node:
+            k.all.filled(rooms, k.weighted([k.all.load(room, node) for room in self.iterates], node), node)
+        return rooms
 
 
 class AtEveryNode(Sweep):
@@ -80,32 +86,53 @@ class AtEveryNode(Sweep):
         assert isinstance(self.nodes.plan, CollocationPlan)
         return self.nodes.plan
 
+    def _weighted_rates(self, region: Region, rooms: list[str], node: str) -> None:
+        """h b ḃ into rooms."""
+        region.require(self.plan.relation.rates)
+        values = [region.value(rate) for rate in self.plan.relation.rates]
+        self.nodes.all.filled(rooms, self.nodes.weighted(values, node), node)
+
 
 class FirstOrder(AtEveryNode):
     """The iterates are the rates y at the nodes."""
 
-    def start(self, before: list[Over]) -> list[Over]:
-        """Where the first step begins: what the record holds."""
-        return before
+    def start(self, before: str, node: str) -> str:
+        """What the record holds."""
+        return self.nodes.all.load(before, node)
 
-    def sweep(self, old: list[Over]) -> tuple[list[Over], Over]:
+    def _at(self, weighted: list[str], node: str) -> tuple[Region, list[str]]:
+        """The relation at a node and the iterates there."""
+        own = [self.nodes.all.load(room, node) for room in self.iterates]
+        return self.region(self.nodes.along(weighted, node, self.first), own, node), own
+
+    def sweep(self, found: Found) -> None:
         """Newton's method at each node, once; whether the elimination was stable."""
-        k, plan = self.nodes, self.plan
-        region = self.region([k.along(y, a) for y, a in zip(old, self.first, strict=True)], old)
-        region.require([plan.relation.rates[i] for i in plan.carried])
-        for i in plan.carried:
-            rate = region.value(plan.relation.rates[i])
-            region.bind(plan.relation.second[i], k.along(rate, self.second[i]))
-        region.require([*plan.solved, plan.stable])
-        return [region.value(node) for node in plan.solved], region.value(plan.stable)
+        k, plan, over = self.nodes, self.plan, self.nodes.all
+        weighted, outputs = self._weighted_iterates(), [*plan.solved, plan.stable]
+        carried = [plan.relation.rates[i] for i in plan.carried]
+        rooms = over.rooms(len(carried))
+        again: Callable[[str], Region] | None = None
+        if carried:
+            with over.at() as node:
+                region, _ = self._at(weighted, node)
+                region.require(carried)
+                over.filled(rooms, k.weighted([region.value(rate) for rate in carried], node), node)
+                again = over.handed_on(region, outputs, node)
+        with over.at() as node:
+            region = again(node) if again else self._at(weighted, node)[0]
+            points = k.along(rooms, node, [self.second[i] for i in plan.carried])
+            for i, value in zip(plan.carried, points, strict=True):
+                region.bind(plan.relation.second[i], value)
+            region.require(outputs)
+            found(node, [region.value(y) for y in plan.solved], region.value(plan.stable))
 
-    def increments(self, iterates: list[Over]) -> tuple[list[str], list[Over]]:
+    def increments(self, found: Found) -> list[str]:
         """h Σ b_i y_i and h Σ b_i ḃ_i."""
-        k = self.nodes
-        sums = [k.all.total(k.all.mul(k.weights, y)) for y in iterates]
-        if self.second:
-            sums += self._ends(self.region([k.along(y, a) for y, a in zip(iterates, self.first, strict=True)], iterates))
-        return sums, iterates
+        weighted, ends = self._weighted_iterates(), self.nodes.all.rooms(len(self.second))
+        if ends:
+            with self.nodes.all.at() as node:
+                self._weighted_rates(self._at(weighted, node)[0], ends, node)
+        return self.nodes.totals([*weighted, *ends])
 
 
 class SecondOrder(AtEveryNode):
@@ -115,42 +142,54 @@ class SecondOrder(AtEveryNode):
 
     def __post_init__(self):
         super().__post_init__()
-        k, plan = self.nodes, self.plan
+        k, plan, over = self.nodes, self.plan, self.nodes.all
         start = Region(k.one, plan.graph, self.here)
         start.require(plan.solved)
         self.rates = [start.value(node) for node in plan.solved]
-        self.lines = [k.all.fma(k.times, k.all.splat(v), a) for v, a in zip(self.rates, self.first, strict=True)]
+        self.lines = over.rooms(len(self.rates))
+        with over.at() as node:
+            for room, v, a in zip(self.lines, self.rates, self.first, strict=True):
+                over.store(over.emitter.fma(over.of(k.times, node), over.splat(v), over.splat(a)), room, node)
 
-    def start(self, before: list[Over]) -> list[Over]:
+    def start(self, before: str, node: str) -> str:
         """Where the first step begins: at uniform motion."""
-        return [self.nodes.all.const(0.0) for _ in before]
+        return self.nodes.all.emitter.const(0.0)
 
-    def sweep(self, old: list[Over]) -> tuple[list[Over], Over]:
+    def sweep(self, found: Found) -> None:
         """The same."""
-        k, plan = self.nodes, self.plan
-        region = self.region([k.all.product(k.second, f, line) for f, line in zip(old, self.lines, strict=True)], None)
+        over = self.nodes.all
+        with over.at() as node:
+            lines = [over.load(room, node) for room in self.lines]
+            region = self.region(over.product(self.nodes.second, self.iterates, node, lines, over), [], node)
+            found(node, self._gained(region), over.emitter.true)
+
+    def _gained(self, region: Region) -> list[str]:
+        """The gain times ḃ."""
+        plan, e, found = self.plan, region.emitter, []
         region.require([plan.relation.rates[i] for i in plan.carried])
-        return [self._gained(region, row) for row in plan.gain or []], k.all.splat_of(k.all.emitter.true)
+        for row in plan.gain or []:
+            total = None
+            for i, node in sorted(row.items()):
+                rate, slope = region.value(plan.relation.rates[i]), region.value(node)
+                if total is None:
+                    total = rate if node == plan.graph.one else e.mul(slope, rate)
+                else:
+                    total = e.fma(slope, rate, total)
+            found.append(e.const(0.0) if total is None else total)
+        return found
 
-    def _gained(self, region: Region | Regions, row: dict[int, int]) -> Over:
-        k, total = self.nodes, None
-        for i, node in sorted(row.items()):
-            rate, slope = region.value(self.plan.relation.rates[i]), region.value(node)
-            if total is None:
-                total = rate if node == k.plan.graph.one else k.all.mul(slope, rate)
-            else:
-                total = k.all.fma(slope, rate, total)
-        return k.all.const(0.0) if total is None else total
-
-    def increments(self, iterates: list[Over]) -> tuple[list[str], list[Over]]:
+    def increments(self, found: Found) -> list[str]:
         """Those of one more sweep, in halves whose coefficients are symplectic to the last bit: with those of A² alone the
         energy drifts by some 10⁻¹⁹ a step."""
-        k, e, plan = self.nodes, self.nodes.all, self.plan
-        rates = [k.along(f, e.splat(v)) for f, v in zip(iterates, self.rates, strict=True)]
-        region = self.region([k.along(v, a) for v, a in zip(rates, self.first, strict=True)], rates)
-        region.require([plan.relation.rates[i] for i in plan.carried])
-        found = [self._gained(region, row) for row in plan.gain or []]
-        return [k.all.total(e.mul(k.weights, v)) for v in rates] + self._ends(region), found
+        k, over, forces = self.nodes, self.nodes.all, self._weighted_iterates()
+        speeds, ends = over.rooms(len(self.rates)), over.rooms(len(self.second))
+        with over.at() as node:
+            over.filled(speeds, k.weighted(k.along(forces, node, self.rates), node), node)
+        with over.at() as node:
+            region = self.region(k.along(speeds, node, self.first), [], node)
+            found(node, self._gained(region), over.emitter.true)
+            self._weighted_rates(region, ends, node)
+        return k.totals([*speeds, *ends])
 
 
 class Means(Sweep):
@@ -164,51 +203,50 @@ class Means(Sweep):
         assert isinstance(self.nodes.plan, MeanPlan)
         return self.nodes.plan
 
-    def __post_init__(self):
-        super().__post_init__()
-        k, table = self.nodes, self.plan.quadrature
-        self.many = e = k.over(len(table.points))
-        self.constants = e.constants(k.plan.graph, k.scalar)
-        step = e.splat(k.h)
-        self.matrix = [e.mul(e.vector(column), step) for column in table.matrix.T]
-        self.values = [e.vector(column) for column in table.values.T]
-        self.means = [k.all.vector(column) for column in table.means.T]
-        self.instants = e.add(e.splat(self.time), e.mul(e.vector(table.points), step))
-
-    def start(self, before: list[Over]) -> list[Over]:
+    def start(self, before: str, node: str) -> str:
         """What the record holds."""
-        return before
+        return self.nodes.all.load(before, node)
 
-    def sweep(self, old: list[Over]) -> tuple[list[Over], Over]:
-        rates = self._rates(old)
-        return rates[: len(old)], self.nodes.all.splat_of(self.nodes.all.emitter.true)
+    def sweep(self, found: Found) -> None:
+        n, true = len(self.iterates), self.nodes.all.emitter.true
+        self._rates(lambda node, rates: found(node, rates[:n], true))
 
-    def increments(self, iterates: list[Over]) -> tuple[list[str], list[Over]]:
-        k, rates = self.nodes, self._rates(iterates)
-        return [k.all.total(k.all.mul(k.weights, value)) for value in rates], rates[: len(iterates)]
+    def increments(self, found: Found) -> list[str]:
+        k, n = self.nodes, len(self.iterates)
+        rooms = k.all.rooms(len(self.plan.relation.rates))
 
-    def _rates(self, old: list[Over]) -> list[Over]:
+        def summed(node: str, rates: list[str]) -> None:
+            k.all.filled(rooms, k.weighted(rates, node), node)
+            found(node, rates[:n], k.all.emitter.true)
+
+        self._rates(summed)
+        return k.totals(rooms)
+
+    def _rates(self, found: Callable[[str, list[str]], None]) -> None:
         """(ȧ, ḃ) at the nodes."""
-        k, e, r = self.nodes, self.many, self.plan.relation
-        points = e.region(k.plan.graph, self.constants)
-        points.bind(k.plan.shared.t, self.instants)
-        for node, y, a in zip(r.first, old, self.state, strict=False):
-            points.bind(node, e.product(self.matrix, y, e.splat(a), k.all))
-        for node, y in zip(r.unknowns, old, strict=True):
-            points.bind(node, e.product(self.values, y, None, k.all))
-        points.require(r.slopes)
-        inside = self.region([k.along(y, a) for y, a in zip(old, self.first, strict=False)], None)
-        for mean, slope in zip(r.means, r.slopes, strict=True):
-            inside.bind(mean, k.all.product(self.means, points.value(slope), None, e))
-        inside.require(r.rates)
-        return [inside.value(node) for node in r.rates]
+        k, many, m, r = self.nodes, self.nodes.points, self.nodes.of_points, self.plan.relation
+        weighted, slopes = self._weighted_iterates(), many.rooms(len(r.slopes))
+        with many.at() as node:
+            points = many.product(m.matrix, self.iterates, node, [many.splat(a) for a in self.first], k.all)
+            rates = many.product(m.values, self.iterates, node, [None] * len(self.iterates), k.all)
+            region = self._region(many, m.known, m.instants, points, node, r.unknowns, rates)
+            region.require(r.slopes)
+            many.filled(slopes, [region.value(slope) for slope in r.slopes], node)
+        with k.all.at() as node:
+            region = self.region(k.along(weighted, node, self.first), [], node)
+            means = k.all.product(m.means, slopes, node, [None] * len(slopes), many)
+            for input_, mean in zip(r.means, means, strict=True):
+                region.bind(input_, mean)
+            region.require(r.rates)
+            found(node, [region.value(rate) for rate in r.rates])
 
-    def settled(self, iterates: list[Over], after: list[str]) -> list[str]:
-        k, plan = self.nodes, self.plan
-        region, end = Region(k.one, plan.graph, self.here), k.all.vector(plan.quadrature.end, weights=True)
-        for node, value in zip(plan.relation.after, after, strict=True):
-            region.bind(node, value)
-        for node, rate in zip(plan.relation.unknowns, iterates, strict=True):
-            region.bind(node, k.all.total(k.all.mul(end, rate)))
+    def settled(self, iterates: list[str], after: list[str]) -> list[str]:
+        k, plan, over = self.nodes, self.plan, self.nodes.all
+        region, ends = Region(k.one, plan.graph, self.here), over.rooms(len(self.iterates))
+        with over.at() as node:
+            of_end = over.of(k.of_points.end, node)
+            over.filled(ends, [over.emitter.mul(of_end, over.load(room, node)) for room in iterates], node)
+        for input_, value in zip([*plan.relation.after, *plan.relation.unknowns], [*after, *k.totals(ends)], strict=True):
+            region.bind(input_, value)
         region.require(plan.relation.settled)
         return [region.value(node) for node in plan.relation.settled]

@@ -1,301 +1,373 @@
-"""Values over the nodes of a step in IR: nodes in the lanes of one vector, or apart, each in a vector over trajectories.
+"""Values over the nodes of a step in IR: nodes in the lanes of one vector, or one after the other, trajectories in the lanes.
 
-Both round alike: what is added to what does not depend on where it stands.
+Both round alike: what is added to what, and in what order, does not depend on where it stands.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial, reduce
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import reduce
 from typing import Any
 
 import numpy as np
 
 from dirax.engines.native.ir.emitter import Body, Emitter
 from dirax.engines.native.ir.lower import Region
-from dirax.program.graph import Graph
 
 SHAPES = (2, 4, 8, 16)
 """Numbers of lanes: those that are missing to the next of them repeat the last node, with weights of zero."""
 
-Over = Any
-"""A value over the nodes: a name in the text, or a list of them."""
+Table = Any
+"""Constants of the nodes: names of vectors, or where they stand in memory."""
 
 
 class OverNodes(ABC):
-    """Arithmetic on values over `count` nodes; `one` writes what a trajectory has one of, and `emitter` what a value is made of."""
+    """What is written `at` the `count` nodes: `emitter` writes what belongs to a node, and `one` what a trajectory has one of.
+
+    What is to be known at other nodes as well stands in a `room`, of which there is one for every node.
+    """
 
     one: Emitter
     emitter: Emitter
     count: int
 
     @abstractmethod
-    def each(self, operation: Callable[..., str], *values: Over) -> Over:
-        """An operation of the emitter at every node."""
+    def at(self) -> AbstractContextManager[str]:
+        """A stretch of code for every node; gives the node."""
 
     @abstractmethod
-    def splat(self, number: str) -> Over:
-        """The same number at every node."""
+    def splat(self, number: str) -> str:
+        """A number of the trajectory."""
 
     @abstractmethod
-    def vector(self, values: np.ndarray, weights: bool = False) -> Over:
-        """A constant with one entry a node; `weights` are zero where there is no node."""
+    def table(self, values: np.ndarray, factor: str = "", weights: bool = False) -> Table:
+        """Constants, one a node, times a double; `weights` are zero where there is no node."""
 
     @abstractmethod
-    def entry(self, value: Over, node: int, to: "OverNodes") -> Over:
-        """What stands at one node, at all nodes of `to`."""
+    def of(self, table: Table, node: str) -> str:
+        """The constant of a node."""
 
     @abstractmethod
-    def total(self, value: Over) -> str:
+    def matrix(self, values: np.ndarray, factor: str = "") -> Table:
+        """A matrix with a row for every node, times a double."""
+
+    @abstractmethod
+    def product(self, matrix: Table, rooms: list[str], node: str, starts: Sequence[str | None], of: "OverNodes") -> list[str]:
+        """start + matrix·x at a node, for several x over the nodes of `of`."""
+
+    @abstractmethod
+    def room(self) -> str:
+        """Memory for a value at every node."""
+
+    @abstractmethod
+    def load(self, room: str, node: str) -> str:
+        """What stands there at a node."""
+
+    @abstractmethod
+    def store(self, value: str, room: str, node: str) -> None:
+        """Put it there."""
+
+    @abstractmethod
+    def last(self, room: str) -> str:
+        """What stands there at the last node, at every node."""
+
+    @abstractmethod
+    def total(self, room: str) -> str:
         """The sum over the nodes, a number."""
 
     @abstractmethod
-    def largest(self, value: Over) -> str:
-        """The largest entry that is not negative, a number."""
+    def flag(self) -> str:
+        """Memory for conditions at the nodes, which hold nowhere."""
 
     @abstractmethod
-    def any(self, condition: Over) -> str:
-        """Whether it holds at some node of a trajectory."""
+    def mark(self, flag: str, condition: str) -> None:
+        """Note that one holds at the node that is being written."""
 
     @abstractmethod
-    def all(self, condition: Over) -> str:
-        """Whether it holds at every node of a trajectory."""
+    def marked(self, flag: str) -> str:
+        """Whether one holds at some node of a trajectory."""
 
     @abstractmethod
-    def chosen(self, condition: str, yes: Over, no: Over) -> Over:
+    def peak(self) -> str:
+        """Memory for the largest of numbers at the nodes, which is zero."""
+
+    @abstractmethod
+    def raised(self, peak: str, value: str) -> None:
+        """Note a number at the node that is being written."""
+
+    @abstractmethod
+    def highest(self, peak: str) -> str:
+        """The largest of them in a trajectory."""
+
+    @abstractmethod
+    def chosen(self, condition: str, yes: str, no: str) -> str:
         """One of two by a condition on the trajectory."""
 
     @abstractmethod
-    def read(self, places: Sequence[str]) -> Over:
-        """From one number in memory a node."""
+    def read(self, places: Sequence[str], room: str) -> None:
+        """Fill a room from one number in memory a node."""
 
     @abstractmethod
-    def write(self, value: Over, places: Sequence[str]) -> None:
-        """To one number in memory a node."""
+    def write(self, room: str, places: Sequence[str]) -> None:
+        """The other way round."""
 
     @abstractmethod
-    def room(self) -> Over:
-        """Memory for a value."""
+    def constants(self, known: Region) -> Region:
+        """What is known of a trajectory in numbers, for regions at the nodes to begin from."""
 
     @abstractmethod
-    def constants(self, graph: Graph, known: Region) -> Region:
-        """What is `known` of a trajectory by numbers, for regions over the nodes to begin from."""
+    def handed_on(self, region: Region, outputs: list[int], node: str) -> Callable[[str], Region]:
+        """What a region at a node knows that these outputs will need, for another stretch at that node."""
 
-    @abstractmethod
-    def region(self, graph: Graph, parent: Region) -> "Region | Regions":
-        """A region at every node."""
+    def filled(self, rooms: list[str], values: list[str], node: str) -> None:
+        """Put values into rooms."""
+        for value, room in zip(values, rooms, strict=True):
+            self.store(value, room, node)
 
-    def load(self, pointer: Over) -> Over:
-        """What stands in a room."""
-        return self.each(lambda p: self.emitter.body.load(self.emitter.real, p, 64), pointer)
+    def rooms(self, count: int) -> list[str]:
+        """Several of them."""
+        return [self.room() for _ in range(count)]
 
-    def store(self, value: Over, pointer: Over) -> None:
-        """Fill a room."""
-        self.each(lambda v, p: self.emitter.body.store(self.emitter.real, v, p, 64) or "", value, pointer)
 
-    def const(self, value: float) -> Over:
-        """A constant at every node."""
-        return self.splat_of(self.emitter.const(value))
+def ways(columns: int) -> int:
+    """Sums side by side that a product of so many columns is made of."""
+    return 4 if columns >= 8 else 2 if columns >= 4 else 1
 
-    @abstractmethod
-    def splat_of(self, literal: str) -> Over:
-        """A literal of the emitter at every node."""
 
-    def add(self, a: Over, b: Over) -> Over:
-        return self.each(self.emitter.add, a, b)
-
-    def sub(self, a: Over, b: Over) -> Over:
-        return self.each(self.emitter.sub, a, b)
-
-    def mul(self, a: Over, b: Over) -> Over:
-        return self.each(self.emitter.mul, a, b)
-
-    def fma(self, a: Over, b: Over, c: Over) -> Over:
-        return self.each(self.emitter.fma, a, b, c)
-
-    def abs(self, a: Over) -> Over:
-        return self.each(self.emitter.abs, a)
-
-    def max(self, a: Over, b: Over) -> Over:
-        return self.each(self.emitter.max, a, b)
-
-    def min(self, a: Over, b: Over) -> Over:
-        return self.each(lambda a, b: self.emitter.select(self.emitter.compare("olt", a, b), a, b), a, b)
-
-    def compare(self, predicate: str, a: Over, b: Over) -> Over:
-        return self.each(partial(self.emitter.compare, predicate), a, b)
-
-    def both(self, a: Over, b: Over) -> Over:
-        return self.each(self.emitter.both, a, b)
-
-    def either(self, a: Over, b: Over) -> Over:
-        return self.each(self.emitter.either, a, b)
-
-    def invert(self, a: Over) -> Over:
-        return self.each(self.emitter.invert, a)
-
-    def product(self, columns: list[Over], x: Over, start: Over | None = None, of: "OverNodes | None" = None) -> Over:
-        """start + matrix·x, for x over the nodes of `of`."""
-        ways = 4 if len(columns) >= 8 else 2 if len(columns) >= 4 else 1
-        parts: list[Over | None] = [start, *[None] * (ways - 1)]
-        for j, column in enumerate(columns):
-            entry = (of or self).entry(x, j, self)
-            part = parts[j % ways]
-            parts[j % ways] = self.mul(column, entry) if part is None else self.fma(column, entry, part)
-        sums = [part for part in parts if part is not None]
-        while len(sums) > 1:
-            sums = [self.add(a, b) for a, b in zip(sums[0::2], sums[1::2], strict=True)]
-        return sums[0]
+def summed(e: Emitter, parts: list[str | None]) -> str:
+    """One sum of those side by side."""
+    sums = [part for part in parts if part is not None]
+    while len(sums) > 1:
+        sums = [e.add(a, b) for a, b in zip(sums[0::2], sums[1::2], strict=True)]
+    return sums[0]
 
 
 class InLanes(OverNodes):
     """The nodes of one trajectory in the lanes of a vector."""
 
     def __init__(self, body: Body, count: int):
-        self.one, self.count = Emitter(body, 1), count
+        self.body, self.one, self.count = body, Emitter(body, 1), count
         self.emitter = Emitter(body, next(n for n in SHAPES if n >= count))
 
-    def each(self, operation, *values):
-        return operation(*values)
+    def at(self):
+        return nullcontext("")
 
     def splat(self, number):
         return self.emitter.splat(number)
 
-    def splat_of(self, literal):
-        return literal
-
-    def vector(self, values, weights=False):
+    def table(self, values, factor="", weights=False):
         last = 0.0 if weights else float(values[-1])
         padded = [*values.tolist(), *[last] * (self.emitter.width - len(values))]
-        return f"<{', '.join(f'double {self.one.const(x)}' for x in padded)}>"
+        vector = f"<{', '.join(f'double {self.one.const(x)}' for x in padded)}>"
+        return self.emitter.mul(vector, self.emitter.splat(factor)) if factor else vector
 
-    def entry(self, value, node, to):
-        real, mask = self.emitter.real, ", ".join([f"i32 {node}"] * to.emitter.width)
-        return self.emitter.body.put(f"shufflevector {real} {value}, {real} poison, <{to.emitter.width} x i32> <{mask}>")
+    def of(self, table, node):
+        return table
 
-    def total(self, value):
-        body, width = self.emitter.body, self.emitter.width
+    def matrix(self, values, factor=""):
+        return [self.table(column, factor) for column in values.T]
+
+    def product(self, matrix, rooms, node, starts, of):
+        return [self._product(matrix, of.load(room, node), start, of) for room, start in zip(rooms, starts, strict=True)]
+
+    def _product(self, columns: list[str], x: str, start: str | None, of: OverNodes) -> str:
+        e, many = self.emitter, ways(len(columns))
+        parts: list[str | None] = [start, *[None] * (many - 1)]
+        for j, column in enumerate(columns):
+            entry, part = self._everywhere(x, j, of), parts[j % many]
+            parts[j % many] = e.mul(column, entry) if part is None else e.fma(column, entry, part)
+        return summed(e, parts)
+
+    def _everywhere(self, x: str, lane: int, of: OverNodes) -> str:
+        real, width = of.emitter.real, self.emitter.width
+        mask = ", ".join([f"i32 {lane}"] * width)
+        return self.body.put(f"shufflevector {real} {x}, {real} poison, <{width} x i32> <{mask}>")
+
+    def room(self):
+        return self.body.alloca(self.emitter.real)
+
+    def load(self, room, node):
+        return self.body.load(self.emitter.real, room, 64)
+
+    def store(self, value, room, node):
+        self.body.store(self.emitter.real, value, room, 64)
+
+    def last(self, room):
+        return self._everywhere(self.load(room, ""), self.count - 1, self)
+
+    def total(self, room):
+        value, width = self.load(room, ""), self.emitter.width
         while width > 1:
             half = width // 2
             kind = f"<{width} x double>"
             low, high = (
-                body.put(
+                self.body.put(
                     f"shufflevector {kind} {value}, {kind} poison, <{half} x i32> "
                     f"<{', '.join(f'i32 {i}' for i in range(first, first + half))}>"
                 )
                 for first in (0, half)
             )
-            value = body.put(f"fadd <{half} x double> {low}, {high}")
+            value = self.body.put(f"fadd <{half} x double> {low}, {high}")
             width = half
-        return body.put(f"extractelement <1 x double> {value}, i64 0")
+        return self.body.put(f"extractelement <1 x double> {value}, i64 0")
 
-    def largest(self, value):
+    def flag(self):
+        flag = self.body.alloca(self.emitter.bool)
+        self.body.store(self.emitter.bool, self.emitter.false, flag)
+        return flag
+
+    def mark(self, flag, condition):
+        self.body.store(self.emitter.bool, condition, flag)
+
+    def marked(self, flag):
+        return self.emitter.any(self.body.load(self.emitter.bool, flag))
+
+    def peak(self):
+        peak = self.room()
+        self.store(self.emitter.const(0.0), peak, "")
+        return peak
+
+    def raised(self, peak, value):
+        self.store(self.emitter.max(value, self.load(peak, "")), peak, "")
+
+    def highest(self, peak):
+        value = self.load(peak, "")
         entries = (self.emitter.extract(value, lane) for lane in range(self.count))
         return reduce(lambda most, entry: self.one.max(entry, most), entries, self.one.const(0.0))
 
-    def any(self, condition):
-        return self.emitter.any(condition)
-
-    def all(self, condition):
-        return self.emitter.all(condition)
-
     def chosen(self, condition, yes, no):
         real = self.emitter.real
-        return self.emitter.body.put(f"select i1 {condition}, {real} {yes}, {real} {no}")
+        return self.body.put(f"select i1 {condition}, {real} {yes}, {real} {no}")
 
-    def read(self, places):
-        numbers = [self.emitter.body.load("double", place) for place in places]
-        return self.emitter.pack(numbers + numbers[-1:] * (self.emitter.width - len(numbers)))
+    def read(self, places, room):
+        numbers = [self.body.load("double", place) for place in places]
+        self.store(self.emitter.pack(numbers + numbers[-1:] * (self.emitter.width - len(numbers))), room, "")
 
-    def write(self, value, places):
+    def write(self, room, places):
+        value = self.load(room, "")
         for lane, place in enumerate(places):
-            self.emitter.body.store("double", self.emitter.extract(value, lane), place)
+            self.body.store("double", self.emitter.extract(value, lane), place)
 
-    def room(self):
-        return self.emitter.body.alloca(self.emitter.real)
-
-    def constants(self, graph, known):
-        region = Region(self.emitter, graph)
+    def constants(self, known):
+        region = Region(self.emitter, known.graph)
         for node, value in known.values.items():
             region.bind(node, self.splat(value))
         return region
 
-    def region(self, graph, parent):
-        return Region(self.emitter, graph, parent)
+    def handed_on(self, region, outputs, node):
+        return lambda node: region
 
 
 class Apart(OverNodes):
-    """The nodes one by one, the trajectories in the lanes of a vector."""
+    """A loop over the nodes, with trajectories in the lanes of a vector."""
 
     def __init__(self, body: Body, count: int, trajectories: int):
+        self.body, self.count = body, count
         self.one = self.emitter = Emitter(body, trajectories)
-        self.count = count
 
-    def each(self, operation, *values):
-        return [operation(*at) for at in zip(*values, strict=True)]
+    @contextmanager
+    def at(self) -> Iterator[str]:
+        with self.body.loop(0, self.count) as node:
+            yield node
 
     def splat(self, number):
-        return [number] * self.count
+        return number
 
-    def splat_of(self, literal):
-        return [literal] * self.count
+    def table(self, values, factor="", weights=False):
+        return self._memory(values, factor)
 
-    def vector(self, values, weights=False):
-        return [self.one.const(x) for x in values.tolist()]
+    def _memory(self, values: np.ndarray, factor: str) -> str:
+        number, table = Emitter(self.body, 1), self.body.alloca("double", values.size)
+        for i, value in enumerate(values.ravel().tolist()):
+            entry = number.mul(number.const(value), factor) if factor else number.const(value)
+            self.body.store("double", entry, self.body.at("double", table, i))
+        return table
 
-    def entry(self, value, node, to):
-        return [value[node]] * to.count
+    def of(self, table, node):
+        return self.emitter.splat(self.body.load("double", self.body.at("double", table, node)))
 
-    def total(self, value):
-        width = next(n for n in SHAPES if n >= self.count)
-        while width > 1:
-            width //= 2
-            low, high = value[:width], value[width:]
-            value = [*(self.one.add(a, b) for a, b in zip(low, high, strict=False)), *low[len(high) :]]
-        return value[0]
+    def matrix(self, values, factor=""):
+        return self._memory(values, factor), values.shape[1]
 
-    def largest(self, value):
-        return reduce(lambda most, entry: self.one.max(entry, most), value, self.one.const(0.0))
-
-    def any(self, condition):
-        return reduce(self.one.either, condition)
-
-    def all(self, condition):
-        return reduce(self.one.both, condition)
-
-    def chosen(self, condition, yes, no):
-        return [self.one.select(condition, a, b) for a, b in zip(yes, no, strict=True)]
-
-    def read(self, places):
-        return [self.one.body.load(self.one.real, place) for place in places]
-
-    def write(self, value, places):
-        for entry, place in zip(value, places, strict=True):
-            self.one.body.store(self.one.real, entry, place)
+    def product(self, matrix, rooms, node, starts, of):
+        (table, columns), e, body = matrix, self.emitter, self.body
+        row, many = body.at("double", table, body.put(f"mul i64 {node}, {columns}")), ways(columns)
+        parts: list[list[str | None]] = [[start, *[None] * (many - 1)] for start in starts]
+        for j in range(columns):
+            factor = self.of(row, str(j))
+            for sums, room in zip(parts, rooms, strict=True):
+                entry, part = of.load(room, str(j)), sums[j % many]
+                sums[j % many] = e.mul(factor, entry) if part is None else e.fma(factor, entry, part)
+        return [summed(e, sums) for sums in parts]
 
     def room(self):
-        return [self.one.body.alloca(self.one.real) for _ in range(self.count)]
+        return self.body.alloca(self.emitter.real, self.count)
 
-    def constants(self, graph, known):
+    def load(self, room, node):
+        return self.body.load(self.emitter.real, self.body.at(self.emitter.real, room, node), 64)
+
+    def store(self, value, room, node):
+        self.body.store(self.emitter.real, value, self.body.at(self.emitter.real, room, node), 64)
+
+    def last(self, room):
+        return self.load(room, str(self.count - 1))
+
+    def total(self, room):
+        values, width = [self.load(room, str(i)) for i in range(self.count)], next(n for n in SHAPES if n >= self.count)
+        while width > 1:
+            width //= 2
+            low, high = values[:width], values[width:]
+            values = [*(self.one.add(a, b) for a, b in zip(low, high, strict=False)), *low[len(high) :]]
+        return values[0]
+
+    def flag(self):
+        flag = self.body.alloca(self.one.bool)
+        self.body.store(self.one.bool, self.one.false, flag)
+        return flag
+
+    def mark(self, flag, condition):
+        self.body.store(self.one.bool, self.one.either(self.body.load(self.one.bool, flag), condition), flag)
+
+    def marked(self, flag):
+        return self.body.load(self.one.bool, flag)
+
+    def peak(self):
+        peak = self.body.alloca(self.one.real)
+        self.body.store(self.one.real, self.one.const(0.0), peak)
+        return peak
+
+    def raised(self, peak, value):
+        self.body.store(self.one.real, self.one.max(value, self.body.load(self.one.real, peak)), peak)
+
+    def highest(self, peak):
+        return self.body.load(self.one.real, peak)
+
+    def chosen(self, condition, yes, no):
+        return self.one.select(condition, yes, no)
+
+    def read(self, places, room):
+        for i, place in enumerate(places):
+            self.store(self.body.load(self.one.real, place), room, str(i))
+
+    def write(self, room, places):
+        for i, place in enumerate(places):
+            self.body.store(self.one.real, self.load(room, str(i)), place)
+
+    def constants(self, known):
         return known
 
-    def region(self, graph, parent):
-        return Regions([Region(self.one, graph, parent) for _ in range(self.count)])
+    def handed_on(self, region, outputs, node):
+        e, graph, needed = self.emitter, region.graph, region.operands_of(outputs)
+        rooms = self.rooms(len(needed))
+        truth = [graph.is_boolean(n) for n in needed]
+        number = lambda n, is_truth: e.select(region.value(n), e.const(1.0), e.const(0.0)) if is_truth else region.value(n)
+        self.filled(rooms, [number(n, is_truth) for n, is_truth in zip(needed, truth, strict=True)], node)
 
+        def again(node: str) -> Region:
+            other = Region(e, graph, region.parent)
+            for n, is_truth, room in zip(needed, truth, rooms, strict=True):
+                value = self.load(room, node)
+                other.bind(n, e.compare("ogt", value, e.const(0.5)) if is_truth else value)
+            return other
 
-class Regions:
-    """What a `Region` is, at several nodes."""
-
-    def __init__(self, parts: list[Region]):
-        self.parts = parts
-
-    def bind(self, node: int, value: list[str]) -> None:
-        for part, entry in zip(self.parts, value, strict=True):
-            part.bind(node, entry)
-
-    def require(self, outputs: Iterable[int]) -> None:
-        outputs = list(outputs)
-        for part in self.parts:
-            part.require(outputs)
-
-    def value(self, node: int) -> list[str]:
-        return [part.value(node) for part in self.parts]
+        return again
