@@ -13,6 +13,10 @@ from dirax.engines.native.loops.step_loop import NUMBERS, define_run
 from dirax.engines.stopping import EPSILON, STALLED
 
 
+FAR = 2.0**-20
+"""Relative changes above which nothing more is asked of an iterate: it is not at its root."""
+
+
 def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma: bool) -> str:
     """IR of `run(lanes, params, outs, blocks, …)`: so many trajectories a block."""
     module = Module(fma)
@@ -38,7 +42,7 @@ class _Kernel:
         self.state = [room() for _ in range(record.state_size)]
         self.lost = [room() for _ in range(record.state_size)]
         n = len(plan.relation.first)
-        self.iterates, self.fresh, self.before, self.least = (self.all.rooms(n) for _ in range(4))
+        self.pair, self.before, self.moved = self.all.pair(n), self.all.rooms(n), self.all.rooms(n)
         self.completed, self.status, self.iterations, self.worst = numbers = [room() for _ in range(4)]
         first_lost = record.size - 4 - record.lost
         scalars = [*self.state, *self.lost, *numbers]
@@ -47,14 +51,14 @@ class _Kernel:
             b.store(one.real, b.load(one.real, place), value)
         first = record.state_size if plan.gain is None else record.state_size + record.kept
         kept = [places[first + j : first + record.kept : n] for j in range(n)]
-        for iterate, of_nodes in zip(self.iterates, kept, strict=True):
+        for iterate, of_nodes in zip(self.pair.now(), kept, strict=True):
             self.all.read(of_nodes, iterate)
         self.sizes = self._sizes(places)
 
         def give_back() -> None:
             for value, place in zip(scalars, spots, strict=True):
                 b.store(one.real, b.load(one.real, value), place)
-            for iterate, of_nodes in zip(self.iterates, kept, strict=True):
+            for iterate, of_nodes in zip(self.pair.now(), kept, strict=True):
                 self.all.write(iterate, of_nodes)
             if plan.gain is not None:
                 self._give_rates(places[record.state_size : record.state_size + record.kept])
@@ -68,8 +72,9 @@ class _Kernel:
     def _sizes(self, places: list[str]) -> list[str]:
         """How large iterates are, those of all nodes of a kind alike: as the unknowns, rates; accelerations as rates by h."""
         b, one, found = self.body, self.one, []
-        first = self.plan.record.sizes(0, len(self.iterates)).start
-        for place in places[first : first + len(self.iterates)]:
+        n = self.pair.count
+        first = self.plan.record.sizes(0, n).start
+        for place in places[first : first + n]:
             size = b.load(one.real, place)
             found.append(size if self.plan.gain is None else one.div(size, one.abs(self.nodes.h)))
         return found
@@ -118,9 +123,10 @@ class _Kernel:
         with b.when(saves):
             self._save(here, number)
         kind = Means if isinstance(plan, MeanPlan) else FirstOrder if plan.gain is None else SecondOrder
-        sweep = kind(self.nodes, here, state, time, self.iterates)
+        sweep = kind(self.nodes, here, state, time, self.pair)
+        iterates = self.pair.now()
         with over.at() as node:
-            over.filled(self.before, [over.load(room, node) for room in self.iterates], node)
+            over.filled(self.before, [over.load(room, node) for room in iterates], node)
         converged, change, count = self._attempts(sweep, one.compare("ogt", done, one.const(0.0)), running)
         increments, change = self._increments(sweep, change)
         new, lost = [], []
@@ -129,7 +135,7 @@ class _Kernel:
             total, error = one.two_sum(old, one.add(increment, b.load(one.real, pointer)))
             new.append(total)
             lost.append(error)
-        for i, more in enumerate(sweep.settled(self.fresh, new)):
+        for i, more in enumerate(sweep.settled(self.pair.others(), new)):
             new[i], error = one.two_sum(new[i], more)
             lost[i] = one.add(lost[i], error)
         for total in new:
@@ -139,10 +145,11 @@ class _Kernel:
         keep = lambda new, pointer: b.store(one.real, one.select(good, new, b.load(one.real, pointer)), pointer)
         for value, pointer in zip([*new, *lost], [*self.state, *self.lost], strict=True):
             keep(value, pointer)
+        self.pair.swap()
+        iterates = self.pair.now()
         with over.at() as node:
-            found = zip(self.fresh, self.before, strict=True)
-            chosen = [over.chosen(good, over.load(new, node), over.load(old, node)) for new, old in found]
-            over.filled(self.iterates, chosen, node)
+            found = zip(iterates, self.before, strict=True)
+            over.filled(iterates, [over.chosen(good, over.load(a, node), over.load(b, node)) for a, b in found], node)
         keep(one.add(done, one.const(1.0)), self.completed)
         keep(one.max(change, b.load(one.real, self.worst)), self.worst)
         outcome = one.select(good, one.const(float(OK)), failure)
@@ -151,11 +158,14 @@ class _Kernel:
         b.store(one.real, one.add(b.load(one.real, self.iterations), more), self.iterations)
 
     def _increments(self, sweep: Sweep, change: str) -> tuple[list[str], str]:
-        """What is added to the state, and the largest last change; the iterates after all sweeps are in `fresh` then."""
-        over, peak = self.all, self.all.peak()
+        """What is added to the state, and the largest last change; the iterates after all sweeps are in the other rooms then."""
+        over, peak, iterates, others = self.all, self.all.peak(), self.pair.now(), self.pair.others()
+        if not sweep.later:
+            with over.at() as node:
+                over.filled(others, [over.load(room, node) for room in iterates], node)
 
         def last(node: str, new: list[str], stable: str) -> None:
-            for value, room, fresh in zip(new, self.iterates, self.fresh, strict=True):
+            for value, room, fresh in zip(new, iterates, others, strict=True):
                 over.raised(peak, over.emitter.abs(over.emitter.sub(value, over.load(room, node))))
                 over.store(value, fresh, node)
 
@@ -173,11 +183,12 @@ class _Kernel:
         with b.loop(0, 2) as attempt, b.when(one.any(b.load(one.bool, self.trying))):
             first = b.put(f"icmp eq i64 {attempt}, 0")
             trying = b.load(one.bool, self.trying)
+            iterates = self.pair.now()
             with b.when(first), over.at() as node:
-                over.filled(self.iterates, sweep.guess(self.before, later, True, node), node)
+                over.filled(iterates, sweep.guess(self.before, later, True, node), node)
             with b.when(b.put(f"xor i1 {first}, true")), over.at() as node:
-                guess = zip(sweep.guess(self.before, later, False, node), self.iterates, strict=True)
-                over.filled(self.iterates, [over.chosen(trying, a, over.load(room, node)) for a, room in guess], node)
+                guess = zip(sweep.guess(self.before, later, False, node), iterates, strict=True)
+                over.filled(iterates, [over.chosen(trying, a, over.load(room, node)) for a, room in guess], node)
             self._iterate(sweep)
         converged = one.both(running, one.invert(b.load(one.bool, self.trying)))
         return converged, b.load(one.real, self.change), b.load(one.real, self.sweeps)
@@ -187,59 +198,65 @@ class _Kernel:
         shrink no more; those `trying` that have come to a root then try no longer."""
         b, over, one = self.body, self.all, self.one
         count_here, active = b.alloca("i64"), b.alloca(one.bool)
-        with over.at() as node:
-            over.filled(self.least, [over.emitter.const(float("inf"))] * len(self.least), node)
         b.store("i64", "0", count_here)
         b.store(one.bool, b.load(one.bool, self.trying), active)
         head, out = b.fresh(), b.fresh()
         b.branch(head)
         b.label(head)
         now, going, unstable = b.load(one.bool, active), over.flag(), over.flag()
-        sweep.sweep(lambda node, new, stable: self._compared(sweep, node, new, stable, now, going, unstable))
+        rooms = self.pair.now(), self.pair.others()
+        sweep.sweep(lambda node, new, stable: self._compared(sweep, node, new, stable, now, going, unstable, *rooms))
         b.store(one.real, one.add(b.load(one.real, self.sweeps), one.select(now, one.const(1.0), one.const(0.0))), self.sweeps)
         count = b.put(f"add i64 {b.load('i64', count_here)}, 1")
         b.store("i64", count, count_here)
         allowed = b.put(f"icmp slt i64 {count}, %cap")
-        still = one.both(now, over.marked(going))
+        still = b.put(f"select i1 {b.put(f'icmp eq i64 {count}, 1')}, {one.bool} {one.true}, {one.bool} {over.marked(going)}")
+        still = one.both(now, still)
         still = b.put(f"select i1 {allowed}, {one.bool} {still}, {one.bool} {one.false}")
         b.store(one.bool, still, active)
         ended = one.both(now, one.invert(still))
         with b.when(one.any(ended)):
-            self._judge(sweep, unstable, ended)
-        with over.at() as node:
-            over.filled(self.iterates, [over.load(room, node) for room in self.fresh], node)
+            self._judge(sweep, unstable, ended, *rooms)
+        self.pair.swap()
         b.branch_if(one.any(still), head, out)
         b.label(out)
 
-    def _compared(self, sweep: Sweep, node: str, new: list[str], stable: str, now: str, going: str, unstable: str) -> None:
-        """The new iterates at a node are those of trajectories that go on `now`; and whether they have to go on from there."""
+    def _compared(
+        self, sweep: Sweep, node: str, new: list[str], stable: str, now: str, going: str, unstable: str, rooms: list, others: list
+    ) -> None:
+        """The new iterates at a node, of trajectories that go on `now`, into the other rooms; and whether they have to go on."""
         over, e = self.all, self.all.emitter
-        further = e.false
-        for iterate, fresh, a, least in zip(self.iterates, self.fresh, new, self.least, strict=True):
-            before, smallest = over.load(iterate, node), over.load(least, node)
-            over.store(a if self.one.width == 1 else over.chosen(now, a, before), fresh, node)
+        found, far = [], e.false
+        for a, room, other in zip(new, rooms, others, strict=True):
+            before = over.load(room, node)
+            over.store(a if self.one.width == 1 else over.chosen(now, a, before), other, node)
             moved, size = e.abs(e.sub(a, before)), e.abs(a)
-            closer = e.compare("olt", moved, smallest)
-            shrinks = e.both(closer, e.compare("ogt", moved, e.mul(size, e.const(EPSILON))))
-            # the next change will be moved²/smallest, and so on; before the second, nothing is known
-            known = e.compare("olt", smallest, e.const(float("inf")))
-            left, floor = e.mul(moved, moved), e.mul(e.mul(size, e.const(EPSILON / 2.0)), smallest)
-            for _ in range(sweep.later):
-                left, floor = e.mul(left, moved), e.mul(floor, smallest)
-            enough = e.both(known, e.compare("olt", left, floor))
-            further = e.either(further, e.both(shrinks, e.invert(enough)))
-            over.store(e.select(closer, moved, smallest), least, node)
-        over.mark(going, further)
+            found.append((moved, size))
+            far = e.either(far, e.compare("ogt", moved, e.mul(size, e.const(FAR))))
+        over.mark(going, far)
+        with over.seldom(e.invert(far)):
+            further = e.false
+            for (moved, size), room in zip(found, self.moved, strict=True):
+                last, floor = over.load(room, node), e.mul(size, e.const(EPSILON))
+                shrinks = e.both(e.compare("olt", moved, last), e.compare("ogt", moved, floor))
+                # the next change will be moved²/last, and so on
+                left = e.mul(moved, moved)
+                floor = e.mul(floor, last)
+                for _ in range(sweep.later):
+                    left, floor = e.mul(left, moved), e.mul(floor, last)
+                further = e.either(further, e.both(shrinks, e.compare("uge", left, floor)))
+            over.mark(going, further)
+        over.filled(self.moved, [moved for moved, _ in found], node)
         if stable != e.true:
             over.mark(unstable, e.invert(stable))
 
-    def _judge(self, sweep: Sweep, unstable: str, ended: str) -> None:
+    def _judge(self, sweep: Sweep, unstable: str, ended: str, rooms: list[str], others: list[str]) -> None:
         """Whether these, whose iteration has ended, are at a root: their last changes are small."""
         b, over, one, e = self.body, self.all, self.one, self.all.emitter
         peak, missed = over.peak(), over.flag()
         with over.at() as node:
             off = e.false
-            for iterate, fresh, unit in zip(self.iterates, self.fresh, self.sizes, strict=True):
+            for iterate, fresh, unit in zip(rooms, others, self.sizes, strict=True):
                 new = over.load(fresh, node)
                 moved = e.abs(e.sub(new, over.load(iterate, node)))
                 most = e.mul(e.add(e.abs(new), over.splat(unit)), e.const(STALLED))

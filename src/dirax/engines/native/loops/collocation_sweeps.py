@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.collocation_nodes import Nodes
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
-from dirax.engines.native.loops.over_nodes import OverNodes
+from dirax.engines.native.loops.over_nodes import OverNodes, Pair
 
 Found = Callable[[str, list[str], str], None]
 """What is done with the new iterates at a node, and whether they are stable."""
@@ -15,13 +15,13 @@ Found = Callable[[str, list[str], str], None]
 
 @dataclass
 class Sweep(ABC):
-    """What the kinds of iteration share: the state of a step in numbers, and rooms for the `iterates`."""
+    """What the kinds of iteration share: the state of a step in numbers, and a pair of rooms for the iterates."""
 
     nodes: Nodes
     here: Region
     state: list[str]
     time: str
-    iterates: list[str]
+    pair: Pair
 
     later = 0
     """Sweeps that `increments` does besides."""
@@ -29,6 +29,11 @@ class Sweep(ABC):
     def __post_init__(self):
         n = len(self.nodes.plan.relation.first)
         self.first, self.second = self.state[:n], self.state[n:]
+
+    @property
+    def iterates(self) -> list[str]:
+        """The rooms of the iterates."""
+        return self.pair.now()
 
     def region(self, points: list[str], rates: list[str], node: str) -> Region:
         """The relation's inputs a and y at a node."""
@@ -71,9 +76,10 @@ class Sweep(ABC):
 
     def _weighted_iterates(self) -> list[str]:
         """Rooms with h b times the iterates."""
-        k, rooms = self.nodes, self.nodes.all.rooms(len(self.iterates))
+        k, iterates = self.nodes, self.iterates
+        rooms = k.all.rooms(len(iterates))
         with k.all.at() as node:
-            k.all.filled(rooms, k.weighted([k.all.load(room, node) for room in self.iterates], node), node)
+            k.all.filled(rooms, k.weighted([k.all.load(room, node) for room in iterates], node), node)
         return rooms
 
 
@@ -157,10 +163,10 @@ class SecondOrder(AtEveryNode):
 
     def sweep(self, found: Found) -> None:
         """The same."""
-        over = self.nodes.all
+        over, iterates = self.nodes.all, self.iterates
         with over.at() as node:
             lines = [over.load(room, node) for room in self.lines]
-            region = self.region(over.product(self.nodes.second, self.iterates, node, lines, over), [], node)
+            region = self.region(over.product(self.nodes.second, iterates, node, lines, over), [], node)
             found(node, self._gained(region), over.emitter.true)
 
     def _gained(self, region: Region) -> list[str]:
@@ -208,11 +214,11 @@ class Means(Sweep):
         return self.nodes.all.load(before, node)
 
     def sweep(self, found: Found) -> None:
-        n, true = len(self.iterates), self.nodes.all.emitter.true
+        n, true = self.pair.count, self.nodes.all.emitter.true
         self._rates(lambda node, rates: found(node, rates[:n], true))
 
     def increments(self, found: Found) -> list[str]:
-        k, n = self.nodes, len(self.iterates)
+        k, n = self.nodes, self.pair.count
         rooms = k.all.rooms(len(self.plan.relation.rates))
 
         def summed(node: str, rates: list[str]) -> None:
@@ -226,9 +232,10 @@ class Means(Sweep):
         """(ȧ, ḃ) at the nodes."""
         k, many, m, r = self.nodes, self.nodes.points, self.nodes.of_points, self.plan.relation
         weighted, slopes = self._weighted_iterates(), many.rooms(len(r.slopes))
+        iterates = self.iterates
         with many.at() as node:
-            points = many.product(m.matrix, self.iterates, node, [many.splat(a) for a in self.first], k.all)
-            rates = many.product(m.values, self.iterates, node, [None] * len(self.iterates), k.all)
+            points = many.product(m.matrix, iterates, node, [many.splat(a) for a in self.first], k.all)
+            rates = many.product(m.values, iterates, node, [None] * self.pair.count, k.all)
             region = self._region(many, m.known, m.instants, points, node, r.unknowns, rates)
             region.require(r.slopes)
             many.filled(slopes, [region.value(slope) for slope in r.slopes], node)
@@ -242,7 +249,7 @@ class Means(Sweep):
 
     def settled(self, iterates: list[str], after: list[str]) -> list[str]:
         k, plan, over = self.nodes, self.plan, self.nodes.all
-        region, ends = Region(k.one, plan.graph, self.here), over.rooms(len(self.iterates))
+        region, ends = Region(k.one, plan.graph, self.here), over.rooms(self.pair.count)
         with over.at() as node:
             of_end = over.of(k.of_points.end, node)
             over.filled(ends, [over.emitter.mul(of_end, over.load(room, node)) for room in iterates], node)

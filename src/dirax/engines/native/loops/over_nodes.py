@@ -17,6 +17,9 @@ from dirax.engines.native.ir.lower import Region
 SHAPES = (2, 4, 8, 16)
 """Numbers of lanes: those that are missing to the next of them repeat the last node, with weights of zero."""
 
+TOGETHER = 4
+"""Products that share a row of the matrix: more of them do not find room in the registers."""
+
 Table = Any
 """Constants of the nodes: names of vectors, or where they stand in memory."""
 
@@ -74,6 +77,14 @@ class OverNodes(ABC):
     @abstractmethod
     def total(self, room: str) -> str:
         """The sum over the nodes, a number."""
+
+    @abstractmethod
+    def pair(self, count: int) -> "Pair":
+        """Two times so many rooms."""
+
+    @abstractmethod
+    def seldom(self, condition: str) -> AbstractContextManager[None]:
+        """A stretch that matters only where a condition holds at the node that is being written."""
 
     @abstractmethod
     def flag(self) -> str:
@@ -140,6 +151,71 @@ def summed(e: Emitter, parts: list[str | None]) -> str:
     while len(sums) > 1:
         sums = [e.add(a, b) for a, b in zip(sums[0::2], sums[1::2], strict=True)]
     return sums[0]
+
+
+class Pair(ABC):
+    """Rooms `now` and others, which take their place."""
+
+    def __init__(self, over: OverNodes, count: int):
+        self.over, self.count = over, count
+
+    @abstractmethod
+    def now(self) -> list[str]:
+        """Those that are in use."""
+
+    @abstractmethod
+    def others(self) -> list[str]:
+        """Those that are not."""
+
+    @abstractmethod
+    def swap(self) -> None:
+        """From here on the others are in use."""
+
+
+class Copied(Pair):
+    """Rooms that registers stand for."""
+
+    def __init__(self, over: OverNodes, count: int):
+        super().__init__(over, count)
+        self._now, self._others = over.rooms(count), over.rooms(count)
+
+    def now(self):
+        return self._now
+
+    def others(self):
+        return self._others
+
+    def swap(self):
+        with self.over.at() as node:
+            self.over.filled(self._now, [self.over.load(room, node) for room in self._others], node)
+
+
+class Swapped(Pair):
+    """Rooms one behind the other, and where they begin."""
+
+    def __init__(self, over: OverNodes, count: int):
+        super().__init__(over, count)
+        body, self._size = over.emitter.body, over.count
+        self._begins = body.alloca("ptr"), body.alloca("ptr")
+        for begin in self._begins:
+            body.store("ptr", body.alloca(over.emitter.real, max(1, count * self._size)), begin)
+
+    def _rooms(self, begin: str) -> list[str]:
+        body, real = self.over.emitter.body, self.over.emitter.real
+        first = body.load("ptr", begin)
+        return [body.at(real, first, i * self._size) for i in range(self.count)]
+
+    def now(self):
+        return self._rooms(self._begins[0])
+
+    def others(self):
+        return self._rooms(self._begins[1])
+
+    def swap(self):
+        body = self.over.emitter.body
+        first, second = (body.load("ptr", begin) for begin in self._begins)
+        body.store("ptr", second, self._begins[0])
+        body.store("ptr", first, self._begins[1])
 
 
 class InLanes(OverNodes):
@@ -211,12 +287,19 @@ class InLanes(OverNodes):
             width = half
         return self.body.put(f"extractelement <1 x double> {value}, i64 0")
 
+    def pair(self, count):
+        return Copied(self, count)
+
+    def seldom(self, condition):
+        return nullcontext()
+
     def flag(self):
         flag = self.body.alloca(self.emitter.bool)
         self.body.store(self.emitter.bool, self.emitter.false, flag)
         return flag
 
     def mark(self, flag, condition):
+        condition = self.emitter.either(self.body.load(self.emitter.bool, flag), condition)
         self.body.store(self.emitter.bool, condition, flag)
 
     def marked(self, flag):
@@ -290,8 +373,14 @@ class Apart(OverNodes):
         return self._memory(values, factor), values.shape[1]
 
     def product(self, matrix, rooms, node, starts, of):
-        (table, columns), e, body = matrix, self.emitter, self.body
-        row, many = body.at("double", table, body.put(f"mul i64 {node}, {columns}")), ways(columns)
+        (table, columns), found = matrix, []
+        row = self.body.at("double", table, self.body.put(f"mul i64 {node}, {columns}"))
+        for first in range(0, len(rooms), TOGETHER):
+            found += self._products(row, columns, rooms[first : first + TOGETHER], starts[first : first + TOGETHER], of)
+        return found
+
+    def _products(self, row: str, columns: int, rooms: list[str], starts: Sequence[str | None], of: OverNodes) -> list[str]:
+        e, many = self.emitter, ways(columns)
         parts: list[list[str | None]] = [[start, *[None] * (many - 1)] for start in starts]
         for j in range(columns):
             factor = self.of(row, str(j))
@@ -319,6 +408,12 @@ class Apart(OverNodes):
             low, high = values[:width], values[width:]
             values = [*(self.one.add(a, b) for a, b in zip(low, high, strict=False)), *low[len(high) :]]
         return values[0]
+
+    def pair(self, count):
+        return Swapped(self, count)
+
+    def seldom(self, condition):
+        return self.body.when(self.one.any(condition))
 
     def flag(self):
         flag = self.body.alloca(self.one.bool)
