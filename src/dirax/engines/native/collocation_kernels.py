@@ -20,9 +20,6 @@ from dirax.program.memo import Memo, Same
 from dirax.program.scalar_program import ScalarProgram
 from dirax.schemes.stage_relation import MeanRelation, StageRelation
 
-MOST_WRITTEN = 12_000
-"""Operations of a sweep at all nodes up to which they are written out one by one."""
-
 
 class CollocationKernels:
     """The machine code of a collocation step: for one trajectory, and for several side by side."""
@@ -44,12 +41,6 @@ class CollocationKernels:
     def record(self) -> Record:
         """What is kept of a trajectory."""
         return self.plan.record
-
-    @functools.cached_property
-    def wide(self) -> bool:
-        """Whether a batch has trajectories in lanes, for which everything is written out at every node."""
-        stages, n = self.plan.tableau.stages, len(self.plan.relation.first)
-        return stages * (self.operations + stages * n) <= MOST_WRITTEN
 
     @property
     def notes(self) -> dict[str, Any]:

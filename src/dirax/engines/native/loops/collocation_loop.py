@@ -197,7 +197,8 @@ class _Kernel:
         """Sweeps until what the next one would leave to change of every entry of an iterate is below its roundoff, or until changes
         shrink no more; those `trying` that have come to a root then try no longer."""
         b, over, one = self.body, self.all, self.one
-        count_here, active = b.alloca("i64"), b.alloca(one.bool)
+        count_here, active, shaky = b.alloca("i64"), b.alloca(one.bool), b.alloca(one.bool)
+        b.store(one.bool, one.false, shaky)
         b.store("i64", "0", count_here)
         b.store(one.bool, b.load(one.bool, self.trying), active)
         head, out = b.fresh(), b.fresh()
@@ -214,12 +215,11 @@ class _Kernel:
         still = one.both(now, still)
         still = b.put(f"select i1 {allowed}, {one.bool} {still}, {one.bool} {one.false}")
         b.store(one.bool, still, active)
-        ended = one.both(now, one.invert(still))
-        with b.when(one.any(ended)):
-            self._judge(sweep, unstable, ended, *rooms)
+        b.store(one.bool, b.put(f"select {one.bool} {now}, {one.bool} {over.marked(unstable)}, {one.bool} {b.load(one.bool, shaky)}"), shaky)
         self.pair.swap()
         b.branch_if(one.any(still), head, out)
         b.label(out)
+        self._judge(sweep, b.load(one.bool, shaky))
 
     def _compared(
         self, sweep: Sweep, node: str, new: list[str], stable: str, now: str, going: str, unstable: str, rooms: list, others: list
@@ -246,27 +246,28 @@ class _Kernel:
                     left, floor = e.mul(left, moved), e.mul(floor, last)
                 further = e.either(further, e.both(shrinks, e.compare("uge", left, floor)))
             over.mark(going, further)
-        over.filled(self.moved, [moved for moved, _ in found], node)
+        alone = self.one.width == 1
+        for (moved, _), room in zip(found, self.moved, strict=True):
+            over.store(moved if alone else over.chosen(now, moved, over.load(room, node)), room, node)
         if stable != e.true:
             over.mark(unstable, e.invert(stable))
 
-    def _judge(self, sweep: Sweep, unstable: str, ended: str, rooms: list[str], others: list[str]) -> None:
-        """Whether these, whose iteration has ended, are at a root: their last changes are small."""
+    def _judge(self, sweep: Sweep, shaky: str) -> None:
+        """Those that tried and whose last changes are small are at a root, and try no longer."""
         b, over, one, e = self.body, self.all, self.one, self.all.emitter
-        peak, missed = over.peak(), over.flag()
+        peak, missed, trying, iterates = over.peak(), over.flag(), b.load(one.bool, self.trying), self.pair.now()
         with over.at() as node:
             off = e.false
-            for iterate, fresh, unit in zip(rooms, others, self.sizes, strict=True):
-                new = over.load(fresh, node)
-                moved = e.abs(e.sub(new, over.load(iterate, node)))
-                most = e.mul(e.add(e.abs(new), over.splat(unit)), e.const(STALLED))
+            for iterate, room, unit in zip(iterates, self.moved, self.sizes, strict=True):
+                moved = over.load(room, node)
+                most = e.mul(e.add(e.abs(over.load(iterate, node)), over.splat(unit)), e.const(STALLED))
                 off = e.either(off, e.compare("ugt", moved, most))
                 if not sweep.later:
                     over.raised(peak, moved)
             over.mark(missed, off)
-        good = one.invert(one.either(over.marked(missed), over.marked(unstable)))
-        b.store(one.real, one.select(ended, over.highest(peak), b.load(one.real, self.change)), self.change)
-        b.store(one.bool, one.both(b.load(one.bool, self.trying), one.invert(one.both(ended, good))), self.trying)
+        if not sweep.later:
+            b.store(one.real, one.select(trying, over.highest(peak), b.load(one.real, self.change)), self.change)
+        b.store(one.bool, one.both(trying, one.either(over.marked(missed), shaky)), self.trying)
 
     def _save(self, here: Region, number: str) -> None:
         b, e, plan = self.body, self.one, self.plan
