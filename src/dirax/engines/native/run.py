@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem, Progress, finished
+from dirax.engines.contract import NOT_CONVERGED, Outcome, Problem, Progress, finished
 from dirax.engines.native.collocation_kernels import CollocationKernels, collocation_kernels
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
@@ -54,7 +54,7 @@ class Ready:
         places = places_of(p, self.made)
         lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
         fields = lanes.fields
-        if p.record is None and isinstance(self.made, Kernels):  # a fixed point seldom needs them
+        if p.record is None and isinstance(self.made, Kernels):  # a fixed point finds its own
             find_sizes(lanes, self.made.of_sizes(self.width) if self.notes["kernel_cached"] else None)
         compile_seconds, cached, started = self.compile_seconds, self.notes["kernel_cached"], time.perf_counter()
         done, interrupted, threads = p.after, False, 1
@@ -74,10 +74,10 @@ class Ready:
             interrupted = True
         by_newton = None
         if not interrupted and lanes.stuck:
-            with_present_sizes(lanes, self.made)
-            by_newton = _by_newton(lanes) if isinstance(self.made, CollocationKernels) else None
-            if by_newton:
-                with_present_sizes(lanes, by_newton)
+            if isinstance(self.made, CollocationKernels):
+                by_newton = _by_newton(lanes)
+            else:
+                with_present_sizes(lanes, self.made)
         run_seconds = time.perf_counter() - started
         closing = lanes.close(self.kernel)
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
@@ -116,6 +116,9 @@ def _by_newton(lanes: Lanes | OneLane) -> Kernels | None:
     except UnsupportedPrimitive:  # too large to be written out: they end where they are
         return None
     own = table[left]
-    own[:, record.status], own[:, record.differences] = OK, 0.0
-    lanes.put(left, lanes.attempt(left, made, own))
+    own[:, record.differences] = 0.0
+    for i, (stage, _) in enumerate(p.equation.stages):
+        own[:, record.sizes(i, stage.unknowns)] = 0.0
+    lanes.put(left, own)
+    with_present_sizes(lanes, made)
     return made

@@ -53,7 +53,7 @@ class _Kernel:
         kept = [places[first + j : first + record.kept : n] for j in range(n)]
         for iterate, of_nodes in zip(self.pair.now(), kept, strict=True):
             self.all.read(of_nodes, iterate)
-        self.sizes = self._sizes(places)
+        self._take_sizes(places)
 
         def give_back() -> None:
             for value, place in zip(scalars, spots, strict=True):
@@ -62,6 +62,7 @@ class _Kernel:
                 self.all.write(iterate, of_nodes)
             if plan.gain is not None:
                 self._give_rates(places[record.state_size : record.state_size + record.kept])
+            self._give_sizes()
             b.line("ret void")
 
         self._steps(give_back)
@@ -69,15 +70,21 @@ class _Kernel:
         pointers = "ptr noalias %lanes, ptr noalias %params, ptr noalias %outs"
         b.module.define(f"define internal void @block({pointers}, {NUMBERS}) noinline", b)
 
-    def _sizes(self, places: list[str]) -> list[str]:
+    def _take_sizes(self, places: list[str]) -> None:
         """How large iterates are, those of all nodes of a kind alike: as the unknowns, rates; accelerations as rates by h."""
-        b, one, found = self.body, self.one, []
-        n = self.pair.count
+        b, one, n = self.body, self.one, self.pair.count
         first = self.plan.record.sizes(0, n).start
-        for place in places[first : first + n]:
-            size = b.load(one.real, place)
-            found.append(size if self.plan.gain is None else one.div(size, one.abs(self.nodes.h)))
-        return found
+        self.of_sizes, self.sizes = places[first : first + n], [b.alloca(one.real) for _ in range(n)]
+        self.scale = None if self.plan.gain is None else one.abs(self.nodes.h)
+        for place, size in zip(self.of_sizes, self.sizes, strict=True):
+            value = b.load(one.real, place)
+            b.store(one.real, one.div(value, self.scale) if self.scale else value, size)
+
+    def _give_sizes(self) -> None:
+        b, one = self.body, self.one
+        for place, size in zip(self.of_sizes, self.sizes, strict=True):
+            value = b.load(one.real, size)
+            b.store(one.real, one.mul(value, self.scale) if self.scale else value, place)
 
     def _give_rates(self, places: list[str]) -> None:
         """The rates where the steps end, for every node: where Newton's method begins if it has to go on."""
@@ -253,21 +260,36 @@ class _Kernel:
             over.mark(unstable, e.invert(stable))
 
     def _judge(self, sweep: Sweep, shaky: str) -> None:
-        """Those that tried and whose last changes are small are at a root, and try no longer."""
-        b, over, one, e = self.body, self.all, self.one, self.all.emitter
-        peak, missed, trying, iterates = over.peak(), over.flag(), b.load(one.bool, self.trying), self.pair.now()
-        with over.at() as node:
-            off = e.false
-            for iterate, room, unit in zip(iterates, self.moved, self.sizes, strict=True):
-                moved = over.load(room, node)
-                most = e.mul(e.add(e.abs(over.load(iterate, node)), over.splat(unit)), e.const(STALLED))
-                off = e.either(off, e.compare("ugt", moved, most))
-                if not sweep.later:
-                    over.raised(peak, moved)
-            over.mark(missed, off)
+        """Those that tried and whose last changes are small are at a root, and try no longer. An iterate that is nothing but
+        roundoff is measured by what it is made of."""
+        b, over, one = self.body, self.all, self.one
+        missed, trying = over.flag(), b.load(one.bool, self.trying)
+        self._compare(missed)
+        far = one.both(trying, over.marked(missed))
+        with b.when(one.any(far)):
+            for size, value in zip(self.sizes, sweep.terms(), strict=True):
+                known = b.load(one.real, size)
+                b.store(one.real, one.select(far, one.max(value, known), known), size)
+            over.clear(missed)
+            self._compare(missed)
         if not sweep.later:
+            peak = over.peak()
+            with over.at() as node:
+                for room in self.moved:
+                    over.raised(peak, over.load(room, node))
             b.store(one.real, one.select(trying, over.highest(peak), b.load(one.real, self.change)), self.change)
         b.store(one.bool, one.both(trying, one.either(over.marked(missed), shaky)), self.trying)
+
+    def _compare(self, missed: str) -> None:
+        """Mark where a last change is not small."""
+        over, e, one = self.all, self.all.emitter, self.one
+        sizes, iterates = [self.body.load(one.real, size) for size in self.sizes], self.pair.now()
+        with over.at() as node:
+            off = e.false
+            for iterate, room, size in zip(iterates, self.moved, sizes, strict=True):
+                most = e.mul(e.add(e.abs(over.load(iterate, node)), over.splat(size)), e.const(STALLED))
+                off = e.either(off, e.compare("ugt", over.load(room, node), most))
+            over.mark(missed, off)
 
     def _save(self, here: Region, number: str) -> None:
         b, e, plan = self.body, self.one, self.plan

@@ -65,6 +65,19 @@ class Sweep(ABC):
     def sweep(self, found: Found) -> None:
         """One more sweep: new iterates from those in the rooms, which `found` is called with at every node."""
 
+    def terms(self) -> list[str]:
+        """How large what the iterates are made of is, at the state where the step begins and with the last iterates."""
+        plan, over = self.nodes.plan, self.nodes.all
+        region = Region(self.nodes.one, plan.graph, self.here)
+        for input_, room in zip(plan.relation.unknowns, self.iterates, strict=True):
+            region.bind(input_, over.final(room))
+        self._bind_means(region)
+        region.require(plan.terms)
+        return [region.value(node) for node in plan.terms]
+
+    def _bind_means(self, region: Region) -> None:
+        """Means over the step, of which there are none."""
+
     @abstractmethod
     def increments(self, found: Found) -> list[str]:
         """What the step adds to the state by sums over the nodes; `found` is called with the iterates of a last sweep, if there
@@ -227,6 +240,13 @@ class Means(Sweep):
 
         self._rates(summed)
         return k.totals(rooms)
+
+    def _bind_means(self, region: Region) -> None:
+        """Slopes at one point in their place."""
+        r = self.plan.relation
+        region.require(r.slopes)
+        for mean, slope in zip(r.means, r.slopes, strict=True):
+            region.bind(mean, region.value(slope))
 
     def _rates(self, found: Callable[[str, list[str]], None]) -> None:
         """(ȧ, ḃ) at the nodes."""

@@ -75,6 +75,10 @@ class OverNodes(ABC):
         """What stands there at the last node, at every node."""
 
     @abstractmethod
+    def final(self, room: str) -> str:
+        """What stands there at the last node, a number."""
+
+    @abstractmethod
     def total(self, room: str) -> str:
         """The sum over the nodes, a number."""
 
@@ -89,6 +93,10 @@ class OverNodes(ABC):
     @abstractmethod
     def flag(self) -> str:
         """Memory for conditions at the nodes, which hold nowhere."""
+
+    @abstractmethod
+    def clear(self, flag: str) -> None:
+        """They hold nowhere again."""
 
     @abstractmethod
     def mark(self, flag: str, condition: str) -> None:
@@ -271,6 +279,9 @@ class InLanes(OverNodes):
     def last(self, room):
         return self._everywhere(self.load(room, ""), self.count - 1, self)
 
+    def final(self, room):
+        return self.emitter.extract(self.load(room, ""), self.count - 1)
+
     def total(self, room):
         value, width = self.load(room, ""), self.emitter.width
         while width > 1:
@@ -295,8 +306,11 @@ class InLanes(OverNodes):
 
     def flag(self):
         flag = self.body.alloca(self.emitter.bool)
-        self.body.store(self.emitter.bool, self.emitter.false, flag)
+        self.clear(flag)
         return flag
+
+    def clear(self, flag):
+        self.body.store(self.emitter.bool, self.emitter.false, flag)
 
     def mark(self, flag, condition):
         condition = self.emitter.either(self.body.load(self.emitter.bool, flag), condition)
@@ -401,6 +415,9 @@ class Apart(OverNodes):
     def last(self, room):
         return self.load(room, str(self.count - 1))
 
+    def final(self, room):
+        return self.last(room)
+
     def total(self, room):
         values, width = [self.load(room, str(i)) for i in range(self.count)], next(n for n in SHAPES if n >= self.count)
         while width > 1:
@@ -417,8 +434,11 @@ class Apart(OverNodes):
 
     def flag(self):
         flag = self.body.alloca(self.one.bool)
-        self.body.store(self.one.bool, self.one.false, flag)
+        self.clear(flag)
         return flag
+
+    def clear(self, flag):
+        self.body.store(self.one.bool, self.one.false, flag)
 
     def mark(self, flag, condition):
         self.body.store(self.one.bool, self.one.either(self.body.load(self.one.bool, flag), condition), flag)
