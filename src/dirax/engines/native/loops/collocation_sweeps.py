@@ -24,7 +24,7 @@ class Sweep(ABC):
     pair: Pair
 
     later = 0
-    """Sweeps that `increments` does besides."""
+    """Sweeps that `increments` does besides, and on which the iteration counts."""
 
     def __post_init__(self):
         n = len(self.nodes.plan.relation.first)
@@ -213,8 +213,6 @@ class SecondOrder(AtEveryNode):
 
 class Means(Sweep):
     """The iterates are the rates y at the nodes, of means over the step."""
-
-    later = 1
 
     @property
     def plan(self) -> MeanPlan:
