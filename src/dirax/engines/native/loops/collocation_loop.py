@@ -1,4 +1,4 @@
-"""The kernel of collocation steps as LLVM IR: of one trajectory, with the nodes of a step in lanes, or of trajectories in lanes."""
+"""The kernel of collocation steps as LLVM IR: one trajectory with the nodes of a step in lanes, or trajectories in lanes."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,6 @@ from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPla
 from dirax.engines.native.loops.collocation_sweeps import FirstOrder, Means, SecondOrder, Sweep
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
 from dirax.engines.stopping import EPSILON, STALLED
-
 
 FAR = 2.0**-20
 """Relative changes above which nothing more is asked of an iterate: it is not at its root."""
@@ -201,8 +200,8 @@ class _Kernel:
         return converged, b.load(one.real, self.change), b.load(one.real, self.sweeps)
 
     def _iterate(self, sweep: Sweep) -> None:
-        """Sweeps until what the next one would leave to change of every entry of an iterate is below its roundoff, or until changes
-        shrink no more; those `trying` that have come to a root then try no longer."""
+        """Sweeps until the next change of every entry of an iterate is below its roundoff, or changes shrink no more; those that
+        have come to a root then try no longer."""
         b, over, one = self.body, self.all, self.one
         count_here, active, shaky = b.alloca("i64"), b.alloca(one.bool), b.alloca(one.bool)
         b.store(one.bool, one.false, shaky)
@@ -222,7 +221,8 @@ class _Kernel:
         still = one.both(now, still)
         still = b.put(f"select i1 {allowed}, {one.bool} {still}, {one.bool} {one.false}")
         b.store(one.bool, still, active)
-        b.store(one.bool, b.put(f"select {one.bool} {now}, {one.bool} {over.marked(unstable)}, {one.bool} {b.load(one.bool, shaky)}"), shaky)
+        before = one.both(b.load(one.bool, shaky), one.invert(now))
+        b.store(one.bool, one.either(before, one.both(now, over.marked(unstable))), shaky)
         self.pair.swap()
         b.branch_if(one.any(still), head, out)
         b.label(out)

@@ -1,4 +1,4 @@
-"""What a kernel of collocation steps knows beforehand: the tableau times h over the nodes, and what depends on parameters alone."""
+"""What a kernel of collocation steps knows beforehand: the tableau times h, and what depends on the parameters alone."""
 
 from dirax.engines.native.ir.emitter import Body
 from dirax.engines.native.ir.lower import Region

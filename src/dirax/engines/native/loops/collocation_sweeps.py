@@ -71,12 +71,12 @@ class Sweep(ABC):
         region = Region(self.nodes.one, plan.graph, self.here)
         for input_, room in zip(plan.relation.unknowns, self.iterates, strict=True):
             region.bind(input_, over.final(room))
-        self._bind_means(region)
+        if isinstance(plan, MeanPlan):  # slopes at one point in the place of means
+            region.require(plan.relation.slopes)
+            for mean, slope in zip(plan.relation.means, plan.relation.slopes, strict=True):
+                region.bind(mean, region.value(slope))
         region.require(plan.terms)
         return [region.value(node) for node in plan.terms]
-
-    def _bind_means(self, region: Region) -> None:
-        """Means over the step, of which there are none."""
 
     @abstractmethod
     def increments(self, found: Found) -> list[str]:
@@ -190,10 +190,8 @@ class SecondOrder(AtEveryNode):
             total = None
             for i, node in sorted(row.items()):
                 rate, slope = region.value(plan.relation.rates[i]), region.value(node)
-                if total is None:
-                    total = rate if node == plan.graph.one else e.mul(slope, rate)
-                else:
-                    total = e.fma(slope, rate, total)
+                alone = rate if node == plan.graph.one else None
+                total = e.fma(slope, rate, total) if total is not None else alone or e.mul(slope, rate)
             found.append(e.const(0.0) if total is None else total)
         return found
 
@@ -238,13 +236,6 @@ class Means(Sweep):
 
         self._rates(summed)
         return k.totals(rooms)
-
-    def _bind_means(self, region: Region) -> None:
-        """Slopes at one point in their place."""
-        r = self.plan.relation
-        region.require(r.slopes)
-        for mean, slope in zip(r.means, r.slopes, strict=True):
-            region.bind(mean, region.value(slope))
 
     def _rates(self, found: Callable[[str, list[str]], None]) -> None:
         """(ȧ, ḃ) at the nodes."""
