@@ -21,6 +21,10 @@ from dirax.program.scalar_program import ScalarProgram
 from dirax.schemes.stage_relation import MeanRelation, StageRelation
 
 
+MOST_SIDE_BY_SIDE = 100
+"""Unknowns of a step up to which a batch has trajectories in lanes: the iterates of more do not stay near the processor."""
+
+
 class CollocationKernels:
     """The machine code of a collocation step: for one trajectory, and for several side by side."""
 
@@ -41,6 +45,11 @@ class CollocationKernels:
     def record(self) -> Record:
         """What is kept of a trajectory."""
         return self.plan.record
+
+    @property
+    def wide(self) -> bool:
+        """Whether a batch has trajectories in lanes."""
+        return self.plan.tableau.stages * len(self.plan.relation.first) <= MOST_SIDE_BY_SIDE
 
     @property
     def notes(self) -> dict[str, Any]:

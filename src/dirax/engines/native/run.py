@@ -36,7 +36,7 @@ class Ready:
         nodes = collocation_kernels(p.equation, p.params, p.batch_params)
         made = nodes or kernels(p.equation, p.params, p.batch_params, p.compensated)
         self.made = made
-        self.width = width_for(p.batch or 1)
+        self.width = width_for(p.batch or 1) if nodes is None or nodes.wide else 1
         self.kernel, cached = made.kernel(self.width)
         self.first_unknowns = made.record.unknowns(0, p.equation.stages[0][0].unknowns)
         self.notes = {
