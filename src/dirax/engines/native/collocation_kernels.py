@@ -20,7 +20,6 @@ from dirax.program.memo import Memo, Same
 from dirax.program.scalar_program import ScalarProgram
 from dirax.schemes.stage_relation import MeanRelation, StageRelation
 
-
 MOST_SIDE_BY_SIDE = 100
 """Unknowns of a step up to which a batch has trajectories in lanes: the iterates of more do not stay near the processor."""
 
