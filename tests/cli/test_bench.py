@@ -180,8 +180,9 @@ def test_missing_libraries_and_compositions_are_left_out(monkeypatch):
     composed = Subject("composed", oscillator, dx.Composition(scheme, "yoshida4"), data, 0.1, 20)
     first, second = bench([plain, composed], 1).rows
     assert first.skipped == {
-        "CasADi C": "casadi is not installed", **dict.fromkeys(("heyoka", "DOP853", "diffrax"), "scipy is not installed")
-    }  # fmt: skip
+        "CasADi C": "casadi is not installed",
+        **dict.fromkeys(("collocation", "heyoka", "DOP853", "diffrax"), "scipy is not installed"),
+    }
     assert set(first.seconds) == {"native", "native batch", "xla", "xla batch", "plain JAX", "plain JAX batch"}
     assert not second.seconds and set(second.skipped.values()) == {"the scheme is a composition"}
 
@@ -209,6 +210,7 @@ def test_the_command_measures_and_stores(tmp_path):
     programs = row["programs"]
     assert row["steps"] == 60
     assert programs["native"]["ratio"] == 1.0 and programs["DOP853"]["end_error"] <= programs["native"]["end_error"]
+    assert programs["collocation"]["end_error"] <= programs["native"]["end_error"] and programs["collocation"]["stages"] in (4, 8)
     assert set(programs) | set(row["left_out"]) == set(PROGRAMS)
     assert all(entry["median"] > 0 for entry in programs.values())
     assert picture.stat().st_size > 5000

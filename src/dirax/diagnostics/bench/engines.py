@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -14,9 +15,13 @@ from dirax.engines.engine import AbstractEngine
 from dirax.engines.native import Native
 from dirax.engines.xla import Xla
 from dirax.program.interpreter import UnsupportedPrimitive
+from dirax.schemes.collocation import Collocation
 
 BATCH, BATCH_STEPS = 1024, 50
 """Size of the batches and the steps that each of their trajectories takes."""
+
+STAGES, MOST_HALVINGS = (4, 8), 16
+"""Stages of collocation that are tried, each with 2, 4, 8, … steps."""
 
 TOLERANCE, MOST_UPDATES = 1e-14, 20
 
@@ -69,6 +74,40 @@ def _many(subject: Subject) -> tuple[Problem, float]:
     """A batch from points along the trajectory, and the share of its time that is that of one run of the subject."""
     rows = Native().run(subject.one.with_numbers(save_every=max(1, subject.steps // BATCH)))
     return subject.batch(rows, BATCH, BATCH_STEPS), subject.steps / (BATCH * BATCH_STEPS)
+
+
+def collocation(subject: Subject, reference: np.ndarray, wanted: float) -> Program:
+    """`dx.Collocation` on one trajectory, with the stages and the step that reach the wanted error at the end soonest."""
+    engine, found = Native(), []
+    for stages in STAGES:
+        try:
+            problem = replace(subject, scheme=Collocation(stages)).one
+        except (TypeError, ValueError) as error:
+            raise Skipped(f"it does not step this system: {str(error).split(':')[0]}") from None
+        for steps in (2**k for k in range(1, MOST_HALVINGS)):
+            last = replace(problem, h=subject.span / steps, steps=steps, save_every=steps)
+            outcome = engine.run(last)
+            ended = bool(np.all(np.asarray(outcome.completed) == steps))
+            if ended and end_error(np.asarray(outcome.fields[subject.shown][0, -1]), reference) <= wanted:
+                found.append((min(engine.run(last).run_seconds for _ in range(3)), stages, last))
+                break
+    if not found:
+        raise Skipped(f"does not reach the error {wanted:.1e}")
+    _, stages, chosen = min(found, key=lambda one: one[0])
+    last_run: dict[str, Outcome] = {}
+
+    def run() -> float:
+        last_run["outcome"] = engine.run(chosen)
+        return last_run["outcome"].run_seconds
+
+    run()
+    settings = {"stages": stages, "steps": chosen.steps}
+    return Program(run, lambda: np.asarray(last_run["outcome"].fields[subject.shown][0, -1]), settings)
+
+
+def end_error(end: np.ndarray, reference: np.ndarray) -> float:
+    """Largest difference, relative to the largest entry of the reference where that is above 1."""
+    return float(np.max(np.abs(end - reference)) / max(1.0, float(np.max(np.abs(reference)))))
 
 
 def run_once(run: Callable[[], float]) -> None:

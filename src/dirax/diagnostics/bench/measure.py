@@ -35,7 +35,8 @@ SAME_ERROR: dict[str, Callable[[ExplicitODE, float, np.ndarray, float], Program]
 }
 """Programs that take steps of their own, at the end error of the scheme."""
 
-PROGRAMS = (*SAME_STEPS, *SAME_ERROR)
+COLLOCATION = "collocation"
+PROGRAMS = (*SAME_STEPS, COLLOCATION, *SAME_ERROR)
 LONGEST_RUN = 0.5
 """Seconds of a run from which on it is timed once and not repeated."""
 
@@ -154,7 +155,7 @@ class Bench:
     def plot(self) -> Any:
         """A dot for every program and system on a logarithmic axis; returns the matplotlib figure."""
         figure, ax = new_figure(size=(9, 1.8 + 0.34 * len(self.rows)))
-        markers = dict(zip(PROGRAMS, ("|", "s", "o", "D", "^", "<", "P", "X", "v", "*"), strict=True))
+        markers = dict(zip(PROGRAMS, ("|", "s", "o", "D", "^", "<", "P", "h", "X", "v", "*"), strict=True))
         for program in PROGRAMS:
             points = [(r, i) for i, row in enumerate(self.rows) if (r := row.ratio(program)) is not None]
             if points and program != NATIVE:
@@ -220,12 +221,13 @@ def measure(subject: Subject, repeats: int, say: Callable[[str], Any]) -> Row:
     if NATIVE not in programs:
         return Row(row.name, row.scheme, row.step, row.steps, skipped=row.skipped)
     reference = None
-    with leaving_out(row, *SAME_ERROR):
+    with leaving_out(row, COLLOCATION, *SAME_ERROR):
         ode = explicit_ode(subject.system, subject.arrays, subject.leaves)
         reference = ode_solvers.reference_end(ode, subject.span)
         end = programs[NATIVE].end()
         assert end is not None
-        wanted = max(ROUNDOFF, ode_solvers.end_error(end, reference))
+        wanted = max(ROUNDOFF, engines.end_error(end, reference))
+        add(COLLOCATION, lambda: engines.collocation(subject, reference, wanted))
         for name, make in SAME_ERROR.items():
             add(name, lambda make=make: make(ode, subject.span, reference, wanted))
     say("timing")
@@ -235,5 +237,5 @@ def measure(subject: Subject, repeats: int, say: Callable[[str], Any]) -> Row:
     row.settings = {name: dict(program.settings) for name, program in programs.items()}
     ends = {name: end for name, program in programs.items() if (end := program.end()) is not None}
     if reference is not None:
-        row.error = {name: ode_solvers.end_error(end, reference) for name, end in ends.items()}
+        row.error = {name: engines.end_error(end, reference) for name, end in ends.items()}
     return row

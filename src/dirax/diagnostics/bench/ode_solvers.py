@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.diagnostics.bench.engines import end_error
 from dirax.diagnostics.bench.ode import ExplicitODE
 from dirax.diagnostics.bench.subject import Program, Skipped, library
 from dirax.engines.native.ir.compiled_function import loaded
@@ -28,11 +29,6 @@ MOST_SECONDS = 15.0
 
 MOST_STEPS = 20_000
 """Steps after which a method is given up: at a loose tolerance a trajectory may run off to infinity."""
-
-
-def end_error(end: np.ndarray, reference: np.ndarray) -> float:
-    """Largest difference, relative to the largest entry of the reference where that is above 1."""
-    return float(np.max(np.abs(end - reference)) / max(1.0, float(np.max(np.abs(reference)))))
 
 
 def reference_end(ode: ExplicitODE, span: float) -> np.ndarray:

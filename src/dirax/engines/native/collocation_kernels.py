@@ -20,9 +20,12 @@ from dirax.program.memo import Memo, Same
 from dirax.program.scalar_program import ScalarProgram
 from dirax.schemes.stage_relation import MeanRelation, StageRelation
 
+MOST_SIDE_BY_SIDE = 100
+"""Unknowns of a step up to which a batch has trajectories in lanes: the iterates of more do not stay near the processor."""
+
 
 class CollocationKernels:
-    """The machine code of a collocation step, for one trajectory at a time."""
+    """The machine code of a collocation step: for one trajectory, and for several side by side."""
 
     def __init__(self, step: StepProgram, plan: CollocationPlan | MeanPlan):
         self.step, self.plan = step, plan
@@ -35,12 +38,17 @@ class CollocationKernels:
         self.saved: Any = None
         """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
         self.places: Any = None
-        self._run: Any = None
+        self._runs: dict[int, Any] = {}
 
     @functools.cached_property
     def record(self) -> Record:
         """What is kept of a trajectory."""
         return self.plan.record
+
+    @property
+    def wide(self) -> bool:
+        """Whether a batch has trajectories in lanes."""
+        return self.plan.tableau.stages * len(self.plan.relation.first) <= MOST_SIDE_BY_SIDE
 
     @property
     def notes(self) -> dict[str, Any]:
@@ -54,15 +62,12 @@ class CollocationKernels:
 
     def kernel(self, width: int) -> tuple[Any, bool]:
         """The compiled `run`, and whether it came from a cache."""
-        if self._run is not None:
-            return self._run, True
-        text = lambda: collocation_module(self.plan, llvm.has_fma())
+        if width in self._runs:
+            return self._runs[width], True
+        text = lambda: collocation_module(self.plan, width, llvm.has_fma())
         library, _, cached = linked("run", (self.digest, width, "collocation"), text, lambda: self.operations)
-        self._run = llvm.function(library, "run", SIGNATURE)
-        return self._run, cached
-
-    def of_sizes(self, width: int) -> None:
-        """No kernel: sizes are found by NumPy."""
+        self._runs[width] = llvm.function(library, "run", SIGNATURE)
+        return self._runs[width], cached
 
 
 _kernels: Memo[CollocationKernels | None] = Memo(KEPT)

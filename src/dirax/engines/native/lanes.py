@@ -109,17 +109,6 @@ class Lanes:
         """Whether there is a trajectory for which Newton's method has not converged."""
         return bool((self.records[:, self.record.status] == NOT_CONVERGED).any())
 
-    def left(self) -> list[int]:
-        """The trajectories that have not converged; of blocks of one lane."""
-        return np.flatnonzero(self.records[:, self.record.status, 0] == NOT_CONVERGED).tolist()
-
-    def again(self, kernel, lane: int) -> None:
-        """Go on with a trajectory, in a block of its own, by another kernel."""
-        p, record, one = self.problem, self.record, self.records[lane : lane + 1]
-        one[:, record.status] = OK
-        one[:, record.differences] = 0.0
-        self.call(kernel, one, self.outs[lane : lane + 1], int(one[0, record.completed, 0]), p.steps, p.save_every, 1, lane)
-
     def close(self, kernel) -> dict[str, np.ndarray]:
         """The rows of the last states."""
         closing, outs = self.arrays(2)

@@ -88,16 +88,6 @@ class OneLane:
         """Whether Newton's method has not converged."""
         return bool(self.memory[self.record.status] == NOT_CONVERGED)
 
-    def left(self) -> list[int]:
-        """The trajectories that have not converged."""
-        return [0] if self.stuck else []
-
-    def again(self, kernel, lane: int) -> None:
-        """Go on with a trajectory by another kernel."""
-        memory, record = self.memory, self.record
-        memory[record.status], memory[record.differences] = OK, 0.0
-        self.advance(kernel, int(memory[record.completed]), self.problem.steps)
-
     def attempt(self, numbers: np.ndarray, made: Kernels | CollocationKernels, table: np.ndarray) -> np.ndarray:
         """The record after going on from one, which is not kept."""
         kept, self.memory[: self.places.record] = self.memory[: self.places.record].copy(), table[0]

@@ -4,8 +4,8 @@ import time
 
 import numpy as np
 
-from dirax.engines.contract import Outcome, Problem, Progress, finished
-from dirax.engines.native.collocation_kernels import collocation_kernels
+from dirax.engines.contract import NOT_CONVERGED, Outcome, Problem, Progress, finished
+from dirax.engines.native.collocation_kernels import CollocationKernels, collocation_kernels
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
 from dirax.engines.native.one_lane import OneLane, places_of
@@ -35,8 +35,8 @@ class Ready:
         started = time.perf_counter()
         nodes = collocation_kernels(p.equation, p.params, p.batch_params)
         made = nodes or kernels(p.equation, p.params, p.batch_params, p.compensated)
-        self.made, self.is_collocation = made, nodes is not None
-        self.width = 1 if self.is_collocation else width_for(p.batch or 1)
+        self.made = made
+        self.width = width_for(p.batch or 1) if nodes is None or nodes.wide else 1
         self.kernel, cached = made.kernel(self.width)
         self.first_unknowns = made.record.unknowns(0, p.equation.stages[0][0].unknowns)
         self.notes = {
@@ -54,7 +54,7 @@ class Ready:
         places = places_of(p, self.made)
         lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
         fields = lanes.fields
-        if p.record is None:
+        if p.record is None and isinstance(self.made, Kernels):  # a fixed point finds its own
             find_sizes(lanes, self.made.of_sizes(self.width) if self.notes["kernel_cached"] else None)
         compile_seconds, cached, started = self.compile_seconds, self.notes["kernel_cached"], time.perf_counter()
         done, interrupted, threads = p.after, False, 1
@@ -72,9 +72,12 @@ class Ready:
                     progress(done, p.steps)
         except KeyboardInterrupt:
             interrupted = True
-        by_newton = _by_newton(lanes) if self.is_collocation and not interrupted else None
-        if not interrupted and (by_newton or not self.is_collocation):
-            with_present_sizes(lanes, by_newton or self.made)
+        by_newton = None
+        if not interrupted and lanes.stuck:
+            if isinstance(self.made, CollocationKernels):
+                by_newton = _by_newton(lanes)
+            else:
+                with_present_sizes(lanes, self.made)
         run_seconds = time.perf_counter() - started
         closing = lanes.close(self.kernel)
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
@@ -103,14 +106,19 @@ class Ready:
 def _by_newton(lanes: Lanes | OneLane) -> Kernels | None:
     """Go on with trajectories whose fixed-point iteration has not converged, by Newton's method for all nodes together, with
     these kernels; None where there are no such trajectories."""
-    left, p = lanes.left(), lanes.problem
-    if not left:
+    p, record, table = lanes.problem, lanes.record, lanes.table()
+    left = np.flatnonzero(table[:, record.status] == NOT_CONVERGED)
+    if not len(left):
         return None
     try:
         made = kernels(p.equation, p.params, p.batch_params, True)
-        newton, _ = made.kernel(1)
+        made.kernel(1)
     except UnsupportedPrimitive:  # too large to be written out: they end where they are
         return None
-    for lane in left:
-        lanes.again(newton, lane)
+    own = table[left]
+    own[:, record.differences] = 0.0
+    for i, (stage, _) in enumerate(p.equation.stages):
+        own[:, record.sizes(i, stage.unknowns)] = 0.0
+    lanes.put(left, own)
+    with_present_sizes(lanes, made)
     return made

@@ -28,6 +28,17 @@ class Region:
     def bind(self, node: int, value: str) -> None:
         self._values[node] = value
 
+    @property
+    def values(self) -> dict[int, str]:
+        """What was bound or emitted in this region itself."""
+        return self._values
+
+    def operands_of(self, outputs: Iterable[int]) -> list[int]:
+        """The nodes of this region itself from which the outputs follow, with the inputs that are not known yet."""
+        outputs = list(outputs)
+        asked = {a for node in self._missing(outputs) for a in self.graph.args[node]}
+        return sorted(node for node in asked.union(outputs) if node in self._values)
+
     def known(self, node: int) -> str | None:
         """The value of a node, if this region or one around it has it."""
         region: Region | None = self

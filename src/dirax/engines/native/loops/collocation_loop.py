@@ -1,4 +1,4 @@
-"""The kernel of collocation steps of one trajectory: every node of a step in a lane of its own, as LLVM IR."""
+"""The kernel of collocation steps as LLVM IR: one trajectory with the nodes of a step in lanes, or trajectories in lanes."""
 
 from collections.abc import Callable
 
@@ -12,52 +12,56 @@ from dirax.engines.native.loops.collocation_sweeps import FirstOrder, Means, Sec
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
 from dirax.engines.stopping import EPSILON, STALLED
 
+FAR = 2.0**-20
+"""Relative changes above which nothing more is asked of an iterate: it is not at its root."""
 
-def collocation_module(plan: CollocationPlan | MeanPlan, fma: bool) -> str:
-    """IR of `run(lanes, params, outs, blocks, …)`: one trajectory a block."""
+
+def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma: bool) -> str:
+    """IR of `run(lanes, params, outs, blocks, …)`: so many trajectories a block."""
     module = Module(fma)
     add_far_reduction(module)
-    _Kernel(plan, module).define()
-    define_run(module, [8 * count for count in (plan.record.size, len(plan.shared.params), len(plan.rows))])
+    _Kernel(plan, module, trajectories).define()
+    counts = plan.record.size, len(plan.shared.params), len(plan.rows)
+    define_run(module, [8 * count * trajectories for count in counts])
     return module.text()
 
 
 class _Kernel:
-    """Emits `block`: the steps of one trajectory."""
+    """Emits `block`: the steps of a block of trajectories."""
 
-    def __init__(self, plan: CollocationPlan | MeanPlan, module: Module):
+    def __init__(self, plan: CollocationPlan | MeanPlan, module: Module, trajectories: int):
         self.plan, self.body = plan, Body(module)
-        self.nodes = Nodes(plan, self.body)
+        self.nodes = Nodes(plan, self.body, trajectories)
         self.one, self.all = self.nodes.one, self.nodes.all
 
     def define(self) -> None:
-        b, plan, record = self.body, self.plan, self.plan.record
-        places = [b.at("double", "%lanes", i) for i in range(record.size)]
-        self.state = [b.alloca("double") for _ in range(record.state_size)]
-        self.lost = [b.alloca("double") for _ in range(record.state_size)]
-        self.iterates = [b.alloca(self.all.real) for _ in plan.relation.first]
-        numbers = [b.alloca("double") for _ in range(4)]
-        self.completed, self.status, self.iterations, self.worst = numbers
+        b, plan, record, one = self.body, self.plan, self.plan.record, self.one
+        places = [b.at(one.real, "%lanes", i) for i in range(record.size)]
+        room = lambda: b.alloca(one.real)
+        self.state = [room() for _ in range(record.state_size)]
+        self.lost = [room() for _ in range(record.state_size)]
+        n = len(plan.relation.first)
+        self.pair, self.before, self.moved = self.all.pair(n), self.all.rooms(n), self.all.rooms(n)
+        self.completed, self.status, self.iterations, self.worst = numbers = [room() for _ in range(4)]
         first_lost = record.size - 4 - record.lost
         scalars = [*self.state, *self.lost, *numbers]
         spots = [*places[: record.state_size], *places[first_lost:]]
         for value, place in zip(scalars, spots, strict=True):
-            b.store("double", b.load("double", place), value)
+            b.store(one.real, b.load(one.real, place), value)
         first = record.state_size if plan.gain is None else record.state_size + record.kept
-        before = places[first : first + record.kept]
-        self._read_iterates(before)
-        self.sizes = self._sizes(places)
+        kept = [places[first + j : first + record.kept : n] for j in range(n)]
+        for iterate, of_nodes in zip(self.pair.now(), kept, strict=True):
+            self.all.read(of_nodes, iterate)
+        self._take_sizes(places)
 
         def give_back() -> None:
             for value, place in zip(scalars, spots, strict=True):
-                b.store("double", b.load("double", value), place)
-            n = len(self.iterates)
-            for j, iterate in enumerate(self.iterates):
-                vector = b.load(self.all.real, iterate)
-                for i in range(self.nodes.stages):
-                    b.store("double", self.all.extract(vector, i), before[i * n + j])
+                b.store(one.real, b.load(one.real, value), place)
+            for iterate, of_nodes in zip(self.pair.now(), kept, strict=True):
+                self.all.write(iterate, of_nodes)
             if plan.gain is not None:
                 self._give_rates(places[record.state_size : record.state_size + record.kept])
+            self._give_sizes()
             b.line("ret void")
 
         self._steps(give_back)
@@ -65,33 +69,37 @@ class _Kernel:
         pointers = "ptr noalias %lanes, ptr noalias %params, ptr noalias %outs"
         b.module.define(f"define internal void @block({pointers}, {NUMBERS}) noinline", b)
 
-    def _sizes(self, places: list[str]) -> list[str]:
+    def _take_sizes(self, places: list[str]) -> None:
         """How large iterates are, those of all nodes of a kind alike: as the unknowns, rates; accelerations as rates by h."""
-        b, one, found = self.body, self.one, []
-        first = self.plan.record.sizes(0, len(self.iterates)).start
-        for place in places[first : first + len(self.iterates)]:
-            size = b.load("double", place)
-            found.append(self.all.splat(size if self.plan.gain is None else one.div(size, one.abs("%h"))))
-        return found
+        b, one, n = self.body, self.one, self.pair.count
+        first = self.plan.record.sizes(0, n).start
+        self.of_sizes, self.sizes = places[first : first + n], [b.alloca(one.real) for _ in range(n)]
+        self.scale = None if self.plan.gain is None else one.abs(self.nodes.h)
+        for place, size in zip(self.of_sizes, self.sizes, strict=True):
+            value = b.load(one.real, place)
+            b.store(one.real, one.div(value, self.scale) if self.scale else value, size)
 
-    def _read_iterates(self, places: list[str]) -> None:
-        b, n = self.body, len(self.iterates)
-        for j, iterate in enumerate(self.iterates):
-            numbers = [b.load("double", places[i * n + j]) for i in range(self.nodes.stages)]
-            numbers += [numbers[0]] * (self.nodes.lanes - self.nodes.stages)
-            b.store(self.all.real, self.all.pack(numbers), iterate)
+    def _give_sizes(self) -> None:
+        b, one = self.body, self.one
+        for place, size in zip(self.of_sizes, self.sizes, strict=True):
+            value = b.load(one.real, size)
+            b.store(one.real, one.mul(value, self.scale) if self.scale else value, place)
 
     def _give_rates(self, places: list[str]) -> None:
         """The rates where the steps end, for every node: where Newton's method begins if it has to go on."""
-        plan = self.plan
+        plan, one = self.plan, self.one
         assert isinstance(plan, CollocationPlan)
-        region = Region(self.one, plan.graph, self.nodes.scalar)
+        region = Region(one, plan.graph, self.nodes.scalar)
         for node, pointer in zip([*plan.relation.first, *plan.relation.second], self.state, strict=True):
-            region.bind(node, self.body.load("double", pointer))
+            region.bind(node, self.body.load(one.real, pointer))
         region.require(plan.solved)
         rates = [region.value(node) for node in plan.solved]
         for i, place in enumerate(places):
-            self.body.store("double", rates[i % len(rates)], place)
+            self.body.store(one.real, rates[i % len(rates)], place)
+
+    def _running(self) -> str:
+        """Whether nothing has failed so far."""
+        return self.one.compare("oeq", self.body.load(self.one.real, self.status), self.one.const(float(OK)))
 
     def _steps(self, give_back: Callable[[], None]) -> None:
         b = self.body
@@ -104,18 +112,16 @@ class _Kernel:
             full = b.put(f"icmp eq i64 {now}, %every")
             b.store("i64", b.put(f"select i1 {full}, i64 0, i64 {now}"), since)
             going, leave = b.fresh(), b.fresh()
-            running = self.one.compare("oeq", b.load("double", self.status), self.one.const(float(OK)))
-            b.branch_if(running, going, leave)
+            b.branch_if(self.one.any(self._running()), going, leave)
             b.label(leave)
             give_back()
             b.label(going)
 
     def _step(self, number: str, saves: str) -> None:
-        b, one, plan, r = self.body, self.one, self.plan, self.plan.relation
-        done = b.load("double", self.completed)
-        count = one.add(b.put("sitofp i64 %offset to double"), done)
-        time = one.add("%t0", one.mul(count, "%h"))
-        state = [b.load("double", pointer) for pointer in self.state]
+        b, one, plan, r, over = self.body, self.one, self.plan, self.plan.relation, self.all
+        done, running = b.load(one.real, self.completed), self._running()
+        time = one.add(one.splat("%t0"), one.mul(one.add(one.splat(b.put("sitofp i64 %offset to double")), done), self.nodes.h))
+        state = [b.load(one.real, pointer) for pointer in self.state]
         here = Region(one, plan.graph, self.nodes.scalar)
         here.bind(plan.shared.t, time)
         for node, value in zip([*r.first, *r.second], state, strict=True):
@@ -123,95 +129,178 @@ class _Kernel:
         with b.when(saves):
             self._save(here, number)
         kind = Means if isinstance(plan, MeanPlan) else FirstOrder if plan.gain is None else SecondOrder
-        sweep = kind(self.nodes, here, state, time)
-        converged, size, count = self._attempts(sweep, one.compare("ogt", done, one.const(0.0)))
-        iterates = [b.load(self.all.real, pointer, 64) for pointer in self.iterates]
-        increments = sweep.increments(iterates)
+        sweep = kind(self.nodes, here, state, time, self.pair)
+        iterates = self.pair.now()
+        with over.at() as node:
+            over.filled(self.before, [over.load(room, node) for room in iterates], node)
+        converged, change, count = self._attempts(sweep, one.compare("ogt", done, one.const(0.0)), running)
+        increments, change = self._increments(sweep, change)
         new, lost = [], []
         finite = one.true
         for old, pointer, increment in zip(state, self.lost, increments, strict=True):
-            total, error = one.two_sum(old, one.add(increment, b.load("double", pointer)))
+            total, error = one.two_sum(old, one.add(increment, b.load(one.real, pointer)))
             new.append(total)
             lost.append(error)
-        for i, more in enumerate(sweep.settled(iterates, new)):
+        for i, more in enumerate(sweep.settled(self.pair.others(), new)):
             new[i], error = one.two_sum(new[i], more)
             lost[i] = one.add(lost[i], error)
         for total in new:
             finite = one.both(finite, one.compare("olt", one.abs(total), one.const(float("inf"))))
-        good = one.both(finite, converged)
-        failure = one.select(finite, one.const(float(NOT_CONVERGED)), one.const(float(NOT_FINITE)))
-        b.store("double", one.select(good, one.const(float(OK)), failure), self.status)
-        b.store("double", one.add(b.load("double", self.iterations), count), self.iterations)
-        with b.when(good):
-            for value, pointer in zip([*new, *lost], [*self.state, *self.lost], strict=True):
-                b.store("double", value, pointer)
-            b.store("double", one.add(done, one.const(1.0)), self.completed)
-            b.store("double", one.max(size, b.load("double", self.worst)), self.worst)
+        good = one.both(running, one.both(finite, converged))
+        failure = one.select(converged, one.const(float(NOT_FINITE)), one.const(float(NOT_CONVERGED)))
+        keep = lambda new, pointer: b.store(one.real, one.select(good, new, b.load(one.real, pointer)), pointer)
+        for value, pointer in zip([*new, *lost], [*self.state, *self.lost], strict=True):
+            keep(value, pointer)
+        self.pair.swap()
+        iterates = self.pair.now()
+        with over.at() as node:
+            found = zip(iterates, self.before, strict=True)
+            over.filled(iterates, [over.chosen(good, over.load(a, node), over.load(b, node)) for a, b in found], node)
+        keep(one.add(done, one.const(1.0)), self.completed)
+        keep(one.max(change, b.load(one.real, self.worst)), self.worst)
+        outcome = one.select(good, one.const(float(OK)), failure)
+        b.store(one.real, one.select(running, outcome, b.load(one.real, self.status)), self.status)
+        more = one.select(running, one.add(count, one.const(float(sweep.later))), one.const(0.0))
+        b.store(one.real, one.add(b.load(one.real, self.iterations), more), self.iterations)
 
-    def _attempts(self, sweep: Sweep, later: str) -> tuple[str, str, str]:
-        """The iteration from the polynomial of the step before, where that fails from constants: (converged, the largest last
-        change, sweeps)."""
-        b, e = self.body, self.all
-        before = [b.load(e.real, pointer, 64) for pointer in self.iterates]
-        converged, change, sweeps = b.alloca("i1"), b.alloca(e.real), b.alloca("i64")
-        b.store("i1", "false", converged, 1)
-        b.store("i64", "0", sweeps)
-        with b.loop(0, 2) as attempt, b.when(b.put(f"xor i1 {b.load('i1', converged, 1)}, true")):
+    def _increments(self, sweep: Sweep, change: str) -> tuple[list[str], str]:
+        """What is added to the state, and the largest last change; the iterates after all sweeps are in the other rooms then."""
+        over, peak, iterates, others = self.all, self.all.peak(), self.pair.now(), self.pair.others()
+        if not sweep.later:
+            with over.at() as node:
+                over.filled(others, [over.load(room, node) for room in iterates], node)
+
+        def last(node: str, new: list[str], stable: str) -> None:
+            for value, room, fresh in zip(new, iterates, others, strict=True):
+                over.raised(peak, over.emitter.abs(over.emitter.sub(value, over.load(room, node))))
+                over.store(value, fresh, node)
+
+        increments = sweep.increments(last)
+        return increments, over.highest(peak) if sweep.later else change
+
+    def _attempts(self, sweep: Sweep, later: str, running: str) -> tuple[str, str, str]:
+        """The iteration from the polynomial of the step before, where that fails from constants: (converged, the last change,
+        sweeps) of those that are running."""
+        b, over, one = self.body, self.all, self.one
+        self.trying, self.change, self.sweeps = b.alloca(one.bool), b.alloca(one.real), b.alloca(one.real)
+        b.store(one.bool, running, self.trying)
+        b.store(one.real, one.const(0.0), self.sweeps)
+        b.store(one.real, one.const(0.0), self.change)
+        with b.loop(0, 2) as attempt, b.when(one.any(b.load(one.bool, self.trying))):
             first = b.put(f"icmp eq i64 {attempt}, 0")
-            for pointer, value in zip(self.iterates, sweep.guess(before, later, first), strict=True):
-                b.store(e.real, value, pointer, 64)
-            b.store("i1", self._iterate(sweep, change, sweeps), converged, 1)
-        last, largest = b.load(e.real, change, 64), self.one.const(0.0)
-        for lane in range(self.nodes.stages):
-            largest = self.one.max(e.extract(last, lane), largest)
-        count = b.put(f"sitofp i64 {b.load('i64', sweeps)} to double")
-        return b.load("i1", converged, 1), largest, count
+            trying = b.load(one.bool, self.trying)
+            iterates = self.pair.now()
+            with b.when(first), over.at() as node:
+                over.filled(iterates, sweep.guess(self.before, later, True, node), node)
+            with b.when(b.put(f"xor i1 {first}, true")), over.at() as node:
+                guess = zip(sweep.guess(self.before, later, False, node), iterates, strict=True)
+                over.filled(iterates, [over.chosen(trying, a, over.load(room, node)) for a, room in guess], node)
+            self._iterate(sweep)
+        converged = one.both(running, one.invert(b.load(one.bool, self.trying)))
+        return converged, b.load(one.real, self.change), b.load(one.real, self.sweeps)
 
-    def _iterate(self, sweep: Sweep, change: str, sweeps: str) -> str:
-        """Sweeps until the next change of every entry of an iterate is below its roundoff, or no smaller than a change before;
-        whether that is a root."""
-        b, e = self.body, self.all
-        least, count_here = [b.alloca(e.real) for _ in self.iterates], b.alloca("i64")
-        for pointer in least:
-            b.store(e.real, e.const(float("inf")), pointer, 64)
+    def _iterate(self, sweep: Sweep) -> None:
+        """Sweeps until the next change of every entry of an iterate is below its roundoff, or changes shrink no more; those that
+        have come to a root then try no longer."""
+        b, over, one = self.body, self.all, self.one
+        count_here, active, shaky = b.alloca("i64"), b.alloca(one.bool), b.alloca(one.bool)
+        b.store(one.bool, one.false, shaky)
         b.store("i64", "0", count_here)
+        b.store(one.bool, b.load(one.bool, self.trying), active)
         head, out = b.fresh(), b.fresh()
         b.branch(head)
         b.label(head)
-        old = [b.load(e.real, pointer, 64) for pointer in self.iterates]
-        new, stable = sweep.sweep(old)
-        going, worst, missed = e.false, e.const(0.0), e.const(0.0)
-        for pointer, before, a, least_of, unit in zip(self.iterates, old, new, least, self.sizes, strict=True):
-            b.store(e.real, a, pointer, 64)
-            moved, size, smallest = e.abs(e.sub(a, before)), e.abs(a), b.load(e.real, least_of, 64)
-            shrinks = e.both(e.compare("olt", moved, smallest), e.compare("ogt", moved, e.mul(size, e.const(EPSILON))))
-            # the next change will be moved²/smallest; before the second, nothing is known
-            known = e.compare("olt", smallest, e.const(float("inf")))
-            floor = e.mul(e.mul(size, e.const(EPSILON / 2.0)), smallest)
-            enough = e.both(known, e.compare("olt", e.mul(moved, moved), floor))
-            going = e.either(going, e.both(shrinks, e.invert(enough)))
-            b.store(e.real, e.select(e.compare("olt", moved, smallest), moved, smallest), least_of, 64)
-            worst = e.max(moved, worst)
-            missed = e.max(e.sub(moved, e.mul(e.add(size, unit), e.const(STALLED))), missed)
-        b.store(e.real, worst, change, 64)
-        b.store("i64", b.put(f"add i64 {b.load('i64', sweeps)}, 1"), sweeps)
+        now, going, unstable = b.load(one.bool, active), over.flag(), over.flag()
+        rooms = self.pair.now(), self.pair.others()
+        sweep.sweep(lambda node, new, stable: self._compared(sweep, node, new, stable, now, going, unstable, *rooms))
+        b.store(one.real, one.add(b.load(one.real, self.sweeps), one.select(now, one.const(1.0), one.const(0.0))), self.sweeps)
         count = b.put(f"add i64 {b.load('i64', count_here)}, 1")
         b.store("i64", count, count_here)
         allowed = b.put(f"icmp slt i64 {count}, %cap")
-        b.branch_if(b.put(f"and i1 {e.any(going)}, {allowed}"), head, out)
+        still = b.put(f"select i1 {b.put(f'icmp eq i64 {count}, 1')}, {one.bool} {one.true}, {one.bool} {over.marked(going)}")
+        still = one.both(now, still)
+        still = b.put(f"select i1 {allowed}, {one.bool} {still}, {one.bool} {one.false}")
+        b.store(one.bool, still, active)
+        before = one.both(b.load(one.bool, shaky), one.invert(now))
+        b.store(one.bool, one.either(before, one.both(now, over.marked(unstable))), shaky)
+        self.pair.swap()
+        b.branch_if(one.any(still), head, out)
         b.label(out)
-        return e.all(e.both(e.compare("ole", missed, e.const(0.0)), stable))
+        self._judge(sweep, b.load(one.bool, shaky))
+
+    def _compared(
+        self, sweep: Sweep, node: str, new: list[str], stable: str, now: str, going: str, unstable: str, rooms: list, others: list
+    ) -> None:
+        """The new iterates at a node, of trajectories that go on `now`, into the other rooms; and whether they have to go on."""
+        over, e = self.all, self.all.emitter
+        found, far = [], e.false
+        for a, room, other in zip(new, rooms, others, strict=True):
+            before = over.load(room, node)
+            over.store(a if self.one.width == 1 else over.chosen(now, a, before), other, node)
+            moved, size = e.abs(e.sub(a, before)), e.abs(a)
+            found.append((moved, size))
+            far = e.either(far, e.compare("ogt", moved, e.mul(size, e.const(FAR))))
+        over.mark(going, far)
+        with over.seldom(e.invert(far)):
+            further = e.false
+            for (moved, size), room in zip(found, self.moved, strict=True):
+                last, floor = over.load(room, node), e.mul(size, e.const(EPSILON))
+                shrinks = e.both(e.compare("olt", moved, last), e.compare("ogt", moved, floor))
+                # the next change will be moved²/last, and so on
+                left = e.mul(moved, moved)
+                floor = e.mul(floor, last)
+                for _ in range(sweep.later):
+                    left, floor = e.mul(left, moved), e.mul(floor, last)
+                further = e.either(further, e.both(shrinks, e.compare("uge", left, floor)))
+            over.mark(going, further)
+        alone = self.one.width == 1
+        for (moved, _), room in zip(found, self.moved, strict=True):
+            over.store(moved if alone else over.chosen(now, moved, over.load(room, node)), room, node)
+        if stable != e.true:
+            over.mark(unstable, e.invert(stable))
+
+    def _judge(self, sweep: Sweep, shaky: str) -> None:
+        """Those that tried and whose last changes are small are at a root, and try no longer. An iterate that is nothing but
+        roundoff is measured by what it is made of."""
+        b, over, one = self.body, self.all, self.one
+        missed, trying = over.flag(), b.load(one.bool, self.trying)
+        self._compare(missed)
+        far = one.both(trying, over.marked(missed))
+        with b.when(one.any(far)):
+            for size, value in zip(self.sizes, sweep.terms(), strict=True):
+                known = b.load(one.real, size)
+                b.store(one.real, one.select(far, one.max(value, known), known), size)
+            over.clear(missed)
+            self._compare(missed)
+        if not sweep.later:
+            peak = over.peak()
+            with over.at() as node:
+                for room in self.moved:
+                    over.raised(peak, over.load(room, node))
+            b.store(one.real, one.select(trying, over.highest(peak), b.load(one.real, self.change)), self.change)
+        b.store(one.bool, one.both(trying, one.either(over.marked(missed), shaky)), self.trying)
+
+    def _compare(self, missed: str) -> None:
+        """Mark where a last change is not small."""
+        over, e, one = self.all, self.all.emitter, self.one
+        sizes, iterates = [self.body.load(one.real, size) for size in self.sizes], self.pair.now()
+        with over.at() as node:
+            off = e.false
+            for iterate, room, size in zip(iterates, self.moved, sizes, strict=True):
+                most = e.mul(e.add(e.abs(over.load(iterate, node)), over.splat(size)), e.const(STALLED))
+                off = e.either(off, e.compare("ugt", over.load(room, node), most))
+            over.mark(missed, off)
 
     def _save(self, here: Region, number: str) -> None:
         b, e, plan = self.body, self.one, self.plan
-        row, inside = b.put(f"sdiv i64 {number}, %every"), Region(self.one, plan.graph, here)
+        row, inside = b.put(f"sdiv i64 {number}, %every"), Region(e, plan.graph, here)
         inside.require([node for _, nodes in plan.rows for node in nodes])
         for f, (_, nodes) in enumerate(plan.rows):
-            if nodes:
-                bytes_ = b.put(f"mul i64 {row}, {8 * len(nodes)}")
-                target = b.at("i8", b.load("ptr", b.at("ptr", "%outs", f)), bytes_)
+            bytes_ = b.put(f"mul i64 {row}, {8 * len(nodes)}")
+            for lane in range(e.width if nodes else 0):
+                target = b.at("i8", b.load("ptr", b.at("ptr", "%outs", f * e.width + lane)), bytes_)
                 for j, node in enumerate(nodes):
                     value = inside.value(node)
                     if plan.graph.is_boolean(node):
                         value = e.select(value, e.const(1.0), e.const(0.0))
-                    b.store("double", value, b.at("double", target, j))
+                    b.store("double", e.extract(value, lane), b.at("double", target, j))

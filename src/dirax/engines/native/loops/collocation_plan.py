@@ -1,5 +1,6 @@
 """What a kernel of collocation steps does: the relation at one node as scalar expressions, and how its unknowns are iterated."""
 
+import functools
 from dataclasses import dataclass, field
 
 from dirax.engines.native.loops.record import Record
@@ -7,6 +8,7 @@ from dirax.engines.newton_step import Factors, pivot_order
 from dirax.engines.step_program import Inputs
 from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import jacobian
+from dirax.program.rounding import rounding_nodes
 from dirax.schemes.collocation_tables import Quadrature, Tableau
 
 
@@ -42,6 +44,8 @@ class CollocationPlan:
     stable: int = -1
     gain: list[dict[int, int]] | None = None
     carried: list[int] = field(default_factory=list)
+    terms: list[int] = field(default_factory=list)
+    """How large what the iterates are made of is, however it cancels."""
 
     def __post_init__(self):
         g, r = self.graph, self.relation
@@ -59,6 +63,11 @@ class CollocationPlan:
         needed = set(g.reachable(self.solved))
         self.carried = [i for i, node in enumerate(r.second) if node in needed]
         self.gain = self._gain()
+        self.terms = rounding_nodes(g, self.solved if self.gain is None else [self._gained(row) for row in self.gain])
+
+    def _gained(self, row: dict[int, int]) -> int:
+        g = self.graph
+        return functools.reduce(g.add, (g.mul(slope, self.relation.rates[i]) for i, slope in sorted(row.items())), g.zero)
 
     def _gain(self) -> list[dict[int, int]] | None:
         g, r = self.graph, self.relation
@@ -83,7 +92,7 @@ class CollocationPlan:
     @property
     def identity(self) -> tuple:
         """What tells two plans of equal graphs apart."""
-        own = (self.relation, self.solved, self.stable, self.gain, self.carried)
+        own = (self.relation, self.solved, self.stable, self.gain, self.carried, self.terms)
         return *own, self.rows, self.shared, self.tableau.stages, self.tableau.matrix.tolist()
 
 
@@ -113,7 +122,13 @@ class MeanPlan:
     tableau: Tableau
     quadrature: Quadrature
     rows: list[tuple[str, list[int]]]
+    terms: list[int] = field(default_factory=list)
     gain = None
+
+    def __post_init__(self):
+        g, r = self.graph, self.relation
+        errors = dict(zip(r.means, rounding_nodes(g, r.slopes), strict=True))
+        self.terms = rounding_nodes(g, r.rates[: len(r.first)], errors)
 
     @property
     def record(self) -> Record:
@@ -129,7 +144,7 @@ class MeanPlan:
     @property
     def identity(self) -> tuple:
         """What tells two plans of equal graphs apart."""
-        return self.relation, self.rows, self.shared, self.tableau.matrix.tolist(), self.quadrature.means.tolist()
+        return self.relation, self.terms, self.rows, self.shared, self.tableau.matrix.tolist(), self.quadrature.means.tolist()
 
 
 def record_of(relation: TracedRelation | TracedMean, tableau: Tableau) -> Record:

@@ -1,72 +1,99 @@
 """The fixed-point iterations of a collocation step in IR: for the rates at the nodes, for the accelerations, or by means."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from dirax.engines.native.ir.emitter import Emitter
 from dirax.engines.native.ir.lower import Region
-from dirax.engines.native.loops.collocation_nodes import Nodes, lanes_for
+from dirax.engines.native.loops.collocation_nodes import Nodes
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
+from dirax.engines.native.loops.over_nodes import OverNodes, Pair
+
+Found = Callable[[str, list[str], str], None]
+"""What is done with the new iterates at a node, and whether they are stable."""
 
 
 @dataclass
 class Sweep(ABC):
-    """What both kinds of iteration share: the state of a step as numbers and over the nodes."""
+    """What the kinds of iteration share: the state of a step in numbers, and a pair of rooms for the iterates."""
 
     nodes: Nodes
     here: Region
     state: list[str]
     time: str
+    pair: Pair
+
+    later = 0
+    """Sweeps that `increments` does besides, and on which the iteration counts."""
 
     def __post_init__(self):
-        k = self.nodes
-        e, n = k.all, len(k.plan.relation.first)
-        self.first = [e.splat(value) for value in self.state[:n]]
-        self.second = [e.splat(value) for value in self.state[n:]]
-        self.clock = e.add(e.splat(self.time), k.times)
+        n = len(self.nodes.plan.relation.first)
+        self.first, self.second = self.state[:n], self.state[n:]
 
-    def region(self, points: list[str], rates: list[str] | None) -> Region:
-        """The relation's inputs a and y at the nodes."""
+    @property
+    def iterates(self) -> list[str]:
+        """The rooms of the iterates."""
+        return self.pair.now()
+
+    def region(self, points: list[str], rates: list[str], node: str) -> Region:
+        """The relation's inputs a and y at a node."""
         k, r = self.nodes, self.nodes.plan.relation
-        region = Region(k.all, k.plan.graph, k.known)
-        region.bind(k.plan.shared.t, self.clock)
-        for node, value in zip(r.first, points, strict=True):
-            region.bind(node, value)
-        for node, value in zip(r.unknowns, rates or [], strict=False):
-            region.bind(node, value)
+        return self._region(k.all, k.known, k.times, points, node, [*r.unknowns[: len(rates)]], rates)
+
+    def _region(self, over: OverNodes, known: Region, times, points, node, more: list[int], values: list[str]) -> Region:
+        k, r, region = self.nodes, self.nodes.plan.relation, Region(over.emitter, self.nodes.plan.graph, known)
+        region.bind(k.plan.shared.t, over.emitter.add(over.splat(self.time), over.of(times, node)))
+        for input_, value in zip([*r.first, *more], [*points, *values], strict=True):
+            region.bind(input_, value)
         return region
 
     @abstractmethod
-    def start(self, before: list[str]) -> list[str]:
-        """The iterates with which the first step begins; `before` is what the record holds."""
+    def start(self, before: str, node: str) -> str:
+        """The iterate at a node with which the first step begins; the room `before` has what the record holds."""
 
-    def guess(self, before: list[str], later: str, first: str) -> list[str]:
-        """The iterates at the nodes of this step: those of the step before continued where there is one, in the `first` attempt
-        as a polynomial, then as constants."""
-        k, out = self.nodes, []
-        choose = lambda condition, yes, no: k.body.put(f"select i1 {condition}, {k.all.real} {yes}, {k.all.real} {no}")
-        for vector, start in zip(before, self.start(before), strict=True):
-            constant = k.everywhere(vector, k.stages - 1)
-            out.append(choose(later, choose(first, k.product(k.extrapolation, vector), constant), start))
-        return out
-
-    @abstractmethod
-    def sweep(self, old: list[str]) -> tuple[list[str], str]:
-        """The iterates after one more sweep, and whether it was stable, node by node."""
+    def guess(self, before: list[str], later: str, polynomial: bool, node: str) -> list[str]:
+        """The iterates at a node of this step: those of the step before continued where there is one, as a polynomial or as
+        constants."""
+        k, e = self.nodes, self.nodes.all
+        if polynomial:
+            on = e.product(k.extrapolation, before, node, [None] * len(before), e)
+        else:
+            on = [e.last(room) for room in before]
+        return [e.chosen(later, value, self.start(room, node)) for value, room in zip(on, before, strict=True)]
 
     @abstractmethod
-    def increments(self, iterates: list[str]) -> list[str]:
-        """What the step adds to the state by sums over the nodes."""
+    def sweep(self, found: Found) -> None:
+        """One more sweep: new iterates from those in the rooms, which `found` is called with at every node."""
+
+    def terms(self) -> list[str]:
+        """How large what the iterates are made of is, at the state where the step begins and with the last iterates."""
+        plan, over = self.nodes.plan, self.nodes.all
+        region = Region(self.nodes.one, plan.graph, self.here)
+        for input_, room in zip(plan.relation.unknowns, self.iterates, strict=True):
+            region.bind(input_, over.final(room))
+        if isinstance(plan, MeanPlan):  # slopes at one point in the place of means
+            region.require(plan.relation.slopes)
+            for mean, slope in zip(plan.relation.means, plan.relation.slopes, strict=True):
+                region.bind(mean, region.value(slope))
+        region.require(plan.terms)
+        return [region.value(node) for node in plan.terms]
+
+    @abstractmethod
+    def increments(self, found: Found) -> list[str]:
+        """What the step adds to the state by sums over the nodes; `found` is called with the iterates of a last sweep, if there
+        is one."""
 
     def settled(self, iterates: list[str], after: list[str]) -> list[str]:
-        """What is added at the end, to the state after these sums: nothing."""
+        """What is added at the end, with the last iterates, to the state after these sums: nothing."""
         return []
 
-    def _ends(self, region: Region) -> list[str]:
-        """h Σ b_i ḃ_i."""
-        k, r = self.nodes, self.nodes.plan.relation
-        region.require(r.rates)
-        return [k.total(k.all.mul(k.weights, region.value(node))) for node in r.rates]
+    def _weighted_iterates(self) -> list[str]:
+        """Rooms with h b times the iterates."""
+        k, iterates = self.nodes, self.iterates
+        rooms = k.all.rooms(len(iterates))
+        with k.all.at() as node:
+            k.all.filled(rooms, k.weighted([k.all.load(room, node) for room in iterates], node), node)
+        return rooms
 
 
 class AtEveryNode(Sweep):
@@ -78,80 +105,118 @@ class AtEveryNode(Sweep):
         assert isinstance(self.nodes.plan, CollocationPlan)
         return self.nodes.plan
 
+    def _weighted_rates(self, region: Region, rooms: list[str], node: str) -> None:
+        """h b ḃ into rooms."""
+        region.require(self.plan.relation.rates)
+        values = [region.value(rate) for rate in self.plan.relation.rates]
+        self.nodes.all.filled(rooms, self.nodes.weighted(values, node), node)
+
 
 class FirstOrder(AtEveryNode):
     """The iterates are the rates y at the nodes."""
 
-    def start(self, before: list[str]) -> list[str]:
-        """Where the first step begins: what the record holds."""
-        return before
+    def start(self, before: str, node: str) -> str:
+        """What the record holds."""
+        return self.nodes.all.load(before, node)
 
-    def sweep(self, old: list[str]) -> tuple[list[str], str]:
+    def _at(self, weighted: list[str], node: str) -> tuple[Region, list[str]]:
+        """The relation at a node and the iterates there."""
+        own = [self.nodes.all.load(room, node) for room in self.iterates]
+        return self.region(self.nodes.along(weighted, node, self.first), own, node), own
+
+    def sweep(self, found: Found) -> None:
         """Newton's method at each node, once; whether the elimination was stable."""
-        k, plan = self.nodes, self.plan
-        region = self.region([k.along(y, a) for y, a in zip(old, self.first, strict=True)], old)
-        region.require([plan.relation.rates[i] for i in plan.carried])
-        for i in plan.carried:
-            rate = region.value(plan.relation.rates[i])
-            region.bind(plan.relation.second[i], k.along(rate, self.second[i]))
-        region.require([*plan.solved, plan.stable])
-        return [region.value(node) for node in plan.solved], region.value(plan.stable)
+        k, plan, over = self.nodes, self.plan, self.nodes.all
+        weighted, outputs = self._weighted_iterates(), [*plan.solved, plan.stable]
+        carried = [plan.relation.rates[i] for i in plan.carried]
+        rooms = over.rooms(len(carried))
+        again: Callable[[str], Region] | None = None
+        if carried:
+            with over.at() as node:
+                region, _ = self._at(weighted, node)
+                region.require(carried)
+                over.filled(rooms, k.weighted([region.value(rate) for rate in carried], node), node)
+                again = over.handed_on(region, outputs, node)
+        with over.at() as node:
+            region = again(node) if again else self._at(weighted, node)[0]
+            points = k.along(rooms, node, [self.second[i] for i in plan.carried])
+            for i, value in zip(plan.carried, points, strict=True):
+                region.bind(plan.relation.second[i], value)
+            region.require(outputs)
+            found(node, [region.value(y) for y in plan.solved], region.value(plan.stable))
 
-    def increments(self, iterates: list[str]) -> list[str]:
+    def increments(self, found: Found) -> list[str]:
         """h Σ b_i y_i and h Σ b_i ḃ_i."""
-        k = self.nodes
-        first = [k.total(k.all.mul(k.weights, y)) for y in iterates]
-        if not self.second:
-            return first
-        return first + self._ends(self.region([k.along(y, a) for y, a in zip(iterates, self.first, strict=True)], iterates))
+        weighted, ends = self._weighted_iterates(), self.nodes.all.rooms(len(self.second))
+        if ends:
+            with self.nodes.all.at() as node:
+                self._weighted_rates(self._at(weighted, node)[0], ends, node)
+        return self.nodes.totals([*weighted, *ends])
 
 
 class SecondOrder(AtEveryNode):
     """The iterates are ä at the nodes, the gain times ḃ."""
 
+    later = 1
+
     def __post_init__(self):
         super().__post_init__()
-        k, plan = self.nodes, self.plan
+        k, plan, over = self.nodes, self.plan, self.nodes.all
         start = Region(k.one, plan.graph, self.here)
         start.require(plan.solved)
         self.rates = [start.value(node) for node in plan.solved]
-        self.lines = [k.all.fma(k.times, k.all.splat(v), a) for v, a in zip(self.rates, self.first, strict=True)]
+        self.lines = over.rooms(len(self.rates))
+        with over.at() as node:
+            for room, v, a in zip(self.lines, self.rates, self.first, strict=True):
+                over.store(over.emitter.fma(over.of(k.times, node), over.splat(v), over.splat(a)), room, node)
 
-    def start(self, before: list[str]) -> list[str]:
+    def start(self, before: str, node: str) -> str:
         """Where the first step begins: at uniform motion."""
-        return [self.nodes.all.const(0.0) for _ in before]
+        return self.nodes.all.emitter.const(0.0)
 
-    def sweep(self, old: list[str]) -> tuple[list[str], str]:
+    def sweep(self, found: Found) -> None:
         """The same."""
-        k, plan = self.nodes, self.plan
-        region = self.region([k.product(k.second, f, line) for f, line in zip(old, self.lines, strict=True)], None)
+        over, iterates = self.nodes.all, self.iterates
+        with over.at() as node:
+            lines = [over.load(room, node) for room in self.lines]
+            region = self.region(over.product(self.nodes.second, iterates, node, lines, over), [], node)
+            found(node, self._gained(region), over.emitter.true)
+
+    def _gained(self, region: Region) -> list[str]:
+        """The gain times ḃ."""
+        plan, e, found = self.plan, region.emitter, []
         region.require([plan.relation.rates[i] for i in plan.carried])
-        return [self._gained(region, row) for row in plan.gain or []], k.all.true
+        for row in plan.gain or []:
+            total = None
+            for i, node in sorted(row.items()):
+                rate, slope = region.value(plan.relation.rates[i]), region.value(node)
+                alone = rate if node == plan.graph.one else None
+                total = e.fma(slope, rate, total) if total is not None else alone or e.mul(slope, rate)
+            found.append(e.const(0.0) if total is None else total)
+        return found
 
-    def _gained(self, region: Region, row: dict[int, int]) -> str:
-        k, total = self.nodes, None
-        for i, node in sorted(row.items()):
-            rate, slope = region.value(self.plan.relation.rates[i]), region.value(node)
-            if total is None:
-                total = rate if node == k.plan.graph.one else k.all.mul(slope, rate)
-            else:
-                total = k.all.fma(slope, rate, total)
-        return k.all.const(0.0) if total is None else total
+    def increments(self, found: Found) -> list[str]:
+        """Those of two more sweeps, in halves whose coefficients are symplectic to the last bit: with those of A² alone, or after
+        one such sweep, the energy drifts by some 10⁻¹⁹ a step; and it does where the iteration counts on both."""
+        k, over, ends = self.nodes, self.nodes.all, self.nodes.all.rooms(len(self.second))
+        speeds, forces = self._speeds(self._weighted_iterates()), over.rooms(len(self.rates))
+        with over.at() as node:
+            region = self.region(k.along(speeds, node, self.first), [], node)
+            over.filled(forces, k.weighted(self._gained(region), node), node)
+        speeds = self._speeds(forces)
+        with over.at() as node:
+            region = self.region(k.along(speeds, node, self.first), [], node)
+            found(node, self._gained(region), over.emitter.true)
+            self._weighted_rates(region, ends, node)
+        return k.totals([*speeds, *ends])
 
-    def increments(self, iterates: list[str]) -> list[str]:
-        """Those of two more sweeps, in halves whose coefficients are symplectic to the last bit: with those of A² alone the
-        energy drifts by some 10⁻¹⁹ a step."""
-        k, e = self.nodes, self.nodes.all
-        rates, region = self._half_steps(iterates)
-        region.require([self.plan.relation.rates[i] for i in self.plan.carried])
-        rates, region = self._half_steps([self._gained(region, row) for row in k.plan.gain or []])
-        return [k.total(e.mul(k.weights, v)) for v in rates] + self._ends(region)
-
-    def _half_steps(self, forces: list[str]) -> tuple[list[str], Region]:
-        """The rates and the points at the nodes that belong to these ä."""
-        k = self.nodes
-        rates = [k.along(f, k.all.splat(v)) for f, v in zip(forces, self.rates, strict=True)]
-        return rates, self.region([k.along(v, a) for v, a in zip(rates, self.first, strict=True)], rates)
+    def _speeds(self, forces: list[str]) -> list[str]:
+        """Rooms with h b times the rates that belong to weighted ä."""
+        k, over = self.nodes, self.nodes.all
+        speeds = over.rooms(len(self.rates))
+        with over.at() as node:
+            over.filled(speeds, k.weighted(k.along(forces, node, self.rates), node), node)
+        return speeds
 
 
 class Means(Sweep):
@@ -163,51 +228,51 @@ class Means(Sweep):
         assert isinstance(self.nodes.plan, MeanPlan)
         return self.nodes.plan
 
-    def __post_init__(self):
-        super().__post_init__()
-        k, table = self.nodes, self.plan.quadrature
-        self.many = e = Emitter(k.body, lanes_for(len(table.points)))
-        self.constants = k.constants(e)
-        vector = lambda values: k.vector(values, e.width)
-        self.matrix = [e.mul(vector(column), e.splat("%h")) for column in table.matrix.T]
-        self.values = [vector(column) for column in table.values.T]
-        self.means = [k.vector(column) for column in table.means.T]
-        self.instants = e.add(e.splat(self.time), e.mul(vector(table.points), e.splat("%h")))
-
-    def start(self, before: list[str]) -> list[str]:
+    def start(self, before: str, node: str) -> str:
         """What the record holds."""
-        return before
+        return self.nodes.all.load(before, node)
 
-    def sweep(self, old: list[str]) -> tuple[list[str], str]:
-        rates = self._rates(old)
-        return rates[: len(old)], self.nodes.all.true
+    def sweep(self, found: Found) -> None:
+        n, true = self.pair.count, self.nodes.all.emitter.true
+        self._rates(lambda node, rates: found(node, rates[:n], true))
 
-    def increments(self, iterates: list[str]) -> list[str]:
-        k = self.nodes
-        return [k.total(k.all.mul(k.weights, value)) for value in self._rates(iterates)]
+    def increments(self, found: Found) -> list[str]:
+        k, n = self.nodes, self.pair.count
+        rooms = k.all.rooms(len(self.plan.relation.rates))
 
-    def _rates(self, old: list[str]) -> list[str]:
+        def summed(node: str, rates: list[str]) -> None:
+            k.all.filled(rooms, k.weighted(rates, node), node)
+            found(node, rates[:n], k.all.emitter.true)
+
+        self._rates(summed)
+        return k.totals(rooms)
+
+    def _rates(self, found: Callable[[str, list[str]], None]) -> None:
         """(ȧ, ḃ) at the nodes."""
-        k, e, r = self.nodes, self.many, self.plan.relation
-        points = Region(e, k.plan.graph, self.constants)
-        points.bind(k.plan.shared.t, self.instants)
-        for node, y, a in zip(r.first, old, self.state, strict=False):
-            points.bind(node, k.product(self.matrix, y, e.splat(a), k.all, e))
-        for node, y in zip(r.unknowns, old, strict=True):
-            points.bind(node, k.product(self.values, y, None, k.all, e))
-        points.require(r.slopes)
-        inside = self.region([k.along(y, a) for y, a in zip(old, self.first, strict=False)], None)
-        for mean, slope in zip(r.means, r.slopes, strict=True):
-            inside.bind(mean, k.product(self.means, points.value(slope), None, e, k.all))
-        inside.require(r.rates)
-        return [inside.value(node) for node in r.rates]
+        k, many, m, r = self.nodes, self.nodes.points, self.nodes.of_points, self.plan.relation
+        weighted, slopes = self._weighted_iterates(), many.rooms(len(r.slopes))
+        iterates = self.iterates
+        with many.at() as node:
+            points = many.product(m.matrix, iterates, node, [many.splat(a) for a in self.first], k.all)
+            rates = many.product(m.values, iterates, node, [None] * self.pair.count, k.all)
+            region = self._region(many, m.known, m.instants, points, node, r.unknowns, rates)
+            region.require(r.slopes)
+            many.filled(slopes, [region.value(slope) for slope in r.slopes], node)
+        with k.all.at() as node:
+            region = self.region(k.along(weighted, node, self.first), [], node)
+            means = k.all.product(m.means, slopes, node, [None] * len(slopes), many)
+            for input_, mean in zip(r.means, means, strict=True):
+                region.bind(input_, mean)
+            region.require(r.rates)
+            found(node, [region.value(rate) for rate in r.rates])
 
     def settled(self, iterates: list[str], after: list[str]) -> list[str]:
-        k, plan = self.nodes, self.plan
-        region, end = Region(k.one, plan.graph, self.here), k.vector(plan.quadrature.end)
-        for node, value in zip(plan.relation.after, after, strict=True):
-            region.bind(node, value)
-        for node, rate in zip(plan.relation.unknowns, iterates, strict=True):
-            region.bind(node, k.total(k.all.mul(end, rate)))
+        k, plan, over = self.nodes, self.plan, self.nodes.all
+        region, ends = Region(k.one, plan.graph, self.here), over.rooms(self.pair.count)
+        with over.at() as node:
+            of_end = over.of(k.of_points.end, node)
+            over.filled(ends, [over.emitter.mul(of_end, over.load(room, node)) for room in iterates], node)
+        for input_, value in zip([*plan.relation.after, *plan.relation.unknowns], [*after, *k.totals(ends)], strict=True):
+            region.bind(input_, value)
         region.require(plan.relation.settled)
         return [region.value(node) for node in plan.relation.settled]
