@@ -8,7 +8,7 @@ from typing import TypeVar
 import jax
 import numpy as np
 
-from dirax.sweeps.commit import StoreError
+from dirax.solution.flushed_files import StoreError
 from dirax.sweeps.executors import PlaceLost
 from dirax.sweeps.task import Task
 
