@@ -26,13 +26,13 @@ COLUMNS, ROWS = 4, 3
 def structure(columns: int, rows: int, spacing: float = 1.0) -> tuple[sp.csr_matrix, sp.csr_matrix]:
     """J and B of a sheet."""
     along = lambda count: sp.eye_array(count, k=1, format="csr") - sp.eye_array(count, format="csr")
-    cells, upwards = columns * rows, along(rows)[:-1]
+    cells, upwards = columns * rows, sp.csr_matrix(along(rows))[:-1]
     differences = sp.vstack([sp.kron(along(columns), sp.eye_array(rows)), sp.kron(sp.eye_array(columns), upwards)])
     # dH = Δ² x in the coordinates x, so that the flow of each is a difference over Δ³
     J = sp.block_array([[None, -differences.T], [differences, None]]) / spacing**3
     left, right = np.arange(rows), cells + (columns - 1) * rows + np.arange(rows)
     entries = np.repeat([-1.0, 1.0], rows) / spacing
-    B = sp.csr_matrix((entries, (np.concatenate([left, right]), np.arange(2 * rows))), (J.shape[0], 2 * rows))
+    B = sp.csr_matrix((entries, (np.concatenate([left, right]), np.arange(2 * rows))), (3 * cells - columns, 2 * rows))
     return sp.csr_matrix(J), B
 
 

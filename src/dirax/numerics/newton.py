@@ -21,7 +21,7 @@ AT_FLOOR = 4.0 * EPSILON
 """A step of this size relative to the point is roundoff."""
 
 NEAR = 1e-6
-"""A step of this size relative to each unknown is in the domain, and one that contracts."""
+"""A step of this size relative to the point is in the domain, and one that contracts."""
 
 FAR = 1e3
 """A zero at this distance, relative to 1 + |start|, is none near the start."""
@@ -32,19 +32,20 @@ def damped_step(update: Callable, u: Any, units: Any, sizes: Any, xp: ModuleType
     equations nor those of the unknowns matter, and the domain of the equations is not left.
 
     `update(u)` (…, k) is A⁻¹ r(u), with one A for all u; `units` (…, k) are what steps are measured in, and `sizes` (…, k) how
-    large the unknowns are: a step that is NEAR zero in each of these is taken whole, up to the roundoff of every one. With NumPy,
-    leading axes hold equations side by side; where no shorter step above the roundoff of u is an improvement, u stays.
+    large the unknowns are: steps that are NEAR zero in both go on until neither of them improves. With NumPy, leading axes hold
+    equations side by side; where no shorter step above the roundoff of u is an improvement, u stays.
     """
     size = lambda v: xp.max(xp.abs(v) / units, axis=-1)
     of_each = lambda v: xp.max(xp.abs(v) / sizes, axis=-1)
     change = update(u)
-    here, floor, near = size(change), AT_FLOOR * size(u), of_each(change)
-    at_floor = near <= AT_FLOOR
+    here, largest, of_one = size(change), size(u), of_each(change)
+    floor, near = AT_FLOOR * largest, (of_one <= NEAR) & (here <= NEAR * largest)
+    at_floor = (of_one <= AT_FLOOR) & (here <= floor)
 
     def improves(fraction):
         following = update(u - fraction[..., None] * change)
         better = size(following) <= (1.0 - fraction / 4.0) * here
-        better = xp.where(near <= NEAR, of_each(following) <= near / 2.0, better)
+        better = better | near & (of_each(following) <= of_one / 2.0)
         # not left to the comparison: XLA's vectorized maximum of NaNs can be −∞ on a CPU
         return xp.all(xp.isfinite(following), axis=-1) & better
 
@@ -53,7 +54,7 @@ def damped_step(update: Callable, u: Any, units: Any, sizes: Any, xp: ModuleType
         fraction = xp.where(searching, fraction / 2.0, fraction)
         return fraction, better | searching & improves(fraction)
 
-    unfinished = lambda carry: ~carry[1] & (carry[0] > SHORTEST) & (carry[0] * here > floor) & (near > NEAR)
+    unfinished = lambda carry: ~carry[1] & (carry[0] > SHORTEST) & (carry[0] * here > floor) & ~near
     whole = xp.ones(here.shape)
     with np.errstate(all="ignore"):
         better = at_floor if xp is np and np.all(at_floor) else at_floor | improves(whole)

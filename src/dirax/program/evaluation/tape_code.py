@@ -5,8 +5,6 @@ import functools
 import re
 from typing import Any
 
-from dirax.program import machine_code
-
 LANES = 8
 """Entries that a loop computes side by side."""
 
@@ -53,6 +51,8 @@ def loops() -> tuple[Any, Any]:
     """`numbers(table, count, values, first, blocks, slots)`: operations (number, x, y, z) whose results follow one another from
     slot `first` on, in every block of values; and `rows(table, count, values, rows, columns)`: operations (number, row, x, y, f)
     on rows of one block, with factors among its values."""
+    from dirax.program import machine_code  # LLVM is imported when it is used
+
     library = machine_code.load(machine_code.object_code(_numbers() + _rows()), ("numbers", "rows"))
     pointer, whole = ctypes.c_void_p, ctypes.c_int64
     numbers = machine_code.function(library, "numbers", ctypes.CFUNCTYPE(None, pointer, whole, pointer, whole, whole, whole))
