@@ -64,6 +64,7 @@ def test_method_2_in_large_batches_with_the_jacobian_of_the_graph():
             np.testing.assert_allclose(ours.fields[name], values, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.soak
 def test_equal_stages_are_compiled_once():
     scheme, shape = dx.LagrangeDAlembert(), Shape(4, 2)
     sizes = []

@@ -76,6 +76,7 @@ def test_large_batches_by_jax_alone_and_in_scalars(name):
         assert_agreement(name, dx.simulate(example.system, example.scheme, **run, engine=engine), theirs)
 
 
+@pytest.mark.soak
 def test_derivatives_by_jax_alone():
     """Of a run with constraints, with respect to a parameter."""
     example = gallery.get("rolling-disk")
