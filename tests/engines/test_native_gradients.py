@@ -205,6 +205,7 @@ def test_small_pivots_are_exchanged_in_derivatives_too():
         np.testing.assert_allclose(slopes, np.linalg.inv(matrix), rtol=1e-12, atol=1e-25)
 
 
+@pytest.mark.soak
 def test_what_the_kernel_cannot_take_is_run_by_xla_under_auto():
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(jnp.sort(q) ** 2 * jnp.array([1.0, 2.0])))
     run = lambda q, e: dx.simulate(system, MIDPOINT, q=q, v=jnp.zeros(2), step=0.1, steps=3, engine=e)

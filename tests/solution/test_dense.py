@@ -122,6 +122,7 @@ def test_times_that_are_refused():
         sol[:1].at(0.0)
 
 
+@pytest.mark.soak
 def test_an_engine_without_scalar_programs_is_not_asked_for_them():
     def lagrangian(q, v):
         return v @ v / 2 - jax.scipy.special.i0(q[0])

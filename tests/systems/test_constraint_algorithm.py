@@ -111,6 +111,7 @@ def test_engines_agree_on_a_chain_of_four_levels(tension):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.soak
 def test_a_gradient_through_the_projection_and_a_run_against_finite_differences(tension):
     """By the mass, which moves the start, the tension and the motion; of both engines."""
     away = state_of_the_pendulum(0.9, 0.4, 2.0) + 0.01 * np.cos(np.arange(6.0))

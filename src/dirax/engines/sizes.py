@@ -49,9 +49,10 @@ def sizes_of(problem: Problem) -> tuple[np.ndarray, ...]:
     found, sure = _first_in_numbers(problem) or (None, np.zeros(problem.batch or 1, bool))
     if found is not None and np.all(sure):
         return found
-    closer = _in_numbers(problem)
+    t = problem.t0 + problem.first_step * problem.h
+    closer = _in_numbers(problem, t)
     if closer is None:
-        closer = tuple(map(np.asarray, _compiled(*_arguments(problem))))
+        closer = tuple(map(np.asarray, _compiled(*_arguments(problem, t))))
     if found is None:
         return closer
     chosen = sure[:, None] if problem.batch is not None else sure[0]
@@ -62,7 +63,7 @@ def sizes_by_jax(problem: Problem) -> tuple[jax.Array, ...]:
     """The same of a problem that JAX traces, without derivatives."""
     if problem.size >= FEWEST_SPARSE:
         return tuple(map(jnp.asarray, sizes_of(problem)))
-    return jax.lax.stop_gradient(sizes_at(*_arguments(problem)))
+    return jax.lax.stop_gradient(sizes_at(*_arguments(problem, problem.t0 + problem.first_step * problem.h)))
 
 
 def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple, sizes: tuple) -> tuple:
@@ -82,19 +83,20 @@ def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, stat
         return tuple(np.ones((len(lanes), np.shape(u)[-1])) for u in guess)
     moved = lambda a: np.asarray(a)[lanes] if p.batch is not None else np.asarray(a)[None][lanes]
     params = jax.tree.map(moved, p.params) if p.batch_params else p.params
-    here = dataclasses.replace(p, state=state, guess=guess, params=params, batch=len(lanes), first_step=p.first_step + completed)
-    found = _in_numbers(here)
-    return tuple(map(np.asarray, _compiled(*_arguments(here)))) if found is None else found
+    here = dataclasses.replace(p, state=state, guess=guess, params=params, batch=len(lanes))
+    t = p.t0 + (p.first_step + completed) * p.h
+    found = _in_numbers(here, t)
+    return tuple(map(np.asarray, _compiled(*_arguments(here, t)))) if found is None else found
 
 
-def _in_numbers(p: Problem) -> tuple[np.ndarray, ...] | None:
-    """By the scalar program of the step, once for stages that are equal; None where it has none."""
+def _in_numbers(p: Problem, t: Any) -> tuple[np.ndarray, ...] | None:
+    """By the scalar program of the step at the time t, () or (B,), once for stages that are equal; None where it has none."""
     from dirax.engines.step_program import step_program  # imported when it is used
     from dirax.program.graph import GraphTooLarge
     from dirax.program.interpreter import UnsupportedPrimitive
 
     batch, stages, key = p.batch or 1, p.equation.stages, (p.params, p.batch_params)
-    t, state = np.full(batch, p.t0 + p.first_step * p.h), np.asarray(p.state, float).reshape(batch, -1)
+    t, state = np.broadcast_to(np.asarray(t, float), (batch,)), np.asarray(p.state, float).reshape(batch, -1)
     guesses, h = [np.asarray(g, float).reshape(batch, -1) for g in p.guess], [np.full(batch, a * p.h) for _, a in stages]
     firsts = _first_of_each(stages)
     try:
@@ -257,16 +259,17 @@ def _matters(slopes: Any, terms: Any, xp: ModuleType) -> Any:
     return xp.min(xp.where(sizes > ZERO, sizes, xp.inf), axis=-2)
 
 
-def _arguments(p: Problem) -> tuple:
-    axes = None if p.batch is None else (0, 0, 0 if p.batch_params else None)
-    t, h = jnp.asarray(p.t0 + p.first_step * p.h, float), jnp.asarray(p.h, float)
+def _arguments(p: Problem, t: Any) -> tuple:
+    axes = None if p.batch is None else (0, 0, 0 if p.batch_params else None, 0 if np.ndim(t) else None)
+    t, h = jnp.asarray(t, float), jnp.asarray(p.h, float)
     return p.equation, jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), jax.tree.map(jnp.asarray, p.params), t, h, axes
 
 
 def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: Any, axes: tuple | None = None) -> tuple:
-    """The sizes of each stage of a step from a state, over a batch with the `axes` of (state, guess, params), by JAX."""
+    """The sizes of each stage of a step from a state, over a batch with the `axes` of (state, guess, params, t), by
+    JAX."""
 
-    def one(state, guess, params):
+    def one(state, guess, params, t):
         def linear(i, u, x, part):
             stage, fraction = equation.stages[i]
             residual = lambda u, h: stage.residual(u, x, t, h, params)
@@ -293,7 +296,7 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
             found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, again(jnp.abs(u)), again, after, part, jnp))
         return tuple(found)
 
-    given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params
+    given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params, t
     return one(*given) if axes is None else jax.vmap(one, in_axes=axes)(*given)
 
 
