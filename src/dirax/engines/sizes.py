@@ -49,10 +49,7 @@ def sizes_of(problem: Problem) -> tuple[np.ndarray, ...]:
     found, sure = _first_in_numbers(problem) or (None, np.zeros(problem.batch or 1, bool))
     if found is not None and np.all(sure):
         return found
-    t = problem.t0 + problem.first_step * problem.h
-    closer = _in_numbers(problem, t)
-    if closer is None:
-        closer = tuple(map(np.asarray, _compiled(*_arguments(problem, t))))
+    closer = _closely(problem, _start(problem))
     if found is None:
         return closer
     chosen = sure[:, None] if problem.batch is not None else sure[0]
@@ -63,7 +60,7 @@ def sizes_by_jax(problem: Problem) -> tuple[jax.Array, ...]:
     """The same of a problem that JAX traces, without derivatives."""
     if problem.size >= FEWEST_SPARSE:
         return tuple(map(jnp.asarray, sizes_of(problem)))
-    return jax.lax.stop_gradient(sizes_at(*_arguments(problem, problem.t0 + problem.first_step * problem.h)))
+    return jax.lax.stop_gradient(sizes_at(*_arguments(problem, _start(problem))))
 
 
 def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple, sizes: tuple) -> tuple:
@@ -84,9 +81,18 @@ def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, stat
     moved = lambda a: np.asarray(a)[lanes] if p.batch is not None else np.asarray(a)[None][lanes]
     params = jax.tree.map(moved, p.params) if p.batch_params else p.params
     here = dataclasses.replace(p, state=state, guess=guess, params=params, batch=len(lanes))
-    t = p.t0 + (p.first_step + completed) * p.h
-    found = _in_numbers(here, t)
-    return tuple(map(np.asarray, _compiled(*_arguments(here, t)))) if found is None else found
+    return _closely(here, p.t0 + (p.first_step + completed) * p.h)
+
+
+def _start(p: Problem) -> Any:
+    """The time at which the first step begins."""
+    return p.t0 + p.first_step * p.h
+
+
+def _closely(p: Problem, t: Any) -> tuple[np.ndarray, ...]:
+    """The sizes at the time t, () or (B,), looked at closely."""
+    found = _in_numbers(p, t)
+    return tuple(map(np.asarray, _compiled(*_arguments(p, t)))) if found is None else found
 
 
 def _in_numbers(p: Problem, t: Any) -> tuple[np.ndarray, ...] | None:
@@ -141,7 +147,7 @@ def _first_in_numbers(p: Problem) -> tuple[tuple[np.ndarray, ...], np.ndarray] |
     from dirax.program.interpreter import UnsupportedPrimitive
 
     batch = p.batch or 1
-    t, state = np.full(batch, p.t0 + p.first_step * p.h), np.asarray(p.state, float).reshape(batch, -1)
+    t, state = np.full(batch, _start(p)), np.asarray(p.state, float).reshape(batch, -1)
     found, sure = [], np.ones(batch, bool)
     try:
         program = step_program(p.equation, p.params, p.batch_params)

@@ -27,17 +27,17 @@ FAR = 1e3
 """A zero at this distance, relative to 1 + |start|, is none near the start."""
 
 
-def damped_step(update: Callable, u: Any, units: Any, sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
+def damped_step(change: Any, update: Callable, u: Any, units: Any, sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """(u, whether to go on) after a Newton step that is halved until the next one would be shorter: so neither the units of the
     equations nor those of the unknowns matter, and the domain of the equations is not left.
 
-    `update(u)` (…, k) is A⁻¹ r(u), with one A for all u; `units` (…, k) are what steps are measured in, and `sizes` (…, k) how
-    large the unknowns are: steps that are NEAR zero in both go on until neither of them improves. With NumPy, leading axes hold
-    equations side by side; where no shorter step above the roundoff of u is an improvement, u stays.
+    `update(u)` (…, k) is A⁻¹ r(u), with one A for all u, and `change` its value at the given u; `units` (…, k) are what steps are
+    measured in, and `sizes` (…, k) how large the unknowns are: steps that are NEAR zero in both go on until neither of them
+    improves. With NumPy, leading axes hold equations side by side; where no shorter step above the roundoff of u is an
+    improvement, u stays.
     """
     size = lambda v: xp.max(xp.abs(v) / units, axis=-1)
     of_each = lambda v: xp.max(xp.abs(v) / sizes, axis=-1)
-    change = update(u)
     here, largest, of_one = size(change), size(u), of_each(change)
     floor, near = AT_FLOOR * largest, (of_one <= NEAR) & (here <= NEAR * largest)
     at_floor = (of_one <= AT_FLOOR) & (here <= floor)

@@ -41,17 +41,17 @@ def pseudo_inverse(matrix: Float[Array, "k l"], tolerance: float) -> Float[Array
 
 def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> Float[Array, "l k"]:
     """The pseudo-inverse of a matrix with rows and columns scaled to unit size."""
-    return scaled_inverse_p.bind(matrix)[0] if binds(matrix) else equilibrated_inverse(jnp, matrix)
+    return scaled_inverse_p.bind(matrix)[0] if binds(matrix) else equilibrated_inverse(jnp, matrix)[0]
 
 
-def equilibrated_inverse(xp: ModuleType, matrix: Any) -> Any:
-    """The same by JAX, or by NumPy with leading axes."""
+def equilibrated_inverse(xp: ModuleType, matrix: Any) -> tuple[Any, Any]:
+    """The same by JAX, or by NumPy with leading axes; and the units (…, l) of the unknowns that the scales stand for."""
     sizes = xp.abs(lax.stop_gradient(matrix) if xp is jnp else matrix)  # units have no derivative, which would be ∞ at zero
     rows, columns = balancing_scales(sizes, xp)
     scaled = matrix / rows / columns
     inverse = xp.linalg.pinv(scaled, EQUATION_RANK) if xp is jnp else pseudo_inverses(scaled, EQUATION_RANK, _by_either_scale)
     turned = lambda a: xp.swapaxes(a, -1, -2)
-    return inverse / turned(columns) / turned(rows)
+    return inverse / turned(columns) / turned(rows), 1.0 / columns[..., 0, :]
 
 
 def pseudo_inverses(matrices: np.ndarray, tolerance: float, of_doubtful: Callable = np.linalg.pinv) -> np.ndarray:
@@ -153,4 +153,4 @@ pseudo_inverse_p = plain_primitive(
     lambda matrix, tolerance: [jnp.linalg.pinv(matrix, tolerance)],
     _turned,
 )
-scaled_inverse_p = plain_primitive("dirax_scaled_inverse", lambda matrix: [equilibrated_inverse(jnp, matrix)], _turned)
+scaled_inverse_p = plain_primitive("dirax_scaled_inverse", lambda matrix: [equilibrated_inverse(jnp, matrix)[0]], _turned)

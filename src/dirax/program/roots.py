@@ -11,11 +11,10 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import ad
 from jaxtyping import Array, Float
 
-from dirax.numerics.equilibration import balancing_scales
 from dirax.numerics.newton import damped_step, sizes_of_unknowns
 from dirax.numerics.tolerances import TINY
 from dirax.program.given_tangents import implicit, implicit_tangent
-from dirax.program.linear_solves import scaled_pseudo_inverse
+from dirax.program.linear_solves import equilibrated_inverse, scaled_pseudo_inverse
 from dirax.program.primitives import binds, plain_primitive
 from dirax.program.tracing import closed_over, jacobian
 
@@ -49,8 +48,9 @@ def _root(residual: Callable, max_steps: int, guess, *captured):
 
     def step(carry):
         u, _, count = carry
-        inverse, units, sizes = inverse_at(u)
-        u, going = damped_step(lambda u: inverse(of_unknowns(u)), u, units, sizes, jnp)
+        value = of_unknowns(u)
+        inverse, units, sizes = inverse_at(u, value)
+        u, going = damped_step(inverse(value), lambda u: inverse(of_unknowns(u)), u, units, sizes, jnp)
         return u, going, count + 1
 
     unfinished = lambda carry: carry[1] & (carry[2] < max_steps)
@@ -66,13 +66,13 @@ def _least_change(matrix, right):
 
 
 def _least_changes(equations: Callable) -> Callable:
-    """u ↦ (right-hand side ↦ solution of least size with the Jacobian of `equations` at u, units and sizes of the unknowns)."""
+    """(u, r(u)) ↦ (right-hand side ↦ solution of least size with the Jacobian of the `equations` r at u, units and sizes of the
+    unknowns)."""
 
-    def at(u):
+    def at(u, value):
         matrix = jacobian(equations)(u)
-        inverse = scaled_pseudo_inverse(matrix)
-        units = 1.0 / balancing_scales(jnp.abs(matrix), jnp)[1][0]
-        return (lambda right: inverse @ right), units, sizes_of_unknowns(matrix, inverse, u, equations(u), jnp)
+        inverse, units = equilibrated_inverse(jnp, matrix)
+        return (lambda right: inverse @ right), units, sizes_of_unknowns(matrix, inverse, u, value, jnp)
 
     return at
 
@@ -80,7 +80,7 @@ def _least_changes(equations: Callable) -> Callable:
 def _by_elimination(equations: Callable, sparse: Any) -> Callable:
     """The same of many unknowns, by sparse elimination."""
 
-    def at(u):
+    def at(u, value):
         factors = sparse.factorise(sparse.values(equations, u))
         size = jnp.full(u.shape, jnp.max(jnp.abs(u), initial=TINY))
         return (lambda right: sparse.solve(factors, right)), jnp.ones(u.shape), size

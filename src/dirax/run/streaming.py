@@ -216,8 +216,7 @@ class Stream:
     def marks(self) -> dict[str, Any]:
         """Everything on which the bits of the rows depend, but how many there are."""
         s, p, case = self.settings, self.problem, self.case
-        data = {name: np.asarray(a[0] if np.ndim(a) == 2 else a) for name, a in case.data.items()}
-        _, params = case.first
+        data, params = case.first
         try:
             installed = version("dirax")
         except PackageNotFoundError:

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from dirax.numerics.equilibration import balancing_scales
 from dirax.numerics.newton import damped_step, sizes_of_unknowns
 from dirax.program.evaluation.in_numpy import Slopes, Values
 from dirax.program.graph import GraphTooLarge
@@ -161,15 +160,15 @@ def pseudo_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any,
 
 @numpy_rule("dirax_scaled_inverse")
 def scaled_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
-    return made.between([matrix], [v.aval.shape for v in equation.outvars], lambda operands: [_inverted(*operands)])
+    return made.between([matrix], [v.aval.shape for v in equation.outvars], lambda operands: [_inverted(*operands)[0]])
 
 
-def _inverted(matrices: np.ndarray) -> np.ndarray:
-    """The scaled pseudo-inverses; of a matrix that all entries have, once."""
-    inverted = lambda a: [equilibrated_inverse(np, a)]
+def _inverted(matrices: np.ndarray) -> list[np.ndarray]:
+    """The scaled pseudo-inverses and the units of their rows; of a matrix that all entries have, once."""
+    inverted = lambda a: list(equilibrated_inverse(np, a))
     if len(matrices) > 1 and np.all(matrices == matrices[:1]):
-        return np.repeat(_of_finite(inverted, matrices[:1])[0], len(matrices), axis=0)
-    return _of_finite(inverted, matrices)[0]
+        return [np.repeat(a, len(matrices), axis=0) for a in _of_finite(inverted, matrices[:1])]
+    return _of_finite(inverted, matrices)
 
 
 def _of_finite(function: Callable, matrices: np.ndarray) -> list[np.ndarray]:
@@ -204,11 +203,11 @@ def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands
                 break
             known = [a[going] for a in captured]
             slope, value = linear([*known, found[going]])[0], residual([*known, found[going]])[0]
-            inverse = _inverted(slope)
-            units = 1.0 / balancing_scales(np.abs(slope))[1][..., 0, :]
+            inverse, units = _inverted(slope)
             sizes = sizes_of_unknowns(slope, inverse, found[going], value)
-            update = lambda u, known=known, inverse=inverse: (inverse @ residual([*known, u])[0][..., None])[..., 0]
-            found[going], more = damped_step(update, found[going], units, sizes)
+            changed = lambda value, inverse=inverse: (inverse @ value[..., None])[..., 0]
+            update = lambda u, known=known, changed=changed: changed(residual([*known, u])[0])
+            found[going], more = damped_step(changed(value), update, found[going], units, sizes)
             going = going[more]
         return [found]
 
