@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 
 import dirax as dx
+from dirax import gallery
 from dirax.diagnostics.drift import SMALLEST_SERIES, judge, oscillations
 from dirax.diagnostics.one_step import differentiated_step
 from dirax.diagnostics.report import Line, Report
@@ -283,6 +284,15 @@ def test_a_composition_is_symplectic_in_unbalanced_units():
     report = verify(dx.simulate(heavy, scheme, step=0.1, steps=400, q=[1e-3], v=[0.0]))
     assert report["symplecticity of one step"].verdict == "ok", report
     assert report["discrete Dirac structure"].verdict == "not checked"
+
+
+def test_a_composition_with_several_holonomic_constraints_is_measured():
+    sol = gallery.get("cartesian-double-pendulum").simulate(dx.Composition(dx.LagrangeDAlembert(), "yoshida4"), steps=20)
+    report = verify(sol)
+    assert report.ok and report["constraint"].verdict == report["hidden constraint"].verdict == "ok", report
+    off = sol.fields["constraint"].copy()
+    off[7, 1] += 1e-9
+    assert verify(sol.replace(fields=sol.fields | {"constraint": off}))["constraint"].verdict == "VIOLATED"
 
 
 def test_a_momentum_map_of_no_symmetry_is_violated(kepler):

@@ -7,7 +7,7 @@ import pytest
 
 import dirax as dx
 from dirax.engines import policy
-from dirax.engines.sizes import sizes_at
+from dirax.engines.close_sizes import sizes_at
 from dirax.engines.xla.lane import first_lane, take_step
 from dirax.schemes.step import Shape, make_step_equation
 

@@ -7,6 +7,7 @@ import pytest
 
 import dirax as dx
 from dirax.engines.contract import NOT_FINITE, OK, Problem
+from dirax.engines.sizes import sizes_of, sizes_of_traced
 from dirax.engines.xla import Xla, engine, loop
 from dirax.schemes.step import Field, Shape, StepEquation, explicit_step, make_step_equation
 
@@ -280,3 +281,22 @@ def test_one_compiled_function_serves_every_run_of_an_equation():
         assert compiled  # a batch is another function, so the listener does see compilations
     finally:
         jax.monitoring.unregister_event_duration_listener(listener)
+
+
+@pytest.mark.parametrize("batch", [None, 2])
+def test_sizes_of_a_run_that_jax_traces_are_those_of_the_run(batch):
+    """One by one and over axes of vmap, of the data, of the step and of a parameter."""
+    state, guess = np.array([1.0, 0.5, 0.0, 1e-9]), np.array([1.0, 0.5])
+    many = (lambda a: np.stack([a, 2.0 * a])) if batch else (lambda a: a)
+
+    def sizes(find, h, g, scale):
+        given = problem(PENDULUMS, many(state), many(guess), h, 1, params=g, batch=batch)
+        return find(given.with_numbers(state=many(state) * scale, guess=(many(guess) * scale,)))[0]
+
+    h, g, scale = np.array([0.1, 1e-6]), np.array([9.81, 1e3]), np.array([1.0, 1e-4])
+    apart = [[sizes(sizes_of, *one, s) for s in scale] for one in zip(h, g, strict=True)]
+    traced = lambda h, g, s: sizes(sizes_of_traced, h, g, s)
+    found = jax.jit(jax.vmap(jax.vmap(traced, in_axes=(None, None, 0)), in_axes=(0, 0, None)))(h, g, scale)
+    np.testing.assert_array_equal(found, apart)
+    assert len(np.unique(apart)) > 2
+    np.testing.assert_array_equal(jax.jacfwd(lambda h: traced(h, 9.81, 1.0))(0.1), 0.0)

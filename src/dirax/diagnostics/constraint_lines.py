@@ -26,7 +26,8 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         return None
     residual = np.abs(residual.reshape((-1, *residual.shape[-2:])))
     residual = np.where(np.isnan(residual), 0.0, residual)  # rows that were not reached
-    values, residual = np.max(residual / _constraint_scale(sol, structure), axis=-1), np.max(residual, axis=-1)
+    values = np.max(residual / _constraint_scale(sol, structure, residual.shape[-1]), axis=-1)
+    residual = np.max(residual, axis=-1)
     steps = "constraint" in sol.fields
     given = int(steps and "q0" in sol.initial)  # the first pair was given, not computed
     if residual.shape[1] <= given:
@@ -80,9 +81,9 @@ def _largest(*sizes: np.ndarray) -> np.ndarray:
     return np.where(found > 0, found, TINY)
 
 
-def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str) -> Any:
-    """The size of the constraint's terms: of those that the steps impose, one number for each; the largest saved number of a
-    loaded solution; |dE||x| where the constraint is one on dE; else from its derivative."""
+def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str, count: int) -> Any:
+    """The size of the terms of so many constraints: of those that the steps impose, one number for each; the largest saved
+    number of a loaded solution; |dE||x| where the constraint is one on dE; else from its derivative."""
     if isinstance(structure, AbstractDiscreteStructure) and structure.own_constraints:
         q = np.asarray(sol.q)
         speed = np.abs(np.diff(q, axis=-2)) / (sol.step * sol.save_every)
@@ -95,7 +96,7 @@ def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str)
     if sol.system.constrains_differential:
         return float(np.nanmax(sampled_terms(sol, at_rows(sol, energy_at)))) or TINY
     if form is not None and form.constraints.any and "p" in sol.fields:
-        return _largest(sampled(sol, at_rows(sol, _constraint_terms, form)))
+        return _largest(sampled(sol, at_rows(sol, _constraint_terms, form)))[:count]  # steps say no hidden ones
     return float(np.nanmax(sampled_terms(sol, at_rows(sol, constraint_at)))) or TINY
 
 

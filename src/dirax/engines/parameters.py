@@ -40,14 +40,14 @@ class Parameters:
         leaves, fixed = iter([own(*given) for given in zip(leaves, self.dtypes, strict=True)]), iter(self.fixed)
         return jax.tree.unflatten(self.treedef, [next(leaves) if d else next(fixed) for d in self.dynamic])
 
-    def flatten(self, params: Any, batch: int | None) -> np.ndarray:
+    def flatten(self, params: Any, batch: int | None, xp: Any = np) -> np.ndarray:
         """The floating leaves as (size,), or (B, size) with their batch axis."""
         leaves = jax.tree.leaves(params)
         if len(self.shapes) < len(self.dynamic):
             leaves = [leaf for leaf, d in zip(leaves, self.dynamic, strict=True) if d]
         lead = () if batch is None else (batch,)
-        columns = [np.asarray(leaf, dtype=np.float64).reshape(*lead, -1) for leaf in leaves]
-        return np.concatenate(columns, axis=-1) if columns else np.zeros((*lead, 0))
+        columns = [xp.asarray(leaf, dtype=np.float64).reshape(*lead, -1) for leaf in leaves]
+        return xp.concatenate(columns, axis=-1) if columns else xp.zeros((*lead, 0))
 
 
 def parameters(params: Any, batched: bool) -> Parameters:

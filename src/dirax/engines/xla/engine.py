@@ -13,7 +13,7 @@ from dirax.engines import policy
 from dirax.engines.contract import OK, Outcome, Problem, Progress, finished
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.linear_solver import AbstractLinearSolver
-from dirax.engines.sizes import sizes_by_jax, sizes_of
+from dirax.engines.sizes import sizes_of, sizes_of_traced
 from dirax.engines.xla.lane import Lane, Numerics, first_lane
 from dirax.engines.xla.loop import Clock, axes_of, by_lane, compiled_chunk, make_step, next_row, row_capacity, unpack_rows
 
@@ -101,7 +101,7 @@ class Xla(AbstractEngine):
         p, numerics, notes = self._planned(problem)
         axes = axes_of(p)
         lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), compensated=numerics.increments is not None)
-        clock, sizes = Clock.of(p), _sizes(p, numerics, sizes_by_jax)
+        clock, sizes = Clock.of(p), _sizes(p, numerics, sizes_of_traced)
         one = make_step(p.equation, axes, p.max_iterations, True, numerics)
 
         def step(lanes, k):
