@@ -58,7 +58,10 @@ def sizes_of_traced(problem: Problem) -> Sizes:
     if problem.size >= FEWEST_SPARSE:
         return tuple(map(jnp.asarray, sizes_of(problem)))
     found = _on_host(problem)
-    return jax.lax.stop_gradient(sizes_at(*_arguments(problem, _start(problem)))) if found is None else found
+    if found is None:
+        equation, *given, axes = _arguments(problem, _start(problem))
+        found = jax.jit(lambda given: sizes_at(equation, *given, axes))(given)  # the equation may close over what is traced
+    return jax.lax.stop_gradient(found)
 
 
 def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple, sizes: Sizes) -> tuple:
