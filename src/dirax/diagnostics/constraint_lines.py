@@ -26,8 +26,10 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         return None
     residual = np.abs(residual.reshape((-1, *residual.shape[-2:])))
     residual = np.where(np.isnan(residual), 0.0, residual)  # rows that were not reached
-    values = np.max(residual / _constraint_scale(sol, structure, residual.shape[-1]), axis=-1)
-    residual = np.max(residual, axis=-1)
+    scale, redundant = _constraint_scale(sol, structure, residual.shape[-1]), list(sol.stats.get("redundant_constraints", ()))
+    scale = np.broadcast_to(scale, residual.shape[-1:]).copy()
+    scale[redundant] = np.max(scale)  # what follows from the others has their roundoff
+    values, residual = np.max(residual / scale, axis=-1), np.max(residual, axis=-1)
     steps = "constraint" in sol.fields
     given = int(steps and "q0" in sol.initial)  # the first pair was given, not computed
     if residual.shape[1] <= given:
@@ -39,7 +41,7 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         f"{kind}, relative to its terms; at most {np.max(residual[:, given:]):.2g}, at t = {sol.time_of(row + given, lane):.6g}"
         f"{of_lane(sol, lane)}"
     )
-    if redundant := sol.stats.get("redundant_constraints"):
+    if redundant:
         text += f"; {', '.join(f'number {i}' for i in redundant)} left out, following from the others"
     if given:
         text += f"; the pair given at the start is off by {np.max(residual[:, 0]):.2g}"

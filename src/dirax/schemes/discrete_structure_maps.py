@@ -11,7 +11,7 @@ from dirax.geometry.cotangent_lift import CotangentLift, cotangent_lift
 from dirax.geometry.finite_difference import annihilator_projector
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.spaces import AbstractFlat
-from dirax.program.tracing import gradient
+from dirax.program.tracing import gradient, jacobian
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Claim
 from dirax.systems.forms import RelationForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -89,7 +89,7 @@ class RelationPairs(AbstractDiscreteStructure):
         rest = relation(jnp.zeros_like(v), jnp.zeros_like(multipliers))
         terms = jnp.abs(of_velocity) @ jnp.abs(v) + jnp.abs(of_multipliers) @ jnp.abs(multipliers) + jnp.abs(rest)
         z = jnp.concatenate([x0, x1])
-        scale = jnp.max(terms) + jnp.max(jnp.abs(jax.jacfwd(defect)(z)) @ moved(x0, x1))
+        scale = jnp.max(terms) + jnp.max(jnp.abs(jacobian(defect)(z)) @ moved(x0, x1))
         return jnp.stack([jnp.max(jnp.abs(defect(z))), scale])[:, None]
 
 
@@ -158,13 +158,14 @@ class LiftedPairs(AbstractDiscreteStructure):
         def missed(z):
             legendre, balance = terms_of(z)
             q, _, v, _ = base(z)
-            return jnp.sum(legendre, axis=0), jnp.sum(balance, axis=0), constraints.velocity_defect(t, q, v, params)
+            constraint = constraints.velocity_defect(t, q, v, params)
+            return jnp.concatenate([jnp.sum(legendre, axis=0), jnp.sum(balance, axis=0), constraint])
 
         z = jnp.concatenate([q0, p0, q1, p1])
         size = moved(jnp.concatenate([q0, p0]), jnp.concatenate([q1, p1]))
-        (momentum, force, constraint), slope = missed(z), jax.jacfwd(missed)(z)
+        of_each = lambda numbers: jnp.split(numbers, [n, 2 * n])
+        (momentum, force, constraint), scales = of_each(missed(z)), of_each(jnp.abs(jacobian(missed)(z)) @ size)
         legendre, balance = terms_of(z)
-        scales = [jnp.abs(part) @ size for part in slope]
         of_momentum = jnp.max(jnp.sum(jnp.abs(legendre), axis=0) + scales[0])
         of_force = jnp.max(jnp.sum(jnp.abs(balance), axis=0) + scales[1])
         first, whole = jnp.max(jnp.abs(momentum)), jnp.max(jnp.abs(force))
