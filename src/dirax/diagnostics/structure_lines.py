@@ -50,10 +50,11 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     items = consecutive(sol, structure.reads, points, rows)
     of_rows, limit = eqx.Partial(_terms, structure), roundoff_limit(tolerance, 1)
     terms = where_reached(over_rows(of_rows, sol, (items,)), items)
-    values = _relative(terms, structure.counts)
-    if np.any(values > limit):
-        values = _relative(with_rounding(terms, np.max(values, axis=(0, 2)), of_rows, sol, (items,)), structure.counts)
     parts, middle, lines, first = [part for claim in structure.claims for part in claim.parts], (points - 1) // 2, [], 0
+    follow = _redundant(sol, parts, structure.counts)
+    values = _relative(terms, structure.counts, follow)
+    if np.any(values > limit):
+        values = _relative(with_rounding(terms, np.max(values, axis=(0, 2)), of_rows, sol, (items,)), structure.counts, follow)
     if "q0" in sol.initial:
         values[:, 0, [parts.index(part) for part in structure.given]] = 0.0  # the first pair was given, not computed
     for claim in structure.claims:
@@ -74,11 +75,18 @@ def _terms(structure: AbstractDiscreteStructure, rows, params):
     return structure.membership_terms(rows, params)
 
 
-def _relative(values: np.ndarray, counts: tuple[int, ...]) -> np.ndarray:
+def _redundant(sol: Solution, parts: list[str], counts: tuple[int, ...]) -> np.ndarray:
+    """The numbers of the constraints that follow from the others."""
+    left_out = np.array(sol.stats.get("redundant_constraints", ()), int)
+    return left_out + sum(counts[: parts.index("constraint")]) if left_out.size and "constraint" in parts else left_out[:0]
+
+
+def _relative(values: np.ndarray, counts: tuple[int, ...], follow: np.ndarray) -> np.ndarray:
     """By how much each part is missed, (B, rows, parts), of (B, rows, 2, numbers): each number relative to the largest size of
-    its terms over the trajectory."""
+    its terms over the trajectory, and those that `follow` from others, whose roundoff they have, to the largest of all."""
     missed, sizes = values[:, :, 0], values[:, :, 1]
     largest = np.max(np.where(np.isfinite(sizes), sizes, 0.0), axis=1, keepdims=True)
+    largest[..., follow] = np.max(largest, axis=-1, keepdims=True)
     relative = np.divide(missed, largest, out=np.where(missed > 0.0, np.inf, 0.0), where=largest > 0.0)
     ends = np.cumsum(counts)[:-1]
     return np.stack([np.max(part, axis=2, initial=0.0) for part in np.split(relative, ends, axis=2)], axis=2)

@@ -22,6 +22,7 @@ them itself in no time. Steps of very many unknowns are measured by 1.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -59,8 +60,9 @@ def sizes_of_traced(problem: Problem) -> Sizes:
         return tuple(map(jnp.asarray, sizes_of(problem)))
     found = _on_host(problem)
     if found is None:
-        equation, *given, axes = _arguments(problem, _start(problem))
-        found = jax.jit(lambda given: sizes_at(equation, *given, axes))(given)  # the equation may close over what is traced
+        equation, state, guess, params, t, h, axes = _arguments(problem, _start(problem))
+        one = functools.partial(sizes_at, equation, axes=axes)  # which may close over what is traced
+        found = jax.jit(one)(state, guess, params, t, h)
     return jax.lax.stop_gradient(found)
 
 
