@@ -9,18 +9,29 @@ from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.collocation_nodes import Nodes
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
 from dirax.engines.native.loops.collocation_sweeps import FirstOrder, Means, SecondOrder, Sweep
+from dirax.engines.native.loops.complex_inverse import add_complex_inverse
+from dirax.engines.native.loops.simplified_newton import Eigenbasis, SimplifiedNewton
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
 from dirax.engines.stopping import EPSILON, STALLED
 
 FAR = 2.0**-20
 """Relative changes above which nothing more is asked of an iterate: it is not at its root."""
 
+CLEAR, PATIENCE = 64 * EPSILON, 3.0
+"""Above this relative change an iteration for all entries together may pause so many times before it is at its floor."""
 
-def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma: bool) -> str:
-    """IR of `run(lanes, params, outs, blocks, …)`: so many trajectories a block."""
+
+def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma: bool, newton: bool = False) -> str:
+    """IR of `run(lanes, params, outs, blocks, …)`: so many trajectories a block. With `newton`, of one trajectory, Newton's method
+    in the eigenbasis of A takes the place of the fixed-point iteration."""
     module = Module(fma)
     add_far_reduction(module)
-    _Kernel(plan, module, trajectories).define()
+    if newton:
+        add_complex_inverse(module, len(plan.relation.first))
+        _Kernel(plan, module, 1, SimplifiedNewton).define()
+    else:
+        kind = Means if isinstance(plan, MeanPlan) else FirstOrder if plan.gain is None else SecondOrder
+        _Kernel(plan, module, trajectories, kind).define()
     counts = plan.record.size, len(plan.shared.params), len(plan.rows)
     define_run(module, [8 * count * trajectories for count in counts])
     return module.text()
@@ -29,8 +40,8 @@ def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma:
 class _Kernel:
     """Emits `block`: the steps of a block of trajectories."""
 
-    def __init__(self, plan: CollocationPlan | MeanPlan, module: Module, trajectories: int):
-        self.plan, self.body = plan, Body(module)
+    def __init__(self, plan: CollocationPlan | MeanPlan, module: Module, trajectories: int, kind: type[Sweep]):
+        self.plan, self.body, self.kind = plan, Body(module), kind
         self.nodes = Nodes(plan, self.body, trajectories)
         self.one, self.all = self.nodes.one, self.nodes.all
 
@@ -48,18 +59,20 @@ class _Kernel:
         spots = [*places[: record.state_size], *places[first_lost:]]
         for value, place in zip(scalars, spots, strict=True):
             b.store(one.real, b.load(one.real, place), value)
-        first = record.state_size if plan.gain is None else record.state_size + record.kept
+        first = record.state_size + record.kept * self.kind.of_accelerations
         kept = [places[first + j : first + record.kept : n] for j in range(n)]
         for iterate, of_nodes in zip(self.pair.now(), kept, strict=True):
             self.all.read(of_nodes, iterate)
         self._take_sizes(places)
+        if self.kind is SimplifiedNewton and isinstance(plan, CollocationPlan):
+            self.nodes.eigenbasis = Eigenbasis(self.nodes, plan)
 
         def give_back() -> None:
             for value, place in zip(scalars, spots, strict=True):
                 b.store(one.real, b.load(one.real, value), place)
             for iterate, of_nodes in zip(self.pair.now(), kept, strict=True):
                 self.all.write(iterate, of_nodes)
-            if plan.gain is not None:
+            if self.kind.of_accelerations:
                 self._give_rates(places[record.state_size : record.state_size + record.kept])
             self._give_sizes()
             b.line("ret void")
@@ -74,7 +87,7 @@ class _Kernel:
         b, one, n = self.body, self.one, self.pair.count
         first = self.plan.record.sizes(0, n).start
         self.of_sizes, self.sizes = places[first : first + n], [b.alloca(one.real) for _ in range(n)]
-        self.scale = None if self.plan.gain is None else one.abs(self.nodes.h)
+        self.scale = one.abs(self.nodes.h) if self.kind.of_accelerations else None
         for place, size in zip(self.of_sizes, self.sizes, strict=True):
             value = b.load(one.real, place)
             b.store(one.real, one.div(value, self.scale) if self.scale else value, size)
@@ -128,8 +141,7 @@ class _Kernel:
             here.bind(node, value)
         with b.when(saves):
             self._save(here, number)
-        kind = Means if isinstance(plan, MeanPlan) else FirstOrder if plan.gain is None else SecondOrder
-        sweep = kind(self.nodes, here, state, time, self.pair)
+        sweep = self.kind(self.nodes, here, state, time, self.pair)
         iterates = self.pair.now()
         with over.at() as node:
             over.filled(self.before, [over.load(room, node) for room in iterates], node)
@@ -179,10 +191,11 @@ class _Kernel:
         return increments, over.highest(peak) if sweep.later else change
 
     def _attempts(self, sweep: Sweep, later: str, running: str) -> tuple[str, str, str]:
-        """The iteration from the polynomial of the step before, where that fails from constants: (converged, the last change,
-        sweeps) of those that are running."""
+        """The iteration from the polynomial of the step before, where that fails from constants, or the other way round:
+        (converged, the last change, sweeps) of those that are running."""
         b, over, one = self.body, self.all, self.one
         self.trying, self.change, self.sweeps = b.alloca(one.bool), b.alloca(one.real), b.alloca(one.real)
+        self.changes = [b.alloca(one.real) for _ in range(3)]
         b.store(one.bool, running, self.trying)
         b.store(one.real, one.const(0.0), self.sweeps)
         b.store(one.real, one.const(0.0), self.change)
@@ -191,9 +204,9 @@ class _Kernel:
             trying = b.load(one.bool, self.trying)
             iterates = self.pair.now()
             with b.when(first), over.at() as node:
-                over.filled(iterates, sweep.guess(self.before, later, True, node), node)
+                over.filled(iterates, sweep.guess(self.before, later, sweep.continued[0], node), node)
             with b.when(b.put(f"xor i1 {first}, true")), over.at() as node:
-                guess = zip(sweep.guess(self.before, later, False, node), iterates, strict=True)
+                guess = zip(sweep.guess(self.before, later, sweep.continued[1], node), iterates, strict=True)
                 over.filled(iterates, [over.chosen(trying, a, over.load(room, node)) for a, room in guess], node)
             self._iterate(sweep)
         converged = one.both(running, one.invert(b.load(one.bool, self.trying)))
@@ -204,20 +217,30 @@ class _Kernel:
         have come to a root then try no longer."""
         b, over, one = self.body, self.all, self.one
         count_here, active, shaky = b.alloca("i64"), b.alloca(one.bool), b.alloca(one.bool)
+        if sweep.together:
+            for place, value in zip(self.changes, (float("inf"), float("inf"), 0.0), strict=True):
+                b.store(one.real, one.const(value), place)
         b.store(one.bool, one.false, shaky)
         b.store("i64", "0", count_here)
         b.store(one.bool, b.load(one.bool, self.trying), active)
         head, out = b.fresh(), b.fresh()
         b.branch(head)
         b.label(head)
-        now, going, unstable = b.load(one.bool, active), over.flag(), over.flag()
+        now, unstable = b.load(one.bool, active), over.flag()
         rooms = self.pair.now(), self.pair.others()
-        sweep.sweep(lambda node, new, stable: self._compared(sweep, node, new, stable, now, going, unstable, *rooms))
+        if sweep.together:
+            peak = over.peak()
+            sweep.sweep(lambda node, new, stable: self._measured(sweep, node, new, peak, *rooms))
+            further = self._shrinks(over.highest(peak))
+        else:
+            going = over.flag()
+            sweep.sweep(lambda node, new, stable: self._compared(sweep, node, new, stable, now, going, unstable, *rooms))
+            further = over.marked(going)
         b.store(one.real, one.add(b.load(one.real, self.sweeps), one.select(now, one.const(1.0), one.const(0.0))), self.sweeps)
         count = b.put(f"add i64 {b.load('i64', count_here)}, 1")
         b.store("i64", count, count_here)
         allowed = b.put(f"icmp slt i64 {count}, %cap")
-        still = b.put(f"select i1 {b.put(f'icmp eq i64 {count}, 1')}, {one.bool} {one.true}, {one.bool} {over.marked(going)}")
+        still = b.put(f"select i1 {b.put(f'icmp eq i64 {count}, 1')}, {one.bool} {one.true}, {one.bool} {further}")
         still = one.both(now, still)
         still = b.put(f"select i1 {allowed}, {one.bool} {still}, {one.bool} {one.false}")
         b.store(one.bool, still, active)
@@ -227,6 +250,30 @@ class _Kernel:
         b.branch_if(one.any(still), head, out)
         b.label(out)
         self._judge(sweep, b.load(one.bool, shaky))
+
+    def _measured(self, sweep: Sweep, node: str, new: list[str], peak: str, rooms: list, others: list) -> None:
+        """The new iterates at a node into the other rooms; and their largest change, by the sizes of the iterates."""
+        over, e = self.all, self.all.emitter
+        for a, room, other, place, size in zip(new, rooms, others, self.moved, sweep.sizes(self.sizes), strict=True):
+            moved, scale = e.abs(e.sub(a, over.load(room, node))), e.add(e.abs(a), over.splat(size))
+            over.raised(peak, e.select(e.compare("ogt", moved, e.const(0.0)), e.div(moved, scale), e.const(0.0)))
+            over.store(moved, place, node)
+            over.store(a, other, node)
+
+    def _shrinks(self, update: str) -> str:
+        """Whether the largest change is not small yet, or the next one will be more than roundoff, and the smallest so far is one of
+        the last: an error that goes to and fro between coordinates does not shrink at every sweep."""
+        b, one = self.body, self.one
+        last, least, stale = (b.load(one.real, place) for place in self.changes)
+        more = one.compare("oge", update, least)
+        stale = one.select(more, one.add(stale, one.const(1.0)), one.const(0.0))
+        for value, place in zip((update, one.select(more, least, update), stale), self.changes, strict=True):
+            b.store(one.real, value, place)
+        patience = one.select(one.compare("ogt", update, one.const(CLEAR)), one.const(PATIENCE), one.const(1.0))
+        now = one.max(update, last)
+        left = one.both(one.compare("ogt", now, one.const(EPSILON)), one.compare("olt", stale, patience))
+        begun = one.compare("oeq", last, one.const(float("inf")))
+        return one.either(one.either(begun, one.compare("ogt", update, one.const(STALLED))), left)
 
     def _compared(
         self, sweep: Sweep, node: str, new: list[str], stable: str, now: str, going: str, unstable: str, rooms: list, others: list
@@ -264,14 +311,14 @@ class _Kernel:
         roundoff is measured by what it is made of."""
         b, over, one = self.body, self.all, self.one
         missed, trying = over.flag(), b.load(one.bool, self.trying)
-        self._compare(missed)
+        self._compare(sweep, missed)
         far = one.both(trying, over.marked(missed))
         with b.when(one.any(far)):
             for size, value in zip(self.sizes, sweep.terms(), strict=True):
                 known = b.load(one.real, size)
                 b.store(one.real, one.select(far, one.max(value, known), known), size)
             over.clear(missed)
-            self._compare(missed)
+            self._compare(sweep, missed)
         if not sweep.later:
             peak = over.peak()
             with over.at() as node:
@@ -280,10 +327,10 @@ class _Kernel:
             b.store(one.real, one.select(trying, over.highest(peak), b.load(one.real, self.change)), self.change)
         b.store(one.bool, one.both(trying, one.either(over.marked(missed), shaky)), self.trying)
 
-    def _compare(self, missed: str) -> None:
+    def _compare(self, sweep: Sweep, missed: str) -> None:
         """Mark where a last change is not small."""
-        over, e, one = self.all, self.all.emitter, self.one
-        sizes, iterates = [self.body.load(one.real, size) for size in self.sizes], self.pair.now()
+        over, e = self.all, self.all.emitter
+        sizes, iterates = sweep.sizes(self.sizes), self.pair.now()
         with over.at() as node:
             off = e.false
             for iterate, room, size in zip(iterates, self.moved, sizes, strict=True):

@@ -26,6 +26,15 @@ class Sweep(ABC):
     later = 0
     """Sweeps that `increments` does besides, and on which the iteration counts."""
 
+    of_accelerations = False
+    """Whether the iterates are accelerations, not rates."""
+
+    continued = True, False
+    """Whether the first attempt and the second one begin with the polynomial of the step before, or with its last values."""
+
+    together = False
+    """Whether all entries of the iterates change together, so that the largest change says when to stop; else each by itself."""
+
     def __post_init__(self):
         n = len(self.nodes.plan.relation.first)
         self.first, self.second = self.state[:n], self.state[n:]
@@ -83,6 +92,10 @@ class Sweep(ABC):
         """What the step adds to the state by sums over the nodes; `found` is called with the iterates of a last sweep, if there
         is one."""
 
+    def sizes(self, known: list[str]) -> list[str]:
+        """How large the iterates of a kind are, of all nodes, beside what each of them is: what stands in memory."""
+        return [self.nodes.body.load(self.nodes.one.real, size) for size in known]
+
     def settled(self, iterates: list[str], after: list[str]) -> list[str]:
         """What is added at the end, with the last iterates, to the state after these sums: nothing."""
         return []
@@ -112,7 +125,7 @@ class AtEveryNode(Sweep):
         self.nodes.all.filled(rooms, self.nodes.weighted(values, node), node)
 
 
-class FirstOrder(AtEveryNode):
+class OfRates(AtEveryNode):
     """The iterates are the rates y at the nodes."""
 
     def start(self, before: str, node: str) -> str:
@@ -123,6 +136,18 @@ class FirstOrder(AtEveryNode):
         """The relation at a node and the iterates there."""
         own = [self.nodes.all.load(room, node) for room in self.iterates]
         return self.region(self.nodes.along(weighted, node, self.first), own, node), own
+
+    def increments(self, found: Found) -> list[str]:
+        """h Σ b_i y_i and h Σ b_i ḃ_i."""
+        weighted, ends = self._weighted_iterates(), self.nodes.all.rooms(len(self.second))
+        if ends:
+            with self.nodes.all.at() as node:
+                self._weighted_rates(self._at(weighted, node)[0], ends, node)
+        return self.nodes.totals([*weighted, *ends])
+
+
+class FirstOrder(OfRates):
+    """The fixed-point iteration of the rates."""
 
     def sweep(self, found: Found) -> None:
         """Newton's method at each node, once; whether the elimination was stable."""
@@ -145,19 +170,12 @@ class FirstOrder(AtEveryNode):
             region.require(outputs)
             found(node, [region.value(y) for y in plan.solved], region.value(plan.stable))
 
-    def increments(self, found: Found) -> list[str]:
-        """h Σ b_i y_i and h Σ b_i ḃ_i."""
-        weighted, ends = self._weighted_iterates(), self.nodes.all.rooms(len(self.second))
-        if ends:
-            with self.nodes.all.at() as node:
-                self._weighted_rates(self._at(weighted, node)[0], ends, node)
-        return self.nodes.totals([*weighted, *ends])
-
 
 class SecondOrder(AtEveryNode):
     """The iterates are ä at the nodes, the gain times ḃ."""
 
     later = 1
+    of_accelerations = True
 
     def __post_init__(self):
         super().__post_init__()
