@@ -196,7 +196,7 @@ STIFF = {
     ),
     "rates of a mass matrix": (
         dx.LagrangeDirac(lambda q, v: double_pendulum(q, v, {"g": 9.8}) - 2e4 * (q[1] - q[0]) ** 2),
-        {"q": [0.7, 0.7], "v": [0.3, 0.3]}, 0.1, 4,
+        {"q": [0.7, 0.7], "v": [0.3, 0.3]}, 0.1, 5,
     ),
     "ports": (
         dx.PortHamiltonian(

@@ -53,8 +53,9 @@ class Tableau:
     @cached_property
     def eigenbasis(self) -> "Eigenbasis":
         """That of A."""
-        values, vectors = np.linalg.eig(self.matrix)
-        inverse = np.linalg.inv(vectors)
+        found: Any = np.linalg.eig(self.matrix)
+        values, vectors = found
+        inverse: Any = np.linalg.inv(vectors)
         upper = sorted(np.flatnonzero(values.imag >= 0.0), key=lambda k: -values[k].imag)  # a real one is the last
         rows, columns = [], []
         for k in upper:
@@ -74,8 +75,8 @@ class Tableau:
 
 
 class Eigenbasis(NamedTuple):
-    """The eigenvalues `values` of A, of every pair one, and a real one at the end if s is odd. `into` (s, s) takes vectors of the
-    stages into the basis of eigenvectors, real and imaginary parts one after the other; `back` (s, s) the solutions there back."""
+    """The eigenvalues `values` of A, of every pair one, and a real one at the end if s is odd. `into` (s, s) takes vectors of
+    the stages into the basis of eigenvectors, real and imaginary parts one after the other; `back` (s, s) the solutions back."""
 
     values: np.ndarray
     into: np.ndarray

@@ -13,7 +13,7 @@ from dirax.engines.native.kernels import SIGNATURE, linked, source_digest, too_l
 from dirax.engines.native.loops.collocation_loop import collocation_module
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan, TracedMean, TracedRelation, depends
 from dirax.engines.native.loops.record import Record
-from dirax.engines.native.loops.simplified_newton import MOST_ROOM, room
+from dirax.engines.native.loops.simplified_newton import pays
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program import machine_code as llvm
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
@@ -55,8 +55,8 @@ class CollocationKernels:
     @functools.cached_property
     def by_newton(self) -> "CollocationKernels | None":
         """Those that go on where the fixed-point iteration does not converge: with s/2 complex linear systems of the size of one
-        node. None for a relation of means, and where the systems are too large."""
-        if not isinstance(self.plan, CollocationPlan) or room(self.plan) > MOST_ROOM:
+        node. None for a relation of means, and where they do not pay or are too large."""
+        if not isinstance(self.plan, CollocationPlan) or not pays(self.plan):
             return None
         try:
             _ = self.plan.pencil  # with which the graph has all its nodes

@@ -22,8 +22,8 @@ CLEAR, PATIENCE = 64 * EPSILON, 3.0
 
 
 def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma: bool, newton: bool = False) -> str:
-    """IR of `run(lanes, params, outs, blocks, …)`: so many trajectories a block. With `newton`, of one trajectory, Newton's method
-    in the eigenbasis of A takes the place of the fixed-point iteration."""
+    """IR of `run(lanes, params, outs, blocks, …)`: so many trajectories a block. With `newton`, of one trajectory, Newton's
+    method in the eigenbasis of A takes the place of the fixed-point iteration."""
     module = Module(fma)
     add_far_reduction(module)
     if newton:
@@ -261,8 +261,8 @@ class _Kernel:
             over.store(a, other, node)
 
     def _shrinks(self, update: str) -> str:
-        """Whether the largest change is not small yet, or the next one will be more than roundoff, and the smallest so far is one of
-        the last: an error that goes to and fro between coordinates does not shrink at every sweep."""
+        """Whether the largest change is not small yet, or more than roundoff and the smallest so far is one of the last: an error
+        that goes to and fro between coordinates does not shrink at every sweep."""
         b, one = self.body, self.one
         last, least, stale = (b.load(one.real, place) for place in self.changes)
         more = one.compare("oge", update, least)

@@ -10,11 +10,15 @@ from dirax.engines.native.loops.complex_inverse import padded
 MOST_ROOM = 2**20
 """Bytes of a thread's stack that the matrices may take."""
 
+FEW = 4
+"""Unknowns of a step up to which an elimination of them all, written out, is faster."""
 
-def room(plan: CollocationPlan) -> int:
-    """The bytes that they take."""
+
+def pays(plan: CollocationPlan) -> bool:
+    """Whether the systems of one node are faster than one of all unknowns, and fit."""
     n = len(plan.relation.first)
-    return 16 * len(plan.tableau.eigenbasis.values) * n * 2 * padded(n)
+    room = 16 * len(plan.tableau.eigenbasis.values) * n * 2 * padded(n)
+    return n * plan.tableau.stages > FEW and room <= MOST_ROOM
 
 
 class Eigenbasis:
@@ -104,8 +108,8 @@ class SimplifiedNewton(OfRates):
         return found if self.plan.gain is None else [one.mul(term, one.abs(self.nodes.h)) for term in found]
 
     def sizes(self, known: list[str]) -> list[str]:
-        """Those that are known, the rates where the step begins, and the largest iterates of all nodes: what is roundoff at one of
-        them is so at all."""
+        """Those that are known, the rates where the step begins, and the largest iterates of all nodes: what is roundoff at
+        one of them is so at all."""
         over, one, found = self.nodes.all, self.nodes.one, []
         for rate, size, room in zip(self.rates, super().sizes(known), self.iterates, strict=True):
             peak = over.peak()
