@@ -4,8 +4,10 @@ from typing import Any
 
 from dirax.engines.native.ir.emitter import Body
 from dirax.engines.native.ir.lower import Region
+from dirax.engines.native.loops.apart import Apart
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
-from dirax.engines.native.loops.over_nodes import Apart, InLanes, OverNodes
+from dirax.engines.native.loops.in_lanes import InLanes
+from dirax.engines.native.loops.over_nodes import OverNodes
 
 
 class Nodes:
