@@ -19,7 +19,7 @@ from dirax.schemes.step import Field, StepEquation
 
 NOTICED = 1e-11
 """Changes of the energy in a step, relative to its terms, from which on they are more than roundoff of the rows, whose angles may
-have run to 10⁶. What is less is given back in the momenta, so that it does not add up over many steps."""
+have run to 10⁶."""
 
 
 @dataclass(frozen=True, eq=False)
