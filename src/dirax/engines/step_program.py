@@ -17,7 +17,7 @@ from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
 from dirax.program.evaluation.in_levels import in_levels
 from dirax.program.evaluation.in_numpy import Slopes, Values, in_parts
-from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_ends
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.interpreter import Nodes, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
@@ -183,6 +183,16 @@ class StepProgram:
         return Slopes(self.graph.copy(), first.residual, first.unknowns)
 
     @cached_property
+    def first_entries(self) -> tuple[Nodes, Order]:
+        """The columns of the first stage's Jacobian and its residual (k + 1, k), and an order for them that gives the memory of
+        what is not needed any more to what comes."""
+        index, g = self.stages[0][0], self.graph
+        rows, residual = self.jacobians[index], self.equations[index].residual
+        read = [*(row.get(j, g.zero) for j in range(len(rows)) for row in rows), *residual]
+        (order,) = with_ends(g, [(g.reachable(read), read)])
+        return nodes_array(read).reshape(-1, len(rows)), order
+
+    @cached_property
     def first_in_floats(self) -> Floats:
         """(unknowns, state, t, h, params) ↦ residual and Jacobian of the first stage, for one entry, all of them in one row."""
         first, shared = self.equations[self.stages[0][0]], self.shared
@@ -233,12 +243,14 @@ class StepProgram:
         entries, `params` with `batch_params`. Raises `GraphTooLarge`."""
         index, graph = self.stages[0][0], self.graph
         e = self.equations[index]
-        k, few = len(e.unknowns), len(u) * len(e.unknowns) * len(graph) <= IN_NUMBERS
-        entries = [] if few else [row.get(j, graph.zero) for row in self.jacobians[index] for j in range(k)]
+        few = len(u) * len(e.unknowns) * len(graph) <= IN_NUMBERS
         plan = self.first_slopes if few else None
 
         def read(known: Values) -> list[np.ndarray]:
-            slopes = known.slopes(e.residual, e.unknowns, plan) if plan else known.read(nodes_array(entries).reshape(k, k))
+            if plan is None:
+                both = known.read(*self.first_entries)
+                return [both[:, -1], both[:, :-1].swapaxes(1, 2)]
+            slopes = known.slopes(e.residual, e.unknowns, plan)
             return [known.read(nodes_array(e.residual)), slopes]
 
         leaves = self.parameters.flatten(params, len(u) if batch_params else None)

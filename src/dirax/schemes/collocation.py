@@ -5,7 +5,7 @@ from typing import Any
 from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.schemes.collocation_step import LagrangianCollocation, RelationCollocation
 from dirax.schemes.collocation_tables import MOST_STAGES, Tableau, gauss, lobatto
-from dirax.schemes.constrained_collocation_step import HolonomicCollocation, NonholonomicCollocation
+from dirax.schemes.constrained_collocation_step import ConstrainedCollocation
 from dirax.schemes.manifold_collocation_step import ManifoldCollocation
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
@@ -29,9 +29,9 @@ class Collocation(AbstractScheme):
     two stages are the Störmer–Verlet scheme where the mass matrix is constant).
 
     With constraints of a regular Lagrangian, at Lobatto nodes: holonomic ones, g = 0 at every node and G q̇ = 0 at the rows, a
-    symplectic map of the constraint manifold (two stages are RATTLE); or one-forms, W q̇ + b = 0 at every node, with the λ_1 of a
-    step that of λ_s before. Order 2s − 2 in q and p; the `reactions` λ at the nodes have less, as measured: s − 1 for holonomic
-    constraints, s or s − 1, whichever is even, for one-forms.
+    symplectic map of the constraint manifold (two stages are RATTLE); one-forms, W q̇ + b = 0 at every node, with the λ_1 of a
+    step that of λ_s before; or both. Order 2s − 2 in q and p; the `reactions` λ at the nodes have less, as measured: s − 1 those
+    of holonomic constraints, s or s − 1, whichever is even, those of one-forms.
 
     On a manifold, for a `dx.ManifoldLagrangian` at Gauss nodes: the same in the chart at q_k that belongs to the manifold's
     retraction; symplectic on T*Q, order 2s, every q on the manifold.
@@ -110,10 +110,4 @@ class Collocation(AbstractScheme):
                 'nodes="lobatto" for Lagrangians, dx.EnergyCollocation() for nonholonomic ones, or '
                 'dx.DiscreteDirac(constraints="resolve").'
             )
-        if shape.m and shape.c:
-            raise TypeError(
-                "dx.Collocation at Lobatto nodes keeps holonomic constraints or one-forms, but the system has both, "
-                f'{shape.c} and {shape.m}: take dx.DiscreteDirac(constraints="resolve"), composed for higher order.'
-            )
-        kind = HolonomicCollocation if shape.c else NonholonomicCollocation
-        return kind(lobatto(self.stages), shape, lagrangian).equation()
+        return ConstrainedCollocation(lobatto(self.stages), shape, lagrangian).equation()

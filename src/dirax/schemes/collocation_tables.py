@@ -7,7 +7,7 @@ the rest by exact integrals of Lagrange polynomials.
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,6 +50,20 @@ class Tableau:
         values = np.polynomial.legendre.legvander(2.0 * self.nodes - 1.0, self.stages - 1)
         return np.linalg.inv(values).T.tolist()
 
+    @cached_property
+    def eigenbasis(self) -> "Eigenbasis":
+        """That of A."""
+        found: Any = np.linalg.eig(self.matrix)
+        values, vectors = found
+        inverse: Any = np.linalg.inv(vectors)
+        upper = sorted(np.flatnonzero(values.imag >= 0.0), key=lambda k: -values[k].imag)  # a real one is the last
+        rows, columns = [], []
+        for k in upper:
+            pair = values[k].imag > 0.0
+            rows += [inverse[k].real, inverse[k].imag][: 1 + pair]
+            columns += [2.0 * vectors[:, k].real, -2.0 * vectors[:, k].imag] if pair else [vectors[:, k].real]
+        return Eigenbasis(values[upper], np.array(rows), np.array(columns).T)
+
     def integrals(self, theta: Any) -> list[Any]:
         """∫_0^θ ℓ_j for every j: A of the node θ. `theta` a number or an array."""
         x = 2.0 * theta - 1.0
@@ -58,6 +72,15 @@ class Tableau:
             p.append(((2 * k + 1) * x * p[k] - k * p[k - 1]) / (k + 1))
         moments = [theta, *((p[k + 1] - p[k - 1]) / (4 * k + 2) for k in range(1, self.stages))]
         return [sum((m * c for m, c in zip(moments[1:], row[1:], strict=True)), moments[0] * row[0]) for row in self.modes]
+
+
+class Eigenbasis(NamedTuple):
+    """The eigenvalues `values` of A, of every pair one, and a real one at the end if s is odd. `into` (s, s) takes vectors of
+    the stages into the basis of eigenvectors, real and imaginary parts one after the other; `back` (s, s) the solutions back."""
+
+    values: np.ndarray
+    into: np.ndarray
+    back: np.ndarray
 
 
 @cache

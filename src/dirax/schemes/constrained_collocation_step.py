@@ -1,6 +1,5 @@
 """One step at Lobatto nodes of a Lagrangian with constraints: the pair IIIA–IIIB, with the constraints at every node."""
 
-from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -14,6 +13,7 @@ from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.collocation_step import combined
 from dirax.schemes.collocation_tables import Tableau
 from dirax.schemes.constraint_rows import ConstraintRows
+from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -35,10 +35,16 @@ class Nodes(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class ConstrainedCollocation(AbstractStep):
     """Q_i = q_k + h Σ_j a_ij V_j with the matrix of Lobatto IIIA, ∂L/∂v(Q_i, V_i) = p_k + h Σ_j â_ij Ṗ_j with that of IIIB, and
-    p_{k+1} = p_k + h Σ_i b_i Ṗ_i, where Ṗ_i = ∂L/∂q + f − [W; G]ᵀ λ_i.
+    p_{k+1} = p_k + h Σ_i b_i Ṗ_i, where Ṗ_i = ∂L/∂q + f − Wᵀ λ_i − Gᵀ μ_i.
 
-    The last column of â is zero, so that λ_s acts on p_{k+1} alone. Saved are `multipliers`, h Σ_i b_i λ_i, and `reactions`,
-    the λ_i of every node.
+    Holonomic constraints: g(Q_i) = 0 at every node, and G q̇ + ∂g/∂t = 0 at the end for the velocity of p_{k+1} (Jay 1996;
+    Hairer, Lubich, Wanner, VII.1.4), symplectic on the constraint manifold. The last column of â is zero, so that μ_s acts on
+    p_{k+1} alone. Two stages are RATTLE.
+
+    One-forms: W v̂_i + b = 0 at every node for the velocity v̂_i that belongs to p_k + h Σ_j a_ij Ṗ_j, with the matrix of IIIA;
+    λ_1 is λ_s of the step before, which the state carries (Jay's SPARK methods; Sato Martín de Almagro, arXiv 1810.10926).
+
+    Saved are `multipliers`, h Σ_i b_i (λ_i, μ_i), and `reactions`, the (λ_i, μ_i) of every node.
     """
 
     tableau: Tableau
@@ -72,9 +78,38 @@ class ConstrainedCollocation(AbstractStep):
         }
         return found | ({"work": Field((), "node", (), "work of the forces since the start")} if self.forced else {})
 
-    @abstractmethod
+    @property
+    def state(self) -> Layout:
+        return Layout(q=self.n, p=self.n, reaction=self.rows.nonholonomic, work=self.forced)
+
+    @property
+    def canonical(self) -> bool:
+        return not self.forced and not self.rows.nonholonomic
+
+    @property
+    def ends(self) -> int:
+        """At how many of the last nodes the velocity that belongs to p is wanted."""
+        return self.tableau.stages - 1 if self.rows.nonholonomic else 1
+
+    @property
+    def unknowns(self) -> Layout:
+        s, m, c = self.tableau.stages, self.rows.nonholonomic, self.rows.holonomic
+        return Layout(velocities=(s, self.n), one_forms=(s - 1, m), holonomic=(s, c), constrained=(self.ends, self.n))
+
+    @property
+    def labels(self) -> Labels:
+        s, m, c = self.tableau.stages, self.rows.nonholonomic, self.rows.holonomic
+        at = lambda name, count, nodes: sum((Labels.numbered(f"{name} at node {j}", count) for j in nodes), Labels())
+        inner, later = at("equation {}", self.n, range(1, s + 1)), range(2, s + 1)
+        momenta = at("momentum {}", self.n, range(s + 1 - self.ends, s + 1))
+        rates = at("constraint {}", m, later) + Labels.numbered("rate of constraint {} at the end", c)
+        return inner + at("holonomic constraint {}", c, later) + momenta + rates
+
     def reactions(self, u: Array, state: Array) -> list[Float[Array, " k"]]:
-        """λ_i at every node."""
+        """(λ_i, μ_i) at every node."""
+        found = self.unknowns.split(u)
+        pulls = [self.state.split(state).reaction, *found.one_forms]
+        return [jnp.concatenate(both) for both in zip(pulls, found.holonomic, strict=True)]
 
     @once
     def slope(self, t, q, v, params):
@@ -108,11 +143,25 @@ class ConstrainedCollocation(AbstractStep):
         parts = zip(given, nodes.q, nodes.v, nodes.times, strict=True)
         return [p - self.system.legendre(q, v, params, t) for p, q, v, t in parts]
 
-    def ends(self, nodes: Nodes, state, h) -> dict[str, Array]:
-        """The parts of the new state."""
-        now, weights = self.state.split(state), self.tableau.weights.tolist()
+    def residual(self, u, state, t, h, params):
+        nodes, velocities = self.nodes(u, state, t, h, params), list(self.unknowns.split(u).constrained)
+        places = list(zip(nodes.times, nodes.q, strict=True))
+        # a step moves g by about h² μ, so that g/h and not g is of the size of the other equations
+        positions = [self.rows.position(at, q, params) / h for at, q in places[1:]] if self.rows.holonomic else []
+        momenta, rates = [], []
+        for row, v, (at, q) in zip(self.tableau.matrix[-self.ends :], velocities, places[-self.ends :], strict=True):
+            (p,) = self.momenta(row[None], state, nodes, h)
+            momenta.append(p - self.system.legendre(q, v, params, at))
+            rates.append(self.rows.velocity_defect(at, q, v, params))
+        rates = [*(rate[: self.rows.nonholonomic] for rate in rates[:-1]), rates[-1]]
+        return jnp.concatenate([*self.inner(nodes, state, h, params), *positions, *momenta, *rates])
+
+    def advance(self, u, state, t, h, params):
+        nodes, now, weights = self.nodes(u, state, t, h, params), self.state.split(state), self.tableau.weights.tolist()
         moved = {"q": now.q + h * combined(weights, nodes.v), "p": now.p + h * combined(weights, nodes.rates)}
-        return moved | ({"work": now.work + h * combined(weights, nodes.works)} if self.forced else {})
+        if self.rows.nonholonomic:
+            moved["reaction"] = self.unknowns.split(u).one_forms[-1]
+        return self.state.join(**moved, **({"work": now.work + h * combined(weights, nodes.works)} if self.forced else {}))
 
     @property
     def interpolation(self):
@@ -136,11 +185,20 @@ class ConstrainedCollocation(AbstractStep):
         solved = solve(hessian, jnp.concatenate([free[:, None], matrix.T], axis=1))
         return solve(matrix @ solved[:, 1:], matrix @ solved[:, 0] + drift)
 
-    def begun(self, data) -> dict[str, Array]:
-        """The parts of the first state that every method has."""
+    def start(self, data, h, params):
         if "q0" in data:
             raise ValueError("collocation is a one-step method: start it from q= with v= or p=, not from two points.")
-        return {"q": data["q"], "p": data["p"]}
+        s, m, v, pull = self.tableau.stages, self.rows.nonholonomic, data["v"], self.first_reaction(data, params)
+        guess = {"velocities": jnp.tile(v, (s, 1)), "constrained": jnp.tile(v, (self.ends, 1))}
+        pulls = {"one_forms": jnp.tile(pull[:m], (s - 1, 1)), "holonomic": jnp.tile(pull[m:], (s, 1))}
+        return self.state.join(q=data["q"], p=data["p"], reaction=pull[:m]), self.unknowns.join(**guess, **pulls)
+
+    def resume(self, data, h, params):
+        """With the λ_1 that was saved, where it was, and not with that of the equations of motion."""
+        state, u = self.start(data, h, params)
+        if "reactions" in data:
+            state = self.state.replace(state, reaction=self.rows.pick(data["reactions"][0])[: self.rows.nonholonomic])
+        return state, u
 
     def unpack(self, state, u, t, h, params):
         now, reactions = self.state.split(state), self.reactions(u, state)
@@ -148,103 +206,3 @@ class ConstrainedCollocation(AbstractStep):
         nodes = jnp.stack([self.rows.all(pull) for pull in reactions])
         row = {"q": now.q, "p": now.p, "multipliers": self.rows.all(impulse), "reactions": nodes}
         return row | ({"work": now.work[0]} if self.forced else {})
-
-
-@dataclass(frozen=True, eq=False)
-class HolonomicCollocation(ConstrainedCollocation):
-    """g(Q_i) = 0 at every node, and G q̇ + ∂g/∂t = 0 at the end for the velocity of p_{k+1} (Jay 1996; Hairer, Lubich, Wanner,
-    VII.1.4): symplectic on the constraint manifold. Two stages are RATTLE."""
-
-    @property
-    def state(self) -> Layout:
-        return Layout(q=self.n, p=self.n, work=self.forced)
-
-    @property
-    def canonical(self) -> bool:
-        return not self.forced
-
-    @property
-    def unknowns(self) -> Layout:
-        s, k = self.tableau.stages, self.rows.count
-        return Layout(velocities=(s, self.n), reactions=(s, k), end=self.n)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        s, n, k = self.tableau.stages, self.n, self.rows.count
-        inner = tuple(f"equation {i} at node {j + 1}" for j in range(s) for i in range(n))
-        positions = tuple(f"holonomic constraint {i} at node {j + 1}" for j in range(1, s) for i in range(k))
-        ends = tuple(f"momentum {i} at the end" for i in range(n)) + tuple(f"rate of constraint {i} at the end" for i in range(k))
-        return inner + positions + ends
-
-    def reactions(self, u, state):
-        return list(self.unknowns.split(u).reactions)
-
-    def residual(self, u, state, t, h, params):
-        nodes, end = self.nodes(u, state, t, h, params), self.unknowns.split(u).end
-        out = self.ends(nodes, state, h)
-        # a step moves g by about h² λ, so that g/h and not g is of the size of the other equations
-        positions = [self.rows.position(at, q, params) / h for at, q in zip(nodes.times[1:], nodes.q[1:], strict=True)]
-        last = [out["p"] - self.system.legendre(out["q"], end, params, t + h), self.rows.hidden(t + h, out["q"], end, params)]
-        return jnp.concatenate([*self.inner(nodes, state, h, params), *positions, *last])
-
-    def advance(self, u, state, t, h, params):
-        return self.state.join(**self.ends(self.nodes(u, state, t, h, params), state, h))
-
-    def start(self, data, h, params):
-        begun, pull = self.state.join(**self.begun(data)), self.first_reaction(data, params)
-        s = self.tableau.stages
-        return begun, self.unknowns.join(velocities=jnp.tile(data["v"], (s, 1)), reactions=jnp.tile(pull, (s, 1)), end=data["v"])
-
-
-@dataclass(frozen=True, eq=False)
-class NonholonomicCollocation(ConstrainedCollocation):
-    """W v + b = 0 at every node for the velocity v̂_i that belongs to p_k + h Σ_j a_ij Ṗ_j, with the matrix of IIIA; λ_1 is λ_s
-    of the step before (Jay's SPARK methods; Sato Martín de Almagro, arXiv 1810.10926). The state carries it."""
-
-    @property
-    def state(self) -> Layout:
-        return Layout(q=self.n, p=self.n, reaction=self.rows.count, work=self.forced)
-
-    @property
-    def unknowns(self) -> Layout:
-        s, k = self.tableau.stages, self.rows.count
-        return Layout(velocities=(s, self.n), reactions=(s - 1, k), constrained=(s - 1, self.n))
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        s, n, k = self.tableau.stages, self.n, self.rows.count
-        inner = tuple(f"equation {i} at node {j + 1}" for j in range(s) for i in range(n))
-        momenta = tuple(f"momentum {i} at node {j + 1}" for j in range(1, s) for i in range(n))
-        return inner + momenta + tuple(f"constraint {i} at node {j + 1}" for j in range(1, s) for i in range(k))
-
-    def reactions(self, u, state):
-        return [self.state.split(state).reaction, *self.unknowns.split(u).reactions]
-
-    def residual(self, u, state, t, h, params):
-        nodes, velocities = self.nodes(u, state, t, h, params), list(self.unknowns.split(u).constrained)
-        places = list(zip(nodes.times, nodes.q, strict=True))[1:]
-        given = self.momenta(self.tableau.matrix, state, nodes, h)[1:]
-        momenta = [p - self.system.legendre(q, v, params, at) for p, v, (at, q) in zip(given, velocities, places, strict=True)]
-        kept = [self.rows.velocity_defect(at, q, v, params) for v, (at, q) in zip(velocities, places, strict=True)]
-        return jnp.concatenate([*self.inner(nodes, state, h, params), *momenta, *kept])
-
-    def advance(self, u, state, t, h, params):
-        ends = self.ends(self.nodes(u, state, t, h, params), state, h)
-        return self.state.join(reaction=self.unknowns.split(u).reactions[-1], **ends)
-
-    def start(self, data, h, params):
-        pull, s = self.first_reaction(data, params), self.tableau.stages
-        v = data["v"]
-        guess = {"velocities": jnp.tile(v, (s, 1)), "constrained": jnp.tile(v, (s - 1, 1))}
-        return (
-            self.state.join(reaction=pull, **self.begun(data)),
-            self.unknowns.join(reactions=jnp.tile(pull, (s - 1, 1)), **guess),
-        )
-
-    def resume(self, data, h, params):
-        """With the λ_1 that was saved, where it was, and not with that of the equations of motion."""
-        state, u = self.start(data, h, params)
-        if "reactions" in data:
-            parts = self.state.split(state)
-            state = self.state.join(**parts._asdict() | {"reaction": self.rows.pick(data["reactions"][0])})
-        return state, u

@@ -3,7 +3,8 @@
 from typing import Any
 
 from dirax.schemes.collocation_tables import MOST_STAGES, gauss, quadrature
-from dirax.schemes.energy_collocation_step import HamiltonianEnergyCollocation, LagrangianEnergyCollocation
+from dirax.schemes.hamiltonian_energy_collocation_step import HamiltonianEnergyCollocation
+from dirax.schemes.lagrangian_energy_collocation_step import LagrangianEnergyCollocation
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.systems.forms import RelationForm
 from dirax.systems.system import AbstractSystem

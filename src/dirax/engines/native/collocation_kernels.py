@@ -13,6 +13,7 @@ from dirax.engines.native.kernels import SIGNATURE, linked, source_digest, too_l
 from dirax.engines.native.loops.collocation_loop import collocation_module
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan, TracedMean, TracedRelation, depends
 from dirax.engines.native.loops.record import Record
+from dirax.engines.native.loops.simplified_newton import pays
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program import machine_code as llvm
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
@@ -25,10 +26,11 @@ MOST_SIDE_BY_SIDE = 100
 
 
 class CollocationKernels:
-    """The machine code of a collocation step: for one trajectory, and for several side by side."""
+    """The machine code of a collocation step: for one trajectory, and for several side by side; or, with `newton`, that by
+    Newton's method in the eigenbasis of A, for one."""
 
-    def __init__(self, step: StepProgram, plan: CollocationPlan | MeanPlan):
-        self.step, self.plan = step, plan
+    def __init__(self, step: StepProgram, plan: CollocationPlan | MeanPlan, newton: bool = False):
+        self.step, self.plan, self.newton = step, plan, newton
         g = plan.graph
         self.operations = sum(1 for node in g.reachable(plan.outputs) if g.args[node])
         digest = hashlib.sha256(source_digest().encode())
@@ -50,6 +52,18 @@ class CollocationKernels:
         """Whether a batch has trajectories in lanes."""
         return self.plan.tableau.stages * len(self.plan.relation.first) <= MOST_SIDE_BY_SIDE
 
+    @functools.cached_property
+    def by_newton(self) -> "CollocationKernels | None":
+        """Those that go on where the fixed-point iteration does not converge: with s/2 complex linear systems of the size of one
+        node. None for a relation of means, and where they do not pay or are too large."""
+        if not isinstance(self.plan, CollocationPlan) or not pays(self.plan):
+            return None
+        try:
+            _ = self.plan.pencil  # with which the graph has all its nodes
+        except GraphTooLarge:
+            return None
+        return CollocationKernels(self.step, self.plan, newton=True)
+
     @property
     def notes(self) -> dict[str, Any]:
         """What `stats` say of the iteration."""
@@ -64,8 +78,9 @@ class CollocationKernels:
         """The compiled `run`, and whether it came from a cache."""
         if width in self._runs:
             return self._runs[width], True
-        text = lambda: collocation_module(self.plan, width, llvm.has_fma())
-        library, _, cached = linked("run", (self.digest, width, "collocation"), text, lambda: self.operations)
+        text = lambda: collocation_module(self.plan, width, llvm.has_fma(), self.newton)
+        kind = "collocation", "newton" * self.newton
+        library, _, cached = linked("run", (self.digest, width, *kind), text, lambda: self.operations)
         self._runs[width] = llvm.function(library, "run", SIGNATURE)
         return self._runs[width], cached
 

@@ -1,16 +1,18 @@
 """The run of a kernel, chunk by chunk."""
 
 import time
+from typing import Any
 
 import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, Outcome, Problem, Progress, finished
+from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem, Progress, finished
 from dirax.engines.native.collocation_kernels import CollocationKernels, collocation_kernels
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
 from dirax.engines.native.one_lane import OneLane, places_of
 from dirax.engines.native.sizes_of_lanes import find_sizes, with_present_sizes
 from dirax.program.interpreter import UnsupportedPrimitive
+from dirax.text.representation import counted
 
 CHUNK_SECONDS = 0.1
 WORTH_THREADS = 2e-3
@@ -72,10 +74,10 @@ class Ready:
                     progress(done, p.steps)
         except KeyboardInterrupt:
             interrupted = True
-        by_newton = None
+        others: list[str] = []
         if not interrupted and lanes.stuck:
             if isinstance(self.made, CollocationKernels):
-                by_newton = _by_newton(lanes)
+                others = _by_newton(lanes, self.made)
             else:
                 with_present_sizes(lanes, self.made)
         run_seconds = time.perf_counter() - started
@@ -95,30 +97,48 @@ class Ready:
             interrupted=interrupted,
             compile_seconds=compile_seconds,
             run_seconds=run_seconds,
-            record=None if interrupted or by_newton is not None else (table,),
+            record=None if interrupted or others else (table,),
             engine="native",
-            notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
+            notes={**self.notes, **_told(self.notes, others), "kernel_cached": cached, "threads": lanes.threads},
         )
         whole = places is not None and outcome.completed[0] == p.steps  # then the closing row stands where it belongs
         return outcome if whole else finished(p, outcome)
 
 
-def _by_newton(lanes: Lanes | OneLane) -> Kernels | None:
-    """Go on with trajectories whose fixed-point iteration has not converged, by Newton's method for all nodes together, with
-    these kernels; None where there are no such trajectories."""
-    p, record, table = lanes.problem, lanes.record, lanes.table()
-    left = np.flatnonzero(table[:, record.status] == NOT_CONVERGED)
-    if not len(left):
-        return None
+def _told(notes: dict[str, Any], others: list[str]) -> dict[str, str]:
+    """What `stats` say of the iteration, with the other ones that followed it."""
+    return {"iteration": "; then ".join([notes["iteration"], *others])} if others else {}
+
+
+def _by_newton(lanes: Lanes | OneLane, made: CollocationKernels) -> list[str]:
+    """Go on with trajectories whose fixed-point iteration has not converged: by Newton's method with one Jacobian for all nodes,
+    which needs systems of the size of one node alone, and where that does not converge by Newton's method with all unknowns
+    together. Returns which were tried."""
+    p, record, others = lanes.problem, lanes.record, []
+
+    def left() -> tuple[np.ndarray, np.ndarray]:
+        table = lanes.table()
+        stuck = np.flatnonzero(table[:, record.status] == NOT_CONVERGED)
+        own = table[stuck]
+        own[:, record.differences] = 0.0
+        return stuck, own
+
+    stuck, own = left()
+    if len(stuck) and made.by_newton is not None:
+        own[:, record.status] = OK
+        lanes.put(stuck, lanes.attempt(stuck, made.by_newton, own))
+        others.append(f"simplified Newton in the eigenbasis of A, {counted(len(stuck), 'trajectory', 'trajectories')}")
+        stuck, own = left()
+    if not len(stuck):
+        return others
     try:
-        made = kernels(p.equation, p.params, p.batch_params, True)
-        made.kernel(1)
+        whole = kernels(p.equation, p.params, p.batch_params, True)
+        whole.kernel(1)
     except UnsupportedPrimitive:  # too large to be written out: they end where they are
-        return None
-    own = table[left]
-    own[:, record.differences] = 0.0
+        return others
     for i, (stage, _) in enumerate(p.equation.stages):
         own[:, record.sizes(i, stage.unknowns)] = 0.0
-    lanes.put(left, own)
-    with_present_sizes(lanes, made)
-    return made
+    lanes.put(stuck, own)
+    with_present_sizes(lanes, whole)
+    others.append(f"Newton of all unknowns, {counted(len(stuck), 'trajectory', 'trajectories')}")
+    return others

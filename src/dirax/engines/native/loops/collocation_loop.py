@@ -6,21 +6,27 @@ from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
 from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Module
 from dirax.engines.native.ir.lower import Region
+from dirax.engines.native.loops.collocation_iteration import Iteration
+from dirax.engines.native.loops.collocation_means import Means
 from dirax.engines.native.loops.collocation_nodes import Nodes
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
-from dirax.engines.native.loops.collocation_sweeps import FirstOrder, Means, SecondOrder, Sweep
+from dirax.engines.native.loops.collocation_sweeps import FirstOrder, SecondOrder, Sweep
+from dirax.engines.native.loops.complex_inverse import add_complex_inverse
+from dirax.engines.native.loops.simplified_newton import Eigenbasis, SimplifiedNewton
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
-from dirax.engines.stopping import EPSILON, STALLED
-
-FAR = 2.0**-20
-"""Relative changes above which nothing more is asked of an iterate: it is not at its root."""
 
 
-def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma: bool) -> str:
-    """IR of `run(lanes, params, outs, blocks, …)`: so many trajectories a block."""
+def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma: bool, newton: bool = False) -> str:
+    """IR of `run(lanes, params, outs, blocks, …)`: so many trajectories a block. With `newton`, of one trajectory, Newton's
+    method in the eigenbasis of A takes the place of the fixed-point iteration."""
     module = Module(fma)
     add_far_reduction(module)
-    _Kernel(plan, module, trajectories).define()
+    if newton:
+        add_complex_inverse(module, len(plan.relation.first))
+        _Kernel(plan, module, 1, SimplifiedNewton).define()
+    else:
+        kind = Means if isinstance(plan, MeanPlan) else FirstOrder if plan.gain is None else SecondOrder
+        _Kernel(plan, module, trajectories, kind).define()
     counts = plan.record.size, len(plan.shared.params), len(plan.rows)
     define_run(module, [8 * count * trajectories for count in counts])
     return module.text()
@@ -29,8 +35,8 @@ def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma:
 class _Kernel:
     """Emits `block`: the steps of a block of trajectories."""
 
-    def __init__(self, plan: CollocationPlan | MeanPlan, module: Module, trajectories: int):
-        self.plan, self.body = plan, Body(module)
+    def __init__(self, plan: CollocationPlan | MeanPlan, module: Module, trajectories: int, kind: type[Sweep]):
+        self.plan, self.body, self.kind = plan, Body(module), kind
         self.nodes = Nodes(plan, self.body, trajectories)
         self.one, self.all = self.nodes.one, self.nodes.all
 
@@ -48,18 +54,20 @@ class _Kernel:
         spots = [*places[: record.state_size], *places[first_lost:]]
         for value, place in zip(scalars, spots, strict=True):
             b.store(one.real, b.load(one.real, place), value)
-        first = record.state_size if plan.gain is None else record.state_size + record.kept
+        first = record.state_size + record.kept * self.kind.of_accelerations
         kept = [places[first + j : first + record.kept : n] for j in range(n)]
         for iterate, of_nodes in zip(self.pair.now(), kept, strict=True):
             self.all.read(of_nodes, iterate)
         self._take_sizes(places)
+        if self.kind is SimplifiedNewton and isinstance(plan, CollocationPlan):
+            self.nodes.eigenbasis = Eigenbasis(self.nodes, plan)
 
         def give_back() -> None:
             for value, place in zip(scalars, spots, strict=True):
                 b.store(one.real, b.load(one.real, value), place)
             for iterate, of_nodes in zip(self.pair.now(), kept, strict=True):
                 self.all.write(iterate, of_nodes)
-            if plan.gain is not None:
+            if self.kind.of_accelerations:
                 self._give_rates(places[record.state_size : record.state_size + record.kept])
             self._give_sizes()
             b.line("ret void")
@@ -74,7 +82,7 @@ class _Kernel:
         b, one, n = self.body, self.one, self.pair.count
         first = self.plan.record.sizes(0, n).start
         self.of_sizes, self.sizes = places[first : first + n], [b.alloca(one.real) for _ in range(n)]
-        self.scale = None if self.plan.gain is None else one.abs(self.nodes.h)
+        self.scale = one.abs(self.nodes.h) if self.kind.of_accelerations else None
         for place, size in zip(self.of_sizes, self.sizes, strict=True):
             value = b.load(one.real, place)
             b.store(one.real, one.div(value, self.scale) if self.scale else value, size)
@@ -128,12 +136,12 @@ class _Kernel:
             here.bind(node, value)
         with b.when(saves):
             self._save(here, number)
-        kind = Means if isinstance(plan, MeanPlan) else FirstOrder if plan.gain is None else SecondOrder
-        sweep = kind(self.nodes, here, state, time, self.pair)
+        sweep = self.kind(self.nodes, here, state, time, self.pair)
         iterates = self.pair.now()
         with over.at() as node:
             over.filled(self.before, [over.load(room, node) for room in iterates], node)
-        converged, change, count = self._attempts(sweep, one.compare("ogt", done, one.const(0.0)), running)
+        iteration = Iteration(self.nodes, self.pair, self.before, self.moved, self.sizes)
+        converged, change, count = iteration.emit(sweep, one.compare("ogt", done, one.const(0.0)), running)
         increments, change = self._increments(sweep, change)
         new, lost = [], []
         finite = one.true
@@ -177,119 +185,6 @@ class _Kernel:
 
         increments = sweep.increments(last)
         return increments, over.highest(peak) if sweep.later else change
-
-    def _attempts(self, sweep: Sweep, later: str, running: str) -> tuple[str, str, str]:
-        """The iteration from the polynomial of the step before, where that fails from constants: (converged, the last change,
-        sweeps) of those that are running."""
-        b, over, one = self.body, self.all, self.one
-        self.trying, self.change, self.sweeps = b.alloca(one.bool), b.alloca(one.real), b.alloca(one.real)
-        b.store(one.bool, running, self.trying)
-        b.store(one.real, one.const(0.0), self.sweeps)
-        b.store(one.real, one.const(0.0), self.change)
-        with b.loop(0, 2) as attempt, b.when(one.any(b.load(one.bool, self.trying))):
-            first = b.put(f"icmp eq i64 {attempt}, 0")
-            trying = b.load(one.bool, self.trying)
-            iterates = self.pair.now()
-            with b.when(first), over.at() as node:
-                over.filled(iterates, sweep.guess(self.before, later, True, node), node)
-            with b.when(b.put(f"xor i1 {first}, true")), over.at() as node:
-                guess = zip(sweep.guess(self.before, later, False, node), iterates, strict=True)
-                over.filled(iterates, [over.chosen(trying, a, over.load(room, node)) for a, room in guess], node)
-            self._iterate(sweep)
-        converged = one.both(running, one.invert(b.load(one.bool, self.trying)))
-        return converged, b.load(one.real, self.change), b.load(one.real, self.sweeps)
-
-    def _iterate(self, sweep: Sweep) -> None:
-        """Sweeps until the next change of every entry of an iterate is below its roundoff, or changes shrink no more; those that
-        have come to a root then try no longer."""
-        b, over, one = self.body, self.all, self.one
-        count_here, active, shaky = b.alloca("i64"), b.alloca(one.bool), b.alloca(one.bool)
-        b.store(one.bool, one.false, shaky)
-        b.store("i64", "0", count_here)
-        b.store(one.bool, b.load(one.bool, self.trying), active)
-        head, out = b.fresh(), b.fresh()
-        b.branch(head)
-        b.label(head)
-        now, going, unstable = b.load(one.bool, active), over.flag(), over.flag()
-        rooms = self.pair.now(), self.pair.others()
-        sweep.sweep(lambda node, new, stable: self._compared(sweep, node, new, stable, now, going, unstable, *rooms))
-        b.store(one.real, one.add(b.load(one.real, self.sweeps), one.select(now, one.const(1.0), one.const(0.0))), self.sweeps)
-        count = b.put(f"add i64 {b.load('i64', count_here)}, 1")
-        b.store("i64", count, count_here)
-        allowed = b.put(f"icmp slt i64 {count}, %cap")
-        still = b.put(f"select i1 {b.put(f'icmp eq i64 {count}, 1')}, {one.bool} {one.true}, {one.bool} {over.marked(going)}")
-        still = one.both(now, still)
-        still = b.put(f"select i1 {allowed}, {one.bool} {still}, {one.bool} {one.false}")
-        b.store(one.bool, still, active)
-        before = one.both(b.load(one.bool, shaky), one.invert(now))
-        b.store(one.bool, one.either(before, one.both(now, over.marked(unstable))), shaky)
-        self.pair.swap()
-        b.branch_if(one.any(still), head, out)
-        b.label(out)
-        self._judge(sweep, b.load(one.bool, shaky))
-
-    def _compared(
-        self, sweep: Sweep, node: str, new: list[str], stable: str, now: str, going: str, unstable: str, rooms: list, others: list
-    ) -> None:
-        """The new iterates at a node, of trajectories that go on `now`, into the other rooms; and whether they have to go on."""
-        over, e = self.all, self.all.emitter
-        found, far = [], e.false
-        for a, room, other in zip(new, rooms, others, strict=True):
-            before = over.load(room, node)
-            over.store(a if self.one.width == 1 else over.chosen(now, a, before), other, node)
-            moved, size = e.abs(e.sub(a, before)), e.abs(a)
-            found.append((moved, size))
-            far = e.either(far, e.compare("ogt", moved, e.mul(size, e.const(FAR))))
-        over.mark(going, far)
-        with over.seldom(e.invert(far)):
-            further = e.false
-            for (moved, size), room in zip(found, self.moved, strict=True):
-                last, floor = over.load(room, node), e.mul(size, e.const(EPSILON))
-                shrinks = e.both(e.compare("olt", moved, last), e.compare("ogt", moved, floor))
-                # the next change will be moved²/last, and so on
-                left = e.mul(moved, moved)
-                floor = e.mul(floor, last)
-                for _ in range(sweep.later):
-                    left, floor = e.mul(left, moved), e.mul(floor, last)
-                further = e.either(further, e.both(shrinks, e.compare("uge", left, floor)))
-            over.mark(going, further)
-        alone = self.one.width == 1
-        for (moved, _), room in zip(found, self.moved, strict=True):
-            over.store(moved if alone else over.chosen(now, moved, over.load(room, node)), room, node)
-        if stable != e.true:
-            over.mark(unstable, e.invert(stable))
-
-    def _judge(self, sweep: Sweep, shaky: str) -> None:
-        """Those that tried and whose last changes are small are at a root, and try no longer. An iterate that is nothing but
-        roundoff is measured by what it is made of."""
-        b, over, one = self.body, self.all, self.one
-        missed, trying = over.flag(), b.load(one.bool, self.trying)
-        self._compare(missed)
-        far = one.both(trying, over.marked(missed))
-        with b.when(one.any(far)):
-            for size, value in zip(self.sizes, sweep.terms(), strict=True):
-                known = b.load(one.real, size)
-                b.store(one.real, one.select(far, one.max(value, known), known), size)
-            over.clear(missed)
-            self._compare(missed)
-        if not sweep.later:
-            peak = over.peak()
-            with over.at() as node:
-                for room in self.moved:
-                    over.raised(peak, over.load(room, node))
-            b.store(one.real, one.select(trying, over.highest(peak), b.load(one.real, self.change)), self.change)
-        b.store(one.bool, one.both(trying, one.either(over.marked(missed), shaky)), self.trying)
-
-    def _compare(self, missed: str) -> None:
-        """Mark where a last change is not small."""
-        over, e, one = self.all, self.all.emitter, self.one
-        sizes, iterates = [self.body.load(one.real, size) for size in self.sizes], self.pair.now()
-        with over.at() as node:
-            off = e.false
-            for iterate, room, size in zip(iterates, self.moved, sizes, strict=True):
-                most = e.mul(e.add(e.abs(over.load(iterate, node)), over.splat(size)), e.const(STALLED))
-                off = e.either(off, e.compare("ugt", over.load(room, node), most))
-            over.mark(missed, off)
 
     def _save(self, here: Region, number: str) -> None:
         b, e, plan = self.body, self.one, self.plan

@@ -1,9 +1,13 @@
 """What a kernel of collocation steps knows beforehand: the tableau times h, and what depends on the parameters alone."""
 
+from typing import Any
+
 from dirax.engines.native.ir.emitter import Body
 from dirax.engines.native.ir.lower import Region
+from dirax.engines.native.loops.apart import Apart
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
-from dirax.engines.native.loops.over_nodes import Apart, InLanes, OverNodes
+from dirax.engines.native.loops.in_lanes import InLanes
+from dirax.engines.native.loops.over_nodes import OverNodes
 
 
 class Nodes:
@@ -25,6 +29,8 @@ class Nodes:
         if plan.gain is not None:
             self.second = e.matrix(tableau.second, body.put("fmul double %h, %h"))
         self.known.require([node for row in plan.gain or [] for node in row.values()])
+        self.eigenbasis: Any = None
+        """What Newton's method in the eigenbasis of A has for all steps."""
         if isinstance(plan, MeanPlan):
             self.points = self.over(len(plan.quadrature.points))
             self.of_points = OfPoints(self, plan)

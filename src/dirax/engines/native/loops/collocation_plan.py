@@ -79,6 +79,25 @@ class CollocationPlan:
         rows = jacobian(g, self.solved, r.second)
         return None if depends(g, [n for row in rows for n in row.values()], [*moving, *r.second]) else rows
 
+    @functools.cached_property
+    def pencil(self) -> tuple[list[dict[int, int]], ...]:
+        """ρ_y, ρ_a + ρ_b ∂ḃ/∂y and ρ_b ∂ḃ/∂a, rows {column: node}: with the first, with h and with h² of Newton's method for
+        all nodes. Raises `GraphTooLarge`."""
+        g, r = self.graph, self.relation
+        carried = [r.rates[i] for i in self.carried]
+        by_carried = jacobian(g, r.relation, [r.second[i] for i in self.carried])
+
+        def through(slopes: list[dict[int, int]], begun: list[dict[int, int]]) -> list[dict[int, int]]:
+            for row, factors in zip(begun, by_carried, strict=True):
+                for i, factor in factors.items():
+                    for j, slope in slopes[i].items():
+                        row[j] = g.add(row.get(j, g.zero), g.mul(factor, slope))
+            return begun
+
+        linear = through(jacobian(g, carried, r.unknowns), [dict(row) for row in jacobian(g, r.relation, r.first)])
+        square = through(jacobian(g, carried, r.first), [{} for _ in r.relation])
+        return jacobian(g, r.relation, r.unknowns), linear, square
+
     @property
     def record(self) -> Record:
         """What is kept of a trajectory."""

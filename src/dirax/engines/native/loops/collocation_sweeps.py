@@ -26,6 +26,15 @@ class Sweep(ABC):
     later = 0
     """Sweeps that `increments` does besides, and on which the iteration counts."""
 
+    of_accelerations = False
+    """Whether the iterates are accelerations, not rates."""
+
+    continued = True, False
+    """Whether the first attempt and the second one begin with the polynomial of the step before, or with its last values."""
+
+    together = False
+    """Whether all entries of the iterates change together, so that the largest change says when to stop; else each by itself."""
+
     def __post_init__(self):
         n = len(self.nodes.plan.relation.first)
         self.first, self.second = self.state[:n], self.state[n:]
@@ -83,6 +92,10 @@ class Sweep(ABC):
         """What the step adds to the state by sums over the nodes; `found` is called with the iterates of a last sweep, if there
         is one."""
 
+    def sizes(self, known: list[str]) -> list[str]:
+        """How large the iterates of a kind are, of all nodes, beside what each of them is: what stands in memory."""
+        return [self.nodes.body.load(self.nodes.one.real, size) for size in known]
+
     def settled(self, iterates: list[str], after: list[str]) -> list[str]:
         """What is added at the end, with the last iterates, to the state after these sums: nothing."""
         return []
@@ -112,7 +125,7 @@ class AtEveryNode(Sweep):
         self.nodes.all.filled(rooms, self.nodes.weighted(values, node), node)
 
 
-class FirstOrder(AtEveryNode):
+class OfRates(AtEveryNode):
     """The iterates are the rates y at the nodes."""
 
     def start(self, before: str, node: str) -> str:
@@ -123,6 +136,18 @@ class FirstOrder(AtEveryNode):
         """The relation at a node and the iterates there."""
         own = [self.nodes.all.load(room, node) for room in self.iterates]
         return self.region(self.nodes.along(weighted, node, self.first), own, node), own
+
+    def increments(self, found: Found) -> list[str]:
+        """h Σ b_i y_i and h Σ b_i ḃ_i."""
+        weighted, ends = self._weighted_iterates(), self.nodes.all.rooms(len(self.second))
+        if ends:
+            with self.nodes.all.at() as node:
+                self._weighted_rates(self._at(weighted, node)[0], ends, node)
+        return self.nodes.totals([*weighted, *ends])
+
+
+class FirstOrder(OfRates):
+    """The fixed-point iteration of the rates."""
 
     def sweep(self, found: Found) -> None:
         """Newton's method at each node, once; whether the elimination was stable."""
@@ -145,19 +170,12 @@ class FirstOrder(AtEveryNode):
             region.require(outputs)
             found(node, [region.value(y) for y in plan.solved], region.value(plan.stable))
 
-    def increments(self, found: Found) -> list[str]:
-        """h Σ b_i y_i and h Σ b_i ḃ_i."""
-        weighted, ends = self._weighted_iterates(), self.nodes.all.rooms(len(self.second))
-        if ends:
-            with self.nodes.all.at() as node:
-                self._weighted_rates(self._at(weighted, node)[0], ends, node)
-        return self.nodes.totals([*weighted, *ends])
-
 
 class SecondOrder(AtEveryNode):
     """The iterates are ä at the nodes, the gain times ḃ."""
 
     later = 1
+    of_accelerations = True
 
     def __post_init__(self):
         super().__post_init__()
@@ -217,62 +235,3 @@ class SecondOrder(AtEveryNode):
         with over.at() as node:
             over.filled(speeds, k.weighted(k.along(forces, node, self.rates), node), node)
         return speeds
-
-
-class Means(Sweep):
-    """The iterates are the rates y at the nodes, of means over the step."""
-
-    @property
-    def plan(self) -> MeanPlan:
-        """The plan, which is one of means."""
-        assert isinstance(self.nodes.plan, MeanPlan)
-        return self.nodes.plan
-
-    def start(self, before: str, node: str) -> str:
-        """What the record holds."""
-        return self.nodes.all.load(before, node)
-
-    def sweep(self, found: Found) -> None:
-        n, true = self.pair.count, self.nodes.all.emitter.true
-        self._rates(lambda node, rates: found(node, rates[:n], true))
-
-    def increments(self, found: Found) -> list[str]:
-        k, n = self.nodes, self.pair.count
-        rooms = k.all.rooms(len(self.plan.relation.rates))
-
-        def summed(node: str, rates: list[str]) -> None:
-            k.all.filled(rooms, k.weighted(rates, node), node)
-            found(node, rates[:n], k.all.emitter.true)
-
-        self._rates(summed)
-        return k.totals(rooms)
-
-    def _rates(self, found: Callable[[str, list[str]], None]) -> None:
-        """(ȧ, ḃ) at the nodes."""
-        k, many, m, r = self.nodes, self.nodes.points, self.nodes.of_points, self.plan.relation
-        weighted, slopes = self._weighted_iterates(), many.rooms(len(r.slopes))
-        iterates = self.iterates
-        with many.at() as node:
-            points = many.product(m.matrix, iterates, node, [many.splat(a) for a in self.first], k.all)
-            rates = many.product(m.values, iterates, node, [None] * self.pair.count, k.all)
-            region = self._region(many, m.known, m.instants, points, node, r.unknowns, rates)
-            region.require(r.slopes)
-            many.filled(slopes, [region.value(slope) for slope in r.slopes], node)
-        with k.all.at() as node:
-            region = self.region(k.along(weighted, node, self.first), [], node)
-            means = k.all.product(m.means, slopes, node, [None] * len(slopes), many)
-            for input_, mean in zip(r.means, means, strict=True):
-                region.bind(input_, mean)
-            region.require(r.rates)
-            found(node, [region.value(rate) for rate in r.rates])
-
-    def settled(self, iterates: list[str], after: list[str]) -> list[str]:
-        k, plan, over = self.nodes, self.plan, self.nodes.all
-        region, ends = Region(k.one, plan.graph, self.here), over.rooms(self.pair.count)
-        with over.at() as node:
-            of_end = over.of(k.of_points.end, node)
-            over.filled(ends, [over.emitter.mul(of_end, over.load(room, node)) for room in iterates], node)
-        for input_, value in zip([*plan.relation.after, *plan.relation.unknowns], [*after, *k.totals(ends)], strict=True):
-            region.bind(input_, value)
-        region.require(plan.relation.settled)
-        return [region.value(node) for node in plan.relation.settled]

@@ -1,0 +1,81 @@
+"""One step of energy-preserving collocation of a Hamiltonian with a bracket, with ports too."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.numerics.tolerances import STRUCTURE_DEFECT
+from dirax.program.linear_solves import solve
+from dirax.program.tracing import jacobian
+from dirax.schemes.energy_collocation_step import EnergyCollocationStep
+from dirax.schemes.layout import Layout
+from dirax.schemes.step import Field
+from dirax.systems.forms import EnergyForm, RelationForm
+
+
+@dataclass(frozen=True, eq=False)
+class HamiltonianEnergyCollocation(EnergyCollocationStep):
+    """(ẋ, dH) in a Dirac structure that is a graph, with ports: dH replaced by its means in the energy form's relation."""
+
+    relation: RelationForm
+    form: EnergyForm
+    n: int
+
+    @property
+    def moving(self) -> int:
+        return self.n
+
+    @property
+    def state(self) -> Layout:
+        return Layout(x=self.n, work=2 * int(self.form.ports is not None), energy=(), energy_defect=())
+
+    @property
+    def fields(self) -> dict[str, Field]:
+        work = {"work": Field((2,), "node", ("work",), "energy supplied and energy dissipated since the start")}
+        return {name: Field((self.n,)) for name in self.relation.names} | (work if self.form.ports else {}) | self.book
+
+    def slopes(self, a, rate, t, params):
+        return self.form.differential(a, params)
+
+    def rates(self, a, mean, t, params):
+        defect = lambda rate: self.form.residual(a, rate, jnp.zeros(0), t, params, mean)
+        zero = jnp.zeros(self.n)
+        out = [solve(jacobian(defect)(zero), -defect(zero))]
+        if self.form.ports is not None:
+            driven, outputs, loss = self.form.ports(t, a, mean, params)
+            out += [(driven @ outputs)[None], loss[None]]
+        return jnp.concatenate([*out, jnp.zeros(2)])
+
+    def settle(self, before, after, rate, t, h, params):
+        old, now = self.state.split(before), self.state.split(after)
+        energy = self.form.hamiltonian(now.x, params)
+        balance = (lambda change: change[0] - change[1])(now.work - old.work) if self.form.ports is not None else 0.0
+        size = jnp.abs(energy) + jnp.abs(now.x) @ jnp.abs(self.form.differential(now.x, params))
+        return self.state.join(**self.settled(before, after, energy, balance, size))
+
+    def check(self, data, h, params):
+        if self.form.ports is not None:
+            return
+        point = data["x"] if "x" in data else data["q"]
+        x = jnp.asarray(point if len(point) == self.n else np.concatenate([point, data["p"]]))
+        rate = lambda mean: self.rates(x, mean, data.get("t", 0.0), params)[: self.n]
+        bracket = np.asarray(jacobian(rate)(jnp.zeros(self.n)))
+        worst = np.max(np.abs(bracket + bracket.T))
+        if worst > STRUCTURE_DEFECT * np.max(np.abs(bracket)):
+            raise ValueError(
+                f"the bracket Π of ẋ = Π dH is not antisymmetric at the initial point: max |Π + Πᵀ| = {worst:.3g}, so that the "
+                "energy is not kept. Put the symmetric part into R of a dx.PortHamiltonian."
+            )
+
+    def start(self, data, h, params):
+        if "x" not in data:
+            raise ValueError("this scheme is a one-step method in x: start it from one point, not from two.")
+        x, t = data["x"], data.get("t", 0.0)
+        rate = self.rates(x, self.slopes(x, x, t, params), t, params)[: self.n]
+        return self.state.join(x=x, energy=self.form.hamiltonian(x, params)), jnp.tile(rate, self.tableau.stages)
+
+    def node(self, state, params):
+        now = self.state.split(state)
+        row = self.relation.node(now.x, params) | {"energy_defect": now.energy_defect}
+        return row | ({"work": now.work} if self.form.ports is not None else {})
