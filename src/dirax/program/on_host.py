@@ -85,8 +85,9 @@ def _batched(operands: Sequence, axes: Sequence, **parameters: Any) -> tuple[lis
     size = next(a.shape[axis] for a, axis in zip(operands, axes, strict=True) if axis is not None)
     front = lambda a, axis: jnp.broadcast_to(a, (size, *a.shape)) if axis is None else jnp.moveaxis(a, axis, 0)
     whole = [front(a, axis) for a, axis in zip(operands, axes, strict=True)]
-    results = host_p.bind(*(a.reshape(-1, *a.shape[2:]) for a in whole), **parameters)
-    return [a.reshape(size, -1, *a.shape[1:]) for a in results], [0] * len(results)
+    entries = whole[0].shape[1]
+    results = host_p.bind(*(a.reshape(size * entries, *a.shape[2:]) for a in whole), **parameters)
+    return [a.reshape(size, entries, *a.shape[1:]) for a in results], [0] * len(results)
 
 
 def _tangents(primals: Sequence, along: Sequence, *, jaxpr: ClosedJaxpr, linear: int) -> tuple[list, list]:
@@ -117,7 +118,7 @@ def _transposed(cotangents: Sequence, *operands: Any, jaxpr: ClosedJaxpr, linear
     total = jnp.zeros((sum(sizes), avals[0].shape[0]))
     for rows, flow in zip(jax.vmap(along)(jnp.eye(sum(sizes))), cotangents, strict=True):
         if not isinstance(flow, ad.Zero):
-            total = total + jnp.sum(rows * flow, axis=tuple(range(2, rows.ndim)))
+            total = total + jnp.sum(rows * flow[None], axis=tuple(range(2, rows.ndim)))
     found: list = [None] * len(operands)
     for i, aval, size, end in zip(unknown, avals, sizes, ends, strict=True):
         found[i] = total[end - size : end].T.reshape(aval.shape)

@@ -138,7 +138,9 @@ class _Traced:
         """Whether it is one array of floats and the graph has the same derivative as JAX."""
         one = isinstance(self.result, jax.ShapeDtypeStruct)
         return (
-            one and all(x.dtype == np.float64 for x in (self.result, *self.captured, *self.leaves)) and all_plain(self.jaxpr.jaxpr)
+            one
+            and all(x.dtype == np.float64 for x in (self.result, *self.captured, *self.leaves))
+            and all_plain(self.jaxpr.jaxpr)
         )
 
 
