@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from dirax.bodies.contacts import Round
 from dirax.text.tables import number
 
 KINDS = ("revolute", "prismatic", "ball", "free")
@@ -17,13 +16,7 @@ def is_stated(model: Any) -> bool:
     if model is None or model.forces or model.parameters or model.dropped or any(body.mass == 0 for body in model.bodies):
         return False
     joints = all(joint.kind in KINDS and joint.turned is None for joint in model.joints)
-    return joints and all(_is_thin_wheel(contact) for contact in model.contacts)
-
-
-def _is_thin_wheel(contact: Any) -> bool:
-    shape, level = contact.shape, not np.any(np.asarray(contact.ground)) and np.allclose(contact.normal, UP)
-    rolls = contact.motion == "rolls" and contact.spins
-    return level and rolls and isinstance(shape, Round) and shape.tube == 0 and shape.radius != 0
+    return joints and all(contact.is_thin_wheel for contact in model.contacts)
 
 
 def built(example: Any) -> tuple[Any, dict[str, Any]]:
