@@ -38,8 +38,10 @@ def test_one_model_has_one_motion_in_all_three():
         assert end == pytest.approx(ends[0], abs=1e-3)
 
 
+@pytest.mark.soak
 def test_a_rolling_ball_on_the_group_keeps_its_contact_and_its_momentum():
-    """Holonomic constraints and one-forms on R³ × SO(3), at the nodes to roundoff; Chaplygin's integral."""
+    """Holonomic constraints and one-forms on R³ × SO(3), at the nodes to roundoff; Chaplygin's integral. The page of the machines
+    has the same ball in both descriptions."""
     ball = b.Model(
         [b.Body("ball", 1.0, (0.2, 0.35, 0.5))],
         [b.free("ground", "ball")],

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import dirax as dx
 from dirax import gallery
-from dirax.cli.bench import subject
+from dirax.cli.bench import run_machines, subject
 from dirax.cli.commands import app
 from dirax.diagnostics.bench import casadi_c, machines, measure, ode_solvers
 from dirax.diagnostics.bench.engines import plain_run
@@ -234,11 +234,15 @@ def test_machines_are_measured_and_other_programs_are_columns_where_they_are_ins
     assert rows["car-axis"]["drift"] is None  # its constraints take the time
     assert rows["car-axis"]["constraint"] < 1e-12 and 0 < rows["car-axis"]["error"] < 1e-2
     assert 0 < rows["euler-disk"]["microseconds"] < 1e4 and 0 < rows["euler-disk"]["drift"] < 1e-2
-    found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: True if name == "mujoco" else found(name))
+    found, others = importlib.util.find_spec, machines.OTHERS.values()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "mujoco" or (None if name in others else found(name)))
     shown = machines.bench_machines([gallery.get("euler-disk"), gallery.get("car-axis")], 1, 20)
     assert shown.installed == ("MuJoCo",)
     assert [line[-1] for line in shown.cells()] == [machines.NO_ROLLING, machines.NO_TIME]
+    asked = []
+    monkeypatch.setattr("dirax.cli.bench.bench_machines", lambda examples, *_: asked.extend(e.name for e in examples))
+    run_machines(["four-bar", "bicycle"], 1, True)
+    assert asked == ["four-bar", "bicycle", "bicycle M1", "bicycle M2", "bicycle M3"]
     refused = call("bench", "--machines", "kepler")
     assert refused.exit_code and "'kepler' is no machine" in refused.output
 
@@ -258,3 +262,17 @@ def test_the_same_machine_is_stated_for_mujoco():
     pytest.importorskip("mujoco")
     cell = in_mujoco.measured(example, 100, example.simulate(step=0.001, steps=1000).q[-1], 1)
     assert float(cell.split("error ")[1].split(",")[0]) < 0.01
+
+
+def test_the_same_machine_is_stated_for_exudyn():
+    """Hinges, slides, balls and rolling; where the program is installed, the motion is the same as far as the step allows."""
+    from dirax.diagnostics.bench import in_exudyn
+    from dirax.gallery.bicycle import MANOEUVRES
+
+    stated = {name: in_exudyn.is_stated(gallery.get(name).model) for name in ("bicycle", "four-bar", "euler-disk", "car-axis")}
+    assert stated == {"bicycle": True, "four-bar": True, "euler-disk": False, "car-axis": False}  # thick, and no bodies
+    pytest.importorskip("exudyn")
+    example, steps = MANOEUVRES[1], 50
+    end = example.simulate(step=example.step / 4, steps=4 * steps).q[-1]
+    _, apart, energy = in_exudyn.measured(example, steps, end, 1).split(", ")
+    assert float(apart.split()[1]) < 1e-3 and float(energy.split()[1]) < 1e-5

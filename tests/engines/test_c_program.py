@@ -18,7 +18,7 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C comp
 
 def rows_of(path, *arguments):
     """The columns that the program prints, by name; and its exit status."""
-    flags = ["-O1", "-ffp-contract=off", *["-mfma"] * (llvm.has_fma() and llvm.host()[0].startswith("x86_64"))]
+    flags = ["-O0", "-ffp-contract=off", *["-mfma"] * (llvm.has_fma() and llvm.host()[0].startswith("x86_64"))]
     program = path.with_suffix("")
     subprocess.run([COMPILER, *flags, "-o", program, path, "-lm"], check=True)
     run = subprocess.run([program, *arguments], capture_output=True, text=True)
@@ -39,6 +39,8 @@ def columns(found, name):
         ("rolling-disk", dx.PlusLagrangeDirac()),
         ("kepler", dx.Composition(dx.LagrangeDAlembert(), "suzuki4")),
         ("chaplygin-sphere", dx.LagrangeDAlembert()),
+        ("kepler", dx.Collocation(3)),
+        ("kepler", dx.EnergyCollocation(2)),
     ],
 )
 def test_the_rows_have_the_bits_of_the_run(tmp_path, name, scheme):
@@ -48,6 +50,22 @@ def test_the_rows_have_the_bits_of_the_run(tmp_path, name, scheme):
     found, status = rows_of(path)
     assert status == 0 and np.array_equal(found["t"], sol.t)
     assert np.array_equal(columns(found, "q"), sol.q) and np.array_equal(columns(found, "p"), sol.p)
+
+
+@needs_compiler
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(4)])
+def test_trajectories_of_a_batch_stand_one_after_the_other(tmp_path, scheme):
+    import jax.numpy as jnp
+
+    system = dx.LagrangeDirac(lambda q, v, k: v @ v / 2 + k * jnp.sum(jnp.cos(q)))
+    start = {"q": [[0.1, 3.0e6], [1.2, 0.4], [-0.7, 0.3]], "v": [[0.2, 0.0], [0.0, 0.1], [1.0, 2.0]]}
+    rates = {"params": np.array([1.0, 0.5, 2.0]), "batch_params": True}
+    sol = dx.export_c(tmp_path / "batch.c", system, scheme, **start, **rates, step=0.1, steps=30, save_every=7)
+    found, status = rows_of(tmp_path / "batch.c")
+    rows = len(sol.t)
+    assert status == 0 and np.array_equal(found["trajectory"], np.repeat(np.arange(3.0), rows))
+    assert np.array_equal(found["t"].reshape(3, rows)[1], sol.t)
+    assert np.array_equal(columns(found, "q").reshape(3, rows, 2), sol.q)
 
 
 @needs_compiler
@@ -71,8 +89,13 @@ def test_what_is_not_written_says_why(tmp_path):
     run = {**example.initial, "params": example.params, "step": 0.01, "steps": 5}
     with pytest.raises(ValueError, match=r"must end in \.c"):
         dx.export_c(tmp_path / "run", example.system, example.scheme, **run)
-    with pytest.raises(ValueError, match="collocation"):
-        dx.export_c(tmp_path / "run.c", example.system, dx.Collocation(3), **run)
+    stiff = {"q": [1.0], "v": [0.0], "step": 1.0, "steps": 5}
+    with pytest.raises(ValueError, match="fixed-point iteration of its stages does not converge"):
+        dx.export_c(tmp_path / "run.c", dx.LagrangeDirac(lambda q, v: v @ v / 2 - 1e4 * q @ q), dx.Collocation(3), **stiff)
+    with pytest.raises(ValueError, match="starts from q and v"):
+        free, points = dx.LagrangeDirac(lambda q, v: v @ v / 2), {"q0": [0.1], "q1": [0.2]}
+        dx.export_c(tmp_path / "run.c", free, dx.PlusLagrangeDirac(), **points, step=0.01, steps=5)
+    assert not (tmp_path / "run.c").exists()
 
 
 def test_the_command_writes_a_file(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 import dirax as dx
 from dirax.engines import policy as choice
 from dirax.engines.step_program import step_program
+from dirax.program.interpreter import UnsupportedPrimitive
 
 N = 20
 RUN = {"q": np.sin(np.arange(float(N))), "v": np.zeros(N), "step": 0.01, "steps": 5}
@@ -50,3 +51,16 @@ def test_operations_do_not_matter_where_an_array_program_would_be_far_larger(nes
     sol = dx.simulate(system, dx.DiscreteDirac() if nested else dx.LagrangeDAlembert(), **run, step=0.01, steps=3)
     assert step_program(sol.equation, sol.params, False).nested == nested
     assert sol.stats["engine"] == ("native" if nested else "xla")
+
+
+def test_a_step_whose_elimination_is_too_large_goes_to_arrays(monkeypatch):
+    """Its residual is small enough to be traced, which is all that the native engine says before it writes the kernel."""
+    from dirax.engines.native import kernels
+
+    monkeypatch.setattr(kernels, "NODE_LIMIT", 150)
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(jnp.cos(q[:, None] - q[None, :] * 0.7)))
+    run = {"q": np.linspace(0.1, 0.5, 4), "v": np.zeros(4), "step": 0.05, "steps": 5}
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), **run)
+    assert sol.ok and sol.stats["engine"] == "xla" and "more than 150 scalar operations" in sol.stats["not_native"]
+    with pytest.raises(UnsupportedPrimitive, match="more than 150 scalar operations"):
+        dx.simulate(system, dx.LagrangeDAlembert(), **run, engine="native")

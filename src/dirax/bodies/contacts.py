@@ -78,6 +78,13 @@ class Contact:
         found = {"rolls": ("rolls along", "rolls aside"), "skates": ("skates",), "slides": ()}[self.motion]
         return found if self.spins else (*found, "does not spin")
 
+    @property
+    def is_thin_wheel(self) -> bool:
+        """Whether it is a thin disc of a radius in numbers that rolls on the plane z = 0 and may turn on the spot."""
+        shape, level = self.shape, np.allclose(unit(self.normal), (0.0, 0.0, 1.0)) and not np.any(np.asarray(self.ground, float))
+        thin = isinstance(shape, Round) and shape.tube == 0 and shape.radius != 0 and not isinstance(shape.radius, str)
+        return level and thin and self.motion == "rolls" and self.spins
+
     def arm(self, frame: Frame, normal: Any, params: Any) -> Any:
         """From the origin of the body's frame to the point of contact (3,)."""
         return frame.turn @ vector(self.centre, params) + self.shape.support(frame, normal, params)

@@ -59,6 +59,10 @@ def run_machines(
     others = [example.name for example in chosen if example.name not in MACHINES]
     if others:
         raise ValueError(f"{others[0]!r} is no machine of the gallery: there are {', '.join(MACHINES)}.")
+    if "bicycle" in [example.name for example in chosen]:
+        from dirax.gallery.bicycle import MANOEUVRES
+
+        chosen += MANOEUVRES
     found = bench_machines(chosen, repeats or (QUICK_REPEATS if quick else 5), steps or (QUICK_STEPS if quick else 1000), tell)
     if table is not None:
         table.write_text(json.dumps(found.to_dict(), indent=1, ensure_ascii=False) + "\n", "utf-8")

@@ -28,7 +28,10 @@ class Auto(AbstractEngine):
         """`run` of the engine that takes the problem."""
         native, reason = self._native(problem)
         if native is not None:
-            return native.prepared(problem)
+            try:
+                return native.prepared(problem)
+            except UnsupportedPrimitive as error:  # its Jacobian or its elimination has too many operations
+                reason = str(error)
         engine, notes = self._by_arrays(problem)
 
         def by_arrays(problem: Problem, progress: Progress | None = None) -> Outcome:
@@ -42,7 +45,11 @@ class Auto(AbstractEngine):
         """By the native engine, or that which `prepared` takes."""
         native, _ = self._native(problem)
         if native is not None:
-            return native.walks(problem)
+            try:
+                native.prepared(problem)
+                return native.walks(problem)
+            except UnsupportedPrimitive:
+                pass
         run = self.prepared(problem)
         return lambda problem: WalkByRuns(problem, run)
 

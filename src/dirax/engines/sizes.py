@@ -23,6 +23,7 @@ them itself in no time. Steps of very many unknowns are measured by 1.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -151,10 +152,11 @@ def _on_host(p: Problem) -> Sizes | None:
     def find(*given: Any) -> tuple[np.ndarray, ...]:
         """Of arrays (…, entries, n), with the axes of vmap in front."""
         lead = np.broadcast_shapes(*(a.shape[:-2] for a in given))
-        flat = [np.broadcast_to(a, (*lead, *a.shape[-2:])).reshape(-1, a.shape[-1]) for a in map(np.asarray, given)]
+        many = math.prod(lead) * entries  # said, for a run may have no parameters
+        flat = [np.broadcast_to(a, (*lead, *a.shape[-2:])).reshape(many, a.shape[-1]) for a in map(np.asarray, given)]
         (state, t, h, leaves), guesses = flat[:4], flat[4:]
         here = dataclasses.replace(at, state=state, guesses=guesses, t=t[:, 0], h=h[:, 0], leaves=leaves)
-        return tuple(a.reshape(*lead, entries, -1) for a in _looked_at(here))
+        return tuple(a.reshape(*lead, entries, a.shape[-1]) for a in _looked_at(here))
 
     shapes = tuple(jax.ShapeDtypeStruct((entries, width), float) for width in widths)
     given = jax.lax.stop_gradient((at.state, at.t[:, None], at.h[:, None], at.leaves, *at.guesses))

@@ -6,11 +6,13 @@ Data: Table 1 of the paper (its z points down, so that products of inertia I_xz 
 """
 
 import math
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
 
 from dirax.bodies import Body, Model, free, revolute, wheel
+from dirax.gallery.example import Example
 from dirax.gallery.machine import machine
 
 WHEELBASE, TRAIL, TILT, REAR, FRONT = 1.02, 0.08, math.pi / 10, 0.3, 0.35
@@ -80,3 +82,13 @@ EXAMPLE = machine(
     view=(-0.5, -1.0, 0.4),
     trail="frame",
 )
+
+
+def _manoeuvre(name: str, speed: float, push: float, step: float) -> Example:
+    start = MODEL.state({"frame.z": REAR}, {"frame.x": speed, "frame.roll": push, "frame.yaw": 0.0, "steer": 0.0})
+    title = f"{EXAMPLE.title}, {name}: {speed} m/s, pushed over at {push} rad/s"
+    return replace(EXAMPLE, name=f"bicycle {name}", title=title, initial=start, step=step, steps=round(20 / step))
+
+
+MANOEUVRES = tuple(_manoeuvre(*data) for data in (("M1", 4.0, 0.05, 0.01), ("M2", 4.6, 0.5, 0.02), ("M3", 8.0, 0.05, 0.02)))
+"""Of the IFToMM library of benchmark problems, twenty seconds each: its score is 100 times the range of the energy, relative."""

@@ -138,7 +138,9 @@ class _Traced:
         """Whether it is one array of floats and the graph has the same derivative as JAX."""
         one = isinstance(self.result, jax.ShapeDtypeStruct)
         return (
-            one and all(x.dtype == np.float64 for x in (self.result, *self.captured, *self.leaves)) and _plain(self.jaxpr.jaxpr)
+            one
+            and all(x.dtype == np.float64 for x in (self.result, *self.captured, *self.leaves))
+            and all_plain(self.jaxpr.jaxpr)
         )
 
 
@@ -156,13 +158,14 @@ def closed_over(function: Callable, values: list) -> tuple[ClosedJaxpr, list, An
     return shared(ClosedJaxpr(jaxpr, fixed)), [value for _, value, traced in pairs if traced], result
 
 
-def _plain(jaxpr: Any) -> bool:
+def all_plain(jaxpr: Any) -> bool:
+    """Whether the graph has the same derivative as JAX of all that a jaxpr does."""
     return all(_numbers(e) if e.primitive.name == RULE else _plain_one(e) for e in jaxpr.eqns)
 
 
 def _plain_one(equation: Any) -> bool:
     known = equation.primitive.name in PLAIN or equation.params.get("apart", False)
-    return known and all(map(_plain, jaxprs_in_params(equation.params)))
+    return known and all(map(all_plain, jaxprs_in_params(equation.params)))
 
 
 def _numbers(equation: Any) -> bool:

@@ -15,9 +15,9 @@ def export_c(path: Any, system: AbstractSystem, scheme: AbstractScheme, title: s
 
     `settings` are those of `dx.simulate`: initial data, params, step, steps, save_every. The file says how it is compiled; its
     `main` prints the rows of the run, t and every saved array, with the bits of the Solution. Initial state and parameters are
-    arrays in it, and `run` can be called by a program of one's own. A batch, a start from two points and collocation schemes
-    (whose nodes are found side by side) are not written. Raises what `dx.simulate` raises, and
-    `ValueError` for these.
+    arrays in it, and `run` can be called by a program of one's own. Of a batch, the rows of one trajectory stand after those of
+    another, each behind its number. A start from two points is not written, nor a run by collocation in which the fixed-point
+    iteration of the stages does not converge. Raises what `dx.simulate` raises, and `ValueError` for these.
 
         dx.export_c("disk.c", system, dx.LagrangeDAlembert(), q=q, v=v, step=0.01, steps=1000)
     """

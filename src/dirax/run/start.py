@@ -1,5 +1,6 @@
 """Where a run begins: initial data made complete by the system, then the first state and the first step of the equation."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -181,8 +182,9 @@ class _FirstStep(eqx.Module):
 
 def _of_every(one: Any, kept: tuple, case: Case, given: Any, by_jax: bool) -> Any:
     """`one(given, params, h, t0)` of every trajectory; what is traced for NumPy is remembered by the objects `kept`."""
-    if not by_jax and not begins_by_arrays(case) and not is_traced(given, case.params, case.h, case.t0):
-        found = _in_numpy(one, kept, case, given)
+    if not by_jax and not begins_by_arrays(case):
+        traced = is_traced(given, case.params, case.h, case.t0)
+        found = (_on_host if traced else _in_numpy)(one, kept, case, given)
         if found is not None:
             return found
     axes = None if case.batch is None else (0, 0 if case.batch_params else None, None, None)
@@ -205,22 +207,38 @@ def _in_numpy(one: Any, kept: tuple, case: Case, given: Any) -> Any:
     leaves, found = _program(one, kept, case, given)
     if found is None:
         return None
-    whole = jax.tree.unflatten(found[1], found[0].in_numpy(leaves))
-    return whole if case.batch is not None else jax.tree.map(lambda leaf: leaf[0], whole)
+    return _of_case(jax.tree.unflatten(found[1], found[0].in_numpy(leaves)), case)
+
+
+def _on_host(one: Any, kept: tuple, case: Case, given: Any) -> Any:
+    """The same under JAX's transformations."""
+    from dirax.program.on_host import on_host  # imported when it is used
+
+    found = on_host(*_in_entries(one, kept, case, given, jnp))
+    return None if found is None else _of_case(found, case)
+
+
+def _of_case(entries: Any, case: Case) -> Any:
+    return entries if case.batch is not None else jax.tree.map(lambda leaf: leaf[0], entries)
+
+
+def _in_entries(one: Any, kept: tuple, case: Case, given: Any, xp: Any = np) -> tuple[Callable, list, tuple]:
+    """`one` as a function of leaves, the leaves (entries, …) for every trajectory, and a key of that function."""
+    lead = lambda leaf: xp.asarray(leaf) if case.batch is not None else xp.asarray(leaf)[None]
+    repeated = lambda leaf: xp.broadcast_to(xp.asarray(leaf), (case.batch or 1, *np.shape(leaf)))
+    params = jax.tree.map(lead if case.batch_params else repeated, case.params)
+    leaves, structure = jax.tree.flatten((jax.tree.map(lead, given), params, repeated(case.h), repeated(case.t0)))
+    options = type(one), case.two_points, getattr(one, "project", None), structure
+    return lambda *leaves: one(*jax.tree.unflatten(structure, leaves)), leaves, (*map(Same, kept), options)
 
 
 def _program(one: Any, kept: tuple, case: Case, given: Any) -> tuple[list[np.ndarray], Any]:
     """The arguments of `one` for every trajectory, and its scalar program with the structure of its results, or None."""
     from dirax.program.evaluation.functions import program_of  # imported when it is used
 
-    lead = lambda leaf: np.asarray(leaf) if case.batch is not None else np.asarray(leaf)[None]
-    repeated = lambda leaf: np.broadcast_to(np.asarray(leaf), (case.batch or 1, *np.shape(leaf)))
-    params = jax.tree.map(lead if case.batch_params else repeated, case.params)
-    leaves, structure = jax.tree.flatten((jax.tree.map(lead, given), params, repeated(case.h), repeated(case.t0)))
-    options = type(one), case.two_points, getattr(one, "project", None), structure
+    function, leaves, key = _in_entries(one, kept, case, given)
     shapes = [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves]
-    function = lambda *leaves: one(*jax.tree.unflatten(structure, leaves))
-    return leaves, program_of(function, shapes, (*map(Same, kept), options))
+    return leaves, program_of(function, shapes, key)
 
 
 def program_of_completion(system: Any, case: Case, project: bool) -> tuple[ScalarProgram, Any] | None:

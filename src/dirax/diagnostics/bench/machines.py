@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.diagnostics.bench import in_mujoco
+from dirax.diagnostics.bench import in_exudyn, in_mujoco
 from dirax.diagnostics.bench.timing import machine
 from dirax.text.tables import number, plain, text_table
 
@@ -29,6 +29,8 @@ def _others_on(example: Any, program: str, steps: int, end: np.ndarray, repeats:
         return NO_TIME
     if program == "MuJoCo" and in_mujoco.is_stated(example.model):
         return in_mujoco.measured(example, steps, end, repeats)
+    if program == "Exudyn" and in_exudyn.is_stated(example.model):
+        return in_exudyn.measured(example, steps, end, repeats)
     return NOT_HERE
 
 

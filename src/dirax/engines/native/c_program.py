@@ -9,10 +9,12 @@ import numpy as np
 from dirax.engines.contract import OK, Outcome, Problem, Progress
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.native.c_code import c_code
-from dirax.engines.native.collocation_kernels import collocation_kernels
+from dirax.engines.native.collocation_kernels import CollocationKernels, collocation_kernels
 from dirax.engines.native.engine import Native
+from dirax.engines.native.ir.scalars import scalars
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import arrays_saved
+from dirax.engines.native.loops.collocation_loop import collocation_module
 from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.sizes import sizes_of
 from dirax.program import machine_code as llvm
@@ -26,39 +28,40 @@ PROGRAM = """\
        cc -O2 {fma}-ffp-contract=off -o run {name} -lm && ./run > rows.csv          (rows of dirax.simulate, bit by bit)
        ./run STEPS EVERY                                                  (as many steps, a row every EVERY of them)
 
-   record[0] … record[{last_state}] is the state: {state}; the sizes by which unknowns are measured are those at this one.
-   params: {params}.
+   A record for each trajectory, of which there are {lanes}: its first {state_size} numbers are the state, {state};
+   the sizes by which unknowns are measured are those at this one. Its params: {params}.
    A program of one's own calls run(record, params, fields, 1, t0, h, 0, first, stop, every, iterations): steps first to stop − 1
    of a run that began at t0; fields point to the rows of {saved}. */
 
 {code}
-enum {{ SIZE = {size}, STATE = {state_size}, COMPLETED = {completed}, STATUS = {status}, FIELDS = {fields}, ROW = {row} }};
-static double record[SIZE] = {{{record}}};
-static double params[] = {{{values}}};
+enum {{ LANES = {lanes}, SIZE = {size}, PARAMS = {parameters}, COMPLETED = {completed}, STATUS = {status} }};
+enum {{ FIELDS = {fields}, ROW = {row} }};
+static double records[LANES][SIZE] = {{
+{record}
+}};
+static double params[LANES][PARAMS] = {{
+{values}
+}};
 static const int64_t widths[FIELDS] = {{{widths}}}, is_node[FIELDS] = {{{nodes}}};
 static const double t0 = {t0}, h = {h};
 
-int main(int argc, char **argv) {{
-    int64_t steps = argc > 1 ? atoll(argv[1]) : {steps}, every = argc > 2 ? atoll(argv[2]) : {every};
-    if (steps < 1 || every < 1) {{ fprintf(stderr, "usage: %s [STEPS [EVERY]], whole numbers from 1 on\\n", argv[0]); return 2; }}
-    if (every > steps) every = steps;
+static int trajectory(int64_t lane, int64_t steps, int64_t every) {{
     int64_t rows = (steps + every - 1) / every + 1, completed, given;
-    double closing[ROW], last[SIZE];
+    double closing[ROW], last[SIZE], *record = records[lane];
     void *fields[FIELDS], *ends[FIELDS];
     for (int64_t i = 0, at = 0; i < FIELDS; at += widths[i++]) {{
-        fields[i] = malloc(sizeof(double) * (size_t)(rows * widths[i]));
-        if (!fields[i]) {{ fprintf(stderr, "not enough memory for %lld rows\\n", (long long)rows); return 2; }}
+        fields[i] = malloc(sizeof(double) * (size_t)(rows * widths[i] + 1));
+        if (!fields[i]) {{ fprintf(stderr, "not enough memory for %lld rows\\n", (long long)rows); exit(2); }}
         ends[i] = closing + at;
     }}
-    run(record, params, fields, 1, t0, h, 0, 0, steps, every, {cap});
+    run(record, params[lane], fields, 1, t0, h, 0, 0, steps, every, {cap});
     completed = (int64_t)record[COMPLETED];
-    memcpy(last, record, sizeof record);
-    if (completed == steps) run(last, params, ends, 1, t0, h, 0, 0, 1, 1, {cap});
-    printf("{header}\\n");
+    memcpy(last, record, sizeof last);
+    if (completed == steps) run(last, params[lane], ends, 1, t0, h, 0, 0, 1, 1, {cap});
     given = completed == steps ? rows : (completed + every - 1) / every;
     for (int64_t row = 0; row < given; row++) {{
         int64_t number = row == rows - 1 ? steps : row * every;
-        printf("%.17g", t0 + (double)number * h);
+        {lane}printf("%.17g", t0 + (double)number * h);
         for (int i = 0; i < FIELDS; i++) {{
             const double *from = row == rows - 1 ? ends[i] : (double *)fields[i] + row * widths[i];
             for (int64_t k = 0; k < widths[i]; k++) {{
@@ -68,8 +71,19 @@ int main(int argc, char **argv) {{
         }}
         printf("\\n");
     }}
-    if (record[STATUS] != {ok}) fprintf(stderr, "step %lld failed\\n", (long long)(completed + 1));
-    return record[STATUS] != {ok};
+    for (int64_t i = 0; i < FIELDS; i++) free(fields[i]);
+    if (record[STATUS] == {ok}) return 0;
+    fprintf(stderr, "trajectory %lld: step %lld failed\\n", (long long)lane, (long long)(completed + 1));
+    return 1;
+}}
+
+int main(int argc, char **argv) {{
+    int64_t steps = argc > 1 ? atoll(argv[1]) : {steps}, every = argc > 2 ? atoll(argv[2]) : {every};
+    int failed = 0;
+    if (steps < 1 || every < 1) {{ fprintf(stderr, "usage: %s [STEPS [EVERY]], whole numbers from 1 on\\n", argv[0]); return 2; }}
+    printf("{header}\\n");
+    for (int64_t lane = 0; lane < LANES; lane++) failed |= trajectory(lane, steps, every > steps ? steps : every);
+    return failed;
 }}
 """
 
@@ -77,7 +91,8 @@ int main(int argc, char **argv) {{
 class WritesC(AbstractEngine):
     """The engine "native", which writes what it runs as a C file `path`, too.
 
-    Takes one trajectory from initial data that are not two points, by a scheme whose kernel works on one node at a time.
+    Takes what "native" takes, from initial data that are not two points. Of collocation it is the fixed-point iteration that is
+    written: a run in which that does not converge, for which "native" has Newton's method, is refused after it.
     """
 
     path: str
@@ -86,10 +101,8 @@ class WritesC(AbstractEngine):
 
     def supports(self, problem: Problem) -> str | None:
         """As of "native"; None where there is a C file of it."""
-        if problem.batch is not None or problem.first_step:
-            return "a C file holds one trajectory that starts from q and v, q and p, or x"
-        if collocation_kernels(problem.equation, problem.params, problem.batch_params) is not None:
-            return "the kernel of a collocation scheme has its nodes side by side in vectors, which C has not"
+        if problem.first_step:
+            return "a C file starts from q and v, q and p, or x"
         return Native().supports(problem)
 
     def run(self, problem: Problem, progress: Progress | None = None) -> Outcome:
@@ -97,34 +110,53 @@ class WritesC(AbstractEngine):
         if reason := self.supports(problem):
             raise UnsupportedPrimitive("the run", f"is not written in C: {reason}", "dx.export_c")
         path = Path(self.path)
-        path.write_text(c_program(problem, path.name, self.title), encoding="utf-8")
-        return Native().run(problem, progress)
+        text = c_program(problem, path.name, self.title)
+        outcome = Native().run(problem, progress)
+        if isinstance(_kernels_of(problem), CollocationKernels) and outcome.record is None and not outcome.interrupted:
+            raise UnsupportedPrimitive(
+                "the run", "is not written in C: the fixed-point iteration of its stages does not converge", "dx.export_c"
+            )
+        path.write_text(text, encoding="utf-8")
+        return outcome
 
     def run_traced(self, problem: Problem) -> Outcome:
         """None: values that JAX traces are no numbers."""
         raise UnsupportedPrimitive("the run", "is not written in C: its numbers are traced by JAX", "dx.export_c")
 
 
+def _kernels_of(p: Problem) -> Kernels | CollocationKernels:
+    """The kernels by which "native" runs a problem."""
+    found = collocation_kernels(p.equation, p.params, p.batch_params)
+    return found or kernels(p.equation, p.params, p.batch_params, p.compensated)
+
+
 def c_program(p: Problem, name: str, title: str) -> str:
-    """The C file of a problem of one trajectory. Raises `UnsupportedPrimitive` for a kernel that C does not express."""
-    made: Kernels = kernels(p.equation, p.params, p.batch_params, p.compensated)
-    made.check()
-    assert made.plan is not None
+    """The C file of a problem. Raises `UnsupportedPrimitive` for a kernel that C does not express."""
+    made, lanes, fma = _kernels_of(p), p.batch or 1, llvm.has_fma()
     record, saved, layout = made.record, arrays_saved(p, made), p.equation.stages[0][0].state_layout
-    start = np.zeros(record.size)
-    start[record.state] = p.state
+    start = np.zeros((lanes, record.size))
+    start[:, record.state] = p.state
     for stage, guess in enumerate(p.guess):
-        start[record.unknowns(stage, np.shape(guess)[-1])] = guess
-    record.put_sizes(start, sizes_of(p))
-    values = made.step.parameters.flatten(p.params, None) if made.step.parameters.size else np.zeros(1)
-    of = lambda numbers: ", ".join(float(x).hex() for x in np.ravel(numbers))
-    columns = ["t", *(f"{s.name}{k}" for s in saved for k in range(s.size))]
+        start[:, record.unknowns(stage, np.shape(guess)[-1])] = guess
+    if isinstance(made, CollocationKernels):  # a fixed point finds its own sizes
+        module = scalars(collocation_module(made.plan, 1, fma))
+    else:
+        made.check()
+        assert made.plan is not None
+        record.put_sizes(start, [np.reshape(sizes, (lanes, -1)) for sizes in sizes_of(p)])
+        module = kernel_module(made.plan, 1, fma, groups=False)
+    values = made.step.parameters.flatten(p.params, p.batch if p.batch_params else None)
+    values = np.broadcast_to(values, (lanes, values.shape[-1])) if values.size else np.zeros((lanes, 1))
+    listed = lambda table: ",\n".join("{" + ", ".join(float(x).hex() for x in row) + "}" for row in table)
+    columns = [*(["trajectory"] if p.batch else []), "t", *(f"{s.name}{k}" for s in saved for k in range(s.size))]
     return PROGRAM.format(
         title=title,
         name=name,
-        fma="-mfma " * llvm.has_fma(),
-        code=c_code(kernel_module(made.plan, 1, llvm.has_fma(), groups=False)),
-        last_state=record.state_size - 1,
+        fma="-mfma " * fma,
+        code=c_code(module),
+        lanes=lanes,
+        lane='printf("%lld,", (long long)lane); ' if p.batch else "",
+        parameters=values.shape[-1],
         state_size=record.state_size,
         state=", ".join(f"{part} {shape}" for part, shape in layout.items()),
         params=_names(p.params),
@@ -134,8 +166,8 @@ def c_program(p: Problem, name: str, title: str) -> str:
         status=record.status,
         fields=len(saved),
         row=sum(s.size for s in saved),
-        record=of(start),
-        values=of(values),
+        record=listed(start),
+        values=listed(values),
         widths=", ".join(str(s.size) for s in saved),
         nodes=", ".join(str(int(not s.ends_before)) for s in saved),
         t0=float(p.t0).hex(),
