@@ -19,7 +19,6 @@ RUNS = [  # each has lines that the sizes of terms alone would call violated
     ("euler-disk", dx.PlusLagrangeDirac(), 600),
     ("double-spherical-pendulum", None, 1000),
     ("dc-motor", None, None),
-    ("bricard", dx.PlusLagrangeDirac(), 6),
     pytest.param("bricard", None, None, marks=pytest.mark.soak),
     pytest.param("n-four-bar", None, None, marks=pytest.mark.soak),
 ]
