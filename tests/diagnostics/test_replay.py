@@ -46,6 +46,7 @@ RUNS = {
     "composed Method 1": (BLADE_WITHOUT_FORCES, dx.Composition(dx.DiscreteDirac(), "suzuki4"), GLIDING),
     "adjoint": (DRIVEN, dx.Adjoint(dx.DiscreteDirac(dx.Theta(0.3))), {"q": [1.0, 0.2], "v": [0.0, 0.5], "params": {"c": 0.1}}),
     "collocation": (DRIVEN, dx.Collocation(3), {"q": [1.0, 0.2], "v": [0.0, 0.5], "params": {"c": 0.1}}),
+    "collocation with one-forms": (BLADE, dx.Collocation(3, nodes="lobatto"), GLIDING),
     "discrete gradient": (CIRCUIT, dx.DiscreteGradient(), {"x": [0.4, 0.1]}),
     "discrete gradient at rest": (CIRCUIT, dx.DiscreteGradient(), {"x": [0.0, 0.0]}),
 }

@@ -210,8 +210,9 @@ class Replay:
         """States and first guesses of all stages, (entries, numbers), of runs that go on from the rows, or start `anew`."""
         sol, equation = self.sol, self.sol.equation
         every, back = np.unique(rows, return_inverse=True)
-        items: dict[str, Any] = {name: np.asarray(sol.fields[name]) for name in self.nodes}
-        items = {name: np.take(a, every, axis=int(sol.batch is not None)) for name, a in items.items()}
+        # of the last row no step is saved: what is said of it is that of the step before, which nothing asks for
+        taken = lambda a: np.take(a, np.minimum(every, a.shape[int(sol.batch is not None)] - 1), axis=int(sol.batch is not None))
+        items: dict[str, Any] = {name: taken(np.asarray(a)) for name, a in sol.fields.items()}
         items["t"] = times_at(sol, every)
         try:
             found = over_rows(eqx.Partial(_begun, sol.system, sol.step, Same(equation), anew), sol, (items,))

@@ -19,8 +19,9 @@ AWAY = 1e-3
 
 
 def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, params: Any, t0: float) -> tuple[int, ...]:
-    """The numbers of the constraints, in the order of `Solution.multipliers`, that follow from those before them, given the
+    """The numbers of the constraints, in the order of `Solution.multipliers`, that follow from others, given the
     matrices [W; G] (m + c, n), or (B, m + c, n), at the initial points; `data` and `params` are those of the first trajectory.
+    A one-form that says what the derivative of a holonomic constraint says is left out before this, which holds positions too.
 
     Raises `ValueError` where constraints contradict each other, where their rank is larger near the initial point than
     at it, where one of them has no direction, and where the trajectories of a batch differ in what is redundant.
@@ -38,7 +39,8 @@ def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, par
     where = f" of trajectory {int(np.argmax(ranks < total))}" if len(ranks) > 1 else ""
     _refuse_singular_point(system, matrices, ranks, where, data, params, t0)
     kept: list[int] = []
-    for row in range(total):
+    one_forms = total - (system.sizes(data, params)[2:] or (0,))[0]
+    for row in (*range(one_forms, total), *range(one_forms)):
         if rank_of_equations(matrices[:1, [*kept, row]])[0][0] > len(kept):
             kept.append(row)
     if np.any(ranks != len(kept)) or np.any(rank_of_equations(matrices[:, kept])[0] < len(kept)):
