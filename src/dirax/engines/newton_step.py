@@ -1,4 +1,4 @@
-"""The Newton corrections as nodes: the Jacobian, and its elimination with a pivot order fixed beforehand."""
+"""The corrections of Newton's method as nodes: the Jacobian, and its elimination with a pivot order fixed beforehand."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -43,6 +43,8 @@ class Correction:
     factors: list[int]
     rows: list[int]
     """How large the terms of the equations are, Σ|J_ij|(|u_j| + size_j), which has their units."""
+    linear: bool
+    """Whether the Jacobian does not depend on the unknowns: the second update leaves roundoff alone."""
 
     @property
     def outputs(self) -> list[int]:
@@ -89,7 +91,8 @@ def _correction(
     right = [g.input(f"right{i}") for i in equations]
     unknowns, again = [equation.unknowns[j] for j in places], factors.solve(g, right)
     change = factors.solve(g, residual)
-    return Correction(places, unknowns, residual, own, change, factors.stable, right, again, sorted(factors.nodes), rows)
+    linear = set(g.reachable([entry for row in own for entry in row])).isdisjoint(unknowns)
+    return Correction(places, unknowns, residual, own, change, factors.stable, right, again, sorted(factors.nodes), rows, linear)
 
 
 _known: Memo[tuple] = Memo(KEPT)
@@ -116,18 +119,21 @@ def pivot_order(g: Graph, matrix: list[list[int]]) -> list[list[tuple[int, int]]
     k = len(matrix)
     there = np.array([[entry != g.zero for entry in row] for row in matrix], bool).reshape(k, k)
     constant = np.array([[g.is_constant(entry) for entry in row] for row in matrix], bool).reshape(k, k)
-    values = np.abs(_samples(g, matrix))
+    values = _samples(g, matrix)
     values = np.where(np.isfinite(values), values, 0.0)
     found = []
     for rows, columns in blocks(there):
         block = np.ix_(rows, columns)
-        order = _order_of_block(there[block], constant[block], values[:, *block])
+        inside = values[:, *block]
+        largest = np.abs(inside).max(axis=2, keepdims=True)  # the units of the equations
+        order = _order_of_block(there[block], constant[block], inside / np.where(largest > 0, largest, 1.0))
         found.append([(rows[i], columns[j]) for i, j in order])
     return found
 
 
 def _order_of_block(there: np.ndarray, constant: np.ndarray, values: np.ndarray) -> list[tuple[int, int]]:
-    """The order of a matrix: where it is not zero, where it is constant, and how large it is at the sample points."""
+    """The order of a matrix: where it is not zero, where it is constant, and its values at the sample points, at which entries
+    that always cancel are seen to do so."""
     k = len(there)
     rows, columns, order = np.arange(k), np.arange(k), []
     while len(rows):
@@ -136,8 +142,9 @@ def _order_of_block(there: np.ndarray, constant: np.ndarray, values: np.ndarray)
         if not len(i):  # structurally singular: any order, the guard will see it
             order.extend(zip(rows.tolist(), columns.tolist(), strict=True))
             break
-        largest = values[:, *here].max(axis=1)
-        shares = np.median(values[:, *here] / np.where(largest > 0, largest, 1.0)[:, None], axis=0)[i, j]
+        present = np.abs(values[:, *here])
+        largest = present.max(axis=1)
+        shares = np.median(present / np.where(largest > 0, largest, 1.0)[:, None], axis=0)[i, j]
         fill = (there[here].sum(axis=1) - 1)[i] * (there[here].sum(axis=0) - 1)[j]
         best = np.lexsort((i, j, -np.round(shares, 3), ~constant[here][i, j], fill, shares < ADMISSIBLE))[0]
         i, j = rows[i[best]], columns[j[best]]
@@ -145,9 +152,8 @@ def _order_of_block(there: np.ndarray, constant: np.ndarray, values: np.ndarray)
         rows, columns = rows[rows != i], columns[columns != j]
         others, along = rows[there[rows, j]], columns[there[i, columns]]
         block, pivot = np.ix_(others, along), values[:, i, j]
-        multipliers = values[:, others, j] / np.where(pivot > 0, pivot, 1.0)[:, None]
-        # bounds of magnitude after the elimination: |a| + |m b|
-        values[:, *block] = np.abs(values[:, *block]) + multipliers[:, :, None] * values[:, i, along][:, None]
+        multipliers = values[:, others, j] / np.where(pivot != 0, pivot, 1.0)[:, None]
+        values[:, *block] -= multipliers[:, :, None] * values[:, i, along][:, None]
         there[block] = True
     return order
 

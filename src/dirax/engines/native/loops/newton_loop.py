@@ -120,6 +120,8 @@ class NewtonLoop:
         stalled = e.both(e.compare("oge", ratio, e.const(0.5)), e.compare("olt", update, e.const(STALLED)))
         rounded = e.both(e.compare("ole", update, e.const(FLOOR)), known)
         small = e.either(rounded, e.compare("ole", left, e.const(NEGLIGIBLE)))
+        if self.correction.linear:
+            small = e.either(small, e.both(e.compare("ord", ratio, ratio), e.compare("olt", update, e.const(STALLED))))
         return e.either(small, stalled)
 
 
