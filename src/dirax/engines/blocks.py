@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from dirax.numerics.arrays import Numbers
 
 FEWEST = 6
-"""Unknowns of a block: smaller ones are found together with those before them, since each takes a test of its own when to stop."""
+"""Unknowns of a block: smaller ones are found together with those before them, since each takes a test of when to stop."""
 
 
 def blocks(there: Bool[Numbers, "k k"]) -> list[tuple[list[int], list[int]]]:

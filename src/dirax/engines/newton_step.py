@@ -170,8 +170,8 @@ def _samples(g: Graph, matrix: list[list[int]]) -> np.ndarray:
 
 
 class Factors:
-    """Elimination of a matrix in a given pivot order, block after block: multipliers, upper rows, reciprocal pivots and the guard,
-    for which rows are divided by their `sizes` if these are given. Blocks are not eliminated from those after them."""
+    """Elimination of a matrix in a given pivot order, block after block: multipliers, upper rows, reciprocal pivots and the
+    guard, for which rows are divided by their `sizes` if these are given. Blocks are not eliminated from those after them."""
 
     def __init__(
         self,

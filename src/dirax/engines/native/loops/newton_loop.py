@@ -14,8 +14,8 @@ from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, OWN, ST
 
 
 class NewtonLoop:
-    """The iteration for one block of unknowns, from the guess in `unknowns` to the root there; `sizes` are pointers to those of the
-    unknowns.
+    """The iteration for one block of unknowns, from the guess in `unknowns` to the root there; `sizes` are pointers to those of
+    the unknowns.
 
     After `emit`, `converged` and `count` are, by lane, whether the floor was reached and the number of updates.
     """
