@@ -7,13 +7,13 @@ others, so that Newton's method takes one after the other, each with a matrix of
 import numpy as np
 from jaxtyping import Bool
 
-from dirax.numerics.arrays import Numbers
+from dirax.numerics.arrays import AnyArray
 
 FEWEST = 6
 """Unknowns of a block: smaller ones are found together with those before them, since each takes a test of when to stop."""
 
 
-def blocks(there: Bool[Numbers, "k k"]) -> list[tuple[list[int], list[int]]]:
+def blocks(there: Bool[AnyArray, "k k"]) -> list[tuple[list[int], list[int]]]:
     """(rows, columns) of each block in the order in which they can be solved; `there` says where a matrix is not zero.
 
     One block for a matrix that is singular wherever its entries are."""
@@ -38,7 +38,7 @@ def blocks(there: Bool[Numbers, "k k"]) -> list[tuple[list[int], list[int]]]:
     return [(sorted(rows), sorted(column[i] for i in rows)) for rows in groups]
 
 
-def _matched(there: Bool[Numbers, "k k"]) -> list[int] | None:
+def _matched(there: Bool[AnyArray, "k k"]) -> list[int] | None:
     """A column for each row, every one once, where the matrix is not zero; None if there is no such choice."""
     columns = [np.flatnonzero(row).tolist() for row in there]
     owner: dict[int, int] = {}
