@@ -75,7 +75,7 @@ MORE_FOR_XLA = 2.6
 SCALARS_FOR_ARRAYS = 5
 """Scalar operations that take LLVM as long to compile as XLA takes for one operation on arrays, a millisecond: "auto" gives
 the native engine a step of more than MOST_OPERATIONS where XLA would take longer. The bicycle by Method 2 has 44 600 and 48 100:
-8 s and 60 s to the first result, and 40 µs and 5.5 ms a step."""
+7 s and 60 s to the first result, and 17 µs and 5.5 ms a step."""
 
 MOST_FOR_XLA = 6000
 """Scalar operations of a residual with its Jacobian up to which XLA is given them: it takes some milliseconds to compile each."""
