@@ -40,6 +40,7 @@ def test_operations_do_not_matter_where_an_array_program_would_be_far_larger(nes
     """L = v²/2 − x² − λ y in three coordinates: a chain whose steps differentiate its constraints again and again."""
     monkeypatch.setattr(choice, "LARGEST_FULL", 3)
     monkeypatch.setattr(choice, "MOST_OPERATIONS", 4)
+    monkeypatch.setattr(choice, "SCALARS_FOR_ARRAYS", 0.1)
     plain = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] ** 2 - jnp.cos(q[1]))
     hidden = dx.LagrangeDirac(lambda q, v: v[:2] @ v[:2] / 2 - q[0] ** 2 + q[2] * (q[1] - jnp.sin(q[0])))
     run = {"q": [0.1, 0.2], "v": [0.3, 0.4]}

@@ -16,6 +16,7 @@
 `tests/engines/test_contract.py` asks this of every engine.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -83,6 +84,16 @@ class Problem:
     def fields(self) -> dict[str, Field]:
         """The named arrays of a row: those of the first stage, at which every row is."""
         return self.equation.stages[0][0].fields
+
+    @cached_property
+    def row_size(self) -> int:
+        """Numbers in a row of one trajectory, the time among them."""
+        return 1 + sum(math.prod(field.shape) for field in self.fields.values())
+
+    @cached_property
+    def review(self) -> Callable[[dict[str, Any]], dict[str, Any]]:
+        """What the first stage finds to say of saved arrays."""
+        return self.equation.stages[0][0].review
 
     def is_node(self, name: str) -> bool:
         """Whether a field has a row for the first and the last state, and not for the steps between them alone."""

@@ -70,8 +70,12 @@ NESTED = 4
 hardly any."""
 
 MORE_FOR_XLA = 2.6
-"""So many times more operations "auto" gives to the native engine for each derivative of derivatives: Andrews' squeezer by
-Method 2, with 14 224, takes it some four seconds to compile, and XLA a hundred."""
+"""Operations on arrays that the derivative of one of them takes."""
+
+SCALARS_FOR_ARRAYS = 5
+"""Scalar operations that take LLVM as long to compile as XLA takes for one operation on arrays, a millisecond: "auto" gives
+the native engine a step of more than MOST_OPERATIONS where XLA would take longer. The bicycle by Method 2 has 44 600 and 48 100:
+7 s and 60 s to the first result, and 17 µs and 5.5 ms a step."""
 
 MOST_FOR_XLA = 6000
 """Scalar operations of a residual with its Jacobian up to which XLA is given them: it takes some milliseconds to compile each."""

@@ -46,6 +46,8 @@ class TracedEquation:
     rows: dict[str, Nodes]
     nesting: int
     """How deep derivatives of derivatives go in its functions."""
+    array_operations: float
+    """How many operations on arrays they are for XLA."""
 
 
 @dataclass
@@ -100,7 +102,7 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
         raise UnsupportedPrimitive("unpack", f"returns {len(rows)} arrays for {len(names)} fields", "the scheme")
     return TracedEquation(
         state, unknowns, previous, guess.tolist(), residual.tolist(), advance.tolist(),
-        dict(zip(names, rows, strict=True)), nesting(closed.jaxpr),
+        dict(zip(names, rows, strict=True)), nesting(closed.jaxpr), array_operations(closed.jaxpr),
     )  # fmt: skip
 
 
@@ -118,6 +120,21 @@ def nesting(jaxpr: Any) -> int:
         return known[id(jaxpr)]
 
     return depth(jaxpr)
+
+
+def array_operations(jaxpr: Any) -> float:
+    """How many operations on arrays a jaxpr has, those inside of them counted once for each time that they stand there, and for
+    each derivative that they are under `policy.MORE_FOR_XLA` times."""
+    known: dict[int, float] = {}
+
+    def counted(jaxpr: Any) -> float:
+        if id(jaxpr) not in known:
+            more = lambda e: policy.MORE_FOR_XLA if e.primitive.name in DERIVATIVES else 1.0
+            inner = (more(e) * counted(getattr(j, "jaxpr", j)) for e in jaxpr.eqns for j in jaxprs_in_params(e.params))
+            known[id(jaxpr)] = len(jaxpr.eqns) + sum(inner)
+        return known[id(jaxpr)]
+
+    return counted(jaxpr)
 
 
 @dataclass(eq=False)
@@ -160,6 +177,11 @@ class StepProgram:
     def nesting(self) -> int:
         """How deep derivatives of derivatives go in it."""
         return max(e.nesting for e in self.equations)
+
+    @property
+    def array_operations(self) -> float:
+        """How many operations on arrays the step is for XLA."""
+        return sum(e.array_operations for e in self.equations)
 
     @cached_property
     def jacobians(self) -> list[list[dict[int, int]]]:

@@ -37,7 +37,6 @@ class BatchPlan:
         self.asks_hessian = asks_hessian(settings.system, shape, case)
         self.hessian: ScalarProgram | None = None
         self.regular = Regular(None if case.batch_params else case.params)
-        self.row_bytes = 8 * (1 + (case.batch or 1) * sum(math.prod(field.shape) for field in problem.fields.values()))
 
     @property
     def whole(self) -> bool:

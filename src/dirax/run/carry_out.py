@@ -32,10 +32,6 @@ from dirax.run.validate import Case, refuse_clock_that_stands, refuse_more_than_
 from dirax.schemes.step import Shape, make_step_equation
 from dirax.solution.solution import Solution
 
-MANY_BYTES = 2**26
-"""Saved bytes from which on it is asked whether the memory has room for them."""
-
-
 QUICK = 1e-4
 """Seconds that a start takes at least to be kept for a run from the same numbers."""
 
@@ -126,8 +122,7 @@ def carried_out(
     if kind is not None and kind.plan is not None:
         problem = kind.plan.problem(case, steps, every)
         if problem is not None:
-            if problem.rows * kind.plan.row_bytes > MANY_BYTES:
-                refuse_more_than_memory(problem)
+            refuse_more_than_memory(problem)
             found = Begun(case, problem, (), None, False, _no_plan, save_every=save_every)
             kind.keep(case, found, time.perf_counter() - began)
             return _run(settings, kind, found, steps, progress, entered, began)

@@ -57,7 +57,6 @@ class Plan:
         self.hessian: Floats | None = None
         self.places = _places(initial.data)
         self.regular = Regular(case.params)
-        self.row_bytes = 8 * (1 + sum(math.prod(field.shape) for field in problem.fields.values()))
 
     @property
     def whole(self) -> bool:

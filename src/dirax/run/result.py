@@ -50,7 +50,7 @@ def solution_of(
         field_info=p.fields,
         step=p.h,
         save_every=p.save_every,
-        stats=stats_of(p, outcome, traced) | ({} if traced else p.equation.stages[0][0].review(fields)),
+        stats=stats_of(p, outcome, traced) | ({} if traced else p.review(fields)),
         ok=ok,
         message=message,
         system=system,

@@ -1,6 +1,7 @@
 """The arguments of a run, checked: each mistake is one error that names the argument, what came and what was expected."""
 
 import dataclasses
+import functools
 import math
 import os
 from collections.abc import Mapping
@@ -195,8 +196,7 @@ def plain_floats(value: Any) -> np.ndarray | None:
 
 def refuse_more_than_memory(problem: Any) -> None:
     """Raise `ValueError` for a run whose saved rows are more than this machine can hold."""
-    numbers = 1 + (problem.batch or 1) * sum(math.prod(field.shape) for field in problem.fields.values())
-    there, row = _memory(), 8 * numbers
+    there, row = _memory(), 8 * (problem.batch or 1) * problem.row_size
     if there and problem.rows * row > there:
         every = -(-problem.steps * row * ROOM // there)
         raise ValueError(
@@ -223,6 +223,7 @@ def checked_store(to: Any, events: Any, traced: bool) -> Path | None:
     return path
 
 
+@functools.cache
 def _memory() -> int:
     """The bytes of memory of this machine; 0 where they are not known."""
     try:

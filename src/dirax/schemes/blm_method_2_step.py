@@ -90,10 +90,11 @@ class ProjectedThetaStep(ThetaStep):
         (q_k, p_k) = P(q − θh v, p − (1 − θ)h ṗ),   (q_{k+1}, p_{k+1}) = P(q + (1 − θ)h v, p + θh ṗ),
 
     P(q̃, p̃) = (q', p'): q̃ = q' + M⁻¹G(q')ᵀs with g(q') = 0, and p̃ = p' + [W; G](q')ᵀσ with the velocity of p' on the other
-    constraints; M = ∂²L/∂v² at (q', v). Unknowns are v, σ, the acceleration a and λ of the base point, and s and w of the first
-    half, where h w moves q and M(w − v) = Gᵀs; and v', σ', s' and w' of the second. The equations of a and λ are
+    constraints; M = ∂²L/∂v² at (q', v). Unknowns are v, σ, the acceleration a and λ of the base point, and s and d of the first
+    half, which moves q by d, where M(d/θh − v) = Gᵀs; and v', σ', s' and d' of the second. The equations of a and λ are
     (∂L/∂v)˙ = ∂L/∂q + f + [W; G]ᵀλ and ([W; G] v + …)˙ = 0 along v̇ = a: where there are few of them they are solved in place,
-    else no matrix is inverted. Constraints at the times t_k, t_k + θh and t_k + h hold to roundoff at all three points.
+    else no matrix is inverted. It is d and not a velocity that is unknown since derivatives by d are derivatives by q, of which
+    many stand in the equations anyway. Constraints at the times t_k, t_k + θh and t_k + h hold to roundoff at all three points.
     """
 
     @property
@@ -101,17 +102,18 @@ class ProjectedThetaStep(ThetaStep):
         n, k, c = self.shape.n, self.rows.count, self.rows.holonomic
         moved, last = (n if count else 0 for count in (c * (not self.in_place), c))
         flow = {} if self.in_place else {"a": n, "multipliers": k}
-        return Layout(v=n, sigma=k, **flow, s=c, w=moved, end_v=n, end_sigma=k, end_s=c, end_w=last)
+        return Layout(v=n, sigma=k, **flow, s=c, moved=moved, end_v=n, end_sigma=k, end_s=c, end_moved=last)
 
     @property
     def in_place(self) -> bool:
-        """Whether a and λ are functions of (q, v) and w one of (q, v, s), and no unknowns."""
+        """Whether a and λ are functions of (q, v) and d one of (q, v, s), and no unknowns."""
         return self.shape.n <= FEW and not self.system.forces_see_multipliers
 
     def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
         one_point_only(data)
         v = data["v"]
-        guess = self.unknowns.join(**{name: v for name in ("v", "end_v", "w", "end_w") if self.unknowns[name] == v.shape})
+        values = {"v": v, "end_v": v, "moved": self.theta * h * v, "end_moved": (1.0 - self.theta) * h * v}
+        guess = self.unknowns.join(**{name: value for name, value in values.items() if self.unknowns[name] == v.shape})
         return self.book.start(data["q"], data["p"]), guess
 
     def residual(self, u, state, t, h, params):
@@ -177,33 +179,38 @@ class ProjectedThetaStep(ThetaStep):
             return along(function, (jnp.asarray(t, float), q, v), (jnp.ones(()), v, a))
         return along(lambda q, v: function(t, q, v), (q, v), (v, a))
 
-    def _first(self, t: Any, q: Array, parts: Any, params: Any) -> Float[Array, " n"]:
-        """w of the first half, which is v + M⁻¹G(q_k)ᵀs."""
+    def _first(self, t: Any, q: Array, parts: Any, h: Any, params: Any) -> Float[Array, " n"]:
+        """d of the first half, which is θh (v + M⁻¹G(q_k)ᵀs)."""
         if not self.in_place:
-            return parts.w
+            return parts.moved
         if not self.theta:
-            return parts.v
-        return parts.v + solve(
-            self.system.velocity_hessian(t, q, parts.v, params), self.rows.holonomic_force(t, q, parts.s, params)
-        )
+            return jnp.zeros_like(parts.v)
+        pushed = solve(self.system.velocity_hessian(t, q, parts.v, params), self.rows.holonomic_force(t, q, parts.s, params))
+        return self.theta * h * (parts.v + pushed)
 
-    def _pushed(self, t: Any, q: Array, v: Array, w: Array, s: Array, params: Any) -> Float[Array, " n"]:
-        """M(w − v) − G(q)ᵀs, zero where w is the direction of the projection onto g = 0 at q."""
-        change = along(lambda v: self.system.legendre(q, v, params, t), (v,), (w - v,))
+    def _pushed(self, t: Any, q: Array, v: Array, moved: Array, part: Any, s: Array, params: Any) -> Float[Array, " n"]:
+        """M(d/part − v) − G(q)ᵀs, zero where d is along the projection onto g = 0 at q; `part` of time is that of the half, and
+        d is zero where there is none."""
+        if isinstance(part, float) and not part:
+            return moved
+        change = along(lambda v: self.system.legendre(q, v, params, t), (v,), (moved / part - v,))
         return change - self.rows.holonomic_force(t, q, s, params)
 
     def _base(self, u: Array, state: Array, t: Any, h: Any, params: Any) -> tuple[Any, Array, Array]:
         """The time of the base point, the base point, and where the second half ends."""
-        q0, parts, theta = self.state.split(state).q, self.unknowns.split(u), self.theta
-        first, second = (parts.v, parts.v) if not self.rows.holonomic else (self._first(t, q0, parts, params), parts.end_w)
-        q = q0 + theta * h * first
-        return t + theta * h, q, q + (1.0 - theta) * h * second
+        q0, parts, halves = self.state.split(state).q, self.unknowns.split(u), (self.theta * h, (1.0 - self.theta) * h)
+        if not self.rows.holonomic:
+            first, second = (half * parts.v for half in halves)
+        else:
+            first, second = self._first(t, q0, parts, h, params), parts.end_moved
+        return t + halves[0], q0 + first, q0 + first + second
 
     def _position(self, q0: Array, parts: Any, base: tuple[Any, Array, Array], t: Any, h: Any, params: Any) -> Array:
         """g at the base and at the end, and the directions of both halves; a half of length zero needs no force."""
         (at, q, q1), rows = base, self.rows
         onto = rows.position(at, q, params) / h if self.theta else parts.s
         last = rows.position(t + h, q1, params) / h if self.theta < 1.0 else parts.end_s
-        begun = [] if self.in_place else [self._pushed(t, q0, parts.v, parts.w, parts.s, params)]
-        ended = self._pushed(t + h, q1, parts.v, parts.end_w, parts.end_s, params)
+        first, second = (part and part * h for part in (self.theta, 1.0 - self.theta))
+        begun = [] if self.in_place else [self._pushed(t, q0, parts.v, parts.moved, first, parts.s, params)]
+        ended = self._pushed(t + h, q1, parts.v, parts.end_moved, second, parts.end_s, params)
         return jnp.concatenate([onto, *begun, ended, last])

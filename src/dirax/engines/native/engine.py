@@ -16,8 +16,8 @@ from dirax.program.interpreter import UnsupportedPrimitive
 class Native(AbstractEngine):
     """Small systems on a CPU: the step traced to scalars, compiled by LLVM, run on vectors of trajectories and several threads.
 
-    `most_operations` bounds the scalar operations of a step, more of them the deeper derivatives lie in one another, except of
-    one that is nested; None: as many as can be traced.
+    `most_operations` bounds the scalar operations of a step, unless XLA would compile it even longer; None: as many as can be
+    traced.
     """
 
     most_operations: int | None = None
@@ -30,9 +30,9 @@ class Native(AbstractEngine):
             if collocation_kernels(problem.equation, problem.params, problem.batch_params) is not None:
                 return None
             made = kernels(problem.equation, problem.params, problem.batch_params, problem.compensated)
-            if self.most_operations is not None and not made.step.nested:
+            if self.most_operations is not None:
                 made.check()
-                most = int(self.most_operations * policy.MORE_FOR_XLA ** max(0, made.step.nesting - 1))
+                most = max(self.most_operations, int(policy.SCALARS_FOR_ARRAYS * made.step.array_operations))
                 if made.operations > most:
                     return f"{made.operations} scalar operations a step, more than {most}"
         except UnsupportedPrimitive as error:

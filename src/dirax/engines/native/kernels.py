@@ -15,7 +15,7 @@ from dirax.engines.native.loops.plan import Plan
 from dirax.engines.native.loops.record import Record
 from dirax.engines.native.loops.sizes import sizes_module
 from dirax.engines.native.loops.step_loop import kernel_module
-from dirax.engines.newton_step import newton_correction
+from dirax.engines.newton_step import newton_corrections
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program import graph as graph_module
 from dirax.program import machine_code as llvm
@@ -102,7 +102,7 @@ class Kernels:
             try:
                 g = self._graph()
                 plan = self._plan(g)
-                plan.corrections = [newton_correction(g, step, i) for i in range(len(step.equations))]
+                plan.corrections = [newton_corrections(g, step, i) for i in range(len(step.equations))]
                 if self.compensated:
                     plan.increments = [increments(g, e) for e in step.equations]
             except GraphTooLarge as error:
@@ -143,7 +143,8 @@ def count_operations(plan: Plan) -> int:
     total = 0
     for index, _ in plan.stages:
         e, c = plan.equations[index], plan.corrections[index]
-        needed = plan.graph.reachable([*e.guess, *e.residual, *e.advance, *c.change, *c.again, c.stable])
+        solved = [node for one in c.blocks for node in (*one.change, *one.again, one.stable)]
+        needed = plan.graph.reachable([*e.guess, *e.residual, *e.advance, *solved])
         total += sum(1 for node in needed if plan.graph.args[node])
     return total
 

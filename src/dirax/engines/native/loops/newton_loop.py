@@ -10,19 +10,18 @@ from collections.abc import Sequence
 from dirax.engines.native.ir.emitter import Body, Emitter
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.newton_step import Correction
-from dirax.engines.step_program import TracedEquation
 from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, OWN, STALLED
 
 
 class NewtonLoop:
-    """The iteration of one equation, from the guess in `unknowns` to its root there; `sizes` are pointers to those of the
-    unknowns.
+    """The iteration for one block of unknowns, from the guess in `unknowns` to the root there; `sizes` are pointers to those of
+    the unknowns.
 
     After `emit`, `converged` and `count` are, by lane, whether the floor was reached and the number of updates.
     """
 
-    def __init__(self, equation: TracedEquation, correction: Correction, around: Region, unknowns: list[str], sizes: list[str]):
-        self.equation, self.correction, self.around = equation, correction, around
+    def __init__(self, correction: Correction, around: Region, unknowns: list[str], sizes: list[str]):
+        self.correction, self.around = correction, around
         self.unknowns, self.sizes = unknowns, sizes
         self.e: Emitter = around.emitter
         self.body: Body = self.e.body
@@ -49,7 +48,7 @@ class NewtonLoop:
     def _bound(self, region: Region) -> list[str]:
         """The present unknowns, bound in a region."""
         old = [self.body.load(self.e.real, u) for u in self.unknowns]
-        for node, value in zip(self.equation.unknowns, old, strict=True):
+        for node, value in zip(self.correction.unknowns, old, strict=True):
             region.bind(node, value)
         return old
 
@@ -58,11 +57,11 @@ class NewtonLoop:
         g, correction = self.around.graph, self.correction
         inner = Region(self.e, g, self.around)
         old = self._bound(inner)
-        inner.require([*correction.change, *correction.factors, correction.stable])
+        inner.require(correction.outputs)
         change = [inner.value(n) for n in correction.change]
         stable = inner.value(correction.stable)
         if correction.stable != g.true:
-            change = by_partial_pivoting(inner, correction.jacobian, self.equation.residual, change, stable, now, correction.rows)
+            change = by_partial_pivoting(inner, correction.jacobian, correction.residual, change, stable, now, correction.rows)
         self._apply(old, change, stable, now)
         return inner
 
@@ -71,9 +70,9 @@ class NewtonLoop:
         g = self.around.graph
         here = Region(self.e, g, self.around)
         old = self._bound(here)
-        here.require(self.equation.residual)
+        here.require(self.correction.residual)
         inner = Region(self.e, g, factors)
-        for node, value in zip(self.correction.right, self.equation.residual, strict=True):
+        for node, value in zip(self.correction.right, self.correction.residual, strict=True):
             inner.bind(node, here.value(value))
         inner.require(self.correction.again)
         self._apply(old, [inner.value(n) for n in self.correction.again], self.e.true, now)
@@ -121,6 +120,8 @@ class NewtonLoop:
         stalled = e.both(e.compare("oge", ratio, e.const(0.5)), e.compare("olt", update, e.const(STALLED)))
         rounded = e.both(e.compare("ole", update, e.const(FLOOR)), known)
         small = e.either(rounded, e.compare("ole", left, e.const(NEGLIGIBLE)))
+        if self.correction.linear:
+            small = e.either(small, e.both(e.compare("ord", ratio, ratio), e.compare("olt", update, e.const(STALLED))))
         return e.either(small, stalled)
 
 

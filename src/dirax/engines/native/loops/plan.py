@@ -4,12 +4,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from dirax.engines.native.loops.record import Record
-from dirax.engines.newton_step import Correction
+from dirax.engines.newton_step import Corrections
 from dirax.engines.step_program import Inputs, TracedEquation
 from dirax.program.graph import Graph
 
 RUN, STEP, NEWTON = 1, 2, 3
-"""When a node's value is known: once a run, once a step, once an iteration."""
+"""When a node's value is known: once a run, once a step, once an iteration for the first block of unknowns; NEWTON + 1 for the
+second, and so on."""
 
 
 @dataclass
@@ -19,7 +20,7 @@ class Plan:
     graph: Graph
     shared: Inputs
     equations: list[TracedEquation]
-    corrections: list[Correction]
+    corrections: list[Corrections]
     stages: list[tuple[int, float]]
     rules: dict[str, str] = field(
         default_factory=dict
@@ -63,16 +64,16 @@ class Plan:
         out = []
         for equation, correction in zip(self.equations, self.corrections, strict=True):
             out += [*equation.guess, *equation.residual, *equation.advance]
-            out += [*correction.change, *correction.factors, correction.stable]
+            out += [node for one in correction.blocks for node in one.outputs]
         out += [node for nodes in self.increments for node in nodes if node is not None]
         return out + [node for index in range(len(self.equations)) for *_, nodes in self.saving(index) for node in nodes]
 
     def levels(self) -> dict[int, int]:
-        """Node → RUN, STEP or NEWTON (0 for constants)."""
+        """Node → RUN, STEP or NEWTON with the number of its block (0 for constants)."""
         g = self.graph
         of_input = {node: STEP for e in self.equations for node in (*e.state, *e.previous)}
-        of_input |= {node: NEWTON for e in self.equations for node in e.unknowns}
-        of_input |= {node: NEWTON for c in self.corrections for node in c.right}
+        for number, one in ((number, one) for c in self.corrections for number, one in enumerate(c.blocks)):
+            of_input |= dict.fromkeys([*one.unknowns, *one.right], NEWTON + number)
         of_stage = STEP if len(self.stages) > 1 else RUN
         of_input |= {node: of_stage for c in self.corrections for node in c.sizes}
         of_input |= dict.fromkeys(self.shared.params, RUN)

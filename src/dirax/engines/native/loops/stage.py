@@ -6,9 +6,9 @@ from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
 from dirax.engines.native.ir.emitter import Emitter
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.newton_loop import NewtonLoop
-from dirax.engines.native.loops.plan import STEP, Plan, frontier
+from dirax.engines.native.loops.plan import NEWTON, STEP, Plan, frontier
 from dirax.engines.native.loops.record import Frame
-from dirax.engines.newton_step import Correction
+from dirax.engines.newton_step import Corrections
 
 
 @dataclass(frozen=True)
@@ -59,20 +59,22 @@ def emit_stage(
     last, slopes, bends = (frame.loads(frame.slots(base, k, offset)) for base in (frame.unknowns, frame.slopes, frame.bends))
     for node, value, slope, bend in zip(equation.previous, last, slopes, bends, strict=True):
         region.bind(node, e.add(e.add(value, slope), bend))
-    hoisted = frontier(plan.graph, block.level, [*correction.change, *correction.factors, correction.stable], STEP)
+    hoisted = frontier(plan.graph, block.level, [node for one in correction.blocks for node in one.outputs], STEP)
     region.require([*equation.guess, *hoisted])
-    unknowns = [b.alloca(e.real) for _ in range(k)]
+    unknowns, sizes = [b.alloca(e.real) for _ in range(k)], frame.slots(frame.sizes, k, offset)
     frame.stores([region.value(n) for n in equation.guess], unknowns)
-    converged = e.true
-    if k:
-        newton = NewtonLoop(equation, correction, region, unknowns, frame.slots(frame.sizes, k, offset))
-        newton.emit(active)
-        converged = newton.converged
-        b.store(e.real, e.add(b.load(e.real, frame.iterations), newton.count), frame.iterations)
-    solution = frame.loads(unknowns)
-    after = Region(e, plan.graph, region)
-    for node, value in zip(equation.unknowns, solution, strict=True):
-        after.bind(node, value)
+    converged, count, after = e.true, e.const(0.0), region
+    for solved, one in enumerate(correction.blocks):
+        after.require(frontier(plan.graph, block.level, one.outputs, NEWTON + solved - 1))
+        pointers = [unknowns[i] for i in one.places]
+        newton = NewtonLoop(one, after, pointers, [sizes[i] for i in one.places])
+        newton.emit(e.both(active, converged))
+        converged, count = e.both(converged, newton.converged), e.max(count, newton.count)
+        after = Region(e, plan.graph, after)
+        for node, value in zip(one.unknowns, frame.loads(pointers), strict=True):
+            after.bind(node, value)
+    b.store(e.real, e.add(b.load(e.real, frame.iterations), count), frame.iterations)
+    solution = [after.value(node) for node in equation.unknowns]
     saving = plan.saving(index)
     if saving:
         with b.when(saves):
@@ -92,7 +94,7 @@ def emit_stage(
     frame.stores(solution, frame.slots(frame.fresh, k, offset))
 
 
-def bind_sizes(region: Region, frame: Frame, correction: Correction, offset: int | str = 0) -> None:
+def bind_sizes(region: Region, frame: Frame, correction: Corrections, offset: int | str = 0) -> None:
     """The sizes of the unknowns of a stage, known in a region."""
     pointers = frame.slots(frame.sizes, len(correction.sizes), offset)
     for node, value in zip(correction.sizes, frame.loads(pointers), strict=True):

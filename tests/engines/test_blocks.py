@@ -1,0 +1,97 @@
+"""Blocks of unknowns that are found one after the other, and the elimination of matrices that have them."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax import gallery
+from dirax.engines.blocks import FEWEST, blocks
+from dirax.engines.native.kernels import kernels
+from dirax.engines.newton_step import Factors, pivot_order
+from dirax.program.graph import Graph
+
+
+@pytest.fixture
+def random():
+    return np.random.default_rng(7)
+
+
+def triangular(sizes, random):
+    """A matrix in block triangular form with rows and columns mixed, and which rows and columns belong to each block."""
+    ends = np.cumsum([0, *sizes])
+    k = ends[-1]
+    matrix = random.uniform(0.3, 1.7, (k, k)) * (random.random((k, k)) < 0.4)
+    for a, b in itertools.pairwise(ends):
+        matrix[a:b, b:] = 0.0
+        matrix[a:b, a:b] = random.uniform(0.3, 1.7, (b - a, b - a)) + 3.0 * np.eye(b - a)
+    rows, columns = random.permutation(k), random.permutation(k)
+    members = [(set(np.argsort(rows)[a:b].tolist()), set(np.argsort(columns)[a:b].tolist())) for a, b in itertools.pairwise(ends)]
+    return matrix[rows][:, columns], members
+
+
+@pytest.mark.parametrize("sizes", [(9,), (7, 8), (6, 6, 11), (8, 7, 6, 9)])
+def test_the_blocks_of_a_matrix(sizes, random):
+    matrix, members = triangular(sizes, random)
+    found = blocks(matrix != 0)
+    of = lambda pairs: {(frozenset(rows), frozenset(columns)) for rows, columns in pairs}
+    assert of(found) == of(members)
+    known: set[int] = set()
+    for rows, columns in found:
+        assert len(rows) == len(columns) >= FEWEST
+        known |= set(columns)
+        assert set(np.flatnonzero(matrix[rows].any(axis=0)).tolist()) <= known
+    assert known == set(range(len(matrix)))
+
+
+def test_small_blocks_are_joined_and_singular_matrices_are_one(random):
+    assert len(blocks(np.tril(np.ones((20, 20), bool)))) == 20 // FEWEST
+    there = np.ones((9, 9), bool)
+    there[:, 4] = False
+    assert len(blocks(there)) == 1
+
+
+@pytest.mark.parametrize("sizes", [(7,), (6, 7), (6, 6, 8)])
+def test_elimination_by_blocks_against_numpy(sizes, random):
+    matrix, _ = triangular(sizes, random)
+    g, k = Graph(), len(matrix)
+    nodes = [[g.input(f"{i},{j}") if entry else g.zero for j, entry in enumerate(row)] for i, row in enumerate(matrix)]
+    right, values = [g.input(f"b{i}") for i in range(k)], random.normal(size=k)
+    factors = Factors(g, nodes, pivot_order(g, nodes))
+    inputs = {f"{i},{j}": matrix[i, j] for i in range(k) for j in range(k)} | {f"b{i}": values[i] for i in range(k)}
+    found = g.evaluate(factors.solve(g, right), inputs)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, values), rtol=1e-11)
+    assert g.evaluate([factors.stable], inputs) == [True]
+    bounds = g.evaluate(factors.bounds(g, right), inputs | {f"b{i}": abs(values[i]) for i in range(k)})
+    assert np.all(np.asarray(bounds) >= np.abs(found))
+
+
+def test_entries_that_always_cancel_are_no_pivots():
+    """Rows (m, −m/h) and (k, −k/h): the elimination of either unknown of the first leaves nothing of the other in the second."""
+    g = Graph()
+    m, k, c, h = (g.input(name) for name in ("m", "k", "c", "h"))
+    over = lambda x: g.neg(g.div(x, h))
+    matrix = [[m, over(m), g.zero], [k, over(k), c], [c, m, k]]
+    (order,) = pivot_order(g, matrix)
+    numbers = {"m": 2.0, "k": 0.7, "c": 1.3, "h": 0.01}
+    right = [g.constant(x) for x in (1.0, 2.0, 3.0)]
+    dense = np.array(g.evaluate([entry for row in matrix for entry in row], numbers), float).reshape(3, 3)
+    factors = Factors(g, matrix, [order])
+    assert g.evaluate([factors.stable], numbers) == [True]
+    np.testing.assert_allclose(g.evaluate(factors.solve(g, right), numbers), np.linalg.solve(dense, [1.0, 2.0, 3.0]), rtol=1e-12)
+
+
+def test_saved_velocities_are_a_block_of_their_own():
+    """The unknowns of a constrained step are those that move it and those of the saved momentum, which are linear."""
+    case = gallery.get("hanging-chain")
+    sol = case.simulate(dx.LagrangeDAlembert(), steps=40, engine="native")
+    made = kernels(sol.equation, sol.params, False)
+    made.check()
+    assert made.plan is not None
+    (corrections,) = made.plan.corrections
+    assert [one.linear for one in corrections.blocks] == [False, True]
+    assert sorted(place for one in corrections.blocks for place in one.places) == list(range(sol.equation.unknowns))
+    plain = case.simulate(dx.LagrangeDAlembert(), steps=40, engine="xla")
+    np.testing.assert_allclose(sol.q, plain.q, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(sol.p, plain.p, rtol=1e-10, atol=1e-10 * np.abs(plain.p).max())
