@@ -65,7 +65,7 @@ class FirstSizes:
     """The sizes of one equation as nodes of a graph, which gains them: of the `unknowns`, and `sure`, 1 where there is no
     doubt and 0 where there is; `order` is that of the pivots."""
 
-    def __init__(self, g: Graph, given: Linearized, order: list[tuple[int, int]]):
+    def __init__(self, g: Graph, given: Linearized, order: list[list[tuple[int, int]]]):
         unknowns, residual, matrix, rounded, h = given.unknowns, given.residual, given.matrix, given.terms, given.h
         self.graph = g
         size = lambda node: g.make("abs", node)
