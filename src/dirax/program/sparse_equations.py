@@ -110,15 +110,11 @@ class SparseEquations(eqx.Module):
 
     def factorise(self, values: Float[Array, " colours*k"]) -> Any:
         """The factors of the Jacobian with these values."""
-        made = self.elimination
-        shapes = [jax.ShapeDtypeStruct(shape, kind) for shape, kind in made.factor_shapes]
-        return tuple(made.kernels[0].in_jax(shapes, *self.tables, values, self.size))[made.work_of_factor :]
+        return self.elimination.factors(jnp, self.tables, values, self.size)
 
     def solve(self, factors: Any, right: Float[Array, " k"], transposed: bool = False) -> Float[Array, " k"]:
         """x with J x = right, or Jᵀ x = right."""
-        made = self.elimination
-        shapes = [jax.ShapeDtypeStruct((n,), np.float64) for n in (*made.work, made.size)]
-        return made.kernels[1 + transposed].in_jax(shapes, *self.solve_tables, *factors, right, self.size)[-1]
+        return self.elimination.solution(jnp, self.solve_tables, factors, right, self.size, transposed)
 
     def root(self, function: Callable, root: Float[Array, " k"]) -> Float[Array, " k"]:
         """`root`, with its derivatives as the function of what `function` captures that function(root) = 0 makes of it."""
@@ -133,14 +129,11 @@ class SparseEquations(eqx.Module):
     def in_numpy(self, values: np.ndarray) -> Callable[..., np.ndarray]:
         """(right, transposed=False) ↦ the solution with the Jacobian of these values, in NumPy."""
         made, size = self.elimination, np.asarray(self.size)
-        factors = [np.zeros(shape, kind) for shape, kind in made.factor_shapes]
-        made.kernels[0](*map(np.asarray, self.tables), np.ascontiguousarray(values, float), size, *factors)
+        tables, solve_tables = (tuple(map(np.asarray, arrays)) for arrays in (self.tables, self.solve_tables))
+        factors = made.factors(np, tables, np.ascontiguousarray(values, float), size)
 
         def solve(right: np.ndarray, transposed: bool = False) -> np.ndarray:
-            *work, found = (np.zeros(n) for n in (*made.work, made.size))
-            given = map(np.asarray, self.solve_tables), factors[made.work_of_factor :]
-            made.kernels[1 + transposed](*(a for part in given for a in part), np.ascontiguousarray(right), size, *work, found)
-            return found
+            return made.solution(np, solve_tables, factors, np.ascontiguousarray(right, float), size, transposed)
 
         return solve
 

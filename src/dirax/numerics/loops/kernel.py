@@ -45,6 +45,14 @@ class Kernel:
         self._registered  # noqa: B018  (once)
         return jax.ffi.ffi_call(self.name, list(results), vmap_method="sequential")(*arrays)
 
+    def by(self, xp: Any, results: Sequence[tuple[tuple[int, ...], Any]], *arrays: Any) -> Sequence[Any]:
+        """The results, of these shapes and types, by NumPy or by JAX, whichever module `xp` is."""
+        if xp is not np:
+            return self.in_jax([jax.ShapeDtypeStruct(*one) for one in results], *arrays)
+        filled = [np.empty(*one) for one in results]
+        self(*arrays, *filled)
+        return filled
+
     @functools.cached_property
     def _engine(self) -> Any:
         module = module_of(self.function, self.constants)
