@@ -55,7 +55,7 @@ class Xla(AbstractEngine):
         p, numerics, notes = self._planned(problem)
         chunk = compiled_chunk(jax.default_backend())
         axes, capacity, params = axes_of(p), row_capacity(p), jax.device_put(p.params)
-        sizes = _sizes(p, numerics, sizes_of)
+        sizes = self._sizes(problem, sizes_of)
         lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, numerics.increments is not None)
         if p.record is not None:
             lanes = jax.tree.unflatten(jax.tree.structure(lanes), p.record)
@@ -101,7 +101,7 @@ class Xla(AbstractEngine):
         p, numerics, notes = self._planned(problem)
         axes = axes_of(p)
         lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), compensated=numerics.increments is not None)
-        clock, sizes = Clock.of(p), _sizes(p, numerics, sizes_of_traced)
+        clock, sizes = Clock.of(p), self._sizes(problem, sizes_of_traced)
         one = make_step(p.equation, axes, p.max_iterations, True, numerics)
 
         def step(lanes, k):
@@ -149,10 +149,9 @@ class Xla(AbstractEngine):
             p = dataclasses.replace(p, equation=equation)
         return p, Numerics(self.linear_solver, increments, jacobians), notes
 
-
-def _sizes(p: Problem, numerics: Numerics, found: Callable) -> tuple | None:
-    """Those of the unknowns of every stage; None for sparse ones, which are measured by 1."""
-    return None if numerics.sparse is not None else found(p)
+    def _sizes(self, p: Problem, found: Callable) -> tuple:
+        """Those of the unknowns of every stage."""
+        return found(p)
 
 
 def _outcome(
