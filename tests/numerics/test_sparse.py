@@ -10,6 +10,7 @@ from dirax.numerics.loops.compiler import Doubles, Longs
 from dirax.numerics.loops.kernel import Kernel
 from dirax.numerics.sparse.colours import column_colours
 from dirax.numerics.sparse.band import BandElimination
+from dirax.numerics.sparse.border import BorderedElimination
 from dirax.numerics.sparse.elimination import StructurallySingular, elimination
 from dirax.numerics.sparse.exchanged import ExchangedElimination
 from dirax.numerics.sparse.fixed import FixedElimination
@@ -81,6 +82,14 @@ def without_pivots(matrix: sp.csr_matrix) -> sp.csr_matrix:
     return sp.csr_matrix((np.concatenate([upper.data, upper.data, np.zeros(2 * n)]), (rows, columns)), (2 * n, 2 * n))
 
 
+def with_border(matrix: sp.csr_matrix) -> sp.csr_matrix:
+    """With a full row and a full column, at different numbers."""
+    n = matrix.shape[0]
+    whole = matrix.tolil()
+    whole[3], whole[:, 7] = RNG.normal(size=(1, n)), RNG.normal(size=(n, 1))
+    return whole.tocsr()
+
+
 MATRICES = {
     "tridiagonal, without a diagonal": (sp.diags([np.ones(39), np.ones(39)], [-1, 1]).tocsr(), BandElimination),
     "ring": (ring(60), BandElimination),
@@ -88,6 +97,7 @@ MATRICES = {
     "lattice": (lattice(20), FixedElimination),
     "saddle point of a lattice": (saddle(lattice(20), 30), FixedElimination),
     "rows in another order": (ring(50)[RNG.permutation(50)], BandElimination),
+    "full row and column": (with_border(ring(600)), BorderedElimination),
     "lattice, rows in another order": (lattice(20)[RNG.permutation(400)], ExchangedElimination),
     "lattice, pivots that are zero": (without_pivots(lattice(20)), FixedElimination),
 }

@@ -86,7 +86,7 @@ def _by_levels(equation: Any, stage: Any, shapes: tuple, params: Any, batch_para
     rows, columns = np.array([(i, j) for i, row in enumerate(jacobian) for j in row], np.int64).reshape(-1, 2).T
     equations = SparseEquations.of_entries(stage.unknowns, rows, columns)
     entries = made.in_levels(index, [node for row in jacobian for node in row.values()])
-    places, size = equations.places(rows, columns), equations.count * stage.unknowns
+    places, size = equations.places(rows, columns), equations.products * stage.unknowns
     values = jax.jit(lambda *args: jnp.zeros(size).at[places].set(entries(*args)))
     return replaced(stage, made, index, made.in_levels), SparseSolver(equations, values)
 

@@ -50,7 +50,7 @@ class Kernel:
         if xp is not np:
             return self.in_jax([jax.ShapeDtypeStruct(*one) for one in results], *arrays)
         filled = [np.empty(*one) for one in results]
-        self(*arrays, *filled)
+        self(*map(np.ascontiguousarray, arrays), *filled)
         return filled
 
     @functools.cached_property

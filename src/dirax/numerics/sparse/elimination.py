@@ -1,4 +1,5 @@
-"""How a sparse matrix of known pattern is factored: in a band, in a fixed order that makes little fill, or with exchanged rows.
+"""How a sparse matrix of known pattern is factored: in a band, in a fixed order that makes little fill, or with exchanged rows;
+rows and columns that are full apart.
 
 Each way has `tables` and `solve_tables`, what it knows of the pattern; `factors` and `solution` from them, by NumPy or by JAX;
 `stats`, and the multiplications that a factorization takes, `operations`.
@@ -11,10 +12,11 @@ import scipy.sparse as sp
 from scipy.sparse import csgraph
 
 from dirax.numerics.sparse.band import BandElimination
+from dirax.numerics.sparse.border import MOST, BorderedElimination, full_lines
 from dirax.numerics.sparse.exchanged import ExchangedElimination
 from dirax.numerics.sparse.fixed import FixedElimination
 
-Elimination: TypeAlias = BandElimination | FixedElimination | ExchangedElimination
+Elimination: TypeAlias = BandElimination | FixedElimination | ExchangedElimination | BorderedElimination
 
 NARROW, WIDEST_BAND = 40, 128
 """Diagonals, those of exchanged rows with them, up to which a matrix is factored in its band without looking further, and up to
@@ -47,12 +49,26 @@ def elimination(pattern: Any) -> Elimination:
     narrower band. Such a match says nothing of how large entries are, so that pivots are not taken in a fixed order then.
     """
     own, matched = np.arange(pattern.shape[0]), matched_rows(pattern)
+    if (bordered := _bordered(pattern, own if np.all(pattern.diagonal()) else matched)) is not None:
+        return bordered
     width, order, rows, below, above = min((_in_band(pattern, rows) for rows in (own, matched)), key=lambda choice: choice[0])
     band = BandElimination(pattern, order, rows[order], below, above)
     if width <= NARROW:
         return band
     other = FixedElimination(pattern, matched) if _has_pivots(pattern) else ExchangedElimination(pattern, matched, matched)
     return band if width <= WIDEST_BAND and band.operations <= IN_BAND * other.operations else other
+
+
+def _bordered(pattern: Any, rows: np.ndarray) -> BorderedElimination | None:
+    """With a border, if some lines are full: these and those that they are beside with these `rows`, so that what is left has a
+    full diagonal too."""
+    full_rows, full_columns = full_lines(pattern)
+    columns = np.union1d(full_columns, np.flatnonzero(np.isin(rows, full_rows)))
+    if not 0 < len(columns) <= MOST:
+        return None
+    inner = np.setdiff1d(np.arange(len(rows)), columns)
+    core = pattern[np.sort(rows[inner])][:, inner]
+    return BorderedElimination(len(rows), elimination(sp.csr_matrix(core)), rows[columns], columns)
 
 
 def _in_band(pattern: Any, rows: np.ndarray) -> tuple[int, np.ndarray, np.ndarray, int, int]:
