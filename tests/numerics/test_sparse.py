@@ -8,9 +8,9 @@ import scipy.sparse as sp
 
 from dirax.numerics.loops.compiler import Doubles, Longs
 from dirax.numerics.loops.kernel import Kernel
-from dirax.numerics.sparse.colours import column_colours
 from dirax.numerics.sparse.band import BandElimination
 from dirax.numerics.sparse.border import BorderedElimination
+from dirax.numerics.sparse.colours import column_colours
 from dirax.numerics.sparse.elimination import StructurallySingular, elimination
 from dirax.numerics.sparse.exchanged import ExchangedElimination
 from dirax.numerics.sparse.fixed import FixedElimination

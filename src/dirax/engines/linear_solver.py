@@ -39,7 +39,7 @@ class AbstractLinearSolver(eqx.Module):
         return jax.linear_transpose(lambda b: self.solve(factors, b), right)(right)[0]
 
     def in_units(self, matrix: Any, sizes: Float[Array, " k"]) -> tuple[Any, Any]:
-        """The matrix with its rows in units of the terms of their equations, among which pivots are chosen, where the unknowns have
-        these sizes, and what the rows are multiplied with. A solver that chooses pivots by itself leaves them as they are."""
+        """The matrix with its rows in units of the terms of their equations, among which pivots are chosen, where the unknowns
+        have these sizes, and what the rows are multiplied with. A solver that chooses pivots in another way leaves them."""
         unit = 1.0 / (jnp.abs(matrix) @ sizes)
         return unit[:, None] * matrix, unit

@@ -3,8 +3,8 @@
 The data u, state and h, each number changed by about a last place at random, change the residual by what its terms round by and
 by what it makes of the change, and the root by r_u⁻¹ times that: in units of ε, and as a root mean square, this is what
 `sizes.py` bounds by |r_u⁻¹| E. It takes an update of Newton's method for each sample, at the state and near the end of a short
-step, where numbers are less special. Among unknowns of one part of the layout, which have one unit, none is less than LEAST of the
-largest: where all is zero as yet, as ahead of a wave, nothing else says how large it will be.
+step, where numbers are less special. Among unknowns of one part of the layout, which have one unit, none is less than LEAST of
+the largest: where all is zero as yet, as ahead of a wave, nothing else says how large it will be.
 """
 
 from typing import Any, NamedTuple
@@ -69,8 +69,8 @@ def _sizes(equation: Any, solvers: tuple, state: Any, guess: tuple, params: Any,
 
 
 class _Look(NamedTuple):
-    """One evaluation: where its data are from, whether they are blurred, whether its root is that of the short step; the part of a
-    step."""
+    """One evaluation: where its data are from, whether they are blurred, whether its root is that of the short step; the part of
+    a step."""
 
     at_end: np.ndarray
     from_solution: np.ndarray

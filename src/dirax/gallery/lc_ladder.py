@@ -22,8 +22,9 @@ def frequencies(sections: int = 4, inductance: float = 1.0, capacitance: float =
 
 
 def pulse(sections: int, place: float, width: float, inductance: float = 1.0, capacitance: float = 1.0) -> np.ndarray:
-    """Charges and fluxes (2·sections,) of a pulse of voltage 1 that goes to the right, 1/√(LC) sections in a unit of time, as long
-    as it is wide and far from the ends (d'Alembert): `place` and `width` in sections, the current is the voltage over √(L/C)."""
+    """Charges and fluxes (2·sections,) of a pulse of voltage 1 that goes to the right, 1/√(LC) sections in a unit of time, as
+    d'Alembert has it of one that is wide and far from the ends: `place` and `width` in sections; the voltage is √(L/C) times the
+    current."""
     shape = lambda at: np.exp(-(((at - place) / width) ** 2))
     at = np.arange(sections)
     return np.concatenate([capacitance * shape(at + 1.0), np.sqrt(inductance * capacitance) * shape(at + 0.5)])

@@ -10,8 +10,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
 
-from dirax.numerics.sparse.colours import column_colours
 from dirax.numerics.sparse.border import full_lines
+from dirax.numerics.sparse.colours import column_colours
 from dirax.numerics.sparse.elimination import elimination
 from dirax.program.sparsity import pattern_of
 

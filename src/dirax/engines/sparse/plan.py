@@ -23,6 +23,10 @@ KEPT = 64
 """Plans kept in memory."""
 
 
+class Unsolvable(str):
+    """Why the equations of a step have no unique solution, whatever the numbers in them."""
+
+
 class SparsePlan(NamedTuple):
     """The equation as it is run, and a solver for each of its stages."""
 
@@ -66,7 +70,8 @@ def _planned(equation: Any, params: Any, batch_params: bool) -> SparsePlan | str
         except Dense as error:
             return str(error)
         except StructurallySingular as error:
-            return f"the equations {', '.join(stage.labels[int(row)] for row in error.rows[:4])} have too few unknowns"
+            named = ", ".join(stage.labels[int(row)] for row in error.rows[:4])
+            return Unsolvable(f"the equations {named} have too few unknowns beside the others")
         found[id(stage)] = made
     stages = tuple((found[id(stage)][0], fraction) for stage, fraction in equation.stages)
     return SparsePlan(joined(equation, stages), tuple(found[id(stage)][1] for stage, _ in equation.stages))

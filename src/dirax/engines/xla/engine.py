@@ -68,7 +68,7 @@ class Xla(AbstractEngine):
             return after, {name: by_lane(np.asarray(values), p.batch, np) for name, values in rows.items()}
 
         _, empty = call(lanes, 0, 0)  # compile
-        compile_seconds, started = time.perf_counter() - started, time.perf_counter()
+        compile_seconds, started, solved = time.perf_counter() - started, time.perf_counter(), numerics.seconds
 
         fields = _host_arrays(p, empty)
         done, count, interrupted = p.after, FIRST_CHUNK, False
@@ -94,6 +94,9 @@ class Xla(AbstractEngine):
         outcome.interrupted, outcome.compile_seconds = interrupted, compile_seconds
         outcome.record = None if interrupted else tuple(jax.tree.leaves(lanes))
         outcome.run_seconds = time.perf_counter() - started
+        if solved is not None:
+            spent = (numerics.seconds or 0.0) - solved
+            outcome.notes |= {"evaluation_seconds": outcome.run_seconds - spent, "solution_seconds": spent}
         return finished(p, outcome)
 
     def run_traced(self, problem: Problem) -> Outcome:

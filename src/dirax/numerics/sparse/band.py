@@ -58,6 +58,11 @@ class BandElimination:
         return self.kernels[1 + transposed].by(xp, shapes, *tables, *factors, right, size)[-1]
 
     @property
+    def seconds(self) -> float:
+        """How long its loops have run for all matrices that are factored so."""
+        return sum(kernel.seconds for kernel in self.kernels)
+
+    @property
     def stats(self) -> dict[str, Any]:
         """What `Solution.stats` says of it."""
         solver = "tridiagonal" if self.below <= 1 and self.above <= 1 else "band"

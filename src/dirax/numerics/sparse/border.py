@@ -18,8 +18,8 @@ def full_lines(pattern: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 class BorderedElimination:
-    """Elimination of a matrix [A C; R D] with the rows and columns of its border last: `core` factors A, and D − R A⁻¹ C, of a few
-    rows, is inverted."""
+    """Elimination of a matrix [A C; R D] with the rows and columns of its border last: `core` factors A, and D − R A⁻¹ C, of a
+    few rows, is inverted."""
 
     def __init__(self, size: int, core: Any, rows: np.ndarray, columns: np.ndarray):
         self.size, self.core, self.border, self.columns = size, core, rows, columns  # the border has as many columns as rows
@@ -61,6 +61,11 @@ class BorderedElimination:
         first = solved(right[self.inner_rows])
         last = inverse @ (right[self.border] - below @ first)
         return xp.concatenate([first - lifted @ last, last])[np.argsort(np.concatenate([self.inner_columns, self.columns]))]
+
+    @property
+    def seconds(self) -> float:
+        """How long its loops have run for all matrices that are factored so."""
+        return self.core.seconds
 
     @property
     def stats(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 rows and columns that are full apart.
 
 Each way has `tables` and `solve_tables`, what it knows of the pattern; `factors` and `solution` from them, by NumPy or by JAX;
-`stats`, and the multiplications that a factorization takes, `operations`.
+`stats`, the multiplications that a factorization takes, `operations`, and the `seconds` that it took so far.
 """
 
 from typing import Any, TypeAlias

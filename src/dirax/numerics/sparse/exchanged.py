@@ -48,6 +48,11 @@ class ExchangedElimination:
         return _solve[transposed].by(xp, [numbers, numbers], *tables, *factors, right, size)[-1]
 
     @property
+    def seconds(self) -> float:
+        """How long its loops have run for all matrices that are factored so."""
+        return sum(kernel.seconds for kernel in (_factor, *_solve))
+
+    @property
     def stats(self) -> dict[str, Any]:
         """What `Solution.stats` says of it."""
         return {"solver": "exchanged rows", "fill": 2 * self.most + self.size}

@@ -62,6 +62,11 @@ class FixedElimination:
         return xp.where(left > 0, self.exchanged.solution(xp, tables[4:], factors[4:], right, left, transposed), found)
 
     @property
+    def seconds(self) -> float:
+        """How long its loops have run for all matrices that are factored so."""
+        return sum(kernel.seconds for kernel in (_factor, *_solve)) + self.exchanged.seconds
+
+    @property
     def stats(self) -> dict[str, Any]:
         """What `Solution.stats` says of it."""
         return {"solver": "fixed order", "fill": 2 * len(self.fill[1]) + self.size}
