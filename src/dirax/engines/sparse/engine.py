@@ -19,8 +19,8 @@ class Sparse(Xla):
     """Steps of many unknowns each of which depends on few others: a step costs in proportion to their number.
 
     Which unknowns an equation depends on is found in its functions. `stats` say how the matrix is factored, its bandwidth and
-    fill, and how long factors and solutions took and all else, evaluation most of it. With `only_quicker` steps are left to others
-    that dense elimination is quicker for.
+    fill, and how long factors and solutions took and all else, evaluation most of it. With `only_quicker` steps are left to
+    others that dense elimination is quicker for.
     """
 
     only_quicker: bool = False
