@@ -80,7 +80,7 @@ class Circuit(AbstractSystem):
         """+1 where an element of the kind leaves a node and −1 where it arrives, (nodes, elements); of a transformer's first or
         second `side`. A `SparseMatrix` for very many nodes."""
         chosen = self.elements(kind)
-        ends = [element[side] if kind == "T" else element[1:3] for element in chosen]
+        ends: list[Any] = [element[side] if kind == "T" else element[1:3] for element in chosen]
         number = {node: row for row, node in enumerate(self.nodes)}
         entries = [
             (number[node], column, sign)

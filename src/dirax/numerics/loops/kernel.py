@@ -133,7 +133,7 @@ def _write_handler(module: ir.Module, kernel: Any, count: int) -> None:
         values.append(b.bitcast(pointer(buffer, BUFFER_DATA), argument.type))
     begun = _nanoseconds(b)
     b.call(kernel, values)
-    spent = ir.GlobalVariable(module, ir.IntType(64), SPENT)
+    spent: Any = ir.GlobalVariable(module, ir.IntType(64), SPENT)
     spent.initializer = ir.Constant(ir.IntType(64), 0)
     b.atomic_rmw("add", spent, b.sub(_nanoseconds(b), begun), "monotonic")
     b.ret(null)

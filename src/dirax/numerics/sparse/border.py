@@ -12,9 +12,9 @@ MOST = 8
 def full_lines(pattern: Any) -> tuple[np.ndarray, np.ndarray]:
     """The rows and the columns of a pattern that have far more entries than others; none where they are more than a few."""
     most = 64 + 4 * int(np.sqrt(pattern.shape[0]))
-    lines = tuple(np.flatnonzero(np.bincount(of, minlength=pattern.shape[0]) > most) for of in pattern.nonzero())
+    rows, columns = (np.flatnonzero(np.bincount(of, minlength=pattern.shape[0]) > most) for of in pattern.nonzero())
     none = np.zeros(0, int)
-    return lines if sum(map(len, lines)) <= MOST else (none, none)
+    return (rows, columns) if len(rows) + len(columns) <= MOST else (none, none)
 
 
 class BorderedElimination:
