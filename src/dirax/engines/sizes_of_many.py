@@ -7,6 +7,7 @@ step, where numbers are less special. Among unknowns of one part of the layout, 
 the largest: where all is zero as yet, as ahead of a wave, nothing else says how large it will be.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -53,7 +54,7 @@ def sizes_of_many(p: Problem, traced: bool = False) -> tuple[Any, ...]:
     given = jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), jax.tree.map(jnp.asarray, p.params), *numbers
     given = jax.lax.stop_gradient(given)
     if traced:
-        return jax.jit(lambda *given: _sizes(equation, solvers, *given, axes))(*given)
+        return jax.jit(functools.partial(_sizes, equation, solvers, axes=axes))(*given)
     return tuple(map(np.asarray, _compiled(equation, solvers, *given, axes)))
 
 
