@@ -1,11 +1,13 @@
 """Large systems of the gallery beside what is known of them; each runs on the sparse engine."""
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import dirax as dx
-from dirax.gallery import hanging_chain, oscillator_chain, sine_gordon, wave_line, wave_sheet
+from dirax.gallery import hanging_chain, lc_ladder, oscillator_chain, sine_gordon, wave_line, wave_sheet
 
 
 def test_toda_keeps_its_eigenvalues_and_is_the_limit_of_small_amplitudes():
@@ -87,6 +89,27 @@ def test_waves_go_as_d_alembert_says():
         )
         errors.append(np.max(np.abs(sol.x[-1] - wave_line.pulse(cells, 0.3 + 0.25))))
     assert errors[1] < 1e-3 and 3.5 < errors[0] / errors[1] < 4.5
+
+
+def along_a_line(sections):
+    """The greatest error of a pulse of voltage on an LC line after .3 of its length."""
+    steps, width = 3 * sections // 10, sections / 20
+    sol = dx.simulate(
+        dx.circuit(lc_ladder.ladder(sections)), dx.DiscreteDirac(), x=lc_ladder.pulse(sections, 0.3 * sections, width),
+        step=1.0, steps=steps, save_every=steps,
+    )  # fmt: skip
+    assert sol.ok and sol.stats["engine"] == "sparse" and sol.stats["solver"] == "band"
+    return np.max(np.abs(sol.x[-1] - lc_ladder.pulse(sections, 0.3 * sections + steps, width)))
+
+
+def test_a_pulse_goes_along_a_line_of_a_netlist():
+    assert 1e-3 < along_a_line(300) < 2e-2
+
+
+@pytest.mark.soak
+def test_a_pulse_goes_along_a_line_of_ten_thousand_cells():
+    errors = [along_a_line(sections) for sections in (2500, 5000, 10_000)]
+    assert errors[-1] < 2e-5 and all(3.8 < a / b < 4.2 for a, b in itertools.pairwise(errors))
 
 
 def test_a_sheet_swings_in_its_modes():

@@ -8,8 +8,12 @@ import scipy.sparse as sp
 
 from dirax.numerics.loops.compiler import Doubles, Longs
 from dirax.numerics.loops.kernel import Kernel
+from dirax.numerics.sparse.band import BandElimination
+from dirax.numerics.sparse.border import BorderedElimination
 from dirax.numerics.sparse.colours import column_colours
-from dirax.numerics.sparse.elimination import BandElimination, FixedElimination, StructurallySingular, elimination
+from dirax.numerics.sparse.elimination import StructurallySingular, elimination
+from dirax.numerics.sparse.exchanged import ExchangedElimination
+from dirax.numerics.sparse.fixed import FixedElimination
 
 RNG = np.random.default_rng(0)
 
@@ -70,6 +74,22 @@ def saddle(matrix: sp.csr_matrix, constraints: int) -> sp.csr_matrix:
     return sp.bmat([[matrix, -g.T], [g, None]]).tocsr()
 
 
+def without_pivots(matrix: sp.csr_matrix) -> sp.csr_matrix:
+    """With a full diagonal in its pattern, of zeros."""
+    n = matrix.shape[0]
+    upper, (i, j) = matrix.tocoo(), (np.arange(2 * n),) * 2
+    rows, columns = np.concatenate([upper.row, upper.col + n, i]), np.concatenate([upper.col + n, upper.row, j])
+    return sp.csr_matrix((np.concatenate([upper.data, upper.data, np.zeros(2 * n)]), (rows, columns)), (2 * n, 2 * n))
+
+
+def with_border(matrix: sp.csr_matrix) -> sp.csr_matrix:
+    """With a full row and a full column, at different numbers."""
+    n = matrix.shape[0]
+    whole = matrix.tolil()
+    whole[3], whole[:, 7] = RNG.normal(size=(1, n)), RNG.normal(size=(n, 1))
+    return whole.tocsr()
+
+
 MATRICES = {
     "tridiagonal, without a diagonal": (sp.diags([np.ones(39), np.ones(39)], [-1, 1]).tocsr(), BandElimination),
     "ring": (ring(60), BandElimination),
@@ -77,6 +97,9 @@ MATRICES = {
     "lattice": (lattice(20), FixedElimination),
     "saddle point of a lattice": (saddle(lattice(20), 30), FixedElimination),
     "rows in another order": (ring(50)[RNG.permutation(50)], BandElimination),
+    "full row and column": (with_border(ring(600)), BorderedElimination),
+    "lattice, rows in another order": (lattice(20)[RNG.permutation(400)], ExchangedElimination),
+    "lattice, pivots that are zero": (without_pivots(lattice(20)), FixedElimination),
 }
 
 
@@ -85,15 +108,13 @@ def test_elimination(name):
     matrix, kind = MATRICES[name]
     matrix.sort_indices()
     n = matrix.shape[0]
-    made = elimination(sp.csr_matrix(matrix.astype(bool)))
+    made = elimination(sp.csr_matrix((np.ones(matrix.nnz, bool), matrix.indices, matrix.indptr), matrix.shape))
     assert isinstance(made, kind)
     places = sp.csr_matrix((np.arange(1, matrix.nnz + 1), matrix.indices, matrix.indptr), matrix.shape)
-    factors = [np.zeros(shape, dtype) for shape, dtype in made.factor_shapes]
-    made.kernels[0](*made.tables(places), matrix.data.copy(), np.array([n]), *factors)
-    right, dense = RNG.normal(size=n), matrix.toarray()
-    for kernel, a in ((made.kernels[1], dense), (made.kernels[2], dense.T)):
-        found = np.zeros(n)
-        kernel(*made.solve_tables, *factors[made.work_of_factor :], right, np.array([n]), *map(np.zeros, made.work), found)
+    right, dense, size = RNG.normal(size=n), matrix.toarray(), np.array([n])
+    factors = made.factors(np, made.tables(places), matrix.data.copy(), size)
+    for transposed, a in ((False, dense), (True, dense.T)):
+        found = made.solution(np, made.solve_tables, factors, right, size, transposed)
         np.testing.assert_allclose(found, np.linalg.solve(a, right), rtol=1e-9, atol=1e-9)
 
 

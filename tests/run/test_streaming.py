@@ -161,3 +161,23 @@ dx.simulate(CHAIN, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, step=0.05, steps=
     assert steps > 1000 and not there.ok
     theirs = dx.simulate(CHAIN, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, step=0.05, steps=steps, save_every=100)
     assert np.array_equal(there.q, theirs.q)
+
+
+@pytest.mark.soak
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="the peak of a process's memory is read from /proc")
+def test_memory_does_not_grow_with_the_rows(tmp_path):
+    """Ten thousand oscillators: rows of 640 MB pass through a process that has room for a part of them."""
+    code = """
+import sys, numpy as np, dirax as dx
+from dirax.gallery import oscillator_chain
+q = oscillator_chain.first_mode(10_000)
+chain, rows = oscillator_chain.chain(alpha=0.0, beta=0.8), int(sys.argv[1])
+sol = dx.simulate(chain, dx.LagrangeDAlembert(), q=q, v=0 * q, step=0.05, steps=rows, to=sys.argv[2])
+assert sol.ok and sol.rows == rows + 1 and np.ptp(sol.energy()) < 1e-6 * sol.energy()[0]
+print(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
+"""
+    peaks = []
+    for rows in (400, 4000):
+        given = [sys.executable, "-c", code, str(rows), str(tmp_path / f"{rows}.zarr")]
+        peaks.append(1024 * int(subprocess.run(given, capture_output=True, text=True, check=True).stdout.split()[-1]))
+    assert peaks[1] - peaks[0] < 0.3 * 3600 * 10_000 * 16

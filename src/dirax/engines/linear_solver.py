@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
@@ -36,3 +37,9 @@ class AbstractLinearSolver(eqx.Module):
         """x with matrixᵀ·x = right, which reverse mode needs: JAX transposes `solve`, unless a solver knows better, or has to
         say it because its `solve` is a loop or a call of a library."""
         return jax.linear_transpose(lambda b: self.solve(factors, b), right)(right)[0]
+
+    def in_units(self, matrix: Any, sizes: Float[Array, " k"]) -> tuple[Any, Any]:
+        """The matrix with its rows in units of the terms of their equations, among which pivots are chosen, where the unknowns
+        have these sizes, and what the rows are multiplied with. A solver that chooses pivots in another way leaves them."""
+        unit = 1.0 / (jnp.abs(matrix) @ sizes)
+        return unit[:, None] * matrix, unit

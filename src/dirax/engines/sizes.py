@@ -18,7 +18,7 @@ Newton's method will not converge.
 
 All this is for data that are special, and takes milliseconds (`close_sizes.py`). `first_sizes.py` has the sizes from one
 linearization alone, and says where they leave no doubt: they are those of most runs, and a kernel of the native engine finds
-them itself in no time. Steps of very many unknowns are measured by 1.
+them itself in no time. Those of very many unknowns are found by `sizes_of_many.py`.
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ Sizes = tuple[Any, ...]
 def sizes_of(problem: Problem) -> Sizes:
     """The sizes of the unknowns of each stage, (k,) or (B, k), of a problem in numbers."""
     if problem.size >= FEWEST_SPARSE:
-        return tuple(np.ones(np.shape(guess)) for guess in problem.guess)
+        return _of_many(problem)
     return _in_numbers(problem, _start(problem), _looked_at)
 
 
@@ -58,13 +58,19 @@ def sizes_of_traced(problem: Problem) -> Sizes:
     """The same of a problem that JAX traces, without derivatives: in numbers when it runs, where the step has a scalar program,
     since XLA takes seconds to compile them."""
     if problem.size >= FEWEST_SPARSE:
-        return tuple(map(jnp.asarray, sizes_of(problem)))
+        return _of_many(problem, traced=True)
     found = _on_host(problem)
     if found is None:
         equation, state, guess, params, t, h, axes = _arguments(problem, _start(problem))
         one = functools.partial(sizes_at, equation, axes=axes)  # which may close over what is traced
         found = jax.jit(one)(state, guess, params, t, h)
     return jax.lax.stop_gradient(found)
+
+
+def _of_many(problem: Problem, traced: bool = False) -> Sizes:
+    from dirax.engines.sizes_of_many import sizes_of_many  # imported when it is used
+
+    return sizes_of_many(problem, traced)
 
 
 def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple, sizes: Sizes) -> tuple:

@@ -1,4 +1,4 @@
-"""An LC ladder, stated by a list of its elements."""
+"""An LC ladder, stated by a list of its elements: of very many sections, a transmission line."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +19,15 @@ def frequencies(sections: int = 4, inductance: float = 1.0, capacitance: float =
     """The ladder's angular frequencies, 2/√(LC) sin((2k − 1)π/(4n + 2)), k = 1, …, n."""
     k = np.arange(1, sections + 1)
     return 2 / np.sqrt(inductance * capacitance) * np.sin((2 * k - 1) * np.pi / (4 * sections + 2))
+
+
+def pulse(sections: int, place: float, width: float, inductance: float = 1.0, capacitance: float = 1.0) -> np.ndarray:
+    """Charges and fluxes (2·sections,) of a pulse of voltage 1 that goes to the right, 1/√(LC) sections in a unit of time, as
+    d'Alembert has it of one that is wide and far from the ends: `place` and `width` in sections; the voltage is √(L/C) times the
+    current."""
+    shape = lambda at: np.exp(-(((at - place) / width) ** 2))
+    at = np.arange(sections)
+    return np.concatenate([capacitance * shape(at + 1.0), np.sqrt(inductance * capacitance) * shape(at + 0.5)])
 
 
 def scene(sections: int = 4) -> Scene:

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
 
+from dirax.numerics.sparse.border import full_lines
 from dirax.numerics.sparse.colours import column_colours
 from dirax.numerics.sparse.elimination import elimination
 from dirax.program.sparsity import pattern_of
@@ -23,13 +24,16 @@ entry; elimination that follows indices for each multiplication, and each equati
 class SparseEquations(eqx.Module):
     """What is known of the Jacobian of equations without its values: where entries are, and how it is factored.
 
-    Values are those of one product with the sum of each colour's columns, (colours·k,). On a CPU.
+    Values are those of one product with the sum of each colour's columns, and of one from the left with each full row,
+    (products·k,). On a CPU.
     """
 
     pattern: Any = eqx.field(static=True)
     elimination: Any = eqx.field(static=True)
     count: int = eqx.field(static=True)
     """How many colours there are."""
+    full_rows: tuple[int, ...] = eqx.field(static=True)
+    """The rows with far more entries than others, which colours do not regard."""
     colours: Array
     tables: tuple[Array, ...]
     solve_tables: tuple[Array, ...]
@@ -52,21 +56,28 @@ class SparseEquations(eqx.Module):
 
     def places(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Where the entries at these rows and columns are among the `values`."""
-        return np.asarray(self.colours)[columns].astype(np.int64) * self.elimination.size + rows
+        return _places(self.elimination.size, np.asarray(self.colours), self.count, self.full_rows, rows, columns)
+
+    @property
+    def products(self) -> int:
+        """How many products with vectors have all the values."""
+        return self.count + len(self.full_rows)
 
     @classmethod
     def _of_pattern(cls, pattern: Any) -> "SparseEquations":
         size = pattern.shape[0]
-        colours = column_colours(pattern)
+        full_rows, _ = full_lines(pattern)
+        colours = column_colours(pattern[np.setdiff1d(np.arange(size), full_rows)] if len(full_rows) else pattern)
         count = int(np.max(colours, initial=-1)) + 1
         made = elimination(pattern)
         entries = pattern.tocoo()
-        numbers = 1 + colours[entries.col].astype(np.int64) * size + entries.row
+        full = tuple(full_rows.tolist())
+        numbers = 1 + _places(size, colours, count, full, entries.row, entries.col)
         places = sp.csr_matrix((numbers, pattern.indices, pattern.indptr), pattern.shape)
         with jax.ensure_compile_time_eval():
             arrays = lambda given: tuple(map(jnp.asarray, given))
             return cls(
-                _Static(pattern), made, count, jnp.asarray(colours), arrays(made.tables(places)), arrays(made.solve_tables),
+                _Static(pattern), made, count, full, jnp.asarray(colours), arrays(made.tables(places)), arrays(made.solve_tables),
                 jnp.asarray([size], np.int64),
             )  # fmt: skip
 
@@ -74,10 +85,10 @@ class SparseEquations(eqx.Module):
     def slower(self) -> str | None:
         """Why elimination as of a dense matrix is quicker, where it is."""
         made, size = self.elimination, self.elimination.size
-        sparse = size * (SPARSE_ROW + DENSE_ENTRY * self.count) + SPARSE_OPERATION * made.operations
+        sparse = size * (SPARSE_ROW + DENSE_ENTRY * self.products) + SPARSE_OPERATION * made.operations
         if sparse < size**2 * (DENSE_OPERATION * size / 3 + DENSE_ENTRY):
             return None
-        return f"the Jacobian of {size} equations takes {self.count} products, and {made.operations} multiplications to factor"
+        return f"the Jacobian of {size} equations takes {self.products} products, and {made.operations} multiplications to factor"
 
     @property
     def stats(self) -> dict[str, Any]:
@@ -88,11 +99,16 @@ class SparseEquations(eqx.Module):
             "colours": self.count,
         } | self.elimination.stats
 
-    def values(self, function: Callable, u: Float[Array, " k"]) -> Float[Array, " colours*k"]:
+    def values(self, function: Callable, u: Float[Array, " k"]) -> Float[Array, " products*k"]:
         """The values of the Jacobian of `function` at u."""
         _, linear = jax.linearize(function, u)
         sums = jnp.where(self.colours[None, :] == jnp.arange(self.count, dtype=self.colours.dtype)[:, None], 1.0, 0.0)
-        return jax.vmap(linear)(sums).ravel()
+        columns = jax.vmap(linear)(sums).ravel()
+        if not self.full_rows:
+            return columns
+        transposed = jax.linear_transpose(linear, u)
+        rows = [transposed(jnp.zeros_like(u).at[row].set(1.0))[0] for row in self.full_rows]
+        return jnp.concatenate([columns, *rows])
 
     def matrix(self, values: np.ndarray) -> Any:
         """The Jacobian with these values."""
@@ -104,21 +120,17 @@ class SparseEquations(eqx.Module):
     def values_of(self, matrix: Any) -> np.ndarray:
         """The values of a matrix of this pattern."""
         entries = matrix.tocoo()
-        values = np.zeros(self.count * matrix.shape[0])
+        values = np.zeros(self.products * matrix.shape[0])
         values[self.places(entries.row, entries.col)] = entries.data
         return values
 
-    def factorise(self, values: Float[Array, " colours*k"]) -> Any:
+    def factorise(self, values: Float[Array, " products*k"]) -> Any:
         """The factors of the Jacobian with these values."""
-        made = self.elimination
-        shapes = [jax.ShapeDtypeStruct(shape, kind) for shape, kind in made.factor_shapes]
-        return tuple(made.kernels[0].in_jax(shapes, *self.tables, values, self.size))[made.work_of_factor :]
+        return self.elimination.factors(jnp, self.tables, values, self.size)
 
     def solve(self, factors: Any, right: Float[Array, " k"], transposed: bool = False) -> Float[Array, " k"]:
         """x with J x = right, or Jᵀ x = right."""
-        made = self.elimination
-        shapes = [jax.ShapeDtypeStruct((n,), np.float64) for n in (*made.work, made.size)]
-        return made.kernels[1 + transposed].in_jax(shapes, *self.solve_tables, *factors, right, self.size)[-1]
+        return self.elimination.solution(jnp, self.solve_tables, factors, right, self.size, transposed)
 
     def root(self, function: Callable, root: Float[Array, " k"]) -> Float[Array, " k"]:
         """`root`, with its derivatives as the function of what `function` captures that function(root) = 0 makes of it."""
@@ -133,16 +145,21 @@ class SparseEquations(eqx.Module):
     def in_numpy(self, values: np.ndarray) -> Callable[..., np.ndarray]:
         """(right, transposed=False) ↦ the solution with the Jacobian of these values, in NumPy."""
         made, size = self.elimination, np.asarray(self.size)
-        factors = [np.zeros(shape, kind) for shape, kind in made.factor_shapes]
-        made.kernels[0](*map(np.asarray, self.tables), np.ascontiguousarray(values, float), size, *factors)
+        tables, solve_tables = (tuple(map(np.asarray, arrays)) for arrays in (self.tables, self.solve_tables))
+        factors = made.factors(np, tables, np.ascontiguousarray(values, float), size)
 
         def solve(right: np.ndarray, transposed: bool = False) -> np.ndarray:
-            *work, found = (np.zeros(n) for n in (*made.work, made.size))
-            given = map(np.asarray, self.solve_tables), factors[made.work_of_factor :]
-            made.kernels[1 + transposed](*(a for part in given for a in part), np.ascontiguousarray(right), size, *work, found)
-            return found
+            return made.solution(np, solve_tables, factors, np.ascontiguousarray(right, float), size, transposed)
 
         return solve
+
+
+def _places(size: int, colours: np.ndarray, count: int, full_rows: tuple, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Where the entries at these rows and columns are among the values."""
+    places = colours[columns].astype(np.int64) * size + rows
+    for number, row in enumerate(full_rows):
+        places = np.where(rows == row, (count + number) * size + columns, places)
+    return places
 
 
 class _Static:

@@ -13,10 +13,10 @@ class SparseMatrix:
     Anything else takes it as the dense array that it stands for.
     """
 
-    def __init__(self, matrix: Any):
+    def __init__(self, matrix: Any, shape: tuple[int, int] | None = None):
         from scipy.sparse import csr_matrix  # imported when it is used
 
-        self.matrix: Any = csr_matrix(matrix, dtype=float)
+        self.matrix: Any = csr_matrix(matrix, shape, dtype=float)
         self.matrix.sum_duplicates()
 
     @property

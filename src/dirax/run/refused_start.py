@@ -150,6 +150,7 @@ def _refuse_singular_sparse_step(jacobians: SparseJacobians, labels: Sequence[st
         free = free_direction(jacobians.equations, matrix)
         if free is not None:
             most = np.argsort(-np.abs(free))[:4]
+            most = most[np.abs(free[most]) > 1e-3 * np.abs(free[most[0]])]
             rows = np.unique(matrix.tocsc()[:, most].indices)
             raise ValueError(
                 f"the first step has no unique solution: its matrix ([PY] (21)) is singular at the initial data{which}, and "

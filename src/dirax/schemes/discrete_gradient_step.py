@@ -27,7 +27,9 @@ class DiscreteGradientStep(AbstractStep):
     of closed ports, or the multipliers of constraints.
 
     ∇̄H is the mean of dH at the `points` of the step (0 to 1) with these `weights`, corrected along the step in the metric of the
-    second derivatives of H.
+    second derivatives of H. That is a number times Δx which depends on all of x: of many coordinates it is an unknown with an
+    equation of its own, and the other equations are sparse, in the Euclidean metric, since a diagonal of second derivatives costs
+    as many gradients as there are coordinates.
     """
 
     relation: RelationForm
@@ -42,7 +44,13 @@ class DiscreteGradientStep(AbstractStep):
 
     @property
     def unknowns(self) -> Layout:
-        return Layout(velocity=self.n, multipliers=self.relation.multipliers)
+        correction = {"correction": 1} if self.sparse else {}
+        return Layout(velocity=self.n, multipliers=self.relation.multipliers, **correction)
+
+    @property
+    def sparse(self) -> bool:
+        """Whether the factor of the correction of ∇̄H is an unknown: all else in an equation is near it then."""
+        return self.n >= FEWEST_SPARSE
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -59,32 +67,51 @@ class DiscreteGradientStep(AbstractStep):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        return tuple(f"component {i} of the discrete balance" for i in range(self.n)) + self.relation.labels
+        factor = ("the correction of the discrete gradient",) if self.sparse else ()
+        return tuple(f"component {i} of the discrete balance" for i in range(self.n)) + self.relation.labels + factor
 
     # ------------------------------------------------------------------------------------------------------ the gradient
 
     @once
     def discrete_gradient(self, u, state, h, params):
-        """∇̄H, with ⟨∇̄H, Δx⟩ = H(x + Δx) − H(x), and x̄.
+        """∇̄H, with ⟨∇̄H, Δx⟩ = H(x + Δx) − H(x), and x̄."""
+        mean, middle, change = self._mean(u, state, h, params)
+        if self.sparse:
+            return mean + self.unknowns.split(u).correction * change, middle
+        missing, blurred = self._missing(u, state, h, params)
+        along, share = _along(change, self._metric(middle, params), mean, blurred)
+        instead, _ = _along(change, jnp.ones(self.n), mean, blurred)
+        return mean + missing * (along + (1.0 - share) * instead), middle
+
+    @once
+    def _mean(self, u, state, h, params):
+        """The mean of dH over the step, x̄, and Δx."""
+        x, change = self.state.split(state).x, h * self.unknowns.split(u).velocity
+        at = lambda s: self.energy.differential(x + s * change, params)
+        mean = jnp.stack([w * at(s) for s, w in zip(self.points, self.weights, strict=True)]).sum(axis=0)
+        return mean, x + change / 2, change
+
+    @once
+    def _missing(self, u, state, h, params):
+        """H(x + Δx) − H(x) less ⟨mean, Δx⟩, and what of it roundoff blurs, over NOISE.
 
         H(x) is what it has to be by the balance: H(x_0) + supplied − dissipated.
         """
-        state, change = self.state.split(state), h * self.unknowns.split(u).velocity
-        at = lambda s: self.energy.differential(state.x + s * change, params)
-        gradient = jnp.stack([w * at(s) for s, w in zip(self.points, self.weights, strict=True)]).sum(axis=0)
+        mean, _, change = self._mean(u, state, h, params)
+        state = self.state.split(state)
         gained = (state.supplied - state.dissipated) + (state.lost_supplied - state.lost_dissipated)
         stored = (self.energy.hamiltonian(state.x + change, params) - state.first) - gained
-        blurred = EPSILON * (jnp.abs(state.first) + jnp.abs(gained)) / NOISE
-        middle = state.x + change / 2
-        missing = stored - gradient @ change
-        along, share = _along(change, self._metric(middle, params), gradient, blurred)
-        instead, _ = _along(change, jnp.ones(self.n), gradient, blurred)
-        return gradient + missing * (along + (1.0 - share) * instead), middle
+        return stored - mean @ change, EPSILON * (jnp.abs(state.first) + jnp.abs(gained)) / NOISE
+
+    def _factor(self, u, state, h, params):
+        """What the mean of dH is corrected by, over Δx: the correction in the Euclidean metric."""
+        mean, _, change = self._mean(u, state, h, params)
+        missing, blurred = self._missing(u, state, h, params)
+        length, _, share = _share(change, jnp.ones(self.n), mean, blurred)
+        return missing * (share * (2.0 - share) / length / length)
 
     def _metric(self, x, params):
         """|∂²H/∂x_i²|, shape (n,): in this metric charges and fluxes do not mix, whatever their units."""
-        if self.n >= FEWEST_SPARSE:  # a diagonal costs as many gradients as there are coordinates
-            return jnp.ones(self.n)
         return jnp.abs(jnp.diagonal(jacobian(lambda x: self.energy.differential(x, params))(x)))
 
     @once
@@ -99,8 +126,11 @@ class DiscreteGradientStep(AbstractStep):
 
     def residual(self, u, state, t, h, params):
         gradient, middle = self.discrete_gradient(u, state, h, params)
-        velocity, multipliers = self.unknowns.split(u)
-        return self.energy.residual(middle, velocity, multipliers, t + h / 2, params, gradient)
+        parts = self.unknowns.split(u)
+        relation = self.energy.residual(middle, parts.velocity, parts.multipliers, t + h / 2, params, gradient)
+        if not self.sparse:
+            return relation
+        return jnp.concatenate([relation, parts.correction - self._factor(u, state, h, params)])
 
     def advance(self, u, state, t, h, params):
         driven, outputs, loss = self.ports(u, state, t, h, params)
@@ -119,11 +149,11 @@ class DiscreteGradientStep(AbstractStep):
     def unpack(self, state, u, t, h, params):
         gradient, _ = self.discrete_gradient(u, state, h, params)
         driven, outputs, loss = self.ports(u, state, t, h, params)
-        now, (velocity, multipliers) = self.state.split(state), self.unknowns.split(u)
-        power = jnp.stack([gradient @ velocity, driven @ outputs, loss])
+        now, parts = self.state.split(state), self.unknowns.split(u)
+        power = jnp.stack([gradient @ parts.velocity, driven @ outputs, loss])
         work = jnp.stack([now.supplied + now.lost_supplied, now.dissipated + now.lost_dissipated])
         row = {"x": now.x, "work": work, "power": power}
-        return row | {"multipliers": self.relation.spread(multipliers)} if self.relation.saved else row
+        return row | {"multipliers": self.relation.spread(parts.multipliers)} if self.relation.saved else row
 
     def start(self, data, h, params):
         if "x" not in data:
@@ -145,6 +175,12 @@ def _along(change, metric, gradient, blurred):
 
     Zero for Δx → 0, where what is missing is of higher order than |Δx|: a system at rest has the discrete gradient dH.
     """
+    length, along, share = _share(change, metric, gradient, blurred)
+    return share / length * along, share
+
+
+def _share(change, metric, gradient, blurred):
+    """(|Δx|, G Δx/|Δx|, φ) of `_along`."""
     seen = metric > TINY
     squared = metric @ (change * change)
     steep = (gradient * gradient) @ jnp.where(seen, 1.0 / jnp.where(seen, metric, 1.0), 0.0)
@@ -153,7 +189,7 @@ def _along(change, metric, gradient, blurred):
     on = on & (length * slope > FADED * blurred)
     hidden = jnp.where(on, blurred / length / slope, 0.0)
     share = jnp.where(on, 1.0, 0.0) / jnp.sqrt(1.0 + (hidden * hidden) ** 2)
-    return share / length * (metric * change / length), share
+    return length, metric * change / length, share
 
 
 def _add(total, lost, term):

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data, Numbers
-from dirax.program.roots import nearest_root
+from dirax.program.roots import FEWEST_SPARSE, nearest_root
+from dirax.program.sparse_matrix import SparseMatrix
 from dirax.systems.forms import RelationForm
 from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.shape import Shape
@@ -41,7 +42,8 @@ def circuit(netlist: Sequence[Element]) -> "ImplicitSystem | Circuit":
         φ̇ = Aᵀ_L e,   q/C = Aᵀ_C e,   V = Aᵀ_V e,   Aᵀ_T e = n A'ᵀ_T e.
 
     Loops of capacitors or voltage sources, and nodes with inductors or current sources alone, are found by the constraint
-    algorithm where all elements are linear and constant, as an `ImplicitSystem`.
+    algorithm where all elements are linear and constant, as an `ImplicitSystem`, in circuits of less than 128 nodes. In larger
+    ones a step costs in proportion to the elements.
 
         rectifier = dx.circuit([("V", 1, 0, jnp.sin), ("R", 1, 2, lambda u: 1e-6 * jnp.expm1(20 * u)), ("C", 2, 0, 1.0),
                                 ("R", 2, 0, 5.0)])
@@ -52,11 +54,11 @@ def circuit(netlist: Sequence[Element]) -> "ImplicitSystem | Circuit":
     for element in netlist:
         _check(element)
     made = Circuit(netlist)
-    return made.implicit() if made.is_linear else made
+    return made.implicit() if made.is_linear and not made.is_large else made
 
 
 class Circuit(AbstractSystem):
-    """A circuit with diode-like resistors, or sources that change in time; made by `dx.circuit`."""
+    """A circuit with diode-like resistors, sources that change in time, or very many nodes; made by `dx.circuit`."""
 
     netlist: tuple[Element, ...] = eqx.field(static=True)
     nodes: tuple[int, ...] = eqx.field(static=True)
@@ -74,22 +76,38 @@ class Circuit(AbstractSystem):
         """The values of a kind of elements that have numbers."""
         return np.array([element[3] for element in self.elements(kind)], dtype=float)
 
-    def incidence(self, kind: str, side: int = 1) -> np.ndarray:
+    def incidence(self, kind: str, side: int = 1) -> Any:
         """+1 where an element of the kind leaves a node and −1 where it arrives, (nodes, elements); of a transformer's first or
-        second `side`."""
+        second `side`. A `SparseMatrix` for very many nodes."""
         chosen = self.elements(kind)
-        matrix = np.zeros((len(self.nodes), len(chosen)))
-        for column, element in enumerate(chosen):
-            ends = element[side] if kind == "T" else element[1:3]
-            for node, sign in zip(ends, (1.0, -1.0), strict=True):
-                if node != GROUND:
-                    matrix[self.nodes.index(node), column] = sign
+        ends: list[Any] = [element[side] if kind == "T" else element[1:3] for element in chosen]
+        number = {node: row for row, node in enumerate(self.nodes)}
+        entries = [
+            (number[node], column, sign)
+            for column, pair in enumerate(ends)
+            for node, sign in zip(pair, (1.0, -1.0), strict=True)
+            if node != GROUND
+        ]
+        rows, columns, signs = (np.array(part) for part in zip(*entries, strict=True)) if entries else (np.zeros(0, int),) * 3
+        shape = len(self.nodes), len(chosen)
+        if self.is_large:
+            return SparseMatrix((np.asarray(signs, float), (rows, columns)), shape)
+        matrix = np.zeros(shape)
+        matrix[rows, columns] = signs
         return matrix
 
     @property
-    def transformers(self) -> np.ndarray:
+    def transformers(self) -> Any:
         """A_T − A'_T n: the currents of the nodes by those of the first sides."""
-        return self.incidence("T") - self.incidence("T", 2) * self.values("T")
+        first, second = self.incidence("T"), self.incidence("T", 2)
+        if not self.is_large:
+            return first - second * self.values("T")
+        return SparseMatrix(first.matrix - second.matrix.multiply(self.values("T")[None, :]))
+
+    @property
+    def is_large(self) -> bool:
+        """Whether there are so many nodes that matrices of all of them are sparse ones."""
+        return len(self.nodes) >= FEWEST_SPARSE
 
     @property
     def is_linear(self) -> bool:
@@ -126,20 +144,17 @@ class Circuit(AbstractSystem):
 
     def currents(self, voltages: Float[Numbers, " r"]) -> Float[Numbers, " r"]:
         """The currents of the resistors at their voltages."""
-        found: list[Any] = [
-            value(u) if callable(value) else u / value for (*_, value), u in zip(self.elements("R"), voltages, strict=True)
-        ]
-        return jnp.stack(found) if found else jnp.zeros(0)
+        return _each(self.elements("R"), lambda value, i: value(voltages[i]), lambda values, i: voltages[i] / values)
 
     def source(self, kind: str, t: Any) -> Array:
         """The values of the sources at a time."""
-        found = [jnp.asarray(value(t) if callable(value) else value, float) for *_, value in self.elements(kind)]
-        return jnp.stack(found) if found else jnp.zeros(0)
+        return _each(self.elements(kind), lambda value, _: value(t), lambda values, _: jnp.asarray(values))
 
     def relation(self, x: Array, velocity: Array, multipliers: Array, t: Any, params: Any = None) -> Float[Numbers, " r"]:
         """Kirchhoff's laws: currents of the nodes; voltages of the inductors, capacitors, sources, transformers."""
-        c, l, r, v = (jnp.asarray(self.incidence(kind)) for kind in "CLRV")
-        i, sides = jnp.asarray(self.incidence("I")), jnp.asarray(self.transformers)
+        array = (lambda matrix: matrix) if self.is_large else jnp.asarray
+        c, l, r, v, i = (array(self.incidence(kind)) for kind in "CLRVI")
+        sides = array(self.transformers)
         nc, n, nv = c.shape[1], len(self.nodes), v.shape[1]
         e, i_v, i_t = multipliers[:n], multipliers[n : n + nv], multipliers[n + nv :]
         nodes = c @ velocity[:nc] + l @ (x[nc:] / self.values("L")) + r @ self.currents(r.T @ e) + i @ self.source("I", t)
@@ -227,14 +242,28 @@ def _pairs(netlist: Sequence[Element]) -> list[tuple[int, int]]:
     return [tuple(ends) for kind, *nodes, _ in netlist for ends in (nodes if kind == "T" else [nodes])]
 
 
+def _each(elements: Sequence[Element], of_function: Callable, of_numbers: Callable) -> Array:
+    """A number of each element: by its function, or those with numbers at once; both are given places in the list too."""
+    functions = [i for i, element in enumerate(elements) if callable(element[3])]
+    numbers = np.array([i for i, element in enumerate(elements) if not callable(element[3])], int)
+    found: list[Any] = [jnp.asarray(of_function(elements[i][3], i), float) for i in functions]
+    parts = [jnp.stack(found)] if found else []
+    parts += [of_numbers(np.array([elements[i][3] for i in numbers], float), numbers)] if len(numbers) else []
+    if not parts:
+        return jnp.zeros(0)
+    return jnp.concatenate(parts)[np.argsort([*functions, *numbers])] if len(parts) > 1 else parts[0]
+
+
 def _refuse_islands(netlist: Sequence[Element], nodes: Sequence[int]) -> None:
-    reached, grown = {GROUND}, True
-    while grown:
-        grown = False
-        for start, end in _pairs(netlist):
-            if (start in reached) != (end in reached):
-                reached |= {start, end}
-                grown = True
+    beside: dict[int, list[int]] = {node: [] for node in (GROUND, *nodes)}
+    for start, end in _pairs(netlist):
+        beside[start].append(end)
+        beside[end].append(start)
+    reached, new = {GROUND}, [GROUND]
+    while new:
+        more = [node for node in beside[new.pop()] if node not in reached]
+        reached.update(more)
+        new += more
     if set(nodes) - reached:
         raise ValueError(
             f"the nodes {sorted(set(nodes) - reached)} are not connected to the ground, node {GROUND}; a transformer does not "

@@ -1,11 +1,14 @@
 """The engine "sparse": steps on arrays by XLA, their linear equations by sparse elimination."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
 
 from dirax.engines.contract import Problem
+from dirax.engines.sizes import sizes_of_traced
+from dirax.engines.sizes_of_many import sizes_of_many
 from dirax.engines.sparse.plan import sparse_plan
 from dirax.engines.xla.engine import Xla
 from dirax.engines.xla.lane import Numerics
@@ -15,8 +18,9 @@ from dirax.program.interpreter import UnsupportedPrimitive
 class Sparse(Xla):
     """Steps of many unknowns each of which depends on few others: a step costs in proportion to their number.
 
-    Which unknowns an equation depends on is found in its functions. `stats` say how the matrix is factored, and its bandwidth
-    and fill. With `only_quicker` steps are left to others that dense elimination is quicker for.
+    Which unknowns an equation depends on is found in its functions. `stats` say how the matrix is factored, its bandwidth and
+    fill, and how long factors and solutions took and all else, evaluation most of it. With `only_quicker` steps are left to
+    others that dense elimination is quicker for.
     """
 
     only_quicker: bool = False
@@ -39,3 +43,6 @@ class Sparse(Xla):
         if p.compensated:
             notes["not_compensated"] = "the engine 'sparse' does not know the increments of the step"
         return dataclasses.replace(p, equation=plan.equation), Numerics(sparse=plan.solvers), notes
+
+    def _sizes(self, p: Problem, found: Callable) -> tuple:
+        return sizes_of_many(p, traced=found is sizes_of_traced)

@@ -23,6 +23,10 @@ KEPT = 64
 """Plans kept in memory."""
 
 
+class Unsolvable(str):
+    """Why the equations of a step have no unique solution, whatever the numbers in them."""
+
+
 class SparsePlan(NamedTuple):
     """The equation as it is run, and a solver for each of its stages."""
 
@@ -66,7 +70,8 @@ def _planned(equation: Any, params: Any, batch_params: bool) -> SparsePlan | str
         except Dense as error:
             return str(error)
         except StructurallySingular as error:
-            return f"the equations {', '.join(stage.labels[int(row)] for row in error.rows[:4])} have too few unknowns"
+            named = ", ".join(stage.labels[int(row)] for row in error.rows[:4])
+            return Unsolvable(f"the equations {named} have too few unknowns beside the others")
         found[id(stage)] = made
     stages = tuple((found[id(stage)][0], fraction) for stage, fraction in equation.stages)
     return SparsePlan(joined(equation, stages), tuple(found[id(stage)][1] for stage, _ in equation.stages))
@@ -86,7 +91,7 @@ def _by_levels(equation: Any, stage: Any, shapes: tuple, params: Any, batch_para
     rows, columns = np.array([(i, j) for i, row in enumerate(jacobian) for j in row], np.int64).reshape(-1, 2).T
     equations = SparseEquations.of_entries(stage.unknowns, rows, columns)
     entries = made.in_levels(index, [node for row in jacobian for node in row.values()])
-    places, size = equations.places(rows, columns), equations.count * stage.unknowns
+    places, size = equations.places(rows, columns), equations.products * stage.unknowns
     values = jax.jit(lambda *args: jnp.zeros(size).at[places].set(entries(*args)))
     return replaced(stage, made, index, made.in_levels), SparseSolver(equations, values)
 

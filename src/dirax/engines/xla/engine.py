@@ -55,7 +55,7 @@ class Xla(AbstractEngine):
         p, numerics, notes = self._planned(problem)
         chunk = compiled_chunk(jax.default_backend())
         axes, capacity, params = axes_of(p), row_capacity(p), jax.device_put(p.params)
-        sizes = _sizes(p, numerics, sizes_of)
+        sizes = self._sizes(problem, sizes_of)
         lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, numerics.increments is not None)
         if p.record is not None:
             lanes = jax.tree.unflatten(jax.tree.structure(lanes), p.record)
@@ -68,7 +68,7 @@ class Xla(AbstractEngine):
             return after, {name: by_lane(np.asarray(values), p.batch, np) for name, values in rows.items()}
 
         _, empty = call(lanes, 0, 0)  # compile
-        compile_seconds, started = time.perf_counter() - started, time.perf_counter()
+        compile_seconds, started, solved = time.perf_counter() - started, time.perf_counter(), numerics.seconds
 
         fields = _host_arrays(p, empty)
         done, count, interrupted = p.after, FIRST_CHUNK, False
@@ -94,6 +94,9 @@ class Xla(AbstractEngine):
         outcome.interrupted, outcome.compile_seconds = interrupted, compile_seconds
         outcome.record = None if interrupted else tuple(jax.tree.leaves(lanes))
         outcome.run_seconds = time.perf_counter() - started
+        if solved is not None:
+            spent = (numerics.seconds or 0.0) - solved
+            outcome.notes |= {"evaluation_seconds": outcome.run_seconds - spent, "solution_seconds": spent}
         return finished(p, outcome)
 
     def run_traced(self, problem: Problem) -> Outcome:
@@ -101,7 +104,7 @@ class Xla(AbstractEngine):
         p, numerics, notes = self._planned(problem)
         axes = axes_of(p)
         lanes = first_lane(jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), compensated=numerics.increments is not None)
-        clock, sizes = Clock.of(p), _sizes(p, numerics, sizes_of_traced)
+        clock, sizes = Clock.of(p), self._sizes(problem, sizes_of_traced)
         one = make_step(p.equation, axes, p.max_iterations, True, numerics)
 
         def step(lanes, k):
@@ -149,10 +152,9 @@ class Xla(AbstractEngine):
             p = dataclasses.replace(p, equation=equation)
         return p, Numerics(self.linear_solver, increments, jacobians), notes
 
-
-def _sizes(p: Problem, numerics: Numerics, found: Callable) -> tuple | None:
-    """Those of the unknowns of every stage; None for sparse ones, which are measured by 1."""
-    return None if numerics.sparse is not None else found(p)
+    def _sizes(self, p: Problem, found: Callable) -> tuple:
+        """Those of the unknowns of every stage."""
+        return found(p)
 
 
 def _outcome(

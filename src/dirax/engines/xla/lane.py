@@ -26,6 +26,13 @@ class Numerics(NamedTuple):
     jacobians: tuple[Callable, ...] | None = None
     sparse: tuple[Any, ...] | None = None
 
+    @property
+    def seconds(self) -> float | None:
+        """How long sparse solvers have run so far, all that go the same ways; None without them."""
+        if self.sparse is None:
+            return None
+        return sum(made.seconds for made in {id(own.equations): own.equations.elimination for own in self.sparse}.values())
+
     def of_stages(self, equation) -> list[tuple]:
         """(linear solver, increment, Jacobian) of every stage."""
         none = (None,) * len(equation.stages)

@@ -125,9 +125,8 @@ def newton(
 
     def with_new_jacobian(s: Search) -> Search:
         matrix, unit = jacobian(s.u), 1.0
-        if sizes is not None:  # pivots are chosen among rows in units of the terms of their equations
-            unit = 1.0 / (jnp.abs(matrix) @ (jnp.abs(s.u) + sizes))
-            matrix = unit[:, None] * matrix
+        if sizes is not None:
+            matrix, unit = linear_solver.in_units(matrix, jnp.abs(s.u) + sizes)
         factors = linear_solver.factorise(matrix)
         return jax.lax.while_loop(contracting, lambda s: updated(s, factors, unit), updated(s, factors, unit))
 

@@ -3,6 +3,7 @@
 import ctypes
 import functools
 import re
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ FRAME_EXTENSION, FRAME_OPERANDS, FRAME_RESULTS = 8, 72, 112
 BUFFER_DATA = 24
 EXTENSION_METADATA, METADATA_VERSION = 24, 24
 """Offsets in the structures of XLA's foreign-function interface (`xla/ffi/api/c_api.h`, which comes with JAX)."""
+
+SPENT = "nanoseconds"
+"""The name of the number in a kernel's module that counts its time."""
 
 
 class Kernel:
@@ -44,6 +48,21 @@ class Kernel:
         """The results as JAX's arrays, on a CPU, also under `jax.vmap`."""
         self._registered  # noqa: B018  (once)
         return jax.ffi.ffi_call(self.name, list(results), vmap_method="sequential")(*arrays)
+
+    def by(self, xp: Any, results: Sequence[tuple[tuple[int, ...], Any]], *arrays: Any) -> Sequence[Any]:
+        """The results, of these shapes and types, by NumPy or by JAX, whichever module `xp` is."""
+        if xp is not np:
+            return self.in_jax([jax.ShapeDtypeStruct(*one) for one in results], *arrays)
+        filled = [np.empty(*one) for one in results]
+        self(*map(np.ascontiguousarray, arrays), *filled)
+        return filled
+
+    @property
+    def seconds(self) -> float:
+        """How long it has run within what JAX compiled, since it was compiled."""
+        if "_engine" not in self.__dict__:
+            return 0.0
+        return ctypes.c_int64.from_address(self._engine.get_global_value_address(SPENT)).value * 1e-9
 
     @functools.cached_property
     def _engine(self) -> Any:
@@ -112,5 +131,23 @@ def _write_handler(module: ir.Module, kernel: Any, count: int) -> None:
     for k, argument in enumerate(kernel.args):
         buffer = pointer(given, 8 * k) if k < inputs else pointer(results, 8 * (k - inputs))
         values.append(b.bitcast(pointer(buffer, BUFFER_DATA), argument.type))
+    begun = _nanoseconds(b)
     b.call(kernel, values)
+    spent: Any = ir.GlobalVariable(module, ir.IntType(64), SPENT)
+    spent.initializer = ir.Constant(ir.IntType(64), 0)
+    b.atomic_rmw("add", spent, b.sub(_nanoseconds(b), begun), "monotonic")
     b.ret(null)
+
+
+def _nanoseconds(b: Any) -> Any:
+    """The time of the system's steady clock; 0 where it has none."""
+    i64, clock = ir.IntType(64), getattr(time, "CLOCK_MONOTONIC", None)
+    if clock is None:
+        return ir.Constant(i64, 0)
+    kind = ir.FunctionType(ir.IntType(32), [ir.IntType(32), i64.as_pointer()])
+    call = b.module.globals.get("clock_gettime") or ir.Function(b.module, kind, "clock_gettime")
+    with b.goto_entry_block():
+        now = b.alloca(i64, 2)
+    b.call(call, [ir.Constant(ir.IntType(32), clock), now])
+    seconds, rest = (b.load(b.gep(now, [ir.Constant(i64, i)])) for i in range(2))
+    return b.add(b.mul(seconds, ir.Constant(i64, 10**9)), rest)

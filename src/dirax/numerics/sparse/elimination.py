@@ -1,20 +1,29 @@
-"""How a sparse matrix of known pattern is factored: in a band with exchanged rows, or in a fixed order that makes little fill."""
+"""How a sparse matrix of known pattern is factored: in a band, in a fixed order that makes little fill, or with exchanged rows;
+rows and columns that are full apart.
 
-from functools import cache, cached_property
-from typing import Any
+Each way has `tables` and `solve_tables`, what it knows of the pattern; `factors` and `solution` from them, by NumPy or by JAX;
+`stats`, the multiplications that a factorization takes, `operations`, and the `seconds` that it took so far.
+"""
+
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse import csgraph
-from scipy.sparse.linalg import spilu
 
-from dirax.numerics.loops.kernel import Kernel
-from dirax.numerics.sparse import kernels
+from dirax.numerics.sparse.band import BandElimination
+from dirax.numerics.sparse.border import MOST, BorderedElimination, full_lines
+from dirax.numerics.sparse.exchanged import ExchangedElimination
+from dirax.numerics.sparse.fixed import FixedElimination
 
-WIDEST_BAND = 40
-"""Diagonals, those of exchanged rows with them, up to which a matrix is factored in its band."""
+Elimination: TypeAlias = BandElimination | FixedElimination | ExchangedElimination | BorderedElimination
 
-_count, _list = Kernel(kernels.count_fill, 3), Kernel(kernels.list_fill, 6)
+NARROW, WIDEST_BAND = 40, 128
+"""Diagonals, those of exchanged rows with them, up to which a matrix is factored in its band without looking further, and up to
+which at all."""
+
+IN_BAND = 6.0
+"""Multiplications in a band in the time of one that follows indices: .16 to .21 ns beside 1.2."""
 
 
 class StructurallySingular(ValueError):
@@ -33,20 +42,33 @@ def matched_rows(pattern: Any) -> np.ndarray:
     return matched.astype(int)
 
 
-def elimination(pattern: Any) -> "BandElimination | FixedElimination":
+def elimination(pattern: Any) -> Elimination:
     """The way to factor matrices of this pattern. Raises `StructurallySingular`.
 
     Equations stand beside the unknowns of the same numbers, or beside those that they are matched with, where that makes a
-    narrower band.
+    narrower band. Such a match says nothing of how large entries are, so that pivots are not taken in a fixed order then.
     """
-    own = np.arange(pattern.shape[0])
-    choices = [_in_band(pattern, rows) for rows in (own, matched_rows(pattern))]
-    width, order, rows, below, above = min(choices, key=lambda choice: choice[0])
-    if width <= WIDEST_BAND:
-        return BandElimination(pattern, order, rows[order], below, above)
-    rows = own if _has_pivots(pattern) else choices[1][2]
-    turned = pattern[rows]
-    return FixedElimination(pattern, rows, sp.csr_matrix(turned + turned.T))
+    own, matched = np.arange(pattern.shape[0]), matched_rows(pattern)
+    if (bordered := _bordered(pattern, own if np.all(pattern.diagonal()) else matched)) is not None:
+        return bordered
+    width, order, rows, below, above = min((_in_band(pattern, rows) for rows in (own, matched)), key=lambda choice: choice[0])
+    band = BandElimination(pattern, order, rows[order], below, above)
+    if width <= NARROW:
+        return band
+    other = FixedElimination(pattern, matched) if _has_pivots(pattern) else ExchangedElimination(pattern, matched, matched)
+    return band if width <= WIDEST_BAND and band.operations <= IN_BAND * other.operations else other
+
+
+def _bordered(pattern: Any, rows: np.ndarray) -> BorderedElimination | None:
+    """With a border, if some lines are full: these and those that they are beside with these `rows`, so that what is left has a
+    full diagonal too."""
+    full_rows, full_columns = full_lines(pattern)
+    columns = np.union1d(full_columns, np.flatnonzero(np.isin(rows, full_rows)))
+    if not 0 < len(columns) <= MOST:
+        return None
+    inner = np.setdiff1d(np.arange(len(rows)), columns)
+    core = pattern[np.sort(rows[inner])][:, inner]
+    return BorderedElimination(len(rows), elimination(sp.csr_matrix(core)), rows[columns], columns)
 
 
 def _in_band(pattern: Any, rows: np.ndarray) -> tuple[int, np.ndarray, np.ndarray, int, int]:
@@ -72,169 +94,3 @@ def _width(pattern: Any, order: np.ndarray) -> tuple[int, int]:
     entries = pattern.tocoo()
     away = place[entries.row] - place[entries.col]
     return int(np.max(away, initial=0)), int(np.max(-away, initial=0))
-
-
-def _whole(array: Any, kind: type = np.int32) -> np.ndarray:
-    return np.ascontiguousarray(array, kind)
-
-
-@cache
-def _band_kernels(below: int, width: int) -> tuple[Kernel, Kernel, Kernel]:
-    sizes = {"BELOW": below, "WIDTH": width}
-    return (
-        Kernel(kernels.band_factor, 4, **sizes),
-        Kernel(kernels.band_solve, 2, **sizes),
-        Kernel(kernels.band_solve_transposed, 2, **sizes),
-    )
-
-
-class BandElimination:
-    """Elimination with partial pivoting in the band that the unknowns have in `order` and the equations in `rows`."""
-
-    work_of_factor = 0
-    """How many of the results of a factorization are no factors."""
-
-    def __init__(self, pattern: Any, order: np.ndarray, rows: np.ndarray, below: int, above: int):
-        self.size, self.order, self.rows = pattern.shape[0], _whole(order), _whole(rows)
-        self.below, self.above = below, above
-        self.width = 2 * below + above + 1 if below else above + 1
-        self.kernels = _band_kernels(below, self.width)
-
-    def tables(self, place_of: Any) -> tuple[np.ndarray, ...]:
-        """What the factorization has to know of where values are: `place_of` is the pattern with the numbers of its entries,
-        from 1, in the array of values."""
-        turned = place_of[self.rows][:, self.order].tocsr()
-        turned.sort_indices()
-        counts = np.diff(turned.indptr)
-        first = np.maximum(np.arange(self.size) - self.below, 0)
-        places = turned.indices - np.repeat(first, counts)
-        return _whole(turned.indptr), _whole(places), _whole(turned.data - 1)
-
-    @property
-    def factor_shapes(self) -> list[tuple[tuple[int, ...], type]]:
-        """Shapes and types of U, L, the inverse pivots and the exchanged rows."""
-        n = self.size
-        return [
-            (((n + self.below) * self.width,), np.float64), ((n * max(self.below, 1),), np.float64), ((n,), np.float64),
-            ((n,), np.int32),
-        ]  # fmt: skip
-
-    @property
-    def solve_tables(self) -> tuple[np.ndarray, ...]:
-        """What a solution has to know besides the factors."""
-        return self.order, self.rows
-
-    @property
-    def work(self) -> tuple[int, ...]:
-        """Sizes of the arrays of numbers that a solution needs."""
-        return (self.size + self.width + self.below,)
-
-    @property
-    def stats(self) -> dict[str, Any]:
-        """What `Solution.stats` says of it."""
-        solver = "tridiagonal" if self.below <= 1 and self.above <= 1 else "band"
-        return {"solver": solver, "bandwidth": [self.below, self.above], "fill": self.size * self.width}
-
-    @property
-    def operations(self) -> int:
-        """Multiplications of a factorization."""
-        return self.size * self.below * self.width
-
-
-_fixed_kernels = (
-    Kernel(kernels.fixed_factor, 5), Kernel(kernels.fixed_solve, 2), Kernel(kernels.fixed_solve_transposed, 2),
-)  # fmt: skip
-
-
-class FixedElimination:
-    """Elimination whose pivots are taken in an order found once: of least fill, and what has no diagonal after its neighbours,
-    so that its pivot is made by theirs (the multipliers of a saddle point)."""
-
-    work_of_factor = 2
-
-    def __init__(self, pattern: Any, rows: np.ndarray, both: Any):
-        self.size = pattern.shape[0]
-        order = _after_neighbours(both, pattern[rows].diagonal(), _minimum_degree(both))
-        self.order, self.rows, self.kernels = _whole(order), _whole(rows[order]), _fixed_kernels
-        symmetric = both[order][:, order].tocsr()
-        symmetric.sort_indices()
-        n = self.size
-        size, starts, columns = np.array([n]), _whole(symmetric.indptr), _whole(symmetric.indices)
-        parent, mark, counts = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int64)
-        _count(starts, columns, size, parent, mark, counts)
-        self.fill_starts = np.concatenate([[0], np.cumsum(counts)])
-        total = int(self.fill_starts[-1])
-        self.fill_rows, self.left = np.zeros(total, np.int32), np.zeros(total, np.int32)
-        self.left_starts, self.left_places = np.zeros(n + 1, np.int64), np.zeros(total, np.int64)
-        _list(
-            starts, columns, parent, self.fill_starts, size, mark, np.zeros(n, np.int64),
-            self.fill_rows, self.left_starts, self.left, self.left_places,
-        )  # fmt: skip
-
-    def tables(self, place_of: Any) -> tuple[np.ndarray, ...]:
-        """What the factorization has to know: where values are, of which `place_of` has the numbers from 1, and the fill."""
-        entries = place_of[self.rows][:, self.order].tocoo()
-        pivot = np.minimum(entries.row, entries.col)
-        places = np.where(entries.row >= entries.col, entries.row, -1 - entries.col)
-        by_pivot = np.argsort(pivot, kind="stable")
-        starts = np.concatenate([[0], np.cumsum(np.bincount(pivot, minlength=self.size))])
-        return (
-            _whole(starts), _whole(places[by_pivot]), _whole(entries.data[by_pivot] - 1),
-            self.fill_starts, self.fill_rows, self.left_starts, self.left, self.left_places,
-        )  # fmt: skip
-
-    @property
-    def factor_shapes(self) -> list[tuple[tuple[int, ...], type]]:
-        """Shapes and types of two work arrays, L, U and the inverse pivots."""
-        n, total = self.size, len(self.fill_rows)
-        return [((n,), np.float64)] * 2 + [((total,), np.float64)] * 2 + [((n,), np.float64)]
-
-    @property
-    def solve_tables(self) -> tuple[np.ndarray, ...]:
-        """What a solution has to know besides the factors."""
-        return self.order, self.rows, self.fill_starts, self.fill_rows
-
-    @property
-    def work(self) -> tuple[int, ...]:
-        """Sizes of the arrays of numbers that a solution needs."""
-        return (self.size,)
-
-    @property
-    def stats(self) -> dict[str, Any]:
-        """What `Solution.stats` says of it."""
-        return {"solver": "fixed order", "fill": 2 * len(self.fill_rows) + self.size}
-
-    @cached_property
-    def operations(self) -> int:
-        """Multiplications of a factorization."""
-        counts = np.diff(self.fill_starts)
-        return int(np.sum(counts * (counts + 1)))
-
-
-def _minimum_degree(both: Any) -> np.ndarray:
-    """An order of unknowns in which elimination makes little fill, as SuperLU finds it before it factors anything."""
-    size = both.shape[0]
-    numbers = sp.csc_matrix((np.ones(both.nnz), both.indices, both.indptr), both.shape)
-    numbers = sp.csc_matrix(numbers + 1e3 * sp.identity(size, format="csc"))
-    options: Any = {"SymmetricMode": True}
-    found = spilu(numbers, 1.0, 1.0, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    order = np.empty(size, int)
-    order[found.perm_c] = np.arange(size)
-    return order
-
-
-def _after_neighbours(both: Any, diagonal: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """The order in which an unknown without a diagonal comes after all its neighbours."""
-    without = np.flatnonzero(~np.asarray(diagonal, bool))
-    if not len(without):
-        return order
-    place = np.empty(len(order))
-    place[order] = np.arange(len(order))
-    has = np.ones(len(order), bool)
-    has[without] = False
-    near = both[without].tocoo()
-    inner = has[near.col]
-    latest = np.zeros(len(without))
-    np.maximum.at(latest, near.row[inner], place[near.col[inner]])
-    place[without] = np.maximum(place[without], latest + 0.5)
-    return np.argsort(place, kind="stable")

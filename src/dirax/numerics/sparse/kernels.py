@@ -174,16 +174,23 @@ def band_solve_transposed(
 def fixed_factor(
     starts: Ints, places: Ints, sources: Ints, fill_starts: Longs, fill_rows: Ints,
     left_starts: Longs, left: Ints, left_places: Longs, values: Doubles, sizes: Longs,
-    x: Doubles, y: Doubles, lower: Doubles, upper: Doubles, inverse: Doubles,
+    x: Doubles, y: Doubles, units: Doubles, lower: Doubles, upper: Doubles, inverse: Doubles, left_over: Longs,
 ):  # fmt: skip
     """L by columns and U by rows of a matrix whose pivots are taken in order, both with the pattern `fill_rows`.
 
     Entry a of those of pivot k is `values[sources[a]]`: in column k at row `places[a]`, or in row k at column −1 − `places[a]`.
+    `left_over` is 0, or n where a pivot was less than 1e-4 of its column, rows in units of their largest entries: there it ends.
     """
     n = sizes[0]
+    left_over[0] = 0
     for i in range(n):
         x[i] = 0.0
         y[i] = 0.0
+        units[i] = 0.0
+    for k in range(n):
+        for a in range(starts[k], starts[k + 1]):
+            i = max(places[a], k)
+            units[i] = max(units[i], abs(values[sources[a]]))
     for k in range(n):
         for a in range(starts[k], starts[k + 1]):
             place = places[a]
@@ -204,13 +211,19 @@ def fixed_factor(
                     y[i] = y[i] - upper[a] * low
         one = 1.0 / x[k]
         inverse[k] = one
+        ratio = 1e-4 * abs(one) * units[k]
+        large = 0.0 if ratio < 1e290 else 1.0
         x[k] = 0.0
         for a in range(fill_starts[k], fill_starts[k + 1]):
             i = fill_rows[a]
+            large = 1.0 if abs(x[i]) * ratio > units[i] else large
             lower[a] = x[i] * one
             upper[a] = y[i]
             x[i] = 0.0
             y[i] = 0.0
+        if large > 0.0:
+            left_over[0] = n
+            break
 
 
 def fixed_solve(
