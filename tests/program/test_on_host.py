@@ -43,7 +43,7 @@ def test_values_and_first_derivatives_of_several_entries():
     close(ours, theirs)
     flow = jax.tree.map(lambda a: jnp.cos(jnp.arange(float(a.size))).reshape(a.shape), ours[0])
     product = lambda a, b: sum(float(jnp.vdot(u, v)) for u, v in zip(*map(jax.tree.leaves, (a, b)), strict=True))
-    back = jax.vjp(host, X, A)[1](flow)
+    back = jax.jit(lambda x, a: jax.vjp(host, x, a)[1](flow))(X, A)
     close(product(back, along), product(flow, ours[1]))
     close(jax.vjp(lambda a: host(X, a), A)[1](flow)[0], back[1])  # by one of them alone
 
@@ -54,10 +54,10 @@ def test_second_derivatives_and_axes_of_vmap():
         return jnp.sum(jnp.sin(result["root"]) ** 2) + jnp.sum(result["size"])
 
     several = jnp.stack([X, *(X + sign * 1e-5 * unit for unit in np.eye(4).reshape(4, 2, 2) for sign in (1, -1))])
-    slopes = jax.vmap(jax.grad(cost))(several)
+    slopes = jax.jit(jax.vmap(jax.grad(cost)))(several)
     close(slopes[1], jax.grad(cost)(several[1]), 15)
     differences = (slopes[1::2] - slopes[2::2]).reshape(2, 2, 2, 2) / 2e-5
-    close(jnp.transpose(jax.hessian(cost)(X), (2, 3, 0, 1)), differences, 8)
+    close(jnp.transpose(jax.jit(jax.hessian(cost))(X), (2, 3, 0, 1)), differences, 8)
 
 
 def test_what_is_no_scalar_program_is_left_to_others():

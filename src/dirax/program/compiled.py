@@ -30,6 +30,7 @@ def compiled(function: Callable, **options: Any) -> Callable:
         static = tuple(None if m else leaf for leaf, m in zip(leaves, moves, strict=True))
 
         def jitted() -> Callable:
+            @functools.wraps(function)  # whose name XLA gives the module
             def of_arrays(arrays: list[Any]) -> Any:
                 rest = iter(arrays)
                 values, named = jax.tree.unflatten(
