@@ -123,7 +123,10 @@ def lift_report_of(name):
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=pytest.mark.soak) if n == "SE3" else n for n in sorted(set(MAPS) - {"projected midpoint", "SE2"})],
+    [
+        pytest.param(n, marks=pytest.mark.soak) if n in ("SE3", "projected theta") else n
+        for n in sorted(set(MAPS) - {"projected midpoint", "SE2"})
+    ],
 )
 @examples
 @given(seed=seeds, scale=st.floats(1e-8, 0.8))

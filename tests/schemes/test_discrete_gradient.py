@@ -120,8 +120,10 @@ def test_a_driven_system_that_comes_to_rest_is_stepped_on(step):
     assert np.abs(energy - energy[0] - supplied + dissipated).max() < 1e-13 * supplied[-1]
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "engine"),
+    [*((kind, "native") for kind in KINDS), ("mean-value", "xla"), pytest.param("gonzalez", "xla", marks=pytest.mark.soak)],
+)
 def test_a_system_at_rest_starts_and_one_that_comes_to_rest_goes_on(kind, engine):
     scheme = DiscreteGradient(kind)
     quadratic = lambda x: x @ x / 2

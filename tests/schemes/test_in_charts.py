@@ -95,7 +95,7 @@ def test_mistakes():
         gallery.get("kepler").simulate(pendulums.scheme, steps=1)
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_a_change_of_chart_leaves_the_guess_behind(engine):
     """A fast pendulum on the sphere, over forty changes of chart: the steps of the same L_d without charts."""
     system = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - 3.0 * q[2], dx.Sphere(3))
