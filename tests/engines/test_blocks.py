@@ -2,14 +2,17 @@
 
 import itertools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import dirax as dx
 from dirax import gallery
 from dirax.engines.blocks import FEWEST, blocks
+from dirax.engines.contract import Problem
 from dirax.engines.native.kernels import kernels
 from dirax.engines.newton_step import Factors, pivot_order
+from dirax.engines.policy import engine_of
 from dirax.program.graph import Graph
 
 
@@ -95,3 +98,29 @@ def test_saved_velocities_are_a_block_of_their_own():
     plain = case.simulate(dx.LagrangeDAlembert(), steps=40, engine="xla")
     np.testing.assert_allclose(sol.q, plain.q, rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(sol.p, plain.p, rtol=1e-10, atol=1e-10 * np.abs(plain.p).max())
+
+
+def test_an_equation_with_the_sign_of_a_later_unknown_is_not_solved_before_it():
+    """Its derivative by that unknown is zero, so that the Jacobian alone is block triangular."""
+    k = FEWEST
+
+    def residual(u, x, t, h, params):
+        first, second = u[:k], u[k:]
+        return jnp.concatenate([first**3 - x[0] + 0.1 * jnp.sign(second), 2.0 * second + first - x[1]])
+
+    equation = dx.StepEquation(
+        start=lambda data, h, params: (data["x"], jnp.ones(2 * k)),
+        residual=residual,
+        advance=lambda u, x, t, h, params: x,
+        unpack=lambda x, u, t, h, params: {"x": x, "u": u},
+        state_size=2,
+        unknowns=2 * k,
+        fields={"x": dx.Field((2,)), "u": dx.Field((2 * k,), "step")},
+    )
+    runs = [
+        engine_of(name).run(Problem(equation, np.array([8.0, 1.0]), (np.ones(2 * k),), 0.1, 0.0, 2)) for name in ("native", "xla")
+    ]
+    for out in runs:
+        u = out.fields["u"][0, 0]
+        np.testing.assert_allclose(u[:k] ** 3, 8.1, rtol=1e-14)
+        np.testing.assert_allclose(u[k:], (1.0 - u[:k]) / 2.0, rtol=1e-14)

@@ -105,14 +105,26 @@ def elimination(program: StepProgram, index: int) -> tuple[list[list[int]], list
     def made():
         g, rows = program.graph, program.jacobians[index]
         matrix = [[row.get(j, g.zero) for j in range(len(rows))] for row in rows]
-        return matrix, pivot_order(g, matrix)
+        order = pivot_order(g, matrix)
+        return matrix, order if _in_turn(g, program.equations[index], order) else pivot_order(g, matrix, apart=False)
 
     return _known.get((Same(program), index), made)
 
 
-def pivot_order(g: Graph, matrix: list[list[int]]) -> list[list[tuple[int, int]]]:
+def _in_turn(g: Graph, equation: TracedEquation, order: list[list[tuple[int, int]]]) -> bool:
+    """Whether the equations of each block can be evaluated before the unknowns of later ones are known: an equation may have
+    one in it by which its derivative is zero, such as the sign of it."""
+    later = set(equation.unknowns)
+    for block in order[:-1]:
+        later -= {equation.unknowns[j] for _, j in block}
+        if not later.isdisjoint(g.reachable([equation.residual[i] for i, _ in block])):
+            return False
+    return True
+
+
+def pivot_order(g: Graph, matrix: list[list[int]], apart: bool = True) -> list[list[tuple[int, int]]]:
     """(row, column) of each pivot, block after block: in each the least fill-in (Markowitz) among entries that are not small at
-    random points.
+    random points. All of them in one block if they are not to be kept `apart`.
 
     The points depend on nothing but the graph, so that the order, and with it every bit of a trajectory, does not depend
     on initial data, parameters or neighbours in a batch.
@@ -123,7 +135,7 @@ def pivot_order(g: Graph, matrix: list[list[int]]) -> list[list[tuple[int, int]]
     values = _samples(g, matrix)
     values = np.where(np.isfinite(values), values, 0.0)
     found = []
-    for rows, columns in blocks(there):
+    for rows, columns in blocks(there) if apart else blocks(np.ones_like(there)):
         block = np.ix_(rows, columns)
         inside = values[:, *block]
         largest = np.abs(inside).max(axis=2, keepdims=True)  # the units of the equations
