@@ -361,6 +361,19 @@ def test_redundant_constraints_in_a_batch_and_projected():
     assert moved.ok and np.max(np.abs(bars(jnp.asarray(moved.q[0])))) < 1e-14
 
 
+def test_a_one_form_that_says_what_a_constraint_says_is_left_out():
+    """On the surface z = x²/2 the one-form dz − x dx follows from the constraint, which holds the position too and stays."""
+    on = lambda q: jnp.stack([q[2] - q[0] ** 2 / 2])
+    L = lambda q, v: v @ v / 2 - q[2]
+    given = {"q": [1.0, 0.0, 0.5], "v": [0.3, 0.2, 0.3], "step": 0.05, "steps": 200}
+    twice = dx.simulate(dx.LagrangeDirac(L, lambda q: jnp.stack([-q[0], 0.0, 1.0])[None], holonomic=on), MIDPOINT, **given)
+    once = dx.simulate(dx.LagrangeDirac(L, holonomic=on), MIDPOINT, **given)
+    assert twice.stats["redundant_constraints"] == [0] and np.all(twice.multipliers[:, 0] == 0.0)
+    assert np.max(np.abs(twice.q[:, 2] - twice.q[:, 0] ** 2 / 2)) < 1e-14
+    np.testing.assert_array_equal(twice.q, once.q)
+    np.testing.assert_array_equal(twice.multipliers[:, 1], once.multipliers[:, 0])
+
+
 def test_a_singular_configuration_is_not_redundancy():
     q, v = linkage(*np.array([0.0, 0.3]))
     with pytest.raises(ValueError, match="rank 2 of 3, but have rank 3 nearby: a singular configuration"):
