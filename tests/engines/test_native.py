@@ -15,6 +15,7 @@ from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem
 from dirax.engines.native import Native
 from dirax.engines.native import run as driver
 from dirax.engines.native.kernels import kernels
+from dirax.engines.native.loops.sizes import sizes_module
 from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.xla import Xla
 from dirax.program import machine_code as llvm
@@ -330,6 +331,15 @@ def test_what_cannot_be_compiled_is_named_with_its_line():
     with pytest.raises(UnsupportedPrimitive, match="eigh"):
         native.run(p)
     assert native.supports(problem("Kepler")) is None
+
+
+@pytest.mark.parametrize("module", [kernel_module, sizes_module], ids=["steps", "sizes"])
+def test_the_stages_of_a_composition_have_their_code_once(module):
+    texts = []
+    for name in ("yoshida4", "suzuki8"):  # 3 and 125 stages
+        equation = make_step_equation(dx.Composition(MIDPOINT, name), dx.LagrangeDirac(SYSTEMS["Kepler"][0]), Shape(2, 0))
+        texts.append(len(module(kernels(equation, None, False)._planned(), 1, fma=True)))
+    assert texts[1] < 3 * texts[0]
 
 
 def test_the_kernel_compiles_for_aarch64():

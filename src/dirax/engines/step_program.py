@@ -193,11 +193,6 @@ class StepProgram:
         """Whether the step is small enough for its sizes to be written as nodes."""
         return max(len(e.unknowns) for e in self.equations) * self.size <= WRITTEN
 
-    @property
-    def sizes_are_compiled(self) -> bool:
-        """Whether that is so of all stages one after the other, as machine code has them."""
-        return sum(len(self.equations[index].unknowns) for index, _ in self.stages) * self.size <= WRITTEN
-
     @cached_property
     def first_slopes(self) -> Slopes:
         """How the derivatives of the first stage's residual by the unknowns are found in numbers, in a graph of their own."""

@@ -63,8 +63,8 @@ class Kernels:
         return self._runs[width], cached
 
     def of_sizes(self, width: int) -> Any:
-        """The compiled `run` that finds the sizes; None where they are not written as nodes, or of too many stages."""
-        if width not in self._of_sizes and self.step.sizes_are_compiled:
+        """The compiled `run` that finds the sizes; None where they are not written as nodes."""
+        if width not in self._of_sizes and self.step.sizes_are_written:
             text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
             library, _ = self._library("run", width, text, "sizes", level=0)
             self._of_sizes[width] = llvm.function(library, "run", SIGNATURE)

@@ -24,40 +24,52 @@ def sizes_module(plan: Plan, width: int, fma: bool) -> str:
 
 
 def _define_block(plan: Plan, module: Module, width: int) -> None:
+    """`block`: the stages one after the other, each by the function of its equation."""
     b, record = Body(module), plan.record
-    equations = zip(plan.equations, plan.corrections, strict=True)
-    of = lambda e, c: FirstSizes(plan.graph, Linearized.of(plan.graph, e, plan.shared.h, c.jacobian), c.order)
-    sizes = [of(e, c) if e.unknowns else None for e, c in equations]
     e = Emitter(b, width)
     at = lambda place: b.at(e.real, "%lanes", place)
-    places = lambda part: [at(i) for i in range(part.start or 0, part.stop)]
-    load = lambda pointer: b.load(e.real, pointer)
     first = at(record.sizes(0, 1).start)
-    none = e.compare("oeq", load(first), e.const(0.0))
+    none = e.compare("oeq", b.load(e.real, first), e.const(0.0))
     with b.when(e.any(none)):
-        b.store(e.real, e.select(none, e.const(1.0), load(first)), first)
-        known = Region(e, plan.graph)
-        for i, node in enumerate(plan.shared.params):
-            known.bind(node, load(b.at(e.real, "%params", i)))
-        known.bind(plan.shared.t, e.add(e.splat("%t0"), e.mul(e.splat(b.put("sitofp i64 %offset to double")), e.splat("%h"))))
+        b.store(e.real, e.select(none, e.const(1.0), b.load(e.real, first)), first)
+        t = e.add(e.splat("%t0"), e.mul(e.splat(b.put("sitofp i64 %offset to double")), e.splat("%h")))
         for stage, (index, fraction) in enumerate(plan.stages):
-            found, equation = sizes[index], plan.equations[index]
-            if found is None:
-                continue
-            region, k = Region(e, plan.graph, known), len(equation.unknowns)
-            region.bind(plan.shared.h, e.mul(e.splat("%h"), e.const(fraction)))
-            given = [*places(record.state), *places(record.unknowns(stage, k))]
-            for node, pointer in zip([*equation.state, *equation.unknowns], given, strict=True):
-                region.bind(node, load(pointer))
-            region.require(found.outputs)
-            status = at(record.status)
-            sure = e.compare("oeq", region.value(found.sure), e.const(1.0))
-            new = [_power_of_two(e, region.value(node)) for node in found.unknowns]
-            new.append(e.select(sure, load(status), e.const(float(DOUBTFUL))))
-            for value, pointer in zip(new, [*places(record.sizes(stage, k)), status], strict=True):
-                b.store(e.real, e.select(none, value, load(pointer)), pointer)
+            if plan.equations[index].unknowns:
+                places = f"ptr {at(record.unknowns(stage, 1).start)}, ptr {at(record.sizes(stage, 1).start)}"
+                h = e.mul(e.splat("%h"), e.const(fraction))
+                b.line(f"call void @of_{index}(ptr %lanes, ptr %params, {places}, {e.real} {t}, {e.real} {h}, {e.bool} {none})")
     b.line("ret void")
     module.define(f"define internal void @block(ptr %lanes, ptr %params, ptr %outs, {NUMBERS})", b)
+    for index in sorted({index for index, _ in plan.stages}):
+        if plan.equations[index].unknowns:
+            _define_sizes(plan, module, width, index)
+
+
+def _define_sizes(plan: Plan, module: Module, width: int, index: int) -> None:
+    """`of_‹index›`: the sizes of a stage that solves this equation, in the lanes that have none."""
+    b, record, equation = Body(module), plan.record, plan.equations[index]
+    correction, k = plan.corrections[index], len(equation.unknowns)
+    e = Emitter(b, width)
+    places = lambda base, count: [b.at(e.real, base, i) for i in range(count)]
+    load = lambda pointer: b.load(e.real, pointer)
+    region = Region(e, plan.graph)
+    region.bind(plan.shared.t, "%t")
+    region.bind(plan.shared.h, "%h")
+    given = [*plan.shared.params, *equation.state, *equation.unknowns]
+    at = [*places("%params", len(plan.shared.params)), *places("%lanes", record.state_size), *places("%unknowns", k)]
+    for node, pointer in zip(given, at, strict=True):
+        region.bind(node, load(pointer))
+    found = FirstSizes(plan.graph, Linearized.of(plan.graph, equation, plan.shared.h, correction.jacobian), correction.order)
+    region.require(found.outputs)
+    status = b.at(e.real, "%lanes", record.status)
+    sure = e.compare("oeq", region.value(found.sure), e.const(1.0))
+    new = [_power_of_two(e, region.value(node)) for node in found.unknowns]
+    new.append(e.select(sure, load(status), e.const(float(DOUBTFUL))))
+    for value, pointer in zip(new, [*places("%sizes", k), status], strict=True):
+        b.store(e.real, e.select("%none", value, load(pointer)), pointer)
+    b.line("ret void")
+    head = f"ptr %lanes, ptr %params, ptr %unknowns, ptr %sizes, {e.real} %t, {e.real} %h, {e.bool} %none"
+    module.define(f"define internal void @of_{index}({head}) noinline", b)
 
 
 def _power_of_two(e: Emitter, size: str) -> str:
