@@ -28,6 +28,7 @@ from dirax.run.result import solution_of
 from dirax.run.settings import Settings, kind_of
 from dirax.run.start import begun, completed
 from dirax.run.streaming import Stream
+from dirax.run.traced_run import Carried, carried_by_jax
 from dirax.run.validate import Case, refuse_clock_that_stands, refuse_more_than_memory
 from dirax.schemes.step import Shape, make_step_equation
 from dirax.solution.solution import Solution
@@ -116,6 +117,9 @@ def carried_out(
         return run_with_events(carried_out, _begun, settings, case, steps, save_every, progress, kind, entered)
     began = time.perf_counter()
     every = _checked_times(case, steps, save_every)
+    if case.traced:
+        problem, outcome, row0 = carried_by_jax(_by_jax(settings, steps, every), settings, case, steps, every)
+        return solution_of(settings.system, settings.scheme, case, problem, outcome, row0, True)
     kind = None if settings.to is not None else kind or kind_for(settings, case)
     if kind is not None and kind.starts and (again := kind.again(case, steps, every, save_every)):
         return _run(settings, kind, again, steps, progress, entered, began)
@@ -135,6 +139,16 @@ def carried_out(
         if kind.runs == 2:
             kind.plan = found.plan()
     return _run(settings, kind, found, steps, progress, entered, began)
+
+
+def _by_jax(settings: Settings, steps: int, every: int) -> Callable[[Case], Carried]:
+    """What is compiled of a run with traced values."""
+
+    def carried(case: Case) -> Carried:
+        found = _begun(settings, case, steps, every, every)
+        return found.problem, settings.engine.run_traced(found.problem), found.row0
+
+    return carried
 
 
 def prepared(settings: Settings, case: Case, steps: int, save_every: int) -> Kind | None:

@@ -1,0 +1,70 @@
+"""Runs under JAX's transformations: one compiled function for all of a kind, which JAX differentiates and maps.
+
+Without it `jax.grad(f)(q)` would compile every operation between the arguments and the engine by itself, a hundred and more.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from dirax.engines.contract import Outcome, Problem
+from dirax.program.memo import Memo
+from dirax.run.settings import Settings
+from dirax.run.validate import Case
+
+KEPT = 32
+"""Kinds of runs whose functions are kept."""
+
+COMPUTED = ("fields", "closing", "completed", "status", "iterations", "max_residual", "last_state", "last_unknowns")
+"""What is computed of an Outcome; the rest is known once it has been traced."""
+
+Carried = tuple[Problem, Outcome, dict[str, Any] | None]
+"""The problem of a run, its outcome, and the given row 0 of two points."""
+
+
+@dataclass
+class Kind:
+    """The compiled function of runs of one kind, and what was known besides arrays when it was traced."""
+
+    arrays: Callable[[list], tuple[dict[str, Any], Any]]
+    problem: Any = None
+    outcome: Any = None
+
+
+_kinds: Memo[Kind] = Memo(KEPT)
+
+
+def carried_by_jax(carried: Callable[[Case], Carried], settings: Settings, case: Case, *counts: int) -> Carried:
+    """`carried(case)` of a case with traced values. It must do the same for equal settings, counts and kinds of values.
+
+    Numbers with a point are arguments of the compiled function; the others, which users' functions may count or index by, are
+    part of it.
+    """
+    leaves, structure = jax.tree.flatten((case.data, case.params, case.h, case.t0))
+    moves = tuple(isinstance(leaf, Tracer) or np.asarray(leaf).dtype.kind == "f" for leaf in leaves)
+    kept = tuple(() if m else (np.asarray(leaf).dtype.char, np.asarray(leaf).tobytes()) for m, leaf in zip(moves, leaves, strict=True))
+    shapes = tuple(map(np.shape, leaves)), case.batch, case.batch_params
+    kind = _kinds.get((settings.key, structure, moves, kept, shapes, counts), lambda: _kind(carried, case, leaves, moves))
+    arrays, row0 = kind.arrays([leaf for leaf, m in zip(leaves, moves, strict=True) if m])
+    problem = kind.problem.with_numbers(params=case.params, h=case.h, t0=case.t0)
+    return problem, replace(kind.outcome, **arrays, notes=dict(kind.outcome.notes)), row0
+
+
+def _kind(carried: Callable[[Case], Carried], case: Case, leaves: list, moves: tuple[bool, ...]) -> Kind:
+    structure = jax.tree.structure((case.data, case.params, case.h, case.t0))
+    still = [None if m else leaf for leaf, m in zip(leaves, moves, strict=True)]
+
+    def run(moving: list) -> tuple[dict[str, Any], Any]:
+        rest = iter(moving)
+        data, params, h, t0 = jax.tree.unflatten(structure, [next(rest) if m else s for s, m in zip(still, moves, strict=True)])
+        problem, outcome, row0 = carried(replace(case, data=data, params=params, h=h, t0=t0))
+        kind.problem = problem.with_numbers(state=None, guess=None, params=None, h=None, t0=None)
+        kind.outcome = replace(outcome, **dict.fromkeys(COMPUTED))
+        return {name: getattr(outcome, name) for name in COMPUTED}, row0
+
+    kind = Kind(jax.jit(run))
+    return kind
