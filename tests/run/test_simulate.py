@@ -138,6 +138,24 @@ def test_gradient_against_the_closed_form():
     np.testing.assert_allclose(gradient, [power[0, 0], power[0, 1], dq], rtol=1e-11)
 
 
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_a_second_gradient_compiles_nothing(engine):
+    def end(q, step):
+        sol = dx.simulate(SPRING, PLUS, q=q, v=[0.3], params={"m": 1.0, "k": 2.0}, step=step, steps=3, engine=engine)
+        return jnp.sum(sol.q[-1])
+
+    compiled = []
+    listener = lambda event, duration, **_: compiled.append(event) if event.endswith("backend_compile_duration") else None
+    jax.monitoring.register_event_duration_secs_listener(listener)
+    try:
+        jax.grad(end)(jnp.array([1.0]), 0.1)
+        first = len(compiled)
+        jax.grad(end)(jnp.array([2.0]), 0.2)
+        assert 0 < first == len(compiled)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listener)
+
+
 def test_gradient_with_constraints_against_finite_differences():
     """Initial position, velocity along the constraint and a parameter, for the final position, momentum and multiplier."""
     scheme = dx.LagrangeDAlembert()

@@ -46,7 +46,8 @@ def carried_by_jax(carried: Callable[[Case], Carried], settings: Settings, case:
     """
     leaves, structure = jax.tree.flatten((case.data, case.params, case.h, case.t0))
     moves = tuple(isinstance(leaf, Tracer) or np.asarray(leaf).dtype.kind == "f" for leaf in leaves)
-    kept = tuple(() if m else (np.asarray(leaf).dtype.char, np.asarray(leaf).tobytes()) for m, leaf in zip(moves, leaves, strict=True))
+    value = lambda leaf: (np.asarray(leaf).dtype.char, np.asarray(leaf).tobytes())
+    kept = tuple(() if m else value(leaf) for m, leaf in zip(moves, leaves, strict=True))
     shapes = tuple(map(np.shape, leaves)), case.batch, case.batch_params
     kind = _kinds.get((settings.key, structure, moves, kept, shapes, counts), lambda: _kind(carried, case, leaves, moves))
     arrays, row0 = kind.arrays([leaf for leaf, m in zip(leaves, moves, strict=True) if m])
