@@ -188,10 +188,15 @@ class StepProgram:
         """The rows {column: node} of the Jacobian of every equation's residual. Raises `GraphTooLarge`."""
         return [jacobian(self.graph, e.residual, e.unknowns) for e in self.equations]
 
+    @cached_property
+    def entries(self) -> int:
+        """Operations of the step for each column of a stage's Jacobian: about those of its sizes written as nodes."""
+        return max(len(e.unknowns) for e in self.equations) * self.size
+
     @property
     def sizes_are_written(self) -> bool:
         """Whether the step is small enough for its sizes to be written as nodes."""
-        return max(len(e.unknowns) for e in self.equations) * self.size <= WRITTEN
+        return self.entries <= WRITTEN
 
     @cached_property
     def first_slopes(self) -> Slopes:

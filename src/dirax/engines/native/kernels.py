@@ -28,6 +28,9 @@ LINEARIZED_SIGNATURE = ctypes.CFUNCTYPE(
     None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3
 )
 
+SIZING = 1e-5
+"""A part of the seconds that the kernel of sizes takes to compile (3e-5), for each operation and each column of the Jacobian."""
+
 
 class Kernels:
     """The machine code of a step: kernels by width, made when they are asked for."""
@@ -36,6 +39,8 @@ class Kernels:
         self.step, self.compensated, self.rules = step, compensated, rules
         self.plan: Plan | None = None
         self.operations = 0
+        self.sizing = 0.0
+        """Seconds that runs have spent on sizes without a kernel for them."""
         self.saved: Any = None
         """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
         self.places: Any = None
@@ -63,8 +68,10 @@ class Kernels:
         return self._runs[width], cached
 
     def of_sizes(self, width: int) -> Any:
-        """The compiled `run` that finds the sizes; None where they are not written as nodes."""
-        if width not in self._of_sizes and self.step.sizes_are_written:
+        """The compiled `run` that finds the sizes; None where they are not written as nodes, and as long as runs have spent less
+        than a part of what its compilation takes."""
+        worth = self.sizing > SIZING * self.step.entries
+        if width not in self._of_sizes and worth and self.step.sizes_are_written:
             text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
             library, _ = self._library("run", width, text, "sizes", level=0)
             self._of_sizes[width] = llvm.function(library, "run", SIGNATURE)

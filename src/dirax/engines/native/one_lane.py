@@ -42,7 +42,7 @@ class Places:
 class OneLane:
     """What `Lanes` is for many trajectories."""
 
-    threads = 1
+    threads = width = 1
 
     def __init__(self, p: Problem, made: Kernels | CollocationKernels, places: Places):
         self.problem, self.record, self.places = p, made.record, places

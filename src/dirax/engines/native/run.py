@@ -57,7 +57,7 @@ class Ready:
         lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
         fields = lanes.fields
         if p.record is None and isinstance(self.made, Kernels):  # a fixed point finds its own
-            find_sizes(lanes, self.made.of_sizes(self.width) if self.notes["kernel_cached"] else None)
+            find_sizes(lanes, self.made)
         compile_seconds, cached, started = self.compile_seconds, self.notes["kernel_cached"], time.perf_counter()
         done, interrupted, threads = p.after, False, 1
         count = max(1, FIRST_CHUNK // max(1, p.batch or 1))

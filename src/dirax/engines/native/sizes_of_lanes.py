@@ -1,6 +1,6 @@
 """The sizes of unknowns in the records of trajectories: where a run begins, and where it stops too early."""
 
-from typing import Any
+import time
 
 import jax
 import numpy as np
@@ -21,18 +21,19 @@ _looked: Memo[tuple] = Memo(64)
 """What a closer look at single trajectories found, for runs that begin as others did."""
 
 
-def find_sizes(lanes: Lanes | OneLane, kernel: Any) -> None:
-    """Write the sizes into records that have none: by a kernel of their own, which takes longer to compile than NumPy takes once,
-    or, where that is None, by NumPy."""
+def find_sizes(lanes: Lanes | OneLane, made: Kernels) -> None:
+    """Write the sizes into records that have none: by NumPy, until runs have spent so much on it that a kernel is compiled."""
     if not lanes.record.kept:  # an explicit step
         return
+    kernel = made.of_sizes(lanes.width)
     if kernel is not None:
         lanes.advance(kernel, 0, 0)
         look_closer(lanes)
     else:
-        table = lanes.table()
+        started, table = time.thread_time(), lanes.table()
         lanes.record.put_sizes(table, sizes_of(lanes.problem))
         lanes.put(np.arange(len(table)), table)
+        made.sizing += time.thread_time() - started
 
 
 def look_closer(lanes: Lanes | OneLane) -> None:

@@ -24,7 +24,7 @@ class Segments:
         made = kernels(p.equation, p.params, True, p.compensated)
         self.lanes = Lanes(p, made, width_for(p.batch or 1))
         self.kernel, _ = made.kernel(self.lanes.width)
-        find_sizes(self.lanes, made.of_sizes(self.lanes.width))
+        find_sizes(self.lanes, made)
         self.linearized = made.linearized(reverse, self.lanes.width)
         row_bytes = 8 * (p.batch or 1) * self.stages * (task.state_size + task.unknowns)
         self.length = max(1, SEGMENT_BYTES // row_bytes)
