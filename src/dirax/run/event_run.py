@@ -7,13 +7,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
 from dirax.run.event import TRACED, Event, captures_traced, evaluated, refuse_unknown
 from dirax.run.event_search import EventSearch, places_for
 from dirax.run.event_traced import with_traced_events
 from dirax.run.impact import Impact
 from dirax.run.impact_run import check_walls, fly_all
-from dirax.run.impact_traced import fly_traced
+from dirax.run.impact_traced import flight_of, flown
+from dirax.run.traced_run import carried_by_jax
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
 from dirax.solution.solution import Solution
@@ -181,11 +183,19 @@ def run_with_events(
     def run(count: int) -> Solution:
         if not walls:
             return carry_out(plain, case, count, 1, progress, kind, entered)
-        begun = begin(plain, case, count, 1, 1)
         own = tuple(settings.events[i] for i in walls)
-        captured = check_walls(plain.system, begun.problem, own, tuple(walls))
+
+        def begun_at(case: Any) -> tuple[Any, bool]:
+            begun = begin(plain, case, count, 1, 1)
+            return begun, check_walls(plain.system, begun.problem, own, tuple(walls))
+
+        if case.traced:
+            by_jax = lambda case: flown(plain.system, begun_at(case)[0], own, tuple(walls))
+            found = carried_by_jax(by_jax, plain, case, count, *walls, *map(Same, own))
+            return flight_of(plain, case, *found)
+        begun, captured = begun_at(case)
         if begun.traced or captured:
-            return fly_traced(plain, begun, own, tuple(walls))
+            return flight_of(plain, case, *flown(plain.system, begun, own, tuple(walls)))
         sol = fly_all(plain, begun, own, tuple(walls))
         sol.continuation = lambda _, more, progress: run(count + more)
         return sol

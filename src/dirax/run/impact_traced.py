@@ -167,10 +167,9 @@ def bracketed_fall(function, a, fa, b, fb):
     return b
 
 
-def fly_traced(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> Solution:
-    """The Solution of a traced problem with impacts, every row saved. `sol.events` has MOST entries a step, in the order of time;
-    those that there are not are NaN."""
-    p, system = begun.problem, settings.system
+def flown(system: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> tuple[Problem, Outcome, Any]:
+    """Problem and outcome of a traced run with impacts, every row saved; and the given row 0 with what was hit."""
+    p = begun.problem
     flight = TracedFlight(walls, numbers, system, p)
     lead = lambda a: jnp.asarray(a) if p.batch is not None else jnp.asarray(a)[None]
     of_params = lead if p.batch_params and p.batch is not None else lambda a: jnp.broadcast_to(a, (p.batch or 1, *jnp.shape(a)))
@@ -192,11 +191,18 @@ def fly_traced(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tu
         last_unknowns=unknowns,
         engine="xla",
     )
-    sol = solution_of(system, settings.scheme, begun.case, p, outcome, begun.row0, True)
     t, number, q, momentum = (a.reshape(a.shape[0], -1, *a.shape[3:]) for a in hits)
     order = jnp.argsort(jax.lax.stop_gradient(t), axis=1)  # NaN is last
     pick = lambda a: jnp.concatenate(jnp.take_along_axis(a, order.reshape(*order.shape, *(1,) * (a.ndim - 2)), axis=1))
     lanes = jnp.repeat(jnp.arange(p.batch or 1), order.shape[1])
-    fields = {"q": pick(q), "p": pick(momentum)}
-    sol.events = sol.impacts = Events(pick(t), pick(number), jnp.full(lanes.shape, -1), lanes, fields)
+    impacts = pick(t), pick(number), jnp.full(lanes.shape, -1), lanes, {"q": pick(q), "p": pick(momentum)}
+    return p, outcome, (begun.row0, impacts)
+
+
+def flight_of(settings: Any, case: Any, problem: Problem, outcome: Outcome, more: Any) -> Solution:
+    """The Solution of what `flown` gives. `sol.events` has MOST entries a step, in the order of time; those that there are not
+    are NaN."""
+    row0, impacts = more
+    sol = solution_of(settings.system, settings.scheme, case, problem, outcome, row0, True)
+    sol.events = sol.impacts = Events(*impacts)
     return sol

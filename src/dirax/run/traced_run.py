@@ -3,7 +3,7 @@
 Without it `jax.grad(f)(q)` would compile every operation between the arguments and the engine by itself, a hundred and more.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,8 +22,8 @@ KEPT = 32
 COMPUTED = ("fields", "closing", "completed", "status", "iterations", "max_residual", "last_state", "last_unknowns")
 """What is computed of an Outcome; the rest is known once it has been traced."""
 
-Carried = tuple[Problem, Outcome, dict[str, Any] | None]
-"""The problem of a run, its outcome, and the given row 0 of two points."""
+Carried = tuple[Problem, Outcome, Any]
+"""The problem of a run, its outcome, and other arrays: the given row 0 of two points."""
 
 
 @dataclass
@@ -38,8 +38,8 @@ class Kind:
 _kinds: Memo[Kind] = Memo(KEPT)
 
 
-def carried_by_jax(carried: Callable[[Case], Carried], settings: Settings, case: Case, *counts: int) -> Carried:
-    """`carried(case)` of a case with traced values. It must do the same for equal settings, counts and kinds of values.
+def carried_by_jax(carried: Callable[[Case], Carried], settings: Settings, case: Case, *others: Hashable) -> Carried:
+    """`carried(case)` of a case with traced values. It must do the same for equal settings, kinds of values, and others.
 
     Numbers with a point are arguments of the compiled function; the others, which users' functions may count or index by, are
     part of it.
@@ -49,10 +49,10 @@ def carried_by_jax(carried: Callable[[Case], Carried], settings: Settings, case:
     value = lambda leaf: (np.asarray(leaf).dtype.char, np.asarray(leaf).tobytes())
     kept = tuple(() if m else value(leaf) for m, leaf in zip(moves, leaves, strict=True))
     shapes = tuple(map(np.shape, leaves)), case.batch, case.batch_params
-    kind = _kinds.get((settings.key, structure, moves, kept, shapes, counts), lambda: _kind(carried, case, leaves, moves))
-    arrays, row0 = kind.arrays([leaf for leaf, m in zip(leaves, moves, strict=True) if m])
+    kind = _kinds.get((settings.key, structure, moves, kept, shapes, others), lambda: _kind(carried, case, leaves, moves))
+    arrays, more = kind.arrays([leaf for leaf, m in zip(leaves, moves, strict=True) if m])
     problem = kind.problem.with_numbers(params=case.params, h=case.h, t0=case.t0)
-    return problem, replace(kind.outcome, **arrays, notes=dict(kind.outcome.notes)), row0
+    return problem, replace(kind.outcome, **arrays, notes=dict(kind.outcome.notes)), more
 
 
 def _kind(carried: Callable[[Case], Carried], case: Case, leaves: list, moves: tuple[bool, ...]) -> Kind:
@@ -62,10 +62,10 @@ def _kind(carried: Callable[[Case], Carried], case: Case, leaves: list, moves: t
     def run(moving: list) -> tuple[dict[str, Any], Any]:
         rest = iter(moving)
         data, params, h, t0 = jax.tree.unflatten(structure, [next(rest) if m else s for s, m in zip(still, moves, strict=True)])
-        problem, outcome, row0 = carried(replace(case, data=data, params=params, h=h, t0=t0))
+        problem, outcome, more = carried(replace(case, data=data, params=params, h=h, t0=t0))
         kind.problem = problem.with_numbers(state=None, guess=None, params=None, h=None, t0=None)
         kind.outcome = replace(outcome, **dict.fromkeys(COMPUTED))
-        return {name: getattr(outcome, name) for name in COMPUTED}, row0
+        return {name: getattr(outcome, name) for name in COMPUTED}, more
 
     kind = Kind(jax.jit(run))
     return kind
