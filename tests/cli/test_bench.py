@@ -14,13 +14,14 @@ import dirax as dx
 from dirax import gallery
 from dirax.cli.bench import run_machines, subject
 from dirax.cli.commands import app
-from dirax.diagnostics.bench import casadi_c, machines, measure, ode_solvers
+from dirax.diagnostics.bench import casadi_c, hinges, in_drake, in_pinocchio, machines, measure, ode_solvers
 from dirax.diagnostics.bench.engines import plain_run
 from dirax.diagnostics.bench.measure import PROGRAMS, SAME_STEPS, Bench, Row, bench
 from dirax.diagnostics.bench.ode import eliminate, explicit_ode, pivot_order
 from dirax.diagnostics.bench.subject import Skipped, Subject
 from dirax.diagnostics.bench.timing import compiler, interleaved
 from dirax.engines.native import Native
+from dirax.gallery import bricard
 
 
 def call(*arguments):
@@ -256,12 +257,41 @@ def test_the_same_machine_is_stated_for_mujoco():
     example = gallery.get("four-bar")
     root = ElementTree.fromstring(in_mujoco.mjcf(example.model, 0.01))
     names = [joint.get("name") for joint in root.iter("joint")]
-    (loop,) = root.iter("connect")
-    assert sorted(names) == sorted(example.model.coordinates) and (loop.get("body1"), loop.get("body2")) == ("coupler", "right")
+    ends = {body.get("name"): [site.get("name") for site in body.findall("site")] for body in root.iter("body")}
+    loops = [(loop.get("site1"), loop.get("site2")) for loop in root.iter("connect")]
+    assert sorted(names) == sorted(example.model.coordinates)
+    assert loops == list(zip(ends["right"], ends["coupler"], strict=True)) and len(loops) == 2  # two points of the hinge's axis
     assert in_mujoco.is_stated(example.model) and not in_mujoco.is_stated(gallery.get("bicycle").model)
     pytest.importorskip("mujoco")
-    cell = in_mujoco.measured(example, 100, example.simulate(step=0.001, steps=1000).q[-1], 1)
-    assert float(cell.split("error ")[1].split(",")[0]) < 0.01
+    assert error_by(in_mujoco, example) < 0.01
+
+
+def error_by(program, example):
+    """How far a program is after a second from steps of a tenth of the size."""
+    cell = program.measured(example, 100, example.simulate(step=example.step / 10, steps=1000).q[-1], 1)
+    return float(cell.split("error ")[1].split(",")[0])
+
+
+def test_the_points_of_a_hinge_that_closes_a_loop_coincide():
+    """Also where joints are away from the origin of their body's frame; and branches of the tree follow one another."""
+    model = bricard.MODEL
+    data = model.state({"rod 1": 0.2})
+    frames = model.frames(data["q"], data["v"])
+    starts, pairs = hinges.joint_frames(model), hinges.closing_points(model)
+    assert len(pairs) == 2 and np.linalg.norm(pairs[1][0][1] - pairs[0][0][1]) == pytest.approx(1.0)
+    for pair in pairs:
+        first, second = (np.asarray(frames[name].point(x - starts[name])) for name, x in pair)
+        assert first == pytest.approx(second, abs=1e-10)
+    order = [joint.body for joint in hinges.branch_by_branch(gallery.get("four-bar").model)]
+    assert order == ["left", "coupler", "right"]
+    assert not in_drake.is_stated(model) and in_drake.is_stated(gallery.get("four-bar").model)
+
+
+@pytest.mark.parametrize("name", ["pinocchio", "pydrake"])
+@pytest.mark.parametrize("machine", ["robot-arm", "four-bar"])
+def test_the_same_machine_is_stated_for_pinocchio_and_drake(name, machine):
+    pytest.importorskip(name)
+    assert error_by({"pinocchio": in_pinocchio, "pydrake": in_drake}[name], gallery.get(machine)) < 0.01
 
 
 def test_the_same_machine_is_stated_for_exudyn():

@@ -82,9 +82,9 @@ ON_GROUPS = ("free-top", "heavy-top-so3", "suslov", "chaplygin-sleigh-se2", "und
 
 MACHINES = (
     *("bicycle", "tippe-top", "chaplygin-sphere", "rattleback", "euler-disk", "flyball-governor"),
-    *("snakeboard-gait", "trikke", "n-trailer"),
+    *("snakeboard-gait", "trikke", "n-trailer", "robot-arm"),
 )
-"""They have translations, and rolling, friction or closed loops: no run is made on the quotient."""
+"""They have translations, and rolling, friction, closed loops or many hinges: no run is made on the quotient."""
 
 WITHOUT = {
     "double-pendulum": "gravity singles out the vertical, and time is not a coordinate",

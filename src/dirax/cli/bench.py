@@ -20,7 +20,7 @@ QUICK, QUICK_STEPS, QUICK_REPEATS = ("kepler", "rolling-disk", "vortices"), 100,
 
 MACHINES = (
     *("bicycle", "euler-disk", "rattleback", "tippe-top", "chaplygin-sphere", "n-trailer", "trikke", "snakeboard-gait"),
-    *("andrews-squeezer", "four-bar", "bricard", "flyball-governor", "n-four-bar", "car-axis", "slider-crank"),
+    *("robot-arm", "andrews-squeezer", "four-bar", "bricard", "flyball-governor", "n-four-bar", "car-axis", "slider-crank"),
 )
 QUICK_MACHINES = ("car-axis", "euler-disk")
 

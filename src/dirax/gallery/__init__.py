@@ -64,6 +64,7 @@ _MODULES = {
     "snakeboard-gait": "snakeboard_gait",
     "trikke": "trikke",
     "n-trailer": "n_trailer",
+    "robot-arm": "robot_arm",
 }
 """Name → the module here that defines `EXAMPLE`; a new system is a file and a line."""
 

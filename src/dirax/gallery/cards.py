@@ -70,6 +70,7 @@ LOOK = {
     "snakeboard-gait": "Axles and rotor swing with one frequency: the board rides off.",
     "trikke": "Three skates and a sway: nobody pushes, and it gathers speed.",
     "n-trailer": "Each trailer cuts the corner a little more than the one before it.",
+    "robot-arm": "With its motors off it swings like a pendulum of six hinges, and its wrist goes its own ways.",
     "oscillator-chain": "The energy leaves the first mode and comes back to it.",
     "sine-gordon": "A kink runs along without changing its shape.",
     "hanging-chain": "As many rods as links, all of constant length.",

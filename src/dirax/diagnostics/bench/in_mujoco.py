@@ -1,4 +1,4 @@
-"""Machines of `dx.bodies` in MuJoCo: the same bodies, hinges and slides, a loop closed by an equality of two points."""
+"""Machines of `dx.bodies` in MuJoCo: the same bodies, hinges and slides, the hinge of a loop by equalities of two of its points."""
 
 import time
 from typing import Any
@@ -6,22 +6,16 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 
+from dirax.diagnostics.bench.hinges import MOTIONS, closing_points, is_hinged, joint_frames
 from dirax.text.tables import number
 
-HINGES = {"revolute": "hinge", "prismatic": "slide"}
+is_stated = is_hinged
+
 THIN = 1e-9
 """Of the largest moment of inertia: the smallest that a body there may have."""
 
 STIFF = "2e-3 1"
 """Time constant (s) and damping of loops (`solref`); MuJoCo takes two steps where that is longer."""
-
-
-def is_stated(model: Any) -> bool:
-    """Whether the machine is one of hinges, slides and nothing else, which is what is written here."""
-    if model is None or model.contacts or model.forces or model.parameters:
-        return False
-    trees = all(joint.kind in HINGES and joint.turned is None for joint in model.tree)
-    return trees and all(joint.kind == "revolute" for joint in model.joints if joint.closes)
 
 
 def mjcf(model: Any, step: float) -> str:
@@ -31,24 +25,22 @@ def mjcf(model: Any, step: float) -> str:
     SubElement(root, "option", timestep=str(step), integrator="RK4", gravity=gravity, tolerance="1e-15", iterations="200")
     elements = {"ground": SubElement(root, "worldbody")}
     bodies = {body.name: body for body in model.bodies}
-    starts = {"ground": np.zeros(3)}  # where the frame of dx.bodies is in MuJoCo's, which is at the joint
+    starts = joint_frames(model)
     for joint in model.tree:
-        starts[joint.body] = -np.asarray(joint.on, float)
         place = np.asarray(joint.at, float) + starts[joint.parent]
         elements[joint.body] = e = SubElement(elements[joint.parent], "body", name=joint.body, pos=_text(place))
-        SubElement(e, "joint", name=joint.name, type=HINGES[joint.kind], axis=_text(joint.axis))
+        SubElement(e, "joint", name=joint.name, type=MOTIONS[joint.kind], axis=_text(joint.axis))
         body = bodies[joint.body]
         inertia = np.asarray(body.inertia_matrix(None), float)
         inertia = inertia + max(THIN * np.abs(inertia).max(), 1e-12) * np.eye(3)
         full = _text(inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
         SubElement(e, "inertial", pos=_text(np.asarray(body.centre) + starts[body.name]), mass=str(body.mass), fullinertia=full)
     loops = SubElement(root, "equality")
-    for joint in model.joints:
-        if joint.closes:
-            first, second = (joint.body, joint.on), (joint.parent, joint.at)
-            (one, at), (other, _) = (first, second) if joint.parent == "ground" else (second, first)
-            anchor, more = _text(np.asarray(at, float) + starts[one]), {} if other == "ground" else {"body2": other}
-            SubElement(loops, "connect", body1=one, anchor=anchor, solref=STIFF, **more)
+    for k, ends in enumerate(closing_points(model)):
+        names = [f"end {k}.{end}" for end in (1, 2)]
+        for name, (body, at) in zip(names, ends, strict=True):
+            SubElement(elements[body], "site", name=name, pos=_text(at))
+        SubElement(loops, "connect", site1=names[0], site2=names[1], solref=STIFF)
     return tostring(root, encoding="unicode")
 
 

@@ -8,12 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from dirax.diagnostics.bench import in_exudyn, in_mujoco
+from dirax.diagnostics.bench import in_drake, in_exudyn, in_mujoco, in_pinocchio
 from dirax.diagnostics.bench.timing import machine
 from dirax.text.tables import number, plain, text_table
 
-OTHERS = {"MuJoCo": "mujoco", "Exudyn": "exudyn", "pinocchio": "pinocchio"}
+OTHERS = {"MuJoCo": "mujoco", "Exudyn": "exudyn", "pinocchio": "pinocchio", "Drake": "pydrake"}
 """Programs for machines, and the module that is imported where they are installed: each is then a column."""
+
+STATED = {"MuJoCo": in_mujoco, "Exudyn": in_exudyn, "pinocchio": in_pinocchio, "Drake": in_drake}
+"""How each of them is given a machine."""
+
+ROLLS = ("Exudyn",)
+"""Those that have constraints on velocities, and constraints that take the time."""
 
 NO_ROLLING = "cannot: no constraints on velocities"
 NO_TIME = "cannot: no constraints that take the time"
@@ -23,20 +29,18 @@ FINER = 4
 
 def _others_on(example: Any, program: str, steps: int, end: np.ndarray, repeats: int) -> str:
     """What a program does on the machine, or why it cannot state it, as far as its kinds of constraints go."""
-    if example.system.one_forms is not None and program in ("MuJoCo", "pinocchio"):
+    if program not in ROLLS and example.system.one_forms is not None:
         return NO_ROLLING
-    if example.system.depends_on_time and program in ("MuJoCo", "pinocchio"):
+    if program not in ROLLS and example.system.depends_on_time:
         return NO_TIME
-    if program == "MuJoCo" and in_mujoco.is_stated(example.model):
-        return in_mujoco.measured(example, steps, end, repeats)
-    if program == "Exudyn" and in_exudyn.is_stated(example.model):
-        return in_exudyn.measured(example, steps, end, repeats)
+    if STATED[program].is_stated(example.model):
+        return STATED[program].measured(example, steps, end, repeats)
     return NOT_HERE
 
 
 @dataclass(frozen=True)
 class MachineRow:
-    """One machine by its own scheme and step: seconds of a step, the change of q at the end by steps of a quarter the size, the
+    """One machine by its own scheme and step: seconds of a step, the error of q at the end, as steps of a quarter the size tell it, the
     range of the energy less the work of the forces, relative to the largest energy (NaN where it is no constant), and the
     largest residual of the constraints."""
 
@@ -117,6 +121,7 @@ def _measured(example: Any, repeats: int, steps: int, installed: Sequence[str]) 
         sol = example.simulate(steps=steps)
         seconds.append(min(time.process_time() - before, sol.stats["run_seconds"]))
     fine = example.simulate(step=example.step / FINER, steps=FINER * steps, save_every=FINER * steps)
+    end = fine.q[-1] + (fine.q[-1] - sol.q[-1]) / (FINER**2 - 1)  # the schemes are of order two
     energy = sol.energy()
     size = max(np.abs(energy).max(), 1e-300)
     drift = np.ptp(energy - getattr(sol, "work", 0.0)) / size  # a Solution has it where there are forces
@@ -126,8 +131,8 @@ def _measured(example: Any, repeats: int, steps: int, installed: Sequence[str]) 
         steps,
         int(sol.stats["unknowns"]),
         1e6 * min(seconds) / steps,
-        float(np.abs(sol.q[-1] - fine.q[-1]).max()),
+        float(np.abs(sol.q[-1] - end).max()),
         float("nan") if example.system.energy_changes else float(drift),
         float(np.abs(sol.constraint_residual()).max(initial=0.0)),
-        {program: _others_on(example, program, steps, fine.q[-1], repeats) for program in installed},
+        {program: _others_on(example, program, steps, end, repeats) for program in installed},
     )

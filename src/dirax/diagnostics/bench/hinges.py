@@ -1,0 +1,45 @@
+"""Machines of hinges and slides and nothing else, which every program for machines can state."""
+
+from typing import Any
+
+import numpy as np
+
+from dirax.bodies.frames import unit
+
+MOTIONS = {"revolute": "hinge", "prismatic": "slide"}
+
+
+def is_hinged(model: Any) -> bool:
+    """Whether the machine is a tree of hinges and slides, its loops closed by hinges, under its weight alone."""
+    if model is None or model.contacts or model.forces or model.parameters or model.dropped:
+        return False
+    trees = all(joint.kind in MOTIONS and joint.turned is None for joint in model.tree)
+    return trees and all(joint.kind == "revolute" and joint.turned is None for joint in model.joints if joint.closes)
+
+
+def joint_frames(model: Any) -> dict[str, np.ndarray]:
+    """The origin of each body's frame in a frame that starts at its joint instead, as other programs have it (3,)."""
+    return {"ground": np.zeros(3)} | {joint.body: -np.asarray(joint.on, float) for joint in model.tree}
+
+
+def branch_by_branch(model: Any) -> list[Any]:
+    """The joints of the tree, each with all that hangs on it before the next one begins."""
+    found, waiting = [], [joint for joint in reversed(model.tree) if joint.parent == "ground"]
+    while waiting:
+        found.append(waiting.pop())
+        waiting += [joint for joint in reversed(model.tree) if joint.parent == found[-1].body]
+    return found
+
+
+def closing_points(model: Any) -> list[tuple[tuple[str, np.ndarray], tuple[str, np.ndarray]]]:
+    """Pairs of points that coincide where loops are closed, each of a body in the frame at its joint: two on the axis of every
+    hinge, of whose six demands one follows from the others."""
+    starts, found = joint_frames(model), []
+    for joint in model.joints:
+        if joint.closes:
+            axes = joint.axis if joint.axis_on is None else joint.axis_on, joint.axis
+            ends = ((joint.body, joint.on, axes[0]), (joint.parent, joint.at, axes[1]))
+            for along in (0.0, 1.0):
+                first, second = ((name, np.asarray(at, float) + starts[name] + along * unit(axis)) for name, at, axis in ends)
+                found.append((first, second))
+    return found
