@@ -11,8 +11,8 @@ from dirax.text.tables import number
 
 
 def is_stated(model: Any) -> bool:
-    """Whether the machine is one of hinges and slides in which one hinge at most, of two moving bodies, closes a loop: with others
-    the solver of Drake 1.51 ends the process."""
+    """Whether the machine is one of hinges and slides in which one hinge at most, of two moving bodies, closes a loop: with
+    others the solver of Drake 1.51 ends the process."""
     closing = [joint for joint in model.joints if joint.closes] if model is not None else []
     return is_hinged(model) and len(closing) <= 1 and all(joint.parent != "ground" for joint in closing)
 

@@ -1,4 +1,4 @@
-"""Machines of `dx.bodies` in MuJoCo: the same bodies, hinges and slides, the hinge of a loop by equalities of two of its points."""
+"""Machines of `dx.bodies` in MuJoCo: the same bodies, hinges and slides, the hinge of a loop by equalities of two points."""
 
 import time
 from typing import Any

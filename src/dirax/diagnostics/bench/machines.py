@@ -40,9 +40,9 @@ def _others_on(example: Any, program: str, steps: int, end: np.ndarray, repeats:
 
 @dataclass(frozen=True)
 class MachineRow:
-    """One machine by its own scheme and step: seconds of a step, the error of q at the end, as steps of a quarter the size tell it, the
-    range of the energy less the work of the forces, relative to the largest energy (NaN where it is no constant), and the
-    largest residual of the constraints."""
+    """One machine by its own scheme and step: seconds of a step, the error of q at the end, as steps of a quarter the size
+    tell it, the range of the energy less the work of the forces, relative to the largest energy (NaN where it is no constant),
+    and the largest residual of the constraints."""
 
     name: str
     step: float
