@@ -96,6 +96,20 @@ def test_a_loop_is_assembled_and_one_that_cannot_close_says_which_joint():
         crank(0.5).state({"crank": 1.2})
 
 
+@pytest.mark.parametrize("rotation", ["quaternion", "axis"])
+def test_a_chain_that_is_straight_at_zero_is_bent_to_where_its_end_is_held(rotation):
+    """At zero both rods point at their end, and no joint knows which way to give."""
+    inertia, end = (0.1, 0.1, 0.0), (0.0, 0.0, 1.0)
+    bodies = [b.Body(name, 1.0, inertia, centre=(0, 0, 0.5)) for name in "ac"]
+    joints = [b.ball("ground", "a", rotation), b.ball("a", "c", rotation, at=end)]
+    hold = b.ball("ground", "c", name="hold", at=(0.0, 0.0, 1.2), on=end, closes=True)
+    model = b.Model(bodies, [*joints, hold])
+    data = model.state()
+    frames = model.frames(data["q"], data["v"])
+    assert np.asarray(frames["c"].point(np.array(end))) == pytest.approx([0.0, 0.0, 1.2], abs=1e-11)
+    assert float(frames["a"].point(np.array(end))[2]) == pytest.approx(0.6, abs=1e-11)
+
+
 def rods(*names):
     return [b.Body(name, **ROD) for name in names]
 

@@ -1,9 +1,11 @@
 """One machine with its rotations as Euler angles, as quaternions of length 1, and on SO(3) by a discretization map."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import dirax as dx
+from dirax.gallery import spherical_pendulums
 
 b = dx.bodies
 TOP = b.Body("top", 1.0, (0.1, 0.1, 0.05), centre=(0, 0, 0.4))
@@ -58,6 +60,51 @@ def test_a_rolling_ball_on_the_group_keeps_its_contact_and_its_momentum():
     assert np.ptp(seen["about"], axis=0).max() < 1e-4 and np.ptp(seen["energy"]) < 1e-6
     both = dx.simulate(ball.system, dx.LagrangeDAlembert(), **data, step=0.02, steps=100, save_every=100)
     assert sol.q[-1] == pytest.approx(both.q[-1], abs=1e-3) and np.abs(sol.q[-1] - sol.q[0]).max() > 0.5
+
+
+def test_a_rod_by_its_axis_is_a_conical_pendulum_in_coordinates_and_on_the_sphere():
+    """Ω² = m g c/((I + m c²) cos θ)."""
+    mass, across, centre, tilt = 1.3, 0.1, 0.4, 0.7
+    model = b.Model([b.Body("rod", mass, (across, across, 0.02), centre=(0, 0, centre))], [b.ball("ground", "rod", "axis")])
+    assert model.coordinates == ("rod.ux", "rod.uy", "rod.uz") and model.constraints == ("rod: |u| = 1",)
+    rate = np.sqrt(mass * 9.81 * centre / ((across + mass * centre**2) * np.cos(tilt)))
+    at = lambda angle: np.array([np.sin(tilt) * np.cos(angle), np.sin(tilt) * np.sin(angle), -np.cos(tilt)])
+    data = model.state(at(0.0), rate * np.cross([0, 0, 1], at(0.0)))
+    sphere = dx.DiscreteDirac(model.discretization_map)
+    for system, scheme in ((model.system, dx.LagrangeDAlembert()), (model.manifold_system, sphere)):
+        sol = dx.simulate(system, scheme, **data, step=2e-3, steps=500)
+        assert sol.q[-1] == pytest.approx(at(rate * sol.t[-1]), abs=1e-4)
+        assert np.abs(np.linalg.norm(sol.q, axis=1) - 1).max() < 1e-15
+        seen = model.observables(sol)
+        assert seen["angular_momentum"][:, 2] == pytest.approx(rate * (across + mass * centre**2) * np.sin(tilt) ** 2, abs=1e-12)
+
+
+def test_rods_that_hang_on_each_other_are_the_double_spherical_pendulum():
+    given = spherical_pendulums.PARAMS
+    model = b.Model(
+        [b.Body("a", given["m1"], centre=(0, 0, given["l1"])), b.Body("c", given["m2"], centre=(0, 0, given["l2"]))],
+        [b.ball("ground", "a", "axis"), b.ball("a", "c", "axis", at=(0, 0, given["l1"]))],
+        gravity=(0, 0, -given["g"]),
+    )
+    q, v = jnp.array(np.random.default_rng(4).normal(size=(2, 6)))
+    found, expected = model.system.lagrangian(q, v, None), spherical_pendulums.lagrangian(q, v, given)
+    assert float(found) == pytest.approx(float(expected), abs=1e-13)
+
+
+@pytest.mark.parametrize(
+    "body, joints, message",
+    [
+        ({"inertia": (0.1, 0.2, 0.0)}, [], "moments of inertia across it differ"),
+        ({"centre": (0.1, 0, 0.4)}, [], "mass centre is beside it"),
+        ({}, [b.revolute("rod", "arm")], "'arm' is revolute, which holds more of it"),
+        ({}, [b.ball("rod", "arm", at=(0.1, 0, 0))], "'arm' is beside it"),
+        ({}, [b.free("ground", "arm"), b.fixed("arm", "rod", name="weld", closes=True)], "'weld' is fixed"),
+    ],
+)
+def test_what_needs_more_than_the_axis_is_refused(body, joints, message):
+    bodies = [b.Body("rod", **{"mass": 1.0, "inertia": (0.1, 0.1, 0.0), **body}), *([b.Body("arm", 1.0)] if joints else [])]
+    with pytest.raises(ValueError, match=rf"body 'rod' is stated by its axis z alone.*{message}.*quaternion"):
+        b.Model(bodies, [b.ball("ground", "rod", "axis"), *joints])
 
 
 def test_friction_of_the_normal_force_is_not_stated_on_the_group():

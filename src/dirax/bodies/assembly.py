@@ -14,6 +14,9 @@ MET = 1e-11
 DEPENDENT = 1e-9
 """Part of a row across the rows before it, relative to the row, below which it depends on them."""
 
+ASIDE = (0.1, 0.3, 1.0)
+"""How far from a start at which the machine is not assembled others are tried, in every coordinate (rad, units of length)."""
+
 MOST_STEPS = 200
 RANK = 1e-10
 
@@ -41,19 +44,33 @@ def assembled(model: Any, q: Any, v: Any, params: Any) -> dict[str, np.ndarray]:
     place = start
     if system.holonomic is not None:
         positions = lambda q: tuple(map(np.asarray, evaluated(model.assembly.position, q, params)))
-        place = _solved(positions, start, ~fixed)
-        _refuse_unmet(model, positions(place)[0], place, fixed)
+        place = _assembled_place(model, positions, start, fixed)
     speed, kept = _given(model, v, "v", np.zeros(len(start)))
     if system.constraints.any:
         speed = _moving(model, place, speed, kept, params)
     return {"q": place, "v": speed}
 
 
+def _assembled_place(model: Any, positions: Callable, start: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """Where the machine is assembled: from the start, and where that is a dead centre, at which no joint knows which way to give,
+    from places beside it."""
+    place, rng = _solved(positions, start, ~fixed), np.random.default_rng(0)
+    for size in (0.0, *ASIDE):
+        other = place if size == 0 else _solved(positions, start + size * rng.uniform(-1, 1, len(start)) * ~fixed, ~fixed)
+        if not _unmet(model, positions(other)[0], other):
+            return other
+    missed = _unmet(model, positions(place)[0], place)
+    listed = ", ".join(f"{name} by {value:.3g}" for name, value in missed)
+    kept = [name for name, given in zip(model.coordinates, fixed, strict=True) if given]
+    way = f"Leave some of the given coordinates ({', '.join(kept)}) open" if kept else "Change the lengths of the bodies"
+    raise ValueError(f"the machine cannot be assembled near these data: {listed}. {way}, or start from others.")
+
+
 def _rest(model: Any) -> np.ndarray:
-    """Zero, and quaternions of no rotation."""
+    """Zero, quaternions of no rotation, and axes upwards."""
     q = np.zeros(len(model.coordinates))
-    for _, place in model.quaternions:
-        q[place.start] = 1.0
+    for _, motion, place in model.unit_vectors:
+        q[place] = motion.rest
     return q
 
 
@@ -102,14 +119,10 @@ def _solved(function: Callable, start: np.ndarray, free: np.ndarray) -> np.ndarr
     return x
 
 
-def _refuse_unmet(model: Any, defect: np.ndarray, q: np.ndarray, fixed: np.ndarray) -> None:
+def _unmet(model: Any, defect: np.ndarray, q: np.ndarray) -> list[tuple[str, float]]:
+    """The holonomic constraints that are not met, and by how much."""
     names = model.constraints[-len(defect) :]
-    missed = [(n, d) for n, d in zip(names, defect, strict=True) if not abs(d) <= MET * (1 + np.abs(q).max())]
-    if missed:
-        listed = ", ".join(f"{name} by {value:.3g}" for name, value in missed)
-        kept = [name for name, given in zip(model.coordinates, fixed, strict=True) if given]
-        way = f"Leave some of the given coordinates ({', '.join(kept)}) open" if kept else "Change the lengths of the bodies"
-        raise ValueError(f"the machine cannot be assembled near these data: {listed}. {way}, or start from others.")
+    return [(n, d) for n, d in zip(names, defect, strict=True) if not abs(d) <= MET * (1 + np.abs(q).max())]
 
 
 def _moving(model: Any, q: np.ndarray, v: np.ndarray, kept: np.ndarray, params: Any) -> np.ndarray:

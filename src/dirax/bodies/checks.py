@@ -105,3 +105,44 @@ def check_masses(model: Any) -> None:
                 f"body {body.name!r} has no mass, but moments of inertia {moments}: a body without mass has none. Give it a "
                 "mass, or leave out its inertia."
             )
+
+
+def check_axes(model: Any) -> None:
+    """Raise `ValueError` for bodies by their axis that need more than it: other points, moments of inertia, joints, contacts."""
+    for joint in model.tree:
+        if joint.is_axis:
+            body = next(body for body in model.bodies if body.name == joint.body)
+            for what, wrong in _beside(model, body, joint):
+                if wrong:
+                    raise ValueError(
+                        f'body {body.name!r} is stated by its axis z alone (rotation="axis"), but {what}. Put it on that axis, '
+                        'or take rotation="quaternion".'
+                    )
+
+
+def _beside(model: Any, body: Body, own: Joint) -> list[tuple[str, bool]]:
+    """What of a model would need more of a body than its axis, and whether it does."""
+    off = lambda x: x[0] != 0 or x[1] != 0
+    inertia = np.asarray(body.inertia, dtype=object)
+    moments = inertia if inertia.ndim == 1 else inertia.diagonal()
+    found = [
+        ("its mass centre is beside it", off(body.centre)),
+        ("its moments of inertia across it differ", moments[0] != moments[1]),
+        ("it has products of inertia", inertia.ndim == 2 and any(inertia[k, j] != 0 for k, j in ((0, 1), (0, 2), (1, 2)))),
+        (f"joint {own.name!r} has turned=, which a direction does not feel", own.turned is not None),
+    ]
+    for joint in model.joints:
+        if body.name in (joint.parent, joint.body):
+            at = joint.at if joint.parent == body.name else joint.on
+            found.append((f"joint {joint.name!r} is beside it", off(at)))
+            held = joint.kind == "ball" if joint.closes else joint is own or joint.kind in ("ball", "free")
+            found.append((f"joint {joint.name!r} is {joint.kind}, which holds more of it", not held))
+    for contact in model.contacts:
+        if contact.body == body.name:
+            point = getattr(contact.shape, "radius", 1) == 0 and contact.shape.tube == 0 and contact.motion != "skates"
+            found.append((f"contact {contact.name!r} is beside it", off(contact.centre)))
+            found.append((f"contact {contact.name!r} is no tip() of it that may spin", not (point and contact.spins)))
+    for force in model.forces:
+        ends = [at for name, at in getattr(force, "between", None) or () if name == body.name]
+        found.append((f"{force.name!r} is beside it", any(off(at) for at in ends)))
+    return found

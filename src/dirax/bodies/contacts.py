@@ -85,18 +85,15 @@ class Contact:
         thin = isinstance(shape, Round) and shape.tube == 0 and shape.radius != 0 and not isinstance(shape.radius, str)
         return level and thin and self.motion == "rolls" and self.spins
 
-    def arm(self, frame: Frame, normal: Any, params: Any) -> Any:
-        """From the origin of the body's frame to the point of contact (3,)."""
-        return frame.turn @ vector(self.centre, params) + self.shape.support(frame, normal, params)
-
     def gap(self, frame: Frame, params: Any) -> Any:
         """The height of its lowest point over the plane."""
         normal = unit(self.normal)
-        return normal @ (frame.at + self.arm(frame, normal, params) - np.asarray(self.ground, float))
+        low = frame.point(vector(self.centre, params)) + self.shape.support(frame, normal, params)
+        return normal @ (low - np.asarray(self.ground, float))
 
     def slip(self, frame: Frame, normal: Any, params: Any) -> Any:
         """The velocity (3,) of the material point that touches."""
-        return frame.velocity + cross(frame.spin, self.arm(frame, normal, params))
+        return frame.velocity_of(vector(self.centre, params)) + cross(frame.spin, self.shape.support(frame, normal, params))
 
     def tangents(self, normal: Any) -> tuple[Any, Any]:
         """Two directions (3,) along the ground."""

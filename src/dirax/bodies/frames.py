@@ -84,5 +84,53 @@ class Frame(NamedTuple):
         """The velocity of the point x of the frame."""
         return self.velocity + cross(self.spin, self.turn @ x)
 
+    def turning_energy(self, inertia: Any) -> Any:
+        """ω·I ω/2 for the inertia (3, 3) in the axes of the frame."""
+        spin = self.turn.T @ self.spin
+        return spin @ (inertia @ spin) / 2
+
+    def turning_momentum(self, inertia: Any) -> Any:
+        """R I Rᵀ ω (3,)."""
+        return self.turn @ (inertia @ (self.turn.T @ self.spin))
+
+
+class Ray(NamedTuple):
+    """Where a body is of which only the axis z is known: its direction (3,) with its rate, and the origin with its velocity.
+
+    It has points on the axis alone, and the moment of inertia about what is across it. To what hangs on it, it is a frame that
+    does not turn.
+    """
+
+    direction: Any
+    rate: Any
+    at: Any
+    velocity: Any
+
+    @property
+    def turn(self) -> np.ndarray:
+        """No rotation (3, 3)."""
+        return np.eye(3)
+
+    @property
+    def spin(self) -> np.ndarray:
+        """No angular velocity (3,)."""
+        return np.zeros(3)
+
+    def point(self, x: Any) -> Any:
+        """Where the point x (3,) of the axis is."""
+        return self.at + x[2] * self.direction
+
+    def velocity_of(self, x: Any) -> Any:
+        """The velocity of the point x (3,) of the axis."""
+        return self.velocity + x[2] * self.rate
+
+    def turning_energy(self, inertia: Any) -> Any:
+        """I |u̇|²/2."""
+        return inertia[0, 0] * (self.rate @ self.rate) / 2
+
+    def turning_momentum(self, inertia: Any) -> Any:
+        """I u × u̇ (3,)."""
+        return inertia[0, 0] * cross(self.direction, self.rate)
+
 
 GROUND = Frame(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))

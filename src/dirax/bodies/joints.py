@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.bodies.frames import Frame, Vector, across, unit, vector
-from dirax.bodies.motion import Glide, Motion, Quaternion, Shift, Slide, Turn, TurnBy
+from dirax.bodies.motion import Direct, Glide, Motion, Quaternion, Shift, Slide, Turn, TurnBy
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 ORIGIN = (0.0, 0.0, 0.0)
@@ -54,6 +54,11 @@ class Joint:
         before += [TurnBy(*self.turned)] if self.turned else []
         after = [Shift(_opposite(self.on))] if np.any(np.asarray(self.on) != 0) else []
         object.__setattr__(self, "order", (*before, *self.motions, *after))
+
+    @property
+    def is_axis(self) -> bool:
+        """Whether it gives its body a direction of the axis z and nothing else of a rotation."""
+        return not self.closes and any(isinstance(motion, Direct) for motion in self.motions)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -134,7 +139,9 @@ def universal(parent: str, body: str, axis: Vector = X, second: Vector = Y, name
 
 
 def ball(parent: str, body: str, rotation: str = "quaternion", name: str = "", **where: Any) -> Joint:
-    """A ball joint. `rotation`: "quaternion", or axes of Euler angles such as "zxz", each turned by the ones before it."""
+    """A ball joint. `rotation`: "quaternion"; axes of Euler angles such as "zxz", each turned by the ones before it; or "axis",
+    the direction, as seen from the ground, of the axis z of a rod or of another symmetric body that does not turn about it. To
+    what hangs on such a body, it is a frame that does not turn."""
     name = name or body
     return Joint(name, "ball", parent, body, rotations(rotation, name), **where)
 
@@ -192,11 +199,14 @@ def rolling_wheel(
 
 def rotations(rotation: str, name: str) -> tuple[Motion, ...]:
     """The motions of a rotation; raises `ValueError` for one that is not known."""
+    if rotation == "axis":
+        return (Direct(tuple(f"{name}.{part}" for part in ("ux", "uy", "uz"))),)
     if rotation == "quaternion":
         return (Quaternion(tuple(f"{name}.{part}" for part in ("qw", "qx", "qy", "qz"))),)
     if not isinstance(rotation, str) or len(rotation) != 3 or set(rotation) - set("xyz"):
         raise ValueError(
-            f'rotation must be "quaternion" or three axes of Euler angles such as "zxz" or "zxy", but {rotation!r} was given.'
+            'rotation must be "quaternion", "axis", or three axes of Euler angles such as "zxz" or "zxy", '
+            f"but {rotation!r} was given."
         )
     if rotation[0] == rotation[1] or rotation[1] == rotation[2]:
         raise ValueError(f"rotation {rotation!r} turns about the same axis twice running: no three angles of a rotation.")

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.bodies.assembly import Assembly, assembled, dependent
-from dirax.bodies.checks import GROUND, check_coordinates, check_masses, check_names, sorted_tree
+from dirax.bodies.checks import GROUND, check_axes, check_coordinates, check_masses, check_names, sorted_tree
 from dirax.bodies.contacts import Contact
 from dirax.bodies.drawing import scene_of
 from dirax.bodies.forces import Damper, Motor, Spring
 from dirax.bodies.frames import GROUND as GROUND_FRAME
-from dirax.bodies.frames import Frame, Vector, vector
+from dirax.bodies.frames import Frame, Ray, Vector, vector
 from dirax.bodies.joints import Joint
 from dirax.bodies.model_constraints import MachineConstraints
-from dirax.bodies.motion import Quaternion
+from dirax.bodies.motion import Direct, Quaternion
 from dirax.bodies.parts import Body
 from dirax.bodies.statement import discretization_map, in_coordinates, on_manifold
 from dirax.diagnostics.linearized_field import accelerations
@@ -56,6 +56,7 @@ class Model:
         check_masses(self)
         _ = self.tree
         check_coordinates(self)
+        check_axes(self)
         unknown = [name for name in self.dropped if name not in (*self.demands.all_holonomic, *self.demands.all_rows)]
         if unknown:
             raise ValueError(f"no constraint is called {unknown[0]!r}: there are {', '.join(self.constraints)}.")
@@ -91,8 +92,8 @@ class Model:
 
     # ------------------------------------------------------------------ motion
 
-    def frames(self, q: Any, v: Any, params: Any = None) -> dict[str, Frame]:
-        """The frame of every body, and of "ground", at coordinates q (n,) and velocities v (n,)."""
+    def frames(self, q: Any, v: Any, params: Any = None) -> dict[str, Frame | Ray]:
+        """The frame of every body, and of "ground", at coordinates q (n,) and velocities v (n,); of a body by its axis a ray."""
         params = self.params if params is None else params
         found = {GROUND: GROUND_FRAME}
         for joint in self.tree:
@@ -105,16 +106,16 @@ class Model:
         return {name: values[k] for k, name in enumerate(self.coordinates)}
 
     @cached_property
-    def quaternions(self) -> list[tuple[Joint, slice]]:
-        """The joints with a quaternion, and where it is, in the order of the coordinates."""
+    def unit_vectors(self) -> list[tuple[Joint, Quaternion | Direct, slice]]:
+        """The joints with a quaternion or an axis, this motion, and where it is, in the order of the coordinates."""
         found = []
         for joint in self.tree:
             start = self.places[joint.name].start
             for motion in joint.motions:
-                if isinstance(motion, Quaternion):
-                    found.append((joint, slice(start, start + 4)))
+                if isinstance(motion, Quaternion | Direct):
+                    found.append((joint, motion, slice(start, start + len(motion.names))))
                 start += len(motion.names)
-        return sorted(found, key=lambda place: place[1].start)
+        return sorted(found, key=lambda place: place[2].start)
 
     def _gyration(self, joint: Joint) -> float:
         """A moment of inertia for the rate of |Q|, which is zero: any positive number makes the Lagrangian regular."""
@@ -129,8 +130,9 @@ class Model:
         params = self.params if params is None else params
         frames = self.frames(q, v, params)
         total = sum(body.kinetic_energy(frames[body.name], params) for body in self.bodies)
-        for joint, place in self.quaternions:
-            total += 2 * self._gyration(joint) * ((q[place] @ v[place]) / (q[place] @ q[place])) ** 2
+        for joint, motion, place in self.unit_vectors:
+            if isinstance(motion, Quaternion):
+                total += 2 * self._gyration(joint) * ((q[place] @ v[place]) / (q[place] @ q[place])) ** 2
         return total
 
     def potential_energy(self, q: Any, params: Any = None) -> Any:
@@ -195,8 +197,8 @@ class Model:
 
     @cached_property
     def manifold_system(self) -> ManifoldLagrangian:
-        """The same machine in the same coordinates, with its quaternions as points of SO(3), which a discretization map leaves
-        there: no constraint |Q| = 1 and no multiplier for it.
+        """The same machine in the same coordinates, with its quaternions as points of SO(3) and its axes as points of S², which a
+        discretization map leaves there: no constraint |Q| = 1 or |u| = 1, and no multiplier for it.
 
             scheme = dx.DiscreteDirac(model.discretization_map, constraints="resolve")
             dx.simulate(model.manifold_system, scheme, **model.state(…), step=0.01, steps=1000)
@@ -207,8 +209,8 @@ class Model:
 
     @cached_property
     def discretization_map(self) -> ProductMap:
-        """The map for `manifold_system`: midpoints of lengths and angles, and of rotations the middle of the one-parameter
-        subgroup between them."""
+        """The map for `manifold_system`: midpoints of lengths and angles, of rotations the middle of the one-parameter subgroup
+        between them, of axes the middle of the arc."""
         return discretization_map(self)
 
     # ------------------------------------------------------------------ initial data
@@ -221,9 +223,9 @@ class Model:
     def state(self, q: Any = None, v: Any = None, params: Any = None) -> dict[str, np.ndarray]:
         """Initial data {"q", "v"} of a run: the machine assembled.
 
-        `q` and `v` are numbers by coordinate, which stay as they are while the others are found (from 0, and quaternions from
-        1, as near as can be); or arrays (n,), which are moved onto the constraints. Raises `ValueError` where the machine cannot
-        be assembled, with the residual of every joint and contact that is not met.
+        `q` and `v` are numbers by coordinate, which stay as they are while the others are found (from 0, quaternions from
+        1 and axes from z, as near as can be); or arrays (n,), which are moved onto the constraints. Raises `ValueError` where the
+        machine cannot be assembled, with the residual of every joint and contact that is not met.
         """
         return assembled(self, q, v, self.params if params is None else params)
 

@@ -18,12 +18,10 @@ from dirax.program.user_functions import evaluated
 VANISHES = 1e-11
 """Size of a constraint at points chosen at random below which it is met by the joints alone."""
 
-NORM = "|Q| = 1"
-
 
 @dataclass(frozen=True, eq=False)
 class MachineConstraints:
-    """Norms of quaternions, joints that close loops, contacts that touch: holonomic; rolling and skating: one-forms."""
+    """Norms of quaternions and axes, joints that close loops, contacts that touch: holonomic; rolling and skating: one-forms."""
 
     model: Any
 
@@ -32,7 +30,7 @@ class MachineConstraints:
         """The names of all holonomic constraints that the model states."""
         joints = [f"{joint.name}: {condition}" for joint in self.model.joints for condition in joint.conditions]
         return (
-            *(f"{joint.name}: {NORM}" for joint, _ in self.model.quaternions),
+            *(f"{joint.name}: {motion.norm}" for joint, motion, _ in self.model.unit_vectors),
             *joints,
             *(f"{contact.name}: touches" for contact in self.model.contacts),
         )
@@ -46,7 +44,7 @@ class MachineConstraints:
         """The holonomic constraints of these numbers, or all of them."""
         model = self.model
         frames = model.frames(q, jnp.zeros_like(q), params)
-        found = [norm_defect(q[place]) for _, place in model.quaternions]
+        found = [norm_defect(q[place]) for *_, place in model.unit_vectors]
         for joint in model.joints:
             if joint.closes:
                 found += joint.defect(frames[joint.parent], frames[joint.body], params)
@@ -98,7 +96,7 @@ class MachineConstraints:
     @cached_property
     def off_manifold(self) -> list[int]:
         """Of the kept holonomic constraints those that the manifold of the rotations does not meet."""
-        return [k for k in self.kept[0] if k >= len(self.model.quaternions)]
+        return [k for k in self.kept[0] if k >= len(self.model.unit_vectors)]
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -6,7 +6,9 @@ from typing import Any, ClassVar, TypeAlias
 
 import jax.numpy as jnp
 
-from dirax.bodies.frames import Frame, Vector, cross, quaternion_matrix, quaternion_spin, turn_matrix, unit, vector
+from dirax.bodies.frames import Frame, Ray, Vector, cross, quaternion_matrix, quaternion_spin, turn_matrix, unit, vector
+from dirax.geometry.lie_groups import SO3
+from dirax.geometry.maps import AbstractDiscretizationMap, LieGroupExp, SphereProjection
 from dirax.program.tracing import along, gradient
 
 
@@ -72,12 +74,37 @@ class Quaternion:
     """By a unit quaternion (w, x, y, z), whose four numbers are coordinates, with |Q| = 1 as a holonomic constraint."""
 
     measures: ClassVar[str] = ""
+    norm: ClassVar[str] = "|Q| = 1"
+    rest: ClassVar[tuple[float, ...]] = (1.0, 0.0, 0.0, 0.0)
     names: tuple[str, ...]
+
+    def discretization_map(self) -> AbstractDiscretizationMap:
+        """The middle of the one-parameter subgroup between two rotations."""
+        return LieGroupExp(SO3())
 
     def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
         """The frame moved, for the coordinates q and their rates v."""
         spin = frame.spin + frame.turn @ quaternion_spin(q, v)
         return frame._replace(turn=frame.turn @ quaternion_matrix(q), spin=spin)
+
+
+@dataclass(frozen=True)
+class Direct:
+    """Of an axis z to a direction, a unit vector as seen from the ground, whose three numbers are coordinates, with |u| = 1 as a
+    holonomic constraint. Nothing is said of turns about the axis."""
+
+    measures: ClassVar[str] = ""
+    norm: ClassVar[str] = "|u| = 1"
+    rest: ClassVar[tuple[float, ...]] = (0.0, 0.0, 1.0)
+    names: tuple[str, ...]
+
+    def discretization_map(self) -> AbstractDiscretizationMap:
+        """The middle of the arc between two directions."""
+        return SphereProjection()
+
+    def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Ray:
+        """The axis at the frame's origin, for the coordinates q and their rates v."""
+        return Ray(q, v, frame.at, frame.velocity)
 
 
 @dataclass(frozen=True)
@@ -123,4 +150,4 @@ class Glide:
         return moved._replace(turn=frame.turn @ axes.T, spin=frame.spin + frame.turn @ spin)
 
 
-Motion: TypeAlias = Shift | TurnBy | Slide | Turn | Quaternion | Glide
+Motion: TypeAlias = Shift | TurnBy | Slide | Turn | Quaternion | Direct | Glide

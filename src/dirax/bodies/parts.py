@@ -36,8 +36,8 @@ class Body:
 
     def kinetic_energy(self, frame: Frame, params: Any) -> Any:
         """m |ċ|²/2 + ω·I ω/2."""
-        u, spin = frame.velocity_of(vector(self.centre, params)), frame.turn.T @ frame.spin
-        return scalar(self.mass, params) * (u @ u) / 2 + spin @ (self.inertia_matrix(params) @ spin) / 2
+        u = frame.velocity_of(vector(self.centre, params))
+        return scalar(self.mass, params) * (u @ u) / 2 + frame.turning_energy(self.inertia_matrix(params))
 
     def momentum(self, frame: Frame, params: Any) -> Any:
         """m ċ (3,)."""
@@ -46,8 +46,7 @@ class Body:
     def angular_momentum(self, frame: Frame, about: Any, params: Any) -> Any:
         """(c − about) × m ċ + R I Rᵀ ω (3,)."""
         arm = frame.point(vector(self.centre, params)) - about
-        own = frame.turn @ (self.inertia_matrix(params) @ (frame.turn.T @ frame.spin))
-        return jnp.cross(arm, self.momentum(frame, params)) + own
+        return jnp.cross(arm, self.momentum(frame, params)) + frame.turning_momentum(self.inertia_matrix(params))
 
 
 def rod(name: str, end: Vector, mass: Number = 1.0) -> Body:

@@ -1,4 +1,4 @@
-"""A machine stated as a mechanical system: in coordinates, with quaternions of length 1, or on the manifold of its rotations."""
+"""A machine stated as a mechanical system: in coordinates, with quaternions and axes of length 1, or on their manifold."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,15 +6,14 @@ from typing import Any
 import jax.numpy as jnp
 
 from dirax.bodies.forces import Spring
-from dirax.geometry.lie_groups import SO3
-from dirax.geometry.maps import LieGroupExp, Midpoint, ProductMap
+from dirax.geometry.maps import Midpoint, ProductMap
 from dirax.program.tracing import gradient
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 
 
 def in_coordinates(model: Any) -> LagrangeDirac:
-    """A Lagrangian of all coordinates; |Q| = 1 is among the holonomic constraints."""
+    """A Lagrangian of all coordinates; |Q| = 1 and |u| = 1 are among the holonomic constraints."""
     holonomic, rows = model.demands.kept
     return LagrangeDirac(
         _stated(model, lambda q, v, params: model.kinetic_energy(q, v, params) - model.potential_energy(q, params), 2),
@@ -24,7 +23,7 @@ def in_coordinates(model: Any) -> LagrangeDirac:
 
 
 def on_manifold(model: Any) -> ManifoldLagrangian:
-    """A Lagrangian on R^k × SO(3) × …, without the constraints |Q| = 1."""
+    """A Lagrangian on R^k × SO(3) × S² × …, without the constraints |Q| = 1 and |u| = 1."""
     if any(contact.rubs for contact in model.contacts):
         raise ValueError("Coulomb friction needs the normal force, which systems on a manifold do not see: take model.system.")
     return ManifoldLagrangian(
@@ -36,11 +35,11 @@ def on_manifold(model: Any) -> ManifoldLagrangian:
 
 
 def discretization_map(model: Any) -> ProductMap:
-    """Midpoints of lengths and angles, and of rotations the middle of the one-parameter subgroup between them."""
+    """Midpoints of lengths and angles, and of rotations and axes what their motions say."""
     blocks, start = [], 0
-    for _, place in model.quaternions:
+    for _, motion, place in model.unit_vectors:
         blocks += [(Midpoint(), place.start - start)] if place.start > start else []
-        blocks.append((LieGroupExp(SO3()), 4))
+        blocks.append((motion.discretization_map(), place.stop - place.start))
         start = place.stop
     rest = len(model.coordinates) - start
     return ProductMap(*blocks, *([(Midpoint(), rest)] if rest else []))

@@ -4,8 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from dirax.bodies.frames import unit
-
 MOTIONS = {"revolute": "hinge", "prismatic": "slide"}
 
 
@@ -37,9 +35,12 @@ def closing_points(model: Any) -> list[tuple[tuple[str, np.ndarray], tuple[str, 
     starts, found = joint_frames(model), []
     for joint in model.joints:
         if joint.closes:
-            axes = joint.axis if joint.axis_on is None else joint.axis_on, joint.axis
-            ends = ((joint.body, joint.on, axes[0]), (joint.parent, joint.at, axes[1]))
+            own = joint.axis if joint.axis_on is None else joint.axis_on
+            ends = ((joint.body, joint.on, own), (joint.parent, joint.at, joint.axis))
             for along in (0.0, 1.0):
-                first, second = ((name, np.asarray(at, float) + starts[name] + along * unit(axis)) for name, at, axis in ends)
+                out = [along * np.asarray(axis, float) / np.linalg.norm(axis) for *_, axis in ends]
+                first, second = (
+                    (name, np.asarray(at, float) + starts[name] + x) for (name, at, _), x in zip(ends, out, strict=True)
+                )
                 found.append((first, second))
     return found

@@ -15,7 +15,7 @@ def is_stated(model: Any) -> bool:
     """Whether the machine is one of hinges, slides, balls and thin wheels on level ground, which is what is written here."""
     if model is None or model.forces or model.parameters or model.dropped or any(body.mass == 0 for body in model.bodies):
         return False
-    joints = all(joint.kind in KINDS and joint.turned is None for joint in model.joints)
+    joints = all(joint.kind in KINDS and joint.turned is None and not joint.is_axis for joint in model.joints)
     return joints and all(contact.is_thin_wheel for contact in model.contacts)
 
 
