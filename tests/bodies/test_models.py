@@ -133,12 +133,46 @@ def test_mistakes_get_one_error_each(bodies, joints, message):
         b.Model(bodies, joints)
 
 
+def of_one(body=None, joint=None, **more):
+    return b.Model([body or rods("a")[0]], [joint or b.revolute("ground", "a")], **more)
+
+
+WHEEL = b.rolling_wheel("ground", "a", 0.5)
+BALL = b.gliding("ground", "a", lambda x, y: 0.1 * x * x, 0.5)
+
+
+@pytest.mark.parametrize(
+    "model, message",
+    [
+        (lambda: of_one(joint=b.revolute("ground", "a", (0, 0, 0))), "an axis of joint 'a' must be a direction"),
+        (lambda: of_one(joint=b.revolute("ground", "a", at=(0, 1))), "at= of joint 'a' must be three numbers, but it is"),
+        (lambda: of_one(gravity=(0, -9.81)), "gravity must be three numbers"),
+        (lambda: of_one(b.Body("a", "m")), "mass of body 'a' is 'm', which is no parameter of the model: there are none"),
+        (lambda: of_one(b.Body("a", np.nan)), "mass of body 'a' must be finite"),
+        (lambda: of_one(b.Body("a", 1.0, 0.1)), "three principal moments or a matrix"),
+        (lambda: of_one(b.Body("a")), "joint 'a' moves nothing that has a mass"),
+        (lambda: of_one(forces=[b.Spring(1.0)]), "'spring' acts nowhere"),
+        (lambda: of_one(forces=[b.Motor("a", lambda t: t)]), r"push of 'motor' must be a function of \(t, q, v\)"),
+        (lambda: of_one(contacts=[b.tip("a", motion="roll")]), "must be one of rolls, skates, slides, but it is 'roll'"),
+        (lambda: of_one(contacts=[b.ball_contact("a", -1.0)]), "negative radius"),
+        (lambda: of_one(joint=WHEEL, contacts=[b.wheel("a", 0.4)]), "not the wheel of radius 0.5 and tube 0"),
+        (lambda: of_one(joint=BALL, contacts=[b.ball_contact("a", 0.4)]), "not the ball of radius 0.5"),
+        (lambda: b.Model({"a": 1}, []), "bodies must be a list of Body"),
+    ],
+)
+def test_numbers_that_mean_nothing_get_one_error_each(model, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        model()
+
+
 def test_mistakes_in_data_name_the_coordinates():
     model = b.Model(rods("a"), [b.ball("ground", "a")])
     with pytest.raises(ValueError, match=r"q has 'angle', but the coordinates are a\.qw"):
         model.state({"angle": 1.0})
     with pytest.raises(ValueError, match=r"shape \(4,\)"):
         model.state(np.zeros(3))
+    with pytest.raises(ValueError, match=r"q of 'a\.qw' must be a finite number, but it is nan"):
+        model.state({"a.qw": np.nan})
     with pytest.raises(ValueError, match="no velocity has the given ones"):
         model.state({"a.qw": 1.0}, {"a.qw": 1.0})
     with pytest.raises(ValueError, match="rotation must be"):

@@ -91,6 +91,8 @@ def _given(model: Any, values: Any, name: str, start: np.ndarray) -> tuple[np.nd
     for key, value in values.items():
         if key not in model.coordinates:
             raise ValueError(f"{name} has {key!r}, but the coordinates are {', '.join(model.coordinates)}.")
+        if isinstance(value, str) or np.ndim(value) != 0 or not np.isfinite(value):
+            raise ValueError(f"{name} of {key!r} must be a finite number, but it is {value!r}.")
         k = model.coordinates.index(key)
         start[k], fixed[k] = float(value), True
     return start, fixed

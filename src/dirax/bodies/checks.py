@@ -79,21 +79,23 @@ def check_coordinates(model: Any) -> None:
     if not names:
         raise ValueError("the model has no coordinates: nothing can move. Give a body a joint that is not fixed.")
     for force in model.forces:
+        if getattr(force, "between", None) is None and not force.coordinate:
+            raise ValueError(f"{force.name!r} acts nowhere: give it between=((body, point), (body, point)) or coordinate=.")
         if getattr(force, "between", None) is None and force.coordinate not in names:
             raise ValueError(f"{force.name!r} is at coordinate {force.coordinate!r}, but the coordinates are {', '.join(names)}.")
 
 
 def check_masses(model: Any) -> None:
-    """Raise `ValueError` for masses and moments of inertia that no body has."""
+    """Raise `ValueError` for masses and moments of inertia that no body has, and for joints of a tree that move no mass."""
     for body in model.bodies:
         if isinstance(body.mass, str) or any(isinstance(x, str) for x in np.ravel(np.asarray(body.inertia, dtype=object))):
             continue
-        mass, inertia = float(body.mass), np.asarray(body.inertia_matrix(None), float)
-        if inertia.shape != (3, 3) or np.shape(body.inertia) not in ((3,), (3, 3)):
+        if np.shape(body.inertia) not in ((3,), (3, 3)):
             raise ValueError(
                 f"the inertia of body {body.name!r} must be three principal moments or a matrix (3, 3), but its shape is "
                 f"{np.shape(body.inertia)}."
             )
+        mass, inertia = float(body.mass), np.asarray(body.inertia_matrix(None), float)
         if np.any(inertia != inertia.T):
             raise ValueError(f"the inertia of body {body.name!r} must be a symmetric matrix, but it is not.")
         moments = np.linalg.eigvalsh(inertia)
@@ -104,6 +106,14 @@ def check_masses(model: Any) -> None:
             raise ValueError(
                 f"body {body.name!r} has no mass, but moments of inertia {moments}: a body without mass has none. Give it a "
                 "mass, or leave out its inertia."
+            )
+    weighs = {body.name for body in model.bodies if body.mass != 0}
+    for joint in reversed(model.tree):
+        weighs |= {joint.parent} if joint.body in weighs else set()
+        if joint.coordinates and joint.body not in weighs and not any(other.closes for other in model.joints):
+            raise ValueError(
+                f"joint {joint.name!r} moves nothing that has a mass: give one to body {joint.body!r} or to what hangs "
+                "on it, or make the joint fixed()."
             )
 
 

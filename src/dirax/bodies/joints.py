@@ -31,7 +31,8 @@ class Joint:
 
     The body's frame is moved by `motions`, in their order, from the point `at` of the parent's frame; the point `on` of the
     body's frame is then at that point. A joint that `closes` a loop has no coordinates: it demands of the two bodies what is
-    named in `conditions`.
+    named in `conditions`. Its `axis` is seen from the parent, and `axis_on` is the same axis seen from the body, by default the
+    same numbers.
     """
 
     name: str

@@ -18,6 +18,7 @@ from dirax.bodies.frames import Frame, Ray, Vector, vector
 from dirax.bodies.joints import Joint
 from dirax.bodies.model_constraints import MachineConstraints
 from dirax.bodies.motion import Direct, Quaternion
+from dirax.bodies.number_checks import check_kinds, check_numbers
 from dirax.bodies.parts import Body
 from dirax.bodies.statement import discretization_map, in_coordinates, on_manifold
 from dirax.diagnostics.linearized_field import accelerations
@@ -52,10 +53,12 @@ class Model:
     dropped: Sequence[str] = ()
 
     def __post_init__(self):
+        check_kinds(self)
         check_names(self)
         check_masses(self)
         _ = self.tree
         check_coordinates(self)
+        check_numbers(self)
         check_axes(self)
         unknown = [name for name in self.dropped if name not in (*self.demands.all_holonomic, *self.demands.all_rows)]
         if unknown:

@@ -1,0 +1,127 @@
+"""What is wrong with the numbers of a model: vectors that are none, axes without a direction, parameters that there are not."""
+
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from dirax.bodies.contacts import Contact, Ellipsoid, Round
+from dirax.bodies.forces import Damper, Motor, Spring
+from dirax.bodies.joints import Joint
+from dirax.bodies.motion import Glide, Shift, Slide, Turn
+from dirax.bodies.parts import Body
+
+MOTIONS = ("rolls", "skates", "slides")
+
+
+def check_kinds(model: Any) -> None:
+    """Raise `TypeError` for parts that are no bodies, joints, contacts and forces."""
+    for name, kind in (("bodies", Body), ("joints", Joint), ("contacts", Contact), ("forces", Spring | Damper | Motor)):
+        parts = getattr(model, name)
+        wrong = [part for part in parts if not isinstance(part, kind)] if isinstance(parts, list | tuple) else [parts]
+        if wrong:
+            called = "Spring, Damper and Motor" if name == "forces" else kind.__name__
+            raise TypeError(f"{name} must be a list of {called}, but {wrong[0]!r} came.")
+
+
+def check_numbers(model: Any) -> None:
+    """Raise `ValueError` for numbers that mean nothing, and for names of parameters that the model has not."""
+    for what, values in _vectors(model):
+        if np.shape(values) != (3,):
+            raise ValueError(f"{what} must be three numbers, but it is {values!r}.")
+        _check_all(model, what, values)
+    for what, value in _scalars(model):
+        if np.ndim(value) != 0:
+            raise ValueError(f"{what} must be a number or the name of a parameter, but it is {value!r}.")
+        _check_all(model, what, [value])
+    for what, axis in _axes(model):
+        if np.shape(axis) != (3,) or any(isinstance(x, str) for x in axis) or not np.linalg.norm(np.asarray(axis, float)) > 0:
+            raise ValueError(f"{what} must be a direction, three numbers that are not all zero, but it is {axis!r}.")
+    for contact in model.contacts:
+        if contact.motion not in MOTIONS:
+            raise ValueError(
+                f"motion of contact {contact.name!r} must be one of {', '.join(MOTIONS)}, but it is {contact.motion!r}."
+            )
+        sizes = contact.shape.semi_axes if isinstance(contact.shape, Ellipsoid) else (contact.shape.radius, contact.shape.tube)
+        if any(not isinstance(x, str) and x < 0 for x in sizes):
+            raise ValueError(f"contact {contact.name!r} has a negative radius among {sizes}.")
+        _check_its_joint(model, contact)
+    for force in model.forces:
+        if isinstance(force, Motor) and callable(force.push) and len(inspect.signature(force.push).parameters) not in (3, 4):
+            raise ValueError(f"the push of {force.name!r} must be a function of (t, q, v) or of (t, q, v, params).")
+
+
+def _check_all(model: Any, what: str, values: Any) -> None:
+    for value in values:
+        if isinstance(value, str):
+            if value not in model.parameters:
+                known = ", ".join(model.parameters) or "none"
+                raise ValueError(f"{what} is {value!r}, which is no parameter of the model: there are {known}.")
+        elif not np.isfinite(float(value)):
+            raise ValueError(f"{what} must be finite, but it is {value!r}.")
+
+
+def _vectors(model: Any) -> Iterator[tuple[str, Any]]:
+    yield "gravity", model.gravity
+    for body in model.bodies:
+        yield f"the mass centre of body {body.name!r}", body.centre
+        if np.shape(body.inertia) == (3,):
+            yield f"the inertia of body {body.name!r}", body.inertia
+    for joint in model.joints:
+        yield f"at= of joint {joint.name!r}", joint.at
+        yield f"on= of joint {joint.name!r}", joint.on
+    for contact in model.contacts:
+        yield f"the centre of contact {contact.name!r}", contact.centre
+        yield f"the ground of contact {contact.name!r}", contact.ground
+    for force in model.forces:
+        for name, at in getattr(force, "between", None) or ():
+            yield f"the end of {force.name!r} at {name!r}", at
+
+
+def _axes(model: Any) -> Iterator[tuple[str, Any]]:
+    for joint in model.joints:
+        for motion in joint.motions:
+            if isinstance(motion, Slide | Turn):
+                yield f"an axis of joint {joint.name!r}", motion.axis
+    for contact in model.contacts:
+        yield f"normal= of contact {contact.name!r}", contact.normal
+        yield f"along= of contact {contact.name!r}", contact.along
+        if isinstance(contact.shape, Round):
+            yield f"the axis of contact {contact.name!r}", contact.shape.axis
+
+
+def _scalars(model: Any) -> Iterator[tuple[str, Any]]:
+    for body in model.bodies:
+        yield f"the mass of body {body.name!r}", body.mass
+    for contact in model.contacts:
+        yield f"the drag of contact {contact.name!r}", contact.drag
+        yield f"the friction of contact {contact.name!r}", contact.friction
+    for force in model.forces:
+        names = {Spring: ("stiffness", "length"), Damper: ("rate",), Motor: ("push",)}[type(force)]
+        for name in names:
+            if not callable(getattr(force, name)):
+                yield f"the {name} of {force.name!r}", getattr(force, name)
+
+
+def _check_its_joint(model: Any, contact: Contact) -> None:
+    """A contact on a body that its joint keeps on the ground touches where the joint says."""
+    joint = next(joint for joint in model.tree if joint.body == contact.body)
+    value, shape = (lambda x: model.parameters[x] if isinstance(x, str) else x), contact.shape
+    at_origin = not any(value(x) != 0 for x in contact.centre)
+    if joint.kind == "gliding":
+        (distance,) = (motion.distance for motion in joint.motions if isinstance(motion, Glide))
+        same = isinstance(shape, Round) and (value(shape.radius), value(shape.tube)) == (0, distance)
+        expected = f"ball of radius {distance} around"
+    elif joint.kind == "rolling wheel":
+        tube, radius = (motion.by[2] for motion in joint.motions if isinstance(motion, Shift))
+        across = isinstance(shape, Round) and shape.axis[0] == shape.axis[2] == 0
+        same = across and (value(shape.radius), value(shape.tube)) == (radius, tube)
+        expected = f"wheel of radius {radius} and tube {tube} about the axis y in"
+    else:
+        return
+    if not (same and at_origin):
+        raise ValueError(
+            f"contact {contact.name!r} is not the {expected} the origin of its body, which joint {joint.name!r} keeps on the "
+            "ground: give both the same numbers, or let the body hang on the ground by free()."
+        )
