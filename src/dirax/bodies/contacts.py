@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.bodies.frames import Frame, Number, Vector, across, cross, scalar, unit, vector
+from dirax.bodies.frames import AnyFrame, Number, Vector, across, cross, scalar, unit, vector
 
 ORIGIN = (0.0, 0.0, 0.0)
 TINY_SPEED = 1e-3
@@ -25,7 +25,7 @@ class Round:
     tube: Number
     axis: Vector
 
-    def support(self, frame: Frame, normal: Any, params: Any) -> Any:
+    def support(self, frame: AnyFrame, normal: Any, params: Any) -> Any:
         """From the middle to the lowest point (3,), as seen from the ground."""
         low = -scalar(self.tube, params) * normal
         if isinstance(self.radius, float | int) and self.radius == 0:
@@ -41,7 +41,7 @@ class Ellipsoid:
 
     semi_axes: Vector
 
-    def support(self, frame: Frame, normal: Any, params: Any) -> Any:
+    def support(self, frame: AnyFrame, normal: Any, params: Any) -> Any:
         """From the middle to the lowest point (3,), as seen from the ground."""
         scaled = vector(self.semi_axes, params) * (frame.turn.T @ normal)
         return -(frame.turn @ (vector(self.semi_axes, params) * scaled)) / jnp.sqrt(scaled @ scaled)
@@ -85,13 +85,13 @@ class Contact:
         thin = isinstance(shape, Round) and shape.tube == 0 and shape.radius != 0 and not isinstance(shape.radius, str)
         return level and thin and self.motion == "rolls" and self.spins
 
-    def gap(self, frame: Frame, params: Any) -> Any:
+    def gap(self, frame: AnyFrame, params: Any) -> Any:
         """The height of its lowest point over the plane."""
         normal = unit(self.normal)
         low = frame.point(vector(self.centre, params)) + self.shape.support(frame, normal, params)
         return normal @ (low - np.asarray(self.ground, float))
 
-    def slip(self, frame: Frame, normal: Any, params: Any) -> Any:
+    def slip(self, frame: AnyFrame, normal: Any, params: Any) -> Any:
         """The velocity (3,) of the material point that touches."""
         return frame.velocity_of(vector(self.centre, params)) + cross(frame.spin, self.shape.support(frame, normal, params))
 
@@ -101,7 +101,7 @@ class Contact:
             return across(normal)
         return cross(np.array([0.0, 1.0, 0.0]), normal), cross(normal, np.array([1.0, 0.0, 0.0]))
 
-    def rates(self, frame: Frame, normal: Any, params: Any) -> list[Any]:
+    def rates(self, frame: AnyFrame, normal: Any, params: Any) -> list[Any]:
         """What is zero where it rolls, skates or does not spin: linear in the velocities."""
         slip, found = self.slip(frame, normal, params), []
         if self.motion == "rolls":
@@ -110,7 +110,7 @@ class Contact:
             found.append(cross(normal, frame.turn @ unit(self.along)) @ slip)
         return found if self.spins else [*found, normal @ frame.spin]
 
-    def force(self, frame: Frame, normal: Any, pressure: Any, params: Any) -> Any:
+    def force(self, frame: AnyFrame, normal: Any, pressure: Any, params: Any) -> Any:
         """The force (3,) of drag and friction on what slides, under the normal force `pressure`."""
         slip = self.slip(frame, normal, params)
         slip = slip - (normal @ slip) * normal

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 
-from dirax.bodies.frames import Frame, Number, Vector, scalar, vector
+from dirax.bodies.frames import AnyFrame, Number, Vector, scalar, vector
 
 Points: TypeAlias = tuple[tuple[str, Vector], tuple[str, Vector]]
 """Two points, each of a body (or of "ground") in its frame."""
@@ -23,7 +23,7 @@ class Spring:
     length: Number = 0.0
     name: str = "spring"
 
-    def energy(self, frames: Mapping[str, Frame], q: Mapping[str, Any], params: Any) -> Any:
+    def energy(self, frames: Mapping[str, AnyFrame], q: Mapping[str, Any], params: Any) -> Any:
         """The potential energy."""
         if self.between is None:
             extended = q[self.coordinate]
@@ -73,12 +73,12 @@ class Motor:
         return push(t, q, v, *more) * w[self.coordinate]
 
 
-def apart_of(between: Points, frames: Mapping[str, Frame], params: Any) -> Any:
+def apart_of(between: Points, frames: Mapping[str, AnyFrame], params: Any) -> Any:
     """From the first point to the second one (3,)."""
     (first, a), (second, b) = between
     return frames[second].point(vector(b, params)) - frames[first].point(vector(a, params))
 
 
-def velocity_of(point: tuple[str, Vector], frames: Mapping[str, Frame], params: Any) -> Any:
+def velocity_of(point: tuple[str, Vector], frames: Mapping[str, AnyFrame], params: Any) -> Any:
     """The velocity of a point of a body (3,)."""
     return frames[point[0]].velocity_of(vector(point[1], params))

@@ -133,4 +133,6 @@ class Ray(NamedTuple):
         return inertia[0, 0] * cross(self.direction, self.rate)
 
 
+AnyFrame: TypeAlias = Frame | Ray
+
 GROUND = Frame(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))

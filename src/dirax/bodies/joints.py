@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.bodies.frames import Frame, Vector, across, unit, vector
+from dirax.bodies.frames import AnyFrame, Vector, across, unit, vector
 from dirax.bodies.motion import Direct, Glide, Motion, Quaternion, Shift, Slide, Turn, TurnBy
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
@@ -71,7 +71,7 @@ class Joint:
         """The names of the constraints of a joint that closes a loop."""
         return CONDITIONS[self.kind] if self.closes else ()
 
-    def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
+    def move(self, frame: Any, q: Any, v: Any, params: Any) -> AnyFrame:
         """The body's frame from its parent's, for the joint's coordinates and their rates."""
         start = 0
         for motion in self.order:
@@ -79,7 +79,7 @@ class Joint:
             frame, start = motion.move(frame, q[start:end], v[start:end], params), end
         return frame
 
-    def defect(self, parent: Frame, body: Frame, params: Any) -> list[Any]:
+    def defect(self, parent: AnyFrame, body: AnyFrame, params: Any) -> list[Any]:
         """By how much the conditions are violated, in their order, seen from the parent: lengths and sines of angles."""
         turned = turn_of(self.turned)
         apart = parent.turn.T @ (body.point(vector(self.on, params)) - parent.point(vector(self.at, params)))

@@ -14,7 +14,7 @@ from dirax.bodies.contacts import Contact
 from dirax.bodies.drawing import scene_of
 from dirax.bodies.forces import Damper, Motor, Spring
 from dirax.bodies.frames import GROUND as GROUND_FRAME
-from dirax.bodies.frames import Frame, Ray, Vector, vector
+from dirax.bodies.frames import AnyFrame, Vector, vector
 from dirax.bodies.joints import Joint
 from dirax.bodies.model_constraints import MachineConstraints
 from dirax.bodies.motion import Direct, Quaternion
@@ -95,10 +95,10 @@ class Model:
 
     # ------------------------------------------------------------------ motion
 
-    def frames(self, q: Any, v: Any, params: Any = None) -> dict[str, Frame | Ray]:
+    def frames(self, q: Any, v: Any, params: Any = None) -> dict[str, AnyFrame]:
         """The frame of every body, and of "ground", at coordinates q (n,) and velocities v (n,); of a body by its axis a ray."""
         params = self.params if params is None else params
-        found = {GROUND: GROUND_FRAME}
+        found: dict[str, AnyFrame] = {GROUND: GROUND_FRAME}
         for joint in self.tree:
             place = self.places[joint.name]
             found[joint.body] = joint.move(found[joint.parent], q[place], v[place], params)

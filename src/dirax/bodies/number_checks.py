@@ -12,16 +12,17 @@ from dirax.bodies.joints import Joint
 from dirax.bodies.motion import Glide, Shift, Slide, Turn
 from dirax.bodies.parts import Body
 
+KINDS = {"bodies": (Body,), "joints": (Joint,), "contacts": (Contact,), "forces": (Spring, Damper, Motor)}
 MOTIONS = ("rolls", "skates", "slides")
 
 
 def check_kinds(model: Any) -> None:
     """Raise `TypeError` for parts that are no bodies, joints, contacts and forces."""
-    for name, kind in (("bodies", Body), ("joints", Joint), ("contacts", Contact), ("forces", Spring | Damper | Motor)):
+    for name, kinds in KINDS.items():
         parts = getattr(model, name)
-        wrong = [part for part in parts if not isinstance(part, kind)] if isinstance(parts, list | tuple) else [parts]
+        wrong = [part for part in parts if not isinstance(part, kinds)] if isinstance(parts, list | tuple) else [parts]
         if wrong:
-            called = "Spring, Damper and Motor" if name == "forces" else kind.__name__
+            called = ", ".join(kind.__name__ for kind in kinds)
             raise TypeError(f"{name} must be a list of {called}, but {wrong[0]!r} came.")
 
 
@@ -115,8 +116,11 @@ def _check_its_joint(model: Any, contact: Contact) -> None:
         expected = f"ball of radius {distance} around"
     elif joint.kind == "rolling wheel":
         tube, radius = (motion.by[2] for motion in joint.motions if isinstance(motion, Shift))
-        across = isinstance(shape, Round) and shape.axis[0] == shape.axis[2] == 0
-        same = across and (value(shape.radius), value(shape.tube)) == (radius, tube)
+        same = (
+            isinstance(shape, Round)
+            and shape.axis[0] == shape.axis[2] == 0
+            and (value(shape.radius), value(shape.tube)) == (radius, tube)
+        )
         expected = f"wheel of radius {radius} and tube {tube} about the axis y in"
     else:
         return

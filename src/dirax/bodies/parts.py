@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.bodies.frames import Frame, Number, Vector, scalar, vector
+from dirax.bodies.frames import AnyFrame, Number, Vector, scalar, vector
 
 Inertia: TypeAlias = Sequence[Number] | Sequence[Sequence[Number]] | np.ndarray
 
@@ -34,16 +34,16 @@ class Body:
         rows = [vector(row, params) for row in self.inertia]  # type: ignore[arg-type]
         return np.stack(rows) if all(isinstance(row, np.ndarray) for row in rows) else jnp.stack(rows)
 
-    def kinetic_energy(self, frame: Frame, params: Any) -> Any:
+    def kinetic_energy(self, frame: AnyFrame, params: Any) -> Any:
         """m |ċ|²/2 + ω·I ω/2."""
         u = frame.velocity_of(vector(self.centre, params))
         return scalar(self.mass, params) * (u @ u) / 2 + frame.turning_energy(self.inertia_matrix(params))
 
-    def momentum(self, frame: Frame, params: Any) -> Any:
+    def momentum(self, frame: AnyFrame, params: Any) -> Any:
         """m ċ (3,)."""
         return scalar(self.mass, params) * frame.velocity_of(vector(self.centre, params))
 
-    def angular_momentum(self, frame: Frame, about: Any, params: Any) -> Any:
+    def angular_momentum(self, frame: AnyFrame, about: Any, params: Any) -> Any:
         """(c − about) × m ċ + R I Rᵀ ω (3,)."""
         arm = frame.point(vector(self.centre, params)) - about
         return jnp.cross(arm, self.momentum(frame, params)) + frame.turning_momentum(self.inertia_matrix(params))
