@@ -177,6 +177,8 @@ def test_mistakes_in_data_name_the_coordinates():
         model.state({"a.qw": 1.0}, {"a.qw": 1.0})
     with pytest.raises(ValueError, match="rotation must be"):
         b.ball("ground", "a", "zzq")
+    with pytest.raises(ValueError, match="'a' has turned=, which a rotation from the ground does not feel"):
+        b.ball("ground", "a", "attitude", turned=((0, 0, 1), 0.3))
 
 
 def test_friction_without_a_normal_force_is_refused():

@@ -91,6 +91,27 @@ def test_rods_that_hang_on_each_other_are_the_double_spherical_pendulum():
     assert float(found) == pytest.approx(float(expected), abs=1e-13)
 
 
+def test_an_attitude_is_the_quaternion_from_the_ground():
+    """Of a body that hangs on another one: Q = Q₁ Q₂, and the same Lagrangian."""
+    rng, bodies = np.random.default_rng(6), [b.Body(name, 1.0, (0.1, 0.2, 0.25), centre=(0.1, 0.2, 0.3)) for name in "ac"]
+    relative, absolute = (
+        b.Model(bodies, [b.ball("ground", "a"), b.ball("a", "c", rotation, at=(0.3, 0.4, 1.0))])
+        for rotation in ("quaternion", "attitude")
+    )
+    first, second, rate, other = rng.normal(size=(4, 4))
+
+    def product(p, q):
+        return np.concatenate([[p[0] * q[0] - p[1:] @ q[1:]], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])])
+
+    first, second = first / np.linalg.norm(first), second / np.linalg.norm(second)
+    rate, other = rate - (rate @ first) * first, other - (other @ second) * second
+    q, v = np.concatenate([first, second]), np.concatenate([rate, other])
+    there = np.concatenate([first, product(first, second)])
+    moving = np.concatenate([rate, product(rate, second) + product(first, other)])
+    expected = float(relative.system.lagrangian(jnp.array(q), jnp.array(v), None))
+    assert float(absolute.system.lagrangian(jnp.array(there), jnp.array(moving), None)) == pytest.approx(expected, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     "body, joints, message",
     [

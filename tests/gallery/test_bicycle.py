@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq, root
+from scipy.optimize import brentq, least_squares, root
 from scipy.spatial.transform import Rotation
 
 import dirax as dx
@@ -11,6 +11,9 @@ from dirax.gallery import bicycle
 EIGENVALUES = np.array(  # Meijaard et al. 2007, Table 2, at 5 m/s
     [-0.32286642900409, -0.77534188219585 + 4.46486771378823j, -0.77534188219585 - 4.46486771378823j, -14.07838969279822]
 )
+
+CIRCLES = ((-0.399075868479, 1.208744650950, 3.868576816254), (-0.812289319365, 2.442248923819, 5.856867788678))
+"""Lean, rate of turning and speed of the two circles with the handlebar at .3 rad, of the page on riding a bicycle."""
 
 
 def at_speed(speed):
@@ -53,10 +56,9 @@ def test_the_eigenvalues_from_rest_to_ten_metres_a_second_are_those_of_the_publi
         assert max(np.abs(found - value).min() for value in expected) < 2e-12
 
 
-def newton_euler_defect(data):
-    """What forces at the two contacts leave of the equations of Newton and Euler for all bodies, of the torques about the axles
-    and about the steering axis, of bodies that circle at a constant rate; relative to the weight."""
-    q, v = (dict(zip(bicycle.MODEL.coordinates, data[name], strict=True)) for name in "qv")
+def newton_euler_defect(q, v):
+    """Heights of the contacts and their slip, and what forces at them leave of the equations of Newton and Euler for all bodies,
+    of the torques about the axles and the steering axis, of bodies that circle at a constant rate; relative to the weight."""
     turn = Rotation.from_euler("ZXY", [q["frame.yaw"], q["frame.roll"], q["frame.pitch"]]).as_matrix()
     tilt = bicycle.TILT
     steering = turn @ [-np.sin(tilt), 0.0, np.cos(tilt)]
@@ -76,7 +78,7 @@ def newton_euler_defect(data):
         (4.0, inertia(0.05892, 0.06, 0.00708, 0.00756), turned, axis_at + turned @ [-0.2, 0, 0.7], 0.0, True),
         (3.0, inertia(0.1405, 0.28, 0.1405, 0.0), turned, front, v["front wheel"], True),
     ]
-    contacts = []
+    contacts, defects = [], []
     for centre, axle, radius, spin in (
         (rear, turn[:, 1], 0.3, v["rear wheel"]),
         (front, turned[:, 1], 0.35, v["front wheel"]),
@@ -84,7 +86,7 @@ def newton_euler_defect(data):
         low = (up @ axle) * axle - up
         contacts.append(centre + radius * low / np.linalg.norm(low))
         slip = rate * np.cross(up, centre - middle) + np.cross(rate * up + spin * axle, contacts[-1] - centre)
-        assert abs(contacts[-1][2]) < 1e-12 and np.abs(slip).max() < 1e-11  # both wheels are on the ground and roll
+        defects += [contacts[-1][2], slip[0], slip[1]]
     rows, wanted = [], []
 
     def balance(about, bodies, touching, along=None):
@@ -109,30 +111,53 @@ def newton_euler_defect(data):
     balance(front, parts[3:], (1,), turned[:, 1])
     matrix, sought = np.vstack(rows), np.concatenate(wanted)
     forces = np.linalg.lstsq(matrix, sought, rcond=None)[0]
-    return np.abs(matrix @ forces - sought).max() / (94 * 9.81)
+    return np.concatenate([defects, (matrix @ forces - sought) / (94 * 9.81)])
 
 
-def test_circular_motions_are_relative_equilibria_by_newton_and_euler():
-    """The handlebar-forward family of Basu-Mandal et al. 2007, which leaves straight riding at the capsize speed."""
+def circling_by_newton_and_euler(steer, near):
+    """The circular motion at this angle of steering near such numbers, by their equations alone."""
+    names = ("frame.roll", "frame.pitch", "frame.z", "frame.yaw", "frame.x", "frame.y", "rear wheel", "front wheel")
 
-    def missed(x, steer):
+    def defect(x):
+        q = dict(zip(names[:3], x[:3], strict=True)) | {"frame.x": 0.0, "frame.y": 0.0, "frame.yaw": 0.0, "steer": steer}
+        return newton_euler_defect(q, dict(zip(names[3:], x[3:], strict=True)))
+
+    return least_squares(defect, near, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+
+
+def named(values):
+    return dict(zip(bicycle.MODEL.coordinates, values, strict=True))
+
+
+def circling(steer, near):
+    """The circular motion near this lean and rate, its data, and what Newton and Euler find from numbers beside them."""
+
+    def missed(x):
         found = bicycle.MODEL.accelerations(**bicycle.circling(steer, *x))
         return [found["frame.roll"], found["steer"]]
 
-    speeds = {}
+    solved = root(missed, near, tol=1e-12)
+    assert np.abs(solved.fun).max() < 1e-10
+    data = bicycle.circling(steer, *solved.x)
+    q, v = named(data["q"]), named(data["v"])
+    assert np.abs(newton_euler_defect(q, v)).max() < 1e-11
+    assert dx.linearize(bicycle.MODEL.system, data, symmetries=bicycle.SYMMETRIES).residual < 1e-12
+    ours = [q["frame.roll"], q["frame.pitch"], q["frame.z"], *(v[name] for name in ("frame.yaw", "frame.x", "frame.y"))]
+    ours = np.array([*ours, v["rear wheel"], v["front wheel"]])
+    aside = ours * (1 + 0.01 * np.random.default_rng(5).normal(size=8))
+    assert circling_by_newton_and_euler(steer, aside) == pytest.approx(ours, abs=1e-11)
+    return *solved.x, abs(v["rear wheel"] * bicycle.REAR)
+
+
+def test_circular_motions_are_relative_equilibria_by_newton_and_euler():
+    """Two families (Basu-Mandal et al. 2007): one leaves straight riding at the capsize speed, one lies down as it speeds up."""
     near = 6.0 / (1.02 / np.cos(bicycle.TILT))
-    x = np.array([-(6.0 * near) / 9.81, near]) * 0.001
-    for before, steer in ((0.001, 0.001), (0.001, 0.03), (0.03, 0.1), (0.1, 0.3)):
-        solved = root(missed, x * steer / before, args=(steer,), tol=1e-12)
-        x = solved.x
-        assert np.abs(solved.fun).max() < 1e-10
-        data = bicycle.circling(steer, *x)
-        speeds[steer] = abs(data["v"][bicycle.MODEL.coordinates.index("rear wheel")] * bicycle.REAR)
-        assert newton_euler_defect(data) < 1e-11
-        found = dx.linearize(bicycle.MODEL.system, data, symmetries=bicycle.SYMMETRIES)
-        assert found.residual < 1e-12
-    assert speeds[0.001] == pytest.approx(6.02426201538837, abs=1e-4) and speeds[0.3] < speeds[0.001]
-    assert newton_euler_defect(bicycle.circling(0.1, -0.2, 0.5)) > 1e-3
+    slight = circling(0.001, np.array([-(6.0 * near) / 9.81, near]) * 0.001)
+    assert slight[2] == pytest.approx(6.02426201538837, abs=1e-4)
+    for circle in CIRCLES:
+        assert circling(0.3, np.round(circle[:2], 2)) == pytest.approx(circle, abs=1e-11)
+    other = bicycle.circling(0.1, -0.2, 0.5)
+    assert np.abs(newton_euler_defect(named(other["q"]), named(other["v"]))).max() > 1e-3
 
 
 def test_the_discrete_equations_have_these_eigenvalues_to_second_order():

@@ -139,7 +139,6 @@ def _beside(model: Any, body: Body, own: Joint) -> list[tuple[str, bool]]:
         ("its mass centre is beside it", off(body.centre)),
         ("its moments of inertia across it differ", moments[0] != moments[1]),
         ("it has products of inertia", inertia.ndim == 2 and any(inertia[k, j] != 0 for k, j in ((0, 1), (0, 2), (1, 2)))),
-        (f"joint {own.name!r} has turned=, which a direction does not feel", own.turned is not None),
     ]
     for joint in model.joints:
         if body.name in (joint.parent, joint.body):

@@ -51,6 +51,8 @@ class Joint:
     """All motions, those without coordinates among them."""
 
     def __post_init__(self):
+        if self.turned and any(isinstance(m, Direct) or (isinstance(m, Quaternion) and m.from_ground) for m in self.motions):
+            raise ValueError(f"joint {self.name!r} has turned=, which a rotation from the ground does not feel: leave it out.")
         before = [Shift(self.at)] if np.any(np.asarray(self.at) != 0) else []
         before += [TurnBy(*self.turned)] if self.turned else []
         after = [Shift(_opposite(self.on))] if np.any(np.asarray(self.on) != 0) else []
@@ -140,9 +142,9 @@ def universal(parent: str, body: str, axis: Vector = X, second: Vector = Y, name
 
 
 def ball(parent: str, body: str, rotation: str = "quaternion", name: str = "", **where: Any) -> Joint:
-    """A ball joint. `rotation`: "quaternion"; axes of Euler angles such as "zxz", each turned by the ones before it; or "axis",
-    the direction, as seen from the ground, of the axis z of a rod or of another symmetric body that does not turn about it. To
-    what hangs on such a body, it is a frame that does not turn."""
+    """A ball joint. `rotation`: "quaternion", from the parent; "attitude", a quaternion from the ground; axes of Euler angles such
+    as "zxz", each turned by the ones before it; or "axis", the direction, as seen from the ground, of the axis z of a rod or of
+    another symmetric body that does not turn about it. To what hangs on such a body, it is a frame that does not turn."""
     name = name or body
     return Joint(name, "ball", parent, body, rotations(rotation, name), **where)
 
@@ -202,11 +204,11 @@ def rotations(rotation: str, name: str) -> tuple[Motion, ...]:
     """The motions of a rotation; raises `ValueError` for one that is not known."""
     if rotation == "axis":
         return (Direct(tuple(f"{name}.{part}" for part in ("ux", "uy", "uz"))),)
-    if rotation == "quaternion":
-        return (Quaternion(tuple(f"{name}.{part}" for part in ("qw", "qx", "qy", "qz"))),)
+    if rotation in ("quaternion", "attitude"):
+        return (Quaternion(tuple(f"{name}.{part}" for part in ("qw", "qx", "qy", "qz")), rotation == "attitude"),)
     if not isinstance(rotation, str) or len(rotation) != 3 or set(rotation) - set("xyz"):
         raise ValueError(
-            'rotation must be "quaternion", "axis", or three axes of Euler angles such as "zxz" or "zxy", '
+            'rotation must be "quaternion", "attitude", "axis", or three axes of Euler angles such as "zxz" or "zxy", '
             f"but {rotation!r} was given."
         )
     if rotation[0] == rotation[1] or rotation[1] == rotation[2]:

@@ -71,12 +71,14 @@ class Turn:
 
 @dataclass(frozen=True)
 class Quaternion:
-    """By a unit quaternion (w, x, y, z), whose four numbers are coordinates, with |Q| = 1 as a holonomic constraint."""
+    """By a unit quaternion (w, x, y, z), whose four numbers are coordinates, with |Q| = 1 as a holonomic constraint: from the
+    frame, or `from_ground`, whatever the frame's own rotation is."""
 
     measures: ClassVar[str] = ""
     norm: ClassVar[str] = "|Q| = 1"
     rest: ClassVar[tuple[float, ...]] = (1.0, 0.0, 0.0, 0.0)
     names: tuple[str, ...]
+    from_ground: bool = False
 
     def discretization_map(self) -> AbstractDiscretizationMap:
         """The middle of the one-parameter subgroup between two rotations."""
@@ -84,6 +86,8 @@ class Quaternion:
 
     def move(self, frame: Frame, q: Any, v: Any, params: Any) -> Frame:
         """The frame moved, for the coordinates q and their rates v."""
+        if self.from_ground:
+            return Frame(quaternion_matrix(q), frame.at, quaternion_spin(q, v), frame.velocity)
         spin = frame.spin + frame.turn @ quaternion_spin(q, v)
         return frame._replace(turn=frame.turn @ quaternion_matrix(q), spin=spin)
 
