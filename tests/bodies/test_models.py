@@ -29,7 +29,7 @@ def test_a_double_pendulum_is_the_one_written_by_hand():
     assert value(model.energy(q, v)) == pytest.approx(lagrangian + 2 * g * height, abs=1e-12)
 
 
-@pytest.mark.parametrize("rotation", ["zxz", "zxy", "quaternion"])
+@pytest.mark.parametrize("rotation", ["zxy", "quaternion"])
 def test_a_free_body_keeps_momentum_and_angular_momentum_in_every_description(rotation):
     model = b.Model([b.Body("stone", **ROD, centre=(0.1, 0.2, 0.0))], [b.free("ground", "stone", rotation)], gravity=(0, 0, 0))
     n = len(model.coordinates)

@@ -142,9 +142,9 @@ def universal(parent: str, body: str, axis: Vector = X, second: Vector = Y, name
 
 
 def ball(parent: str, body: str, rotation: str = "quaternion", name: str = "", **where: Any) -> Joint:
-    """A ball joint. `rotation`: "quaternion", from the parent; "attitude", a quaternion from the ground; axes of Euler angles such
-    as "zxz", each turned by the ones before it; or "axis", the direction, as seen from the ground, of the axis z of a rod or of
-    another symmetric body that does not turn about it. To what hangs on such a body, it is a frame that does not turn."""
+    """A ball joint. `rotation`: "quaternion", from the parent; "attitude", a quaternion from the ground; axes of Euler angles
+    such as "zxz", each turned by the ones before it; or "axis", the direction, as seen from the ground, of the axis z of a rod
+    or of another symmetric body that does not turn about it. To what hangs on such a body, it is a frame that does not turn."""
     name = name or body
     return Joint(name, "ball", parent, body, rotations(rotation, name), **where)
 
