@@ -175,4 +175,5 @@ def test_the_governor_turns_freely_and_its_damper_takes_energy():
 def test_machines_are_drawn(name):
     example = gallery.get(name)
     kinds = {part.kind for part in example.scene.parts}
+    assert all(part.settings["radius"] < 0.1 for part in example.scene.parts if part.kind in ("point", "rod"))
     assert kinds >= {"bicycle": {"disk", "plane"}, "andrews-squeezer": {"rod", "spring"}, "euler-disk": {"disk"}}[name]

@@ -11,31 +11,44 @@ from dirax.bodies.forces import Spring
 from dirax.bodies.frames import scalar, turn_matrix, unit, vector
 from dirax.show.scene import Part, Reading, Scene, ball, disk, plane, point, rod, spring
 
+POINT, ROD = 0.05, 0.02
+"""Radii of mass centres and of rods, in units of the machine's size: a report would take them from how far it goes."""
+
 
 def scene_of(model: Any, view: str = "oblique", trail: str = "") -> Scene:
     """Rods from where a body hangs to its mass centre and to the bodies that hang on it; `trail` names a body whose mass centre
     leaves one."""
     frames = _frames(model)
     parts: list[Part] = [plane()] if model.contacts else []
+    small, thin = (share * _size(model) or None for share in (POINT, ROD))
     drawn = {contact.body for contact in model.contacts if _is_round(contact.shape)}
     for contact in model.contacts:
         parts += _contact(model, frames, contact)
     for body in model.bodies:
         centre = _place(frames, body.name, body.centre)
         if body.name not in drawn or np.any(np.asarray(body.centre) != 0):
-            parts.append(point(centre, trail=body.name == trail))
+            parts.append(point(centre, small, trail=body.name == trail))
         if np.any(np.asarray(body.centre) != 0):
-            parts.append(rod(_place(frames, body.name, (0.0, 0.0, 0.0)), centre))
+            parts.append(rod(_place(frames, body.name, (0.0, 0.0, 0.0)), centre, thin))
     for joint in model.joints:
         if joint.parent != "ground" and np.any(np.asarray(joint.at) != 0):
-            parts.append(rod(_place(frames, joint.parent, (0.0, 0.0, 0.0)), _place(frames, joint.parent, joint.at)))
+            parts.append(rod(_place(frames, joint.parent, (0.0, 0.0, 0.0)), _place(frames, joint.parent, joint.at), thin))
         if np.any(np.asarray(joint.on) != 0):
-            parts.append(rod(_place(frames, joint.body, (0.0, 0.0, 0.0)), _place(frames, joint.body, joint.on)))
+            parts.append(rod(_place(frames, joint.body, (0.0, 0.0, 0.0)), _place(frames, joint.body, joint.on), thin))
     for force in model.forces:
         if isinstance(force, Spring) and force.between is not None:
             first, second = force.between
             parts.append(spring(_place(frames, *first), _place(frames, *second)))
     return Scene(tuple(parts), view=view)
+
+
+def _size(model: Any) -> float:
+    """The longest way inside a body, from where it hangs to its mass centre, to what hangs on it, or to its rim."""
+    moving = {body.name for body in model.bodies}
+    inside = [body.centre for body in model.bodies] + [joint.on for joint in model.joints]
+    inside += [joint.at for joint in model.joints if joint.parent in moving]
+    lengths = [np.linalg.norm(np.asarray(vector(x, model.parameters), float)) for x in inside]
+    return float(max(lengths, default=0.0))
 
 
 def _is_round(shape: Any) -> bool:

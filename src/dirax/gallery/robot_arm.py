@@ -44,5 +44,6 @@ EXAMPLE = machine(
     MODEL.state({"upper arm": 1.0, "forearm": 0.3, "wrist 1": 0.2, "wrist 2": 0.3}, {"base": 1.0}),
     step=0.002,
     steps=2500,
+    plane=(1, 2),
     trail="wrist 3",
 )
