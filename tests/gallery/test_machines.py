@@ -19,6 +19,7 @@ from dirax.gallery import (
     n_four_bar,
     n_trailer,
     rattleback,
+    robot_arm,
     slider_crank,
     snakeboard_gait,
     tippe_top,
@@ -169,6 +170,16 @@ def test_the_governor_turns_freely_and_its_damper_takes_energy():
     assert np.abs(sol.constraint_residual()).max() < 1e-12 and np.ptp(sol.q[:, 1]) > 0.01
     assert seen["energy"][-1] < seen["energy"][0] - 0.1
     assert seen["energy"] - sol.work == pytest.approx(seen["energy"][0], rel=1e-4)
+
+
+def test_the_arm_keeps_its_angular_momentum_about_the_base():
+    """Nothing turns its first hinge; and its energy stays, of which the links throw much to and fro."""
+    sol = robot_arm.EXAMPLE.simulate(steps=1000, save_every=100)
+    height = lambda q, v: robot_arm.MODEL.potential_energy(q)
+    seen = robot_arm.MODEL.observables(sol, height=height)
+    about = seen["angular_momentum"][:, 2]
+    assert np.ptp(sol.p[:, 0]) < 1e-12 and about == pytest.approx(sol.p[:, 0], abs=1e-12) and about[0] > 0.5
+    assert np.ptp(sol.energy()) < 1e-3 * np.ptp(seen["height"]) and np.ptp(seen["height"]) > 5.0
 
 
 @pytest.mark.parametrize("name", ["bicycle", "andrews-squeezer", "euler-disk"])
