@@ -26,7 +26,7 @@ SAMPLES = 7
 
 @dataclass
 class Correction:
-    """change = J⁻¹ residual for a block of unknowns of an equation; `stable` says at run time whether the fixed pivots were large
+    """change = J⁻¹ residual for a part of the unknowns of an equation; `stable` says at run time whether the fixed pivots were large
     enough.
 
     `again` is J⁻¹ applied to another right-hand side, the inputs `right`, from the same `factors`.
@@ -55,33 +55,37 @@ class Correction:
 
 @dataclass
 class Corrections:
-    """How the unknowns of an equation are found: block after block, each with the unknowns of those before it known.
+    """How the unknowns of an equation are found: block after block, each with the unknowns of those before it known. A block has
+    several parts where its equations hold the unknowns of later parts only weakly: an update goes over them in turn."""
 
-    `jacobian` and `order` are the whole matrix and the order of its pivots.
-    """
-
-    jacobian: list[list[int]]
-    order: list[list[tuple[int, int]]]
     sizes: list[int]
     """The inputs that say how large the unknowns are."""
-    blocks: list[Correction]
+    blocks: list[list[Correction]]
 
 
-def newton_corrections(g: Graph, program: StepProgram, index: int) -> Corrections:
-    """The corrections of Newton's method of an equation of a step, in a graph that begins as that of the step."""
+Order = list[list[tuple[int, int]]]
+"""(row, column) of each pivot, in parts of which none has unknowns of those after it."""
+
+Elimination = tuple[list[list[int]], Order]
+"""A matrix, and the order of its pivots."""
+
+
+def newton_corrections(g: Graph, program: StepProgram, index: int, whole: bool = False) -> Corrections:
+    """The corrections of Newton's method of an equation of a step, in a graph that begins as that of the step; with the `whole`
+    Jacobian, or without the entries that the step says are weak."""
     equation = program.equations[index]
     if not equation.unknowns:
-        return Corrections([], [], [], [])
-    matrix, order = elimination(program, index)
+        return Corrections([], [])
+    matrix, pivots = _pivots_by_parts(program, index, whole)
     sizes = [g.input(f"size{i}") for i in range(len(matrix))]
     present = [g.add(g.make("abs", u), size) for u, size in zip(equation.unknowns, sizes, strict=True)]
-    return Corrections(matrix, order, sizes, [_correction(g, equation, matrix, block, present) for block in order])
+    return Corrections(sizes, [[_correction(g, equation, matrix, part, present) for part in block] for block in pivots])
 
 
 def _correction(
     g: Graph, equation: TracedEquation, matrix: list[list[int]], order: list[tuple[int, int]], present: list[int]
 ) -> Correction:
-    """That of a block; `present` are the sizes of all unknowns and their values together."""
+    """That of a part of a block; `present` are the sizes of all unknowns and their values together."""
     equations, places = sorted(i for i, _ in order), sorted(j for _, j in order)
     own = [[matrix[i][j] for j in places] for i in equations]
     residual = [equation.residual[i] for i in equations]
@@ -99,32 +103,52 @@ def _correction(
 _known: Memo[tuple] = Memo(KEPT)
 
 
-def elimination(program: StepProgram, index: int) -> tuple[list[list[int]], list[list[tuple[int, int]]]]:
+def elimination(program: StepProgram, index: int) -> Elimination:
     """The Jacobian of an equation of a step, and the order of its pivots by blocks. Raises `GraphTooLarge`."""
 
     def made():
-        g, rows = program.graph, program.jacobians[index]
-        matrix = [[row.get(j, g.zero) for j in range(len(rows))] for row in rows]
-        order = pivot_order(g, matrix)
-        return matrix, order if _in_turn(g, program.equations[index], order) else pivot_order(g, matrix, apart=False)
+        matrix = _jacobian(program, index)
+        return matrix, pivot_order(program.graph, matrix, _blocks(program, index, matrix))
 
     return _known.get((Same(program), index), made)
 
 
-def _in_turn(g: Graph, equation: TracedEquation, order: list[list[tuple[int, int]]]) -> bool:
-    """Whether the equations of each block can be evaluated before the unknowns of later ones are known: an equation may have
-    one in it by which its derivative is zero, such as the sign of it."""
-    later = set(equation.unknowns)
-    for block in order[:-1]:
-        later -= {equation.unknowns[j] for _, j in block}
-        if not later.isdisjoint(g.reachable([equation.residual[i] for i, _ in block])):
-            return False
-    return True
+def _pivots_by_parts(program: StepProgram, index: int, whole: bool) -> tuple[list[list[int]], list[Order]]:
+    """The Jacobian, and for each block of unknowns the order of the pivots of each of its parts."""
+    g, equation = program.graph, program.equations[index]
+    matrix, order = elimination(program, index)
+    if whole or not equation.weak:
+        return matrix, [[part] for part in order]
+    weak = {(i, j) for rows, columns in equation.weak for i in rows for j in columns}
+    there = np.array([[entry != g.zero and (i, j) not in weak for j, entry in enumerate(row)] for i, row in enumerate(matrix)])
+    found = []
+    for block in order:
+        rows, columns = sorted(i for i, _ in block), sorted(j for _, j in block)
+        parts = [([rows[i] for i in r], [columns[j] for j in c]) for r, c in blocks(there[np.ix_(rows, columns)])]
+        found.append(pivot_order(g, matrix, parts) if len(parts) > 1 else [block])
+    return matrix, found
 
 
-def pivot_order(g: Graph, matrix: list[list[int]], apart: bool = True) -> list[list[tuple[int, int]]]:
-    """(row, column) of each pivot, block after block: in each the least fill-in (Markowitz) among entries that are not small at
-    random points. All of them in one block if they are not to be kept `apart`.
+def _jacobian(program: StepProgram, index: int) -> list[list[int]]:
+    g, rows = program.graph, program.jacobians[index]
+    return [[row.get(j, g.zero) for j in range(len(rows))] for row in rows]
+
+
+def _blocks(program: StepProgram, index: int, matrix: list[list[int]]) -> list[tuple[list[int], list[int]]]:
+    """(rows, columns) of the blocks of unknowns; all together where the equations of one cannot be evaluated before the unknowns
+    of later ones are known: an equation may have one in it by which its derivative is zero, such as the sign of it."""
+    g, equation = program.graph, program.equations[index]
+    found, later = blocks(np.array(matrix).reshape(len(matrix), -1) != g.zero), set(equation.unknowns)
+    for rows, columns in found[:-1]:
+        later -= {equation.unknowns[j] for j in columns}
+        if not later.isdisjoint(g.reachable([equation.residual[i] for i in rows])):
+            return [(list(range(len(matrix))), list(range(len(matrix))))]
+    return found
+
+
+def pivot_order(g: Graph, matrix: list[list[int]], parts: list[tuple[list[int], list[int]]] | None = None) -> Order:
+    """The order of the pivots of each of the `parts` (rows, columns) of a matrix, its blocks if they are not given: the least
+    fill-in (Markowitz) among entries that are not small at random points.
 
     The points depend on nothing but the graph, so that the order, and with it every bit of a trajectory, does not depend
     on initial data, parameters or neighbours in a batch.
@@ -135,7 +159,7 @@ def pivot_order(g: Graph, matrix: list[list[int]], apart: bool = True) -> list[l
     values = _samples(g, matrix)
     values = np.where(np.isfinite(values), values, 0.0)
     found = []
-    for rows, columns in blocks(there) if apart else blocks(np.ones_like(there)):
+    for rows, columns in blocks(there) if parts is None else parts:
         block = np.ix_(rows, columns)
         inside = values[:, *block]
         largest = np.abs(inside).max(axis=2, keepdims=True)  # the units of the equations
@@ -190,7 +214,7 @@ class Factors:
         self,
         g: Graph,
         matrix: list[list[int]],
-        order: list[list[tuple[int, int]]],
+        order: Order,
         sizes: list[int] | None = None,
         least: float = GUARD,
     ):

@@ -48,6 +48,8 @@ class TracedEquation:
     """How deep derivatives of derivatives go in its functions."""
     array_operations: float
     """How many operations on arrays they are for XLA."""
+    weak: tuple[tuple[range, range], ...] = ()
+    """(rows, columns) of the Jacobian that Newton's method may leave out."""
 
 
 @dataclass
@@ -102,7 +104,7 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
         raise UnsupportedPrimitive("unpack", f"returns {len(rows)} arrays for {len(names)} fields", "the scheme")
     return TracedEquation(
         state, unknowns, previous, guess.tolist(), residual.tolist(), advance.tolist(),
-        dict(zip(names, rows, strict=True)), nesting(closed.jaxpr), array_operations(closed.jaxpr),
+        dict(zip(names, rows, strict=True)), nesting(closed.jaxpr), array_operations(closed.jaxpr), equation.weak,
     )  # fmt: skip
 
 

@@ -29,4 +29,5 @@ STALLED = 1e-9
 """Updates below this that no longer shrink have reached the floor of an ill-conditioned equation."""
 
 NEAR, CONTRACTING = 1e-3, 1e-2
-"""The Jacobian is used again after a first update below NEAR, and as long as updates shrink by the factor CONTRACTING."""
+"""The Jacobian is used again after a first update below NEAR, as long as updates shrink by the factor CONTRACTING, and for those
+below STALLED, of which roundoff is a part: another Jacobian would not make it any smaller."""

@@ -90,6 +90,11 @@ class AbstractStep(ABC):
         return None
 
     @property
+    def weak(self) -> tuple[tuple[range, range], ...]:
+        """Entries of the Jacobian, as (rows, columns), that Newton's method may leave out."""
+        return ()
+
+    @property
     def hermite(self) -> Callable | None:
         """`between` of the StepEquation, for a method of second order in coordinates."""
         return None
@@ -113,4 +118,5 @@ class AbstractStep(ABC):
             resume=self.resume,
             interpolate=self.interpolation,
             between=self.hermite,
+            weak=self.weak,
         )

@@ -109,6 +109,14 @@ class ProjectedThetaStep(ThetaStep):
         """Whether a and λ are functions of (q, v) and d one of (q, v, s), and no unknowns."""
         return self.shape.n <= FEW and not self.system.forces_see_multipliers
 
+    @property
+    def weak(self) -> tuple[tuple[range, range], ...]:
+        """The balance of the first half by λ, whose impulse σ is counted from: what is left is the turning of the constraints."""
+        if self.in_place or self.system.forces_see_multipliers:
+            return ()
+        n, k = self.shape.n, self.rows.count
+        return ((range(n), range(2 * n + k, 2 * (n + k))),)
+
     def start(self, data: Data, h: Any, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
         one_point_only(data)
         v = data["v"]
@@ -119,9 +127,11 @@ class ProjectedThetaStep(ThetaStep):
     def residual(self, u, state, t, h, params):
         (q0, p0, _), parts, rows = self.state.split(state), self.unknowns.split(u), self.rows
         base = at, q, q1 = self._base(u, state, t, h, params)
-        p, rate, along_flow, _ = self._flow(at, q, parts, params)
-        begun = p0 + rows.force(t, q0, parts.sigma, params) - (p - (1.0 - self.theta) * h * rate)
-        ended = self.system.legendre(q1, parts.end_v, params, t + h) + rows.force(t + h, q1, parts.end_sigma, params)
+        p, rate, along_flow, multipliers = self._flow(at, q, parts, params)
+        impulses = (0.0, 0.0) if self.in_place else ((1.0 - self.theta) * h * multipliers, self.theta * h * multipliers)
+        first, last = parts.sigma - impulses[0], parts.end_sigma + impulses[1]
+        begun = p0 + rows.force(t, q0, first, params) - (p - (1.0 - self.theta) * h * rate)
+        ended = self.system.legendre(q1, parts.end_v, params, t + h) + rows.force(t + h, q1, last, params)
         ends = [
             begun,
             rows.velocity_defect(at, q, parts.v, params),

@@ -90,7 +90,9 @@ class StepEquation(eqx.Module):
       polynomial of the method, which joins both ends;
     - `between(theta, row, after, h, params) -> dict`, the same of the rows at both ends, which hold the time `t` and the velocity
       `v` too: for methods of second order. Where neither is said, the fields at t + θh are those of a step of length θh;
-    - `collocation`, the stage relation or mean relation of which the unknowns are copies: a fact that engines may use or ignore.
+    - `collocation`, the stage relation or mean relation of which the unknowns are copies: a fact that engines may use or ignore;
+    - `weak`, pairs (rows, columns) of entries of the Jacobian that are O(h²) beside the others, so that Newton's method converges
+      almost as fast without them: another one that engines may use or ignore.
 
     Equations are compared by the identity of their functions. One with other functions is made by `dataclasses.replace`.
     Raises `ValueError` where sizes, layouts and labels do not fit.
@@ -115,6 +117,7 @@ class StepEquation(eqx.Module):
     state_layout: Layout = eqx.field(static=True)
     unknown_layout: Layout = eqx.field(static=True)
     collocation: StageRelation | MeanRelation | None = eqx.field(static=True)
+    weak: tuple[tuple[range, range], ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -138,6 +141,7 @@ class StepEquation(eqx.Module):
         interpolate: Callable | None = None,
         between: Callable | None = None,
         collocation: StageRelation | MeanRelation | None = None,
+        weak: tuple[tuple[range, range], ...] = (),
     ):
         self.start, self.residual, self.advance, self.unpack = start, residual, advance, unpack
         self.fields, self.canonical = dict(fields), canonical
@@ -150,7 +154,7 @@ class StepEquation(eqx.Module):
         self.guess = guess or previous_unknowns
         self.resume = resume or start
         self.interpolate, self.between = interpolate, between
-        self.collocation = collocation
+        self.collocation, self.weak = collocation, weak
         if len(self.labels) != self.unknowns:
             raise ValueError(f"labels need one entry per unknown ({self.unknowns}), but {len(self.labels)} were given.")
 

@@ -15,7 +15,7 @@ from dirax.engines.native.loops.plan import Plan
 from dirax.engines.native.loops.record import Record
 from dirax.engines.native.loops.sizes import sizes_module
 from dirax.engines.native.loops.step_loop import kernel_module
-from dirax.engines.newton_step import newton_corrections
+from dirax.engines.newton_step import Elimination, elimination, newton_corrections
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program import graph as graph_module
 from dirax.program import machine_code as llvm
@@ -33,10 +33,11 @@ SIZING = 1e-5
 
 
 class Kernels:
-    """The machine code of a step: kernels by width, made when they are asked for."""
+    """The machine code of a step: kernels by width, made when they are asked for; with the `whole` Jacobians in Newton's method, or
+    without the entries that the step says are weak."""
 
-    def __init__(self, step: StepProgram, compensated: bool, rules: dict[str, str]):
-        self.step, self.compensated, self.rules = step, compensated, rules
+    def __init__(self, step: StepProgram, compensated: bool, rules: dict[str, str], whole: bool):
+        self.step, self.compensated, self.rules, self.whole = step, compensated, rules, whole
         self.plan: Plan | None = None
         self.operations = 0
         self.sizing = 0.0
@@ -72,7 +73,7 @@ class Kernels:
         than a part of what its compilation takes."""
         worth = self.sizing > SIZING * self.step.entries
         if width not in self._of_sizes and worth and self.step.sizes_are_written:
-            text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
+            text = lambda: sizes_module(self._planned(), self._eliminations(), width, llvm.has_fma())
             library, _ = self._library("run", width, text, "sizes", level=0)
             self._of_sizes[width] = llvm.function(library, "run", SIGNATURE)
         return self._of_sizes.get(width)
@@ -109,13 +110,16 @@ class Kernels:
             try:
                 g = self._graph()
                 plan = self._plan(g)
-                plan.corrections = [newton_corrections(g, step, i) for i in range(len(step.equations))]
+                plan.corrections = [newton_corrections(g, step, i, self.whole) for i in range(len(step.equations))]
                 if self.compensated:
                     plan.increments = [increments(g, e) for e in step.equations]
             except GraphTooLarge as error:
                 raise too_large(error) from None
             self.plan, self.operations = plan, count_operations(plan)
         return self.plan
+
+    def _eliminations(self) -> list[Elimination]:
+        return [elimination(self.step, i) for i in range(len(self.step.equations))]
 
     def _plan(self, graph: Graph) -> Plan:
         step = self.step
@@ -150,7 +154,7 @@ def count_operations(plan: Plan) -> int:
     total = 0
     for index, _ in plan.stages:
         e, c = plan.equations[index], plan.corrections[index]
-        solved = [node for one in c.blocks for node in (*one.change, *one.again, one.stable)]
+        solved = [node for parts in c.blocks for one in parts for node in (*one.change, *one.again, one.stable)]
         needed = plan.graph.reachable([*e.guess, *e.residual, *e.advance, *solved])
         total += sum(1 for node in needed if plan.graph.args[node])
     return total
@@ -169,20 +173,21 @@ def source_digest() -> str:
 _kernels: Memo[Kernels] = Memo(KEPT)
 
 
-def kernels(equation: Any, params: Any, batch_params: bool, compensated: bool = False) -> Kernels:
+def kernels(equation: Any, params: Any, batch_params: bool, compensated: bool = False, whole: bool = False) -> Kernels:
     """The kernels of a step. Raises `UnsupportedPrimitive`."""
     step = step_program(equation, params, batch_params)
     rules = {name: field.rule for name, field in equation.stages[0][0].fields.items()} if len(equation.stages) > 1 else {}
-    return _kernels.get((Same(step), compensated, tuple(rules.items())), lambda: Kernels(step, compensated, rules))
+    key = Same(step), compensated, tuple(rules.items()), whole
+    return _kernels.get(key, lambda: Kernels(step, compensated, rules, whole))
 
 
 def _digest(made: Kernels) -> str:
     step, g = made.step, made.step.graph
     rows = lambda e: [(name, nodes.shape, nodes.ravel().tolist()) for name, nodes in sorted(e.rows.items())]
-    outputs = [(e.state, e.unknowns, e.previous, e.guess, e.residual, e.advance, rows(e)) for e in step.equations]
+    outputs = [(e.state, e.unknowns, e.previous, e.guess, e.residual, e.advance, rows(e), e.weak) for e in step.equations]
     constants = sorted((node, value) for node, value in g.value.items() if node < step.size)
     nodes = g.op[: step.size], g.args[: step.size], constants
     digest = hashlib.sha256(source_digest().encode())
-    for part in (*nodes, outputs, step.stages, step.shared, made.compensated, sorted(made.rules.items())):
+    for part in (*nodes, outputs, step.stages, step.shared, made.compensated, made.whole, sorted(made.rules.items())):
         digest.update(repr(part).encode() + b"\0")
     return digest.hexdigest()

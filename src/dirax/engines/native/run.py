@@ -80,6 +80,7 @@ class Ready:
                 others = _by_newton(lanes, self.made)
             else:
                 with_present_sizes(lanes, self.made)
+                others = _with_weak_entries(lanes, self.made)
         run_seconds = time.perf_counter() - started
         closing = lanes.close(self.kernel)
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
@@ -107,7 +108,26 @@ class Ready:
 
 def _told(notes: dict[str, Any], others: list[str]) -> dict[str, str]:
     """What `stats` say of the iteration, with the other ones that followed it."""
-    return {"iteration": "; then ".join([notes["iteration"], *others])} if others else {}
+    return {"iteration": "; then ".join([notes.get("iteration", "Newton's method"), *others])} if others else {}
+
+
+def _with_weak_entries(lanes: Lanes | OneLane, made: Kernels) -> list[str]:
+    """Go on with trajectories whose steps are so long that entries of the Jacobian which are weak in others have to be in it.
+    Returns what was tried."""
+    p, record, table = lanes.problem, lanes.record, lanes.table()
+    stuck = np.flatnonzero(table[:, record.status] == NOT_CONVERGED)
+    if not len(stuck) or not any(stage.weak for stage, _ in p.equation.stages):
+        return []
+    try:
+        whole = kernels(p.equation, p.params, p.batch_params, p.compensated, whole=True)
+        whole.kernel(1)
+    except UnsupportedPrimitive:  # too large to be written out: they end where they are
+        return []
+    own = table[stuck]
+    own[:, record.status] = OK
+    lanes.put(stuck, lanes.attempt(stuck, whole, own))
+    with_present_sizes(lanes, whole)
+    return [f"with the whole Jacobian, {counted(len(stuck), 'trajectory', 'trajectories')}"]
 
 
 def _by_newton(lanes: Lanes | OneLane, made: CollocationKernels) -> list[str]:

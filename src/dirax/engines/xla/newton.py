@@ -121,7 +121,8 @@ def newton(
         return running & ~at_floor(s) & ~jnp.isnan(s.update) & (s.updates < max_iterations)
 
     def contracting(s: Search):
-        return unfinished(s) & ((s.ratio < CONTRACTING) | (jnp.isnan(s.ratio) & (s.update < NEAR)))
+        little = jnp.where(jnp.isnan(s.ratio), s.update < NEAR, s.update < STALLED)
+        return unfinished(s) & ((s.ratio < CONTRACTING) | little)
 
     def with_new_jacobian(s: Search) -> Search:
         matrix, unit = jacobian(s.u), 1.0

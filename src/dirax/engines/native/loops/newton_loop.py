@@ -2,7 +2,8 @@
 
 A Jacobian serves several updates while they contract quickly: a first kind of update computes residual, Jacobian and
 factors together, a second kind the residual alone. Where a pivot was too small the correction comes from partial
-pivoting, and the factors are not used again.
+pivoting, and the factors are not used again. Where a block of unknowns has several parts, an update changes one after the
+other, each by its equations with the new values of those before it (Gauss, Seidel).
 """
 
 from collections.abc import Sequence
@@ -14,15 +15,16 @@ from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, OWN, ST
 
 
 class NewtonLoop:
-    """The iteration for one block of unknowns, from the guess in `unknowns` to the root there; `sizes` are pointers to those of
-    the unknowns.
+    """The iteration for one block of unknowns, from the guess to the root; `unknowns` and `sizes` are pointers to all unknowns of
+    the equation.
 
     After `emit`, `converged` and `count` are, by lane, whether the floor was reached and the number of updates.
     """
 
-    def __init__(self, correction: Correction, around: Region, unknowns: list[str], sizes: list[str]):
-        self.correction, self.around = correction, around
-        self.unknowns, self.sizes = unknowns, sizes
+    def __init__(self, parts: list[Correction], around: Region, unknowns: list[str], sizes: list[str]):
+        self.parts, self.around = parts, around
+        self.unknowns = {node: unknowns[i] for one in parts for node, i in zip(one.unknowns, one.places, strict=True)}
+        self.sizes = {node: sizes[i] for one in parts for node, i in zip(one.unknowns, one.places, strict=True)}
         self.e: Emitter = around.emitter
         self.body: Body = self.e.body
         self.converged = self.count = ""
@@ -45,59 +47,70 @@ class NewtonLoop:
         """Repeat while a lane's flag is up; gives the flags."""
         return _While(self.body, self.e, flag)
 
-    def _bound(self, region: Region) -> list[str]:
-        """The present unknowns, bound in a region."""
-        old = [self.body.load(self.e.real, u) for u in self.unknowns]
-        for node, value in zip(self.correction.unknowns, old, strict=True):
+    def values(self) -> list[tuple[int, str]]:
+        """The unknowns and their present values."""
+        return [(node, self.body.load(self.e.real, pointer)) for node, pointer in self.unknowns.items()]
+
+    def _region(self, known: dict[int, str], around: Region) -> Region:
+        """A region that knows the unknowns."""
+        region = Region(self.e, self.around.graph, around)
+        for node, value in known.items():
             region.bind(node, value)
-        return old
+        return region
 
-    def _first_kind(self, now: str) -> Region:
-        """An update with a new Jacobian; the region that knows its factors."""
-        g, correction = self.around.graph, self.correction
-        inner = Region(self.e, g, self.around)
-        old = self._bound(inner)
-        inner.require(correction.outputs)
-        change = [inner.value(n) for n in correction.change]
-        stable = inner.value(correction.stable)
-        if correction.stable != g.true:
-            change = by_partial_pivoting(inner, correction.jacobian, correction.residual, change, stable, now, correction.rows)
-        self._apply(old, change, stable, now)
-        return inner
+    def _first_kind(self, now: str) -> list[Region]:
+        """An update with new Jacobians; the regions that know their factors."""
+        old, g = dict(self.values()), self.around.graph
+        new, changes, inside, stable = dict(old), {}, [], self.e.true
+        for one in self.parts:
+            inner = self._region(new, self.around)
+            inner.require(one.outputs)
+            change, good = [inner.value(n) for n in one.change], inner.value(one.stable)
+            if one.stable != g.true:
+                change = by_partial_pivoting(inner, one.jacobian, one.residual, change, good, now, one.rows)
+            stable = self.e.both(stable, good)
+            self._changed(one, change, new, changes)
+            inside.append(inner)
+        self._apply(old, new, changes, stable, now)
+        return inside
 
-    def _second_kind(self, factors: Region, now: str) -> None:
-        """An update with the Jacobian of an earlier one."""
-        g = self.around.graph
-        here = Region(self.e, g, self.around)
-        old = self._bound(here)
-        here.require(self.correction.residual)
-        inner = Region(self.e, g, factors)
-        for node, value in zip(self.correction.right, self.correction.residual, strict=True):
-            inner.bind(node, here.value(value))
-        inner.require(self.correction.again)
-        self._apply(old, [inner.value(n) for n in self.correction.again], self.e.true, now)
+    def _second_kind(self, factors: list[Region], now: str) -> None:
+        """An update with the Jacobians of an earlier one."""
+        old = dict(self.values())
+        new, changes = dict(old), {}
+        for one, known in zip(self.parts, factors, strict=True):
+            here = self._region(new, self.around)
+            here.require(one.residual)
+            inner = self._region({n: here.value(r) for n, r in zip(one.right, one.residual, strict=True)}, known)
+            inner.require(one.again)
+            self._changed(one, [inner.value(n) for n in one.again], new, changes)
+        self._apply(old, new, changes, self.e.true, now)
 
-    def _apply(self, old: list[str], change: list[str], stable: str, now: str) -> None:
-        """Subtract the change, measure it, and decide which lanes go on and how."""
+    def _changed(self, one: Correction, change: list[str], new: dict[int, str], changes: dict[int, str]) -> None:
+        """Subtract the change of a part."""
+        for node, value in zip(one.unknowns, change, strict=True):
+            new[node], changes[node] = self.e.sub(new[node], value), value
+
+    def _apply(self, old: dict[int, str], new: dict[int, str], changes: dict[int, str], stable: str, now: str) -> None:
+        """Measure the change, and decide which lanes take it, which go on and how."""
         b, e = self.body, self.e
-        new = [e.sub(a, d) for a, d in zip(old, change, strict=True)]
         update, total = e.const(0.0), e.const(0.0)
-        sizes = [b.load(e.real, size) for size in self.sizes]
-        for a, d, size in zip(new, change, sizes, strict=True):
-            update = e.max(e.div(e.abs(d), e.add(e.abs(a), size)), update)
+        sizes = {node: b.load(e.real, size) for node, size in self.sizes.items()}
+        for node, d in changes.items():
+            update = e.max(e.div(e.abs(d), e.add(e.abs(new[node]), sizes[node])), update)
             total = e.add(total, d)
         update = e.select(e.compare("uno", total, total), e.const(float("nan")), update)
         count = b.load(e.real, self._number)
         first = e.compare("oeq", count, e.const(0.0))
         ratio = e.select(first, e.const(float("nan")), e.div(update, b.load(e.real, self._update)))
-        for pointer, a, c in zip(self.unknowns, new, old, strict=True):
-            b.store(e.real, e.select(now, a, c), pointer)
+        for node, pointer in self.unknowns.items():
+            b.store(e.real, e.select(now, new[node], old[node]), pointer)
         b.store(e.real, e.select(now, update, b.load(e.real, self._update)), self._update)
         count = e.select(now, e.add(count, e.const(1.0)), count)
         b.store(e.real, count, self._number)
         known = e.true
-        for a, d, size in zip(new, change, sizes, strict=True):
-            own = e.add(e.abs(a), e.mul(e.const(OWN), size))
+        for node, d in changes.items():
+            own = e.add(e.abs(new[node]), e.mul(e.const(OWN), sizes[node]))
             known = e.both(known, e.compare("ole", e.mul(ratio, e.abs(d)), e.mul(e.const(FLOOR / 2.0), own)))
         floor = self._at_floor(update, ratio, e.either(first, known))
         b.store(e.bool, e.body.put(f"select {e.bool} {now}, {e.bool} {floor}, {e.bool} {b.load(e.bool, self._floor, 1)}"),
@@ -109,7 +122,8 @@ class NewtonLoop:
         going = e.both(going, e.either(e.invert(now), unfinished))
         b.store(e.bool, going, self._going, 1)
         near = e.both(first, e.compare("olt", update, e.const(NEAR)))
-        quick = e.either(near, e.compare("olt", ratio, e.const(CONTRACTING)))
+        little = e.both(e.invert(first), e.compare("olt", update, e.const(STALLED)))
+        quick = e.either(e.either(near, little), e.compare("olt", ratio, e.const(CONTRACTING)))
         b.store(e.bool, e.both(e.both(now, unfinished), e.both(quick, stable)), self._contracting, 1)
 
     def _at_floor(self, update: str, ratio: str, known: str) -> str:
@@ -120,7 +134,7 @@ class NewtonLoop:
         stalled = e.both(e.compare("oge", ratio, e.const(0.5)), e.compare("olt", update, e.const(STALLED)))
         rounded = e.both(e.compare("ole", update, e.const(FLOOR)), known)
         small = e.either(rounded, e.compare("ole", left, e.const(NEGLIGIBLE)))
-        if self.correction.linear:
+        if len(self.parts) == 1 and self.parts[0].linear:
             small = e.either(small, e.both(e.compare("ord", ratio, ratio), e.compare("olt", update, e.const(STALLED))))
         return e.either(small, stalled)
 

@@ -64,7 +64,7 @@ class Plan:
         out = []
         for equation, correction in zip(self.equations, self.corrections, strict=True):
             out += [*equation.guess, *equation.residual, *equation.advance]
-            out += [node for one in correction.blocks for node in one.outputs]
+            out += [node for parts in correction.blocks for one in parts for node in one.outputs]
         out += [node for nodes in self.increments for node in nodes if node is not None]
         return out + [node for index in range(len(self.equations)) for *_, nodes in self.saving(index) for node in nodes]
 
@@ -72,7 +72,8 @@ class Plan:
         """Node → RUN, STEP or NEWTON with the number of its block (0 for constants)."""
         g = self.graph
         of_input = {node: STEP for e in self.equations for node in (*e.state, *e.previous)}
-        for number, one in ((number, one) for c in self.corrections for number, one in enumerate(c.blocks)):
+        blocks = [numbered for c in self.corrections for numbered in enumerate(c.blocks)]
+        for number, one in ((number, one) for number, parts in blocks for one in parts):
             of_input |= dict.fromkeys([*one.unknowns, *one.right], NEWTON + number)
         of_stage = STEP if len(self.stages) > 1 else RUN
         of_input |= {node: of_stage for c in self.corrections for node in c.sizes}

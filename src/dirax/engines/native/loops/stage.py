@@ -59,19 +59,18 @@ def emit_stage(
     last, slopes, bends = (frame.loads(frame.slots(base, k, offset)) for base in (frame.unknowns, frame.slopes, frame.bends))
     for node, value, slope, bend in zip(equation.previous, last, slopes, bends, strict=True):
         region.bind(node, e.add(e.add(value, slope), bend))
-    hoisted = frontier(plan.graph, block.level, [node for one in correction.blocks for node in one.outputs], STEP)
+    hoisted = frontier(plan.graph, block.level, [n for parts in correction.blocks for one in parts for n in one.outputs], STEP)
     region.require([*equation.guess, *hoisted])
     unknowns, sizes = [b.alloca(e.real) for _ in range(k)], frame.slots(frame.sizes, k, offset)
     frame.stores([region.value(n) for n in equation.guess], unknowns)
     converged, count, after = e.true, e.const(0.0), region
-    for solved, one in enumerate(correction.blocks):
-        after.require(frontier(plan.graph, block.level, one.outputs, NEWTON + solved - 1))
-        pointers = [unknowns[i] for i in one.places]
-        newton = NewtonLoop(one, after, pointers, [sizes[i] for i in one.places])
+    for solved, parts in enumerate(correction.blocks):
+        after.require(frontier(plan.graph, block.level, [n for one in parts for n in one.outputs], NEWTON + solved - 1))
+        newton = NewtonLoop(parts, after, unknowns, sizes)
         newton.emit(e.both(active, converged))
         converged, count = e.both(converged, newton.converged), e.max(count, newton.count)
         after = Region(e, plan.graph, after)
-        for node, value in zip(one.unknowns, frame.loads(pointers), strict=True):
+        for node, value in newton.values():
             after.bind(node, value)
     b.store(e.real, e.add(b.load(e.real, frame.iterations), count), frame.iterations)
     solution = [after.value(node) for node in equation.unknowns]
