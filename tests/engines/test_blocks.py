@@ -93,11 +93,55 @@ def test_saved_velocities_are_a_block_of_their_own():
     made.check()
     assert made.plan is not None
     (corrections,) = made.plan.corrections
-    assert [one.linear for one in corrections.blocks] == [False, True]
-    assert sorted(place for one in corrections.blocks for place in one.places) == list(range(sol.equation.unknowns))
+    assert [one.linear for (one,) in corrections.blocks] == [False, True]
+    assert sorted(place for (one,) in corrections.blocks for place in one.places) == list(range(sol.equation.unknowns))
     plain = case.simulate(dx.LagrangeDAlembert(), steps=40, engine="xla")
     np.testing.assert_allclose(sol.q, plain.q, rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(sol.p, plain.p, rtol=1e-10, atol=1e-10 * np.abs(plain.p).max())
+
+
+def test_method_2_corrects_accelerations_after_the_step_that_hardly_depends_on_them():
+    case, scheme = gallery.get("hanging-chain"), dx.DiscreteDirac(constraints="resolve")
+    sol = case.simulate(scheme, steps=40, engine="native")
+    made = kernels(sol.equation, sol.params, False)
+    made.check()
+    assert made.plan is not None
+    (corrections,) = made.plan.corrections
+    base, *others = corrections.blocks
+    layout = sol.equation.unknown_layout
+    of_the_flow = layout.split(np.arange(sol.equation.unknowns)).a
+    assert len(base) == 2 and set(of_the_flow.tolist()) <= set(base[1].places)
+    assert [len(parts) for parts in others] == [1, 1]
+    plain = case.simulate(scheme, steps=40, engine="xla")
+    for name in ("q", "p", "multipliers"):
+        scale = np.abs(plain.fields[name]).max()
+        np.testing.assert_allclose(sol.fields[name], plain.fields[name], rtol=1e-10, atol=1e-10 * scale)
+
+
+@pytest.mark.parametrize(("coupling", "needed"), [(1e-3, False), (30.0, True)])
+def test_entries_that_are_called_weak_and_are_not(coupling, needed):
+    """Newton's method goes on with the whole Jacobian where it does not converge without them."""
+    k = FEWEST
+
+    def residual(u, x, t, h, params):
+        first, second = u[:k], u[k:]
+        return jnp.concatenate([first + first**3 / 8.0 + coupling * jnp.roll(second, 1) - x[0], 2.0 * second - first - x[1]])
+
+    equation = dx.StepEquation(
+        start=lambda data, h, params: (data["x"], jnp.zeros(2 * k)),
+        residual=residual,
+        advance=lambda u, x, t, h, params: x,
+        unpack=lambda x, u, t, h, params: {"x": x, "u": u},
+        state_size=2,
+        unknowns=2 * k,
+        fields={"x": dx.Field((2,)), "u": dx.Field((2 * k,), "step")},
+        weak=((range(k), range(k, 2 * k)),),
+    )
+    out = engine_of("native").run(Problem(equation, np.array([1.0, 0.5]), (np.zeros(2 * k),), 0.1, 0.0, 3))
+    assert out.completed[0] == 3 and ("whole Jacobian" in out.notes.get("iteration", "")) == needed
+    u = out.fields["u"][0, -1]
+    np.testing.assert_allclose(u[:k] + u[:k] ** 3 / 8.0 + coupling * u[k:], 1.0, rtol=1e-14)
+    np.testing.assert_allclose(2.0 * u[k:] - u[:k], 0.5, rtol=1e-14)
 
 
 def test_an_equation_with_the_sign_of_a_later_unknown_is_not_solved_before_it():

@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
+from dirax.program.alarms import without_alarms
 from dirax.program.memo import Memo
 
 KEPT = 96
@@ -42,6 +43,7 @@ def compiled(function: Callable, **options: Any) -> Callable:
 
         kinds = tuple(map(type, static))  # 1, 1.0 and True are equal
         run = _jitted.get((own, structure, moves, static, kinds), jitted)
-        return run([leaf for leaf, m in zip(leaves, moves, strict=True) if m])
+        with without_alarms():
+            return run([leaf for leaf, m in zip(leaves, moves, strict=True) if m])
 
     return call
