@@ -74,8 +74,8 @@ MORE_FOR_XLA = 2.6
 
 SCALARS_FOR_ARRAYS = 5
 """Scalar operations that take LLVM as long to compile as XLA takes for one operation on arrays, a millisecond: "auto" gives
-the native engine a step of more than MOST_OPERATIONS where XLA would take longer. The bicycle by Method 2 has 44 600 and 48 100:
-7 s and 60 s to the first result, and 17 µs and 5.5 ms a step."""
+the native engine a step of more than MOST_OPERATIONS where XLA would take longer. The bicycle by Method 2 has 31 900 and 48 100:
+4 s and 60 s to the first result, and 14 µs and 5.5 ms a step."""
 
 MOST_FOR_XLA = 6000
 """Scalar operations of a residual with its Jacobian up to which XLA is given them: it takes some milliseconds to compile each."""
