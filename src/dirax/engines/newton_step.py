@@ -26,8 +26,8 @@ SAMPLES = 7
 
 @dataclass
 class Correction:
-    """change = J⁻¹ residual for a part of the unknowns of an equation; `stable` says at run time whether the fixed pivots were large
-    enough.
+    """change = J⁻¹ residual for a part of the unknowns of an equation; `stable` says at run time whether the fixed pivots were
+    large enough.
 
     `again` is J⁻¹ applied to another right-hand side, the inputs `right`, from the same `factors`.
     """

@@ -1,16 +1,17 @@
 """What XLA has to say of how long it takes to compile goes to nobody's terminal: `stats` say it.
 
-XLA writes such alarms to the file of standard errors, from a thread of its own, whatever Python does with `sys.stderr`. Its log has
-one level for the whole process, which is raised while functions of dirax are compiled and run, and set back then.
+XLA writes such alarms to the file of standard errors, from a thread of its own, whatever Python does with `sys.stderr`. Its log
+has one level for the whole process, which is raised while functions of dirax are compiled and run, and set back then.
 """
 
+import importlib
 import os
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import Any
 
 import jax
-from jaxlib import utils
 
 FATAL = 3
 """The level above that of alarms, which are errors to XLA."""
@@ -18,7 +19,10 @@ FATAL = 3
 LEVELS = {"DEBUG": 0, "INFO": 0, "WARN": 1, "WARNING": 1, "ERROR": 2, "CRITICAL": 3, "FATAL": 3}
 """Those of `jax_logging_level`."""
 
-_set_level = getattr(utils, "absl_set_min_log_level", None)  # not of the public interface of JAX
+_set_level: Any = None
+with suppress(ImportError, AttributeError):  # it is not of the public interface of JAX
+    _set_level = importlib.import_module("jaxlib.utils").absl_set_min_log_level
+
 _lock = threading.Lock()
 _inside = 0
 

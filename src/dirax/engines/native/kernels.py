@@ -33,8 +33,8 @@ SIZING = 1e-5
 
 
 class Kernels:
-    """The machine code of a step: kernels by width, made when they are asked for; with the `whole` Jacobians in Newton's method, or
-    without the entries that the step says are weak."""
+    """The machine code of a step: kernels by width, made when they are asked for; with the `whole` Jacobians in Newton's
+    method, or without the entries that the step says are weak."""
 
     def __init__(self, step: StepProgram, compensated: bool, rules: dict[str, str], whole: bool):
         self.step, self.compensated, self.rules, self.whole = step, compensated, rules, whole
