@@ -1,7 +1,7 @@
 """What the first run of an equation costs: tracing and compiling, and the second run in a new place.
 
 `python -m benchmarks.first_call` compares the engines on three systems; with `--gallery` it measures the first call of every
-system of the gallery in new processes, with no kernel on the disk and with one.
+system of the gallery in new processes, with no kernel on the disk and with one, and the first `verify`.
 """
 
 import json
@@ -59,16 +59,21 @@ def measure(name: str, engine: str) -> dict:
 
 
 def first_call(name: str) -> dict:
-    """Seconds of the first call of a system of the gallery in this process, after the imports."""
+    """Seconds of the first call of a system of the gallery in this process, after the imports, and of `verify` of that run."""
     import dirax.engines.native  # noqa: F401  (it is imported when it is used; so that the call is measured alone)
     from dirax import gallery
 
     jax.config.update("jax_enable_compilation_cache", False)
     example = gallery.get(name)
-    wall, processor = time.perf_counter(), time.process_time()
-    stats = example.simulate(steps=10, save_every=10).stats
-    wall, processor = time.perf_counter() - wall, time.process_time() - processor
-    return {"wall": wall, "processor": processor, "engine": stats["engine"], "cached": stats.get("kernel_cached", False)}
+    clocks = lambda: np.array([time.perf_counter(), time.process_time()])
+    started = clocks()
+    sol = example.simulate(steps=10, save_every=10)
+    ran = clocks()
+    dx.verify(sol)
+    verified = clocks()
+    (wall, processor), (_, verify) = (ran - started).tolist(), (verified - ran).tolist()
+    stats = {"engine": sol.stats["engine"], "cached": sol.stats.get("kernel_cached", False)}
+    return {"wall": wall, "processor": processor, "verify": verify, **stats}
 
 
 def over_gallery(repeats: int = 5) -> None:
@@ -85,11 +90,11 @@ def over_gallery(repeats: int = 5) -> None:
             if repeat:  # the first round writes the byte code
                 results.setdefault(name, []).append(pair)
     middle = lambda name, k, clock: statistics.median(pair[k][clock] for pair in results[name])
-    columns = [(0, "wall"), (1, "wall"), (0, "processor"), (1, "processor")]
+    columns = [(0, "wall"), (1, "wall"), (0, "processor"), (1, "processor"), (0, "verify")]
     found = {name: {f"{('first', 'from the disk')[k]}, {c}": middle(name, k, c) for k, c in columns} for name in results}
     names = sorted(found, key=lambda name: middle(name, 0, "wall"))
     rows = [(name, *(f"{value:.3f}" for value in found[name].values()), results[name][0][0]["engine"]) for name in names]
-    header = ("system", "first call", "from the disk", "first, processor", "disk, processor", "engine")
+    header = ("system", "first call", "from the disk", "first, processor", "disk, processor", "verify, processor", "engine")
     print(table(header, rows, f"seconds of the first call in a new process, after the imports; medians of {repeats}"))
     for k, label in ((0, "first call"), (1, "from the disk")):
         times = [middle(name, k, "wall") for name in names]
