@@ -23,6 +23,9 @@ FORGIVEN = 1e-6
 
 SAMPLES = 7
 
+Order = list[list[tuple[int, int]]]
+"""(row, column) of each pivot, in parts of which none has unknowns of those after it."""
+
 
 @dataclass
 class Correction:
@@ -56,18 +59,16 @@ class Correction:
 @dataclass
 class Corrections:
     """How the unknowns of an equation are found: block after block, each with the unknowns of those before it known. A block has
-    several parts where its equations hold the unknowns of later parts only weakly: an update goes over them in turn."""
+    several parts where its equations hold the unknowns of later parts only weakly: an update goes over them in turn.
 
+    `jacobian` and `order` are the whole matrix and the order of its pivots.
+    """
+
+    jacobian: list[list[int]]
+    order: Order
     sizes: list[int]
     """The inputs that say how large the unknowns are."""
     blocks: list[list[Correction]]
-
-
-Order = list[list[tuple[int, int]]]
-"""(row, column) of each pivot, in parts of which none has unknowns of those after it."""
-
-Elimination = tuple[list[list[int]], Order]
-"""A matrix, and the order of its pivots."""
 
 
 def newton_corrections(g: Graph, program: StepProgram, index: int, whole: bool = False) -> Corrections:
@@ -75,11 +76,14 @@ def newton_corrections(g: Graph, program: StepProgram, index: int, whole: bool =
     Jacobian, or without the entries that the step says are weak."""
     equation = program.equations[index]
     if not equation.unknowns:
-        return Corrections([], [])
-    matrix, pivots = _pivots_by_parts(program, index, whole)
+        return Corrections([], [], [], [])
+    matrix, order = elimination(program, index)
+    pivots = [[part] for part in order] if whole else _parts(program, index)
     sizes = [g.input(f"size{i}") for i in range(len(matrix))]
     present = [g.add(g.make("abs", u), size) for u, size in zip(equation.unknowns, sizes, strict=True)]
-    return Corrections(sizes, [[_correction(g, equation, matrix, part, present) for part in block] for block in pivots])
+    return Corrections(
+        matrix, order, sizes, [[_correction(g, equation, matrix, part, present) for part in block] for block in pivots]
+    )
 
 
 def _correction(
@@ -103,7 +107,7 @@ def _correction(
 _known: Memo[tuple] = Memo(KEPT)
 
 
-def elimination(program: StepProgram, index: int) -> Elimination:
+def elimination(program: StepProgram, index: int) -> tuple[list[list[int]], Order]:
     """The Jacobian of an equation of a step, and the order of its pivots by blocks. Raises `GraphTooLarge`."""
 
     def made():
@@ -113,12 +117,12 @@ def elimination(program: StepProgram, index: int) -> Elimination:
     return _known.get((Same(program), index), made)
 
 
-def _pivots_by_parts(program: StepProgram, index: int, whole: bool) -> tuple[list[list[int]], list[Order]]:
-    """The Jacobian, and for each block of unknowns the order of the pivots of each of its parts."""
+def _parts(program: StepProgram, index: int) -> list[Order]:
+    """For each block of unknowns the order of the pivots of each of its parts."""
     g, equation = program.graph, program.equations[index]
     matrix, order = elimination(program, index)
-    if whole or not equation.weak:
-        return matrix, [[part] for part in order]
+    if not equation.weak:
+        return [[part] for part in order]
     weak = {(i, j) for rows, columns in equation.weak for i in rows for j in columns}
     there = np.array([[entry != g.zero and (i, j) not in weak for j, entry in enumerate(row)] for i, row in enumerate(matrix)])
     found = []
@@ -126,7 +130,7 @@ def _pivots_by_parts(program: StepProgram, index: int, whole: bool) -> tuple[lis
         rows, columns = sorted(i for i, _ in block), sorted(j for _, j in block)
         parts = [([rows[i] for i in r], [columns[j] for j in c]) for r, c in blocks(there[np.ix_(rows, columns)])]
         found.append(pivot_order(g, matrix, parts) if len(parts) > 1 else [block])
-    return matrix, found
+    return found
 
 
 def _jacobian(program: StepProgram, index: int) -> list[list[int]]:
@@ -138,7 +142,7 @@ def _blocks(program: StepProgram, index: int, matrix: list[list[int]]) -> list[t
     """(rows, columns) of the blocks of unknowns; all together where the equations of one cannot be evaluated before the unknowns
     of later ones are known: an equation may have one in it by which its derivative is zero, such as the sign of it."""
     g, equation = program.graph, program.equations[index]
-    found, later = blocks(np.array(matrix).reshape(len(matrix), -1) != g.zero), set(equation.unknowns)
+    found, later = blocks(np.array(matrix, int).reshape(len(matrix), len(matrix)) != g.zero), set(equation.unknowns)
     for rows, columns in found[:-1]:
         later -= {equation.unknowns[j] for j in columns}
         if not later.isdisjoint(g.reachable([equation.residual[i] for i in rows])):

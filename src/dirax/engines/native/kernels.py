@@ -15,7 +15,7 @@ from dirax.engines.native.loops.plan import Plan
 from dirax.engines.native.loops.record import Record
 from dirax.engines.native.loops.sizes import sizes_module
 from dirax.engines.native.loops.step_loop import kernel_module
-from dirax.engines.newton_step import Elimination, elimination, newton_corrections
+from dirax.engines.newton_step import newton_corrections
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.program import graph as graph_module
 from dirax.program import machine_code as llvm
@@ -73,7 +73,7 @@ class Kernels:
         than a part of what its compilation takes."""
         worth = self.sizing > SIZING * self.step.entries
         if width not in self._of_sizes and worth and self.step.sizes_are_written:
-            text = lambda: sizes_module(self._planned(), self._eliminations(), width, llvm.has_fma())
+            text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
             library, _ = self._library("run", width, text, "sizes", level=0)
             self._of_sizes[width] = llvm.function(library, "run", SIGNATURE)
         return self._of_sizes.get(width)
@@ -117,9 +117,6 @@ class Kernels:
                 raise too_large(error) from None
             self.plan, self.operations = plan, count_operations(plan)
         return self.plan
-
-    def _eliminations(self) -> list[Elimination]:
-        return [elimination(self.step, i) for i in range(len(self.step.equations))]
 
     def _plan(self, graph: Graph) -> Plan:
         step = self.step

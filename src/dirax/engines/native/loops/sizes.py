@@ -7,25 +7,24 @@ from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.plan import Plan
 from dirax.engines.native.loops.record import DOUBTFUL
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
-from dirax.engines.newton_step import Elimination
 from dirax.numerics.equilibration import BETWEEN, LEAST_SIZE
 
 EXPONENT = 0x7FF << 52
 """The bits of a positive double that a power of two has."""
 
 
-def sizes_module(plan: Plan, eliminations: list[Elimination], width: int, fma: bool) -> str:
+def sizes_module(plan: Plan, width: int, fma: bool) -> str:
     """IR of a `run(lanes, params, outs, blocks, …)` that writes the sizes of every stage, at the state and the unknowns of a
     record, into lanes that have none, by the elimination of the Jacobian of each equation. A lane in which they are in doubt has
     the outcome `DOUBTFUL`."""
     module = Module(fma, groups=False)
     add_far_reduction(module)
-    _define_block(plan, eliminations, module, width)
+    _define_block(plan, module, width)
     define_run(module, [count * width * 8 for count in (plan.record.size, len(plan.shared.params), 0)])
     return module.text()
 
 
-def _define_block(plan: Plan, eliminations: list[Elimination], module: Module, width: int) -> None:
+def _define_block(plan: Plan, module: Module, width: int) -> None:
     """`block`: the stages one after the other, each by the function of its equation."""
     b, record = Body(module), plan.record
     e = Emitter(b, width)
@@ -44,13 +43,13 @@ def _define_block(plan: Plan, eliminations: list[Elimination], module: Module, w
     module.define(f"define internal void @block(ptr %lanes, ptr %params, ptr %outs, {NUMBERS})", b)
     for index in sorted({index for index, _ in plan.stages}):
         if plan.equations[index].unknowns:
-            _define_sizes(plan, eliminations[index], module, width, index)
+            _define_sizes(plan, module, width, index)
 
 
-def _define_sizes(plan: Plan, elimination: Elimination, module: Module, width: int, index: int) -> None:
+def _define_sizes(plan: Plan, module: Module, width: int, index: int) -> None:
     """`of_‹index›`: the sizes of a stage that solves this equation, in the lanes that have none."""
     b, record, equation = Body(module), plan.record, plan.equations[index]
-    (matrix, order), k = elimination, len(equation.unknowns)
+    correction, k = plan.corrections[index], len(equation.unknowns)
     e = Emitter(b, width)
     places = lambda base, count: [b.at(e.real, base, i) for i in range(count)]
     load = lambda pointer: b.load(e.real, pointer)
@@ -61,7 +60,7 @@ def _define_sizes(plan: Plan, elimination: Elimination, module: Module, width: i
     at = [*places("%params", len(plan.shared.params)), *places("%lanes", record.state_size), *places("%unknowns", k)]
     for node, pointer in zip(given, at, strict=True):
         region.bind(node, load(pointer))
-    found = FirstSizes(plan.graph, Linearized.of(plan.graph, equation, plan.shared.h, matrix), order)
+    found = FirstSizes(plan.graph, Linearized.of(plan.graph, equation, plan.shared.h, correction.jacobian), correction.order)
     region.require(found.outputs)
     status = b.at(e.real, "%lanes", record.status)
     sure = e.compare("oeq", region.value(found.sure), e.const(1.0))
