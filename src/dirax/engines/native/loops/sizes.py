@@ -15,8 +15,7 @@ EXPONENT = 0x7FF << 52
 
 def sizes_module(plan: Plan, width: int, fma: bool) -> str:
     """IR of a `run(lanes, params, outs, blocks, …)` that writes the sizes of every stage, at the state and the unknowns of a
-    record, into lanes that have none, by the elimination of the Jacobian of each equation. A lane in which they are in doubt has
-    the outcome `DOUBTFUL`."""
+    record, into lanes that have none. A lane in which they are in doubt has the outcome `DOUBTFUL`."""
     module = Module(fma, groups=False)
     add_far_reduction(module)
     _define_block(plan, module, width)
