@@ -94,9 +94,9 @@ class ProjectedThetaStep(ThetaStep):
     constraints; M = ∂²L/∂v² at (q', v). Unknowns are v, σ, the acceleration a and λ of the base point, and s and d of the first
     half, which moves q by d, where M(d/θh − v) = Gᵀs; and v', σ', s' and d' of the second. The equations of a and λ are
     (∂L/∂v)˙ = ∂L/∂q + f + [W; G]ᵀλ and ([W; G] v + …)˙ = 0 along v̇ = a: where there are few of them they are solved in place,
-    else no matrix is inverted, and σ and σ' are counted from the impulses of λ in their halves, so that the balance of momenta hardly
-    depends on λ. It is d and not a velocity that is unknown since derivatives by d are derivatives by q, of which many stand in
-    the equations anyway. Constraints at the times t_k, t_k + θh and t_k + h hold to roundoff at all three points.
+    else no matrix is inverted, and σ and σ' are counted from the impulses of λ in their halves, so that the balance of momenta
+    hardly depends on λ. It is d and not a velocity that is unknown since derivatives by d are derivatives by q, of which many
+    stand in the equations anyway. Constraints at the times t_k, t_k + θh and t_k + h hold to roundoff at all three points.
     """
 
     @property
