@@ -11,6 +11,7 @@ import sys
 import numpy as np
 
 import dirax as dx
+from benchmarks.newmark import COMPOSED, Newmark
 from dirax import gallery
 from dirax.diagnostics.drift import judge
 from dirax.gallery import contact_particle, transmission
@@ -23,6 +24,9 @@ SCHEMES = {
     "Method 1": dx.DiscreteDirac(constraints="discretize"),
     "Method 2": METHOD_2,
     "Method 2, order 4": dx.Composition(METHOD_2, "suzuki4"),
+    "Newmark, β = ¼, γ = ½": Newmark(0.25, 0.5),
+    "Newmark, composed": COMPOSED,
+    "Newmark, composed, order 4": dx.Composition(COMPOSED, "suzuki4"),
     "energy collocation, order 4": dx.EnergyCollocation(2),
     "energy collocation, order 6": dx.EnergyCollocation(3),
 }
@@ -48,9 +52,16 @@ def cases() -> dict[str, tuple]:
 
 
 def lagrangian_form(example):
-    """The system as the one-sided schemes take it."""
+    """The system as all schemes but Methods 1 and 2 take it."""
     system = example.system
     return system.lagrange_dirac() if hasattr(system, "lagrange_dirac") else system
+
+
+def form_for(example, scheme):
+    """The system as the scheme, or the one that it is composed of, takes it."""
+    while hasattr(scheme, "scheme"):
+        scheme = scheme.scheme
+    return example.system if isinstance(scheme, dx.DiscreteDirac) else lagrangian_form(example)
 
 
 def initial_energy(example, changes: dict) -> float:
@@ -60,7 +71,7 @@ def initial_energy(example, changes: dict) -> float:
 
 def verdict(example, scheme, steps: int, changes: dict) -> str:
     """One cell: the verdict on the energy, its range in the first and last tenth of the run."""
-    system = example.system if isinstance(scheme, dx.DiscreteDirac | dx.Composition) else lagrangian_form(example)
+    system = form_for(example, scheme)
     params = {**(example.params or {}), **changes.get("params", {})} or None
     data = {name: changes[name] for name in ("q", "v") if name in changes} or {name: example.initial[name] for name in ("q", "v")}
     step = changes.get("step", example.step)
