@@ -5,6 +5,11 @@ q = (x, y, θ, ψ, φ): centre and heading of the board, angle of the rotor, and
     L = ½ m (ẋ² + ẏ²) + ½ m r² θ̇² + J_r θ̇ψ̇ + ½ J_r ψ̇² + J_w φ̇²
     −sin(θ ± φ) ẋ + cos(θ ± φ) ẏ ∓ r cos φ θ̇ = 0
 
+No axle moves sideways. Where both stand across, at cos φ = 0, these two one-forms depend on each other, while the motion passes
+there smoothly: their sum has the factor 2 cos φ. Without it, and with half their difference, they are independent everywhere:
+
+    −sin θ ẋ + cos θ ẏ = 0,   sin φ (cos θ ẋ + sin θ ẏ) + r cos φ θ̇ = 0
+
 The momenta of ψ and φ are conserved, J_r (θ̇ + ψ̇) and 2 J_w φ̇; that along the board is not: this is how one rides it.
 """
 
@@ -32,10 +37,10 @@ def potential(q, params):
 
 
 def one_forms(q, params):
-    """No sideways motion of the back and of the front axle, shape (2, 5)."""
-    lever, zero = params["r"] * jnp.cos(q[4]), jnp.zeros(())
-    row = lambda angle, arm: jnp.stack([-jnp.sin(angle), jnp.cos(angle), arm, zero, zero])
-    return jnp.stack([row(q[2] + q[4], -lever), row(q[2] - q[4], lever)])
+    """No sideways motion of the centre, and the turn of the board as the axles stand, shape (2, 5)."""
+    zero, c, s = jnp.zeros(()), jnp.cos(q[2]), jnp.sin(q[2])
+    turning = jnp.sin(q[4]) * jnp.stack([c, s])
+    return jnp.stack([jnp.stack([-s, c, zero, zero, zero]), jnp.stack([*turning, params["r"] * jnp.cos(q[4]), zero, zero])])
 
 
 def scene() -> Scene:
