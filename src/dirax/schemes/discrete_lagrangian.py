@@ -19,6 +19,9 @@ CONSTRAINTS = ("left", "right", "midpoint")
 BASE = {"left": 0.0, "right": 1.0, "midpoint": 0.5}
 """Where the point of a one-point rule lies in the step."""
 
+QUADRATURE = {rule: ((base, 1.0),) for rule, base in BASE.items()} | {"trapezoidal": ((0.0, 0.5), (1.0, 0.5))}
+"""Where the points of a rule lie in the step, with their weights."""
+
 MIRRORED = {"left": "right", "right": "left", "midpoint": "midpoint", "trapezoidal": "trapezoidal"}
 
 """The rule that is the same when time runs backwards, by the name of a rule."""
@@ -101,6 +104,29 @@ def slot_derivatives(ld: Callable, t, q, v, h, params) -> tuple[Float[Array, " n
     """(D1 L_d, D2 L_d) at (q, q + h v), from the derivatives with respect to (q, v)."""
     dq, dv = gradient(ld, (1, 2))(t, q, v, h, params)
     return dq - dv / h, dv / h
+
+
+def derivatives_by_slots(lagrangian: UserFunction, rule: str | UserFunction) -> Callable:
+    """(D1 L_d, D2 L_d) of `discrete_lagrangian` as a function (t0, q0, v, h, params).
+
+    L_d = h Σ w_i L(q0 + c_i h v, v) has the derivatives Σ w_i ((1 − c_i) h ∂L/∂q − ∂L/∂v) and Σ w_i (c_i h ∂L/∂q + ∂L/∂v), in
+    which nothing cancels: where the Lagrangian is separable, (q0, p0) with the rules "right" and "trapezoidal" then is
+    explicit in v not by value alone, but for the engines too.
+    """
+    if isinstance(rule, UserFunction):
+        ld = discrete_lagrangian(lagrangian, rule)
+        return lambda t, q, v, h, params: slot_derivatives(ld, t, q, v, h, params)
+
+    def by_quadrature(t, q, v, h, params):
+        first, last = [], []
+        for share, weight in QUADRATURE[rule]:
+            at, point = (t + share * h, q + share * h * v) if share else (t, q)
+            dq, dv = gradient(lambda q, v, at=at: lagrangian.at(at, q, v, params), (0, 1))(point, v)
+            first.append(weight * ((1.0 - share) * h * dq - dv if share != 1.0 else -dv))
+            last.append(weight * (share * h * dq + dv if share else dv))
+        return sum(first[1:], first[0]), sum(last[1:], last[0])
+
+    return by_quadrature
 
 
 def mirrored(rule: str | UserFunction, sign: float) -> str | Callable:

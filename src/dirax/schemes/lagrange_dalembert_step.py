@@ -12,7 +12,7 @@ from dirax.program.tracing import once
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows, step_constraints
-from dirax.schemes.discrete_lagrangian import discrete_constraint, discrete_forces, discrete_lagrangian, slot_derivatives
+from dirax.schemes.discrete_lagrangian import derivatives_by_slots, discrete_constraint, discrete_forces
 from dirax.schemes.hermite import hermite
 from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
@@ -63,9 +63,9 @@ class LagrangeDAlembertStep(AbstractStep):
         return WorkOfForces(self.system, self.shape.n)
 
     @cached_property
-    def discrete_lagrangian(self):
-        """L_d as a function (t0, q0, v, h, params)."""
-        return discrete_lagrangian(self.system.lagrangian, self.rule)
+    def derivatives(self):
+        """(D1 L_d, D2 L_d) as a function (t0, q0, v, h, params)."""
+        return derivatives_by_slots(self.system.lagrangian, self.rule)
 
     @cached_property
     def discrete_constraint(self):
@@ -120,7 +120,7 @@ class LagrangeDAlembertStep(AbstractStep):
     @once
     def slots(self, t, q, v, h, params, of_constraints=None):
         """(D1 L_d + f_d^−, D2 L_d + f_d^+): a step leaves its first point with minus the one, and arrives with the other."""
-        d1, d2 = slot_derivatives(self.discrete_lagrangian, t, q, v, h, params)
+        d1, d2 = self.derivatives(t, q, v, h, params)
         if self.system.forces is None:
             return d1, d2
         first, last = self.impulses(t, q, v, h, params, of_constraints)
