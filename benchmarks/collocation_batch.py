@@ -19,7 +19,7 @@ from benchmarks.work_precision import henon_heiles
 
 BATCH, SIDE_BY_SIDE, REPEATS, END = 1024, 8, 4, 100.0
 TOLERANCES = 10.0 ** -np.arange(6, 16)
-SETTINGS = ((4, 0.5), (5, 0.5), (6, 1.0), (7, 1.0), (8, 1.0), (8, 0.5), (10, 2.0), (12, 2.0))
+SETTINGS = ((4, 0.25), (4, 0.5), (5, 0.5), (6, 1.0), (7, 1.0), (8, 1.0), (8, 0.5), (10, 2.0), (12, 2.0))
 
 
 def taylor(solver, start: np.ndarray) -> tuple[float, np.ndarray]:
