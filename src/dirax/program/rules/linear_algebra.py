@@ -90,7 +90,7 @@ def small_solve(interpreter: Interpreter, equation: Any, matrix, right):
 def solve_blocks(g: Graph, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """x with matrix x = right, (n, r), for every group of equations by itself."""
     x = np.empty_like(right)
-    for block in _independent(matrix != g.zero):
+    for block in _independent(~np.isin(matrix, [g.zero, g.constant(-0.0)])):
         x[block] = eliminated(g, matrix[np.ix_(block, block)], right[block])
     return x
 
