@@ -298,8 +298,9 @@ def test_systems_that_it_does_not_step_are_refused():
     with pytest.raises(TypeError, match="does not keep holonomic constraints"):
         run(sphere, q=[1.0, 0.0], v=[0.0, 1.0])
     skewed = dx.DiracSystem(dx.DiracStructure.from_bivector(lambda x: jnp.array([[0.0, 1.0], [-0.9, 0.0]])), lambda x: x @ x / 2)
-    with pytest.raises(ValueError, match=r"not (skew|antisymmetric)"):
-        run(skewed, x=[1.0, 0.0])
+    for scheme in (dx.EnergyCollocation(), dx.Collocation(), dx.DiscreteDirac()):  # with none of them the energy would be kept
+        with pytest.raises(ValueError, match=r"not (skew|antisymmetric)"):
+            dx.simulate(skewed, scheme, x=[1.0, 0.0], step=0.1, steps=1)
     with pytest.raises(TypeError, match="ManifoldLagrangian was given"):
         run(dx.ManifoldLagrangian(lambda q, v: v @ v / 2, dx.Sphere(3)), q=[1.0, 0.0, 0.0], v=[0.0, 1.0, 0.0])
     suslov = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ xi / 2, jnp.array([[1.0, 0.0, 0.0]]))
@@ -307,6 +308,19 @@ def test_systems_that_it_does_not_step_are_refused():
         run(suslov, x=suslov.state([0.0, 1.0, 0.0]))
     with pytest.raises(ValueError, match="one-step method"):
         run(SYSTEMS["no constraints"][0], q0=[0.0, 0.0], q1=[0.1, 0.0])
+
+
+def test_vortices_are_stepped_natively():
+    """The matrix of their two-form is constant: the solves of all nodes are traced as one, which falls apart into theirs."""
+    sol = gallery.get("vortices").simulate(dx.EnergyCollocation(2), steps=20)
+    assert sol.stats["engine"] == "native" and np.ptp(sol.energy()) < 1e-14
+
+
+@pytest.mark.soak
+def test_the_snakeboard_passes_where_its_axles_stand_across():
+    sol = gallery.get("snakeboard").simulate(dx.EnergyCollocation(2), steps=5000)
+    across = np.cos(sol.q[:, 4])
+    assert across.min() < -0.5 and np.ptp(sol.energy()) < 1e-14 and sol.stats["energy_defect"] < 1e-13
 
 
 def test_a_distribution_that_changes_its_rank_is_refused_with_the_place():

@@ -214,6 +214,21 @@ def slots_by_hand(rule, q0, q1, h):
     return h * (1 - weight) * along - across, h * weight * along + across
 
 
+def test_steps_of_a_separable_lagrangian_are_explicit():
+    """The trapezoidal rule is Störmer and Verlet's; its equations are linear in v, with the mass for a matrix."""
+    mass = np.array([[2.0, 0.3], [0.3, 1.0]])
+    system = dx.LagrangeDirac(lambda q, v: v @ mass @ v / 2 - jnp.sin(q[0]) * q[1] ** 2)
+    q, v, h, steps = np.array([0.3, 0.8]), np.array([0.5, -0.2]), 0.1, 40
+    sol = dx.simulate(system, dx.LagrangeDAlembert("trapezoidal"), q=q, v=v, step=h, steps=steps, engine="native")
+    assert sol.stats["newton_iterations"] == 2 * steps
+    p, force = mass @ v, lambda q: -np.array([np.cos(q[0]) * q[1] ** 2, 2 * np.sin(q[0]) * q[1]])
+    for _ in range(steps):
+        p = p + h / 2 * force(q)
+        q = q + h * np.linalg.solve(mass, p)
+        p = p + h / 2 * force(q)
+    np.testing.assert_allclose(np.concatenate([sol.q[-1], sol.p[-1]]), np.concatenate([q, p]), rtol=0, atol=1e-14)
+
+
 small = st.floats(-2, 2, allow_subnormal=False)
 points = st.tuples(*[small] * 3).map(np.array)
 

@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from dirax.geometry.lagrangian_submanifolds import LagrangianSubmanifold
+from dirax.geometry.representations import KERNEL_PAIRS
 from dirax.geometry.structures import DiracStructure, Induced
 from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import BRACKET_DEFECT, RATE_RANK
 from dirax.program.linear_solves import pseudo_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
-from dirax.program.user_functions import UserFunction, evaluated
+from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
 from dirax.systems.hamilton_dirac import HamiltonDirac
@@ -230,7 +231,7 @@ class DiracSystem(AbstractSystem):
         return jnp.concatenate([data["q"], data["p"]])
 
     def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
-        """(N, 0), or (N, 0, c) with holonomic constraints."""
+        """(N, 0), or (N, 0, c) with holonomic constraints. Raises `ValueError` where the structure at x is none, with the defect."""
         x = self.point(data)
         out = self.hamiltonian.shape(x, params)
         if out.shape != ():
@@ -241,6 +242,9 @@ class DiracSystem(AbstractSystem):
                 f"the Dirac structure has dimension {F.shape[0]}, but x has {x.size} entries"
                 + (f": {self.structure.ports} ports are open; connect them by `compose`." if self.structure.ports else ".")
             )
+        if not is_traced(x, params):  # whether the matrices are those of a Dirac structure is seen in numbers alone
+            matrices = evaluated(self.structure.evaluate, x, params)
+            KERNEL_PAIRS[self.structure.representation](*(np.asarray(matrix) for matrix in matrices))
         return (x.size, 0) if self.holonomic is None else (x.size, *self.constraints.sizes(x, params))
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
