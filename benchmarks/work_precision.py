@@ -26,7 +26,7 @@ IN_A_ROW = 4
 
 STAGES = (4, 6, 8, 12, 16)
 FEWER = (4, 6, 8)
-"""Of a system whose steps of more stages are too large for the native engine."""
+"""Of a system whose steps of more stages take seconds to compile."""
 
 GRAVITY = 2.95912208286e-4
 MASSES = (1.00000597682, 0.000954786104043, 0.000285583733151, 0.0000437273164546, 0.0000517759138449, 1 / 1.3e8)

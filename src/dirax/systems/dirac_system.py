@@ -231,7 +231,7 @@ class DiracSystem(AbstractSystem):
         return jnp.concatenate([data["q"], data["p"]])
 
     def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
-        """(N, 0), or (N, 0, c) with holonomic constraints. Raises `ValueError` where the structure at x is none, with the defect."""
+        """(N, 0), or (N, 0, c) with holonomic constraints. Raises `ValueError` where the structure at x is none."""
         x = self.point(data)
         out = self.hamiltonian.shape(x, params)
         if out.shape != ():

@@ -55,8 +55,8 @@ class CollocationKernels:
     @functools.cached_property
     def by_newton(self) -> "CollocationKernels | None":
         """Those that go on where the fixed-point iteration does not converge: with s/2 complex linear systems of the size of one
-        node. None for a relation of means, and where they do not pay or are too large."""
-        if not isinstance(self.plan, CollocationPlan) or not pays(self.plan):
+        node. None where they do not pay or are too large."""
+        if not pays(self.plan):
             return None
         try:
             _ = self.plan.pencil  # with which the graph has all its nodes

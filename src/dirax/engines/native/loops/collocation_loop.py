@@ -12,7 +12,7 @@ from dirax.engines.native.loops.collocation_nodes import Nodes
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
 from dirax.engines.native.loops.collocation_sweeps import FirstOrder, SecondOrder, Sweep
 from dirax.engines.native.loops.complex_inverse import add_complex_inverse
-from dirax.engines.native.loops.simplified_newton import Eigenbasis, SimplifiedNewton
+from dirax.engines.native.loops.simplified_newton import Eigenbasis, InEigenbasis, SimplifiedNewton, SimplifiedNewtonOfMeans
 from dirax.engines.native.loops.step_loop import NUMBERS, define_run
 
 
@@ -23,7 +23,7 @@ def collocation_module(plan: CollocationPlan | MeanPlan, trajectories: int, fma:
     add_far_reduction(module)
     if newton:
         add_complex_inverse(module, len(plan.relation.first))
-        _Kernel(plan, module, 1, SimplifiedNewton).define()
+        _Kernel(plan, module, 1, SimplifiedNewtonOfMeans if isinstance(plan, MeanPlan) else SimplifiedNewton).define()
     else:
         kind = Means if isinstance(plan, MeanPlan) else FirstOrder if plan.gain is None else SecondOrder
         _Kernel(plan, module, trajectories, kind).define()
@@ -59,7 +59,7 @@ class _Kernel:
         for iterate, of_nodes in zip(self.pair.now(), kept, strict=True):
             self.all.read(of_nodes, iterate)
         self._take_sizes(places)
-        if self.kind is SimplifiedNewton and isinstance(plan, CollocationPlan):
+        if issubclass(self.kind, InEigenbasis):
             self.nodes.eigenbasis = Eigenbasis(self.nodes, plan)
 
         def give_back() -> None:

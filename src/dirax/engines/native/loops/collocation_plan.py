@@ -149,6 +149,24 @@ class MeanPlan:
         errors = dict(zip(r.means, rounding_nodes(g, r.slopes), strict=True))
         self.terms = rounding_nodes(g, r.rates[: len(r.first)], errors)
 
+    @functools.cached_property
+    def pencil(self) -> tuple[list[dict[int, int]], ...]:
+        """1 − φ_m σ_y, −(φ_a + φ_m σ_a) and nothing, rows {column: node}, of the rates φ and the slopes σ: with the first, with h
+        and with h² of Newton's method for all nodes. Raises `GraphTooLarge`."""
+        g, r, n = self.graph, self.relation, len(self.relation.first)
+        by_mean = jacobian(g, r.rates[:n], r.means)
+
+        def less(begun: list[dict[int, int]], slopes: list[dict[int, int]]) -> list[dict[int, int]]:
+            for row, factors in zip(begun, by_mean, strict=True):
+                for i, factor in factors.items():
+                    for j, slope in slopes[i].items():
+                        row[j] = g.sub(row.get(j, g.zero), g.mul(factor, slope))
+            return begun
+
+        own = [{j: g.neg(entry) for j, entry in row.items()} for row in jacobian(g, r.rates[:n], r.first)]
+        constant = less([{i: g.one} for i in range(n)], jacobian(g, r.slopes, r.unknowns))
+        return constant, less(own, jacobian(g, r.slopes, r.first)), [{} for _ in range(n)]
+
     @property
     def record(self) -> Record:
         """What is kept of a trajectory."""

@@ -1,10 +1,13 @@
 """Newton's method for all nodes of a collocation step together, with one Jacobian, in the eigenbasis of A: for each pair of
 eigenvalues of A a complex linear system of the size of one node."""
 
+from abc import abstractmethod
+
 from dirax.engines.native.ir.lower import Region
+from dirax.engines.native.loops.collocation_means import Means
 from dirax.engines.native.loops.collocation_nodes import Nodes
-from dirax.engines.native.loops.collocation_plan import CollocationPlan
-from dirax.engines.native.loops.collocation_sweeps import Found, OfRates
+from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan
+from dirax.engines.native.loops.collocation_sweeps import Found, OfRates, Sweep
 from dirax.engines.native.loops.complex_inverse import padded
 
 MOST_ROOM = 2**20
@@ -14,7 +17,7 @@ FEW = 4
 """Unknowns of a step up to which an elimination of them all, written out, is faster."""
 
 
-def pays(plan: CollocationPlan) -> bool:
+def pays(plan: CollocationPlan | MeanPlan) -> bool:
     """Whether the systems of one node are faster than one of all unknowns, and fit."""
     n = len(plan.relation.first)
     room = 16 * len(plan.tableau.eigenbasis.values) * n * 2 * padded(n)
@@ -24,7 +27,7 @@ def pays(plan: CollocationPlan) -> bool:
 class Eigenbasis:
     """The memory of the systems and the tables of the eigenbasis, once for all steps."""
 
-    def __init__(self, nodes: Nodes, plan: CollocationPlan):
+    def __init__(self, nodes: Nodes, plan: CollocationPlan | MeanPlan):
         b, one, basis = nodes.body, nodes.one, plan.tableau.eigenbasis
         self.n, n = len(plan.relation.first), len(plan.relation.first)
         self.into, self.back = nodes.all.matrix(basis.into), nodes.all.matrix(basis.back)
@@ -50,9 +53,8 @@ class Eigenbasis:
         return [body.at("double", base, i) for both in parts for base in both]
 
 
-class SimplifiedNewton(OfRates):
-    """With δ the changes of the rates, (ρ_y + z (ρ_a + ρ_b ∂ḃ/∂y) + z² ρ_b ∂ḃ/∂a) δ = −ρ for z = hλ and every eigenvalue λ of A,
-    where the derivatives are those in the middle of the step, on a straight line from its beginning."""
+class InEigenbasis(Sweep):
+    """What iterations with one Jacobian for all nodes share: its systems in the eigenbasis, and the sizes of the rates."""
 
     continued = False, True
     together = True
@@ -62,27 +64,16 @@ class SimplifiedNewton(OfRates):
         basis = self.nodes.eigenbasis
         assert isinstance(basis, Eigenbasis)
         self.basis = basis
-        self._write_pencil()
+        self.rates = self._write_pencil()
         self._invert()
 
-    def _write_pencil(self) -> None:
-        k, plan, b, r = self.nodes, self.plan, self.nodes.body, self.plan.relation
-        begin = Region(k.one, plan.graph, self.here)
-        for node, room in zip(r.unknowns, self.iterates, strict=True):
-            begin.bind(node, k.all.final(room))
-        begin.require(plan.solved)
-        rates = self.rates = [begin.value(node) for node in plan.solved]
-        moving, middle = Region(k.one, plan.graph, self.here), Region(k.one, plan.graph, k.scalar)
-        for region in (moving, middle):
-            for node, rate in zip(r.unknowns, rates, strict=True):
-                region.bind(node, rate)
-        moving.require(r.rates)
-        slopes = [*rates, *(moving.value(node) for node in r.rates)]
-        half = k.one.mul(k.one.const(0.5), k.h)
-        middle.bind(plan.shared.t, k.one.add(self.time, half))
-        for node, value, slope in zip([*r.first, *r.second], self.state, slopes, strict=True):
-            middle.bind(node, k.one.fma(half, slope, value))
-        entries = [(base, i, j, node) for base, rows in zip(self.basis.pencil, plan.pencil, strict=True)
+    @abstractmethod
+    def _write_pencil(self) -> list[str]:
+        """The matrices with 1, z and z² of the Jacobian into memory; returns the rates where the step begins."""
+
+    def _keep(self, pencil: tuple[list[dict[int, int]], ...], middle: Region) -> None:
+        b = self.nodes.body
+        entries = [(base, i, j, node) for base, rows in zip(self.basis.pencil, pencil, strict=True)
                    for i, row in enumerate(rows) for j, node in row.items()]  # fmt: skip
         middle.require([node for *_, node in entries])
         for base, i, j, node in entries:  # transposed, so that products with the inverse go along its rows
@@ -102,10 +93,19 @@ class SimplifiedNewton(OfRates):
         for real, imaginary in self.basis.matrices:
             b.line(f"call void @complex_inverse(ptr {real}, ptr {imaginary})")
 
-    def terms(self) -> list[str]:
-        """Those of the rates, also where the plan has accelerations."""
-        found, one = super().terms(), self.nodes.one
-        return found if self.plan.gain is None else [one.mul(term, one.abs(self.nodes.h)) for term in found]
+    def _changes(self, defects: list[str], node: str) -> list[str]:
+        """J⁻¹ times the defects of all nodes, which stand in these rooms."""
+        over, b, basis, stages = self.nodes.all, self.nodes.body, self.basis, self.nodes.plan.tableau.stages
+        none = [None] * len(defects)
+        over.filled(defects, over.product(basis.into, defects, node, none, over), node)
+        for i, room in enumerate(defects):
+            over.write(room, basis.of_lanes(basis.right, i, b)[:stages])
+        for matrix, right, solution in zip(basis.matrices, basis.right, basis.solution, strict=True):
+            pointers = ", ".join(f"ptr {base}" for base in (*matrix, *right, *solution))
+            b.line(f"call void @complex_product({pointers})")
+        for i, room in enumerate(defects):
+            over.read(basis.of_lanes(basis.solution, i, b)[:stages], room)
+        return over.product(basis.back, defects, node, none, over)
 
     def sizes(self, known: list[str]) -> list[str]:
         """Those that are known, the rates where the step begins, and the largest iterates of all nodes: what is roundoff at
@@ -117,8 +117,38 @@ class SimplifiedNewton(OfRates):
             found.append(one.add(one.max(over.highest(peak), one.abs(rate)), size))
         return found
 
+
+class SimplifiedNewton(InEigenbasis, OfRates):
+    """With δ the changes of the rates, (ρ_y + z (ρ_a + ρ_b ∂ḃ/∂y) + z² ρ_b ∂ḃ/∂a) δ = −ρ for z = hλ and every eigenvalue λ of A,
+    where the derivatives are those in the middle of the step, on a straight line from its beginning."""
+
+    def _write_pencil(self) -> list[str]:
+        k, plan, r = self.nodes, self.plan, self.plan.relation
+        begin = Region(k.one, plan.graph, self.here)
+        for node, room in zip(r.unknowns, self.iterates, strict=True):
+            begin.bind(node, k.all.final(room))
+        begin.require(plan.solved)
+        rates = [begin.value(node) for node in plan.solved]
+        moving, middle = Region(k.one, plan.graph, self.here), Region(k.one, plan.graph, k.scalar)
+        for region in (moving, middle):
+            for node, rate in zip(r.unknowns, rates, strict=True):
+                region.bind(node, rate)
+        moving.require(r.rates)
+        slopes = [*rates, *(moving.value(node) for node in r.rates)]
+        half = k.one.mul(k.one.const(0.5), k.h)
+        middle.bind(plan.shared.t, k.one.add(self.time, half))
+        for node, value, slope in zip([*r.first, *r.second], self.state, slopes, strict=True):
+            middle.bind(node, k.one.fma(half, slope, value))
+        self._keep(plan.pencil, middle)
+        return rates
+
+    def terms(self) -> list[str]:
+        """Those of the rates, also where the plan has accelerations."""
+        found, one = super().terms(), self.nodes.one
+        return found if self.plan.gain is None else [one.mul(term, one.abs(self.nodes.h)) for term in found]
+
     def sweep(self, found: Found) -> None:
-        k, over, plan, b = self.nodes, self.nodes.all, self.plan, self.nodes.body
+        k, over, plan = self.nodes, self.nodes.all, self.plan
         weighted, n, r = self._weighted_iterates(), self.basis.n, self.plan.relation
         rooms, defects = over.rooms(len(plan.carried)), over.rooms(n)
         with over.at() as node:
@@ -131,15 +161,41 @@ class SimplifiedNewton(OfRates):
                 region.bind(r.second[i], value)
             region.require(r.relation)
             over.filled(defects, [region.value(defect) for defect in r.relation], node)
-            none, basis, stages = [None] * n, self.basis, plan.tableau.stages
-            over.filled(defects, over.product(basis.into, defects, node, none, over), node)
-            for i, room in enumerate(defects):
-                over.write(room, basis.of_lanes(basis.right, i, b)[:stages])
-            for matrix, right, solution in zip(basis.matrices, basis.right, basis.solution, strict=True):
-                pointers = ", ".join(f"ptr {base}" for base in (*matrix, *right, *solution))
-                b.line(f"call void @complex_product({pointers})")
-            for i, room in enumerate(defects):
-                over.read(basis.of_lanes(basis.solution, i, b)[:stages], room)
-            changes = over.product(basis.back, defects, node, none, over)
+            changes = self._changes(defects, node)
             e = over.emitter
             found(node, [e.sub(y, change) for y, change in zip(own, changes, strict=True)], e.true)
+
+
+class SimplifiedNewtonOfMeans(InEigenbasis, Means):
+    """The same for rates by means of slopes: (1 − φ_m σ_y − z (φ_a + φ_m σ_a)) δ = φ − y, with the rates φ at a node as a
+    function of a and of the means m there, and the slopes σ as one of a and y.
+
+    The mean of the integral of a polynomial is its value at the node, since what the projection takes away vanishes at Gauss
+    nodes: so the matrix of the means is A too."""
+
+    def _write_pencil(self) -> list[str]:
+        k, plan, r = self.nodes, self.plan, self.plan.relation
+        rates, middle = [k.all.final(room) for room in self.iterates], Region(k.one, plan.graph, k.scalar)
+        half = k.one.mul(k.one.const(0.5), k.h)
+        middle.bind(plan.shared.t, k.one.add(self.time, half))
+        for input_, value, rate in zip(r.first, self.first, rates, strict=True):
+            middle.bind(input_, k.one.fma(half, rate, value))
+        for input_, rate in zip(r.unknowns, rates, strict=True):
+            middle.bind(input_, rate)
+        middle.require(r.slopes)
+        for mean, slope in zip(r.means, r.slopes, strict=True):
+            middle.bind(mean, middle.value(slope))
+        self._keep(plan.pencil, middle)
+        return rates
+
+    def sweep(self, found: Found) -> None:
+        over, n, iterates = self.nodes.all, self.pair.count, self.iterates
+        defects, e = over.rooms(n), over.emitter
+
+        def corrected(node: str, rates: list[str]) -> None:
+            own = [over.load(room, node) for room in iterates]
+            over.filled(defects, [e.sub(y, rate) for y, rate in zip(own, rates[:n], strict=True)], node)
+            changes = self._changes(defects, node)
+            found(node, [e.sub(y, change) for y, change in zip(own, changes, strict=True)], e.true)
+
+        self._rates(corrected)
