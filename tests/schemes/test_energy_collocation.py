@@ -1,5 +1,7 @@
 """Energy-preserving collocation: orders against motions found in another way, the energy and the books, both engines."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ import dirax as dx
 from dirax import gallery
 from dirax.gallery import contact_particle, transmission
 from dirax.schemes.collocation_tables import gauss, quadrature
+from dirax.schemes.step import Shape
 
 DATA = {"q": [0.5, 0.4, 0.1], "v": [0.3, 0.2, -0.12]}
 
@@ -214,6 +217,15 @@ def test_self_adjoint():
     np.testing.assert_allclose(back.q[-1], data["q"], atol=1e-12)
 
 
+class Stated(dx.AbstractScheme):
+    """A step that is given."""
+
+    equation: dx.StepEquation
+
+    def step_equation(self, system, shape):
+        return self.equation
+
+
 def test_where_the_fixed_point_does_not_converge_newton_goes_on():
     stiff = dx.LagrangeDirac(
         lambda q, v: v @ v / 2 - 5000.0 * q[0] ** 2 / 2 - q[1] ** 4 / 4, lambda q: jnp.array([[0.0, q[0], 1.0]])
@@ -222,6 +234,10 @@ def test_where_the_fixed_point_does_not_converge_newton_goes_on():
     sol = dx.simulate(stiff, dx.EnergyCollocation(2), step=0.2, steps=50, engine="native", **data)
     energy = sol.energy()
     assert sol.ok and np.max(np.abs(energy - energy[0])) < 1e-13
+    assert "simplified Newton" in sol.stats["iteration"] and "all unknowns" not in sol.stats["iteration"]
+    flat = replace(dx.EnergyCollocation(2).step_equation(stiff, Shape(3, 1)), collocation=None)
+    whole = dx.simulate(stiff, Stated(flat), step=0.2, steps=50, engine="native", **data)
+    np.testing.assert_allclose(sol.q, whole.q, atol=1e-11)
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
