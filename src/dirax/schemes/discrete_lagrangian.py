@@ -110,8 +110,8 @@ def derivatives_by_slots(lagrangian: UserFunction, rule: str | UserFunction) -> 
     """(D1 L_d, D2 L_d) of `discrete_lagrangian` as a function (t0, q0, v, h, params).
 
     L_d = h Σ w_i L(q0 + c_i h v, v) has the derivatives Σ w_i ((1 − c_i) h ∂L/∂q − ∂L/∂v) and Σ w_i (c_i h ∂L/∂q + ∂L/∂v), in
-    which nothing cancels: where the Lagrangian is separable, (q0, p0) with the rules "right" and "trapezoidal" then is
-    explicit in v not by value alone, but for the engines too.
+    which nothing cancels: of a separable Lagrangian D1 L_d with "right" and "trapezoidal" has no force at q1 in it, so that the
+    equations of the step are linear in v, and are seen to be.
     """
     if isinstance(rule, UserFunction):
         ld = discrete_lagrangian(lagrangian, rule)
