@@ -3,7 +3,8 @@
 A Jacobian serves several updates while they contract quickly: a first kind of update computes residual, Jacobian and
 factors together, a second kind the residual alone. Where a pivot was too small the correction comes from partial
 pivoting, and the factors are not used again. Where a block of unknowns has several parts, an update changes one after the
-other, each by its equations with the new values of those before it (Gauss, Seidel).
+other, each by its equations with the new values of those before it (Gauss, Seidel). Of linear equations whose pivots need no
+watching, an update of each kind is a round without a question in between.
 """
 
 from collections.abc import Sequence
@@ -28,6 +29,8 @@ class NewtonLoop:
         self.e: Emitter = around.emitter
         self.body: Body = self.e.body
         self.converged = self.count = ""
+        self._linear = len(parts) == 1 and parts[0].linear
+        self._direct = self._linear and parts[0].stable == around.graph.true
 
     def emit(self, active: str) -> None:
         b, e = self.body, self.e
@@ -39,8 +42,11 @@ class NewtonLoop:
         b.store(e.real, e.const(0.0), self._number)
         with self._while(self._going) as now:
             factors = self._first_kind(now)
-            with self._while(self._contracting) as now:
+            if self._direct:
                 self._second_kind(factors, now)
+            else:
+                with self._while(self._contracting) as now:
+                    self._second_kind(factors, now)
         self.converged, self.count = b.load(e.bool, self._floor, 1), b.load(e.real, self._number)
 
     def _while(self, flag: str):
@@ -71,7 +77,10 @@ class NewtonLoop:
             stable = self.e.both(stable, good)
             self._changed(one, change, new, changes)
             inside.append(inner)
-        self._apply(old, new, changes, stable, now)
+        if self._direct:
+            self._take(old, new, now)
+        else:
+            self._apply(old, new, changes, stable, now)
         return inside
 
     def _second_kind(self, factors: list[Region], now: str) -> None:
@@ -84,12 +93,38 @@ class NewtonLoop:
             inner = self._region({n: here.value(r) for n, r in zip(one.right, one.residual, strict=True)}, known)
             inner.require(one.again)
             self._changed(one, [inner.value(n) for n in one.again], new, changes)
-        self._apply(old, new, changes, self.e.true, now)
+        if self._direct:
+            self._take(old, new, now)
+            self._end_round(new, changes, now)
+        else:
+            self._apply(old, new, changes, self.e.true, now)
 
     def _changed(self, one: Correction, change: list[str], new: dict[int, str], changes: dict[int, str]) -> None:
         """Subtract the change of a part."""
         for node, value in zip(one.unknowns, change, strict=True):
             new[node], changes[node] = self.e.sub(new[node], value), value
+
+    def _take(self, old: dict[int, str], new: dict[int, str], now: str) -> None:
+        """The new unknowns of the lanes that go on into memory."""
+        for node, pointer in self.unknowns.items():
+            self.body.store(self.e.real, self.e.select(now, new[node], old[node]), pointer)
+
+    def _end_round(self, new: dict[int, str], changes: dict[int, str], now: str) -> None:
+        """The verdict on a second update of linear equations, of which roundoff alone is left where it was small."""
+        b, e = self.body, self.e
+        small, total = e.true, e.const(0.0)
+        for node, d in changes.items():
+            size = e.add(e.abs(new[node]), b.load(e.real, self.sizes[node]))
+            small = e.both(small, e.compare("olt", e.abs(d), e.mul(e.const(STALLED), size)))
+            total = e.add(total, d)
+        count = b.load(e.real, self._number)
+        count = e.select(now, e.add(count, e.const(2.0)), count)
+        b.store(e.real, count, self._number)
+        cap = e.splat(b.put("sitofp i64 %cap to double"))
+        found = e.both(now, e.both(small, e.compare("ole", count, cap)))
+        b.store(e.bool, e.either(b.load(e.bool, self._floor, 1), found), self._floor, 1)
+        allowed = e.both(e.compare("ord", total, total), e.compare("olt", count, cap))
+        b.store(e.bool, e.both(now, e.both(allowed, e.invert(small))), self._going, 1)
 
     def _apply(self, old: dict[int, str], new: dict[int, str], changes: dict[int, str], stable: str, now: str) -> None:
         """Measure the change, and decide which lanes take it, which go on and how."""
@@ -103,8 +138,7 @@ class NewtonLoop:
         count = b.load(e.real, self._number)
         first = e.compare("oeq", count, e.const(0.0))
         ratio = e.select(first, e.const(float("nan")), e.div(update, b.load(e.real, self._update)))
-        for node, pointer in self.unknowns.items():
-            b.store(e.real, e.select(now, new[node], old[node]), pointer)
+        self._take(old, new, now)
         b.store(e.real, e.select(now, update, b.load(e.real, self._update)), self._update)
         count = e.select(now, e.add(count, e.const(1.0)), count)
         b.store(e.real, count, self._number)
@@ -134,7 +168,7 @@ class NewtonLoop:
         stalled = e.both(e.compare("oge", ratio, e.const(0.5)), e.compare("olt", update, e.const(STALLED)))
         rounded = e.both(e.compare("ole", update, e.const(FLOOR)), known)
         small = e.either(rounded, e.compare("ole", left, e.const(NEGLIGIBLE)))
-        if len(self.parts) == 1 and self.parts[0].linear:
+        if self._linear:
             small = e.either(small, e.both(e.compare("ord", ratio, ratio), e.compare("olt", update, e.const(STALLED))))
         return e.either(small, stalled)
 
