@@ -94,7 +94,7 @@ def _with_sparse_first_step(equation: Any, case: Case, start: Start) -> Start:
             f"the first step has no unique solution, whatever the initial data: {plan}. The Lagrangian is singular together with "
             "its constraints: remove the coordinates that it does not determine, or choose another discrete Lagrangian."
         )
-    known = None if isinstance(plan, str) or plan.solvers[0].equations.slower else plan.solvers[0].equations
+    known = None if isinstance(plan, str) or plan.solvers[0].equations.slower else plan.solvers[0]
     if known is None and equation.stages[0][0].unknowns ** 2 > LARGEST_MATRIX:
         return start
     written = equation if isinstance(plan, str) else plan.equation
@@ -102,7 +102,7 @@ def _with_sparse_first_step(equation: Any, case: Case, start: Start) -> Start:
     if known is None:
         return start._replace(residual=first[0], jacobian=first[1])
     residual, values, product = (np.asarray(a) if case.batch is not None else np.asarray(a)[None] for a in first)
-    return start._replace(residual=residual[:, 0], jacobian=SparseJacobians(known, values, product))
+    return start._replace(residual=residual[:, 0], jacobian=SparseJacobians(known.equations, values, product))
 
 
 class SparseJacobians(NamedTuple):
@@ -173,13 +173,14 @@ class _FirstStep(eqx.Module):
     def __call__(self, start: Start, params, h, t0):
         stage, fraction = self.equation.stages[0]
         t = t0 + int(self.two_points) * h
-        solved = lambda u: stage.residual(u, start.state, t, fraction * h, params)
+        given = start.state, t, fraction * h, params
+        solved = lambda u: stage.residual(u, *given)
         if self.sparse is not None:
             u, along = start.guess[0], jnp.asarray(direction(start.guess[0].shape[0]))
 
             def at(u):
                 residual, product = jax.jvp(solved, (u,), (along,))
-                return residual, self.sparse.values(solved, u), product
+                return residual, self.sparse.jacobian_of(stage.residual)(u, *given), product
 
             return jax.lax.map(at, jnp.stack([u, u + AWAY * (1.0 + jnp.max(jnp.abs(u))) * along]))
         return solved(start.guess[0]), jax.jacfwd(solved)(start.guess[0])
