@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from contextlib import contextmanager
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -36,8 +37,14 @@ class Loops(NamedTuple):
 def loops(sites: Sites, arguments: int, results: Sequence[Sequence[Piece]], sizes: Sequence[int]) -> Loops:
     """The loops for results in pieces, of these sizes, of the expressions of `sites`."""
     text = _Writer(sites, arguments, len(results)).text(results)
-    kernel = WrittenKernel(text, ENTRY, arguments + len(sites.constants), len(results))
+    kernel = _kernel(text, arguments + len(sites.constants), len(results))
     return Loops(kernel, tuple(sizes), tuple(sites.constants))
+
+
+@cache
+def _kernel(text: str, inputs: int, results: int) -> WrittenKernel:
+    """The kernel of a text, of which XLA takes one."""
+    return WrittenKernel(text, ENTRY, inputs, results)
 
 
 class _Writer:

@@ -6,6 +6,9 @@ from dirax.program.graph_derivatives import jacobian
 from dirax.program.sites.pieces import NotBySites, Piece
 from dirax.program.sites.walk import Sites
 
+MOST_ENTRIES = 512
+"""Different expressions among the entries: more take LLVM longer than XLA."""
+
 
 def entries_of_jacobian(sites: Sites, argument: int = 0) -> tuple[list[Piece], np.ndarray, np.ndarray]:
     """The entries that can differ from zero as one array in pieces, and their rows and columns. Raises `NotBySites`."""
@@ -17,6 +20,8 @@ def entries_of_jacobian(sites: Sites, argument: int = 0) -> tuple[list[Piece], n
             raise NotBySites("an equation depends on a sum of many terms")
         unknowns, k = [n for n in inputs if e.places[n].argument == argument], np.arange(piece.count)
         (row,) = jacobian(g, [piece.node], unknowns)
+        if len(found) + len(row) > MOST_ENTRIES:
+            raise NotBySites(f"the Jacobian has more than {MOST_ENTRIES} different expressions")
         for j, node in row.items():
             place = e.places[unknowns[j]]
             found.append(Piece(first, 1, piece.count, node))
