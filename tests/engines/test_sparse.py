@@ -193,21 +193,30 @@ def test_singular_first_steps_are_named():
         dx.simulate(dx.LagrangeDirac(missing), dx.LagrangeDAlembert(), **run)
 
 
-def test_a_wrong_pattern_is_refused(monkeypatch):
-    from dirax.engines.sparse import plan
-    from dirax.program import sparse_equations
-    from dirax.program.sparsity import pattern_of
+@pytest.mark.parametrize("wrong", ["residual", "Jacobian"])
+def test_wrong_sites_are_refused(monkeypatch, wrong):
+    from dirax.engines.sparse import by_sites, plan
+    from dirax.program.sites.jacobian import entries_of_jacobian
 
-    def without_one(*given):
-        pattern = pattern_of(*given).tolil()
-        pattern[150, 151] = False
-        return pattern.tocsr()
+    def without_one(sites):
+        (result,) = sites.results
+        kept = [p for p in result if p.start <= 150 < p.start + p.count]
+        assert len(result) == 3 and len(kept) == 1
+        if wrong == "residual":
+            e = sites.expressions
+            sites.results[0][:] = [
+                p._replace(node=e.graph.mul(e.graph.constant(1.01), p.node)) if p in kept else p for p in result
+            ]
+        entries, rows, columns = entries_of_jacobian(sites)
+        entries = [p._replace(node=sites.expressions.graph.zero) if wrong == "Jacobian" and p.start == 0 else p for p in entries]
+        return entries, rows, columns
 
-    monkeypatch.setattr(sparse_equations, "pattern_of", without_one)
+    monkeypatch.setattr(by_sites, "entries_of_jacobian", without_one)
     plan._plans.clear()
     q = np.sin(np.arange(200.0))
-    with pytest.raises(AssertionError, match="equation 150"):
+    with pytest.raises(AssertionError, match=f"{wrong} of the step is wrong"):
         dx.simulate(dx.LagrangeDirac(chain), dx.LagrangeDAlembert(), q=q, v=0 * q, step=0.1, steps=2, engine="sparse")
+    plan._plans.clear()
 
 
 def test_it_says_why_it_does_not_take_a_step():

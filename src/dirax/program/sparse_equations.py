@@ -133,6 +133,10 @@ class SparseEquations(eqx.Module):
         """x with J x = right, or Jᵀ x = right."""
         return self.elimination.solution(jnp, self.solve_tables, factors, right, self.size, transposed)
 
+    def solved(self, values: Any, right: Any, xp: Any) -> Any:
+        """x with J x = right for the Jacobian with these values, by NumPy or by JAX."""
+        return self.in_numpy(values)(right) if xp is np else self.solve(self.factorise(values), right)
+
     def root(self, function: Callable, root: Float[Array, " k"]) -> Float[Array, " k"]:
         """`root`, with its derivatives as the function of what `function` captures that function(root) = 0 makes of it."""
 

@@ -30,7 +30,7 @@ def by_sites(stage: Any, shapes: tuple) -> tuple[Any, SparseSolver] | str:
     equations = SparseEquations.of_entries(stage.unknowns, rows, columns)
     functions = {"residual": _written(stage.residual, of_residual), "advance": _written(stage.advance, of_advance)}
     of_arguments = lambda *arguments: values(*jax.tree.leaves(arguments))[0]
-    return dataclasses.replace(stage, **functions), SparseSolver(equations, of_arguments)
+    return dataclasses.replace(stage, **functions), SparseSolver(equations, of_arguments, True)
 
 
 def _written(function: Callable, made: Loops) -> Callable:
@@ -44,4 +44,8 @@ def _written(function: Callable, made: Loops) -> Callable:
     def _(arguments: tuple, tangents: tuple) -> tuple:
         return by_loops(*arguments), jax.jvp(function, arguments, tangents)[1]
 
-    return by_loops
+    def of_either(*arguments: Any) -> Any:
+        given = jax.tree.leaves(arguments)
+        return made(*given)[0] if made.in_numpy(given) else by_loops(*arguments)
+
+    return of_either

@@ -28,10 +28,20 @@ class Loops(NamedTuple):
     constants: tuple[Any, ...]
 
     def __call__(self, *arguments: Any) -> Sequence[Any]:
-        """The results (size,) each, in JAX on a CPU, of arguments of floats."""
+        """The results (size,) each of arguments of floats, in NumPy or in JAX on a CPU."""
+        if self.in_numpy(arguments):
+            flat = [np.ascontiguousarray(a, float).ravel() for a in arguments]
+            results = [np.empty(size) for size in self.sizes]
+            self.kernel(*flat, *self.constants, *results)
+            return results
         flat = [jax.numpy.ravel(jax.numpy.asarray(a, float)) for a in arguments]
         shapes = [jax.ShapeDtypeStruct((size,), np.float64) for size in self.sizes]
         return self.kernel.in_jax(shapes, *flat, *self.constants)
+
+    @staticmethod
+    def in_numpy(arguments: Sequence[Any]) -> bool:
+        """Whether NumPy is to find the results, of arguments of which none is JAX's."""
+        return not any(isinstance(a, jax.Array) for a in arguments)
 
 
 def loops(sites: Sites, arguments: int, results: Sequence[Sequence[Piece]], sizes: Sequence[int]) -> Loops:

@@ -15,7 +15,8 @@ from dirax.program.graph import Graph
 MOST = 64
 """Pieces of an array; one of more is not made of sites."""
 
-LONGEST_PERIOD = 64
+USUAL_PERIODS, LONGEST_PERIOD = (1, 2, 3, 4, 6), 64
+"""Steps of pieces that are looked for in any array; the longest of those that shapes suggest."""
 
 
 class NotBySites(Exception):
@@ -136,7 +137,7 @@ def progressions(of: np.ndarray, number: np.ndarray, periods: Sequence[int]) -> 
     """(start, step, count, value of `of`, first, along) such that `number` is first + along·k at the k-th; of the steps
     `periods` that with the fewest."""
     best: list[tuple[int, ...]] | None = None
-    for period in sorted({p for p in periods if 1 < p <= LONGEST_PERIOD} | {1}):
+    for period in sorted({p for p in periods if p <= LONGEST_PERIOD} | {*USUAL_PERIODS}):
         if best is not None and len(best) <= period:
             break
         found: list[tuple[int, ...]] | None = []

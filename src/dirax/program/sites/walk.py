@@ -149,8 +149,10 @@ class _Walk:
         size, arrays = math.prod(shape), []
         for value, variable in zip(operands, equation.invars, strict=True):
             own = self.pieces(value, variable.aval.shape)
-            if variable.aval.shape != shape and own:
-                own = [Piece(0, 1, size, self.expressions.moved(own[0].node, 0, 0))]
+            inner = variable.aval.shape
+            if inner != shape and size:  # repeated along axes of length 1
+                there = np.arange(math.prod(inner)).reshape(inner)
+                own = self._taken(own, there.size, np.broadcast_to(there, shape), inner)
             arrays.append(own)
         if not size:
             return []
@@ -237,7 +239,8 @@ class _Walk:
             ]
             term = self._with("mul", *taken)
             total = term if total is None else self._with("add", total, term)
-        return [] if total is None else total
+        size = math.prod(out)
+        return total or ([Piece(0, 1, size, self.expressions.graph.zero)] if size else [])
 
     def _folded(self, equation: Any, value: Value) -> Value:
         shape, axes = equation.invars[0].aval.shape, tuple(equation.params["axes"])
