@@ -26,6 +26,9 @@ CONSTANT = 8
 
 LOGICAL = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "xor", "is_finite", "select_n", "stop_gradient"))
 
+NEVER = frozenset(("custom_linear_solve", "while", "scan", "cond", "lu", "triangular_solve", "cholesky", "sort", "cumsum"))
+"""Primitives whose results are no expressions of a few entries."""
+
 Value = np.ndarray | list[Piece]
 """An array whose numbers are known, or one in pieces."""
 
@@ -80,6 +83,9 @@ class _Walk:
             values[variable] = np.asarray(constant)
         values.update(zip(jaxpr.invars, (o for o, u in zip(operands, used, strict=True) if u), strict=True))
         read = lambda atom: np.asarray(atom.val) if isinstance(atom, Literal) else values[atom]
+        for equation in jaxpr.eqns:  # before anything is done
+            if equation.primitive.name in NEVER:
+                raise NotBySites(f"'{equation.primitive.name}' is not known entry by entry")
         for equation in jaxpr.eqns:
             results = self._equation(equation, [read(atom) for atom in equation.invars])
             values.update(zip(equation.outvars, results, strict=True))
