@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +63,7 @@ def in_casadi(sites: int, solver: str, folder: str) -> Callable[[int], float] | 
     """(steps) ↦ µs of processor time a step of the same by CasADi: derivatives and two updates of Newton's method with one of its
     sparse linear solvers in the C that it writes, SPAN steps a call; None without CasADi or a C compiler."""
     try:
-        import casadi as ca
+        import casadi as ca  # pyright: ignore[reportMissingImports]
     except ImportError:
         return None
     if shutil.which("cc") is None:
@@ -142,7 +143,8 @@ def derivative(sites: int, steps: int) -> dict:
 
 
 def main(short: bool = False) -> None:
-    results, rows = {"system": "FPUT chain with quartic forces, midpoint L_d"}, []
+    results: dict[str, Any] = {"system": "FPUT chain with quartic forces, midpoint L_d"}
+    rows = []
     for sites in (64, 1000, 10_000, 100_000):
         steps = max(20, (200_000 if short else 2_000_000) // sites)
         programs = {
@@ -171,8 +173,9 @@ def _beside_casadi(results: dict, short: bool) -> None:
     """Its two sparse solvers at 1000 sites."""
     sites, steps = 1000, 400 if short else 2000
     with tempfile.TemporaryDirectory() as folder:
-        programs = {solver: in_casadi(sites, solver, folder) for solver in ("qr", "ldl")}
-        if None in programs.values():
+        made = {solver: in_casadi(sites, solver, folder) for solver in ("qr", "ldl")}
+        programs = {solver: run for solver, run in made.items() if run is not None}
+        if not programs:
             return print("CasADi or a C compiler is missing")
         found = interleaved(
             {"dirax": lambda: processor_time(sites, steps)} | {k: lambda run=run: run(steps) for k, run in programs.items()}, 5

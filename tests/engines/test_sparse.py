@@ -200,7 +200,7 @@ def test_wrong_sites_are_refused(monkeypatch, wrong):
 
     def without_one(sites):
         (result,) = sites.results
-        kept = [p for p in result if p.start <= 150 < p.start + p.count]
+        kept = [p for p in result if p.start <= 150 < p.start + p.length]
         assert len(result) == 3 and len(kept) == 1
         if wrong == "residual":
             e = sites.expressions

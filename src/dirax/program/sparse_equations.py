@@ -72,14 +72,15 @@ class SparseEquations(eqx.Module):
             sp.csr_matrix((np.ones(pattern.nnz, bool), pattern.indices, pattern.indptr), pattern.shape),
         )
         made = elimination(there)
+        total = (count + len(full)) * size if length is None else length
         if length is None:
-            entries, length = pattern.tocoo(), (count + len(full)) * size
+            entries = pattern.tocoo()
             numbers = 1 + _places(size, colours, count, full, entries.row, entries.col)
             pattern = sp.csr_matrix((numbers, pattern.indices, pattern.indptr), pattern.shape)
         with jax.ensure_compile_time_eval():
             arrays = lambda given: tuple(map(jnp.asarray, given))
             return cls(
-                _Static(pattern), length, made, count, full, jnp.asarray(colours), arrays(made.tables(pattern)),
+                _Static(pattern), total, made, count, full, jnp.asarray(colours), arrays(made.tables(pattern)),
                 arrays(made.solve_tables), jnp.asarray([size], np.int64),
             )  # fmt: skip
 

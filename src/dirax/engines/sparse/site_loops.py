@@ -71,7 +71,7 @@ class _Writer:
         groups: dict[int, list[tuple[Piece, int]]] = {}
         for i, pieces in enumerate(results):
             for piece in pieces:
-                groups.setdefault(piece.count, []).append((piece, i))
+                groups.setdefault(piece.length, []).append((piece, i))
         for count, group in sorted(groups.items(), reverse=True):
             self._group(count, group)
         self.body.line("ret void")
@@ -164,7 +164,7 @@ class _Writer:
                 e = Emitter(self.body, width)
                 sums[width] = self.body.alloca(e.real)
                 self.body.store(e.real, e.const(0.0), sums[width])
-            for _, region, e in self._regions(piece.count, [piece.node]):
+            for _, region, e in self._regions(piece.length, [piece.node]):
                 before = self.body.load(e.real, sums[e.width])
                 self.body.store(e.real, e.add(before, region.value(piece.node)), sums[e.width])
             for width, where in sums.items():

@@ -32,11 +32,11 @@ class Place(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """Entries start + step·k, k = 0 … count − 1, of an array, which are `node` of a graph."""
+    """Entries start + step·k, k = 0 … length − 1, of an array, which are `node` of a graph."""
 
     start: int
     step: int
-    count: int
+    length: int
     node: int
 
 
@@ -100,7 +100,7 @@ def shared(e: Expressions, arrays: Sequence[Sequence[Piece]]) -> list[tuple[Piec
 def _meeting(p: Piece, q: Piece) -> tuple[tuple[int, int, int], tuple[int, int], tuple[int, int]] | None:
     """The entries that two pieces have in common as (start, step, count), and as (first, along) of either."""
     step = math.lcm(p.step, q.step)
-    low, high = max(p.start, q.start), min(p.start + p.step * (p.count - 1), q.start + q.step * (q.count - 1))
+    low, high = max(p.start, q.start), min(p.start + p.step * (p.length - 1), q.start + q.step * (q.length - 1))
     if low > high or (p.start - q.start) % math.gcd(p.step, q.step):
         return None
     first = low + (p.start - low) % p.step
@@ -123,9 +123,9 @@ def gathered(e: Expressions, pieces: Sequence[Piece], size: int, entries: np.nda
     """The pieces of the array whose entries are those with these numbers of one of `size` in `pieces`; −1 for zero."""
     of, number = np.full(size + 1, -1), np.zeros(size + 1, np.int64)
     for i, p in enumerate(pieces):
-        where = slice(p.start, p.start + p.step * (p.count - 1) + 1, p.step)
+        where = slice(p.start, p.start + p.step * (p.length - 1) + 1, p.step)
         of[where] = i
-        number[where] = 0 if e.fixed(p.node) else np.arange(p.count)
+        number[where] = 0 if e.fixed(p.node) else np.arange(p.length)
     flat = entries.ravel()
     of, number = of[flat], number[flat]
     nodes = [*(p.node for p in pieces), e.graph.zero]

@@ -163,7 +163,7 @@ class _Walk:
         if not size:
             return []
         both = shared(self.expressions, arrays)
-        assert sum(p.count for p, _ in both) == size, (equation, arrays)
+        assert sum(p.length for p, _ in both) == size, (equation, arrays)
         nodes = [np.array(column, np.int64) for column in zip(*(nodes for _, nodes in both), strict=True)]
         (found,) = RULES[equation.primitive.name](self.interpreter, equation, *nodes)
         return [p._replace(node=int(node)) for (p, _), node in zip(both, found, strict=True)]
