@@ -117,7 +117,7 @@ def test_derivatives_of_discrete_gradients_are_those_of_the_dense_engine():
     np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-11)
 
 
-def test_auto_takes_it_where_it_is_quicker():
+def test_auto_takes_it_where_it_is_quicker(monkeypatch):
     run = {"step": 0.05, "steps": 3}
     sol = dx.simulate(FPUT, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, **run)
     assert sol.stats["engine"] == "sparse" and sol.stats["bandwidth"] == [1, 1] and sol.stats["colours"] == 3
@@ -126,6 +126,11 @@ def test_auto_takes_it_where_it_is_quicker():
     coupled = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(jnp.cos(q[:, None] - q[None, :])))
     sol = dx.simulate(coupled, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, **run)
     assert sol.stats["engine"] == "xla" and "64 equations" in sol.stats["not_sparse"]
+    monkeypatch.setattr("dirax.engines.policy.LARGEST_DENSE", 63)
+    with pytest.raises(ValueError, match="a step of 64 unknowns that is not sparse"):
+        again = dx.LagrangeDirac(lambda q, v: v @ v - jnp.sum(jnp.cos(q[:, None] - q[None, :])))
+        dx.simulate(again, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, **run)
+    monkeypatch.undo()
 
 
 def test_a_batch_keeps_its_bits():
