@@ -2,9 +2,14 @@
 
 import json
 import resource
+import shutil
+import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +23,8 @@ from dirax.gallery import hanging_chain, oscillator_chain
 STEP, BETA = 0.05, 0.8
 CHAIN = oscillator_chain.chain(alpha=0.0, beta=BETA)
 LINKS = 128
+SPAN = 100
+"""Steps of a call of CasADi's."""
 
 
 def run(sites: int, steps: int) -> dx.Solution:
@@ -26,10 +33,12 @@ def run(sites: int, steps: int) -> dx.Solution:
 
 
 def processor_time(sites: int, steps: int) -> float:
-    """µs of processor time a step of a run of so many steps."""
+    """µs of processor time a step of a run of so many steps, beyond that of a run of two."""
     started = time.process_time()
-    run(sites, steps)
-    return (time.process_time() - started) / steps * 1e6
+    run(sites, 2)
+    begun = time.process_time()
+    run(sites, steps + 2)
+    return (time.process_time() - begun - (begun - started)) / steps * 1e6
 
 
 def by_hand(sites: int, steps: int) -> float:
@@ -48,6 +57,43 @@ def by_hand(sites: int, steps: int) -> float:
             v = v - solve_banded((1, 1), band, left, check_finite=False)
         q, p = q + STEP * v, 2 * v - p
     return (time.process_time() - started) / steps * 1e6
+
+
+def in_casadi(sites: int, solver: str, folder: str) -> Callable[[int], float] | None:
+    """(steps) ↦ µs of processor time a step of the same by CasADi: derivatives and two updates of Newton's method with one of its
+    sparse linear solvers in the C that it writes, SPAN steps a call; None without CasADi or a C compiler."""
+    try:
+        import casadi as ca  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return None
+    if shutil.which("cc") is None:
+        return None
+    q, p, v = (ca.SX.sym(name, sites) for name in "qpv")
+    middle = ca.vertcat(0, q + STEP / 2 * v, 0)
+    d = middle[1:] - middle[:-1]
+    force = d + BETA * d**3
+    left = v - p + STEP / 2 * (force[:-1] - force[1:])
+    equation = ca.Function("equation", [q, p, v], [left, ca.jacobian(left, v)])
+    q, p, v = (ca.MX.sym(name, sites) for name in "qpv")
+    found = v
+    for _ in range(2):
+        residual, matrix = equation(q, p, found)
+        found = found - ca.solve(matrix, residual, solver)
+    step = ca.Function("step", [ca.vertcat(q, p, v)], [ca.vertcat(q + STEP * found, 2 * found - p, found)])
+    code = step.fold(SPAN).generate(f"{solver}.c")
+    Path(code).rename(f"{folder}/{solver}.c")
+    library = f"{folder}/{solver}.so"
+    subprocess.run(["cc", "-O3", "-march=native", "-shared", "-fPIC", f"{folder}/{solver}.c", "-o", library, "-lm"], check=True)
+    run = ca.external(step.fold(SPAN).name(), library)
+
+    def timed(steps: int) -> float:
+        state = np.concatenate([oscillator_chain.first_mode(sites), np.zeros(2 * sites)])
+        started = time.process_time()
+        for _ in range(steps // SPAN):
+            state = run(state)
+        return (time.process_time() - started) / (steps // SPAN * SPAN) * 1e6
+
+    return timed
 
 
 def peak() -> int:
@@ -97,7 +143,8 @@ def derivative(sites: int, steps: int) -> dict:
 
 
 def main(short: bool = False) -> None:
-    results, rows = {"system": "FPUT chain with quartic forces, midpoint L_d"}, []
+    results: dict[str, Any] = {"system": "FPUT chain with quartic forces, midpoint L_d"}
+    rows = []
     for sites in (64, 1000, 10_000, 100_000):
         steps = max(20, (200_000 if short else 2_000_000) // sites)
         programs = {
@@ -111,6 +158,7 @@ def main(short: bool = False) -> None:
         ours, theirs = found["dirax"]["median"], found["by hand"]["median"]
         cells = (ours / sites, theirs / ours, begun["seconds"], begun["bytes_per_unknown"])
         rows.append((str(sites), *(f"{number:.3g}" for number in cells)))
+    _beside_casadi(results, short)
     links(10)
     results["links"] = min(links(1000) for _ in range(3))
     results["derivative"] = derivative(10_000, 100)
@@ -119,6 +167,22 @@ def main(short: bool = False) -> None:
     times = results["derivative"]
     print(f"{LINKS} links: {results['links']:.3g} µs a step; a gradient takes {times['gradient'] / times['run']:.3g} runs")
     store("sparse", results)
+
+
+def _beside_casadi(results: dict, short: bool) -> None:
+    """Its two sparse solvers at 1000 sites."""
+    sites, steps = 1000, 400 if short else 2000
+    with tempfile.TemporaryDirectory() as folder:
+        made = {solver: in_casadi(sites, solver, folder) for solver in ("qr", "ldl")}
+        programs = {solver: run for solver, run in made.items() if run is not None}
+        if not programs:
+            return print("CasADi or a C compiler is missing")
+        found = interleaved(
+            {"dirax": lambda: processor_time(sites, steps)} | {k: lambda run=run: run(steps) for k, run in programs.items()}, 5
+        )
+    results["casadi"] = {name: summary(values) for name, values in found.items()}
+    cells = [(name, f"{value['median'] / sites:.3g}") for name, value in results["casadi"].items()]
+    print(table(("program", "µs an unknown and step"), cells, f"{sites} sites beside CasADi's C with its sparse solvers"))
 
 
 if __name__ == "__main__":

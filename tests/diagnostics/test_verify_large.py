@@ -1,5 +1,7 @@
 """verify on systems of which no matrix of all coordinates can be formed: right runs pass, changed numbers are found."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 import dirax as dx
 from dirax.diagnostics import rows
 from dirax.diagnostics.report import VIOLATED
+from dirax.diagnostics.symplecticity_of_many import symplecticity_of_many
 from dirax.gallery import hanging_chain
 
 SITES = 600
@@ -23,6 +26,7 @@ def sol():
     return dx.simulate(dx.LagrangeDirac(chain), dx.LagrangeDAlembert(), q=Q, v=0 * Q, step=0.05, steps=12)
 
 
+SYMPLECTIC = "symplecticity of one step"
 JUDGED = "steps replayed", "discrete Dirac structure", "saved p", "action sum stationary"
 
 
@@ -36,7 +40,7 @@ def test_a_right_run_passes(sol, monkeypatch):
     assert {lines[name].verdict for name in JUDGED} == {"ok"}
     assert lines["energy"].verdict == "bounded" and "6 of 12 rows" in lines["steps replayed"].explanation
     assert "5 of 11 steps" in lines["saved p"].explanation
-    assert "derivative of a step" in lines["symplecticity of one step"].explanation
+    assert lines[SYMPLECTIC].verdict == "ok" and "2 pairs of random directions at 2 of 12 rows" in lines[SYMPLECTIC].explanation
 
 
 def test_changed_numbers_are_found(sol):
@@ -45,6 +49,12 @@ def test_changed_numbers_are_found(sol):
     p[-1, 345] += 1e-12
     lines = verdicts(sol.replace(fields={"q": q, "p": p}))
     assert {lines[name].verdict for name in JUDGED} == {VIOLATED}
+
+
+def test_a_step_that_changes_the_form_is_found(sol):
+    equation = sol.equation
+    stretched = dataclasses.replace(equation, advance=lambda *given: (1.0 + 1e-9) * equation.advance(*given))
+    assert symplecticity_of_many(sol.replace(equation=stretched), SYMPLECTIC, None).verdict == VIOLATED
 
 
 @pytest.mark.soak

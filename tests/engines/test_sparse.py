@@ -117,7 +117,7 @@ def test_derivatives_of_discrete_gradients_are_those_of_the_dense_engine():
     np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-11)
 
 
-def test_auto_takes_it_where_it_is_quicker():
+def test_auto_takes_it_where_it_is_quicker(monkeypatch):
     run = {"step": 0.05, "steps": 3}
     sol = dx.simulate(FPUT, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, **run)
     assert sol.stats["engine"] == "sparse" and sol.stats["bandwidth"] == [1, 1] and sol.stats["colours"] == 3
@@ -126,6 +126,11 @@ def test_auto_takes_it_where_it_is_quicker():
     coupled = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(jnp.cos(q[:, None] - q[None, :])))
     sol = dx.simulate(coupled, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, **run)
     assert sol.stats["engine"] == "xla" and "64 equations" in sol.stats["not_sparse"]
+    monkeypatch.setattr("dirax.engines.policy.LARGEST_DENSE", 63)
+    with pytest.raises(ValueError, match="a step of 64 unknowns that is not sparse"):
+        again = dx.LagrangeDirac(lambda q, v: v @ v - jnp.sum(jnp.cos(q[:, None] - q[None, :])))
+        dx.simulate(again, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, **run)
+    monkeypatch.undo()
 
 
 def test_a_batch_keeps_its_bits():
@@ -193,21 +198,30 @@ def test_singular_first_steps_are_named():
         dx.simulate(dx.LagrangeDirac(missing), dx.LagrangeDAlembert(), **run)
 
 
-def test_a_wrong_pattern_is_refused(monkeypatch):
-    from dirax.engines.sparse import plan
-    from dirax.program import sparse_equations
-    from dirax.program.sparsity import pattern_of
+@pytest.mark.parametrize("wrong", ["residual", "Jacobian"])
+def test_wrong_sites_are_refused(monkeypatch, wrong):
+    from dirax.engines.sparse import by_sites, plan
+    from dirax.program.sites.jacobian import entries_of_jacobian
 
-    def without_one(*given):
-        pattern = pattern_of(*given).tolil()
-        pattern[150, 151] = False
-        return pattern.tocsr()
+    def without_one(sites):
+        (result,) = sites.results
+        kept = [p for p in result if p.start <= 150 < p.start + p.length]
+        assert len(result) == 3 and len(kept) == 1
+        if wrong == "residual":
+            e = sites.expressions
+            sites.results[0][:] = [
+                p._replace(node=e.graph.mul(e.graph.constant(1.01), p.node)) if p in kept else p for p in result
+            ]
+        entries, rows, columns = entries_of_jacobian(sites)
+        entries = [p._replace(node=sites.expressions.graph.zero) if wrong == "Jacobian" and p.start == 0 else p for p in entries]
+        return entries, rows, columns
 
-    monkeypatch.setattr(sparse_equations, "pattern_of", without_one)
+    monkeypatch.setattr(by_sites, "entries_of_jacobian", without_one)
     plan._plans.clear()
     q = np.sin(np.arange(200.0))
-    with pytest.raises(AssertionError, match="equation 150"):
+    with pytest.raises(AssertionError, match=f"{wrong} of the step is wrong"):
         dx.simulate(dx.LagrangeDirac(chain), dx.LagrangeDAlembert(), q=q, v=0 * q, step=0.1, steps=2, engine="sparse")
+    plan._plans.clear()
 
 
 def test_it_says_why_it_does_not_take_a_step():

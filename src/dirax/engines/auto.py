@@ -81,7 +81,7 @@ class Auto(AbstractEngine):
         return outcome
 
     def _by_arrays(self, problem: Problem) -> tuple[AbstractEngine, dict[str, str]]:
-        """The sparse engine or the xla engine, and why not the former."""
+        """The sparse engine or the xla engine, and why not the former. Raises `ValueError` for dense steps that are too large."""
         if problem.size < policy.FEWEST_SPARSE:
             return Xla(), {}
         try:
@@ -92,4 +92,12 @@ class Auto(AbstractEngine):
         else:
             if reason is None:
                 return sparse, {}
+        unknowns = max(stage.unknowns for stage, _ in problem.equation.stages)
+        if unknowns > policy.LARGEST_DENSE:
+            raise ValueError(
+                f"a step of {unknowns} unknowns that is not sparse takes a matrix of {8e-9 * unknowns**2:.3g} GB: {reason}. Take "
+                "a scheme whose equations have few unknowns each (dx.EnergyCollocation and mean-value gradients have all; "
+                "dx.DiscreteDirac is the midpoint rule), write the system's functions as sums over neighbours, or ask for "
+                'engine="xla".'
+            )
         return Xla(), {"not_sparse": reason}

@@ -43,6 +43,9 @@ FEWEST_SPARSE = 33
 """Unknowns of a stage, or entries of the state, from which on "auto" asks the sparse engine what native does not take: a chain of
 64 oscillators takes 6 µs a step there, and 47 µs in the xla engine."""
 
+LARGEST_DENSE = 20_000
+"""Unknowns of a step that is not sparse up to which "auto" forms its matrix, 3 GB: more are refused."""
+
 MOST_ARRAY_OPERATIONS = 400
 """Operations on arrays in a residual from which on a sparse step is written by the levels of its scalar program."""
 

@@ -50,6 +50,8 @@ def sizes_of_many(p: Problem, traced: bool = False) -> tuple[Any, ...]:
     elif max(stage.unknowns for stage, _ in p.equation.stages) ** 2 > LARGEST_DENSE:
         return tuple(jnp.ones(np.shape(guess)) for guess in p.guess)
     t, axes = p.t0 + p.first_step * p.h, None if p.batch is None else (0, 0, 0 if p.batch_params else None)
+    if not traced and axes is None and all(solver is not None and solver.by_loops for solver in solvers):
+        return _sizes(equation, solvers, np.asarray(p.state), tuple(map(np.asarray, p.guess)), p.params, t, p.h, None, np)
     numbers = (jnp.asarray(a, float) for a in (t, p.h))
     given = jnp.asarray(p.state), tuple(map(jnp.asarray, p.guess)), jax.tree.map(jnp.asarray, p.params), *numbers
     given = jax.lax.stop_gradient(given)
@@ -58,12 +60,16 @@ def sizes_of_many(p: Problem, traced: bool = False) -> tuple[Any, ...]:
     return tuple(map(np.asarray, _compiled(equation, solvers, *given, axes)))
 
 
-def _sizes(equation: Any, solvers: tuple, state: Any, guess: tuple, params: Any, t: Any, h: Any, axes: tuple | None) -> tuple:
+def _sizes(
+    equation: Any, solvers: tuple, state: Any, guess: tuple, params: Any, t: Any, h: Any, axes: tuple | None, xp: Any = jnp
+) -> tuple:
+    """By JAX; or by NumPy, without anything to compile, where loops evaluate the stages."""
+
     def one(state, guess, params):
         found: dict[int, Any] = {}
         for (stage, fraction), u, solver in zip(equation.stages, guess, solvers, strict=True):
             if id(stage) not in found:
-                found[id(stage)] = _of_stage(stage, solver, u, state, t, fraction * h, params)
+                found[id(stage)] = _of_stage(stage, solver, u, state, t, fraction * h, params, xp)
         return tuple(found[id(stage)] for stage, _ in equation.stages)
 
     return one(state, guess, params) if axes is None else jax.vmap(one, axes)(state, guess, params)
@@ -88,47 +94,53 @@ def _looks() -> _Look:
     return _Look(*map(np.array, zip((no, no, no, yes, SHORT), *place(no), *place(yes), strict=True)))
 
 
-def _of_stage(stage: Any, known: SparseSolver | None, guess: Any, state: Any, t: Any, h: Any, params: Any) -> Any:
-    """One loop, so that XLA compiles the functions of the stage once."""
+def _of_stage(stage: Any, known: SparseSolver | None, guess: Any, state: Any, t: Any, h: Any, params: Any, xp: Any) -> Any:
     if not stage.unknowns:
-        return jnp.ones(0)
+        return xp.ones(0)
     solver: AbstractLinearSolver = known or Dense()
     jacobian = known.jacobian_of(stage.residual) if known else jax.jacfwd(stage.residual)
-    shaken = 1.0 + NEAR / 2 * _scattered(state.shape, 0)
+    solve = known.equations.solved if known else lambda matrix, right, _: solver.solve(solver.factorise(matrix), right)
+    shaken = 1.0 + NEAR / 2 * _scattered(state.shape, 0, xp)
 
     def look(carry, given):
         end, solution, base, largest, moved = carry
         look, number = given
-        blurred = lambda a: a * (1.0 + jnp.where(look.blurred, EPSILON, 0.0) * _scattered(a.shape, number))
-        data = jnp.where(look.from_solution, solution, guess), jnp.where(look.at_end, end, state), look.part * h
+        blurred = lambda a: a * (1.0 + xp.where(look.blurred, EPSILON, 0.0) * _scattered(np.shape(a), number, xp))
+        data = xp.where(look.from_solution, solution, guess), xp.where(look.at_end, end, state), look.part * h
         u, x, part = map(blurred, data)
-        change = solver.solve(solver.factorise(jacobian(u, x, t, part, params)), stage.residual(u, x, t, part, params))
-        root = u - jnp.where(jnp.isfinite(change), change, 0.0)
-        after = shaken * stage.advance(root, x, t, part, params)
-        size = jnp.where(look.at_end, largest, jnp.maximum(largest, jnp.abs(root)))
-        end = jnp.where(look.ends, jnp.where(jnp.isfinite(after), after, 0.0), end)
-        solution = jnp.where(look.from_solution, solution, root)
-        base = jnp.where(look.blurred, base, root)
+        change = solve(jacobian(u, x, t, part, params), xp.asarray(stage.residual(u, x, t, part, params)), xp)
+        root = u - xp.where(xp.isfinite(change), change, 0.0)
+        size = xp.where(look.at_end, largest, xp.maximum(largest, xp.abs(root)))
+        if xp is jnp or look.ends:
+            after = shaken * xp.asarray(stage.advance(root, x, t, part, params))
+            end = xp.where(look.ends, xp.where(xp.isfinite(after), after, 0.0), end)
+        solution = xp.where(look.from_solution, solution, root)
+        base = xp.where(look.blurred, base, root)
         return (end, solution, base, size, moved + ((root - base) / EPSILON) ** 2), None  # which is zero for what is not blurred
 
-    looks = jax.tree.map(jnp.asarray, _looks())
-    begun = state, guess, guess, jnp.abs(guess), jnp.zeros_like(guess)
-    (*_, largest, moved), _ = jax.lax.scan(look, begun, (looks, jnp.arange(1, 1 + len(looks.part))))
-    sizes = jnp.maximum(largest, LARGEST * jnp.sqrt(moved / SAMPLES))
-    return power_of_two(_not_below_others(stage.unknown_layout, sizes), jnp)
+    looks, begun = _looks(), (state, guess, guess, xp.abs(guess), xp.zeros_like(guess))
+    given = looks, np.arange(1, 1 + len(looks.part))
+    if xp is np:
+        for one in zip(*looks, given[1], strict=True):
+            begun, _ = look(begun, (_Look(*one[:-1]), one[-1]))
+        *_, largest, moved = begun
+    else:  # one loop, so that XLA compiles the functions of the stage once
+        (*_, largest, moved), _ = jax.lax.scan(look, begun, jax.tree.map(jnp.asarray, given))
+    sizes = xp.maximum(largest, LARGEST * xp.sqrt(moved / SAMPLES))
+    return power_of_two(_not_below_others(stage.unknown_layout, sizes, xp), xp)
 
 
-def _scattered(shape: tuple[int, ...], number: Any) -> Any:
+def _scattered(shape: tuple[int, ...], number: Any, xp: Any) -> Any:
     """Numbers of mean square 1, others for another `number`: XLA takes a second to compile a generator of random ones."""
-    place = jnp.arange(max(1, *shape) if shape else 1, dtype=float).reshape(shape)
-    return np.sqrt(2.0) * jnp.sin(1.0 + 2.399963 * (place + 1.0) + 1.618034 * jnp.asarray(number, float) * (place + 2.0))
+    place = xp.arange(max(1, *shape) if shape else 1, dtype=float).reshape(shape)
+    return np.sqrt(2.0) * xp.sin(1.0 + 2.399963 * (place + 1.0) + 1.618034 * xp.asarray(number, float) * (place + 2.0))
 
 
-def _not_below_others(layout: Layout, sizes: Any) -> Any:
+def _not_below_others(layout: Layout, sizes: Any, xp: Any) -> Any:
     """Sizes of at least LEAST of the largest of their part, and 1 where all of a part are zero."""
     parts = (sizes[layout.place(name)] for name in layout)
-    floored = (jnp.maximum(part, LEAST * jnp.max(part, initial=0.0)) for part in parts)
-    return jnp.concatenate([jnp.where(part > 0.0, part, 1.0) for part in floored])
+    floored = (xp.maximum(part, LEAST * xp.max(part, initial=0.0)) for part in parts)
+    return xp.concatenate([xp.where(part > 0.0, part, 1.0) for part in floored])
 
 
 _compiled = compiled(_sizes)

@@ -25,10 +25,13 @@ class SparseEquations(eqx.Module):
     """What is known of the Jacobian of equations without its values: where entries are, and how it is factored.
 
     Values are those of one product with the sum of each colour's columns, and of one from the left with each full row,
-    (products·k,). On a CPU.
+    (products·k,); or of the entries alone, in the order in which they were given. On a CPU.
     """
 
     pattern: Any = eqx.field(static=True)
+    """Where entries are, with the numbers of their values, from 1."""
+    length: int = eqx.field(static=True)
+    """How many values there are."""
     elimination: Any = eqx.field(static=True)
     count: int = eqx.field(static=True)
     """How many colours there are."""
@@ -43,20 +46,13 @@ class SparseEquations(eqx.Module):
     def of(cls, function: Callable, unknowns: Any, *others: Any) -> "SparseEquations":
         """Those of `function(unknowns, *others)`, arguments as `pattern_of` takes them. Raises `Dense` and
         `StructurallySingular`."""
-        pattern: Any = pattern_of(function, unknowns, *others)
-        pattern.sort_indices()
-        return cls._of_pattern(pattern)
+        return cls._of_pattern(pattern_of(function, unknowns, *others))
 
     @classmethod
     def of_entries(cls, size: int, rows: np.ndarray, columns: np.ndarray) -> "SparseEquations":
-        """Those of a Jacobian (size, size) with entries at these rows and columns. Raises `StructurallySingular`."""
-        pattern = sp.csr_matrix((np.ones(len(rows), bool), (rows, columns)), (size, size))
-        pattern.sort_indices()
-        return cls._of_pattern(pattern)
-
-    def places(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Where the entries at these rows and columns are among the `values`."""
-        return _places(self.elimination.size, np.asarray(self.colours), self.count, self.full_rows, rows, columns)
+        """Those of a Jacobian (size, size) whose values are the entries at these rows and columns, each once. Raises
+        `StructurallySingular`."""
+        return cls._of_pattern(sp.csr_matrix((np.arange(1, len(rows) + 1), (rows, columns)), (size, size)), len(rows))
 
     @property
     def products(self) -> int:
@@ -64,21 +60,28 @@ class SparseEquations(eqx.Module):
         return self.count + len(self.full_rows)
 
     @classmethod
-    def _of_pattern(cls, pattern: Any) -> "SparseEquations":
+    def _of_pattern(cls, pattern: Any, length: int | None = None) -> "SparseEquations":
+        """With values in the order of `pattern`, which is numbers from 1 to `length`, or by colours."""
+        pattern.sort_indices()
         size = pattern.shape[0]
         full_rows, _ = full_lines(pattern)
         colours = column_colours(pattern[np.setdiff1d(np.arange(size), full_rows)] if len(full_rows) else pattern)
         count = int(np.max(colours, initial=-1)) + 1
-        made = elimination(pattern)
-        entries = pattern.tocoo()
-        full = tuple(full_rows.tolist())
-        numbers = 1 + _places(size, colours, count, full, entries.row, entries.col)
-        places = sp.csr_matrix((numbers, pattern.indices, pattern.indptr), pattern.shape)
+        full, there = (
+            tuple(full_rows.tolist()),
+            sp.csr_matrix((np.ones(pattern.nnz, bool), pattern.indices, pattern.indptr), pattern.shape),
+        )
+        made = elimination(there)
+        total = (count + len(full)) * size if length is None else length
+        if length is None:
+            entries = pattern.tocoo()
+            numbers = 1 + _places(size, colours, count, full, entries.row, entries.col)
+            pattern = sp.csr_matrix((numbers, pattern.indices, pattern.indptr), pattern.shape)
         with jax.ensure_compile_time_eval():
             arrays = lambda given: tuple(map(jnp.asarray, given))
             return cls(
-                _Static(pattern), made, count, full, jnp.asarray(colours), arrays(made.tables(places)), arrays(made.solve_tables),
-                jnp.asarray([size], np.int64),
+                _Static(pattern), total, made, count, full, jnp.asarray(colours), arrays(made.tables(pattern)),
+                arrays(made.solve_tables), jnp.asarray([size], np.int64),
             )  # fmt: skip
 
     @property
@@ -99,8 +102,9 @@ class SparseEquations(eqx.Module):
             "colours": self.count,
         } | self.elimination.stats
 
-    def values(self, function: Callable, u: Float[Array, " k"]) -> Float[Array, " products*k"]:
-        """The values of the Jacobian of `function` at u."""
+    def values(self, function: Callable, u: Float[Array, " k"]) -> Float[Array, " values"]:
+        """The values of the Jacobian of `function` at u, by colours."""
+        assert self.length == self.products * self.elimination.size, "values of entries have another order"
         _, linear = jax.linearize(function, u)
         sums = jnp.where(self.colours[None, :] == jnp.arange(self.count, dtype=self.colours.dtype)[:, None], 1.0, 0.0)
         columns = jax.vmap(linear)(sums).ravel()
@@ -113,24 +117,26 @@ class SparseEquations(eqx.Module):
     def matrix(self, values: np.ndarray) -> Any:
         """The Jacobian with these values."""
         pattern = self.pattern.value
-        entries = pattern.tocoo()
-        data = np.asarray(values)[self.places(entries.row, entries.col)]
-        return sp.csr_matrix((data, pattern.indices, pattern.indptr), pattern.shape)
+        return sp.csr_matrix((np.asarray(values)[pattern.data - 1], pattern.indices, pattern.indptr), pattern.shape)
 
     def values_of(self, matrix: Any) -> np.ndarray:
         """The values of a matrix of this pattern."""
-        entries = matrix.tocoo()
-        values = np.zeros(self.products * matrix.shape[0])
-        values[self.places(entries.row, entries.col)] = entries.data
+        entries, pattern = matrix.tocoo(), self.pattern.value
+        values = np.zeros(self.length)
+        values[np.asarray(pattern[entries.row, entries.col]).ravel() - 1] = entries.data
         return values
 
-    def factorise(self, values: Float[Array, " products*k"]) -> Any:
+    def factorise(self, values: Float[Array, " values"]) -> Any:
         """The factors of the Jacobian with these values."""
         return self.elimination.factors(jnp, self.tables, values, self.size)
 
     def solve(self, factors: Any, right: Float[Array, " k"], transposed: bool = False) -> Float[Array, " k"]:
         """x with J x = right, or Jᵀ x = right."""
         return self.elimination.solution(jnp, self.solve_tables, factors, right, self.size, transposed)
+
+    def solved(self, values: Any, right: Any, xp: Any) -> Any:
+        """x with J x = right for the Jacobian with these values, by NumPy or by JAX."""
+        return self.in_numpy(values)(right) if xp is np else self.solve(self.factorise(values), right)
 
     def root(self, function: Callable, root: Float[Array, " k"]) -> Float[Array, " k"]:
         """`root`, with its derivatives as the function of what `function` captures that function(root) = 0 makes of it."""

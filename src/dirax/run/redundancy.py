@@ -38,17 +38,31 @@ def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, par
         return ()
     where = f" of trajectory {int(np.argmax(ranks < total))}" if len(ranks) > 1 else ""
     _refuse_singular_point(system, matrices, ranks, where, data, params, t0)
-    kept: list[int] = []
     one_forms = total - (system.sizes(data, params)[2:] or (0,))[0]
-    for row in (*range(one_forms, total), *range(one_forms)):
-        if rank_of_equations(matrices[:1, [*kept, row]])[0][0] > len(kept):
-            kept.append(row)
+    kept = _independent(matrices[:1], [*range(one_forms, total), *range(one_forms)])
     if np.any(ranks != len(kept)) or np.any(rank_of_equations(matrices[:, kept])[0] < len(kept)):
         raise ValueError(
             f"the constraints that follow from others are not the same in all trajectories of the batch (ranks from "
             f"{np.min(ranks)} to {np.max(ranks)} of {total}): run the trajectories in groups."
         )
     return tuple(row for row in range(total) if row not in kept)
+
+
+def _independent(matrices: np.ndarray, rows: list[int]) -> list[int]:
+    """Those of the rows (of matrices (1, m, n)) that do not follow from the ones before: most of many, so that the next one that
+    does is looked for in steps that double, and then between the last two."""
+    follows = lambda rows: rank_of_equations(matrices[:, rows])[0][0] < len(rows)
+    kept: list[int] = []
+    while rows:
+        most, step = 0, 1
+        while most < len(rows) and not follows([*kept, *rows[: most + step]]):
+            most, step = min(most + step, len(rows)), 2 * step
+        least = min(most + step, len(rows))
+        while least - most > 1:
+            middle = (most + least) // 2
+            most, least = (most, middle) if follows([*kept, *rows[:middle]]) else (middle, least)
+        kept, rows = [*kept, *rows[:most]], rows[most + 1 :]
+    return kept
 
 
 def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> None:

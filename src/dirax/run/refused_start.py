@@ -137,16 +137,18 @@ def _refuse_singular_sparse_step(jacobians: SparseJacobians, labels: Sequence[st
     That the pattern has all entries is checked by a product with a vector that was not found with it."""
     from dirax.numerics.sparse.ranks import free_direction  # imported when it is used
 
-    for lane, (values, products) in enumerate(zip(jacobians.values, jacobians.product, strict=True)):
+    for lane, (values, products, missed) in enumerate(zip(*jacobians[1:], strict=True)):
         which = f" of trajectory {lane}" if len(jacobians.values) > 1 else ""
         matrix, near = map(jacobians.equations.matrix, values)
         along = direction(matrix.shape[1])
-        for a, product in ((near, products[1]), (matrix, products[0])):
-            missed = np.abs(a @ along - product) / np.maximum(abs(a) @ along, TINY)
-            if np.any(missed > PRODUCT):  # never where it is not a number: out of the domain nothing is known
-                raise AssertionError(
-                    f"the sparse Jacobian of the step is wrong in {labels[int(np.argmax(missed))]}: report this."
-                )
+        products = [
+            np.abs(a @ along - product) / np.maximum(abs(a) @ along, TINY)
+            for a, product in zip((matrix, near), products, strict=True)
+        ]
+        for what, of in (("residual", missed), ("sparse Jacobian", products)):
+            worst = np.max(np.nan_to_num(of), axis=0)  # out of the domain nothing is known
+            if np.any(worst > PRODUCT):
+                raise AssertionError(f"the {what} of the step is wrong in {labels[int(np.argmax(worst))]}: report this.")
         free = free_direction(jacobians.equations, matrix)
         if free is not None:
             most = np.argsort(-np.abs(free))[:4]
@@ -162,7 +164,7 @@ def _refuse_singular_sparse_step(jacobians: SparseJacobians, labels: Sequence[st
 
 
 PRODUCT = 1e-10
-"""Difference of two ways to a product of the Jacobian with a vector, relative to its terms, that roundoff makes."""
+"""Difference of two ways to a residual, or to a product of the Jacobian with a vector, relative to terms, that roundoff makes."""
 
 
 def _lanes(values: Any, ndim: int) -> np.ndarray:

@@ -94,24 +94,26 @@ def _with_sparse_first_step(equation: Any, case: Case, start: Start) -> Start:
             f"the first step has no unique solution, whatever the initial data: {plan}. The Lagrangian is singular together with "
             "its constraints: remove the coordinates that it does not determine, or choose another discrete Lagrangian."
         )
-    known = None if isinstance(plan, str) or plan.solvers[0].equations.slower else plan.solvers[0].equations
+    known = None if isinstance(plan, str) or plan.solvers[0].equations.slower else plan.solvers[0]
     if known is None and equation.stages[0][0].unknowns ** 2 > LARGEST_MATRIX:
         return start
-    written = equation if isinstance(plan, str) else plan.equation
-    first = _of_every(_FirstStep(written, case.two_points, known), (equation,), case, start._replace(row0=None), True)
+    written = None if isinstance(plan, str) else plan.equation.stages[0][0]
+    first = _of_every(_FirstStep(equation, case.two_points, known, written), (equation,), case, start._replace(row0=None), True)
     if known is None:
         return start._replace(residual=first[0], jacobian=first[1])
-    residual, values, product = (np.asarray(a) if case.batch is not None else np.asarray(a)[None] for a in first)
-    return start._replace(residual=residual[:, 0], jacobian=SparseJacobians(known, values, product))
+    residual, *found = (np.asarray(a) if case.batch is not None else np.asarray(a)[None] for a in first)
+    return start._replace(residual=residual[:, 0], jacobian=SparseJacobians(known.equations, *found))
 
 
 class SparseJacobians(NamedTuple):
-    """Sparse Jacobians of every trajectory at the first guess and near it: what is known of them all, `values` (B, 2, …), and the
-    products (B, 2, k) with `direction(k)`."""
+    """Sparse Jacobians of every trajectory at the first guess and near it: what is known of them all, `values` (B, 2, …), the
+    products (B, 2, k) with `direction(k)`, and by how much the residual as it is run differs from that of the scheme (B, 2, k),
+    relative to the largest numbers in it."""
 
     equations: Any
     values: np.ndarray
     product: np.ndarray
+    missed: np.ndarray
 
 
 AWAY = 1e-3
@@ -169,17 +171,23 @@ class _FirstStep(eqx.Module):
     equation: Any
     two_points: bool
     sparse: Any = None
+    written: Any = None
+    """The stage as it is run."""
 
     def __call__(self, start: Start, params, h, t0):
         stage, fraction = self.equation.stages[0]
         t = t0 + int(self.two_points) * h
-        solved = lambda u: stage.residual(u, start.state, t, fraction * h, params)
+        given = start.state, t, fraction * h, params
+        solved = lambda u: stage.residual(u, *given)
         if self.sparse is not None:
             u, along = start.guess[0], jnp.asarray(direction(start.guess[0].shape[0]))
 
             def at(u):
                 residual, product = jax.jvp(solved, (u,), (along,))
-                return residual, self.sparse.values(solved, u), product
+                size = lambda a: jnp.max(jnp.abs(a), initial=0.0)
+                large = size(u) + size(residual) + size(start.state) * (1.0 + size(product) / jnp.abs(h))
+                missed = jnp.abs(self.written.residual(u, *given) - residual) / jnp.where(large > 0, large, 1.0)
+                return residual, self.sparse.jacobian_of(stage.residual)(u, *given), product, missed
 
             return jax.lax.map(at, jnp.stack([u, u + AWAY * (1.0 + jnp.max(jnp.abs(u))) * along]))
         return solved(start.guess[0]), jax.jacfwd(solved)(start.guess[0])

@@ -10,6 +10,7 @@ from jax.extend.core import jaxprs_in_params
 
 from dirax.engines import policy
 from dirax.engines.in_jax import joined, replaced
+from dirax.engines.sparse.by_sites import by_sites
 from dirax.engines.sparse.solver import SparseSolver
 from dirax.engines.step_program import step_program
 from dirax.numerics.sparse.elimination import StructurallySingular
@@ -65,7 +66,9 @@ def _planned(equation: Any, params: Any, batch_params: bool) -> SparsePlan | str
             continue
         shapes = numbers(stage.unknowns), numbers(stage.state_size), scalar, scalar, given
         try:
-            if (made := _by_levels(equation, stage, shapes, params, batch_params)) is None:
+            if isinstance(made := by_sites(stage, shapes), str):
+                made = _by_levels(equation, stage, shapes, params, batch_params)
+            if made is None:
                 made = stage, SparseSolver(SparseEquations.of(stage.residual, *shapes))
         except Dense as error:
             return str(error)
@@ -91,9 +94,7 @@ def _by_levels(equation: Any, stage: Any, shapes: tuple, params: Any, batch_para
     rows, columns = np.array([(i, j) for i, row in enumerate(jacobian) for j in row], np.int64).reshape(-1, 2).T
     equations = SparseEquations.of_entries(stage.unknowns, rows, columns)
     entries = made.in_levels(index, [node for row in jacobian for node in row.values()])
-    places, size = equations.places(rows, columns), equations.products * stage.unknowns
-    values = jax.jit(lambda *args: jnp.zeros(size).at[places].set(entries(*args)))
-    return replaced(stage, made, index, made.in_levels), SparseSolver(equations, values)
+    return replaced(stage, made, index, made.in_levels), SparseSolver(equations, jax.jit(entries))
 
 
 def operations(jaxpr: Any) -> int:

@@ -13,6 +13,8 @@ class SparseSolver(AbstractLinearSolver):
 
     equations: SparseEquations
     values: Callable | None = None
+    by_loops: bool = False
+    """Whether `values` and the functions of the stage are compiled loops, which NumPy's arrays can be given to."""
 
     def jacobian_of(self, residual: Callable) -> Callable:
         """(u, *args) ↦ the values of the Jacobian of `residual(u, *args)`."""

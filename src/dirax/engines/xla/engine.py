@@ -53,7 +53,7 @@ class Xla(AbstractEngine):
         """Run `problem`, saving into host arrays; Ctrl-C and failing steps keep what was computed."""
         started = time.perf_counter()
         p, numerics, notes = self._planned(problem)
-        chunk = compiled_chunk(jax.default_backend())
+        chunk = compiled_chunk(jax.default_backend(), numerics.sparse is not None)
         axes, capacity, params = axes_of(p), row_capacity(p), jax.device_put(p.params)
         sizes = self._sizes(problem, sizes_of)
         lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, numerics.increments is not None)

@@ -110,7 +110,7 @@ def take_step(
         u, count, converged = newton_root(stage.residual, guess, fixed, max_iterations, sizes, running, jacobian, linear_solver)
         new, left = stage.advance(u, *fixed), stage.residual(u, *fixed)
         # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
-        finite = jnp.isfinite(jnp.sum(0.0 * jnp.concatenate([new, left])))
+        finite = jnp.isfinite(jnp.sum(0.0 * new) + jnp.sum(0.0 * left))
         outcome = jnp.where(finite, jnp.where(converged, OK, NOT_CONVERGED), NOT_FINITE)
         status = jnp.where(running, outcome, status)
         updates = updates + jnp.where(running, count, 0)

@@ -21,6 +21,10 @@ UNPACKED_ROWS = 64
 QUICK_TO_COMPILE = {"xla_cpu_use_fusion_emitters": False}
 """Halves the time of compilation on a CPU, where the steps were measured to take the same time or less."""
 
+BY_ITSELF = {"xla_cpu_experimental_ynn_fusion_type": ""}
+"""Leaves long arrays to the code that XLA compiles: its library of array operations shares them out to threads that wait for one
+another, which takes a fifth more of the processor's time."""
+
 
 class Clock(eqx.Module):
     """The numbers of a chunk of steps, all of them traced, so that one compiled function serves every run of an equation.
@@ -61,15 +65,20 @@ def unpack_rows(equation, axes, packed, params, clock: Clock) -> dict:
 
 
 @functools.cache
-def compiled_chunk(platform: str) -> Any:
-    """`_chunk` compiled for a platform, with the options that this version of XLA knows."""
-    if platform != "cpu":
-        return compiled(_chunk)
+def compiled_chunk(platform: str, long: bool = False) -> Any:
+    """`_chunk` compiled for a platform, with the options that this version of XLA knows; for `long` arrays with more of them."""
+    options = {} if platform != "cpu" else QUICK_TO_COMPILE | (BY_ITSELF if long else {})
+    known = {name: value for name, value in options.items() if _is_known(name, value)}
+    return compiled(_chunk, compiler_options=known) if known else compiled(_chunk)
+
+
+@functools.cache
+def _is_known(name: str, value: Any) -> bool:
     try:
-        jax.jit(lambda: 0.0, compiler_options=QUICK_TO_COMPILE).lower().compile()
+        jax.jit(lambda: 0.0, compiler_options={name: value}).lower().compile()
     except jax.errors.JaxRuntimeError:
-        return compiled(_chunk)
-    return compiled(_chunk, compiler_options=QUICK_TO_COMPILE)  # pyright: ignore[reportCallIssue]
+        return False
+    return True
 
 
 def _chunk(

@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import hashlib
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -32,8 +33,11 @@ class Kernel:
     Compiled when it is first called; `constants` are values of names in it.
     """
 
+    level = 3
+    """How much LLVM optimizes."""
+
     def __init__(self, function: Callable, results: int, **constants: int):
-        self.function, self.results, self.constants = function, results, constants
+        self.function, self.results, self.constants, self.entry = function, results, constants, function.__name__
         self.kinds = list(argument_kinds(function).values())
         self.name = "_".join(["dirax", function.__name__, *(f"{k}{v}" for k, v in sorted(constants.items()))])
 
@@ -64,18 +68,22 @@ class Kernel:
             return 0.0
         return ctypes.c_int64.from_address(self._engine.get_global_value_address(SPENT)).value * 1e-9
 
+    def module(self) -> Any:
+        """The function as LLVM has it, with what XLA calls."""
+        made = module_of(self.function, self.constants)
+        _write_handler(made, made.get_global(self.entry), self.results)
+        return llvm.parse_assembly(str(made))
+
     @functools.cached_property
     def _engine(self) -> Any:
-        module = module_of(self.function, self.constants)
-        _write_handler(module, module.get_global(self.function.__name__), self.results)
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
-        parsed = llvm.parse_assembly(str(module))
+        parsed = self.module()
         features = llvm.get_host_cpu_features().flatten()
         machine = llvm.Target.from_default_triple().create_target_machine(
             cpu=llvm.get_host_cpu_name(), features=features, opt=3, jit=True
         )
-        options = llvm.create_pipeline_tuning_options(speed_level=3)
+        options = llvm.create_pipeline_tuning_options(speed_level=self.level)
         builder = llvm.create_pass_builder(machine, options)
         builder.getModulePassManager().run(parsed, builder)
         engine = llvm.create_mcjit_compiler(parsed, machine)
@@ -85,7 +93,7 @@ class Kernel:
     @functools.cached_property
     def _call(self) -> Any:
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(self.kinds))
-        return kind(self._engine.get_function_address(self.function.__name__))
+        return kind(self._engine.get_function_address(self.entry))
 
     @functools.cached_property
     def _registered(self) -> Any:
@@ -94,6 +102,25 @@ class Kernel:
         capsule = new(self._engine.get_function_address("handler"), None, None)
         jax.ffi.register_ffi_target(self.name, capsule, platform="cpu")
         return capsule
+
+
+class WrittenKernel(Kernel):
+    """The same of LLVM's text, a function `entry` of pointers to doubles, `inputs` and then `results` of them."""
+
+    level = 1
+
+    def __init__(self, text: str, entry: str, inputs: int, results: int):
+        self.text, self.entry, self.results, self.kinds = text, entry, results, ["f8"] * (inputs + results)
+        self.name = f"dirax_{entry}_{hashlib.sha256(text.encode()).hexdigest()[:24]}"  # what XLA keeps on disk refers to it
+
+    def module(self) -> Any:
+        """The text, with what XLA calls."""
+        handler = ir.Module()
+        kind = ir.FunctionType(ir.VoidType(), [ir.DoubleType().as_pointer()] * len(self.kinds))
+        _write_handler(handler, ir.Function(handler, kind, self.entry), self.results)
+        made = llvm.parse_assembly(self.text)
+        made.link_in(llvm.parse_assembly(str(handler)))
+        return made
 
 
 @functools.cache

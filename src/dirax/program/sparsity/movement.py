@@ -21,7 +21,7 @@ MOVES = frozenset(
 
 def moved(equation: Any, *operands: Value) -> list[Value]:
     """Numbers of entries are moved, counted from 1; 0 is that of an entry which depends on nothing."""
-    rule: Any = _pad if equation.primitive.name == "pad" else RULES[equation.primitive.name]
+    rule: Any = pad if equation.primitive.name == "pad" else RULES[equation.primitive.name]
     if all(o.known is not None for o in operands):
         return [Value(known=np.asarray(a)) for a in rule(None, equation, *(o.known for o in operands))]
     shapes = [v.aval.shape for v in equation.invars]
@@ -65,11 +65,7 @@ def scattered(equation: Any, value: Value, indices: Value, updates: Value) -> li
         raise Dense(f"'{equation.primitive.name}' has indices that depend on values")
     shape, given = equation.invars[0].aval.shape, equation.invars[2].aval.shape
     total, name = math.prod(shape), equation.primitive.name
-    put = lambda updates: _scatter_add(equation, np.zeros(shape), indices.known, updates)
-    with jax.ensure_compile_time_eval():
-        numbers = jax.numpy.arange(1.0, total + 1).reshape(shape)
-        found = jax.linear_transpose(put, jax.ShapeDtypeStruct(given, np.float64))(numbers)[0]
-        places = np.asarray(found).ravel().astype(int)
+    places = places_of_updates(equation, indices.known, shape, given)
     inside = np.flatnonzero(places > 0)
     targets = places[inside] - 1
     kept, zero = value.sets, value.zeros(shape).ravel().copy()
@@ -86,6 +82,15 @@ def scattered(equation: Any, value: Value, indices: Value, updates: Value) -> li
         there = sp.csr_matrix((np.ones(len(inside), bool), (targets, inside)), (total, len(places)))
         kept = union(kept, there @ updates.sets)
     return [Value(kept, None, zero.reshape(shape))]
+
+
+def places_of_updates(equation: Any, indices: np.ndarray, shape: tuple[int, ...], given: tuple[int, ...]) -> np.ndarray:
+    """Where a scatter adds each of its updates, of shape `given`, in an array of `shape`, counted from 1; 0 for outside it."""
+    put = lambda updates: _scatter_add(equation, np.zeros(shape), indices, updates)
+    with jax.ensure_compile_time_eval():
+        numbers = jax.numpy.arange(1.0, math.prod(shape) + 1).reshape(shape)
+        found = jax.linear_transpose(put, jax.ShapeDtypeStruct(given, np.float64))(numbers)[0]
+        return np.asarray(found).ravel().astype(int)
 
 
 def updated(equation: Any, value: Value, updates: Value, *starts: Value) -> list[Value]:
@@ -114,7 +119,7 @@ def _scatter_add(equation: Any, zeros: np.ndarray, indices: np.ndarray, updates:
     )  # fmt: skip
 
 
-def _pad(_: Any, equation: Any, x: np.ndarray, filler: np.ndarray) -> list[np.ndarray]:
+def pad(_: Any, equation: Any, x: np.ndarray, filler: np.ndarray) -> list[np.ndarray]:
     out = np.full(equation.outvars[0].aval.shape, filler.item(), x.dtype)
     source, target = [], []
     for n, size, (low, _, inside) in zip(x.shape, out.shape, equation.params["padding_config"], strict=True):

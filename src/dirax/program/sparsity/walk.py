@@ -121,7 +121,7 @@ def _results(equation: Any, operands: list[Value]) -> list[Value]:
         if name in IN_NUMPY:
             return [Value(known=IN_NUMPY[name](*(o.known for o in operands)).astype(equation.outvars[0].aval.dtype))]
         if name == "iota":
-            return [Value(known=_iota(equation))]
+            return [Value(known=iota(equation))]
         if _is_whole(equation):
             return [Value(known=a) for a in evaluated(equation, [o.known for o in operands])]
     if name in BY_NAME:
@@ -152,7 +152,7 @@ def _branches(equation: Any, operands: list[Value]) -> list[Value]:
     return [Value(sets) for sets in found]
 
 
-def _iota(equation: Any) -> np.ndarray:
+def iota(equation: Any) -> np.ndarray:
     shape, along = equation.outvars[0].aval.shape, equation.params["dimension"]
     inner = [1] * len(shape)
     inner[along] = -1

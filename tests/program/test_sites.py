@@ -1,0 +1,68 @@
+"""Functions of arrays by sites: their loops do what JAX does, and what is not made of sites is told so."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dirax.engines.sparse.site_loops import loops
+from dirax.program.sites.jacobian import entries_of_jacobian
+from dirax.program.sites.pieces import NotBySites
+from dirax.program.sites.walk import sites_of
+
+RNG = np.random.default_rng(0)
+N = 43  # no multiple of a vector
+Q, P = RNG.normal(size=N), RNG.normal(size=2 * N)
+MASSES, EDGES = RNG.uniform(1, 2, N), (np.arange(N - 1), np.arange(1, N))
+
+
+def energy(q):
+    d = jnp.diff(jnp.concatenate([jnp.zeros(1), q, jnp.zeros(1)]))
+    return jnp.sum(jnp.cos(q)) + jnp.sum(d**4)
+
+
+FUNCTIONS = {
+    "chain": (jax.grad(energy), Q),
+    "masses": (lambda q: MASSES * jnp.roll(q, 1) / (2 + jnp.sin(q)), Q),
+    "edges": (lambda q: jax.ops.segment_sum(q[EDGES[0]] * q[EDGES[1]], EDGES[1], N), Q),
+    "links": (lambda p: jnp.linalg.norm(jnp.diff(p.reshape(-1, 2), axis=0), axis=1), P),
+    "one in two": (jax.grad(lambda p: jnp.sum(p[1::2] ** 3) + jnp.sum(p[::-1] ** 2 * p)), P),
+    "turned": (lambda p: jnp.einsum("ij,nj->ni", jnp.array([[0.6, 0.8], [-0.8, 0.6]]), p.reshape(-1, 2)).ravel(), P),
+    "masked": (lambda q: jnp.where(jnp.arange(N) % 2 == 0, q, jnp.where(q > 0, jnp.exp(q), -q)), Q),
+    "total": (lambda q: q / jnp.sum(q**2), Q),
+    "few": (lambda q: jnp.sum(jnp.sin(q[:8, None] - q[None, :8]), axis=1), Q),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_loops_over_sites_do_what_jax_does(name):
+    function, given = FUNCTIONS[name]
+    sites = sites_of(function, jax.ShapeDtypeStruct(given.shape, float))
+    (found,) = loops(sites, 1, sites.results, sites.sizes)(given)
+    expected = np.asarray(function(jnp.asarray(given))).ravel()
+    np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["chain", "masses", "edges", "one in two"])
+def test_entries_of_the_jacobian_are_all_of_it(name):
+    function, given = FUNCTIONS[name]
+    sites = sites_of(function, jax.ShapeDtypeStruct(given.shape, float))
+    entries, rows, columns = entries_of_jacobian(sites)
+    (values,) = loops(sites, 1, [entries], [len(rows)])(given)
+    matrix = np.zeros((sites.sizes[0], given.size))
+    matrix[rows, columns] = values
+    np.testing.assert_allclose(matrix, jax.jacfwd(function)(jnp.asarray(given)), rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("function", "why"),
+    [
+        (lambda q: q[jnp.argsort(q)], "sort"),
+        (lambda q: jnp.cumsum(q), "cumsum"),
+        (lambda q: q[RNG.permutation(400) % N], "different expressions"),
+        (lambda q: q[(q[0] > 0).astype(int) + jnp.arange(3)], "depend on values"),
+    ],
+)
+def test_what_is_not_made_of_sites_is_told_so(function, why):
+    with pytest.raises(NotBySites, match=why):
+        sites_of(function, jax.ShapeDtypeStruct((N,), float))
