@@ -224,6 +224,26 @@ def test_wrong_sites_are_refused(monkeypatch, wrong):
     plan._plans.clear()
 
 
+def test_a_wrong_pattern_is_refused(monkeypatch):
+    """Of a step that is not taken as sites."""
+    from dirax.engines.sparse import plan
+    from dirax.program import sparse_equations
+    from dirax.program.sparsity import pattern_of
+
+    def without_one(*given):
+        pattern = pattern_of(*given).tolil()
+        pattern[150, 151] = False
+        return pattern.tocsr()
+
+    monkeypatch.setattr(plan, "by_sites", lambda *given: "it is not")
+    monkeypatch.setattr(sparse_equations, "pattern_of", without_one)
+    plan._plans.clear()
+    q = np.sin(np.arange(200.0))
+    with pytest.raises(AssertionError, match="equation 150"):
+        dx.simulate(dx.LagrangeDirac(chain), dx.LagrangeDAlembert(), q=q, v=0 * q, step=0.1, steps=2, engine="sparse")
+    plan._plans.clear()
+
+
 def test_it_says_why_it_does_not_take_a_step():
     size = 3000
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(q) ** 2)
