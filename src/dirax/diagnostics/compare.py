@@ -10,8 +10,9 @@ import numpy as np
 from dirax.diagnostics.bench.subject import Skipped
 from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.drift import judge
-from dirax.diagnostics.energy_lines import energy_less_work
+from dirax.diagnostics.energy_lines import energy_less_work, energy_scale
 from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
+from dirax.numerics.tolerances import EPSILON
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
@@ -186,7 +187,7 @@ def _entry(name: str, sol: Solution, order, precision, note: str, seconds: float
         band = float(np.ptp(energy))
         slope = float(np.polyfit(sol.t - sol.t.mean(), energy, 1)[0])
         motion = np.asarray(sol.fields["q"] if "q" in sol.fields else sol.fields["x"])
-        roundoff = np.finfo(float).eps * max(1.0, float(np.max(np.abs(energy)))) * 8 * np.sqrt(steps)
+        roundoff = 8 * EPSILON * np.sqrt(steps) * energy_scale(sol, energy)
         drift = "not checked" if changes else judge(sol.t, energy, motion, roundoff).verdict
     constraint = np.asarray(sol.constraint_residual())
     return Entry(

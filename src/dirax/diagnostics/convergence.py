@@ -281,7 +281,7 @@ def _slope(h: np.ndarray, errors: np.ndarray, finest: float | None) -> tuple[flo
     """(order, standard error); against the scheme's own refinement e(h) = C (h^p − h_ref^p), solved by iteration for p."""
     corrected, order, error = errors, 0.0, 0.0
     for _ in range(1 if finest is None else 10):
-        x, y = np.log(h), np.log(corrected)
+        x, y = np.log(h / h[0]), np.log(corrected / corrected[0])  # ratios have no units
         order, offset = np.polyfit(x, y, 1)
         residual = y - order * x - offset
         spread = np.sum((x - x.mean()) ** 2)
