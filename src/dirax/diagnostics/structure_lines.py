@@ -67,8 +67,14 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         if len(claim.parts) > 1:
             each = zip(claim.parts, of_claim[lane, row], strict=True)
             text += ": " + ", ".join(f"{part} {value:.2g}" for part, value in each)
-        lines.append(judged(sol, claim.quantity, np.max(of_claim, axis=(1, 2)), limit, text))
+        allowed = roundoff_limit(tolerance, _unknowns(sol)) if claim.solved else limit
+        lines.append(judged(sol, claim.quantity, np.max(of_claim, axis=(1, 2)), allowed, text))
     return lines
+
+
+def _unknowns(sol: Solution) -> int:
+    """How many a step solves for."""
+    return 1 if sol.equation is None else max(stage.unknowns for stage, _ in sol.equation.stages)
 
 
 def _terms(structure: AbstractDiscreteStructure, rows, params):
