@@ -197,7 +197,9 @@ class LagrangeDirac(AbstractSystem):
     def _lifted(self, q, v, rows, params, t):
         """metric⁻¹ rowsᵀ in the metric ∂²L/∂v² where it is positive definite and the Euclidean one elsewhere."""
         hessian = jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v)
-        values = jnp.linalg.eigvalsh(hessian)
+        own = jnp.diagonal(hessian)  # with which coordinates have no units
+        units = jnp.sqrt(jnp.where(own > 0.0, own, 1.0))
+        values = jnp.linalg.eigvalsh(hessian / units[:, None] / units[None])
         regular = values[0] > METRIC_RANK * jnp.abs(values[-1])
         return solve(jnp.where(regular, hessian, jnp.eye(q.shape[0])), rows.T)
 
