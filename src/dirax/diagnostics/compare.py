@@ -187,8 +187,9 @@ def _entry(name: str, sol: Solution, order, precision, note: str, seconds: float
         band = float(np.ptp(energy))
         slope = float(np.polyfit(sol.t - sol.t.mean(), energy, 1)[0])
         motion = np.asarray(sol.fields["q"] if "q" in sol.fields else sol.fields["x"])
-        roundoff = 8 * EPSILON * np.sqrt(steps) * energy_scale(sol, energy)
-        drift = "not checked" if changes else judge(sol.t, energy, motion, roundoff).verdict
+        size = energy_scale(sol, energy)
+        roundoff = 8 * EPSILON * np.sqrt(steps) * size
+        drift = "not checked" if changes else judge(sol.t, energy, motion, roundoff, size).verdict
     constraint = np.asarray(sol.constraint_residual())
     return Entry(
         scheme=name,
