@@ -128,6 +128,8 @@ def compare(
     named = dict(schemes) if isinstance(schemes, Mapping) else _named(schemes)
     if not named:
         raise ValueError("schemes must name at least one scheme, but it is empty.")
+    if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
+        raise ValueError(f"repeats must be a whole number ≥ 1, but {repeats!r:.80} was given.")
     sols = {name: simulate(system, scheme, step=step, steps=steps, **run) for name, scheme in named.items()}
     seconds = {name: [] for name in named}
     for _ in range(repeats):

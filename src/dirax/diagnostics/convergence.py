@@ -236,6 +236,8 @@ def _checked(step_sizes, time: float) -> np.ndarray:
     h = np.sort(np.unique(np.asarray(step_sizes, dtype=float)))[::-1]
     if len(h) < USABLE or not np.all(np.isfinite(h)) or h[-1] <= 0:
         raise ValueError(f"step_sizes must be at least {USABLE} different positive numbers, but {step_sizes!r} was given.")
+    if not 0 < time < np.inf:
+        raise ValueError(f"time must be a positive finite number, but {time!r:.80} was given.")
     ratios = np.append(h[0] / h, time / h[0])
     off = np.abs(ratios - np.round(ratios)) > 1e-9 * ratios
     if np.any(off) or round(time / h[0]) < 1:

@@ -17,6 +17,7 @@ from dirax.run.validate import (
     checked_store,
     count,
     engine_from,
+    flag,
     validated_case,
 )
 from dirax.schemes.step import AbstractScheme
@@ -59,7 +60,8 @@ def stated(
     case = validated_case(data, params, batch_params, step, t0)
     system = system if inputs is None else system.with_inputs(inputs)
     path = checked_store(to, events, case.traced)
-    settings = Settings(system, scheme, on, project, check_initial, max_iterations, bool(compensated), events, path)
+    project, check_initial = flag(project, "project"), flag(check_initial, "check_initial")
+    settings = Settings(system, scheme, on, project, check_initial, max_iterations, flag(compensated, "compensated"), events, path)
     return settings, case, steps, save_every
 
 
