@@ -86,7 +86,8 @@ def compared(name, scheme, **more):
     sizes = np.maximum(np.abs(p).max(), np.abs(p).max(axis=0))
     assert np.abs(scaled_q - q).max() <= 1e-12 * np.abs(q).max()
     assert np.all(np.abs(scaled_p - p).max(axis=0) <= 1e-11 * sizes)
-    assert abs(scaled_updates - updates) <= 0.2 * updates
+    # a sweep of a fixed point more or less is decided by the roundoff of what is zero, Newton's updates are not
+    assert abs(scaled_updates - updates) <= (0.5 if isinstance(scheme, dx.Collocation) else 0.2) * updates
     return np.array_equal(scaled_q, q) and np.array_equal(scaled_p, p) and scaled_updates == updates
 
 
