@@ -83,17 +83,18 @@ def judge(
     told = max(roundoff, found.band, SIGNIFICANT * found.standard_error * float(t[-1] - t[0]))
     rate = f"{found.slope:.2g} ± {found.standard_error:.1g} per unit of time"
     trend = found.trend and abs(found.drift) > roundoff
-    told_as_drift = trend and turns >= OSCILLATIONS_FOR_TREND or found.departure and turns >= OSCILLATIONS_FOR_DEPARTURE
-    size = float(np.max(np.abs(series))) if size is None else size
-    if told_as_drift and unsettled(motion, UNSETTLED * width / max(size, np.finfo(float).tiny), bool(trend)):
+    goes = trend and turns >= OSCILLATIONS_FOR_TREND
+    leaves = found.departure and turns >= OSCILLATIONS_FOR_DEPARTURE
+    size = max(float(np.max(np.abs(series))) if size is None else size, np.finfo(float).tiny)
+    if (goes or leaves) and unsettled(motion, UNSETTLED * width / size, trend):
         verdict = NOT_CHECKED
         text = (
-            f"it moved by {width:.2g}, {rate}, while squares of the coordinates drift as well, and by far more: a longer run shows "
-            "whether it follows them, or drifts"
+            f"it moved by {width:.2g}, {rate}, while squares of the coordinates drift as well, and by far more: a longer run "
+            "shows whether it follows them, or drifts"
         )
-    elif trend and turns >= OSCILLATIONS_FOR_TREND:
+    elif goes:
         verdict, text = DRIFTS, f"steady trend of {rate}, out of a band of {found.band:.2g}"
-    elif found.departure and turns >= OSCILLATIONS_FOR_DEPARTURE:
+    elif leaves:
         verdict, text = DRIFTS, f"leaves its band of {found.band:.2g}; mean rate {rate}"
     elif trend or found.departure:
         verdict = NOT_CHECKED

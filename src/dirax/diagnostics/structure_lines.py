@@ -22,8 +22,8 @@ LARGEST_STATE = 1000
 """Numbers of a state, or of a row, up to which the derivative of a step and the distribution at a row, matrices, are taken."""
 
 LEFT_OUT = (
-    "; only the constraints that were left out are missed: they follow from the others where all holonomic ones hold, and the rows "
-    "of this scheme are off that"
+    "; only the constraints that were left out are missed: they follow from the others where all holonomic ones hold, and the "
+    "rows of this scheme are off that"
 )
 WITHOUT_SYSTEM = "the solution was loaded without its system"
 WORDS = {2: "two", 3: "three"}

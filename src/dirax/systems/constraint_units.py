@@ -23,8 +23,8 @@ UNDETERMINED = 2.0**-20
 """Weight of a logarithm's being zero, beside what determines it."""
 
 APART = 8.0
-"""Coordinates of one letter, q say, have units of their own where their sizes differ by more powers of two; else one: lengths along
-two axes are not to be measured differently because of the point."""
+"""Coordinates of one letter, q say, have units of their own where their sizes differ by more powers of two; else one: lengths
+along two axes are not to be measured differently because of the point."""
 
 MOST = 400
 """Coordinates and multipliers up to which their units are looked for: one matrix of all of them."""

@@ -242,7 +242,7 @@ class LagrangeDirac(AbstractSystem):
         return self._as_large(t, q, v, v, params)
 
     def _as_large(self, t, q, v, x, params):
-        """How large each coordinate would be that had the length of x in the kinetic metric alone; 0 where L is degenerate in it."""
+        """How large each coordinate would be that alone had the length of x in the kinetic metric; 0 where that is degenerate."""
         metric = jnp.abs(jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v))
         along, own = jnp.abs(x) @ metric @ jnp.abs(x), jnp.diagonal(metric)
         return jnp.sqrt(jnp.where(own > 0.0, along / jnp.where(own > 0.0, own, 1.0), 0.0))
