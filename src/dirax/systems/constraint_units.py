@@ -54,32 +54,30 @@ def natural_units(form: ImplicitForm, params) -> Units:
     slopes = np.asarray(evaluated(slope, form.point, params))
     if not all(np.all(np.isfinite(a)) for a in (matrix, right, slopes)):
         return plain
-    places = np.concatenate([np.arange(size), size + 1 + np.arange(matrix.shape[1] - size)])  # of x, τ and u among all
-    entries, rows = [], []
-    for i, j in zip(*np.nonzero(matrix), strict=True):
-        entries.append(matrix[i, j])
-        rows.append({places[j]: -1.0, "r": i} | ({size: 1.0} if j < size else {}))
-    for i, j in zip(*np.nonzero(slopes), strict=True):
-        entries.append(slopes[i, j])
-        rows.append({j: -1.0, "r": i})
-    for i in np.flatnonzero(right):
-        entries.append(right[i])
-        rows.append({"r": i})
-    for j in np.flatnonzero(form.point):
-        entries.append(form.point[j])
-        rows.append({j: 1.0})
-    unknowns = matrix.shape[1] + 1
-    design = np.zeros((len(rows), unknowns + count))
-    for k, row in enumerate(rows):
-        for place, sign in row.items():
-            design[k, unknowns + sign if place == "r" else place] = 1.0 if place == "r" else sign
-    logarithms = np.frexp(np.abs(entries))[1].astype(float)
+    unknowns = matrix.shape[1] + 1  # x, τ and u, before the equations
+
+    def terms(values, *units):
+        """The logarithms of values, and the rows for the units, places and powers, that they are products of."""
+        rows = np.zeros((len(values), unknowns + count))
+        for places, power in units:
+            rows[np.arange(len(values)), places] = power
+        return np.frexp(np.abs(values))[1].astype(float), rows
+
+    i, j = np.nonzero(matrix)
+    (k, l), m, there, rates = np.nonzero(slopes), np.flatnonzero(right), np.flatnonzero(form.point), j < size
+    given = [
+        terms(matrix[i, j][rates], (unknowns + i[rates], 1.0), (j[rates], -1.0), (size, 1.0)),
+        terms(matrix[i, j][~rates], (unknowns + i[~rates], 1.0), (j[~rates] + 1, -1.0)),
+        terms(slopes[k, l], (unknowns + k, 1.0), (l, -1.0)),
+        terms(right[m], (unknowns + m, 1.0)),
+        terms(form.point[there], (there, 1.0)),
+    ]
+    logarithms, design = (np.concatenate(a) for a in zip(*given, strict=True))
+    equation = np.concatenate([i[rates], i[~rates], k, m, np.full(there.size, -1)])
     found = _fitted(design, logarithms)
     left = logarithms - design @ found
-    of_point = np.array(["r" not in row for row in rows])
-    of_row = np.array([row.get("r", -1) for row in rows])
-    largest = np.array([np.max(left[of_row == i], initial=-np.inf) for i in range(count)])
-    noise = np.where(of_point, left < -NOISE, left < largest[of_row] - NOISE)
+    largest = np.array([np.max(left[equation == e], initial=-np.inf) for e in range(count)] + [0.0])  # the last of x
+    noise = left < largest[equation] - NOISE
     if np.any(noise):
         found = _fitted(design[~noise], logarithms[~noise])
     found[:size] = _of_kinds(found[:size], form.coordinates)
