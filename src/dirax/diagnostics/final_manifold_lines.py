@@ -66,7 +66,7 @@ def _defect(chain: ConstraintChain, t, q, p, params: Any):
     """The largest |φ| at a row, and of |∂φ| times the largest entry of the row, in the units of the chain."""
     x = jnp.concatenate([q, p, jnp.reshape(t, (1,))] if chain.clock else [q, p])
     slope = jacobian(lambda x: chain.constraints(x, params))(x)
-    size = jnp.max(jnp.abs(slope * chain.units)) * jnp.max(jnp.abs(x / chain.units)[: q.size + p.size])
+    size = jnp.max(jnp.abs(slope * chain.units[None])) * jnp.max(jnp.abs(x / chain.units)[: q.size + p.size])
     return jnp.stack([jnp.max(jnp.abs(chain.constraints(x, params))), size])
 
 
