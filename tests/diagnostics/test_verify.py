@@ -13,6 +13,7 @@ from hypothesis import given, settings
 import dirax as dx
 from dirax import gallery
 from dirax.diagnostics.drift import SMALLEST_SERIES, judge, oscillations
+from dirax.diagnostics.energy_lines import energy_line
 from dirax.diagnostics.one_step import differentiated_step
 from dirax.diagnostics.report import Line, Report
 from dirax.diagnostics.verdicts import EPSILON, ROUNDINGS
@@ -534,3 +535,12 @@ def test_a_residual_is_judged_against_the_size_of_its_terms():
         assert line.verdict == "ok" and 0 <= line.value < 1e-13
         sol.stats["max_residual"] = 1e-3 * unit
         assert dx.verify(sol)["steps solved"].verdict == "VIOLATED"
+
+
+def test_half_a_recurrence_of_a_chain_is_no_drift():
+    """The error of the energy follows the modes: it goes up over 2000 steps, and comes back."""
+    verdicts = []
+    for times in (1, 4, 16):
+        sol = gallery.get("oscillator-chain").simulate(steps=2000 * times, save_every=times)
+        verdicts.append(energy_line(sol).verdict)
+    assert verdicts == ["not checked", "not checked", "bounded"]

@@ -470,3 +470,25 @@ def test_method_2_of_a_singular_lagrangian_needs_its_final_manifold():
         ValueError, "the Lagrangian is singular", "needs its final manifold", "constraint_algorithm", ".resolved()",
         system=circuit, scheme=dx.DiscreteDirac(constraints="resolve"), **data,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["project", "check_initial", "compensated"])
+def test_what_is_neither_true_nor_false(name):
+    complaint(TypeError, f"{name} must be True or False", "'maybe'", **{name: "maybe"})
+
+
+def test_stores_that_no_file_can_be(tmp_path):
+    complaint(ValueError, "has 305 bytes", to=tmp_path / f"{'x' * 300}.zarr")
+    complaint(ValueError, "the character of number 0", to=tmp_path / "a\0b.zarr")
+
+
+def test_numbers_of_diagnostics_that_say_nothing():
+    data = {"q": GOOD["q"], "v": GOOD["v"]}
+    with pytest.raises(ValueError, match="must sum to 1"):
+        dx.Composition(PLUS, [np.nan])
+    with pytest.raises(ValueError, match="time must be a positive finite number"):
+        dx.convergence(OSCILLATOR, PLUS, step_sizes=[0.1, 0.05, 0.025], time=np.inf, **data)
+    with pytest.raises(ValueError, match="repeats must be a whole number"):
+        dx.compare(OSCILLATOR, [PLUS], step=0.1, steps=3, repeats=0, **data)
+    with pytest.raises(ValueError, match="tolerance must be a number"):
+        dx.verify(dx.simulate(OSCILLATOR, PLUS, **GOOD), tolerance=np.nan)

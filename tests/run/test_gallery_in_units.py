@@ -46,18 +46,23 @@ def in_units(s):
     )
 
 
-def both(name, scheme, steps=40):
-    """The runs in plain units and in others, q, p and the updates of either in plain ones."""
+def in_both(name, away=0.0):
+    """(system, initial data that are `away` from the example's, params, step, units) in plain units and in others."""
     example, random = gallery.get(name), np.random.default_rng(len(name))
     exponents = {c.unit: int(random.integers(-30, 30)) for c in example.coordinates}
     a = np.array([2.0 ** exponents[c.unit] for c in example.coordinates])
     tau, c = 2.0 ** random.integers(-20, 20), 2.0 ** random.integers(-40, 40)
     system = in_units(example.system)
+    moved = {name: np.asarray(example.initial[name]) + away * random.normal(size=len(a)) for name in ("q", "v")}
     for units in ({"a": np.ones(len(a)), "tau": 1.0, "c": 1.0}, {"a": a, "tau": tau, "c": c}):
-        start = {"q": np.asarray(example.initial["q"]) * units["a"]}
-        start["v"] = np.asarray(example.initial["v"]) * units["a"] / units["tau"]
-        run = {"step": example.step * units["tau"], "steps": steps, "params": units | {"own": example.params}}
-        sol = dx.simulate(system, scheme, **start, **run)
+        start = {"q": moved["q"] * units["a"], "v": moved["v"] * units["a"] / units["tau"]}
+        yield system, start, units | {"own": example.params}, example.step * units["tau"], units
+
+
+def both(name, scheme, steps=40, away=0.0, **more):
+    """The runs in plain units and in others, q, p and the updates of either in plain ones."""
+    for system, start, params, step, units in in_both(name, away):
+        sol = dx.simulate(system, scheme, **start, step=step, steps=steps, params=params, **more)
         assert sol.ok, sol.message
         yield sol.q / units["a"], sol.p * units["a"] / units["c"] / units["tau"], sol.stats["newton_iterations"]
 
@@ -68,13 +73,21 @@ def stated(name):
     return plain and not example.system.forces_see_multipliers
 
 
-def compared(name, scheme):
+def chain_in_both(name):
+    """What the constraint algorithm says in plain units and in others, and its point, (q, p), in plain ones."""
+    for system, start, params, _, units in in_both(name):
+        chain, n = dx.constraint_algorithm(system, start, params), len(units["a"])
+        yield str(chain), chain.point[:n] / units["a"], chain.point[-n:] * units["a"] / units["c"] / units["tau"]
+
+
+def compared(name, scheme, **more):
     """A root before the first step is found to a rounding; without one the runs are the same to the last bit."""
-    (q, p, updates), (scaled_q, scaled_p, scaled_updates) = both(name, scheme)
+    (q, p, updates), (scaled_q, scaled_p, scaled_updates) = both(name, scheme, **more)
     sizes = np.maximum(np.abs(p).max(), np.abs(p).max(axis=0))
     assert np.abs(scaled_q - q).max() <= 1e-12 * np.abs(q).max()
     assert np.all(np.abs(scaled_p - p).max(axis=0) <= 1e-11 * sizes)
-    assert abs(scaled_updates - updates) <= 0.2 * updates
+    # a sweep of a fixed point more or less is decided by the roundoff of what is zero, Newton's updates are not
+    assert abs(scaled_updates - updates) <= (0.5 if isinstance(scheme, dx.Collocation) else 0.2) * updates
     return np.array_equal(scaled_q, q) and np.array_equal(scaled_p, p) and scaled_updates == updates
 
 
@@ -87,6 +100,31 @@ def test_a_ball_on_a_turntable_in_other_units(scheme):
 @pytest.mark.parametrize("name", ["heisenberg", "contact-particle"])
 def test_systems_that_begin_without_a_root_have_every_bit(name):
     assert compared(name, dx.DiscreteDirac())
+
+
+def compared_chains(name):
+    (said, q, p), (scaled_said, scaled_q, scaled_p) = chain_in_both(name)
+    assert scaled_said == said
+    np.testing.assert_allclose(scaled_q, q, rtol=1e-9, atol=1e-12 * np.abs(q).max())
+    np.testing.assert_allclose(scaled_p, p, rtol=1e-9, atol=1e-12 * np.abs(p).max())
+
+
+def test_data_are_projected_in_other_units():
+    """The mass matrix of lengths and angles was called singular in some, and the data came out off the constraint."""
+    compared("rolling-disk", SCHEMES["lagrange-dalembert"], steps=2, away=0.01, project=True)
+
+
+def test_the_constraint_algorithm_in_other_units():
+    """Its ranks were not constant in some: samples around a point were as far away as 1 + |x|."""
+    compared_chains("cartesian-double-pendulum")
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("name", gallery.names())
+def test_chains_of_the_gallery_in_other_units(name):
+    if not stated(name) or name in ("bricard", "bicycle"):  # a rank that changes at the point itself; minutes
+        pytest.skip("its functions are not those of q and v alone, or its chain is not to be had in reasonable time")
+    compared_chains(name)
 
 
 @pytest.mark.soak

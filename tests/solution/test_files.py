@@ -18,7 +18,7 @@ import xarray as xr
 from numcodecs import zstd
 
 import dirax as dx
-from dirax.solution import atomic_files, saving, zarr_store
+from dirax.solution import atomic_files, netcdf, saving, zarr_store
 from dirax.solution.description import Description, Variable, describe
 from dirax.solution.plain_forms import decode_scheme, encode_scheme
 
@@ -578,6 +578,22 @@ def test_files_of_the_first_version(ending, tmp_path):
     np.testing.assert_allclose(again.q, loaded.q, rtol=1e-12, atol=1e-13)
     np.testing.assert_allclose(again.energy(), loaded.derived["energy"], rtol=1e-12)
     assert_same(dx.load(loaded.save(tmp_path / f"again{ending}")), loaded)
+
+
+def test_a_netcdf_file_in_circles_is_refused(tmp_path, monkeypatch):
+    """A list of free places that goes on at itself, in a file without checksums: the HDF5 library never ends."""
+    import h5py
+
+    path = tmp_path / "circle.nc"
+    with h5py.File(path, "w", libver="earliest") as file:
+        file["a"] = file["b"] = np.arange(3.0)
+    raw = bytearray(path.read_bytes())
+    heap, number = raw.index(b"HEAP"), lambda place: int.from_bytes(raw[place : place + 8], "little")
+    free, data = number(heap + 16), number(heap + 24)
+    raw[data + free : data + free + 8] = free.to_bytes(8, "little")
+    path.write_bytes(raw)
+    monkeypatch.setattr(netcdf, "LIMIT", 2.0)
+    assert "did not come to an end of it within 2 s" in one_sentence(path)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

@@ -157,7 +157,8 @@ def test_an_undetermined_coordinate_is_gauge_freedom():
     chain = constraint_algorithm(dx.LagrangeDirac(lambda q, v: (v[0] - q[1]) ** 2 / 2), {"q": [0.1, 0.2], "v": [0.3, 0.4]})
     assert (dimensions(chain), chain.verdict, chain.freedom) == ([3, 2, 2], "gauge freedom", 1)
     assert chain.point[2:] == pytest.approx([0.0, 0.0], abs=1e-14)
-    assert np.abs(chain.gauge(chain.point)[:, 0]) == pytest.approx([0.0, 1.0, 0.0, 0.0], abs=1e-12)
+    free = np.abs(chain.gauge(chain.point)[:, 0])
+    assert free / free.max() == pytest.approx([0.0, 1.0, 0.0, 0.0], abs=1e-12)
 
 
 def test_momenta_not_affine_in_velocities_go_to_the_pontryagin_bundle():

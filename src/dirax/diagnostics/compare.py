@@ -10,8 +10,9 @@ import numpy as np
 from dirax.diagnostics.bench.subject import Skipped
 from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.drift import judge
-from dirax.diagnostics.energy_lines import energy_less_work
+from dirax.diagnostics.energy_lines import energy_less_work, energy_scale
 from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
+from dirax.numerics.tolerances import EPSILON
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
@@ -127,6 +128,8 @@ def compare(
     named = dict(schemes) if isinstance(schemes, Mapping) else _named(schemes)
     if not named:
         raise ValueError("schemes must name at least one scheme, but it is empty.")
+    if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
+        raise ValueError(f"repeats must be a whole number ≥ 1, but {repeats!r:.80} was given.")
     sols = {name: simulate(system, scheme, step=step, steps=steps, **run) for name, scheme in named.items()}
     seconds = {name: [] for name in named}
     for _ in range(repeats):
@@ -186,8 +189,9 @@ def _entry(name: str, sol: Solution, order, precision, note: str, seconds: float
         band = float(np.ptp(energy))
         slope = float(np.polyfit(sol.t - sol.t.mean(), energy, 1)[0])
         motion = np.asarray(sol.fields["q"] if "q" in sol.fields else sol.fields["x"])
-        roundoff = np.finfo(float).eps * max(1.0, float(np.max(np.abs(energy)))) * 8 * np.sqrt(steps)
-        drift = "not checked" if changes else judge(sol.t, energy, motion, roundoff).verdict
+        size = energy_scale(sol, energy)
+        roundoff = 8 * EPSILON * np.sqrt(steps) * size
+        drift = "not checked" if changes else judge(sol.t, energy, motion, roundoff, size).verdict
     constraint = np.asarray(sol.constraint_residual())
     return Entry(
         scheme=name,

@@ -47,7 +47,7 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         text += f"; the pair given at the start is off by {np.max(residual[:, 0]):.2g}"
     inside = sol.scheme is not None and not sol.scheme.constraints_at_rows
     if not steps and inside and np.max(values) > roundoff_limit(tolerance, 1):
-        text = f"Method 1 imposes it inside each step; at the rows it is off by {np.max(residual):.2g}"
+        text = f"the scheme imposes it inside each step; at the rows it is off by {np.max(residual):.2g}"
         return Line(name, float(np.max(values)), None, NOT_CHECKED, text)
     return judged(sol, name, np.max(values, axis=1), roundoff_limit(tolerance, 1), text)
 

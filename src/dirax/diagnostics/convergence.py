@@ -236,6 +236,8 @@ def _checked(step_sizes, time: float) -> np.ndarray:
     h = np.sort(np.unique(np.asarray(step_sizes, dtype=float)))[::-1]
     if len(h) < USABLE or not np.all(np.isfinite(h)) or h[-1] <= 0:
         raise ValueError(f"step_sizes must be at least {USABLE} different positive numbers, but {step_sizes!r} was given.")
+    if not 0 < time < np.inf:
+        raise ValueError(f"time must be a positive finite number, but {time!r:.80} was given.")
     ratios = np.append(h[0] / h, time / h[0])
     off = np.abs(ratios - np.round(ratios)) > 1e-9 * ratios
     if np.any(off) or round(time / h[0]) < 1:
@@ -281,7 +283,7 @@ def _slope(h: np.ndarray, errors: np.ndarray, finest: float | None) -> tuple[flo
     """(order, standard error); against the scheme's own refinement e(h) = C (h^p − h_ref^p), solved by iteration for p."""
     corrected, order, error = errors, 0.0, 0.0
     for _ in range(1 if finest is None else 10):
-        x, y = np.log(h), np.log(corrected)
+        x, y = np.log(h / h[0]), np.log(corrected / corrected[0])  # ratios have no units
         order, offset = np.polyfit(x, y, 1)
         residual = y - order * x - offset
         spread = np.sum((x - x.mean()) ** 2)

@@ -10,6 +10,10 @@ If it is bounded, these means scatter inside the band that every window shows; i
 - departure: the means spread wider than the band of any window, and GROWTH times wider over the run than over a typical
   quarter of it (a random walk: twice as wide; waves: not). This finds random walks and explosive growth.
 
+A motion that has not settled is no sign of one: the energy error of a scheme that keeps a structure is a function of the state,
+and where squares of coordinates themselves drift, by UNSETTLED times more than the energy, it may follow them. A chain of Fermi,
+Pasta, Ulam and Tsingou over half of its recurrence looks like a drift, and eight of them show that there is none.
+
 Each is asked for three numbers of windows, and must hold for all, so that no oscillation in step with the windows passes.
 A series is judged only after the motion has gone through a few oscillations: before, nothing can tell a drift from one.
 
@@ -34,6 +38,11 @@ TURNING_BACK = 0.1
 GROWTH = 1.5
 OSCILLATIONS_FOR_TREND = 3
 OSCILLATIONS_FOR_DEPARTURE = 10
+UNSETTLED = 100.0
+SHARE = 1 / 3
+NOTICEABLE = 0.1
+"""Of the components that move, how many drift where the motion has not settled, and how far."""
+
 MOVING = 1e-9
 """Relative range below which a component of the motion counts as constant."""
 
@@ -54,9 +63,14 @@ class Judgement:
 
 
 def judge(
-    t: Float[np.ndarray, " N"], series: Float[np.ndarray, " N"], motion: Float[np.ndarray, "N d"], roundoff: float
+    t: Float[np.ndarray, " N"],
+    series: Float[np.ndarray, " N"],
+    motion: Float[np.ndarray, "N d"],
+    roundoff: float,
+    size: float | None = None,
 ) -> Judgement:
-    """The Judgement of `series` at the times `t`, of a system that moves as `motion`; changes below `roundoff` are none."""
+    """The Judgement of `series` at the times `t`, of a system that moves as `motion`; changes below `roundoff` are none. The
+    terms of the series are of the `size`, by default the largest value."""
     if len(series) < 2:
         return Judgement(NOT_CHECKED, "fewer than two rows were computed", 0.0, roundoff)
     width = float(np.ptp(series))
@@ -69,9 +83,18 @@ def judge(
     told = max(roundoff, found.band, SIGNIFICANT * found.standard_error * float(t[-1] - t[0]))
     rate = f"{found.slope:.2g} ± {found.standard_error:.1g} per unit of time"
     trend = found.trend and abs(found.drift) > roundoff
-    if trend and turns >= OSCILLATIONS_FOR_TREND:
+    goes = trend and turns >= OSCILLATIONS_FOR_TREND
+    leaves = found.departure and turns >= OSCILLATIONS_FOR_DEPARTURE
+    size = max(float(np.max(np.abs(series))) if size is None else size, np.finfo(float).tiny)
+    if (goes or leaves) and unsettled(motion, UNSETTLED * width / size, trend):
+        verdict = NOT_CHECKED
+        text = (
+            f"it moved by {width:.2g}, {rate}, while squares of the coordinates drift as well, and by far more: a longer run "
+            "shows whether it follows them, or drifts"
+        )
+    elif goes:
         verdict, text = DRIFTS, f"steady trend of {rate}, out of a band of {found.band:.2g}"
-    elif found.departure and turns >= OSCILLATIONS_FOR_DEPARTURE:
+    elif leaves:
         verdict, text = DRIFTS, f"leaves its band of {found.band:.2g}; mean rate {rate}"
     elif trend or found.departure:
         verdict = NOT_CHECKED
@@ -85,6 +108,20 @@ def judge(
         "oscillations": turns,
     }
     return Judgement(verdict, text, found.drift, told, details)
+
+
+def unsettled(motion: Float[np.ndarray, "N d"], least: float, steadily: bool) -> bool:
+    """Whether the mean squares of a SHARE of the components that move, about their linear trends, change from quarter to quarter
+    of a run, by NOTICEABLE and by more than `least` of them, one way where that is asked (`steadily`)."""
+    residual, moving = _about_trend(motion)
+    squares = np.split(residual[: len(motion) // 4 * 4, moving] ** 2, 4)
+    quarters = np.array([np.mean(square, axis=0) for square in squares])
+    quarters = quarters / np.maximum(np.mean(quarters, axis=0), np.finfo(float).tiny)
+    way = quarters[-1] - quarters[0]
+    back = np.min(np.diff(quarters, axis=0) * np.sign(way), axis=0)
+    gone = np.ptp(quarters, axis=0) > max(NOTICEABLE, least)
+    gone = gone & (back >= -TURNING_BACK * np.abs(way)) if steadily else gone
+    return bool(np.sum(gone) >= SHARE * max(len(way), 1))
 
 
 @dataclass(frozen=True)
@@ -174,14 +211,18 @@ def oscillations(motion: Float[np.ndarray, "N d"]) -> float:
 
     Components that are constant, or linear in time, to a relative MOVING do not count; 0 if none moves.
     """
-    count = len(motion)
-    if count < 3:
+    if len(motion) < 3:
         return 0.0
-    x = np.linspace(-1.0, 1.0, count)
-    centred = motion - motion.mean(axis=0)
-    residual = centred - np.outer(x, x @ centred / (x @ x))
-    moving = np.ptp(residual, axis=0) > MOVING * np.max(np.abs(motion), axis=0)
+    residual, moving = _about_trend(motion)
     if not np.any(moving):
         return 0.0
     above = residual[:, moving] > 0
     return float(np.median(np.sum(above[1:] != above[:-1], axis=0)) / 2)
+
+
+def _about_trend(motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The components less their linear trends, and which of them move."""
+    x = np.linspace(-1.0, 1.0, len(motion))
+    centred = motion - motion.mean(axis=0)
+    residual = centred - np.outer(x, x @ centred / (x @ x))
+    return residual, np.ptp(residual, axis=0) > MOVING * np.max(np.abs(motion), axis=0)

@@ -43,7 +43,8 @@ def energy_line(sol: Solution) -> Line:
     energy = energy.reshape(-1, energy.shape[-1])
     if not np.any(np.isfinite(energy)):
         return Line(name, None, None, NOT_CHECKED, "the system states no energy")
-    roundoff = ROUNDINGS * EPSILON * steps_of(sol) * energy_scale(sol, energy)
+    size = energy_scale(sol, energy)
+    roundoff = ROUNDINGS * EPSILON * steps_of(sol) * size
     if not changes and (jump := _jump(sol, energy, roundoff)):
         return jump
     if changes:
@@ -52,7 +53,7 @@ def energy_line(sol: Solution) -> Line:
     times, found = sol.times, []
     for lane, series in enumerate(energy):
         good = np.isfinite(series)
-        found.append(judge(times[lane][good], series[good], _motion(sol, lane)[good], roundoff))
+        found.append(judge(times[lane][good], series[good], _motion(sol, lane)[good], roundoff, size))
     order = (NOT_CHECKED, BOUNDED, DRIFTS)
     lane = max(range(len(found)), key=lambda i: (order.index(found[i].verdict), abs(found[i].drift)))
     worst = found[lane]

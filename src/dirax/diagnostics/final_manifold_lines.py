@@ -9,12 +9,13 @@ import numpy as np
 from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
 from dirax.diagnostics.rows import initial_of_one, over_rows, shape_of, times_at
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, worst_place
+from dirax.numerics.ranks import rank_of_equations
+from dirax.numerics.tolerances import MANIFOLD_RANK
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.final_manifold import KEPT, MOST, chain_at
 from dirax.solution.solution import Solution
 from dirax.systems.constraint_chain import ConstraintChain
-from dirax.systems.constraint_search import rank_of
 
 NOTICED = 1e-6
 """Jumps below this, relative to the positions, are not called so."""
@@ -55,16 +56,17 @@ def _chain_of(sol: Solution) -> ConstraintChain | None:
     system = sol.system
     if system.lagrangian_form() is None or system.metric_form() is not None or system.final_relation(shape_of(sol)) is not None:
         return None
-    if rank_of(np.asarray(evaluated(system.velocity_hessian, np.asarray(t), q, v, params))) == len(q):
+    hessian = np.asarray(evaluated(system.velocity_hessian, np.asarray(t), q, v, params))
+    if rank_of_equations(hessian[None], MANIFOLD_RANK)[0][0] == len(q):
         return None
     return chain_at(sol.system, q, v, t, params)
 
 
 def _defect(chain: ConstraintChain, t, q, p, params: Any):
-    """The largest |φ| at a row, and of |∂φ| times the largest entry of the row."""
+    """The largest |φ| at a row, and of |∂φ| times the largest entry of the row, in the units of the chain."""
     x = jnp.concatenate([q, p, jnp.reshape(t, (1,))] if chain.clock else [q, p])
     slope = jacobian(lambda x: chain.constraints(x, params))(x)
-    size = jnp.max(jnp.abs(slope)) * jnp.max(jnp.abs(jnp.concatenate([q, p])))
+    size = jnp.max(jnp.abs(slope * chain.units[None])) * jnp.max(jnp.abs(x / chain.units)[: q.size + p.size])
     return jnp.stack([jnp.max(jnp.abs(chain.constraints(x, params))), size])
 
 
@@ -75,4 +77,4 @@ def _jumps(sol: Solution) -> bool:
         return False
     turns, moves = np.abs(q[:, 2:] - 2 * q[:, 1:-1] + q[:, :-2]) / 4, np.abs(q[:, 2:] - q[:, :-2]) / 2
     turns, moves = np.nanmax(turns, axis=1), np.nanmax(moves, axis=1)
-    return bool(np.any((turns > moves) & (turns > NOTICED * np.nanmax(np.abs(q)))))
+    return bool(np.any((turns > moves) & (turns > NOTICED * np.nanmax(np.abs(q), axis=1))))

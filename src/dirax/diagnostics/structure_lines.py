@@ -22,6 +22,10 @@ SAMPLED_STEPS = 8
 LARGEST_STATE = 1000
 """Numbers of a state, or of a row, up to which the derivative of a step and the distribution at a row, matrices, are taken."""
 
+LEFT_OUT = (
+    "; only the constraints that were left out are missed: they follow from the others where all holonomic ones hold, and the "
+    "rows of this scheme are off that"
+)
 WITHOUT_SYSTEM = "the solution was loaded without its system"
 WORDS = {2: "two", 3: "three"}
 
@@ -55,12 +59,16 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     follow = _redundant(sol, parts, structure.counts)
     values = _relative(terms, structure.counts, follow)
     if np.any(values > limit):
-        values = _relative(with_rounding(terms, np.max(values, axis=(0, 2)), of_rows, sol, (items,)), structure.counts, follow)
+        terms = with_rounding(terms, np.max(values, axis=(0, 2)), of_rows, sol, (items,))
+        values = _relative(terms, structure.counts, follow)
+    own = terms.copy()
+    own[:, :, 0, follow] = 0.0
+    without = _relative(own, structure.counts, follow)
     if "q0" in sol.initial:
         values[:, 0, [parts.index(part) for part in structure.given]] = 0.0  # the first pair was given, not computed
     for claim in structure.claims:
-        of_claim = values[..., first : first + len(claim.parts)]
-        first += len(claim.parts)
+        parts_of_claim = slice(first, first + len(claim.parts))
+        of_claim, first = values[..., parts_of_claim], parts_of_claim.stop
         lane, row = worst_place(np.max(of_claim, axis=-1))
         text = f"{claim.statement}; worst at t = {sol.time_of(rows[row] + middle, lane):.6g}{of_lane(sol, lane)}"
         if len(rows) < sol.rows - points + 1:
@@ -68,8 +76,16 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         if len(claim.parts) > 1:
             each = zip(claim.parts, of_claim[lane, row], strict=True)
             text += ": " + ", ".join(f"{part} {value:.2g}" for part, value in each)
-        lines.append(judged(sol, claim.quantity, np.max(of_claim, axis=(1, 2)), limit, text))
+        if np.max(of_claim) > limit >= np.max(without[..., parts_of_claim]):
+            text += LEFT_OUT
+        allowed = roundoff_limit(tolerance, _unknowns(sol)) if claim.solved else limit
+        lines.append(judged(sol, claim.quantity, np.max(of_claim, axis=(1, 2)), allowed, text))
     return lines
+
+
+def _unknowns(sol: Solution) -> int:
+    """How many a step solves for."""
+    return 1 if sol.equation is None else max(stage.unknowns for stage, _ in sol.equation.stages)
 
 
 def _terms(structure: AbstractDiscreteStructure, rows, params):

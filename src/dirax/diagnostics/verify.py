@@ -55,13 +55,15 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     A batch is judged by its worst trajectory, a failed run by the part that was computed, and what cannot be checked says
     so, and why: membership needs every step saved, a loaded solution its system (`dx.load(path, system=…)`).
 
-    Raises `TypeError` or `ValueError` for something that is not a Solution and for symmetries that are neither functions
-    of q nor coordinate numbers.
+    Raises `TypeError` or `ValueError` for something that is not a Solution, for symmetries that are neither functions
+    of q nor coordinate numbers, and for a `tolerance` that is negative or no number.
 
         print(dx.verify(sol, symmetries={"rotation": lambda q: jnp.array([-q[1], q[0]])}))
     """
     if not isinstance(sol, Solution):
         raise TypeError(f"sol must be a dirax Solution (from dx.simulate or dx.load), but a {type(sol).__name__} was given.")
+    if tolerance is not None and not 0.0 <= float(tolerance) < np.inf:
+        raise ValueError(f"tolerance must be a number that is not negative, but {tolerance!r:.80} was given.")
     generators = generators_of(sol, symmetries)
     flight, impacts = longest_flight(sol)
     whole = (

@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.contract import NOT_FINITE, OK, Outcome, Problem
+from dirax.engines.contract import NOT_FINITE, OK, TOO_LARGE, Outcome, Problem
 from dirax.engines.sizes import sizes_of
 from dirax.engines.stage_in_numbers import InJax, InNumbers, in_numbers
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import balanced_condition, balanced_inverse
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
+from dirax.program.graph import GraphTooLarge
 from dirax.program.roots import FEWEST_SPARSE, sparse_equations
 from dirax.schemes.step import CLOCK
 
@@ -58,6 +59,11 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     """The stages of the failing step are replayed one by one, to see where it breaks."""
     params = jax.tree.map(lambda a: np.asarray(a[lane] if p.batch_params else a), p.params)
     state, last = np.asarray(outcome.last_state[lane]), np.asarray(outcome.last_unknowns[lane])
+    if TOO_LARGE in outcome.notes.get("iteration", ""):
+        return (
+            "the fixed-point iteration of the stages did not converge: the equations are stiff for this step. "
+            f"{TOO_LARGE}: take a smaller step, another scheme, or engine='xla', which may compile it for minutes"
+        )
     solved, known, sizes = [], {}, [a[lane if p.batch is not None else ...] for a in sizes_of(p)]
     for (stage, fraction), size in zip(p.equation.stages, sizes, strict=True):
         if id(stage) not in known:
@@ -143,7 +149,10 @@ def _advice(stage, numbers: InNumbers | InJax, u, args, sizes) -> str:
     state, t, h = args
     if not 0 < stage.unknowns < FEWEST_SPARSE:
         return SMALLER
-    here, there = (_roundoff(numbers, u, (state, t, step), sizes) for step in (h, 10 * h))
+    try:
+        here, there = (_roundoff(numbers, u, (state, t, step), sizes) for step in (h, 10 * h))
+    except GraphTooLarge:  # so large a step is run without these derivatives
+        return SMALLER
     hidden = (here > STALLED) & (there < here / 2)
     if not np.any(hidden):
         return SMALLER

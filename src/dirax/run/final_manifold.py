@@ -10,6 +10,8 @@ import numpy as np
 
 from dirax.engines.step_program import linearized
 from dirax.numerics.equilibration import equilibrated
+from dirax.numerics.ranks import rank_of_equations
+from dirax.numerics.tolerances import MANIFOLD_RANK, TINY
 from dirax.program.memo import Memo, Same
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
@@ -17,7 +19,6 @@ from dirax.run.start import Initial, Start, completed
 from dirax.run.validate import Case
 from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import EMPTY, IRREGULAR, ConstraintChain
-from dirax.systems.constraint_search import rank_of
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -92,7 +93,7 @@ def _is_singular(system: AbstractSystem, shape: Shape, case: Case, initial: Init
         at = [of_lane(initial.data[name], lane) for name in ("q", "v")]
         params = jax.tree.map(lambda leaf, lane=lane: leaf[lane], case.params) if case.batch_params else case.params
         hessian = np.asarray(evaluated(system.velocity_hessian, np.asarray(case.t0), *at, params))
-        if np.all(np.isfinite(hessian)) and rank_of(hessian) < n:
+        if np.all(np.isfinite(hessian)) and rank_of_equations(hessian[None], MANIFOLD_RANK)[0][0] < n:
             return True
     return False
 
@@ -126,10 +127,10 @@ def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any
     moved = slice(n, len(x) - chain.clock if q_alone else n if without_v else 2 * n)
     for _ in range(UPDATES if moved.stop > n else 0):
         value = np.asarray(chain.constraints(jnp.asarray(x), params))
-        slope = np.asarray(evaluated(_slope_of(chain), x, params))[:, moved]
-        change = np.linalg.lstsq(slope, value, rcond=1e-10)[0]
-        x[moved] -= change
-        if np.max(np.abs(change), initial=0.0) <= 1e-15 * (1 + np.max(np.abs(x))):
+        slope = np.asarray(evaluated(_slope_of(chain), x, params)) * chain.units
+        change = np.linalg.lstsq(slope[:, moved], value, rcond=1e-10)[0]
+        x[moved] -= change * chain.units[moved]
+        if np.max(np.abs(change), initial=0.0) <= 1e-15 * (1 + np.max(np.abs(x / chain.units))):
             break
     return x
 
@@ -232,7 +233,7 @@ def _off(system: AbstractSystem, row: dict, q, v, t0: float, t: float, params: A
         return 0.0
     x = on_chain(chain, row["q"], row["p"], v, t, params)
     value, slope = np.abs(np.asarray(chain.constraints(x, params))), np.asarray(evaluated(_slope_of(chain), x, params))
-    scale = np.max(np.abs(slope), axis=1) * np.max(np.abs(x))
+    scale = np.max(np.abs(slope * chain.units), axis=1) * np.max(np.abs(x / chain.units))
     return float(np.max(value / np.where(scale > 0, scale, 1.0), initial=0.0))
 
 
@@ -248,7 +249,7 @@ def _after(stage: Any, state: np.ndarray, u: np.ndarray, t: float, h: float, par
         except np.linalg.LinAlgError:
             return None
         u = u - change
-        if np.max(np.abs(change), initial=0.0) <= 1e-14 * (1 + np.max(np.abs(u), initial=0.0)):
+        if np.max(np.abs(change) / np.maximum(np.abs(u), TINY), initial=0.0) <= 1e-14:
             break
     end = stage.advance(jnp.asarray(u), jnp.asarray(state), t, h, params)
     row = stage.unpack(end, jnp.asarray(u), t + h, h, params)

@@ -17,6 +17,7 @@ from dirax.run.validate import (
     checked_store,
     count,
     engine_from,
+    flag,
     validated_case,
 )
 from dirax.schemes.step import AbstractScheme
@@ -59,7 +60,9 @@ def stated(
     case = validated_case(data, params, batch_params, step, t0)
     system = system if inputs is None else system.with_inputs(inputs)
     path = checked_store(to, events, case.traced)
-    settings = Settings(system, scheme, on, project, check_initial, max_iterations, bool(compensated), events, path)
+    given = {"project": project, "check_initial": check_initial, "compensated": compensated}
+    flags = {name: flag(value, name) for name, value in given.items()}
+    settings = Settings(system, scheme, on, max_iterations=max_iterations, events=events, to=path, **flags)
     return settings, case, steps, save_every
 
 

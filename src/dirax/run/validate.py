@@ -17,6 +17,7 @@ from dirax.engines.engine import AbstractEngine
 from dirax.engines.policy import ENGINES, engine_of
 from dirax.program.user_functions import check_finite, is_traced
 from dirax.schemes.step import AbstractScheme
+from dirax.solution.atomic_files import checked_name
 from dirax.systems.system import AbstractSystem
 
 ROOM = 4
@@ -211,6 +212,7 @@ def checked_store(to: Any, events: Any, traced: bool) -> Path | None:
     if to is None:
         return None
     path = Path(to)
+    checked_name(path)
     if path.suffix != ".zarr":
         raise ValueError(f"to must be the path of a zarr store that ends in .zarr, but {str(to)!r} was given.")
     if events:
@@ -264,12 +266,20 @@ def count(value, name: str, most: int = MOST_COUNTED) -> int:
     return int(value)
 
 
+def flag(value, name: str) -> bool:
+    """True or False; raises `TypeError` for anything else."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be True or False, but {value!r:.80} was given.")
+    return bool(value)
+
+
 def _shown(value: int) -> str:
     return str(value) if abs(value) < 10**21 else f"a number of {value.bit_length()} bits"
 
 
 def refuse_clock_that_stands(t0: Any, h: Any, steps: int) -> None:
-    """Raise `ValueError` for a step that is no normal number, and for one that is lost in the times of the run, t + h = t."""
+    """Raise `ValueError` for a step that is no normal number, and for one that is less than the times of the run are apart in
+    floats: t + h = t, or another step."""
     if not (type(t0) is type(h) is float) and is_traced(t0, h):
         return
     if h < TINIEST:
@@ -281,10 +291,10 @@ def refuse_clock_that_stands(t0: Any, h: Any, steps: int) -> None:
     if not math.isfinite(end):
         raise ValueError(f"the run would end at t = t0 + steps·step = {end}: take fewer steps, smaller ones, or another t0.")
     at = max(t0, end, key=abs)
-    if at + h == at or at - h == at:
+    if math.ulp(at) > h:
         raise ValueError(
             f"the times of this run are as large as {at:.6g}, where floats are {np.spacing(abs(at)):.3g} apart, and a step of "
-            f"{h:.3g} is lost (t + h = t): take a larger step, or count time from a t0 near 0."
+            f"{h:.3g} is lost in them (t + h = t, or another step): take a larger step, or count time from a t0 near 0."
         )
 
 

@@ -41,7 +41,7 @@ class Composition(AbstractScheme):
                 )
             coefficients = COEFFICIENTS[coefficients]
         numbers = tuple(float(c) for c in coefficients)
-        if not numbers or abs(sum(numbers) - 1.0) > 1e-12:
+        if not numbers or not abs(sum(numbers) - 1.0) <= 1e-12:
             raise ValueError(f"the coefficients must sum to 1, but {numbers} sum to {sum(numbers):.15g}.")
         self.scheme, self.coefficients = scheme, numbers
 

@@ -149,7 +149,7 @@ def _compared(search: DiscreteConstraintSearch, verdict: str, chain: ConstraintC
     if len(nodes[0]) != len(chain.coordinates):
         return np.nan, False, f"The chain of the system is one of {', '.join(chain.coordinates)}: the two are not compared."
     distance = max(float(np.abs(np.asarray(chain.constraints(jnp.asarray(x)))).max(initial=0.0)) for x in nodes)
-    on = distance <= CONSTRAINT_DEFECT * (1.0 + max(np.abs(x).max() for x in nodes))
+    on = distance <= CONSTRAINT_DEFECT * (1.0 + max(np.abs(x / chain.units[: len(x)]).max() for x in nodes))
     dimension = search.levels[-1].dimension
     if on and dimension == chain.dimension:
         return distance, True, f"M_d,f is M_f, of dimension {chain.dimension}: the nodes stay on it."

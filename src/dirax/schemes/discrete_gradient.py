@@ -17,7 +17,8 @@ class DiscreteGradient(AbstractScheme):
 
     so that H(x_{k+1}) − H(x_k) = h⟨ȳ, ū⟩ − h⟨∇̄H, R∇̄H⟩ exactly: [BLM] (20) with the midpoint map, whose own balance
     ⟨dH(x̄), ẋ_d⟩ is not the change of H. On a DiracSystem (ẋ_d, ∇̄H) ∈ D(x̄), and H is conserved; with holonomic constraints
-    (ẋ_d, ∇̄H − Gᵀλ) ∈ D(x̄) and G(x̄) ẋ_d = 0, as in Method 1. Second order.
+    (ẋ_d, ∇̄H − Gᵀλ) ∈ D(x̄) and G(x̄) ẋ_d = 0, as in Method 1: constraints that are quadratic hold at the rows too, others up to
+    O(h²), which stays bounded or drifts as the motion has it. Second order.
 
     `kind`: "gonzalez", dH(x̄) corrected along the step, in the metric |∂²H/∂x_i²|, in which charges
     and fluxes do not mix whatever their units (the Euclidean one from 128 coordinates on); or "mean-value", the mean of dH over
@@ -41,6 +42,11 @@ class DiscreteGradient(AbstractScheme):
     def adjoint(self, system: Any) -> "DiscreteGradient":
         """Itself: the mean of dH over the step, the correction along it and x̄ are the same from either end."""
         return self
+
+    @property
+    def constraints_at_rows(self) -> bool:
+        """Not those that are not quadratic: they are imposed as G(x̄) ẋ_d = 0."""
+        return False
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
         return "the discrete gradient that (x₁ − x₀)/h is paired with in D is not saved; its balance is measured instead"

@@ -17,11 +17,13 @@ from dirax.numerics.arrays import Data
 
 class Claim(NamedTuple):
     """One thing that a structure says of every step: the `quantity` by its name, the names of its `parts`, the numbers by
-    which it is missed, and what it says in words."""
+    which it is missed, and what it says in words. What is `solved` for together with the other unknowns of a step has a rounding
+    of each of their equations."""
 
     quantity: str
     parts: tuple[str, ...]
     statement: str
+    solved: bool = False
 
 
 class AbstractDiscreteStructure(eqx.Module):

@@ -130,7 +130,7 @@ class LiftedPairs(AbstractDiscreteStructure):
         own = Claim(NAME, names, f"{parts} at the base point of R_d⁻¹ at every step, from q and p alone")
         if not self.constrained:
             return (own,)
-        return own, Claim("saved multipliers", ("multipliers",), "against the forces at the base points")
+        return own, Claim("saved multipliers", ("multipliers",), "against the forces at the base points", solved=True)
 
     def membership_terms(self, rows: dict[str, Array], params: Any) -> Float[Array, "2 numbers"]:
         (q0, q1), (p0, p1), h = rows["q"], rows["p"], self.step

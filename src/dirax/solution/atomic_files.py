@@ -22,13 +22,20 @@ AT_FDCWD, RENAME_EXCHANGE = -100, 2
 """Of Linux's renameat2: paths count from the folder of the process, and both names stay."""
 
 
-def checked_place(path: Path, overwrite: bool, replaceable: Callable[[Path], bool] = Path.is_file) -> None:
-    """Raise where nothing could be written to `path`: `ValueError` for a name that is too long, `FileNotFoundError` without
-    its folder, `FileExistsError` unless `overwrite`, and for what is not `replaceable`."""
+def checked_name(path: Path) -> None:
+    """Raise `ValueError` for a path that no file can have."""
+    if "\0" in str(path):
+        raise ValueError(f"a path cannot have the character of number 0, as {str(path)!r:.80} has: choose another name.")
     if len(os.fsencode(path.name)) > LONGEST_NAME:
         raise ValueError(
             f"the name {path.name[:20]}… has {len(os.fsencode(path.name))} bytes: choose one of at most {LONGEST_NAME}."
         )
+
+
+def checked_place(path: Path, overwrite: bool, replaceable: Callable[[Path], bool] = Path.is_file) -> None:
+    """Raise where nothing could be written to `path`: `ValueError` for a name that is too long, `FileNotFoundError` without
+    its folder, `FileExistsError` unless `overwrite`, and for what is not `replaceable`."""
+    checked_name(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"the folder {path.parent} does not exist: create it before saving {path.name}.")
     if os.path.lexists(path):

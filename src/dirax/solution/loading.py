@@ -80,7 +80,7 @@ def _opened(path: Path, ending: str) -> Iterator[Stored]:
     if ending == ".zarr":
         yield open_growing(path) if is_growing(path) else open_store(path)
     elif not path.is_file():
-        raise Unreadable("it is a folder, not a netCDF file")
+        raise Unreadable("it is a folder, or no file with contents, and not a netCDF file")
     else:
         with open_netcdf(path) as stored:
             yield stored

@@ -1,5 +1,7 @@
 """netCDF files as dirax writes them: numbers as they are, uncompressed, in one HDF5 file."""
 
+import subprocess
+import sys
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -17,6 +19,20 @@ the first versions, and those that another program has written to since, have no
 
 BLOCK = 2**20
 """Bytes that are read at a time."""
+
+LIMIT = 20.0
+"""Seconds that the HDF5 library may take over what describes a file without a checksum."""
+
+LOOK = """
+import sys, h5py
+with h5py.File(sys.argv[1], "r") as file:
+    dict(file.attrs)
+    for name in file:
+        if isinstance(file.get(name, getlink=True), h5py.HardLink):
+            entry = file[name]
+            dict(entry.attrs), entry.shape, entry.dtype, entry.id.get_create_plist().get_nfilters(), entry.id.get_storage_size()
+"""
+"""All of it, in a process of its own."""
 
 DIMENSION = b"This is a netCDF dimension but not a netCDF variable"
 """How netCDF marks the HDF5 arrays that stand for axes without numbers."""
@@ -45,21 +61,37 @@ def open_netcdf(path: Path) -> Iterator[Stored]:
     """Attributes, sizes and arrays of a netCDF file. Raises `Unreadable` for one with anything that dirax does not write."""
     import h5py
 
-    _check_seal(path)
+    if not _is_sealed(path):
+        _look_apart(path)
     with reading("it is not a netCDF file, or incomplete", h5py.File, path, "r") as file:
         yield reading("it cannot be read, being damaged or incomplete", _stored, file)
 
 
-def _check_seal(path: Path) -> None:
-    """`Unreadable` for a file that is not what was written: the HDF5 library may run for ever on damaged ones."""
+def _is_sealed(path: Path) -> bool:
+    """Whether a file has the checksum of what was written; `Unreadable` where it is another: the HDF5 library may run for ever
+    on damaged files."""
     size = path.stat().st_size - len(SEAL) - 4
     if size < 0:
-        return
+        return False
     with open(path, "rb") as raw:
         raw.seek(size)
         end = raw.read()
-    if end.startswith(SEAL) and end[len(SEAL) :] != _checksum(path, size).to_bytes(4, "little"):
+    if not end.startswith(SEAL):
+        return False
+    if end[len(SEAL) :] != _checksum(path, size).to_bytes(4, "little"):
         raise Unreadable("it is not what was saved: the file is damaged or was edited")
+    return True
+
+
+def _look_apart(path: Path) -> None:
+    """`Unreadable` for a file in which the HDF5 library runs for ever, or that ends the process."""
+    command = [sys.executable, "-I", "-c", LOOK, str(path.absolute())]
+    try:
+        ended = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=LIMIT)
+    except subprocess.TimeoutExpired:
+        raise Unreadable(f"it is damaged: the HDF5 library did not come to an end of it within {LIMIT:g} s") from None
+    if ended.returncode < 0:
+        raise Unreadable("it is damaged: the HDF5 library ends the process that reads it")
 
 
 def _checksum(path: Path, size: int) -> int:

@@ -18,7 +18,7 @@ def constraint_algorithm(system: AbstractSystem, near: Any, params: Any = None, 
 
     `near`: a point x (N,), not necessarily on the constraints, or initial data {"q": …, "v": …} of a Lagrangian system, with
     "t" where it depends on time: t is then the last coordinate of the chain, with ṫ = 1, and no projection moves it;
-    `radius`: size of the neighbourhood, relative to 1 + |x|, in which ranks are checked to be constant.
+    `radius`: size of the neighbourhood in which ranks are checked to be constant, relative to 1 + |x| in the chain's `units`.
 
         chain = dx.constraint_algorithm(system, near=x)
         print(chain)

@@ -46,6 +46,7 @@ class ConstraintChain:
     - `verdict`: "determined", "gauge freedom", "empty" or "irregular", and `explanation` in words.
     - `coordinates` and `multiplier_names`; with a `clock` the last coordinate is the time, which no projection moves.
     - `freedom`: the number of undetermined directions of ẋ; `redundant`: that of undetermined multipliers.
+    - `units` (N,): the sizes of the coordinates, powers of two, in which distances between points are measured.
 
     The functions are traceable, inside runs too. Their bases were chosen at `point`; where the pivots of these vanish further
     away, others are taken there.
@@ -62,6 +63,7 @@ class ConstraintChain:
     multiplier_names: tuple[str, ...]
     clock: bool
     params: Any = field(repr=False)
+    units: np.ndarray = field(repr=False)
     _constraints: Callable = field(repr=False)
     _solution: Callable | None = field(repr=False)
     _kernel: Callable | None = field(repr=False)
@@ -86,7 +88,7 @@ class ConstraintChain:
         return self._at(self._constraints, x, params)
 
     def field(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
-        """The tangent field ẋ on M_f; where it is not unique, the one without a part in the undetermined directions.
+        """The tangent field ẋ on M_f; where it is not unique, the one without a part in the undetermined directions, in `units`.
 
         Raises `ValueError` for a chain that ended empty or irregular.
         """
@@ -103,13 +105,14 @@ class ConstraintChain:
         return self._at(self._free_directions, x, params)
 
     def project(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
-        """The point y of M_f nearest to x: y + Dφ(y)ᵀσ = x, φ(y) = 0. Differentiable."""
+        """The point y of M_f nearest to x in `units` U: y + U²Dφ(y)ᵀσ = x, φ(y) = 0. Differentiable."""
         self._solved()
         return self._at(self._nearest, x, params)
 
     def normal(self, covector: Float[Numbers, " N"]) -> Float[Numbers, " N"]:
-        """The vector that a combination of the dφ pushes points along: the same numbers, without the time's."""
-        return covector.at[-1].set(0.0) if self.clock else covector
+        """The vector that a combination of the dφ pushes points along: normal to M_f in `units`, without the time's part."""
+        vector = covector * self.units**2
+        return vector.at[-1].set(0.0) if self.clock else vector
 
     def check(self, x: Float[Numbers, " N"], params: Any = None) -> None:
         """Raise `ValueError` for a point off M_f, with the first level it is off, the values, and its projection."""
@@ -128,8 +131,8 @@ class ConstraintChain:
         params = self._with(params)
         for level in self.levels:
             value, slope = map(np.asarray, self._at(once(_with_slope, level.constraints), x, params))
-            slope = np.abs(slope).max(initial=0.0)
-            if np.abs(value).max(initial=0.0) > OFF_MANIFOLD * slope * (1.0 + np.abs(np.asarray(x)).max()):
+            slope, size = np.abs(slope * self.units).max(initial=0.0), np.abs(np.asarray(x) / self.units).max()
+            if np.abs(value).max(initial=0.0) > OFF_MANIFOLD * slope * (1.0 + size):
                 where = np.asarray(self.project(x, params))
                 return (
                     f"x is off M_{level.number}: its {level.count} new constraint{'s' * (level.count > 1)} there "
@@ -165,17 +168,18 @@ class ConstraintChain:
         multipliers = jnp.zeros(sum(level.count for level in self.levels))
 
         def residual(u):
-            y, sigma = u[: x.shape[0]], u[x.shape[0] :]
+            y, sigma = u[: x.shape[0]] * self.units, u[x.shape[0] :]
             pull = gradient(lambda y: self.constraints(y, params) @ sigma)(y)
-            return jnp.concatenate([y + self.normal(pull) - x, self.constraints(y, params)])
+            return jnp.concatenate([(y + self.normal(pull) - x) / self.units, self.constraints(y, params)])
 
-        return nearest_root(residual, jnp.concatenate([x, multipliers]))[: x.shape[0]]
+        return nearest_root(residual, jnp.concatenate([x / self.units, multipliers]))[: x.shape[0]] * self.units
 
     def _free_directions(self, x, params):
-        """An orthonormal basis of them."""
+        """A basis of them that is orthonormal in `units`."""
         assert self._kernel is not None
-        kernel = self._at(self._kernel, x, params)[: len(self.coordinates)]
-        return jnp.linalg.svd(kernel, full_matrices=False)[0][:, : self.freedom]
+        units = self.units[:, None]
+        kernel = self._at(self._kernel, x, params)[: len(self.coordinates)] / units
+        return jnp.linalg.svd(kernel, full_matrices=False)[0][:, : self.freedom] * units
 
     # ------------------------------------------------------------------ how it shows itself
 

@@ -1,6 +1,7 @@
 """The search of the constraint algorithm: level by level, until it repeats or nothing is left ([BLM] §3)."""
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from dirax.program.user_functions import constant_entries, evaluated
 from dirax.systems.affine_equations import Solved, explicit, solved, switching
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintChain, ConstraintLevel
 from dirax.systems.constraint_points import Function, Points
+from dirax.systems.constraint_units import in_units, natural_units
 from dirax.systems.forms import ImplicitForm
 
 MOST_CHOICES = 6
@@ -42,10 +44,12 @@ class Landing(NamedTuple):
 
 
 class Search:
-    """The state of the algorithm between levels."""
+    """The state of the algorithm between levels; points x are in the natural `units` of the form, until the `end`."""
 
     def __init__(self, form: ImplicitForm, params, radius: float):
-        self.form, self.params = form, params
+        self.units = natural_units(form, params)
+        self.form, self.params = in_units(form, self.units), params
+        form = self.form
         self.x = np.array(form.point)
         self.size, self.unknowns = self.x.size, self.x.size + len(form.multipliers)
         moved = np.arange(self.size) < self.size - form.clock  # what a search may move: all but the time
@@ -303,10 +307,13 @@ class Search:
         return self.end(GAUGE if freedom else DETERMINED, "; ".join(words) + ".", index, freedom, redundant, solution, kernel)
 
     def end(self, verdict, explanation, index=None, freedom=0, redundant=0, solution=None, kernel=None) -> ConstraintChain:
-        """The chain with what was found so far."""
+        """The chain with what was found so far, as functions of x in the units of the system."""
+        units, of_x = self.units.coordinates, self.units.of_x
+        rates = np.concatenate([units / self.units.time, self.units.multipliers])
         return ConstraintChain(
-            levels=tuple(self.levels),
-            point=self.x,
+            levels=tuple(replace(level, constraints=of_x(level.constraints)) for level in self.levels),
+            point=self.x * units,
+            units=units,
             index=len(self.levels) if index is None else index,
             verdict=verdict,
             explanation=explanation,
@@ -316,9 +323,9 @@ class Search:
             multiplier_names=self.form.multipliers,
             clock=self.form.clock,
             params=self.params,
-            _constraints=self.constraints(),
-            _solution=solution,
-            _kernel=kernel,
+            _constraints=of_x(self.constraints()),
+            _solution=None if solution is None else of_x(solution, rates),
+            _kernel=None if kernel is None else of_x(kernel, rates[:, None]),
             _energy=self.form.energy,
         )
 

@@ -127,10 +127,16 @@ class Constraints(eqx.Module):
         return jnp.concatenate([first, self.position_defect(t, q, params), self.hidden_defect(t, q, v, params)])
 
     def terms(
-        self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], speed: Float[Numbers, " n"], params: Any
+        self,
+        t: Any,
+        q: Float[Numbers, " n"],
+        v: Float[Numbers, " n"],
+        speed: Float[Numbers, " n"],
+        params: Any,
+        size: Float[Numbers, " n"] | None = None,
     ) -> Float[Numbers, " k"]:
         """The sizes of the terms of `defect` at velocities as large as |v| + `speed`: a coordinate that does not move, of a
-        system that does, misses its constraint by a rounding of how fast it could."""
+        system that does, misses its constraint by a rounding of how fast it could, and one that is zero by one of its `size`."""
         at = jnp.asarray(t, float)
         fastest, w = jnp.abs(v) + speed, self.one_forms_at(t, q, params)
         first = jnp.abs(w) @ fastest
@@ -140,7 +146,9 @@ class Constraints(eqx.Module):
             return first
         position = rounding(lambda t, q: self.position_defect(t, q, params), at, q)
         moved = jnp.abs(self.hidden_defect(t, q, jnp.zeros_like(v), params))
-        return jnp.concatenate([first, position, jnp.abs(self.holonomic_matrix(t, q, params)) @ fastest + moved])
+        rows = jnp.abs(self.holonomic_matrix(t, q, params))
+        position = position if size is None else position + rows @ size
+        return jnp.concatenate([first, position, rows @ fastest + moved])
 
     def nearest_velocity(
         self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], lifted: Float[Numbers, "n k"], params: Any

@@ -8,6 +8,7 @@ import numpy as np
 
 from dirax.geometry.structures import canonical_two_form
 from dirax.numerics.arrays import Numbers
+from dirax.numerics.equilibration import geometric_scales
 from dirax.numerics.ranks import significant
 from dirax.numerics.tolerances import HESSIAN_RANK
 from dirax.program.linear_solves import solve
@@ -59,19 +60,27 @@ def _momenta(system: Any, q, v, params, t) -> tuple[bool, np.ndarray]:
     """Whether ∂L/∂v is affine in v (at three points around q), and the Hessian ∂²L/∂v² at q."""
     hessian = jax.jit(lambda q, v: jax.hessian(lambda v: system.lagrangian.at(t, q, v, params))(v))
     rng, q, v = np.random.default_rng(0), np.asarray(q), np.asarray(v)
-    here, scale = np.asarray(hessian(q, v)), 1.0 + np.abs(q).max()
+    here, by_q, by_v = np.asarray(hessian(q, v)), _sizes(q), _sizes(v)
     for _ in range(3):
-        at = q + 1e-2 * scale * rng.normal(size=q.shape)
-        one, other = (np.asarray(hessian(at, v + r * rng.normal(size=q.shape))) for r in (0.0, 0.5))
-        if np.abs(one - other).max() > 1e-9 * (1e-300 + np.abs(one).max()):
+        at = q + 1e-2 * by_q * rng.normal(size=q.shape)
+        one, other = (np.asarray(hessian(at, v + r * by_v * rng.normal(size=q.shape))) for r in (0.0, 0.5))
+        rows, columns = geometric_scales(np.maximum(np.abs(one), np.abs(other)))
+        if np.max(np.abs(one - other) / rows / columns) > HESSIAN_RANK * np.max(np.abs(one) / rows / columns):
             return False, here
     return True, here
 
 
+def _sizes(values: np.ndarray) -> np.ndarray:
+    """The sizes of coordinates, those of the largest, or 1, where they are zero."""
+    sizes = np.abs(values)
+    return np.where(sizes > 0, sizes, sizes.max() or 1.0)
+
+
 def _kernel(hessian: np.ndarray) -> np.ndarray:
-    """A basis (n, k) of the kernel of a symmetric matrix."""
-    values, vectors = np.linalg.eigh(hessian)
-    return vectors[:, ~significant(np.abs(values), HESSIAN_RANK)]
+    """A basis (n, k) of the kernel of a symmetric matrix, orthonormal in the units that bring its entries near 1."""
+    rows, columns = geometric_scales(np.abs(hessian))
+    _, values, directions = np.linalg.svd(hessian / rows / columns)
+    return directions[~significant(values, HESSIAN_RANK)].T / columns.T
 
 
 def _on_cotangent_bundle(system: Any, x: np.ndarray, hessian: np.ndarray, params, timed: bool, t: float) -> ImplicitForm:

@@ -197,7 +197,9 @@ class LagrangeDirac(AbstractSystem):
     def _lifted(self, q, v, rows, params, t):
         """metric⁻¹ rowsᵀ in the metric ∂²L/∂v² where it is positive definite and the Euclidean one elsewhere."""
         hessian = jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v)
-        values = jnp.linalg.eigvalsh(hessian)
+        own = jnp.diagonal(hessian)  # with which coordinates have no units
+        units = jnp.sqrt(jnp.where(own > 0.0, own, 1.0))
+        values = jnp.linalg.eigvalsh(hessian / units[:, None] / units[None])
         regular = values[0] > METRIC_RANK * jnp.abs(values[-1])
         return solve(jnp.where(regular, hessian, jnp.eye(q.shape[0])), rows.T)
 
@@ -237,13 +239,18 @@ class LagrangeDirac(AbstractSystem):
 
     def speeds(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " n"]:
         """How fast each coordinate would be that had the kinetic energy alone; 0 where L is degenerate in it."""
+        return self._as_large(t, q, v, v, params)
+
+    def _as_large(self, t, q, v, x, params):
+        """How large each coordinate would be that alone had the length of x in the kinetic metric; 0 where that is degenerate."""
         metric = jnp.abs(jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v))
-        along, own = jnp.abs(v) @ metric @ jnp.abs(v), jnp.diagonal(metric)
+        along, own = jnp.abs(x) @ metric @ jnp.abs(x), jnp.diagonal(metric)
         return jnp.sqrt(jnp.where(own > 0.0, along / jnp.where(own > 0.0, own, 1.0), 0.0))
 
     def constraint_terms(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " k"]:
-        """The sizes of the terms of (W v + b, g, G v + ∂g/∂t), for each coordinate as fast as the kinetic energy makes it."""
-        return self.constraints.terms(t, q, v, self.speeds(t, q, v, params), params)
+        """The sizes of the terms of (W v + b, g, G v + ∂g/∂t), for each coordinate as fast as the kinetic energy makes it, and
+        where it is zero as large as the others make it."""
+        return self.constraints.terms(t, q, v, self.speeds(t, q, v, params), params, self._as_large(t, q, v, q, params))
 
     def _velocity(self, row: Data, params: Any) -> Float[Numbers, " n"]:
         """The velocity that belongs to the saved momentum."""

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.diagnostics.bench.subject import Skipped
+from dirax.numerics.equilibration import equilibrated, geometric_scales
 from dirax.program.memo import Same
 from dirax.program.user_functions import evaluated
 from dirax.systems.dirac_system import DiracSystem
@@ -130,9 +131,11 @@ def _open_ports(system: PortHamiltonian, params: Any) -> Callable:
 def _solved(equations: LinearEquations, start: Any, shown: int) -> ExplicitODE:
     """The equations with z eliminated in scalars; the order of the pivots is the one at the start."""
     matrix = np.asarray(evaluated(lambda y: equations(0.0, y)[0], jnp.asarray(start)))
-    if not np.all(np.isfinite(matrix)) or np.linalg.cond(matrix) > SINGULAR:
+    rows, columns = geometric_scales(np.abs(matrix))  # forces and velocities have units of their own
+    scaled, _ = equilibrated(matrix / rows / columns)
+    if not np.all(np.isfinite(matrix)) or np.linalg.cond(scaled) > SINGULAR:
         raise Skipped("its equations do not determine the derivatives (singular)")
-    order = pivot_order(matrix)
+    order = pivot_order(scaled)
 
     def derivative(t, y):
         matrix, right, rate = equations(t, y)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem, Progress, finished
+from dirax.engines.contract import NOT_CONVERGED, OK, TOO_LARGE, Outcome, Problem, Progress, finished
 from dirax.engines.native.collocation_kernels import CollocationKernels, collocation_kernels
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
@@ -154,8 +154,8 @@ def _by_newton(lanes: Lanes | OneLane, made: CollocationKernels) -> list[str]:
     try:
         whole = kernels(p.equation, p.params, p.batch_params, True)
         whole.kernel(1)
-    except UnsupportedPrimitive:  # too large to be written out: they end where they are
-        return others
+    except UnsupportedPrimitive as error:  # too large to be written out: they end where they are
+        return [*others, f"{TOO_LARGE} ({error})"]
     for i, (stage, _) in enumerate(p.equation.stages):
         own[:, record.sizes(i, stage.unknowns)] = 0.0
     lanes.put(stuck, own)
