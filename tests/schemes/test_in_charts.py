@@ -81,7 +81,8 @@ def test_near_a_pole_angles_fail_with_a_message_and_charts_do_not():
     q, v = jax.jvp(point, (ANGLES,), (RATES,))
     angles = dx.simulate(dx.LagrangeDirac(in_angles), dx.LagrangeDAlembert(), q=ANGLES, v=RATES, step=0.01, steps=1000)
     assert not angles.ok
-    assert "Newton did not converge" in angles.message and "kept up to step" in angles.message
+    assert "did not converge" in angles.message or "is singular" in angles.message
+    assert "kept up to step" in angles.message
     charted = pendulums.simulate(q=q, v=v, steps=1000)
     assert charted.ok and np.ptp(charted.energy()) < 2e-3
 
