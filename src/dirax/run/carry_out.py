@@ -117,10 +117,10 @@ def carried_out(
         return run_with_events(carried_out, _begun, settings, case, steps, save_every, progress, kind, entered)
     began = time.perf_counter()
     every = _checked_times(case, steps, save_every)
-    if case.traced:
+    kind = None if settings.to is not None else kind or kind_for(settings, case)
+    if kind is None and case.traced:
         problem, outcome, row0 = carried_by_jax(_by_jax(settings, steps, every), settings, case, steps, every)
         return solution_of(settings.system, settings.scheme, case, problem, outcome, row0, True)
-    kind = None if settings.to is not None else kind or kind_for(settings, case)
     if kind is not None and kind.starts and (again := kind.again(case, steps, every, save_every)):
         return _run(settings, kind, again, steps, progress, entered, began)
     if kind is not None and kind.plan is not None:

@@ -154,6 +154,7 @@ def planned(settings: Settings, case: Case, shape: Shape, initial: Initial, star
     if len(stages) > 1 and not system.constraints.any and "p" in fields and system.final_relation(shape) is not None:
         return None
     made = Plan if case.batch is None else BatchPlan
+    _ = problem.fields, problem.row_size, problem.review  # found once: others are made of this one
     plan = made(settings, case, shape, initial, start, problem)
     return plan if plan.whole else None
 
