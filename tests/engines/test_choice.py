@@ -32,7 +32,7 @@ def test_sparse_steps_beyond_the_size_of_full_ones_are_native():
 def test_too_large_a_step_says_its_size():
     size = choice.LARGEST_NATIVE // 2 + 1
     large = dx.simulate(potential(jnp.diff), dx.LagrangeDAlembert(), q=np.zeros(size), v=np.ones(size), step=0.01, steps=1)
-    assert large.stats["engine"] == "sparse" and large.stats["not_native"] == f"{2 * size} numbers a step, more than 96"
+    assert large.stats["engine"] == "sparse" and large.stats["not_native"] == f"{2 * size} numbers a step, more than 192"
 
 
 @pytest.mark.parametrize("nested", [False, True])

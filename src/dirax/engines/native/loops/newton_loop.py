@@ -194,15 +194,20 @@ def by_partial_pivoting(
     store(change, memory)
     weak = e.both(e.invert(stable), now)
     with b.when(e.any(weak)):
-        nodes = [node for row in matrix for node in row]
+        places = [(i * k + j, node) for i, row in enumerate(matrix) for j, node in enumerate(row) if node != region.graph.zero]
+        nodes = [node for _, node in places]
         cold = Region(e, region.graph, region)
         cold.require([*nodes, *right, *sizes])
         values, sides = [cold.value(n) for n in nodes], [cold.value(n) for n in right]
         if sizes:
             units = [e.div(e.const(1.0), cold.value(n)) for n in sizes]
-            values = [e.mul(value, units[i // k]) for i, value in enumerate(values)]
+            values = [e.mul(value, units[at // k]) for value, (at, _) in zip(values, places, strict=True)]
             sides = [e.mul(value, unit) for value, unit in zip(sides, units, strict=True)]
-        store(values, entries)
+        if len(places) < k * k:
+            with b.loop(0, str(k * k)) as at:
+                b.store(e.real, e.const(0.0), b.at(e.real, entries, at))
+        for value, (at, _) in zip(values, places, strict=True):
+            b.store(e.real, value, b.at(e.real, entries, at))
         store(sides, side)
         for lane in range(e.width):
             with b.when(e.extract(weak, lane, e.bool)):
