@@ -8,6 +8,7 @@ error is the largest of all trajectories at the end. On a busy machine only proc
 
 import os
 import time
+from collections.abc import Iterator
 
 os.environ["DIRAX_THREADS"] = "1"
 
@@ -25,26 +26,38 @@ SETTINGS = ((4, 0.25), (4, 0.5), (5, 0.5), (6, 1.0), (7, 1.0), (8, 1.0), (8, 0.5
 def taylor(solver, start: np.ndarray) -> tuple[float, np.ndarray]:
     """(seconds, ends) of heyoka's batch integrator."""
     ends, begun = np.empty_like(start), time.perf_counter()
-    for i in range(0, BATCH, SIDE_BY_SIDE):
-        solver.set_time(0.0)
-        solver.state[:] = start[i : i + SIDE_BY_SIDE].T
-        solver.propagate_until(END)
-        ends[i : i + SIDE_BY_SIDE] = solver.state.T
+    for part in propagated(solver, start):
+        ends[part] = solver.state.T
     return time.perf_counter() - begun, ends
 
 
-def main() -> None:
-    """Print a line for every setting."""
+def propagated(solver, start: np.ndarray) -> Iterator[slice]:
+    """The trajectories that heyoka's integrator has at the end, those side by side one after the other."""
+    for i in range(0, BATCH, SIDE_BY_SIDE):
+        part = slice(i, i + SIDE_BY_SIDE)
+        solver.set_time(0.0)
+        solver.state[:] = start[part].T
+        solver.propagate_until(END)
+        yield part
+
+
+def beside_heyoka(tolerances) -> tuple[np.ndarray, np.ndarray, dict, np.ndarray]:
+    """Positions and velocities (BATCH, 2) of a start, heyoka's integrators by their tolerances, and the positions at the end."""
     numbers = np.random.default_rng(0)
     q = np.array([0.3, 0.1]) * (1 - 0.3 * numbers.random((BATCH, 1)))
     v = np.array([0.2, 0.35]) * (1 - 0.3 * numbers.random((BATCH, 1)))
     x, y, u, w = hy.make_vars("x", "y", "u", "w")
     field = [(x, u), (y, w), (u, -x - 2 * x * y), (w, -y - x * x + y * y)]
     made = lambda tolerance: hy.taylor_adaptive_batch(field, np.zeros((4, SIDE_BY_SIDE)), tol=float(tolerance))
-    start = np.concatenate([q, v], axis=1)
-    exact, system = taylor(made(1e-18), start)[1][:, :2], dx.LagrangeDirac(henon_heiles)
-    solvers, found = {t: made(t) for t in TOLERANCES}, {}
-    runs = {}
+    exact = taylor(made(1e-18), np.concatenate([q, v], axis=1))[1][:, :2]
+    return q, v, {t: made(t) for t in tolerances}, exact
+
+
+def main() -> None:
+    """Print a line for every setting."""
+    q, v, solvers, exact = beside_heyoka(TOLERANCES)
+    start, system = np.concatenate([q, v], axis=1), dx.LagrangeDirac(henon_heiles)
+    found, runs = {}, {}
     for s, h in SETTINGS:
         n = round(END / h)
         runs[s, h] = dx.prepare(system, dx.Collocation(s), q=q, v=v, step=END / n, steps=n, save_every=n)

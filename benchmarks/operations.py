@@ -18,12 +18,11 @@ import time
 
 os.environ["DIRAX_THREADS"] = "1"
 
-import heyoka as hy
 import llvmlite.binding as llvm
 import numpy as np
 
 import dirax as dx
-from benchmarks.collocation_batch import BATCH, END, SIDE_BY_SIDE, taylor
+from benchmarks.collocation_batch import BATCH, END, SIDE_BY_SIDE, beside_heyoka, propagated, taylor
 from benchmarks.splitting import FOURTEEN
 from benchmarks.work_precision import henon_heiles
 from dirax.engines.native import kernel_cache
@@ -154,18 +153,12 @@ def peak() -> float:
 
 def main() -> None:
     """Print the table."""
-    numbers = np.random.default_rng(0)
-    q = np.array([0.3, 0.1]) * (1 - 0.3 * numbers.random((BATCH, 1)))
-    v = np.array([0.2, 0.35]) * (1 - 0.3 * numbers.random((BATCH, 1)))
-    x, y, u, w = hy.make_vars("x", "y", "u", "w")
-    field = [(x, u), (y, w), (u, -x - 2 * x * y), (w, -y - x * x + y * y)]
-    made = lambda tolerance: hy.taylor_adaptive_batch(field, np.zeros((4, SIDE_BY_SIDE)), tol=float(tolerance))
-    start = np.concatenate([q, v], axis=1)
-    exact, system = taylor(made(1e-18), start)[1][:, :2], dx.LagrangeDirac(henon_heiles)
+    q, v, solvers, exact = beside_heyoka(TOLERANCES)
+    start, system = np.concatenate([q, v], axis=1), dx.LagrangeDirac(henon_heiles)
     fastest, blocks = peak(), BATCH // SIDE_BY_SIDE
     print(f"peak: {fastest:.3g} vector instructions a second")
     rows: dict[str, list] = collections.defaultdict(list)
-    solvers, runs = {t: made(t) for t in TOLERANCES}, {}
+    runs = {}
 
     def prepared(scheme, n, more=1, system=system):
         return dx.prepare(system, scheme, q=q, v=v, step=END / n, steps=n * more, save_every=n * more)
@@ -177,12 +170,7 @@ def main() -> None:
         runs[label] = prepared(scheme, n), prepared(scheme, n, 2)
         instructions[label] = counted(lambda of=(scheme, n, 1, anew()): prepared(*of)) / blocks
     for tolerance, solver in solvers.items():
-        steps = []
-        for i in range(0, BATCH, SIDE_BY_SIDE):
-            solver.set_time(0.0)
-            solver.state[:] = start[i : i + SIDE_BY_SIDE].T
-            solver.propagate_until(END)
-            steps.append(max(int(one[3]) for one in solver.propagate_res))
+        steps = [max(int(one[3]) for one in solver.propagate_res) for _ in propagated(solver, start)]
         label = f"heyoka, {tolerance:.0e}, order {solver.order}, {np.mean(steps):.0f} steps"
         instructions[label] = of_a_step(solver) * float(np.mean(steps))
         runs[label] = solver

@@ -118,6 +118,21 @@ def test_method_2_corrects_accelerations_after_the_step_that_hardly_depends_on_t
         np.testing.assert_allclose(sol.fields[name], plain.fields[name], rtol=1e-10, atol=1e-10 * scale)
 
 
+def of_two_parts(residual, guess, **more):
+    """An equation for 2 FEWEST unknowns, which begin with a guess, of a state (2,) that stays."""
+    size = 2 * FEWEST
+    return dx.StepEquation(
+        start=lambda data, h, params: (data["x"], jnp.full(size, guess)),
+        residual=residual,
+        advance=lambda u, x, t, h, params: x,
+        unpack=lambda x, u, t, h, params: {"x": x, "u": u},
+        state_size=2,
+        unknowns=size,
+        fields={"x": dx.Field((2,)), "u": dx.Field((size,), "step")},
+        **more,
+    )
+
+
 @pytest.mark.parametrize(("coupling", "needed"), [(1e-3, False), (30.0, True)])
 def test_entries_that_are_called_weak_and_are_not(coupling, needed):
     """Newton's method goes on with the whole Jacobian where it does not converge without them."""
@@ -127,16 +142,7 @@ def test_entries_that_are_called_weak_and_are_not(coupling, needed):
         first, second = u[:k], u[k:]
         return jnp.concatenate([first + first**3 / 8.0 + coupling * jnp.roll(second, 1) - x[0], 2.0 * second - first - x[1]])
 
-    equation = dx.StepEquation(
-        start=lambda data, h, params: (data["x"], jnp.zeros(2 * k)),
-        residual=residual,
-        advance=lambda u, x, t, h, params: x,
-        unpack=lambda x, u, t, h, params: {"x": x, "u": u},
-        state_size=2,
-        unknowns=2 * k,
-        fields={"x": dx.Field((2,)), "u": dx.Field((2 * k,), "step")},
-        weak=((range(k), range(k, 2 * k)),),
-    )
+    equation = of_two_parts(residual, 0.0, weak=((range(k), range(k, 2 * k)),))
     out = engine_of("native").run(Problem(equation, np.array([1.0, 0.5]), (np.zeros(2 * k),), 0.1, 0.0, 3))
     assert out.completed[0] == 3 and ("whole Jacobian" in out.notes.get("iteration", "")) == needed
     u = out.fields["u"][0, -1]
@@ -152,15 +158,7 @@ def test_an_equation_with_the_sign_of_a_later_unknown_is_not_solved_before_it():
         first, second = u[:k], u[k:]
         return jnp.concatenate([first**3 - x[0] + 0.1 * jnp.sign(second), 2.0 * second + first - x[1]])
 
-    equation = dx.StepEquation(
-        start=lambda data, h, params: (data["x"], jnp.ones(2 * k)),
-        residual=residual,
-        advance=lambda u, x, t, h, params: x,
-        unpack=lambda x, u, t, h, params: {"x": x, "u": u},
-        state_size=2,
-        unknowns=2 * k,
-        fields={"x": dx.Field((2,)), "u": dx.Field((2 * k,), "step")},
-    )
+    equation = of_two_parts(residual, 1.0)
     runs = [
         engine_of(name).run(Problem(equation, np.array([8.0, 1.0]), (np.ones(2 * k),), 0.1, 0.0, 2)) for name in ("native", "xla")
     ]

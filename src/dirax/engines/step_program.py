@@ -104,7 +104,8 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
         raise UnsupportedPrimitive("unpack", f"returns {len(rows)} arrays for {len(names)} fields", "the scheme")
     return TracedEquation(
         state, unknowns, previous, guess.tolist(), residual.tolist(), advance.tolist(),
-        dict(zip(names, rows, strict=True)), nesting(closed.jaxpr), array_operations(closed.jaxpr), equation.weak,
+        dict(zip(names, rows, strict=True)), nesting(closed.jaxpr),
+        array_operations(closed.jaxpr, policy.MORE_FOR_XLA), equation.weak,
     )  # fmt: skip
 
 
@@ -124,14 +125,14 @@ def nesting(jaxpr: Any) -> int:
     return depth(jaxpr)
 
 
-def array_operations(jaxpr: Any) -> float:
+def array_operations(jaxpr: Any, of_derivative: float = 1.0) -> float:
     """How many operations on arrays a jaxpr has, those inside of them counted once for each time that they stand there, and for
-    each derivative that they are under `policy.MORE_FOR_XLA` times."""
+    each derivative that they are under so many times."""
     known: dict[int, float] = {}
 
     def counted(jaxpr: Any) -> float:
         if id(jaxpr) not in known:
-            more = lambda e: policy.MORE_FOR_XLA if e.primitive.name in DERIVATIVES else 1.0
+            more = lambda e: of_derivative if e.primitive.name in DERIVATIVES else 1.0
             inner = (more(e) * counted(getattr(j, "jaxpr", j)) for e in jaxpr.eqns for j in jaxprs_in_params(e.params))
             known[id(jaxpr)] = len(jaxpr.eqns) + sum(inner)
         return known[id(jaxpr)]

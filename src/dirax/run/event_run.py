@@ -200,7 +200,6 @@ def run_with_events(
         sol.continuation = lambda _, more, progress: run(count + more)
         return sol
 
-    traced = case.traced or is_traced(case.data, case.params)
     if len(walls) == len(settings.events):
         sol = run(steps)
         if is_traced(sol.t, sol.fields):
@@ -208,6 +207,6 @@ def run_with_events(
             sol = thinned(sol, every)
             sol.events = sol.impacts = found
             return sol
-        if not traced:
+        if not case.traced:
             return with_events(lambda _: sol, settings.events, steps, every, progress, False)
-    return with_events(run, settings.events, steps, every, progress, traced)
+    return with_events(run, settings.events, steps, every, progress, case.traced)

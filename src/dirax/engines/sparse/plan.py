@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import jaxprs_in_params
 
 from dirax.engines import policy
 from dirax.engines.in_jax import joined, replaced
 from dirax.engines.sparse.by_sites import by_sites
 from dirax.engines.sparse.solver import SparseSolver
-from dirax.engines.step_program import step_program
+from dirax.engines.step_program import array_operations, step_program
 from dirax.numerics.sparse.elimination import StructurallySingular
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -83,7 +82,7 @@ def _planned(equation: Any, params: Any, batch_params: bool) -> SparsePlan | str
 def _by_levels(equation: Any, stage: Any, shapes: tuple, params: Any, batch_params: bool) -> tuple[Any, SparseSolver] | None:
     """A stage of many operations on small arrays, as one of machines of many bodies is, by the levels of its scalar program, and
     a solver with the entries of its Jacobian; None where it is better left in arrays, or has no such program."""
-    if operations(jax.make_jaxpr(stage.residual)(*shapes).jaxpr) <= policy.MOST_ARRAY_OPERATIONS:
+    if array_operations(jax.make_jaxpr(stage.residual)(*shapes).jaxpr) <= policy.MOST_ARRAY_OPERATIONS:
         return None
     try:
         made = step_program(equation, params, batch_params)
@@ -95,16 +94,3 @@ def _by_levels(equation: Any, stage: Any, shapes: tuple, params: Any, batch_para
     equations = SparseEquations.of_entries(stage.unknowns, rows, columns)
     entries = made.in_levels(index, [node for row in jacobian for node in row.values()])
     return replaced(stage, made, index, made.in_levels), SparseSolver(equations, jax.jit(entries))
-
-
-def operations(jaxpr: Any) -> int:
-    """How many operations on arrays a jaxpr has, those inside of them counted once for each time that they stand there."""
-    known: dict[int, int] = {}
-
-    def counted(jaxpr: Any) -> int:
-        if id(jaxpr) not in known:
-            inner = (counted(getattr(j, "jaxpr", j)) for e in jaxpr.eqns for j in jaxprs_in_params(e.params))
-            known[id(jaxpr)] = len(jaxpr.eqns) + sum(inner)
-        return known[id(jaxpr)]
-
-    return counted(jaxpr)

@@ -118,17 +118,6 @@ class Apart(OverNodes):
     def seldom(self, condition):
         return self.body.when(self.one.any(condition))
 
-    def flag(self):
-        flag = self.body.alloca(self.one.bool)
-        self.clear(flag)
-        return flag
-
-    def clear(self, flag):
-        self.body.store(self.one.bool, self.one.false, flag)
-
-    def mark(self, flag, condition):
-        self.body.store(self.one.bool, self.one.either(self.body.load(self.one.bool, flag), condition), flag)
-
     def marked(self, flag):
         return self.body.load(self.one.bool, flag)
 

@@ -1,6 +1,7 @@
 """What a kernel of collocation steps does: the relation at one node as scalar expressions, and how its unknowns are iterated."""
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from dirax.engines.native.loops.record import Record
@@ -10,6 +11,9 @@ from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.rounding import rounding_nodes
 from dirax.schemes.collocation_tables import Quadrature, Tableau
+
+Rows = list[dict[int, int]]
+"""Rows of a matrix, {column: node}."""
 
 
 @dataclass
@@ -87,13 +91,7 @@ class CollocationPlan:
         carried = [r.rates[i] for i in self.carried]
         by_carried = jacobian(g, r.relation, [r.second[i] for i in self.carried])
 
-        def through(slopes: list[dict[int, int]], begun: list[dict[int, int]]) -> list[dict[int, int]]:
-            for row, factors in zip(begun, by_carried, strict=True):
-                for i, factor in factors.items():
-                    for j, slope in slopes[i].items():
-                        row[j] = g.add(row.get(j, g.zero), g.mul(factor, slope))
-            return begun
-
+        through = functools.partial(_through, g, g.add, by_carried)
         linear = through(jacobian(g, carried, r.unknowns), [dict(row) for row in jacobian(g, r.relation, r.first)])
         square = through(jacobian(g, carried, r.first), [{} for _ in r.relation])
         return jacobian(g, r.relation, r.unknowns), linear, square
@@ -156,16 +154,10 @@ class MeanPlan:
         g, r, n = self.graph, self.relation, len(self.relation.first)
         by_mean = jacobian(g, r.rates[:n], r.means)
 
-        def less(begun: list[dict[int, int]], slopes: list[dict[int, int]]) -> list[dict[int, int]]:
-            for row, factors in zip(begun, by_mean, strict=True):
-                for i, factor in factors.items():
-                    for j, slope in slopes[i].items():
-                        row[j] = g.sub(row.get(j, g.zero), g.mul(factor, slope))
-            return begun
-
+        less = functools.partial(_through, g, g.sub, by_mean)
         own = [{j: g.neg(entry) for j, entry in row.items()} for row in jacobian(g, r.rates[:n], r.first)]
-        constant = less([{i: g.one} for i in range(n)], jacobian(g, r.slopes, r.unknowns))
-        return constant, less(own, jacobian(g, r.slopes, r.first)), [{} for _ in range(n)]
+        constant = less(jacobian(g, r.slopes, r.unknowns), [{i: g.one} for i in range(n)])
+        return constant, less(jacobian(g, r.slopes, r.first), own), [{} for _ in range(n)]
 
     @property
     def record(self) -> Record:
@@ -187,6 +179,15 @@ class MeanPlan:
 def record_of(relation: TracedRelation | TracedMean, tableau: Tableau) -> Record:
     """The iterates of the step before among the unknowns, and sums with their errors."""
     return Record(len(relation.first) + len(relation.second), 1, tableau.stages * len(relation.first), True)
+
+
+def _through(g: Graph, plus: Callable[[int, int], int], by: Rows, slopes: Rows, begun: Rows) -> Rows:
+    """Rows {column: node} that are begun, plus or minus the product of the rows `by` with those of `slopes`."""
+    for row, factors in zip(begun, by, strict=True):
+        for i, factor in factors.items():
+            for j, slope in slopes[i].items():
+                row[j] = plus(row.get(j, g.zero), g.mul(factor, slope))
+    return begun
 
 
 def depends(g: Graph, nodes: list[int], inputs: list[int]) -> bool:

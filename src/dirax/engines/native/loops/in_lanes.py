@@ -104,18 +104,6 @@ class InLanes(OverNodes):
     def seldom(self, condition):
         return nullcontext()
 
-    def flag(self):
-        flag = self.body.alloca(self.emitter.bool)
-        self.clear(flag)
-        return flag
-
-    def clear(self, flag):
-        self.body.store(self.emitter.bool, self.emitter.false, flag)
-
-    def mark(self, flag, condition):
-        condition = self.emitter.either(self.body.load(self.emitter.bool, flag), condition)
-        self.body.store(self.emitter.bool, condition, flag)
-
     def marked(self, flag):
         return self.emitter.any(self.body.load(self.emitter.bool, flag))
 

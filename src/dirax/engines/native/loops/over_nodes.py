@@ -87,17 +87,20 @@ class OverNodes(ABC):
     def seldom(self, condition: str) -> AbstractContextManager[None]:
         """A stretch that matters only where a condition holds at the node that is being written."""
 
-    @abstractmethod
     def flag(self) -> str:
         """Memory for conditions at the nodes, which hold nowhere."""
+        flag = self.emitter.body.alloca(self.emitter.bool)
+        self.clear(flag)
+        return flag
 
-    @abstractmethod
     def clear(self, flag: str) -> None:
         """They hold nowhere again."""
+        self.emitter.body.store(self.emitter.bool, self.emitter.false, flag)
 
-    @abstractmethod
     def mark(self, flag: str, condition: str) -> None:
         """Note that one holds at the node that is being written."""
+        e = self.emitter
+        e.body.store(e.bool, e.either(e.body.load(e.bool, flag), condition), flag)
 
     @abstractmethod
     def marked(self, flag: str) -> str:
