@@ -1,8 +1,11 @@
 """Machines of hinges and slides and nothing else, which every program for machines can state."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+
+from dirax.text.tables import number
 
 MOTIONS = {"revolute": "hinge", "prismatic": "slide"}
 
@@ -44,3 +47,11 @@ def closing_points(model: Any) -> list[tuple[tuple[str, np.ndarray], tuple[str, 
                 )
                 found.append((first, second))
     return found
+
+
+def entry(seconds: float, error: float, energies: Sequence[float], gap: float | None) -> str:
+    """What the table says of a program: the time of a step, the error at the end, the range of the energy beside the largest,
+    and the largest gap of a loop, None where there are no loops."""
+    drift = np.ptp(energies) / np.abs(energies).max()
+    said = f"{number(1e6 * seconds)} µs, error {number(error, 2)}, energy {number(drift, 2)}"
+    return said if gap is None else said + f", loops {number(gap, 2)}"

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.diagnostics.bench.hinges import closing_points, is_hinged, joint_frames
-from dirax.text.tables import number
+from dirax.diagnostics.bench.hinges import closing_points, entry, is_hinged, joint_frames
 
 
 def is_stated(model: Any) -> bool:
@@ -93,6 +92,4 @@ def measured(example: Any, steps: int, end: np.ndarray, repeats: int) -> str:
         for (one, first), (other, second) in loops:
             at = lambda name, x, context=context: plant.EvalBodyPoseInWorld(context, bodies[name]) @ x
             gap = max(gap, np.abs(at(one, first) - at(other, second)).max())
-    drift = np.ptp(energies) / np.abs(energies).max()
-    said = f"{number(1e6 * min(seconds) / steps)} µs, error {number(error, 2)}, energy {number(drift, 2)}"
-    return said + (f", loops {number(gap, 2)}" if loops else "")
+    return entry(min(seconds) / steps, error, energies, gap if loops else None)

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.diagnostics.bench.hinges import branch_by_branch, closing_points, is_hinged, joint_frames
-from dirax.text.tables import number
+from dirax.diagnostics.bench.hinges import branch_by_branch, closing_points, entry, is_hinged, joint_frames
 
 is_stated = is_hinged
 
@@ -85,12 +84,11 @@ def measured(example: Any, steps: int, end: np.ndarray, repeats: int) -> str:
             q, v = following(q, v)
         seconds.append(time.process_time() - before)
     error, (q, v), energies, gap = np.abs(q[order] - end).max(), start, [], 0.0
+    points = closing_points(example.model)
     for _ in range(steps):
         q, v = following(q, v)
         energies.append(pin.computeMechanicalEnergy(model, data, q, v))
-        for (one, first), (other, second) in closing_points(example.model):
+        for (one, first), (other, second) in points:
             apart = data.oMi[made[one]].act(first) - data.oMi[made[other]].act(second)
             gap = max(gap, np.abs(apart).max())
-    drift = np.ptp(energies) / np.abs(energies).max()
-    said = f"{number(1e6 * min(seconds) / steps)} µs, error {number(error, 2)}, energy {number(drift, 2)}"
-    return said + (f", loops {number(gap, 2)}" if len(loops) else "")
+    return entry(min(seconds) / steps, error, energies, gap if len(loops) else None)
