@@ -72,30 +72,39 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
     JAX."""
 
     def one(state, guess, params, t):
-        def linear(i, u, x, part):
+        def linear(i, u, xs, part):
+            """At several states, each with its part of the step; they are one program."""
             stage, fraction = equation.stages[i]
-            residual = lambda u, h: stage.residual(u, x, t, h, params)
-            by_u, by_h = jax.jacfwd(residual, argnums=(0, 1))(u, part * fraction * h)
-            return residual(u, part * fraction * h), jnp.concatenate([by_u, by_h[:, None]], axis=1)
 
-        def terms(i, u, x, sizes):
+            def at(x, h):
+                residual = lambda u, h: stage.residual(u, x, t, h, params)
+                by_u, by_h = jax.jacfwd(residual, argnums=(0, 1))(u, h)
+                return residual(u, h), jnp.concatenate([by_u, by_h[:, None]], axis=1)
+
+            return jax.vmap(at)(jnp.stack(xs), jnp.array(part) * fraction * h)
+
+        def terms(i, u, xs, sizes):
             stage, fraction = equation.stages[i]
-            numbers = u, x, t, fraction * h
-            errors = sizes, *map(jnp.abs, numbers[1:])
-            return rounding(lambda u, x, t, h: stage.residual(u, x, t, h, params), *numbers, errors=errors)
+            residual = lambda u, x, t, h: stage.residual(u, x, t, h, params)
+
+            def at(x):
+                numbers = u, x, t, fraction * h
+                return rounding(residual, *numbers, errors=(sizes, *map(jnp.abs, numbers[1:])))
+
+            return jax.vmap(at)(jnp.stack(xs))
 
         end, found = state, []
         for i in _first_of_each(equation.stages):
             stage, fraction = equation.stages[i]
-            u = _updated(*linear(i, guess[i], end, SHORT), guess[i], jnp)
-            end = stage.advance(u, end, t, SHORT * fraction * h, params)
+            (residual,), (slopes,) = linear(i, guess[i], [end], [SHORT])
+            end = stage.advance(_updated(residual, slopes, guess[i], jnp), end, t, SHORT * fraction * h, params)
         end = end * _nearby(len(state))
         for i, u in enumerate(guess):
-            short, near = linear(i, u, state, SHORT)[1], linear(i, u, end, SHORT)[1]
-            again = lambda sizes, i=i, u=u: [terms(i, u, x, sizes) for x in (state, end)]
+            residuals, (slopes, short, near) = linear(i, u, [state, state, end], [1.0, SHORT, SHORT])
+            again = lambda sizes, i=i, u=u: terms(i, u, [state, end], sizes)
             part, stage = equation.stages[i][1] * h, equation.stages[i][0]
             after = lambda u, stage=stage, part=part: stage.advance(u, state, t, part, params)
-            found.append(_sizes(*linear(i, u, state, 1.0), short, near, u, again(jnp.abs(u)), again, after, part, jnp))
+            found.append(_sizes(residuals[0], slopes, short, near, u, again(jnp.abs(u)), again, after, part, jnp))
         return tuple(found)
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params, t
