@@ -20,9 +20,6 @@ class AbstractEngine(eqx.Module):
     name: ClassVar[str]
     """What `stats["engine"]` says."""
 
-    compiles_start: ClassVar[bool] = False
-    """Whether the start of a run is to be compiled by JAX, too, and not found from scalar programs in NumPy."""
-
     @abstractmethod
     def supports(self, problem: Problem) -> str | None:
         """None if the engine takes the problem, else why it does not, in words that go on after "because"."""
@@ -33,6 +30,11 @@ class AbstractEngine(eqx.Module):
 
         `progress` is called now and then. Raises `UnsupportedPrimitive` for a problem that the engine does not support.
         """
+
+    def compiles_start(self, traced: bool) -> bool:
+        """Whether the start of a run is compiled by JAX, too, and not found from scalar programs; `traced`: under `jax.grad`,
+        `jit` or `vmap`."""
+        return False
 
     def prepared(self, problem: Problem) -> Callable[[Problem, Progress | None], Outcome]:
         """`run` for this problem and for others that differ from it in numbers alone: state, guess, h, t0, floating params, and

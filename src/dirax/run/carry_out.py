@@ -176,7 +176,7 @@ def _no_plan() -> None:
 
 def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: int) -> Begun:
     """The general way from a case to its problem; `asked`: the `save_every` that was asked for."""
-    system, scheme, by_jax = settings.system, settings.scheme, settings.engine.compiles_start
+    system, scheme, by_jax = settings.system, settings.scheme, settings.engine.compiles_start(case.traced)
     given, check_initial = case, settings.check_initial
     data, own = case.first
     # discretize: constraints that follow from others at the completed data are left out of the equation

@@ -179,6 +179,8 @@ def run_with_events(
     plain = replace(settings, events=())
     every = min(save_every, max(1, steps - int(case.two_points)))
     walls = [i for i, event in enumerate(settings.events) if isinstance(event, Impact)]
+    if case.traced and 0 < len(walls) < len(settings.events):
+        raise ValueError(TRACED)
 
     def run(count: int) -> Solution:
         if not walls:

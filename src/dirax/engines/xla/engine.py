@@ -34,7 +34,6 @@ class Xla(AbstractEngine):
     linear_solver: AbstractLinearSolver | None = None
     scalars: Literal["policy", "never"] = "policy"
     name = "xla"
-    compiles_start = True
 
     def __check_init__(self):
         if not isinstance(self.linear_solver, AbstractLinearSolver | None):
@@ -48,6 +47,10 @@ class Xla(AbstractEngine):
     def supports(self, problem: Problem) -> str | None:
         """Every problem."""
         return None
+
+    def compiles_start(self, traced: bool) -> bool:
+        """Where everything is; other starts are found on the host, for XLA would compile longer than they take."""
+        return traced or self.scalars == "never"
 
     def run(self, problem: Problem, progress: Progress | None = None) -> Outcome:
         """Run `problem`, saving into host arrays; Ctrl-C and failing steps keep what was computed."""
