@@ -11,6 +11,8 @@ from jaxtyping import Array, Float
 
 from dirax.numerics.ranks import numerical_rank
 from dirax.numerics.tolerances import SYMMETRY_DEFECT
+from dirax.program.evaluation.functions import in_numpy
+from dirax.program.memo import Same
 from dirax.program.user_functions import UserFunction
 from dirax.reduction.actions import AbstractAction
 from dirax.systems.constraints import Constraints
@@ -198,7 +200,9 @@ def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: An
             size = jnp.maximum(jnp.max(jnp.abs(value)), jnp.max(jnp.abs(slope)))
             return jnp.max(jnp.abs(jnp.reshape(rate, (-1, zero.shape[0]))), axis=0), size
 
-        defect, size = (np.asarray(a) for a in jax.jit(jax.vmap(at))(*map(jnp.asarray, (t, q, v))))
+        samples = [np.asarray(a, float) for a in (t, q, v)]
+        found = in_numpy(at, samples, Same(at), for_few=True)  # quicker than to compile it
+        defect, size = map(np.asarray, found or jax.jit(jax.vmap(at))(*samples))
         known = np.isfinite(defect) & np.isfinite(size)[:, None]
         # one-forms less their span are 0 where they are looked at: they have the unit 1, functions of small units their own
         unit = np.max(size, where=np.isfinite(size), initial=0.0)
