@@ -262,6 +262,24 @@ class Stated(dx.AbstractScheme):
         return self.equation
 
 
+def test_stiff_bars_set_out_from_rest():
+    """Rates that are nothing but roundoff of the stiff forces, by way of the momenta that these make, are at their root."""
+    angles = np.linspace(1.0, 0.3, 6)
+    hanging = np.cumsum(np.stack([np.sin(angles), -np.cos(angles)], axis=1), axis=0).ravel()
+
+    def bars(q, v):
+        points = q.reshape(6, 2)
+        along = jnp.concatenate([points[:1], points[1:] - points[:-1]])
+        stretch = jnp.sqrt(jnp.sum(along**2, axis=1)) - 1
+        return v @ v / 2 - 200.0**2 / 2 * stretch @ stretch - 9.81 * jnp.sum(points[:, 1])
+
+    run = {"q": hanging, "v": np.zeros(12), "step": 0.02, "steps": 2}
+    sol = dx.simulate(dx.LagrangeDirac(bars), dx.EnergyCollocation(4), engine="native", **run)
+    assert sol.ok and "simplified Newton" in sol.stats["iteration"] and sol.stats["newton_iterations"] < 130
+    energy = sol.energy()
+    assert np.max(np.abs(energy - energy[0])) < 1e-12
+
+
 def test_where_the_fixed_point_does_not_converge_newton_goes_on():
     stiff = dx.LagrangeDirac(
         lambda q, v: v @ v / 2 - 5000.0 * q[0] ** 2 / 2 - q[1] ** 4 / 4, lambda q: jnp.array([[0.0, q[0], 1.0]])

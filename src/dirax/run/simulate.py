@@ -52,8 +52,7 @@ def simulate(
     worst trajectory; the error of a whole run grows beyond. It is `sol.step`, and `sol.stats` has `tolerance_error` and
     `tolerance_trials`.
     `progress`: True for a bar, or a function of (steps done, steps in all). `project` moves initial data onto the
-    constraint; `check_initial=False` accepts data off it as they are. `max_iterations` bounds Newton's iterations a step; of
-    collocation in the eigenbasis of its matrix, whose sweeps cost a fraction of one, there may be four times as many.
+    constraint; `check_initial=False` accepts data off it as they are. `max_iterations` bounds Newton's iterations a step.
     `compensated` keeps what rounding takes from the state and gives it back at the next step (Kahan), so that conserved
     quantities do not drift over very long runs.
     `events`: a list of `dx.Event`, whose zeros are found inside the steps and stand in `sol.events`; a terminal one ends the

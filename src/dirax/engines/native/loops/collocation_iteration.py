@@ -11,10 +11,6 @@ FAR = 2.0**-20
 CLEAR, PATIENCE = 64 * EPSILON, 3.0
 """Above this relative change an iteration for all entries together may pause so many times before it is at its floor."""
 
-SWEEPS = 4
-"""Sweeps with one Jacobian for all nodes that are allowed for each of Newton's iterations: they cost a fraction of one, and from
-rest, where no step before says where to begin, stiff systems need up to 110."""
-
 
 class Iteration:
     """The iteration for the iterates in the rooms of `pair`, of which those of the step before stand in the rooms `before`, by a
@@ -73,8 +69,7 @@ class Iteration:
         b.store(one.real, one.add(b.load(one.real, self.sweeps), one.select(now, one.const(1.0), one.const(0.0))), self.sweeps)
         count = b.put(f"add i64 {b.load('i64', count_here)}, 1")
         b.store("i64", count, count_here)
-        cap = b.put(f"mul i64 %cap, {SWEEPS}") if sweep.together else "%cap"
-        allowed = b.put(f"icmp slt i64 {count}, {cap}")
+        allowed = b.put(f"icmp slt i64 {count}, %cap")
         still = b.put(f"select i1 {b.put(f'icmp eq i64 {count}, 1')}, {one.bool} {one.true}, {one.bool} {further}")
         still = one.both(now, still)
         still = b.put(f"select i1 {allowed}, {one.bool} {still}, {one.bool} {one.false}")
