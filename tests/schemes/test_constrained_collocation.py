@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dirax as dx
+from dirax import gallery
 
 
 def reference(lagrangian, rows, forces, q, v, t):
@@ -125,6 +126,25 @@ def test_orders_and_constraints(kind, stages):
     times = np.linspace(0.0, 1.0, 201)
     mean = np.trapezoid([multiplier(t) for t in times], times, axis=0)
     np.testing.assert_allclose(impulse, mean, rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "of_multipliers"),
+    [("cartesian-double-pendulum", OF_HOLONOMIC), pytest.param("rolling-disk", OF_ONE_FORMS, marks=pytest.mark.soak)],
+)
+def test_orders_on_the_gallery(name, of_multipliers):
+    example, end = gallery.get(name), 0.5
+    system, params = example.system.lagrangian_form(), example.params
+    lagrangian = lambda q, v: system.lagrangian.at(0.0, q, v, params)
+    rows = lambda q: system.constraints.matrix(0.0, q, params)
+    q, v = (np.asarray(example.initial[of]) for of in ("q", "v"))
+    *expected, _, multiplier = reference(lagrangian, rows, lambda t, q, v: jnp.zeros_like(q), q, v, end)
+    errors = []
+    for n in (20, 40):
+        sol = dx.simulate(system, dx.Collocation(3, "lobatto"), q=q, v=v, step=end / n, steps=n, params=params)
+        found = zip((sol.q[-1], sol.p[-1], sol.reactions[-1, -1]), (*expected, multiplier(end)), strict=True)
+        errors.append([np.max(np.abs(a - b)) for a, b in found])
+    assert np.all(np.abs(np.log2(np.divide(*errors)) - [4, 4, of_multipliers[3]]) < 0.3), errors
 
 
 def test_two_stages_are_rattle():

@@ -79,6 +79,42 @@ def test_order_in_positions_momenta_and_work(stages, steps, moving):
     assert np.all(np.abs(measured[:, -1] - 2 * stages) < 0.25), measured
 
 
+def frame(q):
+    """A basis of the kernel of one_forms(0, q), of columns that are neither orthogonal nor of length 1."""
+    w = one_forms(0.0, q)[0]
+    return jnp.array([[1.0 + q[0] ** 2, 0.5], [0.3, 2.0], [-(1.0 + q[0] ** 2) * w[0] - 0.3 * w[1], -0.5 * w[0] - 2.0 * w[1]]])
+
+
+@pytest.mark.parametrize(("stages", "steps"), [(2, (20, 40)), (3, (10, 14))])
+def test_order_energy_and_constraint_in_a_frame_of_ones_own(stages, steps):
+    system = dx.LagrangeDirac(lagrangian, lambda q: one_forms(0.0, q), forces=forces)
+    start = system.complete({name: jnp.array(a) for name, a in DATA.items()}, None, True)
+    expected, errors = reference(1.5, start["q"], start["v"], False), []
+    for n in steps:
+        scheme = dx.EnergyCollocation(stages, frame=frame)
+        sol = dx.simulate(system, scheme, step=1.5 / n, steps=n, project=True, **DATA)
+        assert sol.ok and sol.stats["engine"] == "native"
+        errors.append([np.max(np.abs(a - b)) for a, b in zip((sol.q[-1], sol.p[-1], sol.work[-1]), expected, strict=True)])
+    assert np.all(np.abs(orders(np.array(errors).T, 1.5 / np.array(steps)) - 2 * stages) < 0.3), errors
+    energy = sol.energy()
+    np.testing.assert_allclose(energy - energy[0], sol.work, atol=2e-15)
+    assert np.max(np.abs(sol.constraint_residual())) < 1e-15
+
+
+def test_frames_that_are_no_basis_of_the_distribution_are_refused():
+    system = dx.LagrangeDirac(lagrangian, lambda q: one_forms(0.0, q))
+    run = lambda frame: dx.simulate(system, dx.EnergyCollocation(frame=frame), step=0.1, steps=1, project=True, **DATA)
+    with pytest.raises(ValueError, match=r"shape \(3, 2\), a basis of the 2 directions that 1 one-forms leave free.*\(3, 3\)"):
+        run(lambda q: jnp.eye(3))
+    with pytest.raises(ValueError, match=r"independent, but at q = \[0.5 0.4 0.1\] their smallest singular value"):
+        run(lambda q: jnp.stack([frame(q)[:, 0], 2.0 * frame(q)[:, 0]], axis=1))
+    with pytest.raises(ValueError, match=r"kernel of the one-forms, but at q = .* one-form 0 takes column 1 to 0\.0"):
+        run(lambda q: frame(q) + 0.01 * jnp.array([[0.0, 0.0], [0.0, 0.0], [0.0, 1.0]]))
+    with pytest.raises(TypeError, match="the constraints are affine"):
+        moving = dx.LagrangeDirac(lagrangian, lambda q: one_forms(0.0, q), affine=lambda q: jnp.array([0.1]))
+        dx.simulate(moving, dx.EnergyCollocation(frame=frame), step=0.1, steps=1, project=True, **DATA)
+
+
 IRREVERSIBLE = {"contact-particle": contact_particle.CASES, "transmission": transmission.CASES}
 
 
@@ -224,6 +260,24 @@ class Stated(dx.AbstractScheme):
 
     def step_equation(self, system, shape):
         return self.equation
+
+
+def test_stiff_bars_set_out_from_rest():
+    """Rates that are nothing but roundoff of the stiff forces, by way of the momenta that these make, are at their root."""
+    angles = np.linspace(1.0, 0.3, 6)
+    hanging = np.cumsum(np.stack([np.sin(angles), -np.cos(angles)], axis=1), axis=0).ravel()
+
+    def bars(q, v):
+        points = q.reshape(6, 2)
+        along = jnp.concatenate([points[:1], points[1:] - points[:-1]])
+        stretch = jnp.sqrt(jnp.sum(along**2, axis=1)) - 1
+        return v @ v / 2 - 200.0**2 / 2 * stretch @ stretch - 9.81 * jnp.sum(points[:, 1])
+
+    run = {"q": hanging, "v": np.zeros(12), "step": 0.02, "steps": 2}
+    sol = dx.simulate(dx.LagrangeDirac(bars), dx.EnergyCollocation(4), engine="native", **run)
+    assert sol.ok and "simplified Newton" in sol.stats["iteration"] and sol.stats["newton_iterations"] < 130
+    energy = sol.energy()
+    assert np.max(np.abs(energy - energy[0])) < 1e-12
 
 
 def test_where_the_fixed_point_does_not_converge_newton_goes_on():

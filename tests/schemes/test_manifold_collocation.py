@@ -79,3 +79,53 @@ def test_what_is_not_taken_on_a_manifold_is_refused():
     driven = dx.ManifoldLagrangian(pendulum, dx.Sphere(3), forces=lambda t, q, v: -v)
     with pytest.raises(TypeError, match="forces are not taken there"):
         dx.simulate(driven, dx.Collocation(2), q=[1.0, 0.0, 0.0], v=[0.0, 1.0, 0.0], step=0.1, steps=1)
+
+
+MASS, INERTIA, HOOK = 1.3, np.array([1.0, 2.0, 3.0]), np.array([0.3, 0.1, 0.2])
+
+
+def hooked_body(q, v):
+    """A rigid body that hangs on a spring by a point of it, HOOK from its centre of mass, under gravity along −z."""
+    group = dx.SE3()
+    xi = group.to_algebra(q, v)
+    hook = q[4:] + group.matrix(q)[:3, :3] @ HOOK
+    return MASS * xi[:3] @ xi[:3] / 2 + xi[3:] @ (INERTIA * xi[3:]) / 2 - hook @ hook / 2 - hook[2]
+
+
+def newton_euler(t, y):
+    """The same in a quaternion, position, velocity in space and angular velocity of the body."""
+    (w, *xyz), x, velocity, omega = y[:4], y[4:7], y[7:10], y[10:]
+    xyz = np.array(xyz)
+    turn = lambda v: v + 2.0 * np.cross(xyz, np.cross(xyz, v) + w * v)
+    back = lambda v: v + 2.0 * np.cross(xyz, np.cross(xyz, v) - w * v)
+    force = -(x + turn(HOOK)) - np.array([0.0, 0.0, 1.0])
+    spin = (np.cross(INERTIA * omega, omega) + np.cross(HOOK, back(force))) / INERTIA
+    return np.concatenate([[-xyz @ omega / 2], (w * omega + np.cross(xyz, omega)) / 2, velocity, force / MASS, spin])
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("stages", [2, 3])
+def test_a_body_on_se3_whose_rotation_and_translation_are_coupled(stages):
+    group, system = dx.SE3(), dx.ManifoldLagrangian(hooked_body, dx.SE3())
+    q, velocity, omega = np.array([0.8, 0.6, 0.0, 0.0, 0.1, 0.2, 0.3]), np.array([0.1, 0.4, -0.2]), np.array([0.6, 0.5, -0.4])
+    back = np.asarray(group.matrix(jnp.asarray(q)))[:3, :3].T
+    v = np.asarray(group.left_translate(jnp.asarray(q), jnp.concatenate([back @ velocity, omega])))
+    exact = solve_ivp(newton_euler, (0.0, 2.0), [*q, *velocity, *omega], method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+    momentum = np.concatenate([MASS * exact[7:10], INERTIA * exact[10:]])
+    run = lambda n, **more: dx.simulate(system, dx.Collocation(stages), q=q, v=v, step=2.0 / n, steps=n, **more)
+    errors = []
+    for n in (8, 16):
+        sol = run(n)
+        assert sol.ok and (stages == 3 or sol.stats["engine"] == "native"), sol.stats
+        turned = np.array(group.body_momentum(sol.q[-1], sol.p[-1]))
+        turned[:3] = np.asarray(group.matrix(sol.q[-1]))[:3, :3] @ turned[:3]
+        errors.append([np.max(np.abs(sol.q[-1] - exact[:7])), np.max(np.abs(turned - momentum))])
+    assert np.all(np.abs(np.log2(np.divide(*errors)) - 2 * stages) < 0.4), errors
+    assert np.max(np.abs(np.linalg.norm(sol.q[:, :4], axis=1) - 1.0)) < 5e-16
+    if stages == 2:
+        arrays = run(8, engine="xla")
+        np.testing.assert_allclose(run(8).q, arrays.q, atol=1e-13)
+        long = dx.simulate(system, dx.Collocation(2), q=q, v=v, step=0.1, steps=20_000)
+        assert long.ok and np.max(np.abs(np.linalg.norm(long.q[:, :4], axis=1) - 1.0)) < 5e-16
+        (line,) = [line for line in dx.verify(long).lines if line.quantity == "energy"]
+        assert line.verdict == "bounded", line

@@ -145,7 +145,7 @@ class AbstractLieGroup(AbstractGeodesicManifold):
     def nearest(self, x):
         """The rotation divided by its length, the translation as it is."""
         rotation, translation = self._split(x)
-        return self._join(rotation / norm(rotation), lambda: translation)
+        return self._join(rotation / jnp.sqrt(jnp.dot(rotation, rotation)), lambda: translation)
 
     def projection(self, x, v):
         """v without the part of its rotation along the rotation of x."""

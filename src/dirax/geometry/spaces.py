@@ -157,7 +157,7 @@ class Sphere(AbstractGeodesicManifold):
 
     def nearest(self, x):
         """x/‖x‖."""
-        return x / norm(x)
+        return x / jnp.sqrt(jnp.dot(x, x))
 
     def projection(self, x, v):
         """v − ⟨x, v⟩x."""

@@ -85,6 +85,9 @@ POINT_DEFECT = 1e-8
 """Of points and vectors handed to a function that needs them on a manifold, or in its tangent space: more than roundoff
 leaves after a long run, less than any mistake."""
 
+FRAME_DEFECT = 1e-9
+"""The columns of a frame, and how far they are from a distribution that it is to span, both of length 1."""
+
 CONSTRAINT_DEFECT = 1e-9
 """Of constraints at initial data and at nodes, relative to the sizes of their terms."""
 

@@ -85,8 +85,11 @@ class EulerPoincare(AbstractSystem):
         return self.slopes(xi, a, params)[0]
 
     def inverse_legendre(self, momentum: Algebra, a: Advected, params: Any = None) -> Algebra:
-        """The ξ with ∂l/∂ξ = μ."""
-        return nearest_root(lambda xi: self.legendre(xi, a, params) - momentum, jnp.zeros_like(momentum))
+        """The ξ with ∂l/∂ξ = μ; of an l that is quadratic in ξ by linear equations."""
+        of_xi = lambda xi: self.value(xi, a, params)
+        if moves(jax.hessian(of_xi), momentum):
+            return nearest_root(lambda xi: self.legendre(xi, a, params) - momentum, jnp.zeros_like(momentum))
+        return constrained_velocity(of_xi, momentum, jnp.zeros((0, len(momentum))), jnp.zeros(0), momentum)[0]
 
     def constraint_forms(self, a: Advected, params: Any = None) -> Float[Array, "m d"]:
         """A; (0, d) without constraints."""
@@ -130,20 +133,12 @@ class EulerPoincare(AbstractSystem):
         if self.one_forms is not None:
             return None
 
-        def velocity(momentum, a, params):
-            of_xi = lambda xi: self.value(xi, a, params)
-            if moves(jax.hessian(of_xi), momentum):
-                return self.inverse_legendre(momentum, a, params)
-            return constrained_velocity(of_xi, momentum, jnp.zeros((0, len(momentum))), jnp.zeros(0), momentum)[0]
-
         def hamiltonian(x, params):
-            momentum, a = self.space.split(x)
-            xi = velocity(momentum, a, params)
-            return momentum @ xi - self.value(xi, a, params)
+            return self._energy(*self.space.split(x), params)
 
         def differential(x, params):
             momentum, a = self.space.split(x)
-            xi = velocity(momentum, a, params)
+            xi = self.inverse_legendre(momentum, a, params)
             return jnp.concatenate([xi, -self.slopes(xi, a, params)[1]])
 
         def residual(x, rate, multipliers, t, params, gradient):

@@ -15,9 +15,13 @@ from dirax.numerics.equilibration import balanced_condition, balanced_inverse
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
 from dirax.program.graph import GraphTooLarge
 from dirax.program.roots import FEWEST_SPARSE, sparse_equations
+from dirax.run.turning_step import follow
 from dirax.schemes.step import CLOCK
 
 SMALLER = "a smaller step may help"
+
+FOLLOWED = 64
+"""Unknowns of a step up to which its solutions are followed from short steps on, to see whether there are any."""
 
 brief: ContextVar[bool] = ContextVar("brief", default=False)
 """Whether the failed step is not computed again to see where it breaks: of a million trajectories many may fail."""
@@ -64,6 +68,7 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
             "the fixed-point iteration of the stages did not converge: the equations are stiff for this step. "
             f"{TOO_LARGE}: take a smaller step, another scheme, or engine='xla', which may compile it for minutes"
         )
+    alone = p.batch is None and len(p.equation.stages) == 1
     solved, known, sizes = [], {}, [a[lane if p.batch is not None else ...] for a in sizes_of(p)]
     for (stage, fraction), size in zip(p.equation.stages, sizes, strict=True):
         if id(stage) not in known:
@@ -72,13 +77,14 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
         guess = numbers.guess(state, last if len(last) == stage.unknowns else np.zeros(stage.unknowns), h)
         reason, u = _replay_newton(stage, numbers, guess, (state, t, h), params, size, p.max_iterations)
         if reason:
-            return reason
+            return reason + (_where_it_ends(numbers, guess, (state, t, h), size) if reason.endswith(SMALLER) and alone else "")
         solved.append((stage, numbers, guess, (state, t, h), size))
         state, t = numbers.advance(u, state, t, h), t + h
         if not np.all(np.isfinite(state)):
             return "the new state is not finite: it has left the domain of the system's functions, or overflowed"
     advice = next((found for place in solved if (found := _advice(*place)) != SMALLER), SMALLER)
-    return f"Newton did not converge from the values extrapolated from the steps before: {advice}"
+    ends = _where_it_ends(*solved[0][1:]) if alone and advice == SMALLER and solved else ""
+    return f"Newton did not converge from the values extrapolated from the steps before: {advice}{ends}"
 
 
 def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, sizes, max_iterations: int):
@@ -107,6 +113,19 @@ def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, sizes
     ), u
 
 
+def _where_it_ends(numbers: InNumbers | InJax, guess, args, sizes) -> str:
+    """Whether there is a solution, found from shorter steps on."""
+    state, t, h = args
+    if not 0 < len(guess) <= FOLLOWED or h <= 0.0:
+        return ""
+    found = follow(lambda u, step: numbers.linearized(u, state, t, step), guess, np.asarray(sizes), float(h))
+    if found is None:
+        return ""
+    if found.whole:
+        return " (there is a solution, to which those of shorter steps lead, but not Newton's method from these values)"
+    return f" (the solutions of shorter steps lead to h = {found.step:.3g} and turn back there: longer ones have none near)"
+
+
 def _dense(numbers: InNumbers | InJax, args) -> Callable:
     """u ↦ (residual, which rows of it or of its Jacobian are not finite, solution with the Jacobian, its condition number)."""
 
@@ -114,7 +133,7 @@ def _dense(numbers: InNumbers | InJax, args) -> Callable:
         residual, jacobian = numbers.linearized(u, *args)
         broken = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
         condition = np.inf if np.any(broken) else balanced_condition(jacobian)
-        return residual, broken, lambda right: np.linalg.solve(jacobian, right), condition
+        return residual, broken, lambda right: np.linalg.lstsq(jacobian, right)[0], condition
 
     return linearized
 

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.schemes.collocation_step import LagrangianCollocation, RelationCollocation
 from dirax.schemes.collocation_tables import MOST_STAGES, Tableau, gauss, lobatto
 from dirax.schemes.constrained_collocation_step import ConstrainedCollocation
@@ -33,8 +32,8 @@ class Collocation(AbstractScheme):
     step that of λ_s before; or both. Order 2s − 2 in q and p; the `reactions` λ at the nodes have less, as measured: s − 1 those
     of holonomic constraints, s or s − 1, whichever is even, those of one-forms.
 
-    On a manifold, for a `dx.ManifoldLagrangian` at Gauss nodes: the same in the chart at q_k that belongs to the manifold's
-    retraction; symplectic on T*Q, order 2s, every q on the manifold.
+    On a manifold in R^N, for a `dx.ManifoldLagrangian` at Gauss nodes: the same in the chart at q_k whose points are those of the
+    manifold that are nearest to q_k + F r, F a basis of the tangent space; symplectic on T*Q, order 2s, every q on the manifold.
 
     Takes systems without constraints at Gauss nodes: regular `dx.LagrangeDirac`, `dx.DiracSystem` with a Hamiltonian vector
     field, `dx.PortHamiltonian` without closed ports, `dx.LiePoisson`, and `dx.PhaseSpaceLagrangian` on its final manifold.
@@ -97,10 +96,7 @@ class Collocation(AbstractScheme):
             raise TypeError(
                 f'dx.Collocation on a manifold takes nodes="gauss" and L alone, and {what}: take dx.DiscreteDirac(map).'
             )
-        manifold = system.manifold
-        if not isinstance(manifold, AbstractGeodesicManifold):
-            raise TypeError(f"dx.Collocation needs a manifold with a retraction, and {manifold!r} has none.")
-        return ManifoldCollocation(tableau, system, manifold, shape.n).equation()
+        return ManifoldCollocation(tableau, system, shape.n).equation()
 
     def _constrained(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         lagrangian = system.lagrangian_form()

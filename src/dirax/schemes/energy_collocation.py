@@ -1,12 +1,16 @@
 """Energy-preserving collocation: steps of high order that keep the energy of any system with a bracket."""
 
+from collections.abc import Callable
 from typing import Any
 
+from dirax.program.user_functions import UserFunction
 from dirax.schemes.collocation_tables import MOST_STAGES, gauss, quadrature
+from dirax.schemes.framed_energy_collocation_step import FramedEnergyCollocation
 from dirax.schemes.hamiltonian_energy_collocation_step import HamiltonianEnergyCollocation
 from dirax.schemes.lagrangian_energy_collocation_step import LagrangianEnergyCollocation
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.systems.forms import RelationForm
+from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
 
 POINTS = (8, 16)
@@ -29,19 +33,25 @@ class EnergyCollocation(AbstractScheme):
     - `dx.PortHamiltonian` without closed ports: H(x_{k+1}) − H(x_k) is the energy supplied less the energy dissipated,
       which are saved as `work`.
 
+    `frame(q[, params])` (n, n − m) may give a basis of the distribution of a Lagrangian with one-forms, as columns: then the
+    polynomial is one of q and of the momenta π = frameᵀp, and the bracket that of the frame. Another frame gives other
+    trajectories, of the same order and with the same energy. Without it p itself is taken and projected.
+
     `points` is the number of points of the quadrature, by default 8 and from five stages on 16. Saved is `energy_defect`, the
     largest change of the energy in a step so far that is not work, relative to the terms of the energy.
 
     It is neither symplectic nor a (±)-discrete Dirac structure, and keeps no other invariant.
-    Raises `ValueError` for stages that are not 1 to 16 and fewer points than stages, and `TypeError` for other systems.
+    Raises `ValueError` for stages that are not 1 to 16, fewer points than stages, and where a run begins at which the columns of
+    the frame are no basis of the distribution, and `TypeError` for other systems.
 
         sol = dx.simulate(system, dx.EnergyCollocation(stages=3), q=…, v=…, step=0.05, steps=1000)
     """
 
     stages: int
     points: int
+    frame: UserFunction | None
 
-    def __init__(self, stages: int = 2, points: int | None = None):
+    def __init__(self, stages: int = 2, points: int | None = None, *, frame: Callable | None = None):
         if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MOST_STAGES:
             raise ValueError(f"stages must be a whole number from 1 to {MOST_STAGES}, but {stages!r} was given.")
         points = POINTS[stages > 4] if points is None else points
@@ -49,7 +59,12 @@ class EnergyCollocation(AbstractScheme):
             raise ValueError(
                 f"points must be a whole number from the number of stages, {stages}, to {MOST_STAGES}, but {points!r} was given."
             )
+        if frame is not None and not callable(frame):
+            raise TypeError(
+                f"frame must be a function (q) -> (n, n − m) of a basis of the distribution, but {frame!r} was given."
+            )
         self.stages, self.points = stages, points
+        self.frame = None if frame is None else UserFunction(frame, "frame", ("q",))
 
     @property
     def order(self) -> int:
@@ -73,6 +88,8 @@ class EnergyCollocation(AbstractScheme):
                 'one-forms, remove them by coordinates, or take dx.DiscreteDirac(constraints="resolve").'
             )
         tables = gauss(self.stages), quadrature(self.stages, self.points)
+        if self.frame is not None:
+            return FramedEnergyCollocation(*tables, self._in_a_frame(system), shape, self.frame).equation()
         energy = system.energy_form(shape)
         relation = system.relation_form(shape) or system.final_relation(shape)
         relation = RelationForm(energy.residual) if relation is None and energy is not None else relation
@@ -84,4 +101,21 @@ class EnergyCollocation(AbstractScheme):
         raise TypeError(
             "dx.EnergyCollocation steps Lagrangians in coordinates, and Hamiltonians whose bracket determines ẋ, but a "
             f"{type(system).__name__} was given."
+        )
+
+    @staticmethod
+    def _in_a_frame(system: AbstractSystem) -> LagrangeDirac:
+        """The Lagrangian whose distribution a frame may span."""
+        lagrangian = system.lagrangian_form()
+        if lagrangian is None:
+            what = f"a {type(system).__name__} was given"
+        elif lagrangian.affine is not None:
+            what = "the constraints are affine"
+        elif lagrangian.depends_on_time:
+            what = "the system takes the time"
+        else:
+            return lagrangian
+        raise TypeError(
+            f"dx.EnergyCollocation takes frame= for Lagrangians with linear one-forms that do not take the time, but {what}: "
+            "leave it out."
         )

@@ -21,6 +21,13 @@ NOTICED = 1e-11
 """Changes of the energy in a step, relative to its terms, from which on they are more than roundoff of the rows, whose angles may
 have run to 10⁶."""
 
+GIVEN_BACK = 1e-9
+"""Changes of the energy in a step, relative to its terms, up to which they are given back in the momenta, so that they do not
+add up over many steps: roundoff, and what is left near a place where the equations are nearly singular."""
+
+STEEP = 1e-3
+"""Of the terms of the energy, ⟨p, v⟩ below which little is given back."""
+
 
 @dataclass(frozen=True, eq=False)
 class EnergyCollocationStep(AbstractStep):
@@ -121,3 +128,10 @@ class EnergyCollocationStep(AbstractStep):
         extra, functions = self.state.size - self.moving, (self.slopes, self.rates, self.settle)
         relation = MeanRelation(self.moving, extra, *functions, self.tableau, self.quadrature)
         return replace(super().equation(), collocation=relation)
+
+
+def given_back(left: Any, power: Any, size: Any) -> tuple[Any, Any]:
+    """What of the energy `left` out in a step is given back, and by which part of themselves the momenta p change for it, with
+    `power` ⟨p, v⟩ and the `size` of the terms of the energy."""
+    kept = jnp.where(jnp.abs(left) <= GIVEN_BACK * size, left, 0.0)
+    return kept, kept * power / (power * power + (STEEP * size) ** 2)

@@ -8,7 +8,7 @@ import numpy as np
 from dirax.program.legendre import constrained_velocity
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import along, gradient, once
-from dirax.schemes.energy_collocation_step import EnergyCollocationStep
+from dirax.schemes.energy_collocation_step import EnergyCollocationStep, given_back
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -16,13 +16,6 @@ from dirax.systems.shape import Shape
 
 NEARLY_DEPENDENT = 1e-2
 """The smallest singular value of one-forms of length 1 from which on they are called dependent where a step has failed."""
-
-GIVEN_BACK = 1e-9
-"""Changes of the energy in a step, relative to its terms, up to which they are given back in the momenta, so that they do not
-add up over many steps: roundoff, and what is left near a place where the equations are nearly singular."""
-
-STEEP = 1e-3
-"""Of the terms of the energy, ⟨p, v⟩ below which little is given back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +131,8 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         work = (now.work - self.state.split(before).work)[0] - given if self.working else jnp.zeros(())
         changes = {"work": -given[None]} if self.working else {}
         book = self.settled(before, after, energy, work, size)
-        left = self.state.split(before).energy + work - energy
-        kept = jnp.abs(left) <= GIVEN_BACK * size
-        power = (now.p + moved) @ v
-        scale = jnp.where(kept, left, 0.0) * power / (power * power + (STEEP * size) ** 2)
-        book["energy"] = book["energy"] + jnp.where(kept, left, 0.0)
+        kept, scale = given_back(self.state.split(before).energy + work - energy, (now.p + moved) @ v, size)
+        book["energy"] = book["energy"] + kept
         return self.state.join(p=moved + scale * (now.p + moved), **changes, **book)
 
     def remark(self, state, t, h, params):
