@@ -85,8 +85,9 @@ def _turn(frames: Callable, body: str) -> Reading:
 
 def _from_z(axis: np.ndarray) -> np.ndarray:
     """A rotation that takes z to the axis."""
-    if axis[2] < -1.0 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
     x, y, z = axis
+    across = x * x + y * y
+    if across == 0.0:
+        return np.diag([1.0, z, z])
     turning = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
-    return np.eye(3) + turning + turning @ turning / (1.0 + z)
+    return np.eye(3) + turning + turning @ turning * ((1.0 - z) / across)
