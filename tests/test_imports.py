@@ -30,6 +30,7 @@ ROOMS = (
     "public",
     "__init__",
     "cli",
+    "__main__",
 )
 RANK = {room: rank for rank, room in enumerate(ROOMS)}
 LOADED_ON_DEMAND = ("matplotlib", "xarray", "zarr", "h5netcdf", "h5py", "pandas", "typer", "rich", "distributed")

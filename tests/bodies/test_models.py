@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import dirax as dx
+from dirax.bodies.drawing import _from_z
 
 b = dx.bodies
 ROD = {"mass": 2.0, "inertia": (0.3, 0.2, 0.1)}
@@ -301,3 +302,12 @@ def test_a_machine_with_parameters_is_drawn():
         turn = jax.eval_shape(lambda q, params=params: parts["disk"].places["turn"](q, params), np.zeros(5))
         assert turn.shape == (3, 3)
     assert np.asarray(parts["spring"].places["end"](np.zeros(5), None)) == pytest.approx([0.0, 0.0, 0.5])
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0, 0, -1), (0, 1, 0), (1, 2, -3), (-1e-5, 0, -1), (1e-200, 0, 1)])
+def test_wheels_are_drawn_across_their_axes(axis):
+    axis = np.array(axis) / np.linalg.norm(axis)
+    turn = _from_z(axis)
+    np.testing.assert_allclose(turn @ [0.0, 0.0, 1.0], axis, atol=1e-9)
+    np.testing.assert_allclose(turn.T @ turn, np.eye(3), atol=1e-9)
+    assert np.linalg.det(turn) == pytest.approx(1.0)

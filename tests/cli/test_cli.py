@@ -255,6 +255,11 @@ def test_list_and_help_do_not_import_jax():
         assert (status, err.split()) == (0, ["False", "False"]) and "reproduce" in out
 
 
+def test_the_package_is_the_program():
+    run = lambda *command: subprocess.run([sys.executable, *command, "list"], capture_output=True, text=True, timeout=120)
+    assert run("-m", "dirax").stdout == run("-c", "from dirax.cli import main; main()").stdout == call("list").stdout
+
+
 def test_the_listing_says_what_the_examples_say():
     examples = [gallery.get(name) for name in gallery.names()]
     assert listing() == [(e.name, e.title, e.source) for e in examples]

@@ -15,6 +15,7 @@ from dirax.program.evaluation import in_numpy as module
 from dirax.program.evaluation.functions import in_numpy, program_of
 from dirax.program.linear_solves import pseudo_inverses, scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
+from dirax.program.rules import by_numpy
 from dirax.schemes.step import Shape, make_step_equation
 
 symmetric = lambda a: a + a.T
@@ -22,6 +23,7 @@ CASES = {
     "singular values": lambda a, x: (scaled_pseudo_inverse(a @ a.T) @ x, jnp.linalg.svd(a, compute_uv=False)),
     "eigenvalues": lambda a, x: jnp.linalg.eigh(symmetric(a))[0] + jnp.linalg.pinv(symmetric(a)) @ x,
     "a root": lambda a, x: nearest_root(lambda u: jnp.sinh(u) + 0.1 * jnp.sin(a @ u) - x, jnp.zeros(3)),
+    "a root of linear equations": lambda a, x: nearest_root(lambda u: (a @ a.T + jnp.eye(3)) @ u - x, x),
     "a root by halved steps": lambda a, x: nearest_root(lambda u: jnp.arctan(9.0 * (u - x)) + a[0, 0] ** 2 * (u - x), x + 2.0),
     "the best point where there is no root": lambda a, x: nearest_root(lambda u: u * u + x[:1] * a[0, :1], jnp.ones(1)),
     "linear equations": lambda a, x: (
@@ -52,6 +54,15 @@ def test_entries_of_a_batch_are_what_jax_computes(name, monkeypatch):
     found, expected = in_numpy(CASES[name], [a, x], name), jax.jit(jax.vmap(CASES[name]))(a, x)
     for mine, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "inversions"), [("a root of linear equations", 1), ("a root", None)])
+def test_a_derivative_that_is_the_same_everywhere_is_inverted_once(name, inversions, monkeypatch):
+    found, inverted = [], by_numpy._inverted
+    monkeypatch.setattr(by_numpy, "_inverted", lambda matrices: found.append(matrices) or inverted(matrices))
+    rng = np.random.default_rng(5)
+    in_numpy(CASES[name], [rng.normal(size=(7, 3, 3)), rng.normal(size=(7, 3))], name)
+    assert len(found) == inversions if inversions else len(found) > 2
 
 
 @pytest.mark.parametrize("name", ["a root", "linear equations", "a derivative through a root"])

@@ -43,6 +43,20 @@ def test_momentum_map(spring):
     np.testing.assert_allclose(by_hand, by_hand[:, :1] * np.ones((1, 13)), atol=1e-14)
 
 
+@pytest.mark.parametrize("most", [0, 1000])
+def test_momenta_and_energies_with_and_without_a_compilation(most, spring, monkeypatch):
+    """Of short trajectories they are ready at once, of long ones XLA compiles them: the same numbers."""
+    compiled = []
+    monkeypatch.setattr(trajectory, "BY_NUMPY", most)
+    along = trajectory._along
+    monkeypatch.setattr(trajectory, "_along", lambda *given: compiled.append(given) or along(*given))
+    rotation = lambda q: jnp.array([-q[1], q[0]])
+    by_hand = spring.q[..., 0] * spring.p[..., 1] - spring.q[..., 1] * spring.p[..., 0]
+    np.testing.assert_allclose(spring.momentum_map(rotation), by_hand, atol=1e-15)
+    np.testing.assert_allclose(spring.energy(), spring_energy(spring), rtol=1e-14)
+    assert bool(compiled) == (most == 0)
+
+
 @pytest.mark.parametrize("rows", [1, 2, 5, 13, 26, 1000])
 def test_rows_in_blocks(rows, spring, monkeypatch):
     """Long trajectories are worked through in blocks; the last one may be shorter."""

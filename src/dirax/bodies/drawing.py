@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.bodies.contacts import Ellipsoid, Round
 from dirax.bodies.forces import Spring
-from dirax.bodies.frames import scalar, turn_matrix, unit, vector
+from dirax.bodies.frames import scalar, unit, vector
 from dirax.show.scene import Part, Reading, Scene, ball, disk, plane, point, rod, spring
 
 POINT, ROD = 0.05, 0.02
@@ -85,8 +85,9 @@ def _turn(frames: Callable, body: str) -> Reading:
 
 def _from_z(axis: np.ndarray) -> np.ndarray:
     """A rotation that takes z to the axis."""
-    z = np.array([0.0, 0.0, 1.0])
-    across = np.cross(z, axis)
-    if np.linalg.norm(across) < 1e-12:
-        return np.eye(3) if axis[2] > 0 else np.diag([1.0, -1.0, -1.0])
-    return np.asarray(turn_matrix(unit(across), jnp.arccos(axis[2])))
+    x, y, z = axis
+    across = x * x + y * y
+    if across == 0.0:
+        return np.diag([1.0, z, z])
+    turning = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
+    return np.eye(3) + turning + turning @ turning * ((1.0 - z) / across)

@@ -81,8 +81,8 @@ class MachineConstraints:
         model, rng = self.model, np.random.default_rng(0)
         points = [rng.uniform(-0.9, 0.9, len(model.coordinates)) for _ in range(3)]
         sizes = np.zeros(len(self.all_holonomic)), np.zeros(len(self.all_rows))
+        values = self.defects, lambda q, p: jnp.sum(jnp.abs(self.one_forms(q, p)), axis=1)
         for q in points:
-            values = [self.defects, lambda q, p: jnp.sum(jnp.abs(self.one_forms(q, p)), axis=1)]
             for size, value in zip(sizes, values, strict=True):
                 if size.size:
                     found = np.abs(np.asarray(evaluated(value, q, model.params)))

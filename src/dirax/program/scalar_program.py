@@ -80,6 +80,11 @@ class ScalarProgram:
         first = len(self.graph)
         return np.array([self.graph.input(f"x{first + i}") for i in range(math.prod(shape))], np.int64).reshape(shape)
 
+    def depends_on(self, inputs: Nodes) -> bool:
+        """Whether a result needs one of these inputs by operations of the graph."""
+        needed = self.graph.reachable([node for nodes in self.results for node in nodes.ravel().tolist()])
+        return not set(inputs.ravel().tolist()).isdisjoint(needed)
+
     def between(self, operands: list[Nodes], shapes: list[tuple[int, ...]], function: Callable) -> list[Nodes]:
         """The nodes of the results of an opaque computation."""
         self.opaque.append(Opaque(operands, [self.fresh(shape) for shape in shapes], function))

@@ -1,7 +1,8 @@
 """Trajectory: the numbers of a run or of a batch of runs, and the quantities that its system derives from them."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -40,6 +41,16 @@ class SavedRow(dict):
     def __missing__(self, name: str):
         held = ", ".join(key for key in self if key != "t")
         raise ValueError(f"needs {name}, but the rows hold {held} alone (a scheme saves what its `fields` name)")
+
+
+@dataclass(frozen=True)
+class Momentum:
+    """⟨p, ξ_Q(q)⟩ of a row, for the infinitesimal generator ξ_Q; the same for the same generator."""
+
+    generator: Same
+
+    def __call__(self, row: Mapping[str, Any], params: Any) -> Any:
+        return jnp.vdot(row["p"], self.generator.object(row["q"]))
 
 
 class Trajectory:
@@ -169,7 +180,9 @@ class Trajectory:
 
     def momentum_map(self, generator: Callable):
         """⟨p, ξ_Q(q)⟩ along the trajectory, (…, rows), for the infinitesimal generator `generator(q) -> (n,)`."""
-        return self.map_rows(lambda row, params: jnp.vdot(row["p"], generator(row["q"])))
+        momentum = Momentum(Same(generator))
+        values = self._without_compiling(momentum, momentum)
+        return self.map_rows(momentum) if values is None else values
 
     def map_rows(self, function: Callable):
         """`function(row, params)` for every saved row, stacked; `row` is the dict of node fields of one trajectory and of
@@ -207,14 +220,15 @@ class Trajectory:
                     f"this solution was loaded without its system, and its file holds no {name}: "
                     "use dx.load(path, system=system)."
                 )
-            values = self._without_compiling(method)
-            values = self.map_rows(getattr(self.system, method)) if values is None else values
+            function = getattr(self.system, method)
+            values = self._without_compiling(function, (Same(self.system), method))
+            values = self.map_rows(function) if values is None else values
             self.derived[name] = values if is_traced(values) else np.asarray(values)
         return self.derived[name]
 
-    def _without_compiling(self, method: str) -> np.ndarray | None:
-        """A quantity of the system at every row by its scalar program, which is ready sooner than XLA's; None for long
-        trajectories, where XLA is faster, and where there is no such program."""
+    def _without_compiling(self, function: Callable, key: Hashable) -> np.ndarray | None:
+        """The array that `function(row, params)` is at every row by its scalar program, which is ready sooner than XLA's; None
+        for long trajectories, where XLA is faster, and where there is no such program. Functions with equal keys are equal."""
         nodes = {k: a for k, a in self.fields.items() if self.field_info[k].place == "node"}
         leaves, structure = jax.tree.flatten(self._params)
         count = self.batch or 1
@@ -227,11 +241,10 @@ class Trajectory:
         repeated = lambda leaf: np.repeat(leaf, self.rows, axis=0)
         constant = lambda leaf: np.broadcast_to(leaf, (self.rows * count, *np.shape(leaf)))
         along = [(repeated if self.batch_params else constant)(np.asarray(leaf)) for leaf in leaves]
-        function = getattr(self.system, method)
         program = lambda *values: function(
             SavedRow(zip(rows, values, strict=False)), jax.tree.unflatten(structure, values[len(rows) :])
         )
-        values = in_numpy(program, [*rows.values(), *along], (Same(self.system), method, tuple(rows), structure))
+        values = in_numpy(program, [*rows.values(), *along], (key, tuple(rows), structure))
         return None if values is None else values.reshape(*lead, *values.shape[1:])
 
     # ------------------------------------------------------------------ how it shows itself

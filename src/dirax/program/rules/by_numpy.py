@@ -178,37 +178,43 @@ def _of_finite(function: Callable, matrices: np.ndarray) -> list[np.ndarray]:
     return [np.where(spread(a), a, np.nan) for a in function(np.where(spread(matrices), matrices, 0.0))]
 
 
-_equations: Memo[tuple[Callable, Callable]] = Memo(128)
+_equations: Memo[tuple[Callable, Callable, bool]] = Memo(128)
 
 
-def _with_slope(residual: ClosedJaxpr) -> tuple[Callable, Callable]:
-    """A residual and its derivative by the last argument, for arguments with an axis of entries."""
+def _with_slope(residual: ClosedJaxpr) -> tuple[Callable, Callable, bool]:
+    """A residual and its derivative by the last argument, for arguments with an axis of entries; whether that is surely the same
+    whatever the last argument is."""
     slope = jax.make_jaxpr(jacobian(of_one_result(residual), len(residual.in_avals) - 1))(*residual.in_avals)
-    value, linear = (ScalarProgram.of(jaxpr, by_numpy=True).in_numpy for jaxpr in (residual, slope))
-    return value, linear
+    value, linear = (ScalarProgram.of(jaxpr, by_numpy=True) for jaxpr in (residual, slope))
+    fixed = not linear.opaque and linear.inputs[-1].size > 0 and not linear.depends_on(linear.inputs[-1])
+    return value.in_numpy, linear.in_numpy, fixed
 
 
 @numpy_rule("dirax_root")
 def root(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
     """The method of `dirax.program.roots`, for all entries side by side."""
     closed: ClosedJaxpr = equation.params["residual"]
-    residual, linear = _equations.get(Same(closed), lambda: _with_slope(closed))
+    residual, linear, fixed = _equations.get(Same(closed), lambda: _with_slope(closed))
     most = equation.params["max_steps"]
 
     def find(arrays: list[np.ndarray]) -> list[np.ndarray]:
         *captured, found = arrays
         found, going = found.copy(), np.arange(len(found))
+        of_all, among = [], going
         for _ in range(most):
             if not len(going):
                 break
             known = [a[going] for a in captured]
-            slope, value = linear([*known, found[going]])[0], residual([*known, found[going]])[0]
-            inverse, units = _inverted(slope)
+            if not fixed or not of_all:
+                of_all = [slope := linear([*known, found[going]])[0], *_inverted(slope)]
+                among = np.arange(len(going))
+            slope, inverse, units = (a[among] for a in of_all)
+            value = residual([*known, found[going]])[0]
             sizes = sizes_of_unknowns(slope, inverse, found[going], value)
             changed = lambda value, inverse=inverse: (inverse @ value[..., None])[..., 0]
             update = lambda u, known=known, changed=changed: changed(residual([*known, u])[0])
             found[going], more = damped_step(changed(value), update, found[going], units, sizes)
-            going = going[more]
+            going, among = going[more], among[more]
         return [found]
 
     return made.between(list(operands), [equation.outvars[0].aval.shape], find)

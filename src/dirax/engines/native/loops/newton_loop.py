@@ -3,14 +3,17 @@
 A Jacobian serves several updates while they contract quickly: a first kind of update computes residual, Jacobian and
 factors together, a second kind the residual alone. Where a pivot was too small the correction comes from partial
 pivoting, and the factors are not used again. Where a block of unknowns has several parts, an update changes one after the
-other, each by its equations with the new values of those before it (Gauss, Seidel). Of linear equations whose pivots need no
-watching, an update of each kind is a round without a question in between.
+other, each by its equations with the new values of those before it (Gauss, Seidel). The next one begins with the residual of the
+first part where this one ends: it is found together with that of the last part, with which it has all in common that does
+not depend on the unknowns of the last. Of linear equations whose pivots need no watching, an update of each kind is a round
+without a question in between.
 """
 
 from collections.abc import Sequence
 
 from dirax.engines.native.ir.emitter import Body, Emitter
 from dirax.engines.native.ir.lower import Region
+from dirax.engines.native.loops.plan import frontier
 from dirax.engines.newton_step import Correction
 from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, OWN, STALLED
 
@@ -40,6 +43,8 @@ class NewtonLoop:
         b.store(e.bool, e.false, self._floor, 1)
         b.store(e.real, e.const(float("inf")), self._update)
         b.store(e.real, e.const(0.0), self._number)
+        self._begun = [b.alloca(e.real) for _ in self.parts[0].residual] if len(self.parts) > 1 else []
+        self._needs_last = self._need_unknowns_of(self.parts[-1]) if self._begun else {}
         with self._while(self._going) as now:
             factors = self._first_kind(now)
             if self._direct:
@@ -57,6 +62,13 @@ class NewtonLoop:
         """The unknowns and their present values."""
         return [(node, self.body.load(self.e.real, pointer)) for node, pointer in self.unknowns.items()]
 
+    def _need_unknowns_of(self, last: Correction) -> dict[int, int]:
+        """Which nodes of the last part and of the residual of the first need unknowns of the last: 1 for these, 0 for others."""
+        g, own, needs = self.around.graph, set(last.unknowns), {}
+        for node in g.reachable([*last.outputs, *last.residual, *self.parts[0].residual]):
+            needs[node] = int(node in own or any(needs[a] for a in g.args[node]))
+        return needs
+
     def _region(self, known: dict[int, str], around: Region) -> Region:
         """A region that knows the unknowns."""
         region = Region(self.e, self.around.graph, around)
@@ -64,12 +76,31 @@ class NewtonLoop:
             region.bind(node, value)
         return region
 
+    def _region_of(self, one: Correction, known: dict[int, str], wanted: list[int]) -> tuple[Region, Region]:
+        """A region for the `wanted` nodes of a part, and the one around it, which of the last part has all that it and the
+        residual of the first have in common."""
+        if not self._begun or one is not self.parts[-1]:
+            return self._region(known, self.around), self.around
+        shared = self._region({node: value for node, value in known.items() if node not in one.unknowns}, self.around)
+        shared.require(frontier(self.around.graph, self._needs_last, [*wanted, *self.parts[0].residual], 0))
+        return self._region({node: known[node] for node in one.unknowns}, shared), shared
+
+    def _begin_next(self, shared: Region, new: dict[int, str]) -> None:
+        """The residual of the first part, with which the next update begins."""
+        if not self._begun:
+            return
+        residual, last = self.parts[0].residual, self.parts[-1].unknowns
+        inner = self._region({node: new[node] for node in last}, shared)
+        inner.require(residual)
+        for node, pointer in zip(residual, self._begun, strict=True):
+            self.body.store(self.e.real, inner.value(node), pointer)
+
     def _first_kind(self, now: str) -> list[Region]:
         """An update with new Jacobians; the regions that know their factors."""
         old, g = dict(self.values()), self.around.graph
-        new, changes, inside, stable = dict(old), {}, [], self.e.true
+        new, changes, inside, stable, shared = dict(old), {}, [], self.e.true, self.around
         for one in self.parts:
-            inner = self._region(new, self.around)
+            inner, shared = self._region_of(one, new, one.outputs)
             inner.require(one.outputs)
             change, good = [inner.value(n) for n in one.change], inner.value(one.stable)
             if one.stable != g.true:
@@ -77,6 +108,7 @@ class NewtonLoop:
             stable = self.e.both(stable, good)
             self._changed(one, change, new, changes)
             inside.append(inner)
+        self._begin_next(shared, new)
         if self._direct:
             self._take(old, new, now)
         else:
@@ -86,13 +118,19 @@ class NewtonLoop:
     def _second_kind(self, factors: list[Region], now: str) -> None:
         """An update with the Jacobians of an earlier one."""
         old = dict(self.values())
-        new, changes = dict(old), {}
+        new, changes, shared = dict(old), {}, self.around
+        begun = [self.body.load(self.e.real, pointer) for pointer in self._begun]
         for one, known in zip(self.parts, factors, strict=True):
-            here = self._region(new, self.around)
-            here.require(one.residual)
-            inner = self._region({n: here.value(r) for n, r in zip(one.right, one.residual, strict=True)}, known)
+            if begun and one is self.parts[0]:
+                residual = begun
+            else:
+                here, shared = self._region_of(one, new, one.residual)
+                here.require(one.residual)
+                residual = [here.value(node) for node in one.residual]
+            inner = self._region(dict(zip(one.right, residual, strict=True)), known)
             inner.require(one.again)
             self._changed(one, [inner.value(n) for n in one.again], new, changes)
+        self._begin_next(shared, new)
         if self._direct:
             self._take(old, new, now)
             self._end_round(new, changes, now)
