@@ -42,6 +42,8 @@ FUNCTIONS = {
     "drawn": (lambda q: q[DRAWN] * q[DRAWN[::-1]] + jnp.roll(q, 2)[DRAWN], Q),
     "lattice": (jax.grad(lattice), P[: 7 * 9]),
     "beside nothing": (lambda q: jnp.concatenate([jnp.sin(q)[:42].reshape(6, 7), jnp.zeros((6, 0))], axis=1), Q),
+    "totals": (lambda p: jnp.einsum("ij,ij->i", p[:70].reshape(1, 70), jnp.sin(p[10:80]).reshape(1, 70)) * p[:5], P),
+    "totals of rows": (lambda p: jnp.sum(jnp.outer(jnp.arange(1.0, 4.0), p) ** 2, axis=1), P),
     "few": (lambda q: jnp.sum(jnp.sin(q[:8, None] - q[None, :8]), axis=1), Q),
 }
 

@@ -1,7 +1,7 @@
 """A jaxpr run on pieces: every array becomes a few expressions."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -238,9 +238,10 @@ class _Walk:
         rows, columns = factors_of_product(equation, *(np.arange(math.prod(shape)).reshape(shape) for shape in shapes))
         terms, out = rows.shape[-1], (*rows.shape[:2], columns.shape[1])
         pieces = [self.pieces(x, shape) for x, shape in zip((a, b), shapes, strict=True)]
-        if terms > SHORT and math.prod(out) == 1:
-            both = [self._taken(x, math.prod(s), n.ravel(), s) for x, s, n in zip(pieces, shapes, (rows, columns), strict=True)]
-            return self._total(self._with("mul", *both))
+        if terms > SHORT and math.prod(out) <= SHORT:
+            taken = lambda k, numbers: self._taken(pieces[k], math.prod(shapes[k]), numbers, shapes[k])
+            places = ((rows[b, i], columns[b, j]) for b, i, j in np.ndindex(*out))
+            return self._totals(self._with("mul", taken(0, own), taken(1, other)) for own, other in places)
         if terms > SHORT:
             raise NotBySites("'dot_general' has sums of many terms")
         total: list[Piece] | None = None
@@ -260,8 +261,8 @@ class _Walk:
         kept, op = [a for a in range(len(shape)) if a not in axes], FOLDS[equation.primitive.name]
         pieces, out = self.pieces(value, shape), tuple(shape[a] for a in kept)
         numbers = np.arange(math.prod(shape)).reshape(shape).transpose(*kept, *axes).reshape(math.prod(out), -1)
-        if numbers.shape[1] > SHORT and len(numbers) == 1 and op == "add":
-            return self._total(pieces)
+        if numbers.shape[1] > SHORT >= len(numbers) and op == "add":
+            return self._totals(self._taken(pieces, math.prod(shape), row, shape) for row in numbers)
         if not 0 < numbers.shape[1] <= SHORT:
             raise NotBySites(f"'{equation.primitive.name}' has {numbers.shape[1]} terms")
         columns = [self._taken(pieces, math.prod(shape), column.reshape(out), shape) for column in numbers.T]
@@ -270,9 +271,13 @@ class _Walk:
             total = self._with(op, total, column)
         return total
 
-    def _total(self, pieces: list[Piece]) -> list[Piece]:
-        self.totals.append(pieces)
-        return [Piece(Course(0, 1), 1, self.expressions.input(Place(-1, Course(len(self.totals) - 1, 0))))]
+    def _totals(self, arrays: Iterable[list[Piece]]) -> list[Piece]:
+        """The sum of each of these arrays in pieces, an array."""
+        found = []
+        for i, pieces in enumerate(arrays):
+            self.totals.append(pieces)
+            found.append(Piece(Course(i, 1), 1, self.expressions.input(Place(-1, Course(len(self.totals) - 1, 0)))))
+        return found
 
 
 def _periods(shape: tuple[int, ...]) -> list[int]:
