@@ -5,6 +5,7 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse as sp
 
 import dirax as dx
 from dirax.gallery import hanging_chain, lc_ladder, oscillator_chain, sine_gordon, wave_line, wave_sheet
@@ -167,3 +168,36 @@ def test_a_lattice_swings_in_its_modes():
     sol = dx.simulate(dx.LagrangeDirac(lagrangian), dx.LagrangeDAlembert(), q=q, v=0 * q, step=h, steps=steps)
     phase = 2 * np.arctan(np.hypot(*np.sin(angles / 2)) * h) * np.arange(steps + 1)
     np.testing.assert_allclose(sol.q, np.cos(phase)[:, None] * q, rtol=0, atol=1e-12)
+
+
+def test_modes_of_a_sheet_turn_by_the_angle_of_the_gauss_method():
+    """Of linear equations energy-preserving collocation is Gauss's, whose steps of a mode are R(iωh), of modulus 1."""
+    rows, h, steps = 12, 0.4, 30
+    x, frequency = wave_sheet.mode(rows, rows, 1, 2)
+    sol = dx.simulate(wave_sheet.sheet(rows, rows), dx.EnergyCollocation(2), x=x, step=h, steps=steps)
+    z = 1j * frequency * h
+    turned = np.angle((1 + z / 2 + z**2 / 12) / (1 - z / 2 + z**2 / 12))
+    expected = np.cos(turned * np.arange(steps + 1))[:, None] * x[: rows**2]
+    assert sol.ok and sol.stats["engine"] == "sparse" and sol.stats["by_sites"]
+    np.testing.assert_allclose(sol.x[:, : rows**2], expected, rtol=0, atol=1e-12)
+    energy = sol.energy()
+    assert np.max(np.abs(energy - energy[0])) < 4e-15 * energy[0]
+
+
+def lc_line(sections):
+    """A line of inductors and capacitors whose voltage is not in proportion to the charge: x = (charges, fluxes)."""
+    along = sp.eye_array(sections, format="csr") - sp.eye_array(sections, k=-1, format="csr")
+    J = sp.csr_matrix(sp.block_array([[None, along.T], [-along, None]]))
+    return dx.PortHamiltonian(lambda x: x @ x / 2 + 0.1 * jnp.sum(x[:sections] ** 4), J)
+
+
+@pytest.mark.soak
+def test_a_nonlinear_line_of_ten_thousand_sections_keeps_its_energy():
+    sections = 10_000
+    x = lc_ladder.pulse(sections, 3000.0, 20.0)
+    sol = dx.simulate(lc_line(sections), dx.EnergyCollocation(2), x=x, step=0.5, steps=20, save_every=10)
+    energy = sol.energy()
+    assert sol.ok and sol.stats["engine"] == "sparse" and sol.stats["by_sites"]
+    assert np.max(np.abs(energy - energy[0])) < 1e-14 * energy[0] and sol.stats["energy_defect"] < 1e-14
+    place = lambda x: np.sum(np.arange(sections) * x[:sections] ** 2) / np.sum(x[:sections] ** 2)
+    assert 9 < place(sol.x[-1]) - place(sol.x[0]) < 13  # a section in a unit of time, and faster where the voltage is high

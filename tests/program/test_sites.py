@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dirax.engines.sparse.site_loops import loops
+from dirax.program.sites.courses import NotBySites
 from dirax.program.sites.jacobian import entries_of_jacobian
-from dirax.program.sites.pieces import NotBySites
 from dirax.program.sites.walk import sites_of
 
 RNG = np.random.default_rng(0)
@@ -21,6 +21,15 @@ def energy(q):
     return jnp.sum(jnp.cos(q)) + jnp.sum(d**4)
 
 
+DRAWN = RNG.permutation(400) % N
+
+
+def lattice(q, rows=7):
+    u = q.reshape(rows, -1)
+    along, across = jnp.diff(u, axis=0), jnp.diff(u, axis=1)
+    return jnp.sum(along**4) + jnp.sum(jnp.cos(across)) + jnp.sum(u[1:, 1:] * u[:-1, :-1])
+
+
 FUNCTIONS = {
     "chain": (jax.grad(energy), Q),
     "masses": (lambda q: MASSES * jnp.roll(q, 1) / (2 + jnp.sin(q)), Q),
@@ -30,6 +39,11 @@ FUNCTIONS = {
     "turned": (lambda p: jnp.einsum("ij,nj->ni", jnp.array([[0.6, 0.8], [-0.8, 0.6]]), p.reshape(-1, 2)).ravel(), P),
     "masked": (lambda q: jnp.where(jnp.arange(N) % 2 == 0, q, jnp.where(q > 0, jnp.exp(q), -q)), Q),
     "total": (lambda q: q / jnp.sum(q**2), Q),
+    "drawn": (lambda q: q[DRAWN] * q[DRAWN[::-1]] + jnp.roll(q, 2)[DRAWN], Q),
+    "lattice": (jax.grad(lattice), P[: 7 * 9]),
+    "beside nothing": (lambda q: jnp.concatenate([jnp.sin(q)[:42].reshape(6, 7), jnp.zeros((6, 0))], axis=1), Q),
+    "totals": (lambda p: jnp.einsum("ij,ij->i", p[:70].reshape(1, 70), jnp.sin(p[10:80]).reshape(1, 70)) * p[:5], P),
+    "totals of rows": (lambda p: jnp.sum(jnp.outer(jnp.arange(1.0, 4.0), p) ** 2, axis=1), P),
     "few": (lambda q: jnp.sum(jnp.sin(q[:8, None] - q[None, :8]), axis=1), Q),
 }
 
@@ -43,7 +57,7 @@ def test_loops_over_sites_do_what_jax_does(name):
     np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["chain", "masses", "edges", "one in two"])
+@pytest.mark.parametrize("name", ["chain", "masses", "edges", "one in two", "lattice"])
 def test_entries_of_the_jacobian_are_all_of_it(name):
     function, given = FUNCTIONS[name]
     sites = sites_of(function, jax.ShapeDtypeStruct(given.shape, float))
@@ -59,7 +73,7 @@ def test_entries_of_the_jacobian_are_all_of_it(name):
     [
         (lambda q: q[jnp.argsort(q)], "sort"),
         (lambda q: jnp.cumsum(q), "cumsum"),
-        (lambda q: q[RNG.permutation(400) % N], "different expressions"),
+        (lambda q: jnp.stack([jnp.sin(k * q[k % N]) for k in range(100)]), "different expressions"),
         (lambda q: q[(q[0] > 0).astype(int) + jnp.arange(3)], "depend on values"),
     ],
 )

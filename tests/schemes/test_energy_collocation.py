@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from scipy.integrate import solve_ivp
 
 import dirax as dx
@@ -402,3 +403,95 @@ def test_a_distribution_that_changes_its_rank_is_refused_with_the_place():
     sol = run([0.3, 0.2, 0.1, -1.0], [0.0, 0.0, 0.1, 1.0])
     assert not sol.ok and "changes its rank" in sol.message and "near q = [" in sol.message
     assert run([0.3, 0.2, 0.1, -0.97], [0.0, 0.0, 0.1, 1.0]).ok
+
+
+def chain_energy(q):
+    d = jnp.diff(jnp.concatenate([jnp.zeros(1), q, jnp.zeros(1)]))
+    return jnp.sum(d**2 / 2 + d**4 / 5)
+
+
+def averaged_vector_field(data, h, force):
+    """(q, p) after a step of the method of one stage: q' = (p_0 + p_1)/2, p' = ∫ F(q_0 + τ(q_1 − q_0)) dτ, by Simpson's rule."""
+    q0, p0 = data
+    q1, p1 = data
+    for _ in range(60):
+        mean = (force(q0) + 4 * force((q0 + q1) / 2) + force(q1)) / 6  # exact for a cubic force
+        q1, p1 = q0 + h * (p0 + p1) / 2, p0 + h * mean
+    return q1, p1
+
+
+@pytest.mark.parametrize("kind", ["Lagrangian", "canonical bracket"])
+def test_chains_of_many_coordinates_are_sparse_and_keep_their_energy(kind):
+    size, h = 300, 0.1
+    q = np.sin(np.arange(size))
+    force = lambda q: -np.asarray(slope(q))
+    slope = jax.jit(jax.grad(chain_energy))
+    if kind == "Lagrangian":
+        system, data = dx.LagrangeDirac(lambda q, v: v @ v / 2 - chain_energy(q)), {"q": q, "v": 0 * q}
+    else:
+        unit = sp.identity(size)
+        J = sp.csr_matrix(sp.bmat([[None, unit], [-unit, None]]))
+        system = dx.PortHamiltonian(lambda x: x[size:] @ x[size:] / 2 + chain_energy(x[:size]), J)
+        data = {"x": np.concatenate([q, 0 * q])}
+    sol = dx.simulate(system, dx.EnergyCollocation(1, points=2), **data, step=h, steps=8)
+    energy = sol.energy()
+    assert sol.ok and sol.stats["engine"] == "sparse" and sol.stats["by_sites"]
+    assert np.max(np.abs(energy - energy[0])) < 4e-15 * energy[0] and sol.stats["energy_defect"] < 1e-14
+    x = np.concatenate([sol.q, sol.p], axis=1) if kind == "Lagrangian" else sol.x
+    expected = averaged_vector_field((x[0, :size], x[0, size:]), h, force)
+    np.testing.assert_allclose(x[1], np.concatenate(expected), rtol=0, atol=1e-14)
+
+
+def many_ports(size=5):
+    skew = sp.csr_matrix(sp.diags([np.ones(size - 1), -np.ones(size - 1)], [1, -1]))
+    first = sp.csr_matrix(([1.0], ([0], [0])), (size, 1))
+    drive = lambda t, x: jnp.stack([jnp.sin(t)])
+    energy = lambda x: x @ x / 2 + jnp.sum(x**4) / 10
+    system = dx.PortHamiltonian(energy, skew, first, sp.csr_matrix(sp.identity(size) / 10), inputs=drive)
+    return system, {"x": np.sin(np.arange(size))}
+
+
+def many_masses(size=3):
+    """Masses that are not diagonal and change with q, not quadratic in v, with forces and explicit time."""
+
+    def lagrangian(t, q, v):
+        moved = jnp.diff(v)
+        kinetic = v @ v / 2 + jnp.sum((0.3 + 0.1 * jnp.sin(q[1:])) * moved**2) + jnp.sum(v**4) / 50
+        return kinetic - (1 + 0.1 * jnp.cos(t)) * chain_energy(q)
+
+    q = np.sin(np.arange(size))
+    return dx.LagrangeDirac(lagrangian, forces=lambda t, q, v: jnp.sin(t) - v / 10), {"q": q, "v": 0.2 * q[::-1]}
+
+
+@pytest.mark.parametrize("made", [many_ports, many_masses])
+def test_steps_of_many_coordinates_are_those_of_few(made, monkeypatch):
+    """The same step with other unknowns and equations."""
+    run = lambda engine: dx.simulate(made()[0], dx.EnergyCollocation(2, points=4), **made()[1], step=0.1, steps=6, engine=engine)
+    theirs = run("native")
+    for kind in ("hamiltonian", "lagrangian"):
+        monkeypatch.setattr(f"dirax.schemes.{kind}_energy_collocation_step.FEWEST_SPARSE", 2)
+    ours = run("sparse")
+    assert ours.ok and theirs.ok and "iteration" in theirs.stats and ours.stats["unknowns"] in (2 * 5, (4 + 5) * 3)
+    for name in ours.fields:
+        if name != "energy_defect":
+            np.testing.assert_allclose(ours.fields[name], theirs.fields[name], rtol=0, atol=1e-13, err_msg=name)
+    energy, work = ours.energy(), ours.fields["work"]
+    work = work[:, 0] - work[:, 1] if work.ndim == 2 else work
+    np.testing.assert_allclose(energy - energy[0], work, rtol=0, atol=1e-14 * np.max(np.abs(energy)))
+
+
+def test_a_large_bracket_that_is_not_antisymmetric_is_refused():
+    size = 140
+    x = np.sin(np.arange(size))
+    skewed = sp.lil_matrix(sp.diags([np.ones(size - 1), -np.ones(size - 1)], [1, -1]))
+    system = dx.PortHamiltonian(lambda x: x @ x / 2, sp.csr_matrix(skewed))
+    equation = dx.EnergyCollocation(1).step_equation(system, Shape(size))
+    equation.check({"x": x}, 0.1, None)
+    skewed[7, 9] = 1e-3
+    bracket = sp.csr_matrix(skewed)
+    energy = system.energy_form(Shape(size))._replace(
+        residual=lambda x, v, u, t, params, gradient: v - dx.PortHamiltonian(lambda x: x @ x, bracket).J(x) @ gradient, ports=None
+    )
+    step = replace(equation.residual.__self__, form=energy)
+    with pytest.raises(ValueError, match=r"not antisymmetric .* at random"):
+        step.check({"x": x}, 0.1, None)

@@ -96,7 +96,7 @@ class Auto(AbstractEngine):
         if unknowns > policy.LARGEST_DENSE:
             raise ValueError(
                 f"a step of {unknowns} unknowns that is not sparse takes a matrix of {8e-9 * unknowns**2:.3g} GB: {reason}. Take "
-                "a scheme whose equations have few unknowns each (dx.EnergyCollocation and mean-value gradients have all; "
+                "a scheme whose equations have few unknowns each (mean-value gradients have all; "
                 "dx.DiscreteDirac is the midpoint rule), write the system's functions as sums over neighbours, or ask for "
                 'engine="xla".'
             )

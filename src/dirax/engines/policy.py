@@ -32,7 +32,7 @@ which pays after 35 000 steps. At 40 there are more than 60 000 operations, whic
 
 LARGEST_NATIVE = 192
 """The same for steps that are sparse enough: 64 oscillators with forces between neighbours have 4 972 operations, compiled in
-.9 s, and 96 in 1.6 s; they take .04 to .05 µs an oscillator and step, in the sparse engine .11 and .08."""
+.9 s, and 96 in 1.6 s; they take .04 µs an oscillator and step, in the sparse engine .08 and .06."""
 
 MOST_OPERATIONS = 10_000
 """Scalar operations of a step that is sparse enough: a second of compiling, which 20 000 steps get back."""

@@ -46,7 +46,7 @@ def sizes_of_many(p: Problem, traced: bool = False) -> tuple[Any, ...]:
     plan = None if jax.default_backend() != "cpu" else sparse_plan(p.equation, p.params, p.batch_params)
     equation, solvers = p.equation, (None,) * len(p.equation.stages)
     if isinstance(plan, tuple) and not plan.solvers[0].equations.slower:
-        equation, solvers = plan
+        equation, solvers = plan.equation, plan.solvers
     elif max(stage.unknowns for stage, _ in p.equation.stages) ** 2 > LARGEST_DENSE:
         return tuple(jnp.ones(np.shape(guess)) for guess in p.guess)
     t, axes = p.t0 + p.first_step * p.h, None if p.batch is None else (0, 0, 0 if p.batch_params else None)

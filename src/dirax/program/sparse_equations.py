@@ -78,10 +78,11 @@ class SparseEquations(eqx.Module):
             numbers = 1 + _places(size, colours, count, full, entries.row, entries.col)
             pattern = sp.csr_matrix((numbers, pattern.indices, pattern.indptr), pattern.shape)
         with jax.ensure_compile_time_eval():
-            arrays = lambda given: tuple(map(jnp.asarray, given))
+            put = jax.device_put  # `jnp.asarray` compiles a program of its own for each shape, of which XLA keeps a megabyte
+            arrays = lambda given: tuple(map(put, given))
             return cls(
-                _Static(pattern), total, made, count, full, jnp.asarray(colours), arrays(made.tables(pattern)),
-                arrays(made.solve_tables), jnp.asarray([size], np.int64),
+                _Static(pattern), total, made, count, full, put(colours), arrays(made.tables(pattern)),
+                arrays(made.solve_tables), put(np.array([size], np.int64)),
             )  # fmt: skip
 
     @property

@@ -40,6 +40,8 @@ class EnergyCollocation(AbstractScheme):
     `points` is the number of points of the quadrature, by default 8 and from five stages on 16. Saved is `energy_defect`, the
     largest change of the energy in a step so far that is not work, relative to the terms of the energy.
 
+    Steps of many coordinates are sparse where the system's functions are, without one-forms: from 128 entries of x, or of (q, p).
+
     It is neither symplectic nor a (±)-discrete Dirac structure, and keeps no other invariant.
     Raises `ValueError` for stages that are not 1 to 16, fewer points than stages, and where a run begins at which the columns of
     the frame are no basis of the distribution, and `TypeError` for other systems.

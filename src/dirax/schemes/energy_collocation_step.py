@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from dirax.program.tracing import once
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.collocation_tables import Quadrature, Tableau
+from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.stage_relation import MeanRelation
 from dirax.schemes.step import Field, StepEquation
@@ -35,6 +36,11 @@ class EnergyCollocationStep(AbstractStep):
 
     Every state ends with its energy and its `energy_defect`, the largest change of H in a step that is not the work of that
     step, relative to the sizes of the terms of H: what the quadrature leaves, and roundoff.
+
+    Of few coordinates the rates at the nodes are all unknowns, and each equation gives one of them. Where `sparse`, what a matrix
+    would have to be inverted for is not written out, so that an equation has few unknowns: the rates are those that the
+    relation of the system holds for, and what the slopes are taken at beside a, `inner` numbers at each point of the quadrature
+    and at the end, are unknowns too.
     """
 
     tableau: Tableau
@@ -45,13 +51,32 @@ class EnergyCollocationStep(AbstractStep):
     def moving(self) -> int:
         """The length of a."""
 
+    @property
+    @abstractmethod
+    def inner(self) -> int:
+        """How many unknowns there are at every point beside the rates."""
+
+    @property
+    @abstractmethod
+    def sparse(self) -> bool:
+        """Whether the unknowns are so many that no matrix is to be inverted in their equations."""
+
     @abstractmethod
     def slopes(self, a: Array, rate: Array, t: Any, params: Any) -> Float[Array, " g"]:
-        """The derivatives of H at a point of the polynomial whose derivative there is `rate`, and what else is averaged."""
+        """The derivatives of H at a point of the polynomial whose derivative there is `rate`, and what else is averaged. Where
+        there are `inner` unknowns, these instead of the rate."""
 
     @abstractmethod
     def rates(self, a: Array, mean: Float[Array, " g"], t: Any, params: Any) -> Float[Array, " s"]:
         """(ȧ, ḃ) at a node, of the mean of the slopes."""
+
+    @abstractmethod
+    def rates_of_relation(self, a: Array, rate: Array, mean: Array, t: Any, params: Any) -> tuple[Array, Array]:
+        """What is zero (moving,) at the right rate at a node, of the mean of the slopes; and (ȧ, ḃ) (s,) there."""
+
+    @abstractmethod
+    def of_inner(self, a: Array, inner: Array, t: Any, params: Any) -> Float[Array, " i"]:
+        """Zero at the right inner unknowns of a point."""
 
     @abstractmethod
     def settle(self, before: Array, after: Array, rate: Array, t: Any, h: Any, params: Any) -> Float[Array, " s"]:
@@ -59,27 +84,46 @@ class EnergyCollocationStep(AbstractStep):
 
     @property
     def unknowns(self) -> Layout:
-        return Layout(**{f"rate_{i + 1}": self.moving for i in range(self.tableau.stages)})
+        rates = {f"rate_{i + 1}": self.moving for i in range(self.tableau.stages)}
+        return Layout(**rates, **{f"inner_{k + 1}": self.inner for k in range(len(self.quadrature.points) + 1) if self.inner})
 
     @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(f"equation {i} at node {j + 1}" for j in range(self.tableau.stages) for i in range(self.moving))
+    def labels(self) -> Labels:
+        nodes = [(f"equation {{}} at node {j + 1}", 0, self.moving) for j in range(self.tableau.stages)]
+        points = [(f"velocity {{}} at point {k + 1}", 0, self.inner) for k in range(len(self.quadrature.points) + 1)]
+        return Labels([*nodes, *points])
 
-    def nodes(self, u, state, t, h, params) -> Float[Array, "stages s"]:
-        """(ȧ, ḃ) at every node."""
-        y, start, table = u.reshape(self.tableau.stages, -1), state[: self.moving], self.quadrature
+    def _at_points(self, u, state, t, h) -> tuple[Array, Array, Array, Array]:
+        """The rates at the nodes; at every point of the quadrature and at the end a, the rate or the inner unknowns, and t."""
+        table, count = self.quadrature, self.tableau.stages * self.moving
+        y, inner = u[:count].reshape(self.tableau.stages, -1), u[count:]
+        points, values = np.append(table.points, 1.0), np.concatenate([table.values, table.end[None]])
+        a = state[None, : self.moving] + h * (np.concatenate([table.matrix, self.tableau.weights[None]]) @ y)
+        return y, a, inner.reshape(len(points), -1) if self.inner else values @ y, t + h * points
+
+    def _nodes(self, u, state, t, h, params) -> tuple[Array, Array]:
+        """What is zero (stages, moving) at the right rates of the nodes, and (ȧ, ḃ) (stages, s) there."""
+        y, a, at, times = self._at_points(u, state, t, h)
         slopes = lambda a, rate, t: once(self.slopes)(a, rate, t, params)
-        rates = lambda a, mean, t: once(self.rates)(a, mean, t, params)
-        found = jax.vmap(slopes)(start[None] + h * (table.matrix @ y), table.values @ y, t + h * table.points)
-        return jax.vmap(rates)(start[None] + h * (self.tableau.matrix @ y), table.means @ found, t + h * self.tableau.nodes)
+        found = self.quadrature.means @ jax.vmap(slopes)(a[:-1], at[:-1], times[:-1])
+        there = state[None, : self.moving] + h * (self.tableau.matrix @ y), found, t + h * self.tableau.nodes
+        if self.sparse:
+            relation = lambda a, mean, t, rate: once(self.rates_of_relation)(a, rate, mean, t, params)
+            return jax.vmap(relation)(*there, y)
+        rates = jax.vmap(lambda a, mean, t: once(self.rates)(a, mean, t, params))(*there)
+        return y - rates[:, : self.moving], rates
 
     def residual(self, u, state, t, h, params):
-        return u - self.nodes(u, state, t, h, params)[:, : self.moving].ravel()
+        left = self._nodes(u, state, t, h, params)[0].ravel()
+        if not self.inner:
+            return left
+        _, a, inner, times = self._at_points(u, state, t, h)
+        of_inner = lambda a, inner, t: once(self.of_inner)(a, inner, t, params)
+        return jnp.concatenate([left, jax.vmap(of_inner)(a, inner, times).ravel()])
 
     def advance(self, u, state, t, h, params):
-        after = state + h * (self.tableau.weights @ self.nodes(u, state, t, h, params))
-        end = jnp.asarray(self.quadrature.end) @ u.reshape(self.tableau.stages, -1)
-        return after + once(self.settle)(state, after, end, t, h, params)
+        after = state + h * (self.tableau.weights @ self._nodes(u, state, t, h, params)[1])
+        return after + once(self.settle)(state, after, self._at_points(u, state, t, h)[2][-1], t, h, params)
 
     @property
     def interpolation(self):
@@ -94,11 +138,11 @@ class EnergyCollocationStep(AbstractStep):
 
     def interpolate(self, theta, u, state, t, h, params):
         """At the integral of the polynomial of the rates, with its share of what is settled at the end."""
-        rates = self.nodes(u, state, t, h, params)
+        rates = self._nodes(u, state, t, h, params)[1]
         inner = state + h * (jnp.stack(self.tableau.integrals(theta)) @ rates)
         end = state + h * (self.tableau.weights @ rates)
-        slope = jnp.asarray(self.quadrature.end) @ u.reshape(self.tableau.stages, -1)
-        return self.node(inner + theta * once(self.settle)(state, end, slope, t, h, params), params)
+        last = self._at_points(u, state, t, h)[2][-1]
+        return self.node(inner + theta * once(self.settle)(state, end, last, t, h, params), params)
 
     def settled(self, before: Array, after: Array, energy: Any, work: Any, size: Any) -> dict[str, Array]:
         """The parts of what is added that belong to the energy at the end, with the work of the step and the size of the
@@ -124,9 +168,9 @@ class EnergyCollocationStep(AbstractStep):
         return {"energy_defect": defect}
 
     def equation(self) -> StepEquation:
-        """The StepEquation, with the mean relation that it is made of."""
+        """The StepEquation, with the mean relation that it is made of, of few coordinates."""
         extra, functions = self.state.size - self.moving, (self.slopes, self.rates, self.settle)
-        relation = MeanRelation(self.moving, extra, *functions, self.tableau, self.quadrature)
+        relation = None if self.sparse else MeanRelation(self.moving, extra, *functions, self.tableau, self.quadrature)
         return replace(super().equation(), collocation=relation)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from dirax.program.legendre import constrained_velocity
 from dirax.program.linear_solves import solve
+from dirax.program.roots import FEWEST_SPARSE
 from dirax.program.tracing import along, gradient, once
 from dirax.schemes.energy_collocation_step import EnergyCollocationStep, given_back
 from dirax.schemes.layout import Layout
@@ -31,6 +32,8 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
     at the start of every step, they vanish, and along the step they make of the bracket of vector fields of D that of [PY],
     −⟨∂L/∂v, [X, Y]⟩ (Celledoni, Farré Puiggalí, Høiseth, Martín de Diego 2019), without a frame of D. q̇ is projected
     onto W q̇ + b = 0 at the nodes, and p is made ∂L/∂v at the end of the step, where this changes nothing on D.
+
+    Of many coordinates without constraints the velocities at the points and at the end are unknowns, with p = ∂L/∂v.
     """
 
     system: LagrangeDirac
@@ -49,6 +52,16 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
     @property
     def moving(self) -> int:
         return 2 * self.n
+
+    @property
+    def sparse(self) -> bool:
+        """Without constraints alone: the projection P makes every equation one of all unknowns."""
+        return self.moving >= FEWEST_SPARSE and not self.shape.kept
+
+    @property
+    def inner(self) -> int:
+        """The velocities, which are those of p at the right ones."""
+        return self.n if self.sparse else 0
 
     @property
     def state(self) -> Layout:
@@ -73,7 +86,9 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
 
     @once
     def velocity(self, t, q, p, guess, params):
-        """(v, ν)."""
+        """(v, ν); where velocities are unknowns themselves, the `guess`."""
+        if self.inner:
+            return guess, jnp.zeros(0)
         rows, offset = self.constraint(t, q, params)
         return constrained_velocity(lambda v: self.system.lagrangian.at(t, q, v, params), p, rows, offset, guess)
 
@@ -115,6 +130,14 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
                 work = slope @ (rate - own) + own @ (pull + force) + (mean[-1] if self.system.depends_on_time else 0.0)
             out.append(work[None])
         return jnp.concatenate([*out, jnp.zeros(2)])
+
+    def rates_of_relation(self, a, rate, mean, t, params):
+        rates = self.rates(a, mean, t, params)
+        return rate - rates[: self.moving], rates
+
+    def of_inner(self, a, inner, t, params):
+        q, p = a[: self.n], a[self.n :]
+        return p - gradient(lambda v: self.system.lagrangian.at(t, q, v, params))(inner)
 
     @staticmethod
     def _projection(rows):
@@ -158,7 +181,8 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         q, v, p, t = data["q"], data["v"], data["p"], data.get("t", 0.0)
         state = self.state.join(q=q, p=p, energy=self.system.generalized_energy(q, v, p, params, t))
         mean = self.slopes(state[: 2 * self.n], jnp.concatenate([v, jnp.zeros(self.n)]), t, params)
-        return state, jnp.tile(self.rates(state[: 2 * self.n], mean, t, params)[: 2 * self.n], self.tableau.stages)
+        rates = jnp.tile(self.rates(state[: 2 * self.n], mean, t, params)[: 2 * self.n], self.tableau.stages)
+        return state, jnp.concatenate([rates, jnp.tile(v, len(self.quadrature.points) + 1)]) if self.inner else rates
 
     def node(self, state, params):
         now = self.state.split(state)

@@ -9,8 +9,8 @@ import jax
 from dirax.engines.sparse.site_loops import Loops, loops
 from dirax.engines.sparse.solver import SparseSolver
 from dirax.program.graph import GraphTooLarge
+from dirax.program.sites.courses import NotBySites
 from dirax.program.sites.jacobian import entries_of_jacobian
-from dirax.program.sites.pieces import NotBySites
 from dirax.program.sites.walk import sites_of
 from dirax.program.sparse_equations import SparseEquations
 

@@ -39,7 +39,7 @@ class Sparse(Xla):
         plan = sparse_plan(p.equation, p.params, p.batch_params)
         if isinstance(plan, str):
             raise UnsupportedPrimitive("the step as a whole", f"is not sparse: {plan}", "engine='sparse'")
-        notes: dict[str, Any] = dict(plan.solvers[0].equations.stats)
+        notes = plan.stats
         if p.compensated:
             notes["not_compensated"] = "the engine 'sparse' does not know the increments of the step"
         return dataclasses.replace(p, equation=plan.equation), Numerics(sparse=plan.solvers), notes

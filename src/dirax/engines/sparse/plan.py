@@ -28,10 +28,17 @@ class Unsolvable(str):
 
 
 class SparsePlan(NamedTuple):
-    """The equation as it is run, and a solver for each of its stages."""
+    """The equation as it is run, a solver for each of its stages, and why it is not run by sites, "" where it is."""
 
     equation: Any
     solvers: tuple[SparseSolver, ...]
+    not_by_sites: str = ""
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """What `Solution.stats` says of it: of the first stage's matrix, and how all are evaluated."""
+        not_by_sites = {"not_by_sites": self.not_by_sites} if self.not_by_sites else {}
+        return self.solvers[0].equations.stats | {"by_sites": not self.not_by_sites} | not_by_sites
 
 
 _plans: Memo[SparsePlan | str] = Memo(KEPT)
@@ -57,7 +64,7 @@ def _planned(equation: Any, params: Any, batch_params: bool) -> SparsePlan | str
         return leaf
 
     numbers, scalar = lambda n: jax.ShapeDtypeStruct((n,), jnp.float64), jax.ShapeDtypeStruct((), jnp.float64)
-    given, found = jax.tree.map(shaped, params), {}
+    given, found, not_by_sites = jax.tree.map(shaped, params), {}, ""
     for stage, _ in equation.stages:
         if not stage.unknowns:
             return "a stage of the step has nothing to solve"
@@ -66,7 +73,7 @@ def _planned(equation: Any, params: Any, batch_params: bool) -> SparsePlan | str
         shapes = numbers(stage.unknowns), numbers(stage.state_size), scalar, scalar, given
         try:
             if isinstance(made := by_sites(stage, shapes), str):
-                made = _by_levels(equation, stage, shapes, params, batch_params)
+                not_by_sites, made = made, _by_levels(equation, stage, shapes, params, batch_params)
             if made is None:
                 made = stage, SparseSolver(SparseEquations.of(stage.residual, *shapes))
         except Dense as error:
@@ -76,7 +83,7 @@ def _planned(equation: Any, params: Any, batch_params: bool) -> SparsePlan | str
             return Unsolvable(f"the equations {named} have too few unknowns beside the others")
         found[id(stage)] = made
     stages = tuple((found[id(stage)][0], fraction) for stage, fraction in equation.stages)
-    return SparsePlan(joined(equation, stages), tuple(found[id(stage)][1] for stage, _ in equation.stages))
+    return SparsePlan(joined(equation, stages), tuple(found[id(stage)][1] for stage, _ in equation.stages), not_by_sites)
 
 
 def _by_levels(equation: Any, stage: Any, shapes: tuple, params: Any, batch_params: bool) -> tuple[Any, SparseSolver] | None:

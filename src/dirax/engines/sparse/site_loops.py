@@ -14,6 +14,7 @@ from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.numerics.loops.kernel import WrittenKernel
 from dirax.program.machine_code import has_fma, vector_width
+from dirax.program.sites.courses import Course, Listed
 from dirax.program.sites.pieces import Piece
 from dirax.program.sites.walk import Sites
 
@@ -21,7 +22,7 @@ ENTRY = "sites"
 
 
 class Loops(NamedTuple):
-    """Compiled results of `Sites`, and the arrays that it takes beside its arguments."""
+    """Compiled results of `Sites`, and the arrays that it takes beside its arguments: numbers, and lists of entries."""
 
     kernel: WrittenKernel
     sizes: tuple[int, ...]
@@ -46,15 +47,17 @@ class Loops(NamedTuple):
 
 def loops(sites: Sites, arguments: int, results: Sequence[Sequence[Piece]], sizes: Sequence[int]) -> Loops:
     """The loops for results in pieces, of these sizes, of the expressions of `sites`."""
-    text = _Writer(sites, arguments, len(results)).text(results)
-    kernel = _kernel(text, arguments + len(sites.constants), len(results))
-    return Loops(kernel, tuple(sizes), tuple(sites.constants))
+    writer = _Writer(sites, arguments, len(results))
+    text = writer.text(results)
+    constants = *sites.constants, *(listed.numbers for listed in writer.lists)
+    kinds = ["f8"] * (arguments + len(sites.constants)) + ["i8"] * len(writer.lists) + ["f8"] * len(results)
+    return Loops(_kernel(text, tuple(kinds), len(results)), tuple(sizes), constants)
 
 
 @cache
-def _kernel(text: str, inputs: int, results: int) -> WrittenKernel:
+def _kernel(text: str, kinds: tuple[str, ...], results: int) -> WrittenKernel:
     """The kernel of a text, of which XLA takes one."""
-    return WrittenKernel(text, ENTRY, inputs, results)
+    return WrittenKernel(text, ENTRY, kinds, results)
 
 
 class _Writer:
@@ -63,6 +66,8 @@ class _Writer:
         self.inputs, self.results = arguments + len(sites.constants), results
         self.module = Module(has_fma())
         self.body = Body(self.module)
+        self.lists: dict[Listed, str] = {}
+        self.entries: dict[tuple[str, str], str] = {}
         self.totals = self.body.alloca("double", max(1, len(sites.totals)))
 
     def text(self, results: Sequence[Sequence[Piece]]) -> str:
@@ -75,7 +80,8 @@ class _Writer:
         for count, group in sorted(groups.items(), reverse=True):
             self._group(count, group)
         self.body.line("ret void")
-        names = [f"ptr noalias %a{i}" for i in range(self.inputs)] + [f"ptr noalias %r{i}" for i in range(self.results)]
+        given = *(f"%a{i}" for i in range(self.inputs)), *self.lists.values(), *(f"%r{i}" for i in range(self.results))
+        names = [f"ptr noalias {name}" for name in given]
         self.module.define(f"define void @{ENTRY}({', '.join(names)})", self.body)
         if any(self.graph.op[n] in trigonometric.MACHINE_CODE for n in range(len(self.graph))):
             add_far_reduction(self.module)
@@ -86,9 +92,9 @@ class _Writer:
         found: list[int] = []
         for node in self.graph.reachable(nodes):
             place = self.expressions.places.get(node)
-            if place is not None and place.argument < 0 and place.first not in found:
-                inner = self._totals_in(p.node for p in self.sites.totals[place.first])
-                found += [i for i in [*inner, place.first] if i not in found]
+            if place is not None and place.argument < 0 and (number := place.course.first) not in found:
+                inner = self._totals_in(p.node for p in self.sites.totals[number])
+                found += [i for i in [*inner, number] if i not in found]
         return found
 
     def _group(self, count: int, group: list[tuple[Piece, int]]) -> None:
@@ -128,31 +134,35 @@ class _Writer:
         with self.body.loop(first // width, stop // width) as block:
             yield self.body.put(f"mul i64 {block}, {width}")
 
-    def _at(self, first: int, along: int, k: str) -> str:
-        return self.body.put(f"add i64 {first}, {self.body.put(f'mul i64 {along}, {k}')}")
+    def _entry(self, course: Course, k: str, lane: int) -> str:
+        """The number of the entry that a lane of a block from the k-th on has."""
+        b = self.body
+        if course.listed is None:
+            return b.put(f"add i64 {course.first + lane * course.step}, {b.put(f'mul i64 {course.step}, {k}')}")
+        name = self.lists.setdefault(course.listed, f"%l{len(self.lists)}")
+        key = name, f"{k}+{lane}"
+        if key not in self.entries:  # in this block: k is named once
+            self.entries[key] = b.load("i64", b.at("i64", name, b.put(f"add i64 {lane}, {k}")))
+        return b.put(f"add i64 {course.first}, {self.entries[key]}")
 
     def _load(self, e: Emitter, node: int, k: str) -> str:
-        b, (argument, first, along) = self.body, self.expressions.places[node]
+        b, (argument, course) = self.body, self.expressions.places[node]
         array = self.totals if argument < 0 else f"%a{argument}"
-        start = b.at("double", array, self._at(first, along, k))
-        if along == 0:
-            return e.splat(b.load("double", start))
-        if along == 1:
-            return b.load(e.real, start)
-        return (
-            e.pack([b.load("double", b.at("double", start, lane * along)) for lane in range(e.width)])
-            if e.width > 1
-            else b.load("double", start)
-        )
+        at = lambda lane: b.at("double", array, self._entry(course, k, lane))
+        if course.fixed:
+            return e.splat(b.load("double", at(0)))
+        if course.step == 1 or e.width == 1:
+            return b.load(e.real, at(0))
+        return e.pack([b.load("double", at(lane)) for lane in range(e.width)])
 
     def _store(self, e: Emitter, value: str, result: int, piece: Piece, k: str) -> None:
         b = self.body
-        start = b.at("double", f"%r{result}", self._at(piece.start, piece.step, k))
-        if piece.step == 1 or e.width == 1:
-            b.store(e.real, value, start)
+        at = lambda lane: b.at("double", f"%r{result}", self._entry(piece.course, k, lane))
+        if piece.course.step == 1 or e.width == 1:
+            b.store(e.real, value, at(0))
             return
         for lane in range(e.width):
-            b.store("double", e.extract(value, lane), b.at("double", start, lane * piece.step))
+            b.store("double", e.extract(value, lane), at(lane))
 
     def _total(self, number: int, pieces: Sequence[Piece]) -> None:
         """The sum of an array, of every lane by itself and then of the lanes."""

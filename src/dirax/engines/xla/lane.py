@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
 from dirax.engines.linear_solver import AbstractLinearSolver
-from dirax.engines.xla.newton import as_function, newton_root
+from dirax.engines.xla.newton import as_function, folded, newton_root
 from dirax.schemes.step import composed_row, needs_every_part
 
 
@@ -110,11 +110,12 @@ def take_step(
         u, count, converged = newton_root(stage.residual, guess, fixed, max_iterations, sizes, running, jacobian, linear_solver)
         new, left = stage.advance(u, *fixed), stage.residual(u, *fixed)
         # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
-        finite = jnp.isfinite(jnp.sum(0.0 * new) + jnp.sum(0.0 * left))
+        nothing, largest = folded((0.0 * left, jnp.add, 0.0), (jnp.abs(left), jnp.maximum, 0.0))
+        finite = jnp.isfinite(jnp.sum(0.0 * new) + nothing)
         outcome = jnp.where(finite, jnp.where(converged, OK, NOT_CONVERGED), NOT_FINITE)
         status = jnp.where(running, outcome, status)
         updates = updates + jnp.where(running, count, 0)
-        worst = jnp.where(status == OK, jnp.maximum(worst, jnp.max(jnp.abs(left), initial=0.0)), worst)
+        worst = jnp.where(status == OK, jnp.maximum(worst, largest), worst)
         if differentiable:
             args = passing(args, status == OK)
             u = as_function(stage.residual, u, args, linear_solver, jacobian if numerics.sparse else None)

@@ -112,9 +112,9 @@ def newton(
     def updated(s: Search, factors: Any, unit: Any) -> Search:
         change = linear_solver.solve(factors, unit * equation(s.u))
         u = s.u - change
-        update = jnp.max(jnp.abs(change) / (jnp.abs(u) + size))
+        of_size, of_own = (jnp.abs(change) / (jnp.abs(u) + share * size) for share in (1.0, OWN))
+        update, own = folded((of_size, jnp.maximum, 0.0), (of_own, jnp.maximum, 0.0))
         ratio = jnp.where(s.updates > 0, update / s.update, jnp.nan)
-        own = jnp.max(jnp.abs(change) / (jnp.abs(u) + OWN * size))
         return Search(u, jnp.stack([update, ratio, s.updates + 1, own]))
 
     def unfinished(s: Search):
@@ -133,6 +133,13 @@ def newton(
 
     start = Search(guess, jnp.array([jnp.inf, jnp.nan, 0.0, jnp.inf]))
     return jax.lax.while_loop(unfinished, with_new_jacobian, start)
+
+
+def folded(*parts: tuple[Float[Array, " k"], Callable, float]) -> tuple[Float[Array, ""], ...]:
+    """Each array folded by its function, from its beginning on: all in one loop, which takes XLA half the time of two."""
+    arrays, functions, begun = zip(*parts, strict=True)
+    both = lambda a, b: tuple(f(x, y) for f, x, y in zip(functions, a, b, strict=True))
+    return jax.lax.reduce(arrays, tuple(jnp.asarray(x, float) for x in begun), both, (0,))
 
 
 def at_floor(s: Search) -> Bool[Array, ""]:

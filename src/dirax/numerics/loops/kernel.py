@@ -105,12 +105,12 @@ class Kernel:
 
 
 class WrittenKernel(Kernel):
-    """The same of LLVM's text, a function `entry` of pointers to doubles, `inputs` and then `results` of them."""
+    """The same of LLVM's text, a function `entry` of pointers to numbers of these `kinds`, the last of them `results`."""
 
     level = 1
 
-    def __init__(self, text: str, entry: str, inputs: int, results: int):
-        self.text, self.entry, self.results, self.kinds = text, entry, results, ["f8"] * (inputs + results)
+    def __init__(self, text: str, entry: str, kinds: Sequence[str], results: int):
+        self.text, self.entry, self.results, self.kinds = text, entry, results, list(kinds)
         self.name = f"dirax_{entry}_{hashlib.sha256(text.encode()).hexdigest()[:24]}"  # what XLA keeps on disk refers to it
 
     def module(self) -> Any:

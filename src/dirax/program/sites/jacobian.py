@@ -3,7 +3,8 @@
 import numpy as np
 
 from dirax.program.graph_derivatives import jacobian
-from dirax.program.sites.pieces import NotBySites, Piece
+from dirax.program.sites.courses import Course, NotBySites
+from dirax.program.sites.pieces import Piece
 from dirax.program.sites.walk import Sites
 
 MOST_ENTRIES = 512
@@ -18,15 +19,14 @@ def entries_of_jacobian(sites: Sites, argument: int = 0) -> tuple[list[Piece], n
         inputs = [n for n in g.reachable([piece.node]) if n in e.places]
         if any(e.places[n].argument < 0 for n in inputs):
             raise NotBySites("an equation depends on a sum of many terms")
-        unknowns, k = [n for n in inputs if e.places[n].argument == argument], np.arange(piece.length)
+        unknowns = [n for n in inputs if e.places[n].argument == argument]
         (row,) = jacobian(g, [piece.node], unknowns)
         if len(found) + len(row) > MOST_ENTRIES:
             raise NotBySites(f"the Jacobian has more than {MOST_ENTRIES} different expressions")
         for j, node in row.items():
-            place = e.places[unknowns[j]]
-            found.append(Piece(first, 1, piece.length, node))
-            rows.append(piece.start + piece.step * k)
-            columns.append(place.first + place.along * k)
+            found.append(Piece(Course(first, 1), piece.length, node))
+            rows.append(piece.entries)
+            columns.append(e.places[unknowns[j]].course.numbers(piece.length))
             first += piece.length
     i, j = (np.concatenate([np.zeros(0, np.int64), *places]) for places in (rows, columns))
     if len(np.unique(i * (1 + j.max(initial=0)) + j)) < len(i):

@@ -1,7 +1,6 @@
-"""Pieces: entries start, start + step, … of an array that are one expression, whose inputs are entries of arguments.
+"""Pieces: entries of an array that are one expression, whose inputs are entries of arguments.
 
-An input `Place(argument, first, along)` is, for the k-th entry of a piece, entry first + along·k of that argument. Entries of an
-array are numbered by rows, whatever its shape.
+Which entries, of the array or of an argument, says a `Course`. They are numbered by rows, whatever the shape of an array.
 """
 
 import math
@@ -11,33 +10,31 @@ from typing import NamedTuple
 import numpy as np
 
 from dirax.program.graph import Graph
-
-MOST = 64
-"""Pieces of an array; one of more is not made of sites."""
-
-USUAL_PERIODS, LONGEST_PERIOD = (1, 2, 3, 4, 6), 64
-"""Steps of pieces that are looked for in any array; the longest of those that shapes suggest."""
-
-
-class NotBySites(Exception):
-    """Raised where an array is not a few pieces, or a function is not known entry by entry; says what was in the way."""
+from dirax.program.sites.courses import ALL, Course, Listed, entries_of, few, taken_apart
 
 
 class Place(NamedTuple):
-    """Where an input of an expression is."""
+    """Where an input of an expression is: in an argument, by entries of a piece."""
 
     argument: int
-    first: int
-    along: int
+    course: Course
 
 
 class Piece(NamedTuple):
-    """Entries start + step·k, k = 0 … length − 1, of an array, which are `node` of a graph."""
+    """`length` entries of an array, which are `node` of a graph."""
 
-    start: int
-    step: int
+    course: Course
     length: int
     node: int
+
+    @property
+    def entries(self) -> np.ndarray:
+        """Their numbers."""
+        return self.course.numbers(self.length)
+
+    def shifted(self, by: int) -> "Piece":
+        """The same in an array that begins earlier."""
+        return self._replace(course=self.course._replace(first=self.course.first + by))
 
 
 class Expressions:
@@ -46,12 +43,15 @@ class Expressions:
     def __init__(self) -> None:
         self.graph = Graph()
         self.places: dict[int, Place] = {}
-        self._moved: dict[tuple[int, int, int], int] = {}
+        self._lists: dict[Listed, int] = {}
+        self._moved: dict[tuple[int, Course, int], int] = {}
         self._fixed: dict[int, bool] = {}
 
     def input(self, place: Place) -> int:
         """The node of an input."""
-        node = self.graph.input(":".join(map(str, place)))
+        first, step, listed = place.course
+        name = [place.argument, first, step] + ([] if listed is None else [self._lists.setdefault(listed, len(self._lists))])
+        node = self.graph.input(":".join(map(str, name)))
         self.places[node] = place
         return node
 
@@ -59,21 +59,21 @@ class Expressions:
         """Whether a node is the same for all entries of its piece."""
         if node not in self._fixed:
             for n in self.graph.reachable([node], self._fixed):
-                along = self.places[n].along if n in self.places else 0
-                self._fixed[n] = not along and all(self._fixed[a] for a in self.graph.args[n])
+                here = n not in self.places or self.places[n].course.fixed
+                self._fixed[n] = here and all(self._fixed[a] for a in self.graph.args[n])
         return self._fixed[node]
 
-    def moved(self, node: int, first: int, along: int) -> int:
-        """The node whose k-th entry is entry first + along·k of this one."""
-        if (first == 0 and along == 1) or self.fixed(node):
+    def moved(self, node: int, course: Course, count: int) -> int:
+        """The node whose k-th entry is that of this one with the number course_k, of so many entries."""
+        if self.fixed(node) or (course == ALL and not self._lists):  # of a list fewer entries may be taken
             return node
         g, known = self.graph, self._moved
-        key = lambda n: (n, first, along)
+        key = lambda n: (n, course, count)
         for n in g.reachable([node]):
             if key(n) not in known:
                 if n in self.places:
-                    argument, at, by = self.places[n]
-                    known[key(n)] = self.input(Place(argument, at + by * first, by * along))
+                    argument, own = self.places[n]
+                    known[key(n)] = self.input(Place(argument, own.at(course, count)))
                 else:
                     known[key(n)] = g.make(g.op[n], *(known[key(a)] for a in g.args[n])) if g.args[n] else n
         return known[key(node)]
@@ -83,98 +83,75 @@ def shared(e: Expressions, arrays: Sequence[Sequence[Piece]]) -> list[tuple[Piec
     """Pieces on which each of these arrays of one size is one expression: (the piece, of no node, the nodes of the arrays)."""
     found = [(p, [p.node]) for p in arrays[0]]
     for array in arrays[1:]:
-        if len(found) == len(array) and all(p[:3] == q[:3] for (p, _), q in zip(found, array, strict=True)):
+        if len(found) == len(array) and all(p[:2] == q[:2] for (p, _), q in zip(found, array, strict=True)):
             found = [(p, [*nodes, q.node]) for (p, nodes), q in zip(found, array, strict=True)]
             continue
-        new = []
-        for p, nodes in found:
-            for q in array:
-                if (both := _meeting(p, q)) is not None:
-                    (start, step, count), own, other = both
-                    moved = [e.moved(node, *own) for node in nodes]
-                    new.append((Piece(start, step, count, 0), [*moved, e.moved(q.node, *other)]))
-        found = _few(new)
+        listed = any(p.course.listed is not None for p in (*array, *(p for p, _ in found)))
+        found = few([*(_listed_meetings if listed else _meetings)(e, found, array)])
     return found
+
+
+def _meetings(e: Expressions, found: list, array: Sequence[Piece]) -> list:
+    """Of progressions."""
+    new = []
+    for p, nodes in found:
+        for q in array:
+            if (both := _meeting(p, q)) is not None:
+                (start, step, count), own, other = both
+                moved = [e.moved(node, Course(*own), count) for node in nodes]
+                new.append((Piece(Course(start, step), count, 0), [*moved, e.moved(q.node, Course(*other), count)]))
+    return new
+
+
+def _listed_meetings(e: Expressions, found: list, array: Sequence[Piece]) -> list:
+    """Of pieces of any kind: entry by entry."""
+    size = sum(p.length for p, _ in found)
+    (of, number), (of_other, other) = numbered([p for p, _ in found], size), numbered(array, size)
+    new = []
+    for both in np.unique(of * len(array) + of_other).tolist():
+        i, j = divmod(both, len(array))
+        entries = np.flatnonzero((of == i) & (of_other == j))
+        courses = [Course.of(numbers[entries]) for numbers in (number, other)]
+        moved = [e.moved(node, courses[0], len(entries)) for node in found[i][1]]
+        new.append((Piece(entries_of(entries), len(entries), 0), [*moved, e.moved(array[j].node, courses[1], len(entries))]))
+    return new
+
+
+def numbered(pieces: Sequence[Piece], size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of each entry of an array its piece, −1 for none, and its number in it."""
+    of, number = np.full(size, -1), np.zeros(size, np.int64)
+    for i, p in enumerate(pieces):
+        first, step, listed = p.course
+        where = p.entries if listed is not None else slice(first, first + step * (p.length - 1) + 1, max(step, 1))
+        of[where], number[where] = i, np.arange(p.length)
+    return of, number
 
 
 def _meeting(p: Piece, q: Piece) -> tuple[tuple[int, int, int], tuple[int, int], tuple[int, int]] | None:
     """The entries that two pieces have in common as (start, step, count), and as (first, along) of either."""
-    step = math.lcm(p.step, q.step)
-    low, high = max(p.start, q.start), min(p.start + p.step * (p.length - 1), q.start + q.step * (q.length - 1))
-    if low > high or (p.start - q.start) % math.gcd(p.step, q.step):
+    (start, by, _), (other, beside, _) = p.course, q.course
+    step = math.lcm(by, beside)
+    low, high = max(start, other), min(start + by * (p.length - 1), other + beside * (q.length - 1))
+    if low > high or (start - other) % math.gcd(by, beside):
         return None
-    first = low + (p.start - low) % p.step
-    while (first - q.start) % q.step:
-        first += p.step
+    first = low + (start - low) % by
+    while (first - other) % beside:
+        first += by
     if first > high:
         return None
     count = (high - first) // step + 1
-    along = lambda x: ((first - x.start) // x.step, step // x.step if count > 1 else 0)
-    return (first, step if count > 1 else 1, count), along(p), along(q)
-
-
-def _few(pieces: list) -> list:
-    if len(pieces) > MOST:
-        raise NotBySites(f"an array is more than {MOST} different expressions")
-    return pieces
+    along = lambda own, by: ((first - own) // by, step // by if count > 1 else 0)
+    return (first, step if count > 1 else 1, count), along(start, by), along(other, beside)
 
 
 def gathered(e: Expressions, pieces: Sequence[Piece], size: int, entries: np.ndarray, periods: Sequence[int]) -> list[Piece]:
     """The pieces of the array whose entries are those with these numbers of one of `size` in `pieces`; −1 for zero."""
-    of, number = np.full(size + 1, -1), np.zeros(size + 1, np.int64)
+    of, number = numbered(pieces, size + 1)
     for i, p in enumerate(pieces):
-        where = slice(p.start, p.start + p.step * (p.length - 1) + 1, p.step)
-        of[where] = i
-        number[where] = 0 if e.fixed(p.node) else np.arange(p.length)
+        if e.fixed(p.node):
+            number[of == i] = 0
     flat = entries.ravel()
     of, number = of[flat], number[flat]
     nodes = [*(p.node for p in pieces), e.graph.zero]
-    made = lambda start, step, count, i, first, along: Piece(start, step, count, e.moved(nodes[i], first, along))
-    return [made(*run) for run in progressions(of, number, [*periods, *(p.step for p in pieces)])]
-
-
-def progressions(of: np.ndarray, number: np.ndarray, periods: Sequence[int]) -> list[tuple[int, ...]]:
-    """(start, step, count, value of `of`, first, along) such that `number` is first + along·k at the k-th; of the steps
-    `periods` that with the fewest."""
-    best: list[tuple[int, ...]] | None = None
-    for period in sorted({p for p in periods if p <= LONGEST_PERIOD} | {*USUAL_PERIODS}):
-        if best is not None and len(best) <= period:
-            break
-        found: list[tuple[int, ...]] | None = []
-        for c in range(min(period, len(of))):
-            runs = _runs(of[c::period], number[c::period])
-            if runs is None:
-                found = None
-                break
-            for first, count in runs:
-                at = c + period * first
-                along = int(number[at + period] - number[at]) if count > 1 else 0
-                found.append((at, period if count > 1 else 1, count, int(of[at]), int(number[at]), along))
-        if found is not None and (best is None or len(found) < len(best)):
-            best = found
-    if best is None:
-        raise NotBySites(f"an array is more than {MOST} different expressions")
-    return _few(best)
-
-
-def _runs(of: np.ndarray, number: np.ndarray) -> list[tuple[int, int]] | None:
-    """(first, count) of stretches of one value and of numbers in arithmetic progression, the longest from the left."""
-    size = len(of)
-    if size == 0:
-        return []
-    along, same = np.diff(number), of[1:] == of[:-1]
-    ends = ~same
-    ends[1:] |= along[1:] != along[:-1]
-    ends = np.flatnonzero(ends)  # the entry after it may not go on with a stretch from further left
-    if len(ends) > 4 * MOST:
-        return None
-    found, at = [], 0
-    while at < size:
-        if at == size - 1 or not same[at]:
-            stop = at + 1
-        else:
-            place = np.searchsorted(ends, at + 1)
-            stop = int(ends[place]) + 1 if place < len(ends) else size
-        found.append((at, stop - at))
-        at = stop
-    return found
+    courses = taken_apart(of, number, [*periods, *(p.course.step for p in pieces)])
+    return [Piece(course, count, e.moved(nodes[i], among, count)) for course, count, i, among in courses]

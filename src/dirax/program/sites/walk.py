@@ -1,7 +1,7 @@
 """A jaxpr run on pieces: every array becomes a few expressions."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +12,8 @@ from jax.interpreters import partial_eval
 
 from dirax.program.interpreter import RULES, Interpreter, Unsupported, check_dtypes
 from dirax.program.rules.reductions import FOLDS, factors_of_product
-from dirax.program.sites.pieces import Expressions, NotBySites, Piece, Place, gathered, progressions, shared
+from dirax.program.sites.courses import Course, NotBySites, taken_apart
+from dirax.program.sites.pieces import Expressions, Piece, Place, gathered, shared
 from dirax.program.sparsity.movement import MOVES, places_of_updates
 from dirax.program.sparsity.movement import pad as padded
 from dirax.program.sparsity.values import evaluated
@@ -72,7 +73,7 @@ class _Walk:
         return Sites(self.expressions, found, sizes, self.constants, self.totals)
 
     def _argument(self, number: int, size: int) -> list[Piece]:
-        return [Piece(0, 1, size, self.expressions.input(Place(number, 0, int(size > 1))))] if size else []
+        return [Piece(Course(0, 1), size, self.expressions.input(Place(number, Course(0, int(size > 1)))))] if size else []
 
     def _run(self, closed: ClosedJaxpr, operands: Sequence[Value]) -> list[Value]:
         jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))[:2]
@@ -101,6 +102,8 @@ class _Walk:
             return self._run(jax.make_jaxpr(impl)(*(v.aval for v in equation.invars)), operands)
         if all(isinstance(o, np.ndarray) for o in operands):
             return self._known(equation, operands)
+        if not any(v.aval.size for v in equation.outvars):
+            return [[] for _ in equation.outvars]
         try:
             check_dtypes(equation)
             if name in MOVES or name == "pad":
@@ -132,7 +135,7 @@ class _Walk:
     # ------------------------------------------------------------------------------------------------ arrays in pieces
 
     def pieces(self, value: Value, shape: tuple[int, ...]) -> list[Piece]:
-        """An array of this shape in pieces: of one that is known a few constants, or an array beside the arguments."""
+        """An array of this shape in pieces: of one that is known a few constants, or an array beside the arguments and zeros."""
         if isinstance(value, list):
             return value
         flat, graph = np.ravel(value), self.expressions.graph
@@ -142,13 +145,17 @@ class _Walk:
         change = np.flatnonzero(bits[1:] != bits[:-1]) + 1
         if len(change) < CONSTANT:
             starts, stops = [0, *change.tolist()], [*change.tolist(), flat.size]
-            return [Piece(a, 1, b - a, graph.constant(flat[a])) for a, b in zip(starts, stops, strict=True)]
+            return [Piece(Course(a, 1), b - a, graph.constant(flat[a])) for a, b in zip(starts, stops, strict=True)]
         if flat.dtype == np.bool_:
-            _, codes = np.unique(flat, return_inverse=True)
-            runs = progressions(codes, np.zeros(flat.size, np.int64), _periods(shape))
-            return [Piece(a, step, count, graph.constant(flat[a])) for a, step, count, *_ in runs]
-        self.constants.append(np.asarray(flat, float))
-        return self._argument(self.arguments + len(self.constants) - 1, flat.size)
+            courses = taken_apart(flat.astype(np.int64), np.zeros(flat.size, np.int64), _periods(shape))
+            return [Piece(course, count, graph.constant(bool(i))) for course, count, i, _ in courses]
+        numbers = np.asarray(flat, float)
+        self.constants.append(numbers)
+        (whole,) = self._argument(self.arguments + len(self.constants) - 1, flat.size)
+        there = (numbers != 0.0) | np.signbit(numbers)  # what is zero makes no entries of a Jacobian
+        if np.all(there):
+            return [whole]
+        return self._taken([whole], flat.size, np.where(there, np.arange(flat.size), -1).reshape(shape))
 
     def _by_entry(self, equation: Any, operands: list[Value]) -> Value:
         shape = equation.outvars[0].aval.shape
@@ -173,7 +180,7 @@ class _Walk:
         pieces, numbers, first = [], [], 0
         for value, variable in zip(operands, equation.invars, strict=True):
             shape = variable.aval.shape
-            pieces += [p._replace(start=first + p.start) for p in self.pieces(value, shape)]
+            pieces += [p.shifted(first) for p in self.pieces(value, shape)]
             numbers.append(first + np.arange(math.prod(shape)).reshape(shape))
             first += math.prod(shape)
         return pieces, numbers
@@ -231,9 +238,10 @@ class _Walk:
         rows, columns = factors_of_product(equation, *(np.arange(math.prod(shape)).reshape(shape) for shape in shapes))
         terms, out = rows.shape[-1], (*rows.shape[:2], columns.shape[1])
         pieces = [self.pieces(x, shape) for x, shape in zip((a, b), shapes, strict=True)]
-        if terms > SHORT and math.prod(out) == 1:
-            both = [self._taken(x, math.prod(s), n.ravel(), s) for x, s, n in zip(pieces, shapes, (rows, columns), strict=True)]
-            return self._total(self._with("mul", *both))
+        if terms > SHORT and math.prod(out) <= SHORT:
+            taken = lambda k, numbers: self._taken(pieces[k], math.prod(shapes[k]), numbers, shapes[k])
+            places = ((rows[b, i], columns[b, j]) for b, i, j in np.ndindex(*out))
+            return self._totals(self._with("mul", taken(0, own), taken(1, other)) for own, other in places)
         if terms > SHORT:
             raise NotBySites("'dot_general' has sums of many terms")
         total: list[Piece] | None = None
@@ -246,15 +254,15 @@ class _Walk:
             term = self._with("mul", *taken)
             total = term if total is None else self._with("add", total, term)
         size = math.prod(out)
-        return total or ([Piece(0, 1, size, self.expressions.graph.zero)] if size else [])
+        return total or ([Piece(Course(0, 1), size, self.expressions.graph.zero)] if size else [])
 
     def _folded(self, equation: Any, value: Value) -> Value:
         shape, axes = equation.invars[0].aval.shape, tuple(equation.params["axes"])
         kept, op = [a for a in range(len(shape)) if a not in axes], FOLDS[equation.primitive.name]
         pieces, out = self.pieces(value, shape), tuple(shape[a] for a in kept)
         numbers = np.arange(math.prod(shape)).reshape(shape).transpose(*kept, *axes).reshape(math.prod(out), -1)
-        if numbers.shape[1] > SHORT and len(numbers) == 1 and op == "add":
-            return self._total(pieces)
+        if numbers.shape[1] > SHORT >= len(numbers) and op == "add":
+            return self._totals(self._taken(pieces, math.prod(shape), row, shape) for row in numbers)
         if not 0 < numbers.shape[1] <= SHORT:
             raise NotBySites(f"'{equation.primitive.name}' has {numbers.shape[1]} terms")
         columns = [self._taken(pieces, math.prod(shape), column.reshape(out), shape) for column in numbers.T]
@@ -263,9 +271,13 @@ class _Walk:
             total = self._with(op, total, column)
         return total
 
-    def _total(self, pieces: list[Piece]) -> list[Piece]:
-        self.totals.append(pieces)
-        return [Piece(0, 1, 1, self.expressions.input(Place(-1, len(self.totals) - 1, 0)))]
+    def _totals(self, arrays: Iterable[list[Piece]]) -> list[Piece]:
+        """The sum of each of these arrays in pieces, an array."""
+        found = []
+        for i, pieces in enumerate(arrays):
+            self.totals.append(pieces)
+            found.append(Piece(Course(i, 1), 1, self.expressions.input(Place(-1, Course(len(self.totals) - 1, 0)))))
+        return found
 
 
 def _periods(shape: tuple[int, ...]) -> list[int]:
