@@ -119,7 +119,7 @@ def test_a_machine_is_assembled_alike_in_any_unit_of_length(unit):
     np.testing.assert_array_equal(found["v"] / one, wanted["v"])
     assert scaled.redundant(found["q"]) == plain.redundant(wanted["q"])
     for given in ({"q": {"crank": 1.2}}, {"q": {"crank": 0.7}, "v": {"crank": 1.0, "piston": 3.0 * unit}}):
-        with pytest.raises(ValueError, match="no velocity|cannot be assembled"):
+        with pytest.raises(ValueError, match=r"no velocity|cannot be assembled"):
             slider_crank(unit, 0.5 if "v" not in given else 2.5).state(**given)
 
 

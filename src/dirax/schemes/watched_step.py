@@ -83,8 +83,8 @@ class WatchedStep(AbstractStep):
         places = [k / PARTS for k in range(-1, PARTS + 2)]  # one before the step and one after it, for dips at its ends
         inside = self.inside(u, state, after, t, h, params)
         gaps = [self.gaps(*inside(x), params) for x in places]
-        ends = (vector[self.inner.state_layout.place("q")] for vector in (state, after))
-        small = ON_WALL * gap_terms(self.gaps, *inside(0.0), ends, params)
+        ends, (begins, q) = [vector[self.inner.state_layout.place("q")] for vector in (state, after)], inside(0.0)
+        small = ON_WALL * gap_terms(self.gaps, begins, q, ends, params)
         count, far = gaps[0].shape[0], jnp.asarray(jnp.inf)
         wall, place, doubt = jnp.asarray(NONE), far, far
         for i in range(count):
