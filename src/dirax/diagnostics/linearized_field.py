@@ -133,7 +133,8 @@ def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generato
         lifted.append(np.concatenate([value, slope @ v]))
         slopes.append((slope, bend))
     symmetric = np.stack(lifted, axis=1) if lifted else np.zeros((2 * n, 0))
-    units, rate = _units(*(np.asarray(a) for a in evaluated(equations.energy, q, v, params)), v, derivative)
+    energy, metric = (np.asarray(a) for a in evaluated(equations.energy, q, v, params))
+    units, rate = _units(energy, metric, v, derivative)
     field, symmetric = np.concatenate([v, w[:n]]) / units / rate, symmetric / units[:, None]
     if lifted:
         sizes = power_of_two(np.abs(symmetric).max(axis=0))
@@ -167,7 +168,7 @@ def _units(energy: np.ndarray, metric: np.ndarray, v: np.ndarray, derivative: np
 
 
 def filled(units: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Units, powers of two, with those that are 0 such that the entries of the matrix are about 1 at most; 1 where these are 0."""
+    """Units, powers of two; those that are 0 such that the entries of the matrix are about 1 at most, and 1 where these are 0."""
     moved = np.max(np.abs(matrix) * units, axis=1)
     units = np.where(units > 0.0, units, moved)
     return np.where(units > 0.0, power_of_two(units), 1.0)
