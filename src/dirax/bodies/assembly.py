@@ -21,7 +21,7 @@ DEPENDENT = 1e-9
 """Part of a row across the rows before it, relative to the row, below which it depends on them."""
 
 ASIDE = (0.1, 0.3, 1.0)
-"""How far from a start at which a machine is not assembled others are tried, in every coordinate (rad, lengths of the machine)."""
+"""How far from a start at which a machine is not assembled others are tried, in every coordinate (rad, machine lengths)."""
 
 MOST_STEPS = 200
 RANK = 1e-10
