@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from typing import Any
 
 
-def reported(progress: Any) -> bool | Callable[[int, int], None]:
+def reported(progress: Any) -> Any:
     """What a run is told of its progress= as it is. Raises `TypeError` for what says nothing."""
     if isinstance(progress, bool) or callable(progress):
         return progress

@@ -81,7 +81,7 @@ def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Star
             if start.row0 is not None
             else "pass project=True to project them, or check_initial=False to take them as they are"
             if not projected
-            else "project=True, which moves q across the constraint by its forces, found no place on it that way: begin nearer to it"
+            else "project=True, which moves q across the constraint by its forces, found no place on it: begin nearer to it"
         )
         more = system.explain(_lanes(start.state, 1)[lane])
         raise ValueError(
