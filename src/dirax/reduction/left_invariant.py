@@ -87,7 +87,7 @@ def _refuse_asymmetry(system: Any, group: AbstractLieGroup, params: Any) -> None
             fixed, moved = (_on_the_algebra(one_forms, group, h, params) for h in (identity, g))
             defects.append(relative(off_span(moved, fixed), jnp.abs(moved)))
         if holonomic is not None:
-            defects.append(relative(holonomic(g, params), terms(lambda g: holonomic(g, params), g)))
+            defects.append(relative(holonomic(g, params), terms(lambda g, holonomic=holonomic: holonomic(g, params), g)))
         return jnp.concatenate([there[None] - here[None], *defects]), g
 
     values, g = (np.asarray(a) for a in evaluated(jax.vmap(at, in_axes=(0, 0, None)), turn, xi, params))
