@@ -97,6 +97,33 @@ def test_a_loop_is_assembled_and_one_that_cannot_close_says_which_joint():
         crank(0.5).state({"crank": 1.2})
 
 
+def slider_crank(unit, rod=2.5):
+    """A crank of length 1, its rod and a piston, all lengths in this unit; the piston is held to its rail twice."""
+    return b.Model(
+        [b.rod("crank", (unit, 0, 0)), b.rod("rod", (rod * unit, 0, 0)), b.Body("piston", 1.0)],
+        [
+            b.revolute("ground", "crank"),
+            b.revolute("crank", "rod", at=(unit, 0, 0)),
+            b.prismatic("ground", "piston"),
+            b.revolute("rod", "piston", name="pin", at=(rod * unit, 0, 0), closes=True),
+        ],
+    )
+
+
+@pytest.mark.parametrize("unit", [2.0**-43, 2.0**-30, 2.0**35])
+def test_a_machine_is_assembled_alike_in_any_unit_of_length(unit):
+    """Of 1e-13 m it had no constraints, of 1e10 those too that its joints meet; and its velocities were others."""
+    plain, scaled, one = slider_crank(1.0), slider_crank(unit), np.array([1.0, 1.0, unit])
+    wanted, found = (model.state({"crank": 0.7}, {"crank": 1.0}) for model in (plain, scaled))
+    assert scaled.constraints == plain.constraints == ("pin: x", "pin: y")
+    np.testing.assert_array_equal(found["q"] / one, wanted["q"])
+    np.testing.assert_array_equal(found["v"] / one, wanted["v"])
+    assert scaled.redundant(found["q"]) == plain.redundant(wanted["q"])
+    for given in ({"q": {"crank": 1.2}}, {"q": {"crank": 0.7}, "v": {"crank": 1.0, "piston": 3.0 * unit}}):
+        with pytest.raises(ValueError, match=r"no velocity|cannot be assembled"):
+            slider_crank(unit, 0.5 if "v" not in given else 2.5).state(**given)
+
+
 @pytest.mark.parametrize("rotation", ["quaternion", "axis"])
 def test_a_chain_that_is_straight_at_zero_is_bent_to_where_its_end_is_held(rotation):
     """At zero both rods point at their end, and no joint knows which way to give."""

@@ -98,3 +98,39 @@ def test_a_scheme_needs_a_step():
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2)
     with pytest.raises(ValueError, match="give scheme= and step= together"):
         dx.linearize(system, {"q": [0.0], "v": [0.0]}, dx.LagrangeDAlembert())
+
+
+def in_units(length, mass, time):
+    """Two linked pendulums in x and y with friction, and a planet, with all numbers in units by powers of two."""
+
+    def lagrangian(q, v, p):
+        return p["m"] * (v @ v) / 2 - p["m"] * p["g"] * (q[1] + q[3])
+
+    links = lambda q, p: jnp.stack([q[:2] @ q[:2] - p["l"] ** 2, (q[2:] - q[:2]) @ (q[2:] - q[:2]) - p["l"] ** 2])
+    pendulums = dx.LagrangeDirac(lagrangian, holonomic=links, forces=lambda t, q, v, p: -p["c"] * v)
+    planet = dx.LagrangeDirac(lambda q, v, p: p["m"] * ((v @ v) / 2 + p["mu"] / jnp.sqrt(q @ q)))
+    params = {"l": length, "m": 1.5 * mass, "g": 9.0 * length / time**2, "c": 0.2 * mass / time, "mu": length**3 / time**2}
+    hanging = {"q": np.array([0.0, -1.0, 1e-17, -2.0]) * length, "v": np.zeros(4)}
+    orbit = {"q": np.array([2.0, 0.0]) * length, "v": np.array([0.0, np.sqrt(0.5)]) * length / time}
+    return pendulums, hanging, planet, orbit, params, lambda q: jnp.array([-q[1], q[0]])
+
+
+@pytest.mark.parametrize("units", [(2.0**-30, 2.0**-86, 2.0**-40), (2.0**37, 2.0**81, 2.0**25), (2.0**-50, 2.0**90, 2.0**3)])
+def test_linear_equations_in_other_units(units):
+    """Nanometres and planets in metres: an orbit was called an equilibrium at rest, since 6e-3 is small beside 3e4."""
+    found = {}
+    for unit in ((1.0, 1.0, 1.0), units):
+        pendulums, hanging, planet, orbit, params, turns = in_units(*unit)
+        midpoint, step = dx.LagrangeDAlembert(), 0.1 * unit[2]
+        found[unit] = rates = [
+            dx.linearize(pendulums, hanging, params=params),
+            dx.linearize(pendulums, hanging, midpoint, step=step, params=params),
+            dx.linearize(planet, orbit, symmetries=[turns], params=params),
+        ]
+        assert [one.stable for one in rates] == [True] * 3
+        with pytest.raises(ValueError, match="no relative equilibrium"):
+            dx.linearize(planet, orbit, params=params)
+        with pytest.raises(ValueError, match="no relative equilibrium"):
+            dx.linearize(pendulums, hanging | {"q": np.array([0.6, -0.8, 0.6, -1.8]) * unit[0]}, params=params)
+    for plain, scaled in zip(*found.values(), strict=True):
+        assert scaled.eigenvalues * units[2] == pytest.approx(plain.eigenvalues, rel=1e-9, abs=1e-9)

@@ -149,6 +149,21 @@ def test_mistakes(make, kind, message):
         make()
 
 
+@pytest.mark.parametrize("unit", [1e-26, 1e20])
+def test_units_hide_no_asymmetry_and_make_none(unit):
+    """A heavy body of 1e-26 kg was taken for a free one, and forms and constraints of small units for invariant ones."""
+    scaled = lambda function: lambda *values: unit * function(*values)
+    body, wide = dx.LagrangeDirac(scaled(FREE)), dx.LagrangeDirac(scaled(FREE), scaled(KNIFE_IN_SPACE))
+    assert dx.reduce(body, SO3) is not None
+    for system, message in (
+        (dx.ManifoldLagrangian(scaled(heavy), SO3), "lagrangian is not left-invariant"),
+        (wide, "one_forms are not left-invariant"),
+        (dx.LagrangeDirac(scaled(FREE), holonomic=scaled(lambda q: q[:1] - 1.0)), "holonomic constraints are not those"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            dx.reduce(system, SO3)
+
+
 def test_what_is_said_of_a_start_on_the_group_with_advected_quantities():
     top = dx.EulerPoincare(SO3, lambda xi, a: xi @ xi / 2 - a[2], advected=3)
     with pytest.raises(ValueError, match=r"starts from x= \(μ, a\) of shape \(3 \+ 3,\), but q, v were given"):

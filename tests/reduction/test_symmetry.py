@@ -99,6 +99,15 @@ def test_finite_translations_agree_with_the_derivative():
     assert not found and found.defect == pytest.approx(abs(finite), rel=1e-6)
 
 
+@pytest.mark.parametrize("unit", [1e-15, 1e12])
+def test_one_forms_of_any_units(unit):
+    """Of a knife edge that turns with y; moved along y it is another one, in whatever units, and along x the same."""
+    rows = lambda q: unit * jnp.stack([jnp.stack([jnp.sin(q[1]), -jnp.cos(q[1]), 0.3 + 0 * q[2]])])
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2, rows)
+    assert check_invariance(system, Translations([0, 2]), q=[0.1, 0.2, 0.3])
+    assert not check_invariance(system, Translations([1]), q=[0.1, 0.2, 0.3])
+
+
 def test_small_units_hide_no_asymmetry():
     """Masses of 1e-27, as in SI units of atoms."""
     falling = dx.LagrangeDirac(lambda q, v: 1e-27 * (v @ v / 2 - q[1]))

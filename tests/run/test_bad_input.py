@@ -472,12 +472,28 @@ def test_method_2_of_a_singular_lagrangian_needs_its_final_manifold():
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["project", "check_initial", "compensated"])
+@pytest.mark.parametrize("name", ["project", "check_initial", "compensated", "batch_params"])
 def test_what_is_neither_true_nor_false(name):
     complaint(TypeError, f"{name} must be True or False", "'maybe'", **{name: "maybe"})
 
 
+def test_progress_that_says_nothing():
+    for bad in ("x", 1, None):
+        complaint(TypeError, "progress must be True, False or a function", repr(bad), progress=bad)
+        complaint_of(lambda bad=bad: dx.prepare(OSCILLATOR, PLUS, **GOOD)(progress=bad), TypeError, "progress must be")
+        complaint_of(lambda bad=bad: dx.simulate(OSCILLATOR, PLUS, **GOOD).extend(2, bad), TypeError, "progress must be")
+
+
+def test_data_that_cannot_be_projected_are_not_to_be_projected_again():
+    """An ellipse beside which the forces of the constraint lead past it."""
+    ellipse = dx.LagrangeDirac(lambda q, v: v @ v / 2, holonomic=lambda q: jnp.stack([q[0] ** 2 / 100 + q[1] ** 2 - 1]))
+    given = {"q": [30.0, 5.0], "v": [0.0, 0.0], "project": True}
+    text = complaint(ValueError, "off the constraint", "project=True", "found no place on it", system=ellipse, **given)
+    assert "pass project=True" not in text
+
+
 def test_stores_that_no_file_can_be(tmp_path):
+    complaint(TypeError, "to must be the path of a zarr store", "3", to=3)
     complaint(ValueError, "has 305 bytes", to=tmp_path / f"{'x' * 300}.zarr")
     complaint(ValueError, "the character of number 0", to=tmp_path / "a\0b.zarr")
 

@@ -86,8 +86,7 @@ def compared(name, scheme, **more):
     sizes = np.maximum(np.abs(p).max(), np.abs(p).max(axis=0))
     assert np.abs(scaled_q - q).max() <= 1e-12 * np.abs(q).max()
     assert np.all(np.abs(scaled_p - p).max(axis=0) <= 1e-11 * sizes)
-    # a sweep of a fixed point more or less is decided by the roundoff of what is zero, Newton's updates are not
-    assert abs(scaled_updates - updates) <= (0.5 if isinstance(scheme, dx.Collocation) else 0.2) * updates
+    assert abs(scaled_updates - updates) <= 0.2 * updates
     return np.array_equal(scaled_q, q) and np.array_equal(scaled_p, p) and scaled_updates == updates
 
 
@@ -95,6 +94,11 @@ def compared(name, scheme, **more):
 def test_a_ball_on_a_turntable_in_other_units(scheme):
     """Its first momentum was wrong by 1.5e-5, without a word: masses of 2⁻⁶² beside rolling."""
     compared("turntable", SCHEMES[scheme])
+
+
+def test_gauss_nodes_in_other_units():
+    """The elimination of the mass matrix was called unstable in some, and another iteration took its place."""
+    assert compared("charged-particle", SCHEMES["gauss"])
 
 
 @pytest.mark.parametrize("name", ["heisenberg", "contact-particle"])
@@ -122,7 +126,7 @@ def test_the_constraint_algorithm_in_other_units():
 @pytest.mark.soak
 @pytest.mark.parametrize("name", gallery.names())
 def test_chains_of_the_gallery_in_other_units(name):
-    if not stated(name) or name in ("bricard", "bicycle"):  # a rank that changes at the point itself; minutes
+    if not stated(name) or name == "bicycle":  # minutes
         pytest.skip("its functions are not those of q and v alone, or its chain is not to be had in reasonable time")
     compared_chains(name)
 

@@ -228,3 +228,39 @@ def test_short_steps_of_a_composition_go_on_at_their_floor(step):
     assert sol.ok
     energy = np.asarray(sol.energy())
     assert np.max(np.abs(energy - energy[0])) < 1e-12
+
+
+def balls(scheme, units, restitution, data, steps=400):
+    """A ball between a floor and a wall that slopes, in units by powers of two: times, places and momenta in plain ones."""
+    length, mass, time = (units.of(d) for d in (LENGTH, MASS, TIME))
+    system = dx.LagrangeDirac(lambda q, v, p: p["m"] * (v @ v) / 2 - p["m"] * p["g"] * q[1])
+    walls = [dx.Impact(lambda q: q[1], restitution), dx.Impact(lambda q, params: params["l"] - q[0] - q[1] / 4, restitution)]
+    sol = dx.simulate(
+        system, scheme, q=np.array(data["q"]) * length, v=np.array(data["v"]) * length / time, steps=steps, step=0.05 * time,
+        params={"m": 1.5 * mass, "g": 1.1 * length / time**2, "l": 2.0 * length}, events=walls,
+    )  # fmt: skip
+    kept = sol.events.t / time, sol.q / length, sol.p * time / length / mass, sol.events.index
+    return sol.ok, sol.message.split(":")[-1], sol.stats["newton_iterations"], *kept
+
+
+TINY_BALL = Units(length=-30, mass=-86, time=-20)
+"""About 1e-9 m, 1e-26 kg and µs."""
+
+
+@pytest.mark.parametrize("restitution", [1.0, 0.5])
+def test_impacts_in_other_units(restitution):
+    """One that ends in a corner with ever more impacts, and one that begins on the floor."""
+    for data in ({"q": [0.1, 1.0], "v": [0.9, 0.0]}, {"q": [0.0, 0.0], "v": [0.3, 0.7]}):
+        plain = balls(dx.LagrangeDAlembert(), Units(), restitution, data)
+        for units in (TINY_BALL, UNITS[2]):
+            scaled = balls(dx.LagrangeDAlembert(), units, restitution, data)
+            assert scaled[:3] == plain[:3] and len(scaled[3]) > 3
+            for found, wanted in zip(scaled[3:], plain[3:], strict=True):
+                np.testing.assert_array_equal(found, wanted)
+
+
+def test_a_start_behind_a_wall_is_behind_it_in_any_units():
+    for units in (Units(), TINY_BALL):
+        with pytest.raises(ValueError, match=r"events\[0\] must not be negative at the start"):
+            balls(dx.LagrangeDAlembert(), units, 1.0, {"q": [0.1, -1e-10], "v": [0.9, 1.0]})
+        assert balls(dx.LagrangeDAlembert(), units, 1.0, {"q": [0.1, -1e-17], "v": [0.9, 1.0]}, steps=9)[0]

@@ -90,3 +90,21 @@ def test_what_it_does_not_take():
         dx.discrete_constraint_algorithm(TWO, dx.DiscreteDirac(), near=START, step=-H)
     with pytest.raises(ValueError, match="near must be finite"):
         dx.discrete_constraint_algorithm(PENDULUM, dx.DiscreteDirac(), near=np.full(4, np.nan), step=H)
+
+
+@pytest.mark.soak
+def test_chains_in_other_units():
+    """Of a pendulum with one coordinate that L does not know, in metres and in nanometres: dimensions were others."""
+    found, scheme = [], dx.DiscreteDirac()
+    for length, mass, time in ((1.0, 1.0, 1.0), (2.0**-30, 2.0**-86, 2.0**-20), (2.0**35, 2.0**20, 2.0**25)):
+        system = dx.LagrangeDirac(
+            lambda q, v, p: p["m"] * (v[:2] @ v[:2]) / 2 - p["m"] * p["g"] * q[1],
+            holonomic=lambda q, p: jnp.stack([q[:2] @ q[:2] - p["l"] ** 2]),
+        )
+        params = {"m": 1.5 * mass, "g": 9.8 * length / time**2, "l": length}
+        near = {"q": np.array([0.6, -0.8, 0.3]) * length, "v": np.array([0.8, 0.6, 0.0]) * length / time}
+        chain = dx.discrete_constraint_algorithm(system, scheme, near=near, step=0.05 * time, params=params)
+        found.append((str(chain), chain.state[:3] / length))
+    for said, q in found[1:]:
+        assert said == found[0][0]
+        np.testing.assert_allclose(q, found[0][1], rtol=0, atol=1e-13)

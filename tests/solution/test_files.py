@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tracemalloc
 import zipfile
+import zlib
 from pathlib import Path
 
 import jax
@@ -580,8 +581,10 @@ def test_files_of_the_first_version(ending, tmp_path):
     assert_same(dx.load(loaded.save(tmp_path / f"again{ending}")), loaded)
 
 
-def test_a_netcdf_file_in_circles_is_refused(tmp_path, monkeypatch):
-    """A list of free places that goes on at itself, in a file without checksums: the HDF5 library never ends."""
+@pytest.mark.parametrize("sealed", [False, True])
+def test_a_netcdf_file_in_circles_is_refused(tmp_path, monkeypatch, sealed):
+    """A list of free places that goes on at itself, in a file without a checksum or with the right one: the HDF5 library never
+    ends."""
     import h5py
 
     path = tmp_path / "circle.nc"
@@ -591,7 +594,8 @@ def test_a_netcdf_file_in_circles_is_refused(tmp_path, monkeypatch):
     heap, number = raw.index(b"HEAP"), lambda place: int.from_bytes(raw[place : place + 8], "little")
     free, data = number(heap + 16), number(heap + 24)
     raw[data + free : data + free + 8] = free.to_bytes(8, "little")
-    path.write_bytes(raw)
+    seal = netcdf.SEAL + zlib.crc32(raw).to_bytes(4, "little")
+    path.write_bytes(raw + (seal if sealed else b""))
     monkeypatch.setattr(netcdf, "LIMIT", 2.0)
     assert "did not come to an end of it within 2 s" in one_sentence(path)
 

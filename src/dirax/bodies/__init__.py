@@ -11,7 +11,7 @@ A model is plain data and states a `dx.LagrangeDirac`, or a `dx.ManifoldLagrangi
 engines and diagnostics know nothing of it.
 
 model.py              Model: names, energy, observables; model_constraints.py its constraints, statement.py the systems,
-                      assembly.py its initial data, checks.py and number_checks.py its mistakes
+                      assembly.py its initial data, machine_units.py how large it is, checks.py and number_checks.py its mistakes
 parts.py              Body, rod; joints.py, contacts.py, forces.py what is between bodies
 motion.py, frames.py  how a joint moves a frame, with its velocity
 drawing.py            the scene of a report

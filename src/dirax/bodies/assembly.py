@@ -1,21 +1,27 @@
-"""Initial data of a machine: given coordinates kept, the others found so that every joint and contact is met."""
+"""Initial data of a machine: given coordinates kept, the others found so that every joint and contact is met.
+
+All of it is done in the units of the machine, of its lengths and of the terms of its constraints."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
+from dirax.bodies.machine_units import coordinate_units
+from dirax.numerics.equilibration import power_of_two
+from dirax.numerics.tolerances import TINY
+from dirax.program.rounding import rounding
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 
 MET = 1e-11
-"""Residual of a constraint, relative to 1 + |q|, that counts as met."""
+"""Residual of a constraint, relative to its terms in the units of the machine, that counts as met."""
 
 DEPENDENT = 1e-9
 """Part of a row across the rows before it, relative to the row, below which it depends on them."""
 
 ASIDE = (0.1, 0.3, 1.0)
-"""How far from a start at which the machine is not assembled others are tried, in every coordinate (rad, units of length)."""
+"""How far from a start at which a machine is not assembled others are tried, in every coordinate (rad, machine lengths)."""
 
 MOST_STEPS = 200
 RANK = 1e-10
@@ -27,10 +33,10 @@ class Assembly:
     def __init__(self, constraints: Any):
         self.constraints = constraints
 
-    def position(self, q: Any, params: Any) -> tuple[Any, Any]:
-        """g and ∂g/∂q."""
+    def position(self, q: Any, params: Any) -> tuple[Any, Any, Any]:
+        """g, ∂g/∂q, and the sizes of the terms of g."""
         g = lambda q: self.constraints.position_defect(0.0, q, params)
-        return g(q), jacobian(g)(q)
+        return g(q), jacobian(g)(q), rounding(g, q)
 
     def rows(self, q: Any, params: Any) -> Any:
         """[W; ∂g/∂q]."""
@@ -40,26 +46,27 @@ class Assembly:
 def assembled(model: Any, q: Any, v: Any, params: Any) -> dict[str, np.ndarray]:
     """The initial data {"q", "v"} of `Model.state`."""
     start, fixed = _given(model, q, "q", _rest(model))
-    system = model.system
+    system, units = model.system, coordinate_units(model, params)
     place = start
     if system.holonomic is not None:
         positions = lambda q: tuple(map(np.asarray, evaluated(model.assembly.position, q, params)))
-        place = _assembled_place(model, positions, start, fixed)
+        place = _assembled_place(model, positions, start, fixed, units)
     speed, kept = _given(model, v, "v", np.zeros(len(start)))
     if system.constraints.any:
-        speed = _moving(model, place, speed, kept, params)
+        speed = _moving(model, place, speed, kept, units, params)
     return {"q": place, "v": speed}
 
 
-def _assembled_place(model: Any, positions: Callable, start: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+def _assembled_place(model: Any, positions: Callable, start: np.ndarray, fixed: np.ndarray, units: np.ndarray) -> np.ndarray:
     """Where the machine is assembled: from the start, and where that is a dead centre, at which no joint knows which way to give,
     from places beside it."""
-    place, rng = _solved(positions, start, ~fixed), np.random.default_rng(0)
+    free = units * ~fixed
+    place, rng = _solved(positions, start, free), np.random.default_rng(0)
     for size in (0.0, *ASIDE):
-        other = place if size == 0 else _solved(positions, start + size * rng.uniform(-1, 1, len(start)) * ~fixed, ~fixed)
-        if not _unmet(model, positions(other)[0], other):
+        other = place if size == 0 else _solved(positions, start + size * rng.uniform(-1, 1, len(start)) * free, free)
+        if not _unmet(model, positions(other), units):
             return other
-    missed = _unmet(model, positions(place)[0], place)
+    missed = _unmet(model, positions(place), units)
     listed = ", ".join(f"{name} by {value:.3g}" for name, value in missed)
     kept = [name for name, given in zip(model.coordinates, fixed, strict=True) if given]
     way = f"Leave some of the given coordinates ({', '.join(kept)}) open" if kept else "Change the lengths of the bodies"
@@ -98,45 +105,53 @@ def _given(model: Any, values: Any, name: str, start: np.ndarray) -> tuple[np.nd
     return start, fixed
 
 
-def _solved(function: Callable, start: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """The point nearest to `start` where the function vanishes, as far as it can be found: Gauss–Newton steps of least length in
-    the free coordinates, halved while they do not help."""
+def _solved(positions: Callable, start: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """The point nearest to `start` where the constraints vanish, as far as it can be found: Gauss–Newton steps of least length
+    in the free coordinates, halved while they do not help; `free` are their units, and 0 of those that stay."""
     x = start.copy()
-    value, slope = function(x)
+    value, slope, terms = positions(x)
+    sizes = _sizes(slope, terms, free)
+    rows = power_of_two(np.where(sizes > 0.0, sizes, sizes.max()))
     for _ in range(MOST_STEPS):
-        size = np.linalg.norm(value)
+        size = np.linalg.norm(value / rows)
         if size == 0 or not np.isfinite(size):
             break
-        step = np.zeros_like(x)
-        step[free] = np.linalg.lstsq(slope[:, free], -value, rcond=RANK)[0]
+        step = free * np.linalg.lstsq(slope * free / rows[:, None], -value / rows, rcond=RANK)[0]
         fraction = 1.0
         while fraction > 1e-6:
-            following = function(x + fraction * step)
-            if np.linalg.norm(following[0]) < (1 - fraction / 4) * size:
+            following = positions(x + fraction * step)
+            if np.linalg.norm(following[0] / rows) < (1 - fraction / 4) * size:
                 break
             fraction /= 2
         else:
             break
-        x, (value, slope) = x + fraction * step, following
+        x, (value, slope, _) = x + fraction * step, following
     return x
 
 
-def _unmet(model: Any, defect: np.ndarray, q: np.ndarray) -> list[tuple[str, float]]:
-    """The holonomic constraints that are not met, and by how much."""
-    names = model.constraints[-len(defect) :]
-    return [(n, d) for n, d in zip(names, defect, strict=True) if not abs(d) <= MET * (1 + np.abs(q).max())]
+def _sizes(slope: np.ndarray, terms: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """How large constraints are: their terms, or what a coordinate of the size of the machine makes of them."""
+    return np.maximum(terms, np.max(np.abs(slope) * units, axis=1))
 
 
-def _moving(model: Any, q: np.ndarray, v: np.ndarray, kept: np.ndarray, params: Any) -> np.ndarray:
-    """The velocity on the constraints nearest to v that leaves the given ones."""
-    rows = np.asarray(evaluated(model.assembly.rows, q, params))
-    defect = rows @ v
+def _unmet(model: Any, found: tuple[np.ndarray, np.ndarray, np.ndarray], units: np.ndarray) -> list[tuple[str, float]]:
+    """The holonomic constraints that are not met, of g, ∂g/∂q and the terms of g, and by how much."""
+    defect, slope, terms = found
+    names, sizes = model.constraints[-len(defect) :], _sizes(slope, terms, units)
+    return [(n, d) for n, d, size in zip(names, defect, sizes, strict=True) if not abs(d) <= MET * size]
+
+
+def _moving(model: Any, q: np.ndarray, v: np.ndarray, kept: np.ndarray, units: np.ndarray, params: Any) -> np.ndarray:
+    """The velocity on the constraints nearest to v, in these units, that leaves the given ones."""
+    rows = np.asarray(evaluated(model.assembly.rows, q, params)) * units
+    sizes = power_of_two(np.abs(rows).max(axis=1))
+    w, rows = v / units, rows / sizes[:, None]
+    fastest, defect = np.abs(w).max(), rows @ w
     for _ in range(3):  # once, and twice against roundoff
-        v = v.copy()
-        v[~kept] -= np.linalg.lstsq(rows[:, ~kept], defect, rcond=RANK)[0]
-        defect = rows @ v
-    size = MET * (1 + np.abs(v).max()) * (1 + np.abs(rows).max())
-    missed = [(n, d) for n, d in zip(model.constraints, defect, strict=True) if not abs(d) <= size]
+        w = w - ~kept * np.linalg.lstsq(rows * ~kept, defect, rcond=RANK)[0]
+        fastest, defect = max(fastest, np.abs(w).max()), rows @ w
+    v = w * units
+    missed = [(n, d * s) for n, d, s in zip(model.constraints, defect, sizes, strict=True) if not abs(d) <= MET * fastest]
     if missed:
         listed = ", ".join(f"{name} by {value:.3g}" for name, value in missed)
         given = [name for name, k in zip(model.coordinates, kept, strict=True) if k]
@@ -151,10 +166,11 @@ def dependent(model: Any, q: np.ndarray, params: Any) -> tuple[str, ...]:
     if not model.constraints:
         return ()
     found, basis = [], np.zeros((0, q.size))
-    for name, row in zip(model.constraints, np.asarray(evaluated(model.assembly.rows, q, params)), strict=True):
+    rows = np.asarray(evaluated(model.assembly.rows, q, params)) * coordinate_units(model, params)
+    for name, row in zip(model.constraints, rows, strict=True):
         rest = row - basis.T @ (basis @ row)
         rest -= basis.T @ (basis @ rest)
-        if np.linalg.norm(rest) <= DEPENDENT * max(np.linalg.norm(row), 1e-300):
+        if np.linalg.norm(rest) <= DEPENDENT * max(np.linalg.norm(row), TINY):
             found.append(name)
         else:
             basis = np.vstack([basis, rest / np.linalg.norm(rest)])

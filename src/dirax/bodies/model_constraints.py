@@ -11,12 +11,14 @@ import numpy as np
 from dirax.bodies.contacts import Contact
 from dirax.bodies.frames import unit
 from dirax.bodies.joints import norm_defect, stacked
+from dirax.bodies.machine_units import coordinate_units
 from dirax.bodies.motion import Glide
+from dirax.program.rounding import rounding
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 
 VANISHES = 1e-11
-"""Size of a constraint at points chosen at random below which it is met by the joints alone."""
+"""Size of a constraint, relative to its terms, at points chosen at random below which it is met by the joints alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +81,17 @@ class MachineConstraints:
     def kept(self) -> tuple[list[int], list[int]]:
         """Which holonomic constraints and one-forms are those of the system: not dropped, and not met by the tree alone."""
         model, rng = self.model, np.random.default_rng(0)
-        points = [rng.uniform(-0.9, 0.9, len(model.coordinates)) for _ in range(3)]
+        units = coordinate_units(model, model.params)
+        points = [rng.uniform(-0.9, 0.9, len(model.coordinates)) * units for _ in range(3)]
+        row_sizes = lambda q, p: jnp.abs(self.one_forms(q, p)) @ units
+        values = [lambda q, p, f=f: (f(q, p), rounding(lambda q: f(q, p), q)) for f in (self.defects, row_sizes)]
         sizes = np.zeros(len(self.all_holonomic)), np.zeros(len(self.all_rows))
         values = self.defects, lambda q, p: jnp.sum(jnp.abs(self.one_forms(q, p)), axis=1)
         for q in points:
             for size, value in zip(sizes, values, strict=True):
                 if size.size:
-                    found = np.abs(np.asarray(evaluated(value, q, model.params)))
+                    found, terms = (np.abs(np.asarray(a)) for a in evaluated(value, q, model.params))
+                    found = np.divide(found, terms, out=np.zeros(len(terms)), where=terms > 0.0)
                     size[:] = np.maximum(size, np.where(np.isfinite(found), found, 1.0))
         holonomic, rows = (
             [k for k, name in enumerate(names) if size[k] > VANISHES and name not in model.dropped]

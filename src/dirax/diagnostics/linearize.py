@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from dirax.diagnostics.linearized_field import FieldAt, linearized_chain, linearized_lagrangian
-from dirax.diagnostics.linearized_step import StepAt, linearized_step
+from dirax.diagnostics.linearized_step import linearized_step
+from dirax.numerics.tolerances import TINY
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
 
@@ -26,7 +27,7 @@ class Linearization:
     """ẏ = A y, or y_{k+1} = M y_k: small motions on the constraints, modulo the given symmetries.
 
     - `matrix` (d, d): A of the system, M of a scheme; `basis` (N, d): the directions y in the coordinates of the state, (q, v)
-      or x, and of a scheme its own;
+      or x, and of a scheme its own, orthonormal in natural units of these;
     - `eigenvalues` (d,): of A, or log(μ)/h for the eigenvalues μ of M, by real part, largest first; `multipliers`: μ, None of A;
     - `residual`: how far the place is from a relative equilibrium, relative to the terms of the equations.
     """
@@ -57,11 +58,12 @@ class Linearization:
     @property
     def stable(self) -> bool:
         """Whether no small motion grows, up to roundoff of multiple eigenvalues (1e-6)."""
-        return bool(self.eigenvalues[0].real <= 1e-6 * (1.0 + np.abs(self.eigenvalues).max())) if len(self.matrix) else True
+        sizes = np.abs(self.eigenvalues) if self.step is not None else np.abs(self.matrix)
+        return bool(self.eigenvalues[0].real <= 1e-6 * sizes.max()) if len(self.matrix) else True
 
 
 def _order(values: Any) -> np.ndarray:
-    return np.lexsort((-values.imag, -np.round(values.real, 9)))
+    return np.lexsort((-values.imag, -np.round(values.real / np.abs(values).max(initial=TINY), 9)))
 
 
 def _sorted(values: np.ndarray) -> np.ndarray:
@@ -109,14 +111,14 @@ def linearize(
     return _reduced(linearized_step(system, scheme, step, at, found, params), step)
 
 
-def _reduced(found: FieldAt | StepAt, step: float | None) -> Linearization:
+def _reduced(found: FieldAt, step: float | None) -> Linearization:
     if not found.residual <= AT_REST:
         raise ValueError(
             f"the place is no relative equilibrium: in the frame that moves with it the equations leave {found.residual:.3g} of "
             "their terms. Give initial data that stay as they are, or the symmetries= along which they move."
         )
     tangent = _orthonormal(found.tangent)
-    size = np.abs(found.matrix).max(initial=1.0)
+    size = np.abs(found.matrix).max(initial=0.0)
     for name, space in (("the constraints", tangent), ("the symmetries", _orthonormal(found.symmetric))):
         image = found.matrix @ space
         outside = np.abs(image - space @ (space.T @ image)).max(initial=0.0)
@@ -125,7 +127,8 @@ def _reduced(found: FieldAt | StepAt, step: float | None) -> Linearization:
             raise ValueError(f"the linear equations lead out of {name} by {outside:.3g}: {way}.")
     across = tangent - _project(found.symmetric, tangent)
     basis = _orthonormal(across)
-    return Linearization(basis.T @ found.matrix @ basis, basis, float(found.residual), step)
+    matrix = found.rate * (basis.T @ found.matrix @ basis)
+    return Linearization(matrix, found.units[:, None] * basis, float(found.residual), step)
 
 
 def _project(space: np.ndarray, vectors: np.ndarray) -> np.ndarray:

@@ -6,7 +6,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.equilibration import power_of_two
+from dirax.numerics.tolerances import TINY
 from dirax.program.memo import Memo
+from dirax.program.rounding import rounding
 from dirax.program.tracing import along, gradient, jacobian
 from dirax.program.user_functions import evaluated
 from dirax.systems.constraint_algorithm import constraint_algorithm
@@ -18,12 +21,16 @@ RANK = 1e-10
 
 class FieldAt(NamedTuple):
     """The matrix (N, N) of the linear equations in the frame that moves with the motion, and the columns that span the tangent
-    space of the constraints and the directions of the symmetries; how far the place is from a relative equilibrium."""
+    space of the constraints and the directions of the symmetries; how far the place is from a relative equilibrium.
+
+    All of it is in `units` (N,) of the coordinates, and with times of 1/`rate`."""
 
     matrix: np.ndarray
     tangent: np.ndarray
     symmetric: np.ndarray
     residual: float
+    units: np.ndarray
+    rate: float
 
 
 class Equations:
@@ -64,6 +71,11 @@ class Equations:
         """The derivatives of ∂L/∂v by q and by v."""
         return jacobian(lambda q, v: self.system.legendre(q, v, params, self.t), (0, 1))(q, v)
 
+    def energy(self, q: Any, v: Any, params: Any) -> tuple[Any, Any]:
+        """The size of the terms of L, and ∂²L/∂v²."""
+        lagrangian = lambda q, v: jnp.reshape(self.system.lagrangian.at(self.t, q, v, params), ())
+        return rounding(lagrangian, q, v), self.momentum(q, v, params)[1]
+
     def tangent(self, z: Any, params: Any) -> Any:
         """The derivative of all constraints on (q, v)."""
         n = z.shape[0] // 2
@@ -91,8 +103,19 @@ def _solved(equations: Equations, z: Any, params: Any) -> np.ndarray:
     w = np.zeros(n + sum(equations.system.constraints.sizes(z[:n], params)))
     for _ in range(3):  # affine in (a, u), but for forces that see the multipliers
         missed, by_w = (np.asarray(x) for x in evaluated(equations.by_w, z, w, params))
-        w = w - np.linalg.lstsq(by_w, missed, rcond=RANK)[0]
+        w = w - _least_squares(by_w, missed, n)
     return w
+
+
+def _least_squares(by_w: np.ndarray, right: np.ndarray, n: int) -> np.ndarray:
+    """The smallest (a, u) for which by_w (a, u) is nearest to a right-hand side (n + k, …): both measured by the masses of the
+    coordinates, and constraints by their rows in these units."""
+    masses = np.sqrt(np.abs(np.diag(by_w)[:n]))
+    masses = np.where(masses > 0.0, masses, 1.0)
+    largest = lambda rows: power_of_two(np.max(np.abs(rows) / masses, axis=1, initial=0.0))
+    rows, columns = (np.append(power_of_two(masses), largest(a)) for a in (by_w[n:, :n], by_w[:n, n:].T))
+    found = np.linalg.lstsq(by_w / rows[:, None] / columns, (right.T / rows).T, rcond=RANK)[0]
+    return (found.T / columns).T
 
 
 def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generators: Sequence[Callable], params: Any) -> FieldAt:
@@ -103,30 +126,57 @@ def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generato
     by_z, by_w = (np.asarray(x) for x in evaluated(equations.linear, z, w, params))
     derivative = np.zeros((2 * n, 2 * n))
     derivative[:n, n:] = np.eye(n)
-    derivative[n:] = -np.linalg.lstsq(by_w, by_z, rcond=RANK)[0][:n]
+    derivative[n:] = -_least_squares(by_w, by_z, n)[:n]
     lifted, slopes = [], []
     for generator in generators:
         value, slope, bend = (np.asarray(x) for x in evaluated(_lifts.get(generator, lambda g=generator: Lift(g)).at, q, v))
         lifted.append(np.concatenate([value, slope @ v]))
         slopes.append((slope, bend))
     symmetric = np.stack(lifted, axis=1) if lifted else np.zeros((2 * n, 0))
-    field = np.concatenate([v, w[:n]])
-    terms = 1.0 + np.abs(v).max(initial=0.0)
+    energy, metric = (np.asarray(a) for a in evaluated(equations.energy, q, v, params))
+    units, rate = _units(energy, metric, v, derivative)
+    field, symmetric = np.concatenate([v, w[:n]]) / units / rate, symmetric / units[:, None]
     if lifted:
+        sizes = power_of_two(np.abs(symmetric).max(axis=0))
+        symmetric = symmetric / sizes
         shares = np.linalg.lstsq(symmetric, field, rcond=RANK)[0]
-        residual = np.abs(field - symmetric @ shares).max() / (terms + np.abs(field).max())
-        for share, (slope, bend) in zip(shares, slopes, strict=True):
+        residual = np.abs(field - symmetric @ shares).max() / (1.0 + np.abs(field).max())
+        for share, (slope, bend) in zip(shares / sizes * rate, slopes, strict=True):
             derivative[:n, :n] -= share * slope
             derivative[n:, n:] -= share * slope
             derivative[n:, :n] -= share * bend
     else:
-        changed = derivative @ np.concatenate([v, np.zeros(n)])
-        changed = changed / (terms * (1.0 + np.abs(derivative).max()))
-        residual = max(np.abs(w[:n]).max() / (terms + np.abs(w).max()), np.abs(changed).max())
+        drift, changed = field[n:], derivative[n:, :n] @ v / units[n:] / rate**2
+        residual = np.abs([*drift, *changed]).max() / (1.0 + np.abs(field).max())
     tangent = np.eye(2 * n)
     if system.constraints.any:
-        tangent = kernel(np.asarray(evaluated(equations.tangent, z, params)))
-    return FieldAt(derivative, tangent, symmetric, residual)
+        tangent = kernel(np.asarray(evaluated(equations.tangent, z, params)) * units)
+    return FieldAt(scaled_matrix(derivative, units) / rate, tangent, symmetric, residual, units, rate)
+
+
+def _units(energy: np.ndarray, metric: np.ndarray, v: np.ndarray, derivative: np.ndarray) -> tuple[np.ndarray, float]:
+    """Units (2n,) of (q, v), and a rate: that of the fastest small motion, and the speeds at which a motion along each coordinate
+    has the `energy` that L has terms of, with the distances that these go in that time. They do not depend on how near to zero
+    the place happens to be.
+    """
+    n, sizes = v.size, np.abs(np.diag(metric))
+    rate = np.abs(np.linalg.eigvals(derivative)).max(initial=0.0)
+    rate = float(power_of_two(np.asarray(rate))) if rate > 0.0 else 1.0
+    energy = energy + np.abs(v) @ np.abs(metric) @ np.abs(v)
+    speeds = np.sqrt(np.divide(energy, sizes, out=np.zeros(n), where=sizes > 0.0))
+    return filled(np.concatenate([speeds / rate, speeds]), derivative / rate), rate
+
+
+def filled(units: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Units, powers of two; those that are 0 such that the entries of the matrix are about 1 at most, and 1 where these are 0."""
+    moved = np.max(np.abs(matrix) * units, axis=1)
+    units = np.where(units > 0.0, units, moved)
+    return np.where(units > 0.0, power_of_two(units), 1.0)
+
+
+def scaled_matrix(matrix: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """A matrix from coordinates to coordinates, in units of these."""
+    return matrix * units / units[:, None]
 
 
 class Lift:
@@ -160,6 +210,8 @@ def linearized_chain(system: Any, at: Mapping[str, Any], params: Any) -> FieldAt
     field = lambda x: chain.field(x)
     value, slope = (np.asarray(a) for a in evaluated(lambda x: (field(x), jacobian(field)(x)), x))
     rows = np.asarray(evaluated(lambda x: jacobian(lambda x: chain.constraints(x))(x), x))
-    residual = np.abs(value).max(initial=0.0) / (1.0 + np.abs(slope).max() * (1.0 + np.abs(x).max()))
-    tangent = kernel(rows) if rows.shape[0] else np.eye(x.size)
-    return FieldAt(slope, tangent, np.zeros((x.size, 0)), residual)
+    units = chain.units
+    moved, rates = np.abs(value / units).max(initial=0.0), np.abs(scaled_matrix(slope, units)).max(initial=0.0)
+    residual = moved / max(moved + rates * (1.0 + np.abs(x / units).max()), TINY)
+    tangent = kernel(rows * units) if rows.shape[0] else np.eye(x.size)
+    return FieldAt(scaled_matrix(slope, units), tangent, np.zeros((x.size, 0)), residual, units, 1.0)

@@ -1,17 +1,20 @@
 """The derivative of one step of a scheme at a relative equilibrium."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from dirax.diagnostics.linearized_field import FieldAt, equations_of
+from dirax.diagnostics.linearized_field import FieldAt, equations_of, filled, scaled_matrix
+from dirax.numerics.equilibration import balanced_inverse
+from dirax.numerics.newton import AT_FLOOR, sizes_of_unknowns
 from dirax.program.memo import Memo
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.redundancy import redundant_constraints
 from dirax.run.start import begun, completed
 from dirax.run.validate import Case, validated_case
+from dirax.schemes.collision_step import SUMS
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import AbstractScheme, make_step_equation
 from dirax.systems.shape import Shape
@@ -20,17 +23,11 @@ from dirax.systems.system import AbstractSystem
 INVARIANT = 1e-8
 """How far, relative to the step's derivative, it may lead out of the tangent space of the discrete constraints."""
 
+RANK = 1e-12
+"""Singular values of the motions along symmetries in a step, relative to the largest one, that count as zero."""
+
 TRIES = 8
 STEPS = 30
-
-
-class StepAt(NamedTuple):
-    """As `FieldAt`, of a step in the coordinates of the scheme's state."""
-
-    matrix: np.ndarray
-    tangent: np.ndarray
-    symmetric: np.ndarray
-    residual: float
 
 
 class _Stage:
@@ -55,12 +52,13 @@ class _Stage:
         if u.size:
             for _ in range(STEPS):
                 missed, by_u, by_state = (np.asarray(x) for x in evaluated(self.residual, u, state, params))
-                change = np.linalg.solve(by_u, missed)
+                inverse = balanced_inverse(by_u)
+                change, sizes = inverse @ missed, sizes_of_unknowns(by_u, inverse, u, missed)
                 u = u - change
-                if np.abs(change).max() <= 1e-14 * (1.0 + np.abs(u).max()):
+                if np.all(np.abs(change) <= AT_FLOOR * sizes):
                     break
             _, by_u, by_state = (np.asarray(x) for x in evaluated(self.residual, u, state, params))
-            by_state = -np.linalg.solve(by_u, by_state)
+            by_state = -balanced_inverse(by_u) @ by_state
         following, along_u, along_state = (np.asarray(x) for x in evaluated(self.advance, u, state, params))
         return following, along_state + along_u @ by_state
 
@@ -70,8 +68,9 @@ _stages: Memo[_Stage] = Memo(64)
 
 def linearized_step(
     system: AbstractSystem, scheme: AbstractScheme, h: Any, at: Mapping[str, Any], field: FieldAt, params: Any
-) -> StepAt:
-    """The derivative of a step about the relative equilibrium `at`, where the linearization of the system is `field`.
+) -> FieldAt:
+    """The derivative of a step about the relative equilibrium `at`, where the linearization of the system is `field`, in the
+    coordinates of the scheme's state.
 
     Raises `ValueError` where the scheme's own relative equilibrium is another one.
     """
@@ -82,16 +81,24 @@ def linearized_step(
     equation = make_step_equation(scheme, system, Shape(shape.n, shape.m, shape.c, redundant=redundant))
     began = begun(equation, case, initial)
     first = np.asarray(began.state)
-    lift = _lift(system, equation.stages[0][0].state_layout, case)
+    layout = equation.stages[0][0].state_layout
+    lift = _lift(system, layout, case)
     state, matrix, time = first, np.eye(first.size), case.t0
     for (stage, fraction), guess in zip(equation.stages, began.guess, strict=True):
         state, slope = _stage(stage, time, fraction * h).step(state, np.asarray(guess), case.params)
         matrix, time = slope @ matrix, time + fraction * h
     # lifts are tangent to the discrete constraints up to the forces of constraints, of which a step takes no notice
+    units = np.max(np.abs(lift) * field.units, axis=1)
+    energy = np.max(units[layout.place("p")] * field.units[shape.n :])
+    for name in filter(layout.__contains__, SUMS):
+        units[layout.place(name)] = energy
+    units = filled(units, matrix)
+    matrix, lift = scaled_matrix(matrix, units), lift * field.units / units[:, None]
+    first, change = first / units, (state - first) / units
     symmetric, tangent = matrix @ lift @ field.symmetric, matrix @ lift @ field.tangent
-    change, v = state - first, case.data["v"]
-    moved = symmetric if symmetric.size else matrix @ lift @ np.concatenate([v, np.zeros(v.size)])[:, None]
-    shares = np.linalg.lstsq(moved, change, rcond=1e-12)[0]
+    straight = np.concatenate([case.data["v"], np.zeros(shape.n)]) / field.units / field.rate
+    moved = symmetric if symmetric.size else matrix @ lift @ straight[:, None]
+    shares = np.linalg.lstsq(moved, change, rcond=RANK)[0]
     residual = np.abs(change - moved @ shares).max() / (1.0 + np.abs(first).max() + np.abs(change).max())
     for _ in range(TRIES):
         tangent = np.linalg.qr(tangent)[0]
@@ -99,7 +106,7 @@ def linearized_step(
         if np.abs(image - tangent @ (tangent.T @ image)).max(initial=0.0) <= INVARIANT * np.abs(matrix).max():
             break
         tangent = image
-    return StepAt(matrix, tangent, symmetric, residual)
+    return FieldAt(matrix, tangent, symmetric, residual, units, 1.0)
 
 
 def _stage(equation: Any, t: float, h: float) -> _Stage:

@@ -10,15 +10,21 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
 
+from dirax.numerics.loops.kernel import Kernel
+from dirax.numerics.sparse import kernels
 from dirax.numerics.sparse.border import full_lines
 from dirax.numerics.sparse.colours import column_colours
 from dirax.numerics.sparse.elimination import elimination
+from dirax.numerics.sparse.orders import whole
 from dirax.program.sparsity import pattern_of
 
 DENSE_OPERATION, DENSE_ENTRY = 0.05, 4.0
 SPARSE_OPERATION, SPARSE_ROW = 1.2, 60.0
 """Nanoseconds that elimination takes: LAPACK for each of its k³/3 multiplications, and the columns of a dense Jacobian for each
 entry; elimination that follows indices for each multiplication, and each equation."""
+
+
+_in_units = Kernel(kernels.in_units, 2)
 
 
 class SparseEquations(eqx.Module):
@@ -41,6 +47,8 @@ class SparseEquations(eqx.Module):
     tables: tuple[Array, ...]
     solve_tables: tuple[Array, ...]
     size: Array
+    entries: tuple[Array, ...]
+    """Rows and columns of the entries, where they are among the values, and how many of all there are."""
 
     @classmethod
     def of(cls, function: Callable, unknowns: Any, *others: Any) -> "SparseEquations":
@@ -77,12 +85,14 @@ class SparseEquations(eqx.Module):
             entries = pattern.tocoo()
             numbers = 1 + _places(size, colours, count, full, entries.row, entries.col)
             pattern = sp.csr_matrix((numbers, pattern.indices, pattern.indptr), pattern.shape)
+        entries = pattern.tocoo()
+        of_entries = *(whole(a) for a in (entries.row, entries.col, entries.data - 1)), np.array([size, pattern.nnz, total])
         with jax.ensure_compile_time_eval():
             put = jax.device_put  # `jnp.asarray` compiles a program of its own for each shape, of which XLA keeps a megabyte
             arrays = lambda given: tuple(map(put, given))
             return cls(
                 _Static(pattern), total, made, count, full, put(colours), arrays(made.tables(pattern)),
-                arrays(made.solve_tables), put(np.array([size], np.int64)),
+                arrays(made.solve_tables), put(np.array([size], np.int64)), arrays(of_entries),
             )  # fmt: skip
 
     @property
@@ -126,6 +136,14 @@ class SparseEquations(eqx.Module):
         values = np.zeros(self.length)
         values[np.asarray(pattern[entries.row, entries.col]).ravel() - 1] = entries.data
         return values
+
+    def in_units(self, values: Any, sizes: Any, xp: Any = jnp) -> tuple[Any, Any]:
+        """The values of the Jacobian for unknowns of the size 1, where they have these sizes, with its rows in units of their
+        terms; and what the rows are multiplied with."""
+        shapes = [((self.elimination.size,), np.float64), ((self.length,), np.float64)]
+        entries = self.entries if xp is jnp else tuple(map(np.asarray, self.entries))
+        units, scaled = _in_units.by(xp, shapes, *entries[:3], values, sizes, entries[3])
+        return scaled, units
 
     def factorise(self, values: Float[Array, " values"]) -> Any:
         """The factors of the Jacobian with these values."""

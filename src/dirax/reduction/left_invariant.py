@@ -8,6 +8,7 @@ import numpy as np
 
 from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.numerics.tolerances import SYMMETRY_DEFECT
+from dirax.program.rounding import rounding
 from dirax.program.user_functions import UserFunction, evaluated
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.symmetry import off_span
@@ -64,6 +65,10 @@ def _refuse_other_systems(system: Any, group: AbstractLieGroup) -> None:
         )
 
 
+def _nonzero(size: Any) -> Any:
+    return jnp.where(size > 0.0, size, 1.0)
+
+
 def _refuse_asymmetry(system: Any, group: AbstractLieGroup, params: Any) -> None:
     """Raise `ValueError` where L, or the span of the one-forms, at (g, gξ) is another than at (e, ξ), and where holonomic
     constraints are not those of the group."""
@@ -74,12 +79,15 @@ def _refuse_asymmetry(system: Any, group: AbstractLieGroup, params: Any) -> None
     def at(turn, xi, params):
         g = group.group_exp(turn)
         here, there = (system.lagrangian(h, group.left_translate(h, xi), params) for h in (identity, g))
-        defects = [jnp.abs(there - here)[None] / jnp.maximum(1.0, jnp.maximum(jnp.abs(here), jnp.abs(there)))]
+        terms = lambda function, *values: rounding(lambda *values: jnp.reshape(function(*values), (-1,)), *values)
+        relative = lambda defect, sizes: (jnp.max(jnp.abs(defect)) / _nonzero(jnp.max(sizes)))[None]
+        sizes = terms(lambda h, v: system.lagrangian(h, v, params), g, group.left_translate(g, xi))
+        defects = [relative(there - here, sizes)]
         if one_forms is not None:
             fixed, moved = (_on_the_algebra(one_forms, group, h, params) for h in (identity, g))
-            defects.append(jnp.max(jnp.abs(off_span(moved, fixed)))[None] / jnp.maximum(1.0, jnp.max(jnp.abs(moved))))
+            defects.append(relative(off_span(moved, fixed), jnp.abs(moved)))
         if holonomic is not None:
-            defects.append(jnp.max(jnp.abs(holonomic(g, params)))[None])
+            defects.append(relative(holonomic(g, params), terms(lambda g, holonomic=holonomic: holonomic(g, params), g)))
         return jnp.concatenate([there[None] - here[None], *defects]), g
 
     values, g = (np.asarray(a) for a in evaluated(jax.vmap(at, in_axes=(0, 0, None)), turn, xi, params))

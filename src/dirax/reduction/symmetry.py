@@ -148,7 +148,11 @@ def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, para
         there, _, derivative = pulled_back(g, t, q, v)
         moved = affine_rows(constraints, t, there, params)
         moved = jnp.hstack([moved[:, : q.size] @ derivative, moved[:, q.size :]])
-        return moved if _sees_multipliers(system) else off_span(moved, affine_rows(constraints, t, q, params))
+        if _sees_multipliers(system):
+            return moved
+        fixed = affine_rows(constraints, t, q, params)
+        largest = jnp.max(jnp.abs(fixed), axis=1, keepdims=True)  # the unit of each
+        return off_span(moved, fixed) / jnp.where(largest > 0.0, largest, 1.0)
 
     def holonomic(g, t, q, v):
         return constraints.position_defect(t, action(g, q), params)
@@ -204,9 +208,9 @@ def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: An
         found = in_numpy(at, samples, Same(at), for_few=True)  # quicker than to compile it
         defect, size = map(np.asarray, found or jax.jit(jax.vmap(at))(*samples))
         known = np.isfinite(defect) & np.isfinite(size)[:, None]
-        # one-forms less their span are 0 where they are looked at: they have the unit 1, functions of small units their own
-        unit = np.max(size, where=np.isfinite(size), initial=0.0)
-        size = np.maximum(size, 1.0 if name == "one_forms" or unit == 0.0 else min(1.0, unit))
+        # one-forms less their span are 0 where they are looked at, and in their own units; the others have theirs
+        unit = np.median(size[np.isfinite(size) & (size > 0.0)]) if np.any(np.isfinite(size) & (size > 0.0)) else 1.0
+        size = np.maximum(size, 1.0 if name == "one_forms" else unit)
         relative = np.where(known, defect / np.where(known, size[:, None], 1.0), 0.0)
         row, column = np.unravel_index(int(np.argmax(relative)), relative.shape)
         largest = float(relative[row, column])
@@ -248,7 +252,7 @@ def translation_symmetries(
 
     slopes = np.asarray(jax.jit(jax.vmap(at))(jnp.asarray(random.uniform(0, 1, samples)), *points))
     slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))]
-    unit = min(1.0, np.max(np.abs(slopes[:, -1]), initial=0.0))  # L in small units has small derivatives
+    unit = np.max(np.abs(slopes[:, -1]), initial=0.0)  # the size of L at the points, of which its derivatives are part
     slopes = slopes[:, :-1].reshape(-1, q.size)
     if not len(slopes):
         raise ValueError("L is finite at none of the points around q: choose q inside its domain, or a smaller radius.")

@@ -21,7 +21,7 @@ from dirax.run.final_manifold import (
 )
 from dirax.run.plan import AnyPlan, planned
 from dirax.run.premises import bytes_of
-from dirax.run.progress import reporting
+from dirax.run.progress import reported, reporting
 from dirax.run.redundancy import redundant_constraints
 from dirax.run.refused_start import refuse_bad_start
 from dirax.run.result import solution_of
@@ -115,7 +115,7 @@ def carried_out(
     """The Solution of a run. Raises `ValueError` for data that a premise excludes."""
     if settings.events:
         return run_with_events(carried_out, _begun, settings, case, steps, save_every, progress, kind, entered)
-    began = time.perf_counter()
+    began, progress = time.perf_counter(), reported(progress)
     every = _checked_times(case, steps, save_every)
     kind = None if settings.to is not None else kind or kind_for(settings, case)
     if kind is None and case.traced:
@@ -199,7 +199,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     if not (traced := traced or is_traced(start)):
         for stage in dict.fromkeys(stage.check for stage, _ in equation.stages):
             stage(data, case.h, own)
-        refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial, singular)
+        refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial, settings.project, singular)
         if check_initial and singular:
             refuse_off_final_manifold(system, case, initial)
         if check_initial:
@@ -280,7 +280,7 @@ class Continuation:
 
     def __call__(self, sol: Solution, more: int, progress: Any) -> Solution:
         """The solution of the whole run of so many more steps, bit by bit."""
-        began, old = time.perf_counter(), self.begun.problem
+        began, old, progress = time.perf_counter(), self.begun.problem, reported(progress)
         after = old.steps if self.record is not None else 0
         every = min(self.begun.save_every, old.steps + more)
         problem = old.with_numbers(steps=old.steps + more, save_every=every, after=after, record=self.record)

@@ -1,6 +1,6 @@
 """Impact: a wall that the motion bounces off, and what happens to the momentum there."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any
 
@@ -62,6 +62,11 @@ class Impact:
     def __repr__(self) -> str:
         own = getattr(self.gap, "__name__", type(self.gap).__name__).replace("<lambda>", "lambda")
         return f"Impact({own}({', '.join(self.arguments)}), restitution={self.restitution:g})"
+
+
+def gaps_of(walls: Sequence[Impact]) -> Callable:
+    """(t, q, params) ↦ the gaps of all walls (walls,)."""
+    return lambda t, q, params: jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in walls])
 
 
 def jump(system: Any, stage: StepEquation, impact: Impact, state: Any, t: Any, h: Any, params: Any) -> Any:

@@ -13,14 +13,17 @@ from dirax.engines.contract import Outcome, Problem, finished
 from dirax.program.memo import Memo, Same
 from dirax.run.event import captures_traced
 from dirax.run.flight import Flight, alerted
-from dirax.run.impact import Impact, Numbers, jump
+from dirax.run.impact import Impact, Numbers, gaps_of, jump
 from dirax.run.impact_search import ImpactSearch
 from dirax.run.result import solution_of
 from dirax.schemes.collision_step import CollisionStep
 from dirax.schemes.step import CLOCK, PART, STEP_DENSITY, StepEquation
-from dirax.schemes.watched_step import WatchedStep
+from dirax.schemes.watched_step import ON_WALL, WatchedStep, gap_terms
 from dirax.solution.events import Events
 from dirax.solution.solution import Solution
+
+BEHIND = 10.0 * ON_WALL
+"""How far behind a wall, relative to the terms of its gap, a trajectory may begin: by rounding."""
 
 
 def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> Solution:
@@ -86,7 +89,7 @@ def _flights(
 ) -> Callable[[Problem], Flight]:
     """What makes the flight of a trajectory, for those that differ in numbers alone from this one."""
     stage = p.equation.stages[0][0]
-    gaps = lambda t, q, params: jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in walls])
+    gaps = gaps_of(walls)
     same = tuple(map(Same, walls))
     watched, collision = _steps.get(
         ("walls", Same(system), Same(p.equation), *same),
@@ -104,6 +107,8 @@ def _flights(
 
     t, q, state = np.zeros(()), np.zeros(stage.state_layout["q"][0]), np.asarray(p.state)
     gap = Numbers(gaps, [t, q], p.params, "gaps", *same)
+    sizes = lambda t, q, end, params: gap_terms(gaps, t, q, [end], params)
+    terms = Numbers(sizes, [t, q, q], p.params, "terms of gaps", *same)
     jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, state, t, h, params)
     key = "jump", Same(system), Same(p.equation)
     jumps = [Numbers(jumped(wall), [state, t, t], p.params, *key, own) for wall, own in zip(walls, same, strict=True)]
@@ -112,7 +117,7 @@ def _flights(
 
     def flight(p: Problem) -> Flight:
         many, one, hit = problems(p)
-        search = ImpactSearch(p, numbers, run, gap.of(p.params))
+        search = ImpactSearch(p, numbers, run, gap.of(p.params), terms.of(p.params))
         return Flight(search, [one.of(p.params) for one in jumps], watch(many), watch(one), collide(hit))
 
     return flight
@@ -154,14 +159,21 @@ def _refuse_behind(flight: Flight, lane: int | None) -> None:
     p, whose = flight.search.problem, "" if lane is None else f" of trajectory {lane}"
     state = np.asarray(p.state)
     gaps = flight.search.gaps.one(p.t0, state[flight.q])
-    for number, gap in zip(flight.search.numbers, gaps, strict=True):
+    for wall, (number, gap) in enumerate(zip(flight.search.numbers, gaps, strict=True)):
         if not np.isfinite(gap):
             raise ValueError(f"the gap of events[{number}] must be finite along the run, but it is {gap} at the start{whose}.")
-        if not gap >= -1e-12 * (1.0 + np.max(np.abs(state[flight.q]))):
+        if gap < 0.0 and not gap >= -BEHIND * _terms(flight)[wall]:
             raise ValueError(
                 f"the gap of events[{number}] must not be negative at the start{whose}, but it is {gap:.6g}: begin in front "
                 "of the wall, or change the sign of the gap."
             )
+
+
+def _terms(flight: Flight) -> np.ndarray:
+    """The sizes of the terms of the gaps at the start, for the first step."""
+    search, state = flight.search, np.asarray(flight.search.problem.state)
+    end = search.part(state, np.asarray(search.problem.guess[0]), 0.0, 1.0)[1]
+    return search.terms_at(state, state if end is None else end[0], 0.0)
 
 
 def _events(flights: list[Flight], p: Problem) -> Events:

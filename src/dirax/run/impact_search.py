@@ -28,6 +28,8 @@ class ImpactSearch:
     """The places of the walls in `events=`."""
     run: Any
     gaps: Numbers
+    terms: Numbers
+    """Of (t, q, q elsewhere in the step), as of `gap_terms`."""
 
     def __post_init__(self):
         self.layout = self.problem.equation.stages[0][0].state_layout
@@ -64,13 +66,14 @@ class ImpactSearch:
     def next(self, state: np.ndarray, u: np.ndarray, at: float, rest: float) -> tuple[float, int] | None:
         """How long it is to the next impact within a rest of a step, and which wall is hit; None where none is. Raises
         `ValueError` for a gap that is no number."""
+        end = self.part(state, u, at, rest)[1]
+        small = ON_WALL * self.terms_at(state, state if end is None else end[0], at)
         here = self.gaps_at(state, at)
-        q = state[self.layout.place("q")]
-        values: dict[float, np.ndarray] = {0.0: np.where(here < ON_WALL * (1.0 + np.max(np.abs(q))), 0.0, here)}
+        values: dict[float, np.ndarray] = {0.0: np.where(here < small, 0.0, here)}
 
         def gap(part: float) -> np.ndarray:
             if part not in values:
-                _, moved = self.part(state, u, at, part)
+                moved = end if part == rest else self.part(state, u, at, part)[1]
                 values[part] = np.full(len(self.numbers), np.nan) if moved is None else self.gaps_at(moved[0], at + part)
             return values[part]
 
@@ -78,6 +81,11 @@ class ImpactSearch:
         g = np.array([gap(float(x)) for x in places])
         hits = [found for wall in range(len(self.numbers)) if (found := self._hit(wall, gap, places, g[:, wall])) is not None]
         return min(hits) if hits else None
+
+    def terms_at(self, state: np.ndarray, end: np.ndarray, at: float) -> np.ndarray:
+        """The sizes of the terms of every gap at the first state of a step with this end."""
+        q = self.layout.place("q")
+        return self.terms.one(self.time(state, at), state[q], end[q])
 
     def gaps_at(self, state: np.ndarray, at: float) -> np.ndarray:
         """Of every wall. Raises `ValueError` for one that is no number."""

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 
 from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem
 from dirax.program.given_tangents import implicit
-from dirax.run.impact import Impact, jump
+from dirax.run.impact import Impact, gaps_of, jump
 from dirax.run.result import solution_of
 from dirax.schemes.step import CLOCK, StepEquation
-from dirax.schemes.watched_step import ON_WALL, PARTS
+from dirax.schemes.watched_step import ON_WALL, PARTS, gap_terms
 from dirax.solution.events import Events
 from dirax.solution.solution import Solution
 from dirax.solution.steps_again import stepped
@@ -47,8 +47,13 @@ class TracedFlight:
 
     def gaps(self, t, state, params):
         """Of every wall, (walls,)."""
-        t, q = self.time(state, t), state[self.equation.state_layout.place("q")]
-        return jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in self.walls])
+        return gaps_of(self.walls)(self.time(state, t), state[self.equation.state_layout.place("q")], params)
+
+    def terms(self, t, state, end, params):
+        """The sizes of the terms of every gap, as of `gap_terms`; of a step without an end those at its state."""
+        q = self.equation.state_layout.place("q")
+        end = jnp.where(jnp.all(jnp.isfinite(end)), end, state)
+        return jax.lax.stop_gradient(gap_terms(gaps_of(self.walls), self.time(state, t), state[q], [end[q]], params))
 
     def moved(self, state, u, t, h, params):
         """The state after a step of length h and its unknowns; NaN where it has no solution."""
@@ -112,14 +117,16 @@ class TracedFlight:
         """(θ, wall, whether there is one) of the next impact in what is left of a step."""
         fixed, begun = jax.lax.stop_gradient((state, u, t, at, h, params)), jax.lax.stop_gradient(at)
 
-        def gaps(theta, values):
+        def seen(theta, values):
             state, u, t, at, h, params = values
             there, _ = self.moved(state, u, t + at * h, jnp.where(theta > 0.0, theta, 1.0) * h, params)
-            return self.gaps(t + (at + theta) * h, jnp.where(theta > 0.0, there, state), params)
+            there = jnp.where(theta > 0.0, there, state)
+            return self.gaps(t + (at + theta) * h, there, params), there
 
         places = jnp.arange(PARTS + 1) / PARTS * (1.0 - begun)
-        values = jax.lax.map(lambda theta: gaps(theta, fixed), places)
-        small = ON_WALL * (1.0 + jnp.max(jnp.abs(fixed[0])))
+        values, states = jax.lax.map(lambda theta: seen(theta, fixed), places)
+        small = ON_WALL * self.terms(t + begun * h, fixed[0], states[-1], fixed[5])
+        gaps = lambda theta, values: seen(theta, values)[0]
         values = values.at[0].set(jnp.where(values[0] < small, 0.0, values[0]))
         below = values < 0.0
         first = jnp.argmax(below, axis=0)

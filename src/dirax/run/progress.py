@@ -2,6 +2,14 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
+
+
+def reported(progress: Any) -> Any:
+    """What a run is told of its progress= as it is. Raises `TypeError` for what says nothing."""
+    if isinstance(progress, bool) or callable(progress):
+        return progress
+    raise TypeError(f"progress must be True, False or a function of (steps done, steps in all), but {progress!r:.80} was given.")
 
 
 @contextmanager

@@ -18,18 +18,24 @@ FINAL_MANIFOLD = (
 
 
 def refuse_bad_start(
-    system: AbstractSystem, initial: Initial, start: Start, labels: Sequence[str], check_constraint: bool, singular: bool
+    system: AbstractSystem,
+    initial: Initial,
+    start: Start,
+    labels: Sequence[str],
+    check_constraint: bool,
+    projected: bool,
+    singular: bool,
 ) -> None:
     """Raise `ValueError` for functions that are not finite at the data, data off the constraints (with the residual), and a
     first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
-    the equations of the first step; `singular` says that the Lagrangian is."""
+    the equations of the first step; `projected` says that the data have been moved, `singular` that the Lagrangian is."""
     if start.row0 is not None and "constraint" in start.row0:
         both = _lanes(initial.defect, 1), _lanes(start.row0["constraint"], 1)
         initial = initial._replace(defect=np.concatenate(both, axis=-1))
     _refuse_constraints_outside_their_domain(system, initial)
     _refuse_outside_the_domain(initial)
     if check_constraint:
-        _refuse_off_constraint(system, initial, start)
+        _refuse_off_constraint(system, initial, start, projected)
     if start.jacobian is not None:
         _refuse_singular_step(start, labels, singular, initial.lagrangian is not None)
 
@@ -61,7 +67,7 @@ def _refuse_constraints_outside_their_domain(system: AbstractSystem, initial: In
             )
 
 
-def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Start) -> None:
+def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Start, projected: bool) -> None:
     defect = _lanes(initial.defect, 1)
     if not defect.size:
         return
@@ -74,6 +80,8 @@ def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Star
             "choose q1 on the discrete constraint, or pass check_initial=False to take the points as they are"
             if start.row0 is not None
             else "pass project=True to project them, or check_initial=False to take them as they are"
+            if not projected
+            else "project=True, which moves q across the constraint by its forces, found no place on it: begin nearer to it"
         )
         more = system.explain(_lanes(start.state, 1)[lane])
         raise ValueError(

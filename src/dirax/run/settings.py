@@ -57,7 +57,7 @@ def stated(
     on, steps, save_every = engine_from(engine), count(steps, "steps"), count(save_every, "save_every")
     max_iterations = count(max_iterations, "max_iterations", MOST_ITERATIONS)
     events = checked_events(events, (Event, Impact))
-    case = validated_case(data, params, batch_params, step, t0)
+    case = validated_case(data, params, flag(batch_params, "batch_params"), step, t0)
     system = system if inputs is None else system.with_inputs(inputs)
     path = checked_store(to, events, case.traced)
     given = {"project": project, "check_initial": check_initial, "compensated": compensated}

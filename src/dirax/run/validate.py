@@ -207,10 +207,12 @@ def refuse_more_than_memory(problem: Any) -> None:
 
 
 def checked_store(to: Any, events: Any, traced: bool) -> Path | None:
-    """The path of a store to write, None where there is to be none. Raises `ValueError` for another ending, and with events and
-    values that JAX traces."""
+    """The path of a store to write, None where there is to be none. Raises `TypeError` for what is no path, `ValueError` for
+    another ending, and with events and values that JAX traces."""
     if to is None:
         return None
+    if not isinstance(to, str | os.PathLike):
+        raise TypeError(f'to must be the path of a zarr store such as "run.zarr", but {to!r:.80} was given.')
     path = Path(to)
     checked_name(path)
     if path.suffix != ".zarr":

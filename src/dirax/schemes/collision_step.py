@@ -14,7 +14,7 @@ from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import CLOCK, STEP_DENSITY, Field, StepEquation
-from dirax.schemes.watched_step import ON_WALL, velocity
+from dirax.schemes.watched_step import ON_WALL, gap_terms, velocity
 
 SUMS = ("work", "energy_defect")
 """Parts of a state that are sums since the start."""
@@ -79,10 +79,11 @@ class CollisionStep(AbstractStep):
     def advance(self, u, state, t, h, params):
         there, time, gaps = self.at_wall(u, state, t, h, params)
         after, _, speed, share = self._jumped(u, state, there, time, h, params)
-        small = ON_WALL * (1.0 + jnp.max(jnp.abs(there[self.inner.state_layout.place("q")])))
+        begun, end = (vector[self.inner.state_layout.place("q")] for vector in (state, there))
+        small = ON_WALL * gap_terms(self.gaps, time, end, [begun], params)
         good = (u[-1] > 0.0) & (u[-1] <= 1.0) & (speed < 0.0) & (share > HELD)
         for i in range(len(self.restitutions)):
-            good = good & ((state[-2] == i) | (gaps[i] >= -small))
+            good = good & ((state[-2] == i) | (gaps[i] >= -small[i]))
         return jnp.concatenate([jnp.where(good, after, jnp.nan), jnp.stack([state[-3], state[-2], u[-1]])])
 
     def unpack(self, state, u, t, h, params):

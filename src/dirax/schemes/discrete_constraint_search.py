@@ -9,6 +9,7 @@ have one solution (u, s)(x_0) near that point, and s(x_0) = 0 is the condition t
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -20,21 +21,23 @@ from dirax.numerics.ranks import numerical_rank
 from dirax.numerics.tolerances import JACOBIAN_NOISE, STEP_RANK
 from dirax.program.roots import regular_root
 from dirax.schemes.step import StepEquation
+from dirax.schemes.step_units import in_step_units, step_units
 from dirax.systems.constraint_chain import DETERMINED, EMPTY, GAUGE, IRREGULAR, ConstraintLevel
 
 SAMPLES = 4
 """Points around the given one at which ranks are compared."""
 
 ONTO = GaussNewton(rank=JACOBIAN_NOISE, floor=1e-14, least_slope=1.0)
-"""The residual of a step is in the units of its scheme, and its Jacobian has entries of roundoff."""
+"""The Jacobian of a step has entries of roundoff."""
 
 
 class DiscreteConstraintSearch:
-    """The state of the algorithm between levels."""
+    """The state of the algorithm between levels; states and unknowns are in natural `units`, until the `found` ones."""
 
     def __init__(self, equation: StepEquation, state, unknowns, h: float, params, radius: float):
-        self.equation, self.h, self.params = equation, h, params
-        self.state, self.unknowns = state, unknowns
+        self.units = step_units(equation, state, unknowns, h, params)
+        self.equation, self.h, self.params = in_step_units(equation, self.units), h, params
+        self.state, self.unknowns = state / self.units[0], unknowns / self.units[1]
         self.size, self.k = state.size, unknowns.size
         self.radius = radius * (1.0 + np.abs(state).max())
         self.rng = np.random.default_rng(0)
@@ -134,7 +137,7 @@ class DiscreteConstraintSearch:
         free = np.linalg.svd(by_u)[2][rank:].T
         u, x = jnp.asarray(self.unknowns), jnp.asarray(self.state)
         moved = jax.jit(jax.jacfwd(lambda u: self.equation.advance(u, x, 0.0, self.h, self.params)))(u)
-        freedom = _rank(np.asarray(moved) @ free / self.h) if free.size else 0
+        freedom = _rank(np.asarray(moved) @ free) if free.size else 0
         hidden = free.shape[1] - freedom
         words = [f"M_d,f has dimension {dimension} of {self.size}"]
         words.append(
@@ -144,6 +147,13 @@ class DiscreteConstraintSearch:
         )
         words += [f"{hidden} of the other unknowns undetermined"] if hidden else []
         return (GAUGE if freedom else DETERMINED), "; ".join(words) + ".", freedom
+
+    def found(self) -> tuple[np.ndarray, np.ndarray, tuple[ConstraintLevel, ...]]:
+        """The state, the unknowns and the levels in the user's units."""
+        unit = jnp.asarray(self.units[0])
+        of_state = lambda part: lambda x, params: part(x / unit, params)
+        levels = tuple(replace(level, constraints=of_state(level.constraints)) for level in self.levels)
+        return self.state * self.units[0], self.unknowns * self.units[1], levels
 
     def nodes(self, count: int) -> list[np.ndarray]:
         """The saved (q, p) or x at states of S_{d,f} around the present one."""

@@ -89,7 +89,7 @@ def discrete_constraint_algorithm(
     """The chain of constraint manifolds of the difference equations that `scheme` makes of `system`, with step size `step`.
 
     `near`: initial data as a dict such as {"q": …, "v": …}, or a point x (N,), not necessarily on any constraint;
-    `radius`: size of the neighbourhood, relative to 1 + |x|, in which ranks are checked to be constant.
+    `radius`: size of the neighbourhood, relative to 1 + |x| in natural units, in which ranks are checked to be constant.
 
         print(dx.discrete_constraint_algorithm(system, dx.DiscreteDirac(), near={"q": q, "v": v}, step=0.01))
 
@@ -120,10 +120,11 @@ def discrete_constraint_algorithm(
     except (TypeError, ValueError):
         continuous = None
     distance, agrees, comparison = _compared(search, verdict, continuous)
+    state, unknowns, levels = search.found()
     return DiscreteConstraintChain(
-        levels=tuple(search.levels),
-        state=search.state,
-        unknowns=search.unknowns,
+        levels=levels,
+        state=state,
+        unknowns=unknowns,
         step=float(step),
         verdict=verdict,
         explanation=explanation,

@@ -1,12 +1,14 @@
 """A step that looks where it goes: with walls in its way it ends, or says which one is hit first and about where."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import jax.numpy as jnp
 
 from dirax.program.legendre import constrained_velocity
+from dirax.program.rounding import rounding
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.hermite import cubic
 from dirax.schemes.layout import Layout
@@ -16,7 +18,7 @@ PARTS = 4
 """Places of a step at which gaps are looked at."""
 
 ON_WALL = 1e-13
-"""Gaps below this, relative to q, are none."""
+"""Gaps below this are none, relative to their terms at coordinates as large as they are in the step (`gap_terms`)."""
 
 NONE, UNSURE = -1.0, -2.0
 """What stands for a wall where none is hit, and where the gaps do not say which one or whether one is."""
@@ -81,8 +83,8 @@ class WatchedStep(AbstractStep):
         places = [k / PARTS for k in range(-1, PARTS + 2)]  # one before the step and one after it, for dips at its ends
         inside = self.inside(u, state, after, t, h, params)
         gaps = [self.gaps(*inside(x), params) for x in places]
-        layout = self.inner.state_layout
-        small = ON_WALL * (1.0 + jnp.max(jnp.abs(state[layout.place("q")])))
+        ends, (begins, q) = [vector[self.inner.state_layout.place("q")] for vector in (state, after)], inside(0.0)
+        small = ON_WALL * gap_terms(self.gaps, begins, q, ends, params)
         count, far = gaps[0].shape[0], jnp.asarray(jnp.inf)
         wall, place, doubt = jnp.asarray(NONE), far, far
         for i in range(count):
@@ -91,7 +93,7 @@ class WatchedStep(AbstractStep):
             for k in range(PARTS + 1, 1, -1):
                 share = jnp.where(g[k - 1] > 0.0, g[k - 1] / (g[k - 1] - g[k]), 0.0)
                 first = jnp.where(g[k] < 0.0, places[k - 1] + share / PARTS, first)
-            doubt = jnp.where((g[1] <= small) & (g[2] < 0.0), -1.0, doubt)  # it begins on the wall
+            doubt = jnp.where((g[1] <= small[i]) & (g[2] < 0.0), -1.0, doubt)  # it begins on the wall
             for k in range(1, PARTS + 2):
                 doubt = jnp.where(jnp.isfinite(g[k]), doubt, -1.0)
                 near = (g[k] > 0.0) & (g[k] <= g[k - 1]) & (g[k] <= g[k + 1]) & (3.0 * g[k] <= g[k - 1] + g[k + 1])
@@ -116,6 +118,14 @@ class WatchedStep(AbstractStep):
         about = (last["q"] - first["q"]) / length
         v, v_after = (velocity(self.system, row["q"], row["p"], s, about, params) for row, s in ((first, begins), (last, ends)))
         return lambda x: (begins + x * length, cubic(x, first["q"], last["q"], v, v_after, length))
+
+
+def gap_terms(gaps: Callable, t: Any, q: Any, places: Iterable, params: Any) -> Any:
+    """The sizes of the terms of all gaps (walls,) at (t, q), for coordinates that are as large as at any of the `places`: a q
+    that is zero at a wall is known to the roundoff of what it was in the step."""
+    errors = reduce(jnp.maximum, map(jnp.abs, places), jnp.abs(q))
+    t = jnp.asarray(t, float)
+    return rounding(lambda t, q: gaps(t, q, params), t, q, errors=(jnp.abs(t), errors))
 
 
 def velocity(system: Any, q, p, t, about, params):

@@ -1,5 +1,6 @@
 """netCDF files as dirax writes them: numbers as they are, uncompressed, in one HDF5 file."""
 
+import hashlib
 import subprocess
 import sys
 import zlib
@@ -20,8 +21,8 @@ the first versions, and those that another program has written to since, have no
 BLOCK = 2**20
 """Bytes that are read at a time."""
 
-LIMIT = 20.0
-"""Seconds that the HDF5 library may take over what describes a file without a checksum."""
+LIMIT, SLOWEST = 20.0, 2e6
+"""Seconds that the HDF5 library may take over what describes a file, and bytes of it in a second more."""
 
 LOOK = """
 import sys, h5py
@@ -31,8 +32,13 @@ with h5py.File(sys.argv[1], "r") as file:
         if isinstance(file.get(name, getlink=True), h5py.HardLink):
             entry = file[name]
             dict(entry.attrs), entry.shape, entry.dtype, entry.id.get_create_plist().get_nfilters(), entry.id.get_storage_size()
+            if entry.chunks and not entry.id.get_create_plist().get_nfilters() and entry.id.get_storage_size() == entry.nbytes:
+                entry[()]
 """
-"""All of it, in a process of its own."""
+"""All of it, in a process of its own: a checksum says that a file is what someone wrote, and not who did."""
+
+_known: set[bytes] = set()
+"""Digests of the files that this process has written, or looked at in one of its own: there is an end of these."""
 
 DIMENSION = b"This is a netCDF dimension but not a netCDF variable"
 """How netCDF marks the HDF5 arrays that stand for axes without numbers."""
@@ -51,9 +57,10 @@ def write_netcdf(path: Path, variables: Mapping[str, Variable], attributes: Mapp
             made = file.create_variable(name, variable.dims, variable.values.dtype, data=np.asarray(variable.values))
             made.attrs.update(variable.about)
         file.attrs.update(attributes)
-    sealed = SEAL + _checksum(path, path.stat().st_size).to_bytes(4, "little")
+    crc, digest = _sums(path, path.stat().st_size)
     with open(path, "ab") as raw:
-        raw.write(sealed)
+        raw.write(SEAL + crc.to_bytes(4, "little"))
+    _known.add(digest)
 
 
 @contextmanager
@@ -61,46 +68,47 @@ def open_netcdf(path: Path) -> Iterator[Stored]:
     """Attributes, sizes and arrays of a netCDF file. Raises `Unreadable` for one with anything that dirax does not write."""
     import h5py
 
-    if not _is_sealed(path):
+    if (digest := _checked(path)) not in _known:
         _look_apart(path)
+        _known.add(digest)
     with reading("it is not a netCDF file, or incomplete", h5py.File, path, "r") as file:
         yield reading("it cannot be read, being damaged or incomplete", _stored, file)
 
 
-def _is_sealed(path: Path) -> bool:
-    """Whether a file has the checksum of what was written; `Unreadable` where it is another: the HDF5 library may run for ever
-    on damaged files."""
-    size = path.stat().st_size - len(SEAL) - 4
-    if size < 0:
-        return False
+def _checked(path: Path) -> bytes:
+    """The digest of what was written; `Unreadable` where it has another checksum than stands behind it."""
+    whole = path.stat().st_size
+    size = max(0, whole - len(SEAL) - 4)
     with open(path, "rb") as raw:
         raw.seek(size)
         end = raw.read()
     if not end.startswith(SEAL):
-        return False
-    if end[len(SEAL) :] != _checksum(path, size).to_bytes(4, "little"):
+        return _sums(path, whole)[1]
+    crc, digest = _sums(path, size)
+    if end[len(SEAL) :] != crc.to_bytes(4, "little"):
         raise Unreadable("it is not what was saved: the file is damaged or was edited")
-    return True
+    return digest
 
 
 def _look_apart(path: Path) -> None:
     """`Unreadable` for a file in which the HDF5 library runs for ever, or that ends the process."""
-    command = [sys.executable, "-I", "-c", LOOK, str(path.absolute())]
+    command, limit = [sys.executable, "-I", "-c", LOOK, str(path.absolute())], LIMIT + path.stat().st_size / SLOWEST
     try:
-        ended = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=LIMIT)
+        ended = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=limit)
     except subprocess.TimeoutExpired:
-        raise Unreadable(f"it is damaged: the HDF5 library did not come to an end of it within {LIMIT:g} s") from None
+        raise Unreadable(f"it is damaged: the HDF5 library did not come to an end of it within {limit:.3g} s") from None
     if ended.returncode < 0:
         raise Unreadable("it is damaged: the HDF5 library ends the process that reads it")
 
 
-def _checksum(path: Path, size: int) -> int:
-    """The CRC-32 of the first `size` bytes of a file."""
-    found = 0
+def _sums(path: Path, size: int) -> tuple[int, bytes]:
+    """The CRC-32 and the digest of the first `size` bytes of a file."""
+    found, digest = 0, hashlib.blake2b(digest_size=32)
     with open(path, "rb") as raw:
         while size > 0 and (block := raw.read(min(size, BLOCK))):
+            digest.update(block)
             found, size = zlib.crc32(block, found), size - len(block)
-    return found
+    return found, digest.digest()
 
 
 def _stored(file: Any) -> Stored:

@@ -6,11 +6,12 @@ logarithms of the entries, of the slopes ∂b/∂x, of b and of x itself,
     A_ij: r_i − x_j + τ,   A_ik: r_i − u_k,   ∂b_i/∂x_j: r_i − x_j,   b_i: r_i,   x_j: x_j
 
 are least squares for the logarithms r, x, u, τ of the units. In other units of the system, by powers of two, all numbers of the
-search are the same to the last bit. What these do not determine (a point where all of x is zero) is taken to be near 1.
+search are the same to the last bit. What these do not determine is like coordinates of the same letter, and where all of them
+are undetermined (a point where all of x is zero) near 1.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,8 +20,11 @@ from dirax.program.tracing import jacobian, once
 from dirax.program.user_functions import evaluated
 from dirax.systems.forms import ImplicitForm
 
-UNDETERMINED = 2.0**-20
+UNDETERMINED = 2.0**-24
 """Weight of a logarithm's being zero, beside what determines it."""
+
+ALIKE = 2.0**-14
+"""That of the difference of those of two coordinates of one letter: one that nothing else determines is like the others."""
 
 APART = 8.0
 """Coordinates of one letter, q say, have units of their own where their sizes differ by more powers of two; else one: lengths
@@ -55,34 +59,60 @@ def natural_units(form: ImplicitForm, params) -> Units:
     if not all(np.all(np.isfinite(a)) for a in (matrix, right, slopes)):
         return plain
     unknowns = matrix.shape[1] + 1  # x, τ and u, before the equations
-
-    def terms(values, *units):
-        """The logarithms of values, and the rows for the units, places and powers, that they are products of."""
-        rows = np.zeros((len(values), unknowns + count))
-        for places, power in units:
-            rows[np.arange(len(values)), places] = power
-        return np.frexp(np.abs(values))[1].astype(float), rows
-
     i, j = np.nonzero(matrix)
     (k, l), m, there, rates = np.nonzero(slopes), np.flatnonzero(right), np.flatnonzero(form.point), j < size
-    given = [
-        terms(matrix[i, j][rates], (unknowns + i[rates], 1.0), (j[rates], -1.0), (size, 1.0)),
-        terms(matrix[i, j][~rates], (unknowns + i[~rates], 1.0), (j[~rates] + 1, -1.0)),
-        terms(slopes[k, l], (unknowns + k, 1.0), (l, -1.0)),
-        terms(right[m], (unknowns + m, 1.0)),
-        terms(form.point[there], (there, 1.0)),
-    ]
-    logarithms, design = (np.concatenate(a) for a in zip(*given, strict=True))
-    equation = np.concatenate([i[rates], i[~rates], k, m, np.full(there.size, -1)])
-    found = _fitted(design, logarithms)
-    left = logarithms - design @ found
-    largest = np.array([np.max(left[equation == e], initial=-np.inf) for e in range(count)] + [0.0])  # the last of x
-    noise = left < largest[equation] - NOISE
-    if np.any(noise):
-        found = _fitted(design[~noise], logarithms[~noise])
-    found[:size] = _of_kinds(found[:size], form.coordinates)
-    units = np.ldexp(1.0, np.round(found - ODD).astype(int))
+    terms = Terms(unknowns + count)
+    terms.add(matrix[i, j][rates], i[rates], (unknowns + i[rates], 1.0), (j[rates], -1.0), (size, 1.0))
+    terms.add(matrix[i, j][~rates], i[~rates], (unknowns + i[~rates], 1.0), (j[~rates] + 1, -1.0))
+    terms.add(slopes[k, l], k, (unknowns + k, 1.0), (l, -1.0))
+    terms.add(right[m], m, (unknowns + m, 1.0))
+    terms.add(form.point[there], None, (there, 1.0))
+    units = terms.units((slice(0, size), form.coordinates))
     return Units(units[:size], float(units[size]), units[size + 1 : unknowns], units[unknowns:])
+
+
+class Terms:
+    """Numbers that are products of so many units and of numbers near 1."""
+
+    def __init__(self, count: int):
+        self.count = count
+        self.logarithms: list[np.ndarray] = []
+        self.rows: list[np.ndarray] = []
+        self.equations: list[np.ndarray] = []
+
+    def add(self, values: np.ndarray, equations: np.ndarray | None, *units: tuple[Any, float]) -> None:
+        """Values, the equations in which they stand, if in any, and for each the units, as places and powers, it is made of."""
+        rows = np.zeros((len(values), self.count))
+        for places, power in units:
+            rows[np.arange(len(values)), places] += power
+        self.logarithms.append(np.frexp(np.abs(values))[1].astype(float))
+        self.rows.append(rows)
+        self.equations.append(np.full(len(values), -1) if equations is None else equations)
+
+    def units(self, *named: tuple[slice, tuple[str, ...]]) -> np.ndarray:
+        """The units, powers of two; those in `named` places belong to coordinates of these names."""
+        logarithms, design, equations = (np.concatenate(a) for a in (self.logarithms, self.rows, self.equations))
+        ties = self._ties(named)
+        found = _fitted(design, logarithms, ties)
+        left = logarithms - design @ found
+        last = np.max(equations, initial=-1)
+        largest = np.array([np.max(left[equations == e], initial=-np.inf) for e in range(last + 1)] + [0.0])  # those in none
+        noise = left < largest[equations] - NOISE
+        if np.any(noise):
+            found = _fitted(design[~noise], logarithms[~noise], ties)
+        for places, names in named:
+            found[places] = _of_kinds(found[places], names)
+        return np.ldexp(1.0, np.round(found - ODD).astype(int))
+
+    def _ties(self, named: tuple[tuple[slice, tuple[str, ...]], ...]) -> np.ndarray:
+        """Rows for the differences of coordinates of one letter."""
+        rows = [np.zeros((0, self.count))]
+        for places, names in named:
+            letters = np.array([name.rstrip("0123456789") for name in names])
+            for letter in dict.fromkeys(letters.tolist()):
+                own = places.start + np.flatnonzero(letters == letter)
+                rows.append(np.eye(self.count)[own[1:]] - np.eye(self.count)[own[:-1]])
+        return np.concatenate(rows)
 
 
 def _of_kinds(logarithms: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
@@ -96,11 +126,10 @@ def _of_kinds(logarithms: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     return found
 
 
-def _fitted(design: np.ndarray, logarithms: np.ndarray) -> np.ndarray:
+def _fitted(design: np.ndarray, logarithms: np.ndarray, ties: np.ndarray) -> np.ndarray:
     size = design.shape[1]
-    return np.linalg.lstsq(
-        np.concatenate([design, UNDETERMINED * np.eye(size)]), np.concatenate([logarithms, np.zeros(size)]), rcond=None
-    )[0]
+    rows = np.concatenate([design, ALIKE * ties, UNDETERMINED * np.eye(size)])
+    return np.linalg.lstsq(rows, np.concatenate([logarithms, np.zeros(len(ties) + size)]), rcond=None)[0]
 
 
 def in_units(form: ImplicitForm, units: Units) -> ImplicitForm:

@@ -1,10 +1,18 @@
 """The linear solver of sparse steps."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.program.sparse_equations import SparseEquations
+
+
+class InUnits(NamedTuple):
+    """The values of a matrix, or its factors, for unknowns in units of these sizes: pivots are found small or large beside
+    entries of their row and of their column."""
+
+    values: Any
+    sizes: Any
 
 
 class SparseSolver(AbstractLinearSolver):
@@ -21,13 +29,20 @@ class SparseSolver(AbstractLinearSolver):
         return self.values or (lambda u, *args: self.equations.values(lambda u: residual(u, *args), u))
 
     def factorise(self, matrix: Any) -> Any:
+        if isinstance(matrix, InUnits):
+            return InUnits(self.equations.factorise(matrix.values), matrix.sizes)
         return self.equations.factorise(matrix)
 
     def solve(self, factors: Any, right: Any) -> Any:
+        if isinstance(factors, InUnits):
+            return factors.sizes * self.equations.solve(factors.values, right)
         return self.equations.solve(factors, right)
 
     def solve_transposed(self, factors: Any, right: Any) -> Any:
+        if isinstance(factors, InUnits):
+            return self.equations.solve(factors.values, factors.sizes * right, transposed=True)
         return self.equations.solve(factors, right, transposed=True)
 
     def in_units(self, matrix: Any, sizes: Any) -> tuple[Any, Any]:
-        return matrix, 1.0
+        scaled, units = self.equations.in_units(matrix, sizes)
+        return InUnits(scaled, sizes), units

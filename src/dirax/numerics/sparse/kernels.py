@@ -70,6 +70,23 @@ def list_fill(
     left_starts[sizes[0]] = at
 
 
+def in_units(
+    rows: Ints, columns: Ints, places: Ints, values: Doubles, sizes: Doubles, counts: Longs, units: Doubles, scaled: Doubles
+):
+    """A matrix for unknowns of the size 1, and its rows in the `units` of their terms; entry a is `values[places[a]]`. `counts`:
+    how many equations, entries and values."""
+    for i in range(counts[0]):
+        units[i] = 0.0
+    for i in range(counts[2]):
+        scaled[i] = 0.0
+    for a in range(counts[1]):
+        units[rows[a]] = units[rows[a]] + abs(values[places[a]]) * sizes[columns[a]]
+    for i in range(counts[0]):
+        units[i] = 1.0 / units[i]
+    for a in range(counts[1]):
+        scaled[places[a]] = values[places[a]] * units[rows[a]] * sizes[columns[a]]
+
+
 # ---------------------------------------------------------------------------------------------- elimination in a band
 
 

@@ -19,12 +19,37 @@ def free_direction(equations: Any, matrix: Any) -> np.ndarray | None:
 
     `equations` say how matrices of its pattern are factored (`dirax.program.sparse_equations.SparseEquations`).
     """
+    scaled, columns = _scaled_to_one(matrix)
+    smallest, direction = smallest_singular_value(equations, scaled)
+    if smallest > EQUATION_RANK:
+        return None
+    balanced, units = _balanced(matrix)  # largest entries cannot balance a saddle point with small masses
+    scaled, columns = _scaled_to_one(balanced)
+    smallest, direction = smallest_singular_value(equations, scaled)
+    return None if smallest > EQUATION_RANK else units * columns * direction
+
+
+def _scaled_to_one(matrix: Any) -> tuple[Any, np.ndarray]:
+    """With rows, then columns, divided by their largest entries; and what the columns were multiplied with."""
     rows = _inverse(np.asarray(abs(matrix).max(axis=1).todense()).ravel())
     scaled = sp.diags(rows) @ matrix
     columns = _inverse(np.asarray(abs(scaled).max(axis=0).todense()).ravel())
-    scaled = sp.csr_matrix(scaled @ sp.diags(columns))
-    smallest, direction = smallest_singular_value(equations, scaled)
-    return None if smallest > EQUATION_RANK else columns * direction
+    return sp.csr_matrix(scaled @ sp.diags(columns)), columns
+
+
+def _balanced(matrix: Any) -> tuple[Any, np.ndarray]:
+    """With rows and columns multiplied by powers of two such that the logarithms of the entries are least squares (Curtis and
+    Reid 1972); and those of the columns."""
+    from scipy.sparse.linalg import lsqr  # imported when it is used
+
+    entries, size = sp.coo_matrix(matrix), matrix.shape[0]
+    there = entries.data != 0.0
+    rows, columns, number = entries.row[there], entries.col[there], np.arange(np.sum(there))
+    logarithms = np.frexp(np.abs(entries.data[there]))[1].astype(float)
+    ones = np.ones(2 * len(number))
+    design = sp.csr_matrix((ones, (np.tile(number, 2), np.concatenate([rows, size + columns]))), (len(number), 2 * size))
+    found = np.ldexp(1.0, -np.round(lsqr(design, logarithms, atol=1e-9, btol=1e-9)[0]).astype(int))
+    return sp.csr_matrix(sp.diags(found[:size]) @ matrix @ sp.diags(found[size:])), found[size:]
 
 
 def smallest_singular_value(equations: Any, matrix: Any) -> tuple[float, np.ndarray]:

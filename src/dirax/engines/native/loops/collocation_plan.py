@@ -65,7 +65,7 @@ class CollocationPlan:
         else:
             before = r.unknowns
         matrix = [[row.get(j, g.zero) for j in range(len(r.unknowns))] for row in slopes]
-        factors = Factors(g, matrix, pivot_order(g, matrix))
+        factors = Factors(g, matrix, pivot_order(g, matrix), _row_units(g, matrix))
         self.stable = factors.stable
         self.solved = [g.sub(old, change) for old, change in zip(before, factors.solve(g, at), strict=True)]
         needed = set(g.reachable(self.solved))
@@ -183,6 +183,13 @@ class MeanPlan:
     def identity(self) -> tuple:
         """What tells two plans of equal graphs apart."""
         return self.relation, self.terms, self.rows, self.shared, self.tableau.matrix.tolist(), self.quadrature.means.tolist()
+
+
+def _row_units(g: Graph, matrix: list[list[int]]) -> list[int] | None:
+    """The roots of the entries m_ii of a matrix whose rows are paired with its columns, as forces with velocities: in these units
+    of both the diagonal is 1. None where one of them is zero."""
+    diagonal = [matrix[i][i] for i in range(len(matrix))]
+    return None if g.zero in diagonal else [g.make("sqrt", g.make("abs", entry)) for entry in diagonal]
 
 
 def record_of(relation: TracedRelation | TracedMean, tableau: Tableau) -> Record:
