@@ -86,7 +86,6 @@ class MachineConstraints:
         row_sizes = lambda q, p: jnp.abs(self.one_forms(q, p)) @ units
         values = [lambda q, p, f=f: (f(q, p), rounding(lambda q: f(q, p), q)) for f in (self.defects, row_sizes)]
         sizes = np.zeros(len(self.all_holonomic)), np.zeros(len(self.all_rows))
-        values = self.defects, lambda q, p: jnp.sum(jnp.abs(self.one_forms(q, p)), axis=1)
         for q in points:
             for size, value in zip(sizes, values, strict=True):
                 if size.size:
