@@ -52,14 +52,14 @@ class EnergyCollocationStep(AbstractStep):
         """The length of a."""
 
     @property
-    @abstractmethod
     def inner(self) -> int:
         """How many unknowns there are at every point beside the rates."""
+        return 0
 
     @property
-    @abstractmethod
     def sparse(self) -> bool:
         """Whether the unknowns are so many that no matrix is to be inverted in their equations."""
+        return False
 
     @abstractmethod
     def slopes(self, a: Array, rate: Array, t: Any, params: Any) -> Float[Array, " g"]:
@@ -70,13 +70,14 @@ class EnergyCollocationStep(AbstractStep):
     def rates(self, a: Array, mean: Float[Array, " g"], t: Any, params: Any) -> Float[Array, " s"]:
         """(ȧ, ḃ) at a node, of the mean of the slopes."""
 
-    @abstractmethod
     def rates_of_relation(self, a: Array, rate: Array, mean: Array, t: Any, params: Any) -> tuple[Array, Array]:
         """What is zero (moving,) at the right rate at a node, of the mean of the slopes; and (ȧ, ḃ) (s,) there."""
+        rates = self.rates(a, mean, t, params)
+        return rate - rates[: self.moving], rates
 
-    @abstractmethod
     def of_inner(self, a: Array, inner: Array, t: Any, params: Any) -> Float[Array, " i"]:
         """Zero at the right inner unknowns of a point."""
+        return inner
 
     @abstractmethod
     def settle(self, before: Array, after: Array, rate: Array, t: Any, h: Any, params: Any) -> Float[Array, " s"]:

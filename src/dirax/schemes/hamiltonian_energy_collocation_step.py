@@ -36,10 +36,6 @@ class HamiltonianEnergyCollocation(EnergyCollocationStep):
         return self.n >= FEWEST_SPARSE
 
     @property
-    def inner(self) -> int:
-        return 0
-
-    @property
     def state(self) -> Layout:
         return Layout(x=self.n, work=2 * int(self.form.ports is not None), energy=(), energy_defect=())
 
@@ -62,9 +58,6 @@ class HamiltonianEnergyCollocation(EnergyCollocationStep):
 
     def rates_of_relation(self, a, rate, mean, t, params):
         return self.form.residual(a, rate, jnp.zeros(0), t, params, mean), self._with_books(a, rate, mean, t, params)
-
-    def of_inner(self, a, inner, t, params):
-        return jnp.zeros(0)
 
     def _with_books(self, a, rate, mean, t, params):
         out = [rate]

@@ -131,10 +131,6 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
             out.append(work[None])
         return jnp.concatenate([*out, jnp.zeros(2)])
 
-    def rates_of_relation(self, a, rate, mean, t, params):
-        rates = self.rates(a, mean, t, params)
-        return rate - rates[: self.moving], rates
-
     def of_inner(self, a, inner, t, params):
         q, p = a[: self.n], a[self.n :]
         return p - gradient(lambda v: self.system.lagrangian.at(t, q, v, params))(inner)
