@@ -101,7 +101,7 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
         end = end * _nearby(len(state))
         for i, u in enumerate(guess):
             residuals, (slopes, short, near) = linear(i, u, [state, state, end], [1.0, SHORT, SHORT])
-            again = lambda sizes, i=i, u=u: terms(i, u, [state, end], sizes)
+            again = lambda sizes, i=i, u=u: [*terms(i, u, [state, end], sizes)]
             part, stage = equation.stages[i][1] * h, equation.stages[i][0]
             after = lambda u, stage=stage, part=part: stage.advance(u, state, t, part, params)
             found.append(_sizes(residuals[0], slopes, short, near, u, again(jnp.abs(u)), again, after, part, jnp))
