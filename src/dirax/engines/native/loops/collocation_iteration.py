@@ -11,11 +11,6 @@ FAR = 2.0**-20
 CLEAR, PATIENCE = 64 * EPSILON, 3.0
 """Above this relative change an iteration for all entries together may pause so many times before it is at its floor."""
 
-ROUNDED = CLEAR / STALLED
-"""What terms count for beside an iterate that is made of them, where its entries stop each by itself: a change that no longer
-shrinks is small up to STALLED of the iterate, but up to CLEAR of its terms, many thousand times as large in stiff forces.
-"""
-
 
 class Iteration:
     """The iteration for the iterates in the rooms of `pair`, of which those of the step before stand in the rooms `before`, by a
@@ -53,7 +48,6 @@ class Iteration:
         b, over, one = self.body, self.all, self.one
         count_here, active, shaky = b.alloca("i64"), b.alloca(one.bool), b.alloca(one.bool)
         if sweep.together:
-            self._know_terms(sweep, b.load(one.bool, self.trying), 1.0)
             for place, value in zip(self.changes, (float("inf"), float("inf"), 0.0), strict=True):
                 b.store(one.real, one.const(value), place)
         b.store(one.bool, one.false, shaky)
@@ -150,7 +144,9 @@ class Iteration:
         self._compare(sweep, missed)
         far = one.both(trying, over.marked(missed))
         with b.when(one.any(far)):
-            self._know_terms(sweep, far, 1.0 if sweep.together else ROUNDED)
+            for size, value in zip(self.sizes, sweep.terms(), strict=True):
+                known = b.load(one.real, size)
+                b.store(one.real, one.select(far, one.max(value, known), known), size)
             over.clear(missed)
             self._compare(sweep, missed)
         if not sweep.later:
@@ -160,13 +156,6 @@ class Iteration:
                     over.raised(peak, over.load(room, node))
             b.store(one.real, one.select(trying, over.highest(peak), b.load(one.real, self.change)), self.change)
         b.store(one.bool, one.both(trying, one.either(over.marked(missed), shaky)), self.trying)
-
-    def _know_terms(self, sweep: Sweep, some: str, part: float) -> None:
-        """Have the sizes of some trajectories count this part of what their iterates are made of."""
-        b, one = self.body, self.one
-        for size, value in zip(self.sizes, sweep.terms(), strict=True):
-            known = b.load(one.real, size)
-            b.store(one.real, one.select(some, one.max(one.mul(value, one.const(part)), known), known), size)
 
     def _compare(self, sweep: Sweep, missed: str) -> None:
         """Mark where a last change is not small."""
