@@ -209,7 +209,8 @@ def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: An
         defect, size = map(np.asarray, found or jax.jit(jax.vmap(at))(*samples))
         known = np.isfinite(defect) & np.isfinite(size)[:, None]
         # one-forms less their span are 0 where they are looked at, and in their own units; the others have theirs
-        unit = np.median(size[np.isfinite(size) & (size > 0.0)]) if np.any(np.isfinite(size) & (size > 0.0)) else 1.0
+        there = size[np.isfinite(size) & (size > 0.0)]
+        unit = np.median(there) if there.size else 1.0
         size = np.maximum(size, 1.0 if name == "one_forms" else unit)
         relative = np.where(known, defect / np.where(known, size[:, None], 1.0), 0.0)
         row, column = np.unravel_index(int(np.argmax(relative)), relative.shape)

@@ -173,7 +173,7 @@ def _terms(flight: Flight) -> np.ndarray:
     """The sizes of the terms of the gaps at the start, for the first step."""
     search, state = flight.search, np.asarray(flight.search.problem.state)
     end = search.part(state, np.asarray(search.problem.guess[0]), 0.0, 1.0)[1]
-    return search.terms_at(state, state if end is None else end[0], 0.0)
+    return search.terms_at(state, end, 0.0)
 
 
 def _events(flights: list[Flight], p: Problem) -> Events:

@@ -67,7 +67,7 @@ class ImpactSearch:
         """How long it is to the next impact within a rest of a step, and which wall is hit; None where none is. Raises
         `ValueError` for a gap that is no number."""
         end = self.part(state, u, at, rest)[1]
-        small = ON_WALL * self.terms_at(state, state if end is None else end[0], at)
+        small = ON_WALL * self.terms_at(state, end, at)
         here = self.gaps_at(state, at)
         values: dict[float, np.ndarray] = {0.0: np.where(here < small, 0.0, here)}
 
@@ -82,10 +82,10 @@ class ImpactSearch:
         hits = [found for wall in range(len(self.numbers)) if (found := self._hit(wall, gap, places, g[:, wall])) is not None]
         return min(hits) if hits else None
 
-    def terms_at(self, state: np.ndarray, end: np.ndarray, at: float) -> np.ndarray:
-        """The sizes of the terms of every gap at the first state of a step with this end."""
-        q = self.layout.place("q")
-        return self.terms.one(self.time(state, at), state[q], end[q])
+    def terms_at(self, state: np.ndarray, end: tuple | None, at: float) -> np.ndarray:
+        """The sizes of the terms of every gap at the first state of a step with this end, as `part` gives it."""
+        q, last = self.layout.place("q"), state if end is None else end[0]
+        return self.terms.one(self.time(state, at), state[q], last[q])
 
     def gaps_at(self, state: np.ndarray, at: float) -> np.ndarray:
         """Of every wall. Raises `ValueError` for one that is no number."""

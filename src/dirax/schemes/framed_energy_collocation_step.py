@@ -116,9 +116,8 @@ class FramedEnergyCollocation(EnergyCollocationStep):
         frame, rows = (
             np.asarray(a) for a in evaluated(lambda q, params: (self.frame(q, params), self._rows(q, params)), q, params)
         )
-        lengths, sizes = np.linalg.norm(frame, axis=0), np.linalg.norm(rows, axis=1)
-        unit = frame / np.where(lengths > 0.0, lengths, 1.0)
-        least = np.linalg.svd(unit, compute_uv=False)[-1] if np.all(np.isfinite(unit)) else np.nan
+        unit, least = _of_length_one(frame)
+        sizes = np.linalg.norm(rows, axis=1)
         if not least > FRAME_DEFECT:
             raise ValueError(
                 f"the columns of frame(q) must be independent, but {place} their smallest singular value is {least:.3g} "
@@ -143,9 +142,7 @@ class FramedEnergyCollocation(EnergyCollocationStep):
         xi, _ = self.velocity(now.q, now.momentum, jnp.zeros(self.shape.n), params)
         for share in np.linspace(0.0, 1.0, 17):
             q = now.q + share * h * (self.frame(now.q, params) @ xi)
-            frame = np.asarray(self.frame(q, params))
-            lengths = np.linalg.norm(frame, axis=0)
-            least = np.linalg.svd(frame / np.where(lengths > 0.0, lengths, 1.0), compute_uv=False)[-1]
+            _, least = _of_length_one(np.asarray(self.frame(q, params)))
             if not least > NEARLY_DEPENDENT:
                 return (
                     f"near q = {np.array2string(np.asarray(q), precision=4)} the columns of frame(q) depend on each other "
@@ -168,3 +165,10 @@ class FramedEnergyCollocation(EnergyCollocationStep):
         _, p = self.velocity(now.q, now.momentum, jnp.zeros(self.shape.n), params)
         row = {"q": now.q, "p": p, "energy_defect": now.energy_defect}
         return row | ({"work": now.work[0]} if self.system.forces is not None else {})
+
+
+def _of_length_one(frame: np.ndarray) -> tuple[np.ndarray, float]:
+    """The columns of a frame divided by their lengths, and the smallest singular value of these; NaN where one is not finite."""
+    lengths = np.linalg.norm(frame, axis=0)
+    unit = frame / np.where(lengths > 0.0, lengths, 1.0)
+    return unit, np.linalg.svd(unit, compute_uv=False)[-1] if np.all(np.isfinite(unit)) else np.nan
