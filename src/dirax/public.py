@@ -36,9 +36,10 @@ from dirax.geometry.maps import (
     Theta,
 )
 from dirax.geometry.pairs import DiscreteLagrangianSystem
+from dirax.geometry.products import Product
 from dirax.geometry.projected_map import ProjectedMap, Submanifold
 from dirax.geometry.semidirect import SemidirectProduct
-from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
+from dirax.geometry.spaces import Circle, Euclidean, Sphere, Torus
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
 from dirax.geometry.subspaces import PontryaginSubspace
 from dirax.geometry.tulczyjew import (

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from dirax.geometry.charts import Atlas, chart_at, check_chart
 from dirax.geometry.lie_groups import SE2, SO3
-from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
+from dirax.geometry.products import Product
+from dirax.geometry.spaces import Circle, Euclidean, Sphere, Torus
 
 BATCH = 4
 MANIFOLDS = {

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
-from dirax.geometry.spaces import Circle, Euclidean, Product, Sphere, Torus
+from dirax.geometry.products import Product
+from dirax.geometry.spaces import Circle, Euclidean, Sphere, Torus
 from dirax.geometry.squared_angles import arc_over_sine, norm, radial
 from dirax.program.roots import regular_root
 

@@ -22,8 +22,9 @@ from dirax.geometry.maps import (
     SphereProjection,
     Theta,
 )
+from dirax.geometry.products import Product
 from dirax.geometry.projected_map import ProjectedMap, Submanifold
-from dirax.geometry.spaces import Euclidean, Product, Sphere, Torus
+from dirax.geometry.spaces import Euclidean, Sphere, Torus
 
 
 def normalize(x):

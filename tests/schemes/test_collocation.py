@@ -209,6 +209,17 @@ STIFF = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("scheme", [dx.Collocation(3), dx.EnergyCollocation(4)], ids=["Collocation", "EnergyCollocation"])
+def test_a_stiff_bar_is_not_left_where_its_changes_stop_to_shrink(scheme):
+    """The fixed point goes to and fro at 1e-10 of the stiff forces, far above their roundoff."""
+    bar = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 200.0**2 / 2 * (jnp.sqrt(q @ q) - 1) ** 2 - q[1])
+    run = {"q": [np.cos(0.7), -np.sin(0.7)], "v": np.zeros(2), "step": 0.02, "steps": 50}
+    sol = dx.simulate(bar, scheme, engine="native", **run)
+    assert "simplified Newton" in sol.stats["iteration"] and sol.stats["newton_iterations"] < 700
+    report = dx.verify(sol)
+    assert report["steps solved"].value < 1e-13 and report["steps replayed"].verdict == "ok"
+
+
 @pytest.mark.parametrize("name", ["accelerations", "ports", pytest.param("rates of a mass matrix", marks=pytest.mark.soak)])
 def test_where_the_fixed_point_does_not_converge_newton_goes_on_with_systems_of_one_node(name):
     system, data, step, stages = STIFF[name]

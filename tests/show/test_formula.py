@@ -6,7 +6,8 @@ import pytest
 
 from dirax import gallery
 from dirax.show import statement
-from dirax.show.formula import formulas, joined, of_params, symbol, symbols
+from dirax.show.formula import formulas
+from dirax.show.letters import joined, of_params, symbol, symbols
 
 
 def text(function, names="xy", params=None):

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.sparse import csr_matrix
 
 import dirax as dx
 
@@ -114,6 +115,8 @@ def test_method_2_of_closed_ports_names_the_chain():
         ({"J": np.array([[0.0, 1.0], [-1.0, 0.1]])}, r"J is not skew at the initial point: max \|J \+ Jᵀ\| = 0.2"),
         ({"R": np.array([[0.1, 0.2], [0.0, 0.1]])}, r"R is not symmetric.*0.2"),
         ({"R": np.array([[0.1, 0.2], [0.2, 0.1]])}, "R is not positive semidefinite.*lowest eigenvalue is -0.1"),
+        ({"J": csr_matrix(J), "R": np.array([[0.1, 0.2], [0.0, 0.1]])}, r"R is not symmetric.*0.2"),
+        ({"R": csr_matrix([[0.1, 0.0], [0.0, -0.2]])}, "R is not positive semidefinite: it has -0.2 on its diagonal"),
     ],
 )
 def test_structures_that_are_none(change, message):

@@ -10,7 +10,8 @@ import numpy as np
 
 from dirax.gallery.example import Coordinate, Example
 from dirax.geometry.maps import RiemannianExp
-from dirax.geometry.spaces import Product, Sphere
+from dirax.geometry.products import Product
+from dirax.geometry.spaces import Sphere
 from dirax.schemes.in_charts import InCharts
 from dirax.show.scene import Scene, point, rod, sphere
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian

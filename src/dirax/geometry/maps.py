@@ -14,7 +14,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold, Vector
-from dirax.geometry.spaces import Euclidean, Product, Sphere
+from dirax.geometry.products import Product
+from dirax.geometry.spaces import Euclidean, Sphere
 from dirax.geometry.squared_angles import Scalar, norm
 from dirax.program.user_functions import is_traced
 

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from dirax.geometry.charts import RetractionChart
 from dirax.geometry.lie_groups import AbstractLieGroup
 from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold
-from dirax.geometry.spaces import AbstractFlat, Euclidean, Product
+from dirax.geometry.products import Product
+from dirax.geometry.spaces import AbstractFlat, Euclidean
 from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import UserFunction, evaluated

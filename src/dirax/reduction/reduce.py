@@ -3,7 +3,7 @@
 from typing import Any, overload
 
 from dirax.geometry.lie_groups import AbstractLieGroup
-from dirax.geometry.spaces import Product
+from dirax.geometry.products import Product
 from dirax.reduction.actions import Translations
 from dirax.reduction.bundle import GroupConnection, TrivialBundle, translations_on
 from dirax.reduction.connection import AbstractConnection

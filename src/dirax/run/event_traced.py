@@ -10,7 +10,7 @@ from dirax.program.memo import Same
 from dirax.run.event import Event, evaluated, refuse_unknown
 from dirax.run.impact_traced import bracketed_fall
 from dirax.schemes.step import CLOCK
-from dirax.solution.dense import Dense
+from dirax.solution.dense_traced import TracedDense
 from dirax.solution.events import Events
 from dirax.solution.solution import Solution
 from dirax.solution.steps_again import Keyed, compiled_call
@@ -19,7 +19,7 @@ from dirax.solution.steps_again import Keyed, compiled_call
 def with_traced_events(sol: Solution, events: tuple[Event, ...], points: int) -> Solution:
     """The solution of a traced run, of which every row is saved, with its events: one may be in each of so many parts of every
     step, and stands for NaN where there is none. After a terminal event rows and events are NaN."""
-    dense, lanes, h = Dense(sol), sol.batch or 1, jnp.asarray(sol.step, float)
+    dense, lanes, h = TracedDense(sol), sol.batch or 1, jnp.asarray(sol.step, float)
     for number, event in enumerate(events):
         refuse_unknown(event, number, dense.nodes)
     lead = lambda a: jnp.asarray(a) if sol.batch is not None else jnp.asarray(a)[None]
@@ -77,7 +77,7 @@ def _ended(sol: Solution, endings: Any) -> Solution:
 class TracedSearch:
     """Looks for events in one step at a time."""
 
-    def __init__(self, dense: Dense, events: tuple[Event, ...], points: int):
+    def __init__(self, dense: TracedDense, events: tuple[Event, ...], points: int):
         self.dense, self.events, self.points = dense, events, points
 
     def of_step(self, step: tuple) -> tuple:

@@ -1,10 +1,7 @@
 """Functions of the user as formulas: their trace as sums and products, typeset in MathML, or None where it is too long."""
 
-import html
 import math
-import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -13,6 +10,7 @@ import numpy as np
 
 from dirax.program.graph import Graph, GraphTooLarge
 from dirax.program.interpreter import Interpreter, Unavailable
+from dirax.show.letters import SPACE, Written, alone, beside, joined, number_of, raised_text, signed, texts
 
 LONGEST = 420
 """Most characters of a formula as text; a longer one is shown as its source."""
@@ -21,15 +19,6 @@ NODES = 4000
 
 WIDE = 29
 """Most letters of a term that is kept on one line; a line may break inside the parentheses of a longer one."""
-
-SPACE = '<mspace width="0.17em"></mspace>'
-
-GREEK = {
-    **{"alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "epsilon": "ε", "zeta": "ζ", "eta": "η", "theta": "θ"},
-    **{"kappa": "κ", "lambda": "λ", "mu": "μ", "nu": "ν", "xi": "ξ", "rho": "ρ", "sigma": "σ", "tau": "τ", "phi": "φ"},
-    **{"chi": "χ", "psi": "ψ", "omega": "ω", "Gamma": "Γ", "Delta": "Δ", "Theta": "Θ", "Lambda": "Λ", "Pi": "Π"},
-    **{"Sigma": "Σ", "Phi": "Φ", "Psi": "Ψ", "Omega": "Ω"},
-}
 
 FUNCTIONS = {
     **{name: name for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "erf", "max", "min", "sign")},
@@ -40,61 +29,6 @@ FUNCTIONS = {
 
 class NotReadable(Exception):
     """A trace that has no short formula."""
-
-
-@dataclass(frozen=True)
-class Written:
-    """A piece of a formula as text and as MathML; `tight`: whether it can be a factor, or the base of a power, as it is."""
-
-    text: str
-    mathml: str
-    tight: bool = True
-    indexed: tuple[str, str] | None = None
-    """Of a letter with an index, both in MathML, so that a power can stand above the index."""
-
-    def grouped(self) -> "Written":
-        """With parentheses where it needs them."""
-        if self.tight:
-            return self
-        return Written(f"({self.text})", f"<mrow><mo>(</mo>{self.mathml}<mo>)</mo></mrow>")
-
-
-def symbol(name: str, dotted: bool = False) -> Written:
-    """A name as a letter with an index: θ1, m_2, omega; dotted for a velocity."""
-    base, index = name, ""
-    if found := re.fullmatch(r"([^\W\d_]+?)_?(\d+(?:,\d+)*)", name) or re.fullmatch(r"([^\W_]+)_(\w+)", name):
-        base, index = found.groups()
-    base, index = GREEK.get(base, base), GREEK.get(index, index)
-    letter = f"<mi>{html.escape(base)}</mi>"
-    if dotted:
-        letter = f'<mover accent="true">{letter}<mo>˙</mo></mover>'
-    text = base[:1] + "\u0307" * dotted + base[1:] + index
-    if not index:
-        return Written(text, letter)
-    below = f"<mi>{html.escape(index)}</mi>"
-    return Written(text, f"<msub>{letter}{below}</msub>", indexed=(letter, below))
-
-
-def symbols(names: Sequence[str], dotted: bool = False) -> np.ndarray:
-    """One symbol a name."""
-    found = np.empty(len(names), dtype=object)
-    found[:] = [symbol(name, dotted) for name in names]
-    return found
-
-
-def of_params(params: Any) -> Any:
-    """The symbols of parameters: of numbers by their names, of arrays with an index an entry."""
-
-    def named(path: Any, leaf: Any) -> np.ndarray:
-        name = "_".join(str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", key)))) for key in path) or "params"
-        shape = np.shape(leaf)
-        entries = np.empty(shape, dtype=object)
-        for at in np.ndindex(shape):
-            index = ",".join(str(i + 1) for i in at)
-            entries[at] = symbol(f"{name}_{index}" if index else name)
-        return entries
-
-    return jax.tree_util.tree_map_with_path(named, params)
 
 
 def formulas(function: Callable, values: Sequence[Any], names: Sequence[Any]) -> list["list[Written]"] | None:
@@ -126,11 +60,6 @@ def formulas(function: Callable, values: Sequence[Any], names: Sequence[Any]) ->
         return None
 
 
-def joined(pieces: Sequence[Written]) -> Written:
-    """Pieces as one formula."""
-    return Written("".join(one.text for one in pieces), "".join(one.mathml for one in pieces), tight=len(pieces) < 2)
-
-
 class _Writer:
     """Writes nodes of a graph; `table`: input node → (its number, symbol)."""
 
@@ -142,7 +71,7 @@ class _Writer:
     def terms(self, node: int) -> list[Written]:
         """The terms of a sum, each with its sign, positive ones first."""
         parts = self._parts(node)
-        written = [_signed(k, factor, self._fraction(abs(factor), powers)) for k, (factor, powers) in enumerate(parts)]
+        written = [signed(k, factor, self._fraction(abs(factor), powers)) for k, (factor, powers) in enumerate(parts)]
         if sum(len(part.text) for part in written) > LONGEST:
             raise NotReadable
         return written
@@ -153,7 +82,7 @@ class _Writer:
         found = []
         for k, (factor, powers) in enumerate(self._parts(node)):
             first, *rest = self._broken(abs(factor), powers)
-            found += [_signed(k, factor, first), *rest]
+            found += [signed(k, factor, first), *rest]
         return found
 
     def _parts(self, node: int) -> list[tuple[float, tuple[tuple[int, int], ...]]]:
@@ -186,7 +115,7 @@ class _Writer:
         """What opens and closes the parentheses of a power, and the nodes of what is inside; None where it has none."""
         op, args = self.graph.op[node], self.graph.args[node]
         bracket = lambda mark: f'<mo stretchy="false">{mark}</mo>'
-        raised, exponent = (f"<msup>{bracket(')')}<mn>{n}</mn></msup>", _exponent(n)) if n != 1 else (bracket(")"), "")
+        raised, exponent = (f"<msup>{bracket(')')}<mn>{n}</mn></msup>", raised_text(n)) if n != 1 else (bracket(")"), "")
         if op in ("add", "sub"):
             return Written("(", bracket("(")), [node], Written(f"){exponent}", raised)
         if op == "sqrt" and n == 1:
@@ -199,7 +128,7 @@ class _Writer:
     def written(self, node: int) -> Written:
         if node not in self.known:
             terms = self.terms(node)
-            self.known[node] = Written(*_texts(terms), tight=len(terms) == 1 and terms[0].tight)
+            self.known[node] = Written(*texts(terms), tight=len(terms) == 1 and terms[0].tight)
         return self.known[node]
 
     def _summands(self, node: int, factor: float) -> list[tuple[float, int]]:
@@ -259,22 +188,22 @@ class _Writer:
         whole = ratio if float(ratio) == factor else None
         above = [self._power(node, n) for node, n in powers if n > 0]
         below = [self._power(node, -n) for node, n in powers if n < 0]
-        number = _number(factor) if whole is None else None if whole.numerator == 1 else _number(whole.numerator)
+        number = number_of(factor) if whole is None else None if whole.numerator == 1 else number_of(whole.numerator)
         if whole is not None and whole.denominator != 1:
-            below.insert(0, _number(whole.denominator))
+            below.insert(0, number_of(whole.denominator))
         if number is not None:
             above.insert(0, number)
         if not above:
-            above = [_number(1)]
+            above = [number_of(1)]
         if not below:
-            return _beside(above)
-        top, bottom = _alone(above), _alone(below)
-        text = f"{_beside(above).text}/{bottom.grouped().text if len(below) == 1 else '(' + bottom.text + ')'}"
+            return beside(above)
+        top, bottom = alone(above), alone(below)
+        text = f"{beside(above).text}/{bottom.grouped().text if len(below) == 1 else '(' + bottom.text + ')'}"
         return Written(text, f"<mfrac><mrow>{top.mathml}</mrow><mrow>{bottom.mathml}</mrow></mfrac>")
 
     def _power(self, node: int, n: int) -> Written:
         op, args = self.graph.op[node], self.graph.args[node]
-        exponent = _exponent(n) if n != 1 else ""
+        exponent = raised_text(n) if n != 1 else ""
         raised = lambda m: f"<msup><mrow>{m}</mrow><mn>{n}</mn></msup>" if n != 1 else m
         if node in self.table:
             name = self.table[node][1]
@@ -307,42 +236,3 @@ class _Writer:
             group = inner.grouped()
             return Written(group.text + exponent, raised(group.mathml))
         raise NotReadable
-
-
-def _signed(place: int, factor: float, body: Written) -> Written:
-    """A term of a sum with its sign."""
-    minus, plus = ("−", "") if place == 0 else (" − ", " + ")
-    sign = minus if factor < 0 else plus
-    mark = f'<mo form="{"prefix" if place == 0 else "infix"}">{sign.strip()}</mo>' if sign else ""
-    return Written(sign + body.text, mark + body.mathml, tight=place == 0 and factor > 0 and body.tight)
-
-
-def _exponent(n: int) -> str:
-    return f"^{n}" if n > 9 else "⁰¹²³⁴⁵⁶⁷⁸⁹"[n]
-
-
-def _texts(terms: Sequence[Written]) -> tuple[str, str]:
-    whole = joined(terms)
-    return whole.text, f"<mrow>{whole.mathml}</mrow>"
-
-
-def _alone(parts: list[Written]) -> Written:
-    """Factors under or over a line of their own, where a single sum needs no parentheses."""
-    return parts[0] if len(parts) == 1 else _beside(parts)
-
-
-def _beside(parts: list[Written]) -> Written:
-    grouped = [part.grouped() for part in parts]
-    texts = " ".join(part.text for part in grouped)
-    return Written(texts, f"<mrow>{SPACE.join(part.mathml for part in grouped)}</mrow>")
-
-
-def _number(value: float | int) -> Written:
-    text = f"{value:.6g}"
-    if "e" in text:
-        mantissa, exponent = text.split("e")
-        power = str(int(exponent)).replace("-", "−")
-        return Written(
-            f"{mantissa}·10^{power}", f"<mn>{mantissa}</mn><mo>·</mo><msup><mn>10</mn><mn>{power}</mn></msup>", tight=False
-        )
-    return Written(text, f"<mn>{text}</mn>")

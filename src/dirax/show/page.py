@@ -14,7 +14,7 @@ import numpy as np
 from dirax.diagnostics.report import BAD, HEADER, NOT_CHECKED, Line, Report
 from dirax.show import statement
 from dirax.show.arrays import Arrays
-from dirax.show.formula import Written
+from dirax.show.letters import Written
 from dirax.show.series import Run, worst_time
 from dirax.solution.solution import Solution
 from dirax.text.tables import number, plain

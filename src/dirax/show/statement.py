@@ -11,7 +11,8 @@ import jax
 import numpy as np
 
 from dirax.program.user_functions import UserFunction
-from dirax.show.formula import Written, formulas, joined, of_params, symbol, symbols
+from dirax.show.formula import formulas
+from dirax.show.letters import Written, joined, of_params, symbol, symbols
 from dirax.show.series import coordinate_names
 from dirax.solution.solution import Solution
 

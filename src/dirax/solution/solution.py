@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dirax.solution import dense, export, plotting, saving, selection
+from dirax.solution import export, moments, plotting, saving, selection
 from dirax.solution.trajectory import Trajectory
 
 
@@ -56,7 +56,7 @@ class Solution(Trajectory):
     __len__ = selection.count
     __iter__ = selection.each
 
-    at = dense.at
+    at = moments.at
 
     save = saving.save
     to_xarray = export.to_xarray

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold
-from dirax.geometry.spaces import AbstractFlat, Product
+from dirax.geometry.products import Product
+from dirax.geometry.spaces import AbstractFlat
 from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import POINT_DEFECT
 from dirax.program.linear_solves import solve

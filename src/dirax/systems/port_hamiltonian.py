@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -12,13 +11,13 @@ from dirax.geometry.linear import LinearDirac
 from dirax.geometry.structures import DiracStructure
 from dirax.geometry.subspaces import PontryaginSubspace
 from dirax.numerics.arrays import Data, Numbers
-from dirax.numerics.tolerances import STRUCTURE_DEFECT, TINY
 from dirax.program.sparse_matrix import SparseMatrix
 from dirax.program.tracing import gradient
-from dirax.program.user_functions import UserFunction, evaluated, is_traced
+from dirax.program.user_functions import UserFunction, is_traced
 from dirax.systems.constraints import no_constraint
 from dirax.systems.forms import EnergyForm, ImplicitForm, Observed, RelationForm
 from dirax.systems.implicit_form import in_time, names, point_of, uses_time, without_time
+from dirax.systems.port_matrices import constituent, matrix_function, refuse_unless_dissipative, refuse_unless_skew
 from dirax.systems.port_structures import closed_structure, structure_of
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
@@ -54,9 +53,9 @@ class PortHamiltonian(AbstractSystem):
         inputs: Callable | None = None,
     ):
         self.hamiltonian = UserFunction(hamiltonian, "hamiltonian", ("x",))
-        self.J = _matrix_function(J, "J")
-        self.B = None if B is None else _matrix_function(B, "B")
-        self.R = None if R is None else _matrix_function(R, "R")
+        self.J = matrix_function(J, "J")
+        self.B = None if B is None else matrix_function(B, "B")
+        self.R = None if R is None else matrix_function(R, "R")
         self.inputs = None if inputs is None else UserFunction(inputs, "inputs", ("t", "x"))
         self.closed = closed if isinstance(closed, bool) else tuple(int(port) for port in closed)
         if self.closed and B is None:
@@ -66,7 +65,7 @@ class PortHamiltonian(AbstractSystem):
 
     def with_inputs(self, inputs: Callable) -> "PortHamiltonian":
         """The same open system driven by u = inputs(t, x[, params])."""
-        matrices = (_function(self.J), _function(self.B), _function(self.R))
+        matrices = (constituent(self.J), constituent(self.B), constituent(self.R))
         return PortHamiltonian(self.hamiltonian.function, *matrices, self.closed, inputs)
 
     def differential(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
@@ -225,44 +224,10 @@ class PortHamiltonian(AbstractSystem):
                     f"inputs must return shape ({len(unclosed)},), one number an open port, but it returned shape {shape}."
                 )
         if not is_traced(x, params):
-            self._check_structure(x, params)
+            refuse_unless_skew(self.J, x, params)
+            if self.R is not None:
+                refuse_unless_dissipative(self.R, x, params)
         return size, len(closed)
-
-    def _check_structure(self, x, params) -> None:
-        if isinstance(self.J, ConstantFunction):
-            return self._check_sparse_structure()
-        J = np.asarray(evaluated(self.J, x, params))
-        skewness = np.max(np.abs(J + J.T), initial=0.0)
-        if skewness > STRUCTURE_DEFECT * max(np.max(np.abs(J), initial=0.0), TINY):
-            raise ValueError(f"J is not skew at the initial point: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
-        if self.R is None:
-            return
-        R = np.asarray(evaluated(self.R, x, params))
-        scale = max(np.max(np.abs(R), initial=0.0), TINY)
-        if np.max(np.abs(R - R.T)) > STRUCTURE_DEFECT * scale:
-            raise ValueError(f"R is not symmetric at the initial point: max |R − Rᵀ| = {np.max(np.abs(R - R.T)):.3g}.")
-        lowest = np.linalg.eigvalsh(R)[0]
-        if lowest < -STRUCTURE_DEFECT * scale:
-            raise ValueError(
-                f"R is not positive semidefinite at the initial point: its lowest eigenvalue is {lowest:.3g}; dissipation "
-                "must not create energy."
-            )
-
-    def _check_sparse_structure(self) -> None:
-        """The same of sparse matrices; of R what follows from its symmetry and its diagonal, row by row."""
-        J = self.J(None).matrix
-        if (skewness := abs(J + J.T).max()) > STRUCTURE_DEFECT * max(abs(J).max(), TINY):
-            raise ValueError(f"J is not skew: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
-        if not isinstance(self.R, ConstantFunction):
-            return
-        R = self.R(None).matrix
-        scale = max(abs(R).max(), TINY)
-        if (defect := abs(R - R.T).max()) > STRUCTURE_DEFECT * scale:
-            raise ValueError(f"R is not symmetric: max |R − Rᵀ| = {defect:.3g}.")
-        if (lowest := R.diagonal().min()) < -STRUCTURE_DEFECT * scale:
-            raise ValueError(
-                f"R is not positive semidefinite: it has {lowest:.3g} on its diagonal; dissipation must not create energy."
-            )
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         x = data["x"]
@@ -294,44 +259,6 @@ class PortHamiltonian(AbstractSystem):
         return dh @ (abs(self.flow_matrix(x, params)) @ dh + 1.0)
 
 
-def _matrix_function(value: Any, name: str) -> UserFunction:
-    """The user's function of x, or a constant array as one."""
-    if isinstance(value, UserFunction):
-        return value
-    if callable(value):
-        return UserFunction(value, name, ("x",))
-    if is_sparse(value):
-        return ConstantFunction(value, name)
-    constant = np.asarray(value, dtype=float)
-    return UserFunction(lambda x: jnp.asarray(constant), name, ("x",))
-
-
 def _squared(R: Any, covector: Float[Numbers, " N"]) -> Float[Numbers, ""]:
     """⟨α, Rα⟩."""
     return covector @ (R @ covector) if isinstance(R, SparseMatrix) else covector @ R @ covector
-
-
-class ConstantFunction(UserFunction):
-    """The function of x that is a sparse matrix everywhere."""
-
-    def __init__(self, matrix: Any, name: str):
-        constant = matrix if isinstance(matrix, SparseMatrix) else SparseMatrix(matrix)
-        super().__init__(lambda x: constant, name, ("x",))
-
-    def __call__(self, *values: Any):
-        return self.function(None)
-
-    def shape(self, *values: Any) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(self.function(None).shape, jnp.float64)
-
-
-def is_sparse(value: Any) -> bool:
-    """Whether a value is a sparse matrix, of SciPy or of dirax."""
-    return isinstance(value, SparseMatrix) or hasattr(value, "tocsr")
-
-
-def _function(function: UserFunction | None):
-    """What a system is made of again."""
-    if isinstance(function, ConstantFunction):
-        return function.function(None)
-    return None if function is None else function.function

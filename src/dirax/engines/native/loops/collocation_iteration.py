@@ -14,11 +14,13 @@ CLEAR, PATIENCE = 64 * EPSILON, 3.0
 
 class Iteration:
     """The iteration for the iterates in the rooms of `pair`, of which those of the step before stand in the rooms `before`, by a
-    kind of sweep; the last changes are left in the rooms `moved`, and `sizes` are how large iterates are."""
+    kind of sweep; the last changes are left in the rooms `moved`, and `sizes` are how large iterates are. A last change after
+    which more was to be expected than roundoff, the sequence before it says, stands in `open` as well, where others are zero."""
 
     def __init__(self, nodes: Nodes, pair: Pair, before: list[str], moved: list[str], sizes: list[str]):
         self.body, self.one, self.all = nodes.body, nodes.one, nodes.all
         self.pair, self.before, self.moved, self.sizes = pair, before, moved, sizes
+        self.open = nodes.all.rooms(len(moved))
 
     def emit(self, sweep: Sweep, later: str, running: str) -> tuple[str, str, str]:
         """The iteration from the polynomial of the step before, where that fails from constants, or the other way round:
@@ -50,6 +52,9 @@ class Iteration:
         if sweep.together:
             for place, value in zip(self.changes, (float("inf"), float("inf"), 0.0), strict=True):
                 b.store(one.real, one.const(value), place)
+        else:
+            with over.at() as node:
+                over.filled(self.open, [over.emitter.const(float("inf"))] * len(self.open), node)
         b.store(one.bool, one.false, shaky)
         b.store("i64", "0", count_here)
         b.store(one.bool, b.load(one.bool, self.trying), active)
@@ -117,20 +122,23 @@ class Iteration:
             moved, size = e.abs(e.sub(a, before)), e.abs(a)
             found.append((moved, size))
             far = e.either(far, e.compare("ogt", moved, e.mul(size, e.const(FAR))))
+        alone = self.one.width == 1
         over.mark(going, far)
         with over.seldom(e.invert(far)):
             further = e.false
-            for (moved, size), room in zip(found, self.moved, strict=True):
+            for (moved, size), room, open_ in zip(found, self.moved, self.open, strict=True):
                 last, floor = over.load(room, node), e.mul(size, e.const(EPSILON))
-                shrinks = e.both(e.compare("olt", moved, last), e.compare("ogt", moved, floor))
+                shrinks, more = e.compare("olt", moved, last), e.compare("ogt", moved, floor)
                 # the next change will be moved²/last, and so on
                 left = e.mul(moved, moved)
                 floor = e.mul(floor, last)
                 for _ in range(sweep.later):
                     left, floor = e.mul(left, moved), e.mul(floor, last)
-                further = e.either(further, e.both(shrinks, e.compare("uge", left, floor)))
+                more = e.both(more, e.compare("uge", left, floor))
+                further = e.either(further, e.both(shrinks, more))
+                due = e.select(more, moved, e.const(0.0))
+                over.store(due if alone else over.chosen(now, due, over.load(open_, node)), open_, node)
             over.mark(going, further)
-        alone = self.one.width == 1
         for (moved, _), room in zip(found, self.moved, strict=True):
             over.store(moved if alone else over.chosen(now, moved, over.load(room, node)), room, node)
         if stable != e.true:
@@ -158,12 +166,14 @@ class Iteration:
         b.store(one.bool, one.both(trying, one.either(over.marked(missed), shaky)), self.trying)
 
     def _compare(self, sweep: Sweep, missed: str) -> None:
-        """Mark where a last change is not small."""
+        """Mark where a last change is not small, or was not to be the last and is more than roundoff."""
         over, e = self.all, self.all.emitter
         sizes, iterates = sweep.sizes(self.sizes), self.pair.now()
+        limits = [(self.moved, STALLED), *([] if sweep.together else [(self.open, CLEAR)])]
         with over.at() as node:
             off = e.false
-            for iterate, room, size in zip(iterates, self.moved, sizes, strict=True):
-                most = e.mul(e.add(e.abs(over.load(iterate, node)), over.splat(size)), e.const(STALLED))
-                off = e.either(off, e.compare("ugt", over.load(room, node), most))
+            for i, size in enumerate(sizes):
+                whole = e.add(e.abs(over.load(iterates[i], node)), over.splat(size))
+                for changes, most in limits:
+                    off = e.either(off, e.compare("ugt", over.load(changes[i], node), e.mul(whole, e.const(most))))
             over.mark(missed, off)

@@ -1,0 +1,84 @@
+"""Between the rows of a run with values that JAX traces."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from dirax.program.memo import Same
+from dirax.schemes.step import CLOCK, STEP_DENSITY
+from dirax.solution.between_rows import BetweenRows, velocity_of
+from dirax.solution.divided_steps import AT_ROW, step_for
+from dirax.solution.steps_again import Keyed, begun, compiled_call, row_of, stepped
+
+
+class TracedDense(BetweenRows):
+    """The inside of the steps of a run with derivatives, where values are not checked."""
+
+    def at(self, times: Any) -> dict[str, Any]:
+        """The fields at times (T,), (T, …) or (B, T, …), with derivatives. Raises `ValueError` for rows of which some were not
+        saved."""
+        sol = self.sol
+        if sol.impacts is not None:
+            raise ValueError(
+                "under jax.grad, jit and vmap sol.at does not look into steps that walls divide: use rows and events."
+            )
+        if sol.save_every != 1:
+            raise ValueError("under jax.grad, jit and vmap sol.at needs every row: leave save_every= out.")
+        t0, h, last = jnp.asarray(sol.axis[0]), jnp.asarray(sol.step), sol.rows - 2
+        numbers = jnp.clip(jnp.floor(jax.lax.stop_gradient((times - t0) / h)).astype(int), 0, last)
+        own_times = sol.has_own_times
+        rows = {name: jnp.asarray(a) for name, a in self.nodes.items()}
+        steps = {name: jnp.asarray(a) for name, a in sol.fields.items() if name not in rows}
+
+        def lane(rows, steps, params, times, numbers, t0, h):
+            if own_times:
+                numbers = jnp.clip(jnp.searchsorted(jax.lax.stop_gradient(rows[CLOCK]), times, side="right") - 1, 0, last)
+
+            def one(time, number):
+                row, after = ({name: a[number + i] for name, a in rows.items()} for i in (0, 1))
+                of_step = {name: a[number] for name, a in steps.items()}
+                return self._at_one(row, after, of_step, time, t0 + number.astype(float) * h, h, params) | of_step
+
+            return jax.vmap(one)(times, numbers)
+
+        own = (
+            lane if sol.batch is None else jax.vmap(lane, in_axes=(0, 0, 0 if sol.batch_params else None, None, None, None, None))
+        )
+        structure = jax.tree.structure((rows, steps, sol.params))
+        whole = Keyed(own, Same(self.equation), Same(sol.system), sol.batch is None, sol.batch_params, structure)
+        return compiled_call(whole, rows, steps, jax.tree.map(jnp.asarray, sol.params), times, numbers, t0, h)
+
+    def _at_one(self, row, after, of_step, time, t, h, params) -> dict[str, Any]:
+        begins, ends = row.get(CLOCK, t), after.get(CLOCK, t + h)
+        length = ends - begins if CLOCK in row else h
+        return self.inside_one(row, after, of_step, t, h, params)((time - begins) / length)
+
+    def inside_one(self, row, after, of_step, t, h, params) -> Callable:
+        """θ ↦ the fields of nodes at a part θ of the step between two rows, with the fields of the step, as JAX traces them."""
+        system, begins, ends = self.sol.system, row.get(CLOCK, t), after.get(CLOCK, t + h)
+        if self.interpolate is None and (between := self.between) is not None:
+            both = ({**a, "t": s, "v": velocity_of(system, a, s, params)} for a, s in ((row, begins), (after, ends)))
+            first, last = both
+            return lambda theta: {n: a for n, a in between(theta, first, last, h, params).items() if n in self.nodes}
+        state, guess = begun(self.equation, system, row | of_step, begins, h, params)
+        if (interpolate := self.interpolate) is not None:
+            _, (u,), _ = stepped(self.equation, state, guess, begins, h, params)
+
+            def by_polynomial(theta):
+                found = interpolate(theta, u, state, begins, h, params)
+                return {name: found.get(name, row[name]) for name in row}
+
+            return by_polynomial
+
+        def by_step(theta):
+            part = jnp.maximum(theta, AT_ROW) * h
+            if CLOCK in row:
+                part = step_for(part / h, row[STEP_DENSITY], ends - begins, h)
+            there, u, _ = stepped(self.equation, state, guess, begins, part, params)
+            _, unknowns, states = stepped(self.equation, there, u, begins + part, h, params)
+            made = row_of(self.equation, unknowns, states, begins + part, h, params)
+            return {name: jnp.where(theta > AT_ROW, made[name], row[name]) for name in row}
+
+        return by_step

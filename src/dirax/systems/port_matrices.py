@@ -1,0 +1,82 @@
+"""The matrices J, B and R of port-Hamiltonian systems: functions of x, or constant ones, which may be sparse."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dirax.numerics.arrays import Numbers
+from dirax.numerics.tolerances import STRUCTURE_DEFECT, TINY
+from dirax.program.sparse_matrix import SparseMatrix
+from dirax.program.user_functions import UserFunction, evaluated
+
+
+def matrix_function(value: Any, name: str) -> UserFunction:
+    """The user's function of x, or a constant array as one."""
+    if isinstance(value, UserFunction):
+        return value
+    if callable(value):
+        return UserFunction(value, name, ("x",))
+    if is_sparse(value):
+        return ConstantFunction(value, name)
+    constant = np.asarray(value, dtype=float)
+    return UserFunction(lambda x: jnp.asarray(constant), name, ("x",))
+
+
+class ConstantFunction(UserFunction):
+    """The function of x that is a sparse matrix everywhere."""
+
+    def __init__(self, matrix: Any, name: str):
+        constant = matrix if isinstance(matrix, SparseMatrix) else SparseMatrix(matrix)
+        super().__init__(lambda x: constant, name, ("x",))
+
+    def __call__(self, *values: Any):
+        return self.function(None)
+
+    def shape(self, *values: Any) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(self.function(None).shape, jnp.float64)
+
+
+def is_sparse(value: Any) -> bool:
+    """Whether a value is a sparse matrix, of SciPy or of dirax."""
+    return isinstance(value, SparseMatrix) or hasattr(value, "tocsr")
+
+
+def constituent(function: UserFunction | None):
+    """What a system is made of again."""
+    if isinstance(function, ConstantFunction):
+        return function.function(None)
+    return None if function is None else function.function
+
+
+def refuse_unless_skew(J: UserFunction, x: Numbers, params: Any) -> None:
+    """Raise `ValueError` where J is not skew at x, with the defect."""
+    matrix, where = _matrix_at(J, x, params)
+    if (skewness := _largest(matrix + matrix.T)) > STRUCTURE_DEFECT * max(_largest(matrix), TINY):
+        raise ValueError(f"J is not skew{where}: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
+
+
+def refuse_unless_dissipative(R: UserFunction, x: Numbers, params: Any) -> None:
+    """Raise `ValueError` where R is not symmetric positive semidefinite at x, with the defect; of a sparse one what follows from
+    its symmetry and its diagonal, row by row."""
+    matrix, where = _matrix_at(R, x, params)
+    scale = max(_largest(matrix), TINY)
+    if (defect := _largest(matrix - matrix.T)) > STRUCTURE_DEFECT * scale:
+        raise ValueError(f"R is not symmetric{where}: max |R − Rᵀ| = {defect:.3g}.")
+    sparse = isinstance(R, ConstantFunction)
+    lowest = matrix.diagonal().min() if sparse else np.linalg.eigvalsh(matrix)[0]
+    if lowest < -STRUCTURE_DEFECT * scale:
+        what = f"it has {lowest:.3g} on its diagonal" if sparse else f"its lowest eigenvalue is {lowest:.3g}"
+        raise ValueError(f"R is not positive semidefinite{where}: {what}; dissipation must not create energy.")
+
+
+def _matrix_at(function: UserFunction, x: Numbers, params: Any) -> tuple[Any, str]:
+    """The matrix at x, one of SciPy where it is sparse, and where this is, in words."""
+    if isinstance(function, ConstantFunction):
+        return function(None).matrix, ""
+    return np.asarray(evaluated(function, x, params)), " at the initial point"
+
+
+def _largest(matrix: Any) -> float:
+    return abs(matrix).max() if matrix.size else 0.0
