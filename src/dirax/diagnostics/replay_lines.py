@@ -13,7 +13,7 @@ from dirax.solution.solution import Solution
 
 NAME = "steps replayed"
 
-DISTURBANCE = 2.0**-30
+DISTURBANCE = 2.0**-36
 """Relative changes that show what rounding does: far above it, and small enough to do the same, only more."""
 
 SAMPLED = 48

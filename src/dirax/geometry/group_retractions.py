@@ -5,7 +5,8 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.geometry.lie_groups import AbstractLieGroup, Algebra, cross, quarter_turn
+from dirax.geometry.lie_group import AbstractLieGroup, Algebra
+from dirax.geometry.lie_groups import cross, quarter_turn
 from dirax.geometry.manifolds import Vector
 from dirax.program.tracing import gradient
 

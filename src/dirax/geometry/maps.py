@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.geometry.lie_group import AbstractLieGroup
 from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold, Vector
 from dirax.geometry.products import Product
 from dirax.geometry.spaces import Euclidean, Sphere

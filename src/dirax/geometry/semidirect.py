@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.geometry.group_retractions import coadjoint, rotate
-from dirax.geometry.lie_groups import AbstractLieGroup, Algebra, cross, quarter_turn
+from dirax.geometry.lie_group import AbstractLieGroup, Algebra
+from dirax.geometry.lie_groups import cross, quarter_turn
 from dirax.geometry.manifolds import Vector
 
 Advected = Float[Array, " r"]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.geometry.charts import RetractionChart
-from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.geometry.lie_group import AbstractLieGroup
 from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold
 from dirax.geometry.products import Product
 from dirax.geometry.spaces import AbstractFlat, Euclidean

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
+from dirax.geometry.lie_group import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.numerics.arrays import Data
 from dirax.numerics.tolerances import INERTIA_RANK

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.geometry.lie_group import AbstractLieGroup
 from dirax.numerics.tolerances import SYMMETRY_DEFECT
 from dirax.program.rounding import rounding
 from dirax.program.user_functions import UserFunction, evaluated

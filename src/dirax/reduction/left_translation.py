@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.geometry.lie_group import AbstractLieGroup
 from dirax.numerics.tolerances import GROUP_DEFECT
 from dirax.program.user_functions import is_traced
 from dirax.reduction.actions import AbstractAction

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float
 
-from dirax.geometry.lie_groups import AbstractLieGroup, Algebra
+from dirax.geometry.lie_group import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.geometry.structures import DiracStructure
 from dirax.numerics.arrays import Data

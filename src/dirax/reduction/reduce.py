@@ -2,7 +2,7 @@
 
 from typing import Any, overload
 
-from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.geometry.lie_group import AbstractLieGroup
 from dirax.geometry.products import Product
 from dirax.reduction.actions import Translations
 from dirax.reduction.bundle import GroupConnection, TrivialBundle, translations_on

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3, AbstractLieGroup
+from dirax.geometry.lie_group import AbstractLieGroup
+from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.reduction.connection import SAMPLES, AbstractConnection, LinearConnection
 from dirax.reduction.euler_poincare import EulerPoincare

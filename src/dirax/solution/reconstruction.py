@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.geometry.group_retractions import coadjoint
-from dirax.geometry.lie_groups import AbstractLieGroup
+from dirax.geometry.lie_group import AbstractLieGroup
 from dirax.numerics.tolerances import GROUP_DEFECT
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.user_functions import is_traced

@@ -50,6 +50,7 @@ class Iteration:
         b, over, one = self.body, self.all, self.one
         count_here, active, shaky = b.alloca("i64"), b.alloca(one.bool), b.alloca(one.bool)
         if sweep.together:
+            self._know_terms(sweep, b.load(one.bool, self.trying))
             for place, value in zip(self.changes, (float("inf"), float("inf"), 0.0), strict=True):
                 b.store(one.real, one.const(value), place)
         else:
@@ -152,9 +153,7 @@ class Iteration:
         self._compare(sweep, missed)
         far = one.both(trying, over.marked(missed))
         with b.when(one.any(far)):
-            for size, value in zip(self.sizes, sweep.terms(), strict=True):
-                known = b.load(one.real, size)
-                b.store(one.real, one.select(far, one.max(value, known), known), size)
+            self._know_terms(sweep, far)
             over.clear(missed)
             self._compare(sweep, missed)
         if not sweep.later:
@@ -165,11 +164,18 @@ class Iteration:
             b.store(one.real, one.select(trying, over.highest(peak), b.load(one.real, self.change)), self.change)
         b.store(one.bool, one.both(trying, one.either(over.marked(missed), shaky)), self.trying)
 
+    def _know_terms(self, sweep: Sweep, some: str) -> None:
+        """Take what the iterates of some trajectories are made of into their sizes."""
+        b, one = self.body, self.one
+        for size, value in zip(self.sizes, sweep.terms(), strict=True):
+            known = b.load(one.real, size)
+            b.store(one.real, one.select(some, one.max(value, known), known), size)
+
     def _compare(self, sweep: Sweep, missed: str) -> None:
         """Mark where a last change is not small, or was not to be the last and is more than roundoff."""
         over, e = self.all, self.all.emitter
         sizes, iterates = sweep.sizes(self.sizes), self.pair.now()
-        limits = [(self.moved, STALLED), *([] if sweep.together else [(self.open, CLEAR)])]
+        limits = [(self.moved, CLEAR)] if sweep.together else [(self.moved, STALLED), (self.open, CLEAR)]
         with over.at() as node:
             off = e.false
             for i, size in enumerate(sizes):

@@ -165,7 +165,8 @@ class _Kernel:
             found = zip(iterates, self.before, strict=True)
             over.filled(iterates, [over.chosen(good, over.load(a, node), over.load(b, node)) for a, b in found], node)
         keep(one.add(done, one.const(1.0)), self.completed)
-        keep(one.max(change, b.load(one.real, self.worst)), self.worst)
+        of_rates = one.mul(change, self.scale) if self.scale else change
+        keep(one.max(of_rates, b.load(one.real, self.worst)), self.worst)
         outcome = one.select(good, one.const(float(OK)), failure)
         b.store(one.real, one.select(running, outcome, b.load(one.real, self.status)), self.status)
         more = one.select(running, one.add(count, one.const(float(sweep.later))), one.const(0.0))

@@ -7,14 +7,10 @@ from dataclasses import dataclass, field
 from dirax.engines.native.loops.record import Record
 from dirax.engines.newton_step import Factors, pivot_order
 from dirax.engines.step_program import Inputs
-from dirax.engines.stopping import EPSILON, STALLED
 from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.rounding import rounding_nodes
 from dirax.schemes.collocation_tables import Quadrature, Tableau
-
-ROUNDINGS = 64 * EPSILON / STALLED
-"""Of a change that is STALLED beside its terms, that which is some roundings of them."""
 
 Rows = list[dict[int, int]]
 """Rows of a matrix, {column: node}."""
@@ -149,7 +145,7 @@ class MeanPlan:
     def __post_init__(self):
         g, r = self.graph, self.relation
         sizes = {node: g.make("abs", node) for node in r.first}
-        step = g.mul(g.make("abs", self.shared.h), g.constant(ROUNDINGS))
+        step = g.make("abs", self.shared.h)
         for _ in range(2):  # a at a node is made of rates, and has their roundings beside its own
             errors = sizes | dict(zip(r.means, rounding_nodes(g, r.slopes, sizes), strict=True))
             self.terms = rounding_nodes(g, r.rates[: len(r.first)], errors)
