@@ -184,55 +184,6 @@ def test_quadratic_invariants_are_kept():
     np.testing.assert_allclose(casimir, casimir[0], rtol=2e-14)
 
 
-def stiff_springs(q, v):
-    """Two bobs in a chain, accelerations."""
-    lengths = jnp.sqrt(jnp.stack([q[:2] @ q[:2], (q[2:] - q[:2]) @ (q[2:] - q[:2])]))
-    return v @ v / 2 - 1e4 * jnp.sum((lengths - 1.0) ** 2) / 2 - 9.8 * (q[1] + q[3])
-
-
-STIFF = {
-    "accelerations": (
-        dx.LagrangeDirac(stiff_springs), {"q": [0.6, -0.8, 1.2, -1.6], "v": [0.4, 0.3, 0.0, 0.1]}, 0.06, 3,
-    ),
-    "rates of a mass matrix": (
-        dx.LagrangeDirac(lambda q, v: double_pendulum(q, v, {"g": 9.8}) - 2e4 * (q[1] - q[0]) ** 2),
-        {"q": [0.7, 0.7], "v": [0.3, 0.3]}, 0.1, 5,
-    ),
-    "ports": (
-        dx.PortHamiltonian(
-            lambda x: x @ x / 2 + x[0] ** 4 / 4,
-            J=lambda x: jnp.array([[0.0, 1.0 + x[1], 0.0], [-1.0 - x[1], 0.0, 3.0], [0.0, -3.0, 0.0]]),
-            R=lambda x: jnp.diag(jnp.array([0.0, 0.0, 1e4])),
-        ),
-        {"x": [1.0, 0.2, 0.5]}, 0.2, 3,
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("scheme", [dx.Collocation(3), dx.EnergyCollocation(4)], ids=["Collocation", "EnergyCollocation"])
-def test_a_stiff_bar_is_not_left_where_its_changes_stop_to_shrink(scheme):
-    """The fixed point goes to and fro at 1e-10 of the stiff forces, far above their roundoff."""
-    bar = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 200.0**2 / 2 * (jnp.sqrt(q @ q) - 1) ** 2 - q[1])
-    run = {"q": [np.cos(0.7), -np.sin(0.7)], "v": np.zeros(2), "step": 0.02, "steps": 50}
-    sol = dx.simulate(bar, scheme, engine="native", **run)
-    assert "simplified Newton" in sol.stats["iteration"] and sol.stats["newton_iterations"] < 700
-    report = dx.verify(sol)
-    assert report["steps solved"].value < 1e-13 and report["steps replayed"].verdict == "ok"
-
-
-@pytest.mark.parametrize("name", ["accelerations", "ports", pytest.param("rates of a mass matrix", marks=pytest.mark.soak)])
-def test_where_the_fixed_point_does_not_converge_newton_goes_on_with_systems_of_one_node(name):
-    system, data, step, stages = STIFF[name]
-    run = lambda engine, data: dx.simulate(system, dx.Collocation(stages), step=step, steps=30, engine=engine, **data)
-    native, arrays = run("native", data), run("xla", data)
-    assert "then simplified Newton" in native.stats["iteration"] and "all unknowns" not in native.stats["iteration"]
-    for field, values in native.fields.items():
-        np.testing.assert_allclose(values, arrays.fields[field], rtol=1e-11, atol=1e-11)
-    batch = run("native", {field: np.array([np.multiply(0.1, values), values]) for field, values in data.items()})
-    for field, values in native.fields.items():
-        np.testing.assert_array_equal(batch.fields[field][1], values)
-
-
 def test_a_trajectory_of_a_batch_has_the_bits_of_its_own_run_and_failures_stay_in_their_lane():
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 1.0 / q[0])  # falls into the centre at a time that depends on q
     q, v = [[1.0, 0.0], [0.2, 0.0], [2.0, 0.1]], [[0.0, 0.0], [0.0, 0.0], [0.1, 0.1]]
