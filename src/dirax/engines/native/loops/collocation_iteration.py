@@ -8,8 +8,11 @@ from dirax.engines.stopping import EPSILON, STALLED
 FAR = 2.0**-20
 """Relative changes above which nothing more is asked of an iterate: it is not at its root."""
 
-CLEAR, PATIENCE = 64 * EPSILON, 3.0
-"""Above this relative change an iteration for all entries together may pause so many times before it is at its floor."""
+CLEAR = 64 * EPSILON
+"""Changes above it, relative to the terms of an iterate, are more than their roundoff."""
+
+PATIENCE = 3.0
+"""Times that an iteration for all entries together may pause above it before it is at its floor."""
 
 
 class Iteration:
@@ -146,8 +149,8 @@ class Iteration:
             over.mark(unstable, e.invert(stable))
 
     def _judge(self, sweep: Sweep, shaky: str) -> None:
-        """Those that tried and whose last changes are small are at a root, and try no longer. An iterate that is nothing but
-        roundoff is measured by what it is made of."""
+        """Those that tried and whose last changes are roundoff, or had nothing after them, are at a root, and try no longer. An
+        iterate that is nothing but roundoff is measured by what it is made of."""
         b, over, one = self.body, self.all, self.one
         missed, trying = over.flag(), b.load(one.bool, self.trying)
         self._compare(sweep, missed)
