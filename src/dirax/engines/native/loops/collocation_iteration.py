@@ -12,7 +12,7 @@ CLEAR = 64 * EPSILON
 """Changes above it, relative to the terms of an iterate, are more than their roundoff."""
 
 PATIENCE = 3.0
-"""Times that an iteration for all entries together may pause above it before it is at its floor."""
+"""Times that an iteration may pause above it: its error can go to and fro between the entries."""
 
 
 class Iteration:
@@ -48,10 +48,10 @@ class Iteration:
         return converged, b.load(one.real, self.change), b.load(one.real, self.sweeps)
 
     def _iterate(self, sweep: Sweep) -> None:
-        """Sweeps until the next change of every entry of an iterate is below its roundoff, or changes shrink no more; those that
-        have come to a root then try no longer."""
+        """Sweeps until the next change of every entry of an iterate is below its roundoff, or changes shrink no more, and again
+        where these are more than roundoff; those that have come to a root then try no longer."""
         b, over, one = self.body, self.all, self.one
-        count_here, active, shaky = b.alloca("i64"), b.alloca(one.bool), b.alloca(one.bool)
+        count_here, active, shaky, pauses = b.alloca("i64"), b.alloca(one.bool), b.alloca(one.bool), b.alloca(one.real)
         if sweep.together:
             self._know_terms(sweep, b.load(one.bool, self.trying))
             for place, value in zip(self.changes, (float("inf"), float("inf"), 0.0), strict=True):
@@ -61,8 +61,9 @@ class Iteration:
                 over.filled(self.open, [over.emitter.const(float("inf"))] * len(self.open), node)
         b.store(one.bool, one.false, shaky)
         b.store("i64", "0", count_here)
+        b.store(one.real, one.const(0.0), pauses)
         b.store(one.bool, b.load(one.bool, self.trying), active)
-        head, out = b.fresh(), b.fresh()
+        head, out, ended = b.fresh(), b.fresh(), b.fresh()
         b.branch(head)
         b.label(head)
         now, unstable = b.load(one.bool, active), over.flag()
@@ -88,7 +89,16 @@ class Iteration:
         self.pair.swap()
         b.branch_if(one.any(still), head, out)
         b.label(out)
-        self._judge(sweep, b.load(one.bool, shaky))
+        missed = self._missed(sweep)
+        if not sweep.together:
+            paused = b.load(one.real, pauses)
+            again = one.both(missed, one.compare("olt", paused, one.const(PATIENCE)))
+            again = b.put(f"select i1 {allowed}, {one.bool} {again}, {one.bool} {one.false}")
+            b.store(one.real, one.select(again, one.add(paused, one.const(1.0)), paused), pauses)
+            b.store(one.bool, again, active)
+            b.branch_if(one.any(again), head, ended)
+            b.label(ended)
+        self._judge(sweep, one.either(missed, b.load(one.bool, shaky)))
 
     def _measured(self, sweep: Sweep, node: str, new: list[str], peak: str, rooms: list, others: list) -> None:
         """The new iterates at a node into the other rooms; and their largest change, by the sizes of the iterates."""
@@ -148,9 +158,9 @@ class Iteration:
         if stable != e.true:
             over.mark(unstable, e.invert(stable))
 
-    def _judge(self, sweep: Sweep, shaky: str) -> None:
-        """Those that tried and whose last changes are roundoff, or had nothing after them, are at a root, and try no longer. An
-        iterate that is nothing but roundoff is measured by what it is made of."""
+    def _missed(self, sweep: Sweep) -> str:
+        """Which of those that try have changed by more than roundoff and not for the last time. An iterate that is nothing but
+        roundoff is measured by what it is made of."""
         b, over, one = self.body, self.all, self.one
         missed, trying = over.flag(), b.load(one.bool, self.trying)
         self._compare(sweep, missed)
@@ -159,13 +169,19 @@ class Iteration:
             self._know_terms(sweep, far)
             over.clear(missed)
             self._compare(sweep, missed)
+        return one.both(trying, over.marked(missed))
+
+    def _judge(self, sweep: Sweep, failed: str) -> None:
+        """Those that tried and have not failed are at a root, and try no longer."""
+        b, over, one = self.body, self.all, self.one
+        trying = b.load(one.bool, self.trying)
         if not sweep.later:
             peak = over.peak()
             with over.at() as node:
                 for room in self.moved:
                     over.raised(peak, over.load(room, node))
             b.store(one.real, one.select(trying, over.highest(peak), b.load(one.real, self.change)), self.change)
-        b.store(one.bool, one.both(trying, one.either(over.marked(missed), shaky)), self.trying)
+        b.store(one.bool, one.both(trying, failed), self.trying)
 
     def _know_terms(self, sweep: Sweep, some: str) -> None:
         """Take what the iterates of some trajectories are made of into their sizes."""
