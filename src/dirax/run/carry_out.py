@@ -160,7 +160,7 @@ def prepared(settings: Settings, case: Case, steps: int, save_every: int) -> Kin
     found = _begun(settings, case, steps, save_every, save_every)
     if not found.traced and not found.redundant:
         kind.plan = kind.plan or found.plan()
-        kind.engine = kind.engine or settings.engine.prepared(found.problem)
+        kind.engine = kind.engine or settings.engine.prepared(found.problem.with_numbers(often=True))
     return kind
 
 
