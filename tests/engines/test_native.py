@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 import dirax as dx
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem
 from dirax.engines.native import Native
-from dirax.engines.native import run as driver
 from dirax.engines.native import kernels as of_steps
+from dirax.engines.native import run as driver
 from dirax.engines.native.kernels import QUICK, SOON, kernels
 from dirax.engines.native.loops.sizes import sizes_module
 from dirax.engines.native.loops.step_loop import kernel_module
