@@ -173,11 +173,17 @@ def _largest(xp: ModuleType, matrix: Any, axis: int) -> Any:
 
 
 def _maximum(xp: ModuleType, sizes: Any, axis: int) -> Any:
-    """The largest of sizes that are not negative, along an axis; of many small matrices NumPy finds it far quicker column by
-    column."""
-    if xp is np and sizes.ndim > 2 and len(sizes) > MANY and sizes.shape[axis]:
-        return np.expand_dims(functools.reduce(np.maximum, np.moveaxis(sizes, axis, 0)), axis)
+    """The largest of sizes that are not negative, along an axis."""
+    if xp is np and sizes.ndim > 2 and sizes.shape[axis]:
+        return np.expand_dims(largest_of_few(sizes, axis), axis)
     return xp.max(sizes, axis=axis, keepdims=True, initial=0.0)
+
+
+def largest_of_few(numbers: np.ndarray, axis: int = -1) -> np.ndarray:
+    """`np.max` along an axis, the last one or that before it; of many small arrays it is found far quicker column by column."""
+    if numbers.ndim > -axis and len(numbers) > MANY:
+        return functools.reduce(np.maximum, np.moveaxis(numbers, axis, 0))
+    return np.max(numbers, axis=axis)
 
 
 def _nonzero(xp: ModuleType, sizes: Any) -> Any:
