@@ -106,10 +106,10 @@ class Kernels:
         """The code of `run` for a width."""
         return self._library("run", width, lambda: kernel_module(self._planned(), width, llvm.has_fma()), levels=levels)
 
-    def of_sizes(self, width: int) -> Any:
+    def of_sizes(self, width: int, often: bool = False) -> Any:
         """The compiled `run` that finds the sizes; None where they are not written as nodes, and as long as runs have spent less
-        than a part of what its compilation takes."""
-        worth = self.sizing > SIZING * self.step.entries
+        than a part of what its compilation takes, unless they are said to be found `often`."""
+        worth = often or self.sizing > SIZING * self.step.entries
         if width not in self._of_sizes and worth and self.step.sizes_are_written:
             text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
             found = self._library("run", width, text, "sizes", levels=(SOON,))

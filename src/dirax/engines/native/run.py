@@ -41,6 +41,8 @@ class Ready:
         self.made = made
         self.width = width_for(p.batch or 1) if nodes is None or nodes.wide else 1
         _, cached = made.runs.kernel(self.width, self._steps(p))
+        if p.often and isinstance(made, Kernels) and made.record.kept:
+            made.of_sizes(self.width, often=True)
         self.first_unknowns = made.record.unknowns(0, p.equation.stages[0][0].unknowns)
         self.notes = {
             "unknowns": sum(len(made.step.equations[i].unknowns) for i, _ in made.step.stages),
