@@ -75,9 +75,9 @@ class CollocationKernels:
         return {"iteration": f"fixed point of the {kind}, {side}"}
 
     def _run(self, width: int, levels: tuple[int, ...]) -> Linked:
-        """The code of `run` for a width."""
+        """The code of `run` for a width, which is compiled in little time, and so is quick at once."""
         text = lambda: collocation_module(self.plan, width, llvm.has_fma(), self.newton)
-        return linked("run", (self.digest, width, "collocation", "newton" * self.newton), text, lambda: self.operations, levels)
+        return linked("run", (self.digest, width, "collocation", "newton" * self.newton), text, lambda: self.operations)
 
 
 _kernels: Memo[CollocationKernels | None] = Memo(KEPT)

@@ -33,9 +33,12 @@ SOON, QUICK = 0, 2
 """Levels of LLVM's optimization. Code of the first is ready in a quarter of the time, and runs a half to a third as fast as that
 of the second, with the same bits."""
 
-MANY = 10_000
-"""Steps, of all runs with a kernel together, from which on it is worth while to have it QUICK: the time that compiling for it
-takes grows with the operations of a step as the time that it saves in every step."""
+MANY = 400_000
+"""Steps of a run for which code is QUICK from the beginning."""
+
+PRICE = 1.5e-5
+"""Seconds for each operation of a step that runs spend with code that is ready SOON before it is worth while to have it QUICK:
+about a fifth of what compiling for that takes."""
 
 SIZING = 1e-5
 """A part of the seconds that the kernel of sizes takes to compile (3e-5), for each operation and each column of the Jacobian."""
@@ -51,27 +54,34 @@ class Linked(NamedTuple):
 
 
 class Runs:
-    """The compiled `run` of a step by width, of the level that pays for the steps that are taken with it."""
+    """The compiled `run` of a step by width: at first ready soon, and quick when that pays."""
 
     def __init__(self, linked: Callable[[int, tuple[int, ...]], Linked]):
         self._linked = linked
-        self._made: dict[int, tuple[Any, int]] = {}
-        self._taken: Counter[int] = Counter()
+        self._made: dict[int, tuple[Any, Linked]] = {}
+        self._spent: Counter[int] = Counter()
 
     def kernel(self, width: int, steps: float) -> tuple[Any, bool]:
         """The `run` for a width, with which so many steps are about to be taken, and whether it came from a cache."""
-        run, level = self._made.get(width, (None, SOON))
-        quick = self._taken[width] + steps > MANY
-        if run is not None and (level == QUICK or not quick):
+        quick = steps > MANY or self.quick_pays(width, 0.0)
+        run, found = self._made.get(width, (None, None))
+        if found is not None and (found.level == QUICK or not quick):
             return run, True
         found = self._linked(width, (QUICK,) if quick else (QUICK, SOON))
         run = llvm.function(found.library, "run", SIGNATURE)
-        self._made[width] = run, found.level
+        self._made[width] = run, found
         return run, found.cached
 
-    def took(self, width: int, steps: int) -> None:
-        """Count steps that were taken."""
-        self._taken[width] += steps
+    def spent(self, width: int, seconds: float) -> None:
+        """Count seconds of runs with this width."""
+        self._spent[width] += seconds
+
+    def quick_pays(self, width: int, seconds: float) -> bool:
+        """Whether quick code is worth its compiling where what there is would run for so long from now on."""
+        if width not in self._made:
+            return False
+        _, found = self._made[width]
+        return found.level != QUICK and self._spent[width] + seconds > PRICE * found.operations
 
 
 class Kernels:

@@ -19,7 +19,7 @@ CHUNK_SECONDS = 0.1
 WORTH_THREADS = 2e-3
 """Seconds of work from which on it is shared among threads."""
 
-FIRST_CHUNK = 20_000
+FIRST_CHUNK = 2_000
 """Lane-steps of the first call, from which the speed is estimated."""
 
 
@@ -60,17 +60,15 @@ class Ready:
 
     def __call__(self, p: Problem, progress: Progress | None = None) -> Outcome:
         """Run `p`, as `Native.run` has it."""
-        entered = time.perf_counter()
-        kernel, ready = self.made.runs.kernel(self.width, self._steps(p))
-        if not ready:
-            self.compile_seconds += time.perf_counter() - entered
+        entered, runs = time.perf_counter(), self.made.runs
+        kernel, ready = runs.kernel(self.width, self._steps(p))
+        waited = 0.0 if ready else time.perf_counter() - entered
         places = places_of(p, self.made)
         lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
         fields = lanes.fields
         if p.record is None and isinstance(self.made, Kernels):  # a fixed point finds its own
             find_sizes(lanes, self.made)
-        compile_seconds, cached, started = self.compile_seconds, self.notes["kernel_cached"] and ready, time.perf_counter()
-        done, interrupted, threads = p.after, False, 1
+        started, before, done, interrupted, threads = time.perf_counter(), waited, p.after, False, 1
         count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
         try:
             while done < p.steps and (done == p.after or lanes.going):
@@ -78,7 +76,13 @@ class Ready:
                 tick = time.perf_counter()
                 lanes.advance(kernel, done, done + count, threads)
                 done += count
-                rate = count / max(time.perf_counter() - tick, 1e-9)
+                seconds = max(time.perf_counter() - tick, 1e-9)
+                rate = count / seconds
+                runs.spent(self.width, seconds)
+                if runs.quick_pays(self.width, (p.steps - done) / rate):
+                    tick = time.perf_counter()
+                    kernel, found = runs.kernel(self.width, math.inf)
+                    ready, waited = ready and found, waited + time.perf_counter() - tick
                 count = max(1, int(rate * CHUNK_SECONDS))
                 threads = lanes.threads if threads > 1 or p.steps - done > rate * WORTH_THREADS else 1
                 if progress:
@@ -92,9 +96,9 @@ class Ready:
             else:
                 with_present_sizes(lanes, self.made)
                 others = _with_weak_entries(lanes, self.made)
-        run_seconds = time.perf_counter() - started
+        run_seconds = time.perf_counter() - started - (waited - before)
         closing = lanes.close(kernel)
-        self.made.runs.took(self.width, (done - p.after) * -(-(p.batch or 1) // self.width))
+        compile_seconds, cached = self.compile_seconds + waited, self.notes["kernel_cached"] and ready
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
         table, record = lanes.table(), lanes.record
         counts = table[:, record.completed : record.iterations + 1].astype(np.int64)
