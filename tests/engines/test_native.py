@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 import dirax as dx
 from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem
 from dirax.engines.native import Native
+from dirax.engines.native import kernels as of_steps
 from dirax.engines.native import run as driver
-from dirax.engines.native.kernels import kernels
+from dirax.engines.native.kernels import QUICK, SOON, kernels
 from dirax.engines.native.loops.sizes import sizes_module
 from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.xla import Xla
@@ -318,6 +319,62 @@ def test_kernels_are_cached_on_disk_and_damaged_entries_are_made_again(tmp_path,
     monkeypatch.setenv("DIRAX_CACHE", "off")
     forget()
     assert not native.run(p).notes["kernel_cached"]
+
+
+@pytest.mark.parametrize("name", ["rolling disk, midpoint", "Hénon–Heiles"])
+@pytest.mark.parametrize("size", [None, 11])
+def test_code_that_is_ready_soon_has_the_bits_of_quick_code(name, size, monkeypatch):
+    monkeypatch.setenv("DIRAX_CACHE", "off")
+    levels = compiled_levels(monkeypatch)
+    p = problem(name, steps=40) if size is None else spread(problem(name, steps=40), size)
+    dx.clear_caches()
+    soon = native.run(p)
+    dx.clear_caches()
+    quick = native.run(p.with_numbers(often=True))
+    assert levels == [SOON, QUICK, SOON]  # the last one is that of the sizes
+    assert_same_bits(soon, quick)
+
+
+def test_quick_code_is_compiled_once_it_pays(tmp_path, monkeypatch):
+    """After runs that took long together, or in one; what is quick and on the disk is taken for a few steps as well."""
+    monkeypatch.setenv("DIRAX_CACHE", str(tmp_path))
+    monkeypatch.setattr(of_steps, "SIZING", 1e9)
+    levels, p = compiled_levels(monkeypatch), problem("harmonic oscillator", steps=60)
+    dx.clear_caches()
+    run = native.prepared(p)
+    first = run(p)
+    monkeypatch.setattr(of_steps, "PRICE", 1e-12)
+    second, third = run(p), run(p)
+    assert levels == [SOON, QUICK]
+    assert [o.notes["kernel_cached"] for o in (first, second, third)] == [False, False, True]
+    assert second.compile_seconds > 0.0 == third.compile_seconds
+    assert_same_bits(first, second)
+    dx.clear_caches()
+    assert native.run(p).notes["kernel_cached"] and levels == [SOON, QUICK]
+    dx.clear_caches()
+    monkeypatch.setenv("DIRAX_CACHE", "off")
+    monkeypatch.setattr(driver, "FIRST_CHUNK", 20)  # in the midst of a run
+    midst = native.run(p)
+    assert_same_bits(first, midst)
+    assert levels[2:] == [SOON, QUICK] and midst.compile_seconds > midst.run_seconds > 0.0
+    dx.clear_caches()
+    monkeypatch.setattr(of_steps, "MANY", 100)
+    native.run(p.with_numbers(steps=101))
+    lagrangian, _, scheme, q, v, h, *_ = SYSTEMS["harmonic oscillator"]
+    dx.prepare(dx.LagrangeDirac(lagrangian), scheme, q=q, v=v, step=h, steps=1)
+    assert levels[4:] == [QUICK, QUICK, SOON]
+
+
+def compiled_levels(monkeypatch) -> list[int]:
+    """The levels at which kernels are compiled from now on."""
+    levels, compiled = [], llvm.object_code
+
+    def noted(text, level):
+        levels.append(level)
+        return compiled(text, level=level)
+
+    monkeypatch.setattr(llvm, "object_code", noted)
+    return levels
 
 
 def test_what_cannot_be_compiled_is_named_with_its_line():

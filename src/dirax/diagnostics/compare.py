@@ -88,7 +88,7 @@ class Comparison:
     def plot(self, ax: "Axes | None" = None) -> "Axes":
         """Work and precision, both logarithmic: the error over the time of the run that has it, one curve a scheme, over the
         step that was compared (the large mark), and its half, quarter and eighth. Further left and down is better; a scheme
-        whose order could not be measured is left out."""
+        whose runs failed is left out."""
         ax = given_or_new(ax)
         for k, entry in enumerate(entry for entry in self.entries if entry.precision):
             steps, errors = np.array(entry.precision).T
@@ -178,7 +178,8 @@ def _order(system, scheme, step, steps, reference, run) -> tuple[float | None, t
         return None, (), str(reason)
     first = next(iter(found.slopes.values()))
     precision = tuple((stretch * step / h, float(error)) for h, error in zip(found.step_sizes, first.errors, strict=True))
-    return first.order, precision, " ".join(found.notes) if found.agrees is False else ""
+    told = not np.isfinite(first.order) or found.agrees is False
+    return first.order if np.isfinite(first.order) else None, precision, " ".join(found.notes) if told else ""
 
 
 def _entry(name: str, sol: Solution, order, precision, note: str, seconds: float) -> Entry:

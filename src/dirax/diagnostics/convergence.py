@@ -43,7 +43,7 @@ class Slope:
     """The measured order of one quantity: the slope of log(error) over log(h), its standard error, and what it rests on.
 
     `errors` holds the largest error over the common times for each step size, `used` says which ones the slope rests on;
-    `end_errors` are those at the last common time.
+    `end_errors` are those at the last common time. Where fewer than three can be used, the order is NaN, and none are.
     """
 
     order: float
@@ -52,10 +52,16 @@ class Slope:
     used: np.ndarray
     end_errors: np.ndarray
 
+    @property
+    def text(self) -> str:
+        """The order for a cell."""
+        return f"{self.order:.3f} ± {self.standard_error:.1g}" if np.any(self.used) else number(self.order)
+
 
 @dataclass(frozen=True)
 class Convergence:
-    """What `dx.convergence` measured; prints as a table. `order` is that of q (or x); `orders` has all by name."""
+    """What `dx.convergence` measured; prints as a table. `order` is that of q (or x); `orders` has all by name. NaN is an order
+    that these runs do not show, and `notes` say why."""
 
     title: str
     step_sizes: np.ndarray
@@ -87,7 +93,7 @@ class Convergence:
         for i, h in enumerate(self.step_sizes):
             cells = [number(s.errors[i]) + ("" if s.used[i] else " (not used)") for s in self.slopes.values()]
             rows.append((number(h, 6), *cells))
-        rows.append(("order", *(f"{s.order:.3f} ± {s.standard_error:.1g}" for s in self.slopes.values())))
+        rows.append(("order", *(s.text for s in self.slopes.values())))
         return header, rows, f"{self.title}, against {self.reference}"
 
     def __str__(self) -> str:
@@ -106,9 +112,12 @@ class Convergence:
         ax = given_or_new(ax)
         for k, (name, slope) in enumerate(self.slopes.items()):
             h, errors, colour = self.step_sizes, np.asarray(slope.errors), COLOURS[k % len(COLOURS)]
-            centre = np.exp(np.mean(np.log(errors[slope.used])) - slope.order * np.mean(np.log(h[slope.used])))
             text = f"${name}$" if len(name) == 1 else name
-            ax.plot(h, centre * h**slope.order, color=colour, lw=0.9, label=f"{text}: order {slope.order:.2f}")
+            if np.any(slope.used):
+                centre = np.exp(np.mean(np.log(errors[slope.used])) - slope.order * np.mean(np.log(h[slope.used])))
+                ax.plot(h, centre * h**slope.order, color=colour, lw=0.9, label=f"{text}: order {slope.order:.2f}")
+            else:
+                ax.plot([], [], MARKERS[k % len(MARKERS)], mfc="none", color=colour, ms=5, label=f"{text}: no order")
             for used, fill in ((slope.used, colour), (~slope.used, "none")):
                 ax.plot(h[used], errors[used], MARKERS[k % len(MARKERS)], mfc=fill, color=colour, ms=5)
         ax.set(
@@ -146,9 +155,9 @@ def convergence(
     `quantities`: names of saved fields, by default all of q, p, x that the reference has, and the multipliers of discrete
     Lagrange–d'Alembert schemes, compared as μ_k/h at their nodes from the second on.
 
-    The slope is a regression over the step sizes above the roundoff plateau. Raises `ValueError` for step sizes that do
-    not fit, a run that fails, or fewer than three step sizes that can be used, among them those of a scheme that converges to
-    something else.
+    The slope is a regression over the step sizes above the roundoff plateau. Where fewer than three can be used, because the
+    scheme is exact up to roundoff or converges to something else, the order is NaN, and `notes` say what the errors are. Raises
+    `ValueError` for step sizes that do not fit and for a run that fails.
     """
     h = _checked(step_sizes, time)
     if "q0" in run or "q1" in run:
@@ -200,18 +209,17 @@ def convergence(
         finest = h[-1] / REFINEMENT if name in own else None
         size = max(float(np.max(np.abs(expected[name]))), np.finfo(float).tiny)
         used = _above_plateau(errors, np.finfo(float).eps * size * np.sqrt(time / h) * PLATEAU)
-        if np.sum(used) < USABLE:
-            if name != names[0]:
-                notes.append(f"{name}: too few errors above roundoff for an order ({', '.join(number(e) for e in errors)}).")
-                continue
-            if name in apart:
-                raise ValueError(f"no order can be measured. {next(note for note in notes if note.startswith(name))}")
-            raise ValueError(
-                f"only {int(np.sum(used))} of the step sizes give errors of {name} that fall and lie above roundoff, and an "
-                f"order needs {USABLE}: errors {', '.join(number(e) for e in errors)} for steps "
-                f"{', '.join(number(s) for s in h)}; take larger steps, or more of them."
-            )
-        slopes[name] = Slope(*_slope(h[used], errors[used], finest), errors, used, at_end)
+        if np.sum(used) >= USABLE:
+            slope = _slope(h[used], errors[used], finest)
+        else:
+            if name not in apart:
+                notes.append(
+                    f"{name}: {int(np.sum(used))} of the step sizes give errors that fall and lie above roundoff, and an order "
+                    f"needs {USABLE}: errors {', '.join(number(e) for e in errors)} for steps "
+                    f"{', '.join(number(s) for s in h)}; take larger steps, or more of them."
+                )
+            slope, used = (np.nan, np.nan), np.zeros(len(h), bool)
+        slopes[name] = Slope(*slope, errors, used, at_end)
     title = f"{type(scheme).__name__} on {type(system).__name__}, t ≤ {time:g}"
     return Convergence(title, h, slopes, label, tuple(notes), None if explicit is None else not apart)
 

@@ -191,10 +191,12 @@ def _sizes(
         coupled = xp.maximum(*coupling) * blurred[..., None, :] > COUPLED * blurred[..., None]
         coupled = coupled & xp.swapaxes(coupled, -1, -2)
         hidden = ~known & (solution > ROUNDINGS * blurred) & ~xp.any(coupled & known[..., None, :], axis=-1)
-        end, moved_end = xp.abs(after(u)), xp.abs(after(u + xp.where(hidden, blurred, 0.0)) - after(u))
-        lost = (moved_end > 4.0 * STALLED * end) & (end > ROUNDINGS * moved_end)
-        too_short = xp.any(hidden, axis=-1, keepdims=True) & xp.any(lost, axis=-1, keepdims=True)
-        unknowns = xp.maximum(xp.where(too_short, reached, sizes), xp.abs(u))
+        if xp is not np or np.any(hidden):
+            end, moved_end = xp.abs(after(u)), xp.abs(after(u + xp.where(hidden, blurred, 0.0)) - after(u))
+            lost = (moved_end > 4.0 * STALLED * end) & (end > ROUNDINGS * moved_end)
+            too_short = xp.any(hidden, axis=-1, keepdims=True) & xp.any(lost, axis=-1, keepdims=True)
+            sizes = xp.where(too_short, reached, sizes)
+        unknowns = xp.maximum(sizes, xp.abs(u))
         rounded = again(unknowns)
         more, matters = of_terms(rounded)[1], _matters(slopes[..., :k], rounded[0], xp)
         more = xp.where((more < ZERO) & (matters < xp.inf), TYPICAL * matters, more)

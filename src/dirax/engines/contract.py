@@ -48,6 +48,8 @@ class Problem:
     A run that goes on has the `record` that the engine gave after its first `after` steps: rows of these need not be computed
     again, and whatever stands in them is written over. An engine may run all of it instead, since the bits are the same, unless
     rows before `first_row` are not wanted: then the saved arrays begin with that one, at step `after` or before it.
+
+    What is to be run `often`, with other numbers, is worth any time that an engine takes to get ready.
     """
 
     equation: Any
@@ -66,6 +68,7 @@ class Problem:
     after: int = 0
     record: Any = None
     first_row: int = 0
+    often: bool = False
 
     @property
     def size(self) -> int:

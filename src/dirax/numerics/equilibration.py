@@ -57,8 +57,9 @@ def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     exponents = xp.where(sizes > 0.0, xp.frexp(sizes)[1].astype(int), NOTHING)
     if not k * l:
         rows, columns = xp.zeros((*lead, k, 1), int), xp.zeros((*lead, 1, l), int)
-    elif xp is np and math.prod(lead) == 1:
-        rows, columns = (a.reshape(*lead, *a.shape) for a in _remembered(exponents.tobytes(), k, l))
+    elif xp is np and math.prod(lead) <= REMEMBERED:
+        each = [_remembered(one.tobytes(), k, l) for one in exponents.reshape(-1, k, l)]
+        rows, columns = (np.reshape(a, (*lead, *a[0].shape)) for a in zip(*each, strict=True))
     else:
         rows, columns = _mean_exponents(exponents, xp)
     power = lambda exponents: xp.ldexp(xp.ones(exponents.shape), exponents)  # XLA's exp2 is not exact
@@ -67,6 +68,10 @@ def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
 
 NOTHING = -(2**20)
 """Stands for the exponent of zero."""
+
+
+REMEMBERED = 4
+"""Matrices at a time of which each is looked for among those before."""
 
 
 @functools.lru_cache(256)
@@ -173,11 +178,17 @@ def _largest(xp: ModuleType, matrix: Any, axis: int) -> Any:
 
 
 def _maximum(xp: ModuleType, sizes: Any, axis: int) -> Any:
-    """The largest of sizes that are not negative, along an axis; of many small matrices NumPy finds it far quicker column by
-    column."""
-    if xp is np and sizes.ndim > 2 and len(sizes) > MANY and sizes.shape[axis]:
-        return np.expand_dims(functools.reduce(np.maximum, np.moveaxis(sizes, axis, 0)), axis)
+    """The largest of sizes that are not negative, along an axis."""
+    if xp is np and sizes.ndim > 2 and sizes.shape[axis]:
+        return np.expand_dims(largest_of_few(sizes, axis), axis)
     return xp.max(sizes, axis=axis, keepdims=True, initial=0.0)
+
+
+def largest_of_few(numbers: np.ndarray, axis: int = -1) -> np.ndarray:
+    """`np.max` along an axis, the last one or that before it; of many small arrays it is found far quicker column by column."""
+    if numbers.ndim > -axis and len(numbers) > MANY:
+        return functools.reduce(np.maximum, np.moveaxis(numbers, axis, 0))
+    return np.max(numbers, axis=axis)
 
 
 def _nonzero(xp: ModuleType, sizes: Any) -> Any:

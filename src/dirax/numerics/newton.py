@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from dirax.numerics.equilibration import largest_of_few
 from dirax.numerics.tolerances import EPSILON, ON_MANIFOLD
 
 SHORTEST = 2.0**-30
@@ -36,8 +37,9 @@ def damped_step(change: Any, update: Callable, u: Any, units: Any, sizes: Any, x
     improves. With NumPy, leading axes hold equations side by side; where no shorter step above the roundoff of u is an
     improvement, u stays.
     """
-    size = lambda v: xp.max(xp.abs(v) / units, axis=-1)
-    of_each = lambda v: xp.max(xp.abs(v) / sizes, axis=-1)
+    largest_of = largest_of_few if xp is np else lambda v: xp.max(v, axis=-1)
+    size = lambda v: largest_of(xp.abs(v) / units)
+    of_each = lambda v: largest_of(xp.abs(v) / sizes)
     here, largest, of_one = size(change), size(u), of_each(change)
     floor, near = AT_FLOOR * largest, (of_one <= NEAR) & (here <= NEAR * largest)
     at_floor = (of_one <= AT_FLOOR) & (here <= floor)

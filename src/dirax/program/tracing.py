@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, jaxprs_in_params
 
-from dirax.program.memo import Memo
+from dirax.program.memo import Memo, Same
 from dirax.program.primitives import binds, is_tracing, plain_primitive
 from dirax.program.same_jaxpr import shared
 
@@ -35,6 +35,7 @@ RULE = "custom_jvp_call"
 """A function with a rule of its own for its derivative, which the graph knows how to take where it is one of numbers."""
 
 _jitted: Memo[Callable] = Memo(KEPT)
+_inner: Memo[bool] = Memo(KEPT)
 
 
 class once:
@@ -165,7 +166,12 @@ def all_plain(jaxpr: Any) -> bool:
 
 def _plain_one(equation: Any) -> bool:
     known = equation.primitive.name in PLAIN or equation.params.get("apart", False)
-    return known and all(map(all_plain, jaxprs_in_params(equation.params)))
+    return known and all(map(_all_plain_within, jaxprs_in_params(equation.params)))
+
+
+def _all_plain_within(jaxpr: Any) -> bool:
+    """The same of a function that is called, which is so in many places, and is asked once."""
+    return _inner.get(Same(jaxpr), lambda: all_plain(jaxpr))
 
 
 def _numbers(equation: Any) -> bool:

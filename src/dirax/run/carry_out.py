@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Outcome, Problem
-from dirax.program.memo import Memo
+from dirax.program.memo import Memo, patience
 from dirax.program.user_functions import is_traced, values_matter
 from dirax.run.event_run import run_with_events
 from dirax.run.final_manifold import (
@@ -138,7 +138,8 @@ def carried_out(
         kind.runs += 1
         if kind.runs == 2:
             kind.plan = found.plan()
-    return _run(settings, kind, found, steps, progress, entered, began)
+    with patience():
+        return _run(settings, kind, found, steps, progress, entered, began)
 
 
 def _by_jax(settings: Settings, steps: int, every: int) -> Callable[[Case], Carried]:
@@ -160,7 +161,7 @@ def prepared(settings: Settings, case: Case, steps: int, save_every: int) -> Kin
     found = _begun(settings, case, steps, save_every, save_every)
     if not found.traced and not found.redundant:
         kind.plan = kind.plan or found.plan()
-        kind.engine = kind.engine or settings.engine.prepared(found.problem)
+        kind.engine = kind.engine or settings.engine.prepared(found.problem.with_numbers(often=True))
     return kind
 
 
@@ -174,6 +175,7 @@ def _no_plan() -> None:
     return None
 
 
+@patience()
 def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: int) -> Begun:
     """The general way from a case to its problem; `asked`: the `save_every` that was asked for."""
     system, scheme, by_jax = settings.system, settings.scheme, settings.engine.compiles_start(case.traced)

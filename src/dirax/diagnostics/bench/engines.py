@@ -47,7 +47,7 @@ def xla_batch(subject: Subject) -> Program:
 
 
 def _one(subject: Subject, engine: AbstractEngine) -> Program:
-    problem, last = subject.one, {}
+    problem, last = subject.one.with_numbers(often=True), {}
 
     def run() -> float:
         last["outcome"] = outcome = engine.run(problem)
@@ -73,7 +73,7 @@ def _batch(subject: Subject, engine: AbstractEngine) -> Program:
 def _many(subject: Subject) -> tuple[Problem, float]:
     """A batch from points along the trajectory, and the share of its time that is that of one run of the subject."""
     rows = Native().run(subject.one.with_numbers(save_every=max(1, subject.steps // BATCH)))
-    return subject.batch(rows, BATCH, BATCH_STEPS), subject.steps / (BATCH * BATCH_STEPS)
+    return subject.batch(rows, BATCH, BATCH_STEPS).with_numbers(often=True), subject.steps / (BATCH * BATCH_STEPS)
 
 
 def collocation(subject: Subject, reference: np.ndarray, wanted: float) -> Program:
@@ -81,7 +81,7 @@ def collocation(subject: Subject, reference: np.ndarray, wanted: float) -> Progr
     engine, found = Native(), []
     for stages in STAGES:
         try:
-            problem = replace(subject, scheme=Collocation(stages)).one
+            problem = replace(subject, scheme=Collocation(stages)).one.with_numbers(often=True)
         except (TypeError, ValueError) as error:
             raise Skipped(f"it does not step this system: {str(error).split(':')[0]}") from None
         for steps in (2**k for k in range(1, MOST_HALVINGS)):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.native.kernels import SIGNATURE, linked, source_digest, too_large
+from dirax.engines.native.kernels import Linked, Runs, linked, source_digest, too_large
 from dirax.engines.native.loops.collocation_loop import collocation_module
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan, TracedMean, TracedRelation, depends
 from dirax.engines.native.loops.record import Record
@@ -40,7 +40,7 @@ class CollocationKernels:
         self.saved: Any = None
         """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
         self.places: Any = None
-        self._runs: dict[int, Any] = {}
+        self.runs = Runs(self._run)
 
     @functools.cached_property
     def record(self) -> Record:
@@ -74,15 +74,10 @@ class CollocationKernels:
             side = f"{len(plan.quadrature.points)} points of the quadrature side by side, then {side}"
         return {"iteration": f"fixed point of the {kind}, {side}"}
 
-    def kernel(self, width: int) -> tuple[Any, bool]:
-        """The compiled `run`, and whether it came from a cache."""
-        if width in self._runs:
-            return self._runs[width], True
+    def _run(self, width: int, levels: tuple[int, ...]) -> Linked:
+        """The code of `run` for a width, which is compiled in little time, and so is quick at once."""
         text = lambda: collocation_module(self.plan, width, llvm.has_fma(), self.newton)
-        kind = "collocation", "newton" * self.newton
-        library, _, cached = linked("run", (self.digest, width, *kind), text, lambda: self.operations)
-        self._runs[width] = llvm.function(library, "run", SIGNATURE)
-        return self._runs[width], cached
+        return linked("run", (self.digest, width, "collocation", "newton" * self.newton), text, lambda: self.operations)
 
 
 _kernels: Memo[CollocationKernels | None] = Memo(KEPT)

@@ -4,9 +4,10 @@ import contextlib
 import ctypes
 import functools
 import hashlib
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dirax.engines.compensation import increments
 from dirax.engines.native import kernel_cache
@@ -28,8 +29,59 @@ LINEARIZED_SIGNATURE = ctypes.CFUNCTYPE(
     None, *[ctypes.c_void_p] * 4, ctypes.c_int64, *[ctypes.c_double] * 2, *[ctypes.c_int64] * 3
 )
 
+SOON, QUICK = 0, 2
+"""Levels of LLVM's optimization. Code of the first is ready in a quarter of the time, and runs a half to a third as fast as that
+of the second, with the same bits."""
+
+MANY = 400_000
+"""Steps of a run for which code is QUICK from the beginning."""
+
+PRICE = 1.5e-5
+"""Seconds for each operation of a step that runs spend with code that is ready SOON before it is worth while to have it QUICK:
+about a fifth of what compiling for that takes."""
+
 SIZING = 1e-5
 """A part of the seconds that the kernel of sizes takes to compile (3e-5), for each operation and each column of the Jacobian."""
+
+
+class Linked(NamedTuple):
+    """Linked code, the operations of a step in it, whether it came from the disk, and how far it is optimized."""
+
+    library: Any
+    operations: int
+    cached: bool
+    level: int
+
+
+class Runs:
+    """The compiled `run` of a step by width: at first ready soon, and quick when that pays."""
+
+    def __init__(self, linked: Callable[[int, tuple[int, ...]], Linked]):
+        self._linked = linked
+        self._made: dict[int, tuple[Any, Linked]] = {}
+        self._spent: Counter[int] = Counter()
+
+    def kernel(self, width: int, steps: float) -> tuple[Any, bool]:
+        """The `run` for a width, with which so many steps are about to be taken, and whether it came from a cache."""
+        quick = steps > MANY or self.quick_pays(width, 0.0)
+        run, found = self._made.get(width, (None, None))
+        if found is not None and (found.level == QUICK or not quick):
+            return run, True
+        found = self._linked(width, (QUICK,) if quick else (QUICK, SOON))
+        run = llvm.function(found.library, "run", SIGNATURE)
+        self._made[width] = run, found
+        return run, found.cached
+
+    def spent(self, width: int, seconds: float) -> None:
+        """Count seconds of runs with this width."""
+        self._spent[width] += seconds
+
+    def quick_pays(self, width: int, seconds: float) -> bool:
+        """Whether quick code is worth its compiling where what there is would run for so long from now on."""
+        if width not in self._made:
+            return False
+        _, found = self._made[width]
+        return found.level != QUICK and self._spent[width] + seconds > PRICE * found.operations
 
 
 class Kernels:
@@ -46,7 +98,7 @@ class Kernels:
         """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
         self.places: Any = None
         self.digest = _digest(self)
-        self._runs: dict[int, Any] = {}
+        self.runs = Runs(self._run)
         self._of_sizes: dict[int, Any] = {}
         self._linearizations: dict[tuple[bool, int], Any] = {}
 
@@ -60,40 +112,37 @@ class Kernels:
         """What is kept of a lane."""
         return self.bare.record
 
-    def kernel(self, width: int) -> tuple[Any, bool]:
-        """The compiled `run` for a width, and whether it came from a cache."""
-        if width in self._runs:
-            return self._runs[width], True
-        library, cached = self._library("run", width, lambda: kernel_module(self._planned(), width, llvm.has_fma()))
-        self._runs[width] = llvm.function(library, "run", SIGNATURE)
-        return self._runs[width], cached
+    def _run(self, width: int, levels: tuple[int, ...]) -> Linked:
+        """The code of `run` for a width."""
+        return self._library("run", width, lambda: kernel_module(self._planned(), width, llvm.has_fma()), levels=levels)
 
-    def of_sizes(self, width: int) -> Any:
+    def of_sizes(self, width: int, often: bool = False) -> Any:
         """The compiled `run` that finds the sizes; None where they are not written as nodes, and as long as runs have spent less
-        than a part of what its compilation takes."""
-        worth = self.sizing > SIZING * self.step.entries
+        than a part of what its compilation takes, unless they are said to be found `often`."""
+        worth = often or self.sizing > SIZING * self.step.entries
         if width not in self._of_sizes and worth and self.step.sizes_are_written:
             text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
-            library, _ = self._library("run", width, text, "sizes", level=0)
-            self._of_sizes[width] = llvm.function(library, "run", SIGNATURE)
+            found = self._library("run", width, text, "sizes", levels=(SOON,))
+            self._of_sizes[width] = llvm.function(found.library, "run", SIGNATURE)
         return self._of_sizes.get(width)
 
     def linearized(self, reverse: bool, width: int) -> Any:
         """The compiled `linearized` for a width: tangents forward or cotangents backward. Raises `UnsupportedPrimitive`."""
         if (reverse, width) not in self._linearizations:
             text = lambda: self._linearized(reverse).module(width, llvm.has_fma())
-            library, _ = self._library("linearized", width, text, "backward" if reverse else "forward")
-            self._linearizations[reverse, width] = llvm.function(library, "linearized", LINEARIZED_SIGNATURE)
+            found = self._library("linearized", width, text, "backward" if reverse else "forward")
+            self._linearizations[reverse, width] = llvm.function(found.library, "linearized", LINEARIZED_SIGNATURE)
         return self._linearizations[reverse, width]
 
     def check(self) -> None:
         """Raise `UnsupportedPrimitive` for a step with too many operations."""
         self._planned()
 
-    def _library(self, name: str, width: int, text: Callable[[], str], *more: str, level: int = 2) -> tuple[Any, bool]:
-        """The linked code that exports `name`, and whether it came from the disk."""
-        library, self.operations, cached = linked(name, (self.digest, width, *more), text, lambda: self.operations, level)
-        return library, cached
+    def _library(self, name: str, width: int, text: Callable[[], str], *more: str, levels: tuple[int, ...] = (QUICK,)) -> Linked:
+        """The linked code that exports `name`."""
+        found = linked(name, (self.digest, width, *more), text, lambda: self.operations, levels)
+        self.operations = found.operations
+        return found
 
     def _linearized(self, reverse: bool) -> LinearizedLoop:
         step, one = self.step, backward if reverse else forward
@@ -129,17 +178,19 @@ class Kernels:
 
 
 def linked(
-    name: str, key: tuple, text: Callable[[], str], operations: Callable[[], int], level: int = 2
-) -> tuple[Any, int, bool]:
-    """The linked code of the IR `text()` that exports `name`, the operations of a step, and whether it came from the disk."""
-    entry = kernel_cache.name_of(*key, *llvm.version())
-    stored = kernel_cache.read(entry)
-    if stored is not None:
-        with contextlib.suppress(RuntimeError):  # the linker does not take it: it is compiled anew
-            return llvm.load(stored.code, (name,)), stored.operations, True
-    code = llvm.object_code(text(), level=level)
-    kernel_cache.write(entry, kernel_cache.Kernel(operations(), code))
-    return llvm.load(code, (name,)), operations(), False
+    name: str, key: tuple, text: Callable[[], str], operations: Callable[[], int], levels: tuple[int, ...] = (QUICK,)
+) -> Linked:
+    """The linked code of the IR `text()` that exports `name`: of the first of the `levels` that is on the disk, or else compiled
+    for the last one. `operations`: those of a step, known when it is compiled."""
+    entries = {level: kernel_cache.name_of(*key, level, *llvm.version()) for level in levels}
+    for level, entry in entries.items():
+        stored = kernel_cache.read(entry)
+        if stored is not None:
+            with contextlib.suppress(RuntimeError):  # the linker does not take it: it is compiled anew
+                return Linked(llvm.load(stored.code, (name,)), stored.operations, True, level)
+    code = llvm.object_code(text(), level=levels[-1])
+    kernel_cache.write(entries[levels[-1]], kernel_cache.Kernel(operations(), code))
+    return Linked(llvm.load(code, (name,)), operations(), False, levels[-1])
 
 
 def too_large(error: GraphTooLarge) -> UnsupportedPrimitive:

@@ -118,7 +118,7 @@ class Lanes:
     def attempt(self, numbers: np.ndarray, made: Kernels | CollocationKernels, table: np.ndarray) -> np.ndarray:
         """The records (n, quantities) after some of the trajectories went on from others, which are not kept: one by one, since
         each is at another step, and with the bits that it has alone."""
-        p, kernel = self.problem, made.kernel(1)[0]
+        p, kernel = self.problem, made.runs.kernel(1, self.problem.steps)[0]
         params = jax.tree.map(lambda a: np.asarray(a)[numbers], p.params) if p.batch_params else p.params
         alone = Lanes(p.with_numbers(params=params, batch=len(numbers), record=(table,)), made, 1)
         blocks, places = np.divmod(numbers, self.width)

@@ -91,7 +91,8 @@ class OneLane:
     def attempt(self, numbers: np.ndarray, made: Kernels | CollocationKernels, table: np.ndarray) -> np.ndarray:
         """The record after going on from one, which is not kept."""
         kept, self.memory[: self.places.record] = self.memory[: self.places.record].copy(), table[0]
-        self.advance(made.kernel(1)[0], int(table[0, self.record.completed]), self.problem.steps)
+        steps = self.problem.steps
+        self.advance(made.runs.kernel(1, steps)[0], int(table[0, self.record.completed]), steps)
         after = self.memory[: self.places.record].copy()
         self.memory[: self.places.record] = kept
         return after[None]

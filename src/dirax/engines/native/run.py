@@ -1,5 +1,6 @@
 """The run of a kernel, chunk by chunk."""
 
+import math
 import time
 from typing import Any
 
@@ -18,7 +19,7 @@ CHUNK_SECONDS = 0.1
 WORTH_THREADS = 2e-3
 """Seconds of work from which on it is shared among threads."""
 
-FIRST_CHUNK = 20_000
+FIRST_CHUNK = 2_000
 """Lane-steps of the first call, from which the speed is estimated."""
 
 
@@ -39,7 +40,9 @@ class Ready:
         made = nodes or kernels(p.equation, p.params, p.batch_params, p.compensated)
         self.made = made
         self.width = width_for(p.batch or 1) if nodes is None or nodes.wide else 1
-        self.kernel, cached = made.kernel(self.width)
+        _, cached = made.runs.kernel(self.width, self._steps(p))
+        if p.often and isinstance(made, Kernels) and made.record.kept:
+            made.of_sizes(self.width, often=True)
         self.first_unknowns = made.record.unknowns(0, p.equation.stages[0][0].unknowns)
         self.notes = {
             "unknowns": sum(len(made.step.equations[i].unknowns) for i, _ in made.step.stages),
@@ -51,23 +54,35 @@ class Ready:
         }
         self.compile_seconds = time.perf_counter() - started
 
+    def _steps(self, p: Problem) -> float:
+        """The steps that a kernel is to take of it, in all blocks of lanes; as many as pay for any code if it is run `often`."""
+        return math.inf if p.often else (p.steps - p.after) * -(-(p.batch or 1) // self.width)
+
     def __call__(self, p: Problem, progress: Progress | None = None) -> Outcome:
         """Run `p`, as `Native.run` has it."""
+        entered, runs = time.perf_counter(), self.made.runs
+        kernel, ready = runs.kernel(self.width, self._steps(p))
+        waited = 0.0 if ready else time.perf_counter() - entered
         places = places_of(p, self.made)
         lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
         fields = lanes.fields
         if p.record is None and isinstance(self.made, Kernels):  # a fixed point finds its own
             find_sizes(lanes, self.made)
-        compile_seconds, cached, started = self.compile_seconds, self.notes["kernel_cached"], time.perf_counter()
-        done, interrupted, threads = p.after, False, 1
+        started, before, done, interrupted, threads = time.perf_counter(), waited, p.after, False, 1
         count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
         try:
             while done < p.steps and (done == p.after or lanes.going):
                 count = min(count, p.steps - done)
                 tick = time.perf_counter()
-                lanes.advance(self.kernel, done, done + count, threads)
+                lanes.advance(kernel, done, done + count, threads)
                 done += count
-                rate = count / max(time.perf_counter() - tick, 1e-9)
+                seconds = max(time.perf_counter() - tick, 1e-9)
+                rate = count / seconds
+                runs.spent(self.width, seconds)
+                if runs.quick_pays(self.width, (p.steps - done) / rate):
+                    tick = time.perf_counter()
+                    kernel, found = runs.kernel(self.width, math.inf)
+                    ready, waited = ready and found, waited + time.perf_counter() - tick
                 count = max(1, int(rate * CHUNK_SECONDS))
                 threads = lanes.threads if threads > 1 or p.steps - done > rate * WORTH_THREADS else 1
                 if progress:
@@ -81,8 +96,9 @@ class Ready:
             else:
                 with_present_sizes(lanes, self.made)
                 others = _with_weak_entries(lanes, self.made)
-        run_seconds = time.perf_counter() - started
-        closing = lanes.close(self.kernel)
+        run_seconds = time.perf_counter() - started - (waited - before)
+        closing = lanes.close(kernel)
+        compile_seconds, cached = self.compile_seconds + waited, self.notes["kernel_cached"] and ready
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
         table, record = lanes.table(), lanes.record
         counts = table[:, record.completed : record.iterations + 1].astype(np.int64)
@@ -120,7 +136,7 @@ def _with_weak_entries(lanes: Lanes | OneLane, made: Kernels) -> list[str]:
         return []
     try:
         whole = kernels(p.equation, p.params, p.batch_params, p.compensated, whole=True)
-        whole.kernel(1)
+        whole.runs.kernel(1, p.steps)
     except UnsupportedPrimitive:  # too large to be written out: they end where they are
         return []
     own = table[stuck]
@@ -153,7 +169,7 @@ def _by_newton(lanes: Lanes | OneLane, made: CollocationKernels) -> list[str]:
         return others
     try:
         whole = kernels(p.equation, p.params, p.batch_params, True)
-        whole.kernel(1)
+        whole.runs.kernel(1, p.steps)
     except UnsupportedPrimitive as error:  # too large to be written out: they end where they are
         return [*others, f"{TOO_LARGE} ({error})"]
     for i, (stage, _) in enumerate(p.equation.stages):

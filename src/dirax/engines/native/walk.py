@@ -14,7 +14,7 @@ class KernelWalk(AbstractWalk):
     def __init__(self, p: Problem):
         super().__init__(p)
         made = kernels(p.equation, p.params, p.batch_params, p.compensated)
-        self.kernel, self.record = made.kernel(1)[0], made.record
+        self.kernel, self.record = made.runs.kernel(1, p.steps)[0], made.record
         self._memory = np.zeros(self.record.size)
         self._params = np.array(made.step.parameters.flatten(p.params, None), float).ravel()
         self._outs = np.array([self.rows[saved.name].ctypes.data for saved in arrays_saved(p, made)], np.int64)

@@ -23,7 +23,7 @@ class Segments:
         self.stages = len(p.equation.stages)
         made = kernels(p.equation, p.params, True, p.compensated)
         self.lanes = Lanes(p, made, width_for(p.batch or 1))
-        self.kernel, _ = made.kernel(self.lanes.width)
+        self.kernel, _ = made.runs.kernel(self.lanes.width, p.steps * self.lanes.blocks)
         find_sizes(self.lanes, made)
         self.linearized = made.linearized(reverse, self.lanes.width)
         row_bytes = 8 * (p.batch or 1) * self.stages * (task.state_size + task.unknowns)
