@@ -11,7 +11,8 @@ from dirax import gallery
 from dirax.engines.blocks import FEWEST, blocks
 from dirax.engines.contract import Problem
 from dirax.engines.native.kernels import kernels
-from dirax.engines.newton_step import Factors, pivot_order
+from dirax.engines.newton_step import Factors
+from dirax.engines.pivot_order import pivot_order, symmetric_signs
 from dirax.engines.policy import engine_of
 from dirax.program.graph import Graph
 
@@ -83,6 +84,60 @@ def test_entries_that_always_cancel_are_no_pivots():
     factors = Factors(g, matrix, [order])
     assert g.evaluate([factors.stable], numbers) == [True]
     np.testing.assert_allclose(g.evaluate(factors.solve(g, right), numbers), np.linalg.solve(dense, [1.0, 2.0, 3.0]), rtol=1e-12)
+
+
+def saddle_point(g, one, two, line):
+    """Nodes of [M, −Gᵀ; G, 0]: two rods of length 1, the second on the first and as heavy, and the velocity of its end across a
+    line, of which each is an angle. The lower half is that of the upper one in other words."""
+    sin, cos, mass = lambda x: g.make("sin", x), lambda x: g.make("cos", x), g.input("m")
+    across = [g.sub(g.mul(sin(x), cos(line)), g.mul(cos(x), sin(line))) for x in (one, two)]
+    along, beside = g.mul(mass, g.mul(cos(one), cos(two))), g.mul(mass, g.mul(sin(one), sin(two)))
+    return [
+        [g.add(mass, mass), g.add(along, beside), across[0]],
+        [g.mul(mass, g.add(g.mul(sin(one), sin(two)), g.mul(cos(one), cos(two)))), mass, across[1]],
+        [*[g.mul(cos(x), g.sub(sin(line), g.mul(cos(line), g.div(sin(x), cos(x))))) for x in (one, two)], g.zero],
+    ]
+
+
+def test_pivots_of_masses_with_constraints_vanish_nowhere(random):
+    """They are on the diagonal, masses first, whereas an entry of G that is large at some angles is zero at others."""
+    g, names = Graph(), ("one", "two", "line")
+    matrix = saddle_point(g, *[g.input(name) for name in names])
+    assert symmetric_signs(g, matrix) == [1, 1, -1]
+    (order,) = pivot_order(g, matrix)
+    assert pivot_order(g, [[g.neg(entry) for entry in row] for row in matrix]) == [order]
+    assert set(order[:2]) == {(0, 0), (1, 1)} and order[2] == (2, 2)
+    values = (1.0, 2.0, 3.0)
+    factors = Factors(g, matrix, [order])
+    outputs = [*factors.solve(g, [g.constant(x) for x in values]), factors.stable]
+    for angles in (*np.eye(3) * np.pi / 2, *random.uniform(-np.pi, np.pi, (20, 3))):
+        numbers = dict(zip(names, angles, strict=True)) | {"m": 0.7}
+        dense = np.array(g.evaluate([entry for row in matrix for entry in row], numbers), float).reshape(3, 3)
+        *found, stable = g.evaluate(outputs, numbers)
+        assert stable
+        np.testing.assert_allclose(found, np.linalg.solve(dense, values), rtol=1e-11)
+
+
+def test_of_symmetric_matrices_half_is_eliminated():
+    def differences(name):
+        g = Graph()
+        factors = Factors(g, [[g.input(name(i, j)) for j in range(6)] for i in range(6)], [[(i, i) for i in range(6)]])
+        return sum(g.op[node] == "sub" for node in g.reachable(factors.nodes))
+
+    assert differences(lambda i, j: f"{i},{j}") == 55  # Σ m², m = 1, …, 5
+    assert differences(lambda i, j: f"{min(i, j)},{max(i, j)}") == 35  # Σ m(m + 1)/2
+
+
+def test_entries_are_the_same_only_where_they_are_so_everywhere():
+    """|x| and √x² are x at points that are positive, and x + 1e-30 y is x where y is not large."""
+    g = Graph()
+    x, y, two = g.input("x"), g.input("y"), g.constant(2.0)
+    square, more = g.make("sqrt", g.mul(x, x)), g.add(x, g.mul(g.constant(1e-30), y))
+    for other in (y, g.make("abs", x), square, more, g.zero):
+        assert symmetric_signs(g, [[two, x], [other, two]]) is None
+    for other, found in ((g.sub(g.add(x, y), y), [1, 1]), (g.sub(y, g.add(x, y)), [1, -1])):
+        assert symmetric_signs(g, [[two, x], [other, two]]) == found
+    assert symmetric_signs(g, [[two, square], [square, two]]) == [1, 1]
 
 
 def test_saved_velocities_are_a_block_of_their_own():

@@ -7,24 +7,16 @@ from functools import reduce
 import numpy as np
 
 from dirax.engines.blocks import blocks
+from dirax.engines.pivot_order import Order, pivot_order, symmetric_signs
 from dirax.engines.step_program import KEPT, StepProgram, TracedEquation
 from dirax.program.graph import Graph
 from dirax.program.memo import Memo, Same
-
-ADMISSIBLE = 0.9
-"""A pivot is considered if it is at least this much of the largest entry of its column at the sample points: less than that saves
-a twentieth of the operations, and fails where masses of 100 and .1 stand in a matrix."""
 
 GUARD = 1e-4
 """In a run, a pivot smaller than this beside its column sends the step to partial pivoting."""
 
 FORGIVEN = 1e-6
 """The same for an update of Newton's method, which is measured by the residual after it: 1e6 roundings in it do no harm."""
-
-SAMPLES = 7
-
-Order = list[list[tuple[int, int]]]
-"""(row, column) of each pivot, in parts of which none has unknowns of those after it."""
 
 
 @dataclass
@@ -91,17 +83,32 @@ def _correction(
 ) -> Correction:
     """That of a part of a block; `present` are the sizes of all unknowns and their values together."""
     equations, places = sorted(i for i, _ in order), sorted(j for _, j in order)
-    own = [[matrix[i][j] for j in places] for i in equations]
-    residual = [equation.residual[i] for i in equations]
+    inside = [(equations.index(i), places.index(j)) for i, j in order]
+    own, signs = _mirrored(g, [[matrix[i][j] for j in places] for i in equations], inside)
+    residual = [_signed(g, sign, equation.residual[i]) for i, sign in zip(equations, signs, strict=True)]
     terms = lambda row: [g.mul(g.make("abs", entry), present[j]) for entry, j in zip(row, places, strict=True) if entry != g.zero]
     rows = [reduce(g.add, terms(row), g.zero) for row in own]
-    inside = [(equations.index(i), places.index(j)) for i, j in order]
     factors = Factors(g, own, [inside], rows, FORGIVEN)
     right = [g.input(f"right{i}") for i in equations]
     unknowns, again = [equation.unknowns[j] for j in places], factors.solve(g, right)
     change = factors.solve(g, residual)
     linear = set(g.reachable([entry for row in own for entry in row])).isdisjoint(unknowns)
     return Correction(places, unknowns, residual, own, change, factors.stable, right, again, sorted(factors.nodes), rows, linear)
+
+
+def _mirrored(g: Graph, matrix: list[list[int]], order: list[tuple[int, int]]) -> tuple[list[list[int]], list[int]]:
+    """(matrix, signs): where pivots are on the diagonal of a matrix that is symmetric but for the signs of its rows, that of the
+    rows times their signs, its lower half by the nodes of the upper one."""
+    k = len(matrix)
+    signs = symmetric_signs(g, matrix) if all(i == j for i, j in order) else None
+    if signs is None:
+        return matrix, [1] * k
+    upper = [[_signed(g, signs[i], matrix[i][j]) if j >= i else g.zero for j in range(k)] for i in range(k)]
+    return [[upper[min(i, j)][max(i, j)] for j in range(k)] for i in range(k)], signs
+
+
+def _signed(g: Graph, sign: int, node: int) -> int:
+    return node if sign > 0 else g.neg(node)
 
 
 _known: Memo[tuple] = Memo(KEPT)
@@ -150,66 +157,6 @@ def _blocks(program: StepProgram, index: int, matrix: list[list[int]]) -> list[t
     return found
 
 
-def pivot_order(g: Graph, matrix: list[list[int]], parts: list[tuple[list[int], list[int]]] | None = None) -> Order:
-    """The order of the pivots of each of the `parts` (rows, columns) of a matrix, its blocks if they are not given: the least
-    fill-in (Markowitz) among entries that are not small at random points.
-
-    The points depend on nothing but the graph, so that the order, and with it every bit of a trajectory, does not depend
-    on initial data, parameters or neighbours in a batch.
-    """
-    k = len(matrix)
-    there = np.array([[entry != g.zero for entry in row] for row in matrix], bool).reshape(k, k)
-    constant = np.array([[g.is_constant(entry) for entry in row] for row in matrix], bool).reshape(k, k)
-    values = _samples(g, matrix)
-    values = np.where(np.isfinite(values), values, 0.0)
-    found = []
-    for rows, columns in blocks(there) if parts is None else parts:
-        block = np.ix_(rows, columns)
-        inside = values[:, *block]
-        largest = np.abs(inside).max(axis=2, keepdims=True)  # the units of the equations
-        order = _order_of_block(there[block], constant[block], inside / np.where(largest > 0, largest, 1.0))
-        found.append([(rows[i], columns[j]) for i, j in order])
-    return found
-
-
-def _order_of_block(there: np.ndarray, constant: np.ndarray, values: np.ndarray) -> list[tuple[int, int]]:
-    """The order of a matrix: where it is not zero, where it is constant, and its values at the sample points, at which entries
-    that always cancel are seen to do so."""
-    k = len(there)
-    rows, columns, order = np.arange(k), np.arange(k), []
-    while len(rows):
-        here = np.ix_(rows, columns)
-        i, j = np.nonzero(there[here])
-        if not len(i):  # structurally singular: any order, the guard will see it
-            order.extend(zip(rows.tolist(), columns.tolist(), strict=True))
-            break
-        present = np.abs(values[:, *here])
-        largest = present.max(axis=1)
-        shares = np.median(present / np.where(largest > 0, largest, 1.0)[:, None], axis=0)[i, j]
-        fill = (there[here].sum(axis=1) - 1)[i] * (there[here].sum(axis=0) - 1)[j]
-        best = np.lexsort((i, j, -np.round(shares, 3), ~constant[here][i, j], fill, shares < ADMISSIBLE))[0]
-        i, j = rows[i[best]], columns[j[best]]
-        order.append((int(i), int(j)))
-        rows, columns = rows[rows != i], columns[columns != j]
-        others, along = rows[there[rows, j]], columns[there[i, columns]]
-        block, pivot = np.ix_(others, along), values[:, i, j]
-        multipliers = values[:, others, j] / np.where(pivot != 0, pivot, 1.0)[:, None]
-        values[:, *block] -= multipliers[:, :, None] * values[:, i, along][:, None]
-        there[block] = True
-    return order
-
-
-def _samples(g: Graph, matrix: list[list[int]]) -> np.ndarray:
-    k, random = len(matrix), np.random.default_rng(20230331)
-    flat = [entry for row in matrix for entry in row]
-    names = sorted(str(g.value[n]) for n in g.reachable(flat) if g.op[n] == "input")
-    points = {name: random.uniform(0.3, 1.7, SAMPLES) for name in names}
-    points["h"] = np.full(SAMPLES, 0.01)
-    with np.errstate(all="ignore"):
-        columns = g.evaluate(flat, points)
-    return np.stack([np.broadcast_to(np.asarray(c, dtype=float), SAMPLES) for c in columns], axis=1).reshape(SAMPLES, k, k)
-
-
 class Factors:
     """Elimination of a matrix in a given pivot order, block after block: multipliers, upper rows, reciprocal pivots and the
     guard, for which rows are divided by their `sizes` if these are given. Blocks are not eliminated from those after them."""
@@ -239,6 +186,7 @@ class Factors:
             pivot = a[i].get(j, g.zero)
             self.inverses[i] = g.recip(pivot)
             guard = g.constant(least) if sizes is None else g.mul(g.constant(least), sizes[i])
+            known: dict[tuple[int, ...], int] = {}
             for other in sorted(remaining):
                 entry = a[other].pop(j, None)
                 if entry is None:
@@ -249,7 +197,11 @@ class Factors:
                 self.multipliers[-1].append((other, i, factor))
                 for c, upper in a[i].items():
                     if c in columns:
-                        a[other][c] = g.sub(a[other].get(c, g.zero), g.mul(factor, upper))
+                        old = a[other].get(c, g.zero)
+                        both = old, *sorted((entry, upper))  # of symmetric matrices half of the entries
+                        if both not in known:
+                            known[both] = g.sub(old, g.mul(factor, upper))
+                        a[other][c] = known[both]
 
     @property
     def nodes(self) -> set[int]:

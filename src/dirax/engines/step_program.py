@@ -13,6 +13,7 @@ from jax.extend.core import jaxprs_in_params
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines import policy
 from dirax.engines.parameters import Parameters, parameters
+from dirax.program.equal_nodes import without_equals
 from dirax.program.evaluation.by_jax import by_jax
 from dirax.program.evaluation.in_floats import Floats, in_floats
 from dirax.program.evaluation.in_levels import in_levels
@@ -22,6 +23,9 @@ from dirax.program.graph_derivatives import jacobian
 from dirax.program.interpreter import Nodes, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
 from dirax.program.scalar_program import ScalarProgram
+
+DERIVED = 4
+"""Nodes of Jacobians, as a multiple of the limit of the graph, of which those that are left are counted that are not equal."""
 
 KEPT = 128
 """Programs kept in memory."""
@@ -189,7 +193,11 @@ class StepProgram:
     @cached_property
     def jacobians(self) -> list[list[dict[int, int]]]:
         """The rows {column: node} of the Jacobian of every equation's residual. Raises `GraphTooLarge`."""
-        return [jacobian(self.graph, e.residual, e.unknowns) for e in self.equations]
+        every = self.graph.copy(DERIVED * self.graph.limit)
+        found = [jacobian(every, e.residual, e.unknowns) for e in self.equations]
+        entries = iter(without_equals(self.graph, every, [node for rows in found for row in rows for node in row.values()]))
+        kept = [[{j: next(entries) for j in row} for row in rows] for rows in found]
+        return [[{j: node for j, node in row.items() if node != self.graph.zero} for row in rows] for rows in kept]
 
     @cached_property
     def entries(self) -> int:

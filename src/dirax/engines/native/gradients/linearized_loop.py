@@ -16,7 +16,8 @@ from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.dense import add_dense_solve
 from dirax.engines.native.loops.newton_loop import by_partial_pivoting
-from dirax.engines.newton_step import Factors, pivot_order
+from dirax.engines.newton_step import Factors
+from dirax.engines.pivot_order import pivot_order
 from dirax.engines.step_program import Inputs, TracedEquation
 from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import directional, gradient

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from dirax.engines.native.loops.record import Record
-from dirax.engines.newton_step import Factors, pivot_order
+from dirax.engines.newton_step import Factors
+from dirax.engines.pivot_order import pivot_order
 from dirax.engines.step_program import Inputs
 from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import jacobian

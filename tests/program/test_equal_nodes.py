@@ -1,0 +1,74 @@
+"""Nodes that are equal as functions."""
+
+import numpy as np
+import pytest
+
+from dirax.program.equal_nodes import PRIME, values_modulo_prime, without_equals
+from dirax.program.graph import Graph
+from dirax.program.graph_derivatives import jacobian
+
+
+def values(g, *nodes):
+    found = values_modulo_prime(g, g.reachable(nodes))
+    return [found[node] for node in nodes]
+
+
+def test_values_are_those_of_exact_arithmetic():
+    """A float is the fraction that it is: .1 + .2 is not .3."""
+    g = Graph()
+    x, y, c = g.input("x"), g.input("y"), g.constant
+    exact, sums, tenths = values(
+        g,
+        g.sub(g.mul(g.add(c(0.25), x), c(3.0)), g.mul(c(3.0), x)),
+        g.sub(g.add(g.add(x, c(0.1)), g.add(y, c(0.2))), g.add(x, y)),
+        c(0.3),
+    )
+    assert exact == 3 * pow(4, -1, PRIME) % PRIME
+    a, b = (0.1).as_integer_ratio(), (0.2).as_integer_ratio()
+    assert sums == (a[0] * pow(a[1], -1, PRIME) + b[0] * pow(b[1], -1, PRIME)) % PRIME != tenths
+
+
+def test_what_is_known_of_sines_and_what_is_not():
+    g = Graph()
+    x, y = g.input("x"), g.input("y")
+    of = lambda op, node: g.make(op, node)
+    circle, one = values(g, g.add(g.mul(of("sin", x), of("sin", x)), g.mul(of("cos", x), of("cos", x))), g.one)
+    assert circle == one
+    apart = g.sub(x, y), g.sub(y, x)
+    sines, cosines = (values(g, *(of(op, node) for node in apart)) for op in ("sin", "cos"))
+    assert sum(sines) == PRIME and cosines[0] == cosines[1]
+    again = g.sub(g.add(x, y), y)
+    assert len(set(values(g, of("exp", x), of("exp", again)))) == 1
+    names = "exp", "log", "sqrt", "abs", "tanh", "floor"
+    assert len(set(values(g, x, y, *(of(name, x) for name in names), g.make("max", x, y), g.constant(np.inf)))) == 10
+
+
+@pytest.mark.parametrize("op", ["sin", "exp", "sqrt"])
+def test_second_derivatives_are_taken_over_once(op):
+    """Of f(x y, x) the Hessian has three entries and not four, with the values that it had, and no node twice."""
+    g = Graph()
+    x, y = g.input("x"), g.input("y")
+    function = g.mul(g.make(op, g.mul(x, y)), g.add(x, g.make("exp", y)))
+    (gradient,) = jacobian(g, [function], [x, y])
+    first = [gradient[0], gradient[1]]
+    every = g.copy()
+    rows = jacobian(every, first, [x, y])
+    found = without_equals(g, every, [rows[i][j] for i in range(2) for j in range(2)])
+    assert rows[0][1] != rows[1][0] and found[1] == found[2]
+    point = {"x": 0.7, "y": 1.3}
+    expected = every.evaluate([rows[i][j] for i in range(2) for j in range(2)], point)
+    np.testing.assert_allclose(g.evaluate(found, point), expected, rtol=1e-14)
+    needed = g.reachable(found)
+    new = [value for node, value in values_modulo_prime(g, needed).items() if g.args[node]]
+    assert len(set(new)) == len(new)
+
+
+def test_opposite_nodes_and_zeros():
+    g = Graph()
+    x, y = g.input("x"), g.input("y")
+    every = g.copy()
+    a = every.mul(x, every.sub(x, y))
+    opposite = every.sub(every.mul(x, y), every.mul(x, x))
+    nothing = every.add(a, opposite)
+    one, other, zero = without_equals(g, every, [a, opposite, nothing])
+    assert other == g.neg(one) and zero == g.zero
