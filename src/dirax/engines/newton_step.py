@@ -93,8 +93,7 @@ def _correction(
     equations, places = sorted(i for i, _ in order), sorted(j for _, j in order)
     own = [[matrix[i][j] for j in places] for i in equations]
     residual = [equation.residual[i] for i in equations]
-    terms = lambda row: [g.mul(g.make("abs", entry), present[j]) for entry, j in zip(row, places, strict=True) if entry != g.zero]
-    rows = [reduce(g.add, terms(row), g.zero) for row in own]
+    rows = terms_of_rows(g, own, [present[j] for j in places])
     inside = [(equations.index(i), places.index(j)) for i, j in order]
     factors = Factors(g, own, [inside], rows, FORGIVEN)
     right = [g.input(f"right{i}") for i in equations]
@@ -102,6 +101,12 @@ def _correction(
     change = factors.solve(g, residual)
     linear = set(g.reachable([entry for row in own for entry in row])).isdisjoint(unknowns)
     return Correction(places, unknowns, residual, own, change, factors.stable, right, again, sorted(factors.nodes), rows, linear)
+
+
+def terms_of_rows(g: Graph, matrix: list[list[int]], present: list[int]) -> list[int]:
+    """How large the terms of equations are, Σ|J_ij|·present_j, from the rows of the Jacobian and how large the unknowns are."""
+    terms = lambda row: [g.mul(g.make("abs", entry), p) for entry, p in zip(row, present, strict=True) if entry != g.zero]
+    return [reduce(g.add, terms(row), g.zero) for row in matrix]
 
 
 _known: Memo[tuple] = Memo(KEPT)
