@@ -5,6 +5,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -264,3 +265,33 @@ def test_a_start_behind_a_wall_is_behind_it_in_any_units():
         with pytest.raises(ValueError, match=r"events\[0\] must not be negative at the start"):
             balls(dx.LagrangeDAlembert(), units, 1.0, {"q": [0.1, -1e-10], "v": [0.9, 1.0]})
         assert balls(dx.LagrangeDAlembert(), units, 1.0, {"q": [0.1, -1e-17], "v": [0.9, 1.0]}, steps=9)[0]
+
+
+GRADIENT_UNITS = (Units(mass=-80), Units(length=-60, mass=60, time=-20))
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_derivatives_in_other_units(engine):
+    """A sleigh that goes nearly along x: the entry 1e-8 of its one-form was a pivot with masses of 2⁻⁸⁰, and derivatives backward
+    were off by 3e-7."""
+    straight = dataclasses.replace(
+        SLEIGH,
+        data={"q": [0.0, 0.0, 1e-8], "v": [1.0, 1e-8, 0.0]},
+        params=SLEIGH.params | {"a": (1e-9, LENGTH), "k": (0.0, STIFFNESS)},
+    )
+    system = straight.system()
+
+    def derivatives(units: Units, by: Callable):
+        q, time = np.array([units.of(d) for d in straight.coordinates]), units.of(TIME)
+        params = {name: value * units.of(d) for name, (value, d) in straight.params.items()}
+        settings = {"q": np.array(straight.data["q"]) * q, "step": straight.step * time, "steps": 8, "engine": engine}
+        given = settings | {"check_initial": False}
+        end = lambda v, m: dx.simulate(system, dx.DiscreteDirac(), v=v, params=params | {"m": m}, **given).q[-1]
+        by_v, by_m = by(end, (0, 1))(jnp.array(straight.data["v"]) * q / time, jnp.array(params["m"]))
+        return np.asarray(by_v) / q[:, None] * q / time, np.asarray(by_m) / q * units.of(MASS)
+
+    for by in (jax.jacfwd, jax.jacrev):
+        plain = derivatives(Units(), by)
+        for units in GRADIENT_UNITS:
+            for found, wanted in zip(derivatives(units, by), plain, strict=True):
+                np.testing.assert_array_equal(found, wanted)

@@ -86,8 +86,7 @@ def _correction(
     inside = [(equations.index(i), places.index(j)) for i, j in order]
     own, signs = _mirrored(g, [[matrix[i][j] for j in places] for i in equations], inside)
     residual = [_signed(g, sign, equation.residual[i]) for i, sign in zip(equations, signs, strict=True)]
-    terms = lambda row: [g.mul(g.make("abs", entry), present[j]) for entry, j in zip(row, places, strict=True) if entry != g.zero]
-    rows = [reduce(g.add, terms(row), g.zero) for row in own]
+    rows = terms_of_rows(g, own, [present[j] for j in places])
     factors = Factors(g, own, [inside], rows, FORGIVEN)
     right = [g.input(f"right{i}") for i in equations]
     unknowns, again = [equation.unknowns[j] for j in places], factors.solve(g, right)
@@ -109,6 +108,12 @@ def _mirrored(g: Graph, matrix: list[list[int]], order: list[tuple[int, int]]) -
 
 def _signed(g: Graph, sign: int, node: int) -> int:
     return node if sign > 0 else g.neg(node)
+
+
+def terms_of_rows(g: Graph, matrix: list[list[int]], present: list[int]) -> list[int]:
+    """How large the terms of equations are, Σ|J_ij|·present_j, from the rows of the Jacobian and how large the unknowns are."""
+    terms = lambda row: [g.mul(g.make("abs", entry), p) for entry, p in zip(row, present, strict=True) if entry != g.zero]
+    return [reduce(g.add, terms(row), g.zero) for row in matrix]
 
 
 _known: Memo[tuple] = Memo(KEPT)

@@ -5,7 +5,8 @@ u̇ = −r_u⁻¹ (r_x ẋ + r_t ṫ + r_h ḣ + r_c ċ) and the next ẋ is tha
 r_uᵀ μ = a_uᵀ λ + ū, and the derivatives of λ·a − μ·r are those of everything else.
 
 A lane's carry is, for each quantity, `width` doubles: ẋ or λ · of the parameters · of t0 · of h · the step before which the
-trajectory ended. Rows hold the state and the unknowns of a stage, then what flows in or out there, in the same order.
+trajectory ended. Its numbers are the parameters and for each stage the sizes of the unknowns, by which the rows of r_u have
+units. Rows hold the state and the unknowns of a stage, then what flows in or out there, in the same order.
 """
 
 from collections.abc import Iterable
@@ -16,7 +17,7 @@ from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.dense import add_dense_solve
 from dirax.engines.native.loops.newton_loop import by_partial_pivoting
-from dirax.engines.newton_step import Factors
+from dirax.engines.newton_step import Factors, terms_of_rows
 from dirax.engines.pivot_order import pivot_order
 from dirax.engines.step_program import Inputs, TracedEquation
 from dirax.program.graph import Graph
@@ -31,10 +32,13 @@ class Linearized:
     """The derivatives of one stage as nodes.
 
     `flow` are the inputs: (ẋ, ċ, ṫ, ḣ) forward, (λ, ū) backward. `right` is to be solved with `matrix`, the solution is
-    bound to `solved`, and `out` are the next ẋ forward, the cotangents of (x, c, t, h) backward.
+    bound to `solved`, and `out` are the next ẋ forward, the cotangents of (x, c, t, h) backward. `sizes` are inputs, those of
+    the unknowns, and `rows` what they make the units of the rows of the matrix: pivots are chosen whatever the units.
     """
 
     flow: list[int]
+    sizes: list[int]
+    rows: list[int]
     matrix: list[list[int]]
     right: list[int]
     change: list[int]
@@ -43,10 +47,10 @@ class Linearized:
     out: list[int]
 
 
-def _solution(g: Graph, matrix: list[list[int]], right: list[int]) -> tuple[list[int], int]:
+def _solution(g: Graph, matrix: list[list[int]], right: list[int], rows: list[int]) -> tuple[list[int], int]:
     if not right:
         return [], g.true
-    factors = Factors(g, matrix, pivot_order(g, matrix))
+    factors = Factors(g, matrix, pivot_order(g, matrix), rows)
     return factors.solve(g, right), factors.stable
 
 
@@ -58,9 +62,11 @@ def forward(g: Graph, e: TracedEquation, shared: Inputs, rows: list[dict[int, in
     tangents = dict(zip(known, flow, strict=True))
     right = [g.neg(node) for node in directional(g, e.residual, tangents)]
     matrix = [[row.get(j, g.zero) for j in range(k)] for row in rows]
-    change, stable = _solution(g, matrix, right)
+    sizes, present = _present(g, e)
+    units = terms_of_rows(g, matrix, present)
+    change, stable = _solution(g, matrix, right, units)
     out = directional(g, e.advance, tangents | dict(zip(e.unknowns, solved, strict=True)))
-    return Linearized(flow, matrix, right, change, stable, solved, out)
+    return Linearized(flow, sizes, units, matrix, right, change, stable, solved, out)
 
 
 def backward(g: Graph, e: TracedEquation, shared: Inputs, rows: list[dict[int, int]]) -> Linearized:
@@ -72,10 +78,18 @@ def backward(g: Graph, e: TracedEquation, shared: Inputs, rows: list[dict[int, i
     from_state = gradient(g, _seeds(g, e.advance, weights), e.unknowns)
     right = [g.add(a, b) for a, b in zip(from_state, of_unknowns, strict=True)]
     matrix = [[rows[i].get(j, g.zero) for i in range(k)] for j in range(k)]
-    change, stable = _solution(g, matrix, right)
+    sizes, present = _present(g, e)
+    units = [g.recip(p) for p in present]
+    change, stable = _solution(g, matrix, right, units)
     seeds = _seeds(g, [*e.advance, *e.residual], [*weights, *map(g.neg, solved)])
     out = gradient(g, seeds, [*e.state, *shared.params, shared.t, shared.h])
-    return Linearized([*weights, *of_unknowns], matrix, right, change, stable, solved, out)
+    return Linearized([*weights, *of_unknowns], sizes, units, matrix, right, change, stable, solved, out)
+
+
+def _present(g: Graph, e: TracedEquation) -> tuple[list[int], list[int]]:
+    """The sizes of the unknowns, inputs, and the two of size and value together."""
+    sizes = [g.input(f"size{i}") for i in range(len(e.unknowns))]
+    return sizes, [g.add(g.make("abs", u), size) for u, size in zip(e.unknowns, sizes, strict=True)]
 
 
 def _seeds(g: Graph, nodes: Iterable[int], weights: Iterable[int]) -> dict[int, int]:
@@ -108,25 +122,35 @@ class LinearizedLoop:
     @property
     def row(self) -> int:
         """Quantities of a row, which belongs to a stage: the state and the unknowns of the largest equation."""
-        return self.state_size + max(1, *(len(e.unknowns) for e in self.equations))
+        return self.state_size + max(1, self.sizes)
+
+    @property
+    def sizes(self) -> int:
+        """Sizes of a stage: those of the unknowns of the largest equation."""
+        return max(len(e.unknowns) for e in self.equations)
+
+    @property
+    def numbers(self) -> int:
+        """Parameters, and sizes of all stages."""
+        return len(self.shared.params) + len(self.stages) * self.sizes
 
     def module(self, width: int, fma: bool) -> str:
-        """IR of `linearized(carry, params, rows, flow, blocks, …)` for consecutive blocks of `width` lanes."""
+        """IR of `linearized(carry, numbers, rows, flow, blocks, …)` for consecutive blocks of `width` lanes."""
         module = Module(fma)
         add_far_reduction(module)
         add_dense_solve(module)
         _Block(self, module, width).define()
         body = Body(module)
         rows = body.put(f"mul i64 %count, {len(self.stages) * self.row * width * 8}")
-        sizes = self.carry * width * 8, len(self.shared.params) * width * 8, rows, rows
+        sizes = self.carry * width * 8, self.numbers * width * 8, rows, rows
         with body.loop(0, "%blocks") as i:
             moved = [
                 body.at("i8", pointer, body.put(f"mul i64 {i}, {size}"))
-                for pointer, size in zip(("%carry", "%params", "%rows", "%flow"), sizes, strict=True)
+                for pointer, size in zip(("%carry", "%numbers", "%rows", "%flow"), sizes, strict=True)
             ]
             body.line(f"call void @block({', '.join(f'ptr {m}' for m in moved)}, {NUMBERS})")
         body.line("ret void")
-        module.define(f"define void @linearized(ptr %carry, ptr %params, ptr %rows, ptr %flow, i64 %blocks, {NUMBERS})", body)
+        module.define(f"define void @linearized(ptr %carry, ptr %numbers, ptr %rows, ptr %flow, i64 %blocks, {NUMBERS})", body)
         return module.text()
 
 
@@ -142,7 +166,7 @@ class _Block:
         size, count = loop.carry, len(loop.stages)
         self.run = Region(e, loop.graph)
         for i, node in enumerate(loop.shared.params):
-            self.run.bind(node, b.load(e.real, b.at(e.real, "%params", i)))
+            self.run.bind(node, b.load(e.real, b.at(e.real, "%numbers", i)))
         self.carry = [b.at(e.real, "%carry", i) for i in range(size)]
         scalar = Emitter(b, 1)
         before, total = [], 0.0
@@ -165,6 +189,8 @@ class _Block:
             place = b.put(f"mul i64 {i}, {loop.row}")
             row, flow = b.at(e.real, "%rows", place), b.at(e.real, "%flow", place)
             which = b.load("i64", b.at("i64", "@equation", stage))
+            own = b.put(f"add i64 {b.put(f'mul i64 {stage}, {loop.sizes}')}, {len(loop.shared.params)}")
+            sizes = b.at(e.real, "%numbers", own)
             for index, (equation, linear) in enumerate(zip(loop.equations, loop.linearized, strict=True)):
                 with b.when(b.put(f"icmp eq i64 {which}, {index}")):
                     region = Region(e, loop.graph, self.run)
@@ -172,10 +198,12 @@ class _Block:
                     region.bind(loop.shared.h, e.splat(scalar.mul(fraction, "%h")))
                     for j, node in enumerate([*equation.state, *equation.unknowns]):
                         region.bind(node, b.load(e.real, b.at(e.real, row, j)))
+                    for j, node in enumerate(linear.sizes):
+                        region.bind(node, b.load(e.real, b.at(e.real, sizes, j)))
                     stage_of = self._backward if loop.reverse else self._forward
                     stage_of(region, equation, linear, flow, e.splat(steps), e.splat(fraction), active)
         b.line("ret void")
-        pointers = "ptr noalias %carry, ptr noalias %params, ptr noalias %rows, ptr noalias %flow"
+        pointers = "ptr noalias %carry, ptr noalias %numbers, ptr noalias %rows, ptr noalias %flow"
         b.module.define(f"define internal void @block({pointers}, {NUMBERS}) noinline", b)
 
     def _table(self, name: str, kind: str, values: list[str]) -> None:
@@ -187,7 +215,7 @@ class _Block:
         change = [region.value(n) for n in linear.change]
         if linear.stable != region.graph.true:
             stable = region.value(linear.stable)
-            change = by_partial_pivoting(region, linear.matrix, linear.right, change, stable, active)
+            change = by_partial_pivoting(region, linear.matrix, linear.right, change, stable, active, linear.rows)
         return change
 
     def _forward(self, region: Region, equation: TracedEquation, linear: Linearized, flow, steps, fraction, active) -> None:

@@ -25,6 +25,8 @@ class Segments:
         self.lanes = Lanes(p, made, width_for(p.batch or 1))
         self.kernel, _ = made.runs.kernel(self.lanes.width, p.steps * self.lanes.blocks)
         find_sizes(self.lanes, made)
+        sizes = self.lanes.records[:, self.lanes.record.all_sizes]
+        self.numbers = np.concatenate([self.lanes.params, sizes], axis=1)
         self.linearized = made.linearized(reverse, self.lanes.width)
         row_bytes = 8 * (p.batch or 1) * self.stages * (task.state_size + task.unknowns)
         self.length = max(1, SEGMENT_BYTES // row_bytes)
@@ -65,7 +67,7 @@ class Segments:
         p, lanes = self.problem, self.lanes
 
         def part(low: int, high: int) -> None:
-            pointers = (a.ctypes.data + low * a.strides[0] for a in (carry, lanes.params, rows, flow))
+            pointers = (a.ctypes.data + low * a.strides[0] for a in (carry, self.numbers, rows, flow))
             self.linearized(*pointers, high - low, p.t0, p.h, p.first_step, first, count)
 
         bounds = np.linspace(0, lanes.blocks, lanes.threads + 1).astype(int).tolist()

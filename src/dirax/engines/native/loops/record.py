@@ -60,6 +60,11 @@ class Record:
         first = self.state_size + 3 * self.kept + stage * self.history
         return slice(first, first + count)
 
+    @cached_property
+    def all_sizes(self) -> slice:
+        """Those of the unknowns of all stages."""
+        return slice(self.state_size + 3 * self.kept, self.state_size + 4 * self.kept)
+
     def put_sizes(self, table: np.ndarray, sizes: Sequence[np.ndarray]) -> None:
         """Write those of every stage, (…, k), into records (…, quantities)."""
         for stage, values in enumerate(sizes):
