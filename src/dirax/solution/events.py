@@ -6,6 +6,9 @@ import numpy as np
 
 from dirax.program.user_functions import is_traced
 
+WALLS_WORK = "walls_work"
+"""The entry of `stats` that says whether a wall of the run changes the energy."""
+
 
 class Events:
     """What happened between the rows of a run, trajectory after trajectory, each in the order of time.
