@@ -35,6 +35,22 @@ def test_events_stand_beside_walls():
     assert np.max(np.abs(sol.events.of(1).t - [1.0, 1.0 + 2 * FALL])) <= 1e-13
 
 
+@pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.VariableSteps(dx.Collocation(2), lambda q: 1.0 + 0.0 * q[0])])
+def test_events_beside_walls_stay_in_a_run_that_is_extended(scheme):
+    given = {"events": [FLOOR, dx.Event(lambda v: v[1], direction=-1)], "step": 0.05, **DROP}
+    whole = dx.simulate(BALL, scheme, steps=140, **given)
+    longer = dx.simulate(BALL, scheme, steps=70, **given).extend(70)
+    assert np.array_equal(whole.events.index, [0, 1, 0, 1]) and np.array_equal(longer.events.index, whole.events.index)
+    assert np.array_equal(longer.events.t, whole.events.t)
+
+
+def test_what_comes_after_a_terminal_event_is_no_impact_of_the_run():
+    apex = dx.Event(lambda v: v[1], direction=-1, terminal=True)
+    sol = dx.simulate(BALL, dx.Collocation(2), step=0.05, steps=160, events=[FLOOR, apex], **DROP)
+    assert len(sol.events) == 2 and np.max(np.abs(sol.impacts.t - FALL)) <= 1e-13 and len(sol.impacts) == 1
+    assert dx.verify(sol)["impacts"].value == 1
+
+
 def test_a_batch_has_the_bits_of_single_runs():
     q, v = np.array([[0.0, 1.0], [0.0, 2.0]]), np.array([[0.3, 0.0], [0.1, 0.0]])
     batch = dx.simulate(BALL, dx.LagrangeDAlembert(), q=q, v=v, step=0.05, steps=60, events=[FLOOR])
