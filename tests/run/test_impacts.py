@@ -35,6 +35,22 @@ def test_events_stand_beside_walls():
     assert np.max(np.abs(sol.events.of(1).t - [1.0, 1.0 + 2 * FALL])) <= 1e-13
 
 
+@pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.VariableSteps(dx.Collocation(2), lambda q: 1.0 + 0.0 * q[0])])
+def test_events_beside_walls_stay_in_a_run_that_is_extended(scheme):
+    given = {"events": [FLOOR, dx.Event(lambda v: v[1], direction=-1)], "step": 0.05, **DROP}
+    whole = dx.simulate(BALL, scheme, steps=140, **given)
+    longer = dx.simulate(BALL, scheme, steps=70, **given).extend(70)
+    assert np.array_equal(whole.events.index, [0, 1, 0, 1]) and np.array_equal(longer.events.index, whole.events.index)
+    assert np.array_equal(longer.events.t, whole.events.t)
+
+
+def test_what_comes_after_a_terminal_event_is_no_impact_of_the_run():
+    apex = dx.Event(lambda v: v[1], direction=-1, terminal=True)
+    sol = dx.simulate(BALL, dx.Collocation(2), step=0.05, steps=160, events=[FLOOR, apex], **DROP)
+    assert len(sol.events) == 2 and np.max(np.abs(sol.impacts.t - FALL)) <= 1e-13 and len(sol.impacts) == 1
+    assert dx.verify(sol)["impacts"].value == 1
+
+
 def test_a_batch_has_the_bits_of_single_runs():
     q, v = np.array([[0.0, 1.0], [0.0, 2.0]]), np.array([[0.3, 0.0], [0.1, 0.0]])
     batch = dx.simulate(BALL, dx.LagrangeDAlembert(), q=q, v=v, step=0.05, steps=60, events=[FLOOR])
@@ -277,3 +293,33 @@ def test_what_is_refused():
     with pytest.raises(ValueError, match=r"under jax\.grad"):
         run_both = {"step": 0.05, "steps": 20, "events": [FLOOR, dx.Event(lambda q: q[0])]}
         jax.grad(lambda x: dx.simulate(BALL, dx.LagrangeDAlembert(), q=[0.0, x], v=[0.3, 0.0], **run_both).q[-1, 1])(1.0)
+
+
+WALL = 0.3
+
+
+@pytest.mark.parametrize(
+    ("forces", "gap", "restitution"),
+    [
+        (lambda t, q, v: -0.1 * v, lambda q: WALL - q[0], 1.0),
+        (None, lambda q: WALL - q[0], 0.9),
+        (None, lambda t, q: WALL + 0.1 * jnp.sin(3 * t) - q[0], 1.0),
+    ],
+    ids=["forces", "a wall that takes energy", "a wall that moves"],
+)
+def test_what_impacts_do_to_energy_and_multipliers_is_no_violation(forces, gap, restitution):
+    rod = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([q @ q - 1.0]), forces=forces)
+    sol = dx.simulate(
+        rod, dx.LagrangeDAlembert(), q=[0.0, -1.0], v=[1.0, 0.0], step=0.02, steps=200, events=[dx.Impact(gap, restitution)]
+    )
+    assert len(sol.events) and dx.verify(sol).ok
+    q = np.asarray(sol.q).copy()
+    q[:, 0] += 1e-9
+    assert not dx.verify(sol.replace(fields=sol.fields | {"q": q})).ok
+
+
+def test_verify_sees_an_energy_that_a_wall_at_rest_has_changed():
+    sol = dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=80, events=[FLOOR], **DROP)
+    after = sol.t > sol.events.t[0]
+    p = np.asarray(sol.p) + np.outer(after, [0.1, 0.0])
+    assert dx.verify(sol.replace(fields=sol.fields | {"p": p}))["energy"].verdict == "VIOLATED"

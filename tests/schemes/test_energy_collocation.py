@@ -247,6 +247,20 @@ def test_the_books_of_ports_are_verified():
     assert line.verdict == "ok", line
 
 
+def test_self_adjoint_with_one_forms_in_a_frame_alone():
+    system = dx.LagrangeDirac(lagrangian, lambda q: one_forms(0.0, q))
+    with pytest.raises(TypeError, match=r"give it frame="):
+        dx.simulate(system, dx.Adjoint(dx.EnergyCollocation(1)), step=0.1, steps=1, project=True, **DATA)
+    density = lambda q: 1 + q[0] ** 2
+    lines = []
+    for scheme in (dx.EnergyCollocation(1), dx.EnergyCollocation(1, frame=frame)):
+        sol = dx.simulate(system, dx.VariableSteps(scheme, density), step=0.2, steps=5, project=True, **DATA)
+        lines.append(dx.verify(sol)["steps taken back"])
+    without, framed = lines
+    assert without.verdict == "not checked" and without.value > 1e-9 and "give it frame=" in without.explanation
+    assert framed.verdict == "ok"
+
+
 def test_self_adjoint():
     system, data, step = SYSTEMS["no constraints"]
     sol = dx.simulate(system, dx.EnergyCollocation(2), step=step, steps=30, **data)

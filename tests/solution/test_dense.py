@@ -52,6 +52,35 @@ CONSTRAINED = {
 }
 
 
+@pytest.mark.parametrize("affine", [0.0, 0.2])
+@pytest.mark.parametrize(
+    ("scheme", "order"),
+    [(dx.EnergyCollocation(2), 3), (dx.EnergyCollocation(3), 4), (dx.Collocation(3, nodes="lobatto"), 3)],
+    ids=lambda value: repr(value),
+)
+def test_the_order_between_rows_with_one_forms(scheme, order, affine):
+    """A blade in a wind: v = u e − b n with e = (cos φ, sin φ), n = (sin φ, −cos φ), φ̇ = ω and u̇ = bω − cos φ."""
+    rows = CONSTRAINED["blade"][0].one_forms.function
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0], rows, affine=lambda q: jnp.array([affine]))
+    begun, rate, speed = 0.2, 1.3, 1.0
+
+    def velocity(t):
+        angle = begun + rate * t
+        along = speed + affine * rate * t - (np.sin(angle) - np.sin(begun)) / rate
+        return np.array([along * np.cos(angle) - affine * np.sin(angle), along * np.sin(angle) + affine * np.cos(angle), rate])
+
+    errors = []
+    for step in (0.1, 0.05, 0.025):
+        sol = dx.simulate(system, scheme, q=[0.0, 0.0, begun], v=velocity(0.0), step=step, steps=round(1 / step))
+        t = 0.4 + step * np.array([0.13, 0.37, 0.81])
+        found = sol.at(t)
+        errors.append([np.max(np.abs(found.p - np.stack([velocity(at) for at in t])))])
+        if affine and "work" in found.fields:
+            errors[-1].append(np.max(np.abs(np.sum(found.p**2, axis=1) / 2 + found.q[:, 0] - found.work - sol.energy()[0])))
+    slopes = -np.polyfit(np.arange(3), np.log2(errors), 1)[0]
+    assert np.all(slopes > order - 0.25), (slopes, errors)
+
+
 @pytest.mark.parametrize("name", CONSTRAINED)
 @pytest.mark.parametrize(
     "scheme",

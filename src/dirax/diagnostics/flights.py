@@ -7,14 +7,18 @@ from dirax.solution.solution import Solution
 
 
 def longest_flight(sol: Solution) -> tuple[Solution, Line | None]:
-    """The rows of the longest flight of any trajectory, with a line that says so; the solution itself without impacts."""
+    """The rows of the longest flight of any trajectory, with a line that says so; the solution itself without impacts.
+
+    It begins a step after the row that a divided step leads to, whose momentum and multipliers are those of both steps.
+    """
     if sol.impacts is None or not len(sol.impacts) or sol.save_every != 1:
         return sol, None
     hits, best = sol.impacts, (0, 0, 0)
     for lane in range(sol.batch or 1):
         own = sol if sol.batch is None else sol[lane]
         ends = np.searchsorted(sol.times[lane], hits.t[hits.lane == lane], side="right")  # the first rows after the impacts
-        starts, stops = np.concatenate([[0], ends]), np.concatenate([ends, [own.rows]])
+        stops = np.concatenate([ends, [own.rows]])
+        starts = np.concatenate([[0], np.minimum(ends + 1, stops[1:] - 1)])
         longest = int(np.argmax(stops - starts))
         best = max(best, (int((stops - starts)[longest]), lane, int(starts[longest])))
     count, lane, start = best

@@ -82,7 +82,7 @@ class Searched:
         own = [(i, event) for i, event in enumerate(self.events) if isinstance(event, Event)]
         parts = [self.found] if self.found is not None else []
         if sol.impacts is not None:
-            parts = [sol.impacts]
+            parts = [sol.impacts, *(part[np.isin(part.index, [i for i, _ in own])] for part in parts)]
         if sol.rows > 1 and own:
             dense = Dense(sol)
             last = int(dense.ends.max())
@@ -103,6 +103,8 @@ class Searched:
         kept = thinned(ended_at(sol, self.endings), save_every)
         kept.stats = sol.stats | {"events_seconds": self.seconds}
         kept.events = self.found
+        if sol.impacts is not None:
+            kept.impacts = sol.impacts[sol.impacts.t <= self.endings[sol.impacts.lane]]
         if np.any(ended):
             own = [self._ending(lane) if ended[lane] else "" for lane in range(len(ended))]
             if sol.batch is None:

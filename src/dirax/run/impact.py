@@ -54,6 +54,11 @@ class Impact:
         self.arguments = names_of(gap, "gap", KNOWN)
         self.gap, self.restitution = gap, float(restitution)
 
+    @property
+    def works(self) -> bool:
+        """Whether it changes the energy: it moves, or does not give all of it back."""
+        return self.restitution < 1.0 or "t" in self.arguments
+
     def __call__(self, t: Any, q: Any, params: Any) -> Any:
         """The gap at one place."""
         known = {"t": t, "q": q, "params": params}

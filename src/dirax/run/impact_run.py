@@ -19,7 +19,7 @@ from dirax.run.result import solution_of
 from dirax.schemes.collision_step import CollisionStep
 from dirax.schemes.step import CLOCK, PART, STEP_DENSITY, StepEquation
 from dirax.schemes.watched_step import ON_WALL, WatchedStep, gap_terms
-from dirax.solution.events import Events
+from dirax.solution.events import WALLS_WORK, Events
 from dirax.solution.solution import Solution
 
 BEHIND = 10.0 * ON_WALL
@@ -73,7 +73,11 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
         engine=sample.engine,
         interrupted=interrupted,
         run_seconds=seconds,
-        notes={**sample.notes, "impacts": sum(len(flight.hits) for flight in flights)},
+        notes={
+            **sample.notes,
+            "impacts": sum(len(flight.hits) for flight in flights),
+            WALLS_WORK: any(wall.works for wall in walls),
+        },
     )
     said = [flight.message for flight in flights]
     sol = solution_of(system, settings.scheme, begun.case, p, finished(p, outcome), begun.row0, False, said)

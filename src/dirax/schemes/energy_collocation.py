@@ -23,7 +23,8 @@ class EnergyCollocation(AbstractScheme):
         ẏ(c_i) = Π(y(c_i)) (1/b_i) ∫_0^1 ℓ_i(τ) ∇H(y(τ)) dτ
 
     at Gauss nodes (Hairer 2010; Cohen, Hairer 2011): order 2s, self-adjoint, H(y_{k+1}) = H(y_k) as far as the quadrature of
-    the integral is exact; Jacobi's identity is not needed.
+    the integral is exact; Jacobi's identity is not needed. With one-forms and without `frame` it is self-adjoint up to
+    O(h^(2s+2)) in a step, so that a `dx.Composition` has the order 2s + 1, and not the one of its name.
 
     - a regular `dx.LagrangeDirac` or `dx.NonholonomicMechanics`, with one-forms or without: the almost-Poisson bracket on D*
       (Celledoni, Farré Puiggalí, Høiseth, Martín de Diego, arXiv 1605.02845), from L and the one-forms alone. The
@@ -74,7 +75,13 @@ class EnergyCollocation(AbstractScheme):
         return 2 * self.stages
 
     def adjoint(self, system: AbstractSystem) -> "EnergyCollocation":
-        """The scheme itself, for nodes that lie symmetrically."""
+        """The scheme itself, for nodes that lie symmetrically. Raises `TypeError` for one-forms without a frame, where a step
+        begins at p = ∂L/∂v and ends at another p of a point of D*."""
+        lagrangian = system.lagrangian_form() if self.frame is None else None
+        if lagrangian is not None and lagrangian.one_forms is not None:
+            raise TypeError(
+                "with one-forms dx.EnergyCollocation is self-adjoint in a frame alone, and has no other adjoint: give it frame=."
+            )
         return self
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:

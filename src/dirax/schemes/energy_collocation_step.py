@@ -137,13 +137,18 @@ class EnergyCollocationStep(AbstractStep):
     def unpack(self, state, u, t, h, params):
         return self.node(state, params)
 
+    def lifted(self, place: Array, rate: Array, t: Any, params: Any) -> Float[Array, " s"]:
+        """What is added to a place of the polynomial for the state that it stands for, with a rate near its own."""
+        return jnp.zeros_like(place)
+
     def interpolate(self, theta, u, state, t, h, params):
-        """At the integral of the polynomial of the rates, with its share of what is settled at the end."""
+        """At the integral of the polynomial of the rates, lifted, with its share of what else is settled at the end."""
         rates = self._nodes(u, state, t, h, params)[1]
         inner = state + h * (jnp.stack(self.tableau.integrals(theta)) @ rates)
         end = state + h * (self.tableau.weights @ rates)
         last = self._at_points(u, state, t, h)[2][-1]
-        return self.node(inner + theta * once(self.settle)(state, end, last, t, h, params), params)
+        settled = once(self.settle)(state, end, last, t, h, params) - once(self.lifted)(end, last, t + h, params)
+        return self.node(inner + once(self.lifted)(inner, last, t + theta * h, params) + theta * settled, params)
 
     def settled(self, before: Array, after: Array, energy: Any, work: Any, size: Any) -> dict[str, Array]:
         """The parts of what is added that belong to the energy at the end, with the work of the step and the size of the

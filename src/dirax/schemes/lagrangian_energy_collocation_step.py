@@ -140,6 +140,15 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         """α ↦ P α."""
         return lambda vector: vector - rows.T @ solve(rows @ rows.T, rows @ vector) if len(rows) else vector
 
+    def lifted(self, place, rate, t, params):
+        """p becomes ∂L/∂v, and the work that of this p."""
+        if not self.shape.kept:
+            return jnp.zeros_like(place)
+        now = self.state.split(place)
+        _, multipliers = self.velocity(t, now.q, now.p, rate[: self.n], params)
+        rows, offset = self.constraint(t, now.q, params)
+        return self.state.join(p=rows.T @ multipliers, **({"work": -(multipliers @ offset)[None]} if self.working else {}))
+
     def settle(self, before, after, rate, t, h, params):
         now = self.state.split(after)
         v, multipliers = self.velocity(t + h, now.q, now.p, rate[: self.n], params)

@@ -236,7 +236,8 @@ class AbstractScheme(eqx.Module):
 
     def adjoint(self, system: Any) -> "AbstractScheme | None":
         """The adjoint Φ*_h = (Φ_{−h})⁻¹ on this system as a scheme of its own; None where it is the inverse map as such,
-        whose equation `dx.Adjoint` makes of the scheme's. A scheme that is self-adjoint returns itself."""
+        whose equation `dx.Adjoint` makes of the scheme's. A scheme that is self-adjoint returns itself. Raises `TypeError`
+        where there is none."""
         return None
 
     def part(self, system: Any, shape: Shape) -> "AbstractScheme":

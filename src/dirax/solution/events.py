@@ -6,6 +6,9 @@ import numpy as np
 
 from dirax.program.user_functions import is_traced
 
+WALLS_WORK = "walls_work"
+"""The entry of `stats` that says whether a wall of the run changes the energy."""
+
 
 class Events:
     """What happened between the rows of a run, trajectory after trajectory, each in the order of time.
@@ -54,12 +57,13 @@ class Events:
 
 
 def joined(parts: list[Events]) -> Events:
-    """All of them, sorted by trajectory and time."""
+    """All of them, sorted by trajectory and time, with the fields that all have."""
     if len(parts) == 1:
         return parts[0]
     t, index, direction, lane = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "index", "direction", "lane")
     )
-    fields = {name: np.concatenate([part.fields[name] for part in parts]) for name in parts[0].fields}
+    names = [name for name in parts[0].fields if all(name in part.fields for part in parts)]
+    fields = {name: np.concatenate([part.fields[name] for part in parts]) for name in names}
     whole = Events(t, index, direction, lane, fields)
     return whole[np.lexsort((t, lane))]
