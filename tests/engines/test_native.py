@@ -297,6 +297,17 @@ def test_an_interruption_keeps_what_was_computed(monkeypatch):
     np.testing.assert_array_equal(outcome.closing["q"], outcome.last_state[:, :2])
 
 
+def test_code_of_few_operations_is_quick_from_the_beginning(monkeypatch):
+    monkeypatch.setenv("DIRAX_CACHE", "off")
+    levels = compiled_levels(monkeypatch)
+    for few, level in ((1000, QUICK), (10, SOON)):
+        monkeypatch.setattr(of_steps, "FEW", few)
+        dx.clear_caches()
+        native.run(problem("rolling disk, midpoint", steps=2))
+        assert levels.pop(0) == level
+        levels.clear()
+
+
 def test_kernels_are_cached_on_disk_and_damaged_entries_are_made_again(tmp_path, monkeypatch):
     monkeypatch.setenv("DIRAX_CACHE", str(tmp_path))
     p = problem("Hénon–Heiles", steps=30)
@@ -366,8 +377,9 @@ def test_quick_code_is_compiled_once_it_pays(tmp_path, monkeypatch):
 
 
 def compiled_levels(monkeypatch) -> list[int]:
-    """The levels at which kernels are compiled from now on."""
+    """The levels at which kernels are compiled from now on, those of few operations as those of many."""
     levels, compiled = [], llvm.object_code
+    monkeypatch.setattr(of_steps, "FEW", 0)
 
     def noted(text, level):
         levels.append(level)

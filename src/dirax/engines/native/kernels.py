@@ -33,6 +33,9 @@ SOON, QUICK = 0, 2
 """Levels of LLVM's optimization. Code of the first is ready in a quarter of the time, and runs a half to a third as fast as that
 of the second, with the same bits."""
 
+FEW = 1000
+"""Operations of a step up to which code is QUICK from the beginning: that is ready in less than a tenth of a second."""
+
 MANY = 400_000
 """Steps of a run for which code is QUICK from the beginning."""
 
@@ -181,16 +184,18 @@ def linked(
     name: str, key: tuple, text: Callable[[], str], operations: Callable[[], int], levels: tuple[int, ...] = (QUICK,)
 ) -> Linked:
     """The linked code of the IR `text()` that exports `name`: of the first of the `levels` that is on the disk, or else compiled
-    for the last one. `operations`: those of a step, known when it is compiled."""
+    for the last one, where there are FEW operations for the first. `operations`: those of a step, known when it is compiled."""
     entries = {level: kernel_cache.name_of(*key, level, *llvm.version()) for level in levels}
     for level, entry in entries.items():
         stored = kernel_cache.read(entry)
         if stored is not None:
             with contextlib.suppress(RuntimeError):  # the linker does not take it: it is compiled anew
                 return Linked(llvm.load(stored.code, (name,)), stored.operations, True, level)
-    code = llvm.object_code(text(), level=levels[-1])
-    kernel_cache.write(entries[levels[-1]], kernel_cache.Kernel(operations(), code))
-    return Linked(llvm.load(code, (name,)), operations(), False, levels[-1])
+    ir = text()
+    level = levels[0] if operations() <= FEW else levels[-1]
+    code = llvm.object_code(ir, level=level)
+    kernel_cache.write(entries[level], kernel_cache.Kernel(operations(), code))
+    return Linked(llvm.load(code, (name,)), operations(), False, level)
 
 
 def too_large(error: GraphTooLarge) -> UnsupportedPrimitive:
