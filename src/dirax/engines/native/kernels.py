@@ -36,9 +36,9 @@ of the second, with the same bits."""
 MANY = 400_000
 """Steps of a run for which code is QUICK from the beginning."""
 
-PRICE = 1.5e-5
+PRICE = 3e-5
 """Seconds for each operation of a step that runs spend with code that is ready SOON before it is worth while to have it QUICK:
-about a fifth of what compiling for that takes."""
+about a third of what compiling for that takes."""
 
 SIZING = 1e-5
 """A part of the seconds that the kernel of sizes takes to compile (3e-5), for each operation and each column of the Jacobian."""
