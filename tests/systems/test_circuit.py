@@ -103,7 +103,7 @@ def test_what_is_no_netlist_is_refused(netlist):
 def test_data_of_the_wrong_length_and_off_the_laws():
     for resistor in (2.0, lambda u: u / 2.0):
         system = dx.circuit([("C", 1, 0, 1.0), ("R", 1, 0, resistor)])
-        with pytest.raises((TypeError, ValueError), match="x are the charges and then the fluxes .*, 1 numbers, not 2"):
+        with pytest.raises((TypeError, ValueError), match=r"x are the charges and then the fluxes .*, 1 numbers, not 2"):
             dx.simulate(system, MIDPOINT, x=[0.0, 1.0], step=0.1, steps=2)
     system = dx.circuit([("V", 1, 0, jnp.sin), ("C", 1, 0, 1.0)])
     with pytest.raises(ValueError, match="x are the charges"):

@@ -4,7 +4,7 @@ import contextlib
 import ctypes
 import functools
 import hashlib
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -59,7 +59,7 @@ class Runs:
     def __init__(self, linked: Callable[[int, tuple[int, ...]], Linked]):
         self._linked = linked
         self._made: dict[int, tuple[Any, Linked]] = {}
-        self._spent: Counter[int] = Counter()
+        self._spent: defaultdict[int, float] = defaultdict(float)
 
     def kernel(self, width: int, steps: float) -> tuple[Any, bool]:
         """The `run` for a width, with which so many steps are about to be taken, and whether it came from a cache."""
