@@ -240,7 +240,7 @@ def worst(found: dict[str, dict[str, Any]], count: int = 4) -> str:
 def main() -> None:
     from dirax import gallery
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="*")
     parser.add_argument("--parts", default=",".join([*PARTS, "program"]))
     chosen = parser.parse_args()

@@ -1,5 +1,7 @@
 """dx.circuit: linear ones as implicit systems, diode-like resistors and sources in time as Circuits, against exact solutions."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -76,6 +78,15 @@ def test_a_linear_circuit_is_the_same_as_a_function():
         (("R", 1, 0, lambda u: -u), ValueError, "has the sign of its voltage"),
         (("R", 1, 0, lambda u: u / (1 + 100 * u * u)), ValueError, "never falls"),
         (("C", 5, 6, 1.0), ValueError, "not connected to the ground"),
+        (("C", "a", 0, 1.0), TypeError, "nodes are whole numbers, 0 that of the ground"),
+        (("C", None, 0, 1.0), TypeError, "nodes are whole numbers"),
+        (("T", (1, 1), (2, 0), 1.0), ValueError, "between two nodes"),
+        (("T", (1, 0), (2, 0), 0.0), ValueError, "ratio of a transformer is not zero"),
+        (("V", 1, 0, math.sin), TypeError, r"voltage\(t\) could not be traced"),
+        (("V", 1, 0, lambda t: jnp.stack([t, t])), TypeError, r"voltage\(t\) must return one number, .* shape \(2,\)"),
+        (("I", 1, 0, lambda t, phase: t + phase), TypeError, r"a function current\(t\), without params"),
+        (("R", 1, 0, lambda u: u if u > 0 else 0.0), TypeError, r"current\(u\) could not be traced .* jnp\.where"),
+        (("R", 1, 0, lambda u: jnp.expm1(2000 * u)), ValueError, "it is inf"),
     ],
 )
 def test_what_is_no_element_is_refused(element, error, message):
@@ -83,7 +94,17 @@ def test_what_is_no_element_is_refused(element, error, message):
         dx.circuit([("C", 1, 0, 1.0), element])
 
 
+@pytest.mark.parametrize("netlist", [[], None, "C 1 0 2", {"C": 1}])
+def test_what_is_no_netlist_is_refused(netlist):
+    with pytest.raises(TypeError, match="netlist must be a list of elements"):
+        dx.circuit(netlist)
+
+
 def test_data_of_the_wrong_length_and_off_the_laws():
+    for resistor in (2.0, lambda u: u / 2.0):
+        system = dx.circuit([("C", 1, 0, 1.0), ("R", 1, 0, resistor)])
+        with pytest.raises((TypeError, ValueError), match=r"x are the charges and then the fluxes .*, 1 numbers, not 2"):
+            dx.simulate(system, MIDPOINT, x=[0.0, 1.0], step=0.1, steps=2)
     system = dx.circuit([("V", 1, 0, jnp.sin), ("C", 1, 0, 1.0)])
     with pytest.raises(ValueError, match="x are the charges"):
         dx.simulate(system, MIDPOINT, x=[0.0, 1.0], step=0.1, steps=2)

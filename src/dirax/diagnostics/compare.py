@@ -141,11 +141,12 @@ def compare(
     if reference is None:
         try:
             reference = explicit_solution(system, run)
-            reference(np.array([float(run.get("t0", 0.0)) + min(steps, ORDER_STEPS) * step]))
+            reference(float(run.get("t0", 0.0)) + np.arange(min(steps, ORDER_STEPS) + 1) * step)
             label = ExplicitSolution.label
         except Skipped:
             reference = None
-    orders = {name: _order(system, scheme, step, steps, reference, run) for name, scheme in named.items()}
+    # without another reference a scheme is measured against itself, refined
+    orders = {name: _order(system, scheme, step, steps, reference or scheme, run) for name, scheme in named.items()}
     best = max((name for name in named if orders[name][0] is not None), key=lambda n: orders[n][0] or 0.0, default=None)
     target = reference if reference is not None else named[best] if best is not None else None
     entries = []

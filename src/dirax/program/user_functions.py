@@ -171,8 +171,11 @@ class UserFunction(eqx.Module):
         return self.signature
 
     def _without_params(self, values) -> str:
-        missing = self.takes_params and values[-1] is None
-        return " and params=None (it takes params, which were not given: pass params=…)" if missing else ""
+        if not self.takes_params or values[-1] is not None:
+            return ""
+        last = _parameters_of(self.function)[len(self.arguments) :][:1]
+        takes = f"its argument {last[0]} stands for" if last and last[0] != "params" else "it takes"
+        return f" and params=None ({takes} params, which were not given: pass params=…)"
 
 
 def _parameters_of(function: Callable) -> tuple[str, ...]:

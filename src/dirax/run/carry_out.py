@@ -256,15 +256,12 @@ def _run(
     solution = solution_of(settings.system, settings.scheme, found.case, problem, outcome, found.row0, traced)
     if not traced:
         solution.continuation = Continuation(settings, kind, found, outcome.record, steps)
-        found_in_run = outcome.compile_seconds > ready - started  # by an engine that prepares nothing
+        getting_ready, compiling = ready - started, outcome.compile_seconds  # an engine may compile when it runs, too
         solution.stats |= {
             "validate_seconds": began - entered if entered else 0.0,
             "start_seconds": started - began,
-            "trace_seconds": ready - started - (0.0 if found_in_run else outcome.compile_seconds),
-            "result_seconds": max(
-                0.0,
-                time.perf_counter() - ready - outcome.run_seconds - (outcome.compile_seconds if found_in_run else 0.0),
-            ),
+            "trace_seconds": max(0.0, getting_ready - compiling),
+            "result_seconds": max(0.0, time.perf_counter() - ready - outcome.run_seconds - max(0.0, compiling - getting_ready)),
         }
     return solution
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from dirax.numerics.arrays import Data, Numbers
 from dirax.program.roots import FEWEST_SPARSE, nearest_root
 from dirax.program.sparse_matrix import SparseMatrix
+from dirax.program.user_functions import UserFunction
 from dirax.systems.forms import RelationForm
 from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.shape import Shape
@@ -21,6 +22,7 @@ Element = tuple[str, Any, Any, Any]
 """(kind, from, to, value): see `circuit`."""
 
 KINDS = ("C", "L", "R", "V", "I", "T")
+ELEMENT = "(C, L, R, V, I or T, node, other node, value)"
 TRIED = np.concatenate([-np.geomspace(1e-9, 1.0, 40)[::-1], [0.0], np.geomspace(1e-9, 1.0, 40)])
 """Voltages at which a diode-like resistor is asked for its current."""
 
@@ -49,8 +51,11 @@ def circuit(netlist: Sequence[Element]) -> "ImplicitSystem | Circuit":
                                 ("R", 2, 0, 5.0)])
 
     Raises `ValueError` for unknown kinds, values that are not positive, resistors that give energy, and parts that are not
-    connected to the ground; `TypeError` for what is no number and no function where it has to be one.
+    connected to the ground; `TypeError` for what is no number and no function of one number where it has to be one, and for
+    nodes that are no whole numbers.
     """
+    if not isinstance(netlist, list | tuple) or not netlist:
+        raise TypeError(f"netlist must be a list of elements {ELEMENT}, but {netlist!r:.100} was given.")
     for element in netlist:
         _check(element)
     made = Circuit(netlist)
@@ -128,6 +133,10 @@ class Circuit(AbstractSystem):
         B[n + nl + nc : n + nl + nc + nv, :n], B[n + nl + nc + nv :, :n] = v.T, t.T
         given = -i @ values["I"]
 
+        def stated(x):
+            self.refuse_length(x)
+            return jnp.asarray(E)
+
         def f(x):
             current, voltage = x[nc:] / values["L"], x[:nc] / values["C"]
             nodes = -jnp.asarray(l) @ current
@@ -135,7 +144,7 @@ class Circuit(AbstractSystem):
             parts = [nodes, jnp.zeros(nl), -voltage, -jnp.asarray(values["V"])]
             return jnp.concatenate([*parts, jnp.zeros(nt)] if nt else parts)
 
-        return ImplicitSystem(lambda x: jnp.asarray(E), f, lambda x: jnp.asarray(B), self.energy)
+        return ImplicitSystem(stated, f, lambda x: jnp.asarray(B), self.energy)
 
     def energy(self, x: Float[Numbers, " N"]) -> Float[Numbers, ""]:
         """That of the capacitors and inductors."""
@@ -166,12 +175,14 @@ class Circuit(AbstractSystem):
 
     def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         refuse_start(self, data, "x")
+        self.refuse_length(data["x"])
+        return data["x"].shape[0], len(self.nodes) + len(self.elements("V")) + len(self.elements("T"))
+
+    def refuse_length(self, x: Any) -> None:
+        """Raise `ValueError` for data of another circuit."""
         expected = len(self.elements("C")) + len(self.elements("L"))
-        if data["x"].shape[0] != expected:
-            raise ValueError(
-                f"x are the charges and then the fluxes of the circuit, {expected} numbers, not {data['x'].shape[0]}."
-            )
-        return expected, len(self.nodes) + len(self.elements("V")) + len(self.elements("T"))
+        if x.shape[0] != expected:
+            raise ValueError(f"x are the charges and then the fluxes of the circuit, {expected} numbers, not {x.shape[0]}.")
 
     def relation_form(self, shape: Shape) -> RelationForm:
         currents = [f"current of {kind} {i}" for kind in "VT" for i in range(len(self.elements(kind)))]
@@ -204,29 +215,47 @@ class Circuit(AbstractSystem):
 
 def _check(element: Any) -> None:
     given = f"{element!r:.100} was given"
-    if not isinstance(element, tuple | list) or len(element) != 4 or element[0] not in KINDS:
-        raise ValueError(f"an element is (C, L, R, V, I or T, node, other node, value), but {given}.")
+    if not isinstance(element, tuple | list) or len(element) != 4 or not isinstance(element[0], str) or element[0] not in KINDS:
+        raise ValueError(f"an element is {ELEMENT}, but {given}.")
     kind, start, end, value = element
-    if start == end:
-        raise ValueError(f"an element is (C, L, R, V, I or T, node, other node, value) between two nodes, but {given}.")
-    if kind == "T" and not all(isinstance(ends, tuple | list) and len(ends) == 2 for ends in (start, end)):
+    sides = (start, end) if kind == "T" else ((start, end),)
+    if not all(isinstance(ends, tuple | list) and len(ends) == 2 for ends in sides):
         raise ValueError(f"a transformer is (T, (a, b), (c, d), ratio), but {given}.")
+    if not all(isinstance(node, int | np.integer) and not isinstance(node, bool) for ends in sides for node in ends):
+        raise TypeError(f"nodes are whole numbers, {GROUND} that of the ground, but {given}.")
+    if any(a == b for a, b in sides):
+        raise ValueError(f"an element is {ELEMENT} between two nodes, but {given}.")
     if callable(value):
         if kind not in "RVI":
             raise TypeError(f"only R, V and I may be functions, of the voltage and of the time, but {given}.")
+        _check_function(value, "voltage" if kind == "V" else "current", "u" if kind == "R" else "t", given)
         if kind == "R":
             _check_current(value, given)
         return
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
         raise TypeError(f"the value of an element must be a finite number, or a function for R, V and I, but {given}.")
-    if (kind in "CLR" and not value > 0) or (kind == "T" and value == 0):
+    if kind in "CLR" and not value > 0:
         raise ValueError(f"an element is (C, L, R, V, I or T, node, other node, value > 0), but {given}.")
+    if kind == "T" and value == 0:
+        raise ValueError(f"the ratio of a transformer is not zero, but {given}.")
+
+
+def _check_function(value: Callable, name: str, argument: str, given: str) -> None:
+    """Refuse what is no function of one number, with a number for result, that JAX can trace."""
+    try:
+        function = UserFunction(value, name, (argument,))
+        if function.takes_params:
+            raise TypeError(f"{name} must be a function {name}({argument}), without params.")
+        if shape := function.shape(np.float64(0.0), None).shape:
+            raise TypeError(f"{name}({argument}) must return one number, but it returned shape {shape}.")
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{str(error).rstrip('.')}; {given}.") from error
 
 
 def _check_current(current: Callable, given: str) -> None:
     """Refuse a resistor that gives energy, or has a falling current."""
     found = np.array([float(current(u)) for u in TRIED])
-    wrong = (found * TRIED < 0) | (found * (TRIED == 0) != 0) | ~np.isfinite(found)
+    wrong = ~np.isfinite(found) | (np.sign(found) * TRIED < 0) | ((TRIED == 0) & (found != 0))
     if np.any(wrong):
         at = TRIED[int(np.argmax(wrong))]
         raise ValueError(

@@ -28,6 +28,11 @@ def force_function(forces: Callable, constrained: bool) -> UserFunction:
         names = list(inspect.signature(forces).parameters)
     except (TypeError, ValueError):
         names = []
+    if "multipliers" in names and names[3:4] != ["multipliers"]:
+        raise TypeError(
+            f"forces that see the multipliers are forces(t, q, v, multipliers[, params]), but a function of "
+            f"({', '.join(names)}) was given."
+        )
     if names[3:4] != ["multipliers"]:
         return UserFunction(forces, "forces", ("t", "q", "v"))
     if not constrained:

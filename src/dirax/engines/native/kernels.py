@@ -4,7 +4,7 @@ import contextlib
 import ctypes
 import functools
 import hashlib
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,9 +39,9 @@ FEW = 1000
 MANY = 400_000
 """Steps of a run for which code is QUICK from the beginning."""
 
-PRICE = 1.5e-5
+PRICE = 3e-5
 """Seconds for each operation of a step that runs spend with code that is ready SOON before it is worth while to have it QUICK:
-about a fifth of what compiling for that takes."""
+about a third of what compiling for that takes."""
 
 SIZING = 1e-5
 """A part of the seconds that the kernel of sizes takes to compile (3e-5), for each operation and each column of the Jacobian."""
@@ -62,7 +62,7 @@ class Runs:
     def __init__(self, linked: Callable[[int, tuple[int, ...]], Linked]):
         self._linked = linked
         self._made: dict[int, tuple[Any, Linked]] = {}
-        self._spent: Counter[int] = Counter()
+        self._spent: defaultdict[int, float] = defaultdict(float)
 
     def kernel(self, width: int, steps: float) -> tuple[Any, bool]:
         """The `run` for a width, with which so many steps are about to be taken, and whether it came from a cache."""

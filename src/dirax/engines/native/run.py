@@ -73,13 +73,13 @@ class Ready:
         try:
             while done < p.steps and (done == p.after or lanes.going):
                 count = min(count, p.steps - done)
-                tick = time.perf_counter()
+                tick, busy = time.perf_counter(), time.thread_time()
                 lanes.advance(kernel, done, done + count, threads)
                 done += count
-                seconds = max(time.perf_counter() - tick, 1e-9)
-                rate = count / seconds
-                runs.spent(self.width, seconds)
-                if runs.quick_pays(self.width, (p.steps - done) / rate):
+                rate = count / max(time.perf_counter() - tick, 1e-9)
+                busy = time.thread_time() - busy  # of one thread: another program may have the processor
+                runs.spent(self.width, busy)
+                if runs.quick_pays(self.width, busy * (p.steps - done) / count):
                     tick = time.perf_counter()
                     kernel, found = runs.kernel(self.width, math.inf)
                     ready, waited = ready and found, waited + time.perf_counter() - tick
