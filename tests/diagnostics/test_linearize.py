@@ -94,6 +94,12 @@ def test_a_system_on_its_final_manifold():
         dx.linearize(system, {"x": [0.0, 0.0]}, dx.DiscreteDirac(), step=0.1)
 
 
+@pytest.mark.parametrize("at", [{"x": [1.0, 0.0]}, {"q": [1.0, 0.0]}, {}, [1.0, 0.0]])
+def test_a_place_of_other_names_is_refused(at):
+    with pytest.raises(ValueError, match=r"is linearized is \{\"q\": …, \"v\": …\}, but .* was given"):
+        dx.linearize(dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2), at)
+
+
 def test_a_scheme_needs_a_step():
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2)
     with pytest.raises(ValueError, match="give scheme= and step= together"):

@@ -92,12 +92,17 @@ def linearize(
 
         dx.linearize(bicycle.MODEL.system, bicycle.straight(5.0), symmetries=bicycle.SYMMETRIES).eigenvalues
 
-    Raises `ValueError` at a place that is no relative equilibrium, and for generators that are no symmetries; `TypeError` for
-    systems without a Lagrangian where symmetries or a scheme are given.
+    Raises `ValueError` for a place of other names, at one that is no relative equilibrium, and for generators that are no
+    symmetries; `TypeError` for systems without a Lagrangian where symmetries or a scheme are given.
     """
     generators = list(symmetries.values()) if isinstance(symmetries, Mapping) else list(symmetries)
     if (scheme is None) != (step is None):
         raise ValueError("a scheme is linearized with its step: give scheme= and step= together, or neither.")
+    wanted = ("x",) if system.lagrangian_form() is None else ("q", "v")
+    if not isinstance(at, Mapping) or not set(wanted) <= set(at):
+        given = f"{', '.join(map(str, at)) or 'nothing'} was given" if isinstance(at, Mapping) else f"{at!r:.80} was given"
+        place = ", ".join(f'"{name}": …' for name in wanted)
+        raise ValueError(f"the place at which a {type(system).__name__} is linearized is {{{place}}}, but {given}.")
     if system.lagrangian_form() is None:
         if scheme is not None or generators:
             raise TypeError(
