@@ -94,6 +94,25 @@ def test_a_system_on_its_final_manifold():
         dx.linearize(system, {"x": [0.0, 0.0]}, dx.DiscreteDirac(), step=0.1)
 
 
+@pytest.mark.parametrize("at", [{"x": [1.0, 0.0]}, {"q": [1.0, 0.0]}, {}, [1.0, 0.0]])
+def test_a_place_of_other_names_is_refused(at):
+    with pytest.raises(ValueError, match=r"is linearized is \{\"q\": …, \"v\": …\}, but .* was given"):
+        dx.linearize(dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2), at)
+
+
+@pytest.mark.parametrize("step", [1e-2, 1e-4])
+def test_a_step_along_symmetries_that_turn_is_refused_for_what_it_is(step):
+    """A spherical pendulum that goes round at the angle .8: ω² = Ω² (1 + 3 cos² .8), Ω² = 1/cos .8."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[2], holonomic=lambda q: jnp.array([q @ q - 1.0]))
+    turning = np.sqrt(1 / np.cos(0.8))
+    at = {"q": [np.sin(0.8), 0.0, -np.cos(0.8)], "v": [0.0, turning * np.sin(0.8), 0.0]}
+    about = [lambda q: jnp.stack([-q[1], q[0], 0.0])]
+    swing = turning * np.sqrt(1 + 3 * np.cos(0.8) ** 2)
+    np.testing.assert_allclose(dx.linearize(system, at, symmetries=about).eigenvalues.imag, [swing, 0.0, -swing], atol=1e-12)
+    with pytest.raises(ValueError, match="symmetries that turn are taken as shifts"):
+        dx.linearize(system, at, dx.Collocation(2, nodes="lobatto"), step=step, symmetries=about)
+
+
 def test_a_scheme_needs_a_step():
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2)
     with pytest.raises(ValueError, match="give scheme= and step= together"):

@@ -44,6 +44,16 @@ def test_events_beside_walls_stay_in_a_run_that_is_extended(scheme):
     assert np.array_equal(longer.events.t, whole.events.t)
 
 
+def test_a_stretch_of_time_has_its_own_events():
+    sol = dx.simulate(
+        BALL, dx.Collocation(2), step=0.05, steps=160, events=[FLOOR, dx.Event(lambda v: v[1], direction=-1)], **DROP
+    )
+    part = sol[2.0:5.0]
+    assert np.array_equal(part.events.t, sol.events.t[1:3]) and np.array_equal(part.impacts.t, sol.impacts.t[1:2])
+    assert len(sol[:160].impacts) == len(sol.impacts) and dx.verify(part).ok
+    assert np.array_equal(part.at(4.26).q, sol.at(4.26).q)
+
+
 def test_what_comes_after_a_terminal_event_is_no_impact_of_the_run():
     apex = dx.Event(lambda v: v[1], direction=-1, terminal=True)
     sol = dx.simulate(BALL, dx.Collocation(2), step=0.05, steps=160, events=[FLOOR, apex], **DROP)

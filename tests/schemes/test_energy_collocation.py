@@ -261,6 +261,21 @@ def test_self_adjoint_with_one_forms_in_a_frame_alone():
     assert framed.verdict == "ok"
 
 
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
+def test_at_rest_where_all_terms_of_the_energy_are_zero(engine):
+    oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+
+    def last(q):
+        sol = dx.simulate(oscillator, dx.EnergyCollocation(2), q=q, v=jnp.zeros(1), step=0.1, steps=5, engine=engine)
+        return sol.q[-1, 0]
+
+    rest = dx.simulate(oscillator, dx.EnergyCollocation(2), q=[0.0], v=[0.0], step=0.1, steps=5, engine=engine)
+    assert rest.ok and not np.any(rest.q) and not np.any(rest.energy_defect) and dx.verify(rest).ok
+    np.testing.assert_allclose(jax.grad(last)(jnp.zeros(1)), np.cos(0.5), atol=1e-7)
+    found = dx.linearize(oscillator, {"q": [0.0], "v": [0.0]}, dx.EnergyCollocation(2), step=0.1)
+    np.testing.assert_allclose(found.eigenvalues, [1j, -1j], atol=1e-6)
+
+
 def test_self_adjoint():
     system, data, step = SYSTEMS["no constraints"]
     sol = dx.simulate(system, dx.EnergyCollocation(2), step=step, steps=30, **data)

@@ -18,6 +18,12 @@ AT_REST = 1e-7
 TANGENT = 1e-6
 """How far the linearized equations may lead out of a space that they keep, relative to their size."""
 
+OF_STEPS = (
+    "the scheme's relative equilibrium may be another one than that of the system, and symmetries that turn are taken as shifts "
+    "in a step: leave scheme= and step= out for the equations of the system."
+)
+"""Why a relative equilibrium of a system may be none of a step, and the way out."""
+
 RANK = 1e-9
 """Singular values, relative to the largest one, that count as zero."""
 
@@ -92,12 +98,17 @@ def linearize(
 
         dx.linearize(bicycle.MODEL.system, bicycle.straight(5.0), symmetries=bicycle.SYMMETRIES).eigenvalues
 
-    Raises `ValueError` at a place that is no relative equilibrium, and for generators that are no symmetries; `TypeError` for
-    systems without a Lagrangian where symmetries or a scheme are given.
+    Raises `ValueError` for a place of other names, at one that is no relative equilibrium, and for generators that are no
+    symmetries; `TypeError` for systems without a Lagrangian where symmetries or a scheme are given.
     """
     generators = list(symmetries.values()) if isinstance(symmetries, Mapping) else list(symmetries)
     if (scheme is None) != (step is None):
         raise ValueError("a scheme is linearized with its step: give scheme= and step= together, or neither.")
+    wanted = ("x",) if system.lagrangian_form() is None else ("q", "v")
+    if not isinstance(at, Mapping) or not set(wanted) <= set(at):
+        given = f"{', '.join(map(str, at)) or 'nothing'} was given" if isinstance(at, Mapping) else f"{at!r:.80} was given"
+        place = ", ".join(f'"{name}": …' for name in wanted)
+        raise ValueError(f"the place at which a {type(system).__name__} is linearized is {{{place}}}, but {given}.")
     if system.lagrangian_form() is None:
         if scheme is not None or generators:
             raise TypeError(
@@ -112,6 +123,10 @@ def linearize(
 
 
 def _reduced(found: FieldAt, step: float | None) -> Linearization:
+    if step is not None and not found.residual <= AT_REST:
+        raise ValueError(
+            f"the place is no relative equilibrium of the step, which leaves {found.residual:.3g} of its terms: {OF_STEPS}"
+        )
     if not found.residual <= AT_REST:
         raise ValueError(
             f"the place is no relative equilibrium: in the frame that moves with it the equations leave {found.residual:.3g} of "
@@ -124,7 +139,8 @@ def _reduced(found: FieldAt, step: float | None) -> Linearization:
         outside = np.abs(image - space @ (space.T @ image)).max(initial=0.0)
         if outside > TANGENT * size:
             way = "the generators must be symmetries of the system" if name == "the symmetries" else "report this"
-            raise ValueError(f"the linear equations lead out of {name} by {outside:.3g}: {way}.")
+            way = f"{way}." if step is None else OF_STEPS
+            raise ValueError(f"the linear equations lead out of {name} by {outside:.3g}: {way}")
     across = tangent - _project(found.symmetric, tangent)
     basis = _orthonormal(across)
     matrix = found.rate * (basis.T @ found.matrix @ basis)

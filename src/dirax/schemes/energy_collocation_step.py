@@ -153,7 +153,7 @@ class EnergyCollocationStep(AbstractStep):
     def settled(self, before: Array, after: Array, energy: Any, work: Any, size: Any) -> dict[str, Array]:
         """The parts of what is added that belong to the energy at the end, with the work of the step and the size of the
         terms of the energy."""
-        left = jnp.abs((energy - before[-2]) - work) / size
+        left = jnp.abs((energy - before[-2]) - work) / _divisor(size)
         return {"energy": energy - after[-2], "energy_defect": jnp.where(left > before[-1], left, before[-1]) - after[-1]}
 
     @property
@@ -184,4 +184,9 @@ def given_back(left: Any, power: Any, size: Any) -> tuple[Any, Any]:
     """What of the energy `left` out in a step is given back, and by which part of themselves the momenta p change for it, with
     `power` ⟨p, v⟩ and the `size` of the terms of the energy."""
     kept = jnp.where(jnp.abs(left) <= GIVEN_BACK * size, left, 0.0)
-    return kept, kept * power / (power * power + (STEEP * size) ** 2)
+    return kept, kept * power / _divisor(power * power + (STEEP * size) ** 2)
+
+
+def _divisor(terms: Any) -> Any:
+    """The size of terms, 1 where all of them are zero, as at rest."""
+    return jnp.where(terms > 0.0, terms, 1.0)

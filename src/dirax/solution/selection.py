@@ -23,7 +23,8 @@ def select(sol: Some, which: Any) -> Some:
       rows after its last good one; several trajectories, as a batch.
     - `sol[i:j]` of one trajectory: its rows from i to before j.
 
-    Step fields keep the steps between the rows that are left. `initial` is the first row where that is another one.
+    Step fields keep the steps between the rows that are left, events are those between them. `initial` is the first row where
+    that is another one.
 
     Raises `TypeError` for anything else (a row is `sol.q[i]`), `IndexError` for a trajectory that there is not, `ValueError`
     where no row is left and inside `jax.grad`, `jit` or `vmap` for stretches of time.
@@ -89,7 +90,18 @@ def rows_of(sol: Some, rows: range) -> Some:
     if rows.start > 0:
         names = ("q", "p") if "q" in sol.fields else ("x",)
         changes["initial"] = {k: sol.fields[k][(*lead, rows.start)] for k in names if k in sol.fields}
-    return sol.replace(t=sol.axis[rows.start : rows.stop], fields=fields, **changes)
+    part = sol.replace(t=sol.axis[rows.start : rows.stop], fields=fields, **changes)
+    part.events, part.impacts = (_between_rows(sol, found, rows) for found in (sol.events, sol.impacts))
+    return part
+
+
+def _between_rows(sol: Trajectory, found: Any, rows: range) -> Any:
+    """Those of some events between these rows; at the ends of the run, all that are there."""
+    if found is None or is_traced(found.t, sol.t):
+        return found
+    times, t, lanes = sol.times, found.t, found.lane
+    inside = (rows.start == 0) | (t >= times[lanes, rows.start])
+    return found[inside & ((rows.stop >= sol.rows) | (t <= times[lanes, rows.stop - 1]))]
 
 
 def _trajectories(sol: Some, lanes: Any) -> Some:
@@ -117,4 +129,8 @@ def _trajectory(sol: Some, lane: int) -> Some:
     part.ok, part.message = bool(part.ok), part.message[0] if part.message else ""
     nodes = [a.reshape(len(a), -1) for k, a in part.fields.items() if part.field_info[k].place == "node"]
     good = np.flatnonzero(~np.all(np.isnan(np.concatenate(nodes, axis=1)), axis=1))
-    return part if not len(good) or good[-1] == part.rows - 1 else rows_of(part, range(int(good[-1]) + 1))
+    if not len(good) or good[-1] == part.rows - 1:
+        return part
+    ended = rows_of(part, range(int(good[-1]) + 1))
+    ended.events, ended.impacts = part.events, part.impacts  # one may have ended it
+    return ended
