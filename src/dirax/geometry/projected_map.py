@@ -5,12 +5,14 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.squared_angles import norm
 from dirax.program.linear_solves import solve
 from dirax.program.roots import regular_root
+from dirax.program.user_functions import evaluated
 
 
 class Submanifold(AbstractManifold):
@@ -30,8 +32,8 @@ class Submanifold(AbstractManifold):
 
     def _dimension(self) -> int:
         with jax.ensure_compile_time_eval():
-            x = self.projector(jnp.cos(1.0 + jnp.arange(self.ambient_dimension, dtype=float)))
-            trace = float(jnp.trace(jax.jacfwd(self.projector)(x)))
+            x = np.asarray(evaluated(self.projector, np.cos(1.0 + np.arange(self.ambient_dimension))))
+            trace = float(np.trace(np.asarray(evaluated(jax.jacfwd(self.projector), x))))
         if not abs(trace - round(trace)) < 1e-6:
             raise ValueError(
                 f"The projector's derivative has trace {trace:.6g} at a point of its image, where a projector has a "

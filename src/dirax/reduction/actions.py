@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from dirax.numerics.tolerances import ACTION_DEFECT
 from dirax.program.linear_solves import solve
-from dirax.program.user_functions import UserFunction
+from dirax.program.user_functions import UserFunction, evaluated
 from dirax.reduction.connection import check_fibre, fibre_indices
 
 
@@ -99,7 +99,7 @@ class GroupAction(AbstractAction):
 
     def check(self, q: Float[Array, " n"]) -> None:
         """Raise `ValueError` where the function is no action of an abelian group at q."""
-        random, act = np.random.default_rng(0), jax.jit(self.__call__)
+        random, act = np.random.default_rng(0), lambda g, q: np.asarray(evaluated(self.__call__, g, np.asarray(q)))
         shape = self.action.shape(jnp.zeros(self.size), q, None).shape
         if shape != q.shape:
             raise ValueError(f"action(g, q) must return a point like q, of shape {q.shape}, but it returned shape {shape}.")

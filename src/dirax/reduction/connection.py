@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.numerics.tolerances import STRUCTURE_DEFECT
-from dirax.program.user_functions import UserFunction
+from dirax.program.user_functions import UserFunction, evaluated
 
 SAMPLES = 8
 
@@ -187,7 +187,8 @@ class DiscreteConnection(AbstractConnection):
         shape = self.function.shape(jnp.zeros(n), jnp.zeros(n), None).shape
         if shape != (k,):
             raise ValueError(f"one_form(q0, q1) must return shape ({k},), one entry a group coordinate, but it returned {shape}.")
-        form = jax.jit(lambda a, b: self.function(a, b, None))
+        of_points = lambda a, b: self.function(a, b, None)
+        form = lambda a, b: np.asarray(evaluated(of_points, np.asarray(a), np.asarray(b)))
         with jax.ensure_compile_time_eval():
             for _ in range(SAMPLES):
                 q0, q1 = random.normal(size=n), random.normal(size=n)

@@ -258,9 +258,10 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
 def group_inertia_ranks(system: LagrangeDirac, connection: AbstractConnection, q: Numbers, params: Any) -> tuple[int, int]:
     """Ranks of ∂²L/∂ġ² at rest at q and at a point near it: a generator that vanishes at q has no inertia there only."""
     fibre = list(connection.fibre)
-    whole = jax.jit(jax.hessian(lambda v, q: system.lagrangian.at(0.0, q, v, params)))
+    whole = jax.hessian(lambda v, q: system.lagrangian.at(0.0, q, v, params))
     away = np.asarray(q) + 0.1 * np.random.default_rng(0).uniform(0.5, 1.0, q.shape)
-    here, nearby = (np.asarray(whole(jnp.zeros_like(q), jnp.asarray(point)))[np.ix_(fibre, fibre)] for point in (q, away))
+    rest = np.zeros(np.shape(q))
+    here, nearby = (np.asarray(evaluated(whole, rest, np.asarray(at)))[np.ix_(fibre, fibre)] for at in (q, away))
     if not (np.all(np.isfinite(here)) and np.all(np.isfinite(nearby))):
         return len(fibre), len(fibre)
     size = max(np.max(np.abs(nearby)), 1e-300)

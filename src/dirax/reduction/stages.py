@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from dirax.geometry.lie_group import AbstractLieGroup
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.numerics.tolerances import STRUCTURE_DEFECT
+from dirax.program.user_functions import evaluated
 from dirax.reduction.connection import SAMPLES, AbstractConnection, LinearConnection
 from dirax.reduction.euler_poincare import EulerPoincare
 from dirax.reduction.left_invariant import reduced_by_left_translations
@@ -78,12 +79,12 @@ class StagedConnection(AbstractConnection):
         self.first.check(n)
         shapes, random = n - len(self.first.fibre), np.random.default_rng(0)
         self.second.check(shapes)
-        lift = jax.jit(self.first.lift_of_shapes)
         with jax.ensure_compile_time_eval():
             for _ in range(SAMPLES):
                 (x0, x1), move = random.normal(size=(2, shapes)), np.zeros(shapes)
                 move[list(self.second.fibre)] = random.normal(size=len(self.second.fibre))
-                here, there = (np.asarray(lift(x0 + by, x1 + by)) for by in (np.zeros(shapes), move))
+                lifts = (evaluated(self.first.lift_of_shapes, x0 + by, x1 + by) for by in (np.zeros(shapes), move))
+                here, there = map(np.asarray, lifts)
                 defect = float(np.max(np.abs(there - here)))
                 if not defect <= STRUCTURE_DEFECT * (1.0 + float(np.max(np.abs(here)))):
                     raise ValueError(

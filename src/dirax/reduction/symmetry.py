@@ -234,7 +234,7 @@ def translation_symmetries(
     q, v = checked_state(q, np.zeros_like if v is None else v)
     check_lagrangian(system, q, v, params)
     random = np.random.default_rng(0)
-    points = [jnp.asarray(c + radius * random.uniform(-1, 1, (samples, q.size))) for c in (q, v)]
+    points = [c + radius * random.uniform(-1, 1, (samples, q.size)) for c in (q, v)]
 
     constraints = system.constraints
 
@@ -251,7 +251,9 @@ def translation_symmetries(
         inside = jnp.full((1, q.size), along[0](q))  # not finite where L is not
         return jnp.concatenate([*(jnp.reshape(jax.jacfwd(function)(q), (-1, q.size)) for function in along), inside])
 
-    slopes = np.asarray(jax.jit(jax.vmap(at))(jnp.asarray(random.uniform(0, 1, samples)), *points))
+    points = [np.asarray(a, float) for a in (random.uniform(0, 1, samples), *points)]
+    found = in_numpy(at, points, Same(at), for_few=True)
+    slopes = np.asarray(jax.jit(jax.vmap(at))(*points) if found is None else found)
     slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))]
     unit = np.max(np.abs(slopes[:, -1]), initial=0.0)  # the size of L at the points, of which its derivatives are part
     slopes = slopes[:, :-1].reshape(-1, q.size)

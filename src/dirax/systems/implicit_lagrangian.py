@@ -13,7 +13,7 @@ from dirax.numerics.ranks import significant
 from dirax.numerics.tolerances import HESSIAN_RANK
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import gradient, jacobian, once
-from dirax.program.user_functions import constant_entries
+from dirax.program.user_functions import constant_entries, evaluated
 from dirax.systems.forms import ImplicitForm
 from dirax.systems.implicit_form import in_time, names, uses_time, without_time
 
@@ -58,12 +58,13 @@ def implicit_lagrangian(system: Any, stated: Any, near: Any, params: Any) -> Imp
 
 def _momenta(system: Any, q, v, params, t) -> tuple[bool, np.ndarray]:
     """Whether ∂L/∂v is affine in v (at three points around q), and the Hessian ∂²L/∂v² at q."""
-    hessian = jax.jit(lambda q, v: jax.hessian(lambda v: system.lagrangian.at(t, q, v, params))(v))
+    of_lagrangian = jax.hessian(lambda v, q: system.lagrangian.at(t, q, v, params))
+    hessian = lambda q, v: np.asarray(evaluated(of_lagrangian, v, q))
     rng, q, v = np.random.default_rng(0), np.asarray(q), np.asarray(v)
-    here, by_q, by_v = np.asarray(hessian(q, v)), _sizes(q), _sizes(v)
+    here, by_q, by_v = hessian(q, v), _sizes(q), _sizes(v)
     for _ in range(3):
         at = q + 1e-2 * by_q * rng.normal(size=q.shape)
-        one, other = (np.asarray(hessian(at, v + r * by_v * rng.normal(size=q.shape))) for r in (0.0, 0.5))
+        one, other = (hessian(at, v + r * by_v * rng.normal(size=q.shape)) for r in (0.0, 0.5))
         rows, columns = geometric_scales(np.maximum(np.abs(one), np.abs(other)))
         if np.max(np.abs(one - other) / rows / columns) > HESSIAN_RANK * np.max(np.abs(one) / rows / columns):
             return False, here
