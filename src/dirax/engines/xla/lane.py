@@ -100,6 +100,7 @@ def take_step(
 
     def solved(carry, fraction, before, sizes, stage, known):
         linear_solver, increment, jacobian = known
+        residual = jax.jit(stage.residual, inline=True)  # traced once for all the places that it is in
         state, lost, t, status, updates, worst = carry
         left_state = state
         running = status == OK
@@ -107,8 +108,8 @@ def take_step(
         fixed = passing(args, False) if differentiable else args
         guess = stage.guess(fixed[0], jnp.sum(before, axis=0), *fixed[2:])
         guess = jax.lax.stop_gradient(guess) if differentiable else guess
-        u, count, converged = newton_root(stage.residual, guess, fixed, max_iterations, sizes, running, jacobian, linear_solver)
-        new, left = stage.advance(u, *fixed), stage.residual(u, *fixed)
+        u, count, converged = newton_root(residual, guess, fixed, max_iterations, sizes, running, jacobian, linear_solver)
+        new, left = stage.advance(u, *fixed), residual(u, *fixed)
         # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
         nothing, largest = folded((0.0 * left, jnp.add, 0.0), (jnp.abs(left), jnp.maximum, 0.0))
         finite = jnp.isfinite(jnp.sum(0.0 * new) + nothing)
@@ -118,7 +119,7 @@ def take_step(
         worst = jnp.where(status == OK, jnp.maximum(worst, largest), worst)
         if differentiable:
             args = passing(args, status == OK)
-            u = as_function(stage.residual, u, args, linear_solver, jacobian if numerics.sparse else None)
+            u = as_function(residual, u, args, linear_solver, jacobian if numerics.sparse else None)
             new = stage.advance(u, *args)
         if increment is not None:
             new, left_out = compensated_sum(state, lost, increment(u, *args), new)

@@ -85,7 +85,7 @@ def _chunk(
     equation, lanes: Lane, params, sizes: tuple, clock: Clock, capacity: int, axes, max_iterations: int, numerics: Numerics
 ) -> tuple[Lane, dict]:
     """The steps from clock.start to clock.stop: the lanes after them, and the at most `capacity` rows saved on the way."""
-    step = make_step(equation, axes, max_iterations, False, numerics)
+    step = jax.jit(make_step(equation, axes, max_iterations, False, numerics), inline=True)  # traced once for both uses
     row = jax.eval_shape(step, lanes, params, sizes, clock)[1]
     first_row = next_row(clock.start, clock.every)
 
@@ -108,7 +108,7 @@ def _chunk(
 def _unpack_written(equation, axes, packed, params, clock: Clock, count) -> dict:
     """The named arrays of packed rows, of the first `count` of them: unpacking can cost as much as a step."""
     capacity, block = len(packed), min(UNPACKED_ROWS, len(packed))
-    unpack = lambda rows: unpack_rows(equation, axes, rows, params, clock)
+    unpack = jax.jit(lambda rows: unpack_rows(equation, axes, rows, params, clock), inline=True)
     shapes = jax.eval_shape(unpack, packed[:block])
     empty = jax.tree.map(lambda a: jnp.zeros((capacity, *a.shape[1:]), a.dtype), shapes)
 
