@@ -25,5 +25,11 @@ hypothesis.settings.register_profile("dirax", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("dirax")
 
 
+def pytest_collection_modifyitems(items):
+    """The pages of the documentation and walks through the whole package are long: they go first, so that no worker is left with
+    one at the end."""
+    items.sort(key=lambda item: len(item.path.relative_to(item.config.rootpath).parts))
+
+
 def pytest_sessionfinish():
     gc.freeze()  # pytest collects garbage several times when it ends: nothing of what lives now is looked at again
