@@ -313,6 +313,37 @@ def test_friction_is_of_the_normal_force_and_dampers_take_energy():
     assert v @ np.asarray(force) == pytest.approx(-0.7 * speed**2)
 
 
+def test_friction_at_small_speeds_in_other_units():
+    """Slipping at 2⁻¹⁴ of a length in a unit of time: 1e-3 in the user's own units was small in one and large in another."""
+
+    def rate(length, time):
+        model = b.Model(
+            [b.Body("ball", 2.0, (0.1 * length**2,) * 3)],
+            [b.free("ground", "ball")],
+            contacts=[b.ball_contact("ball", "r", motion="slides", friction=0.2)],
+            gravity=(0.0, 0.0, -8.0 * length / time**2),
+            parameters={"r": 0.5 * length},
+        )
+        data = model.state({"ball.z": 0.5 * length}, {"ball.x": 2.0**-14 * length / time, "ball.qx": 0.0, "ball.qy": 0.0})
+        return model.accelerations(**data)["ball.x"] / length * time**2
+
+    plain = rate(1.0, 1.0)
+    assert -1.6 < plain < -0.01 and plain == pytest.approx(-1.6 / np.hypot(1.0, 1e-3 * 2.0 / 2.0**-14), rel=1e-9)
+    assert rate(2.0**-30, 2.0**-7) == pytest.approx(plain, rel=1e-12) == rate(2.0**20, 2.0**12)
+
+
+def test_friction_needs_to_know_which_speeds_are_small():
+    ball = lambda **given: b.Model(
+        [b.Body("ball", 2.0, (0.1, 0.1, 0.1))],
+        [b.free("ground", "ball")],
+        contacts=[b.ball_contact("ball", 0.5, motion="slides", friction=0.2, **given)],
+        gravity=(0.0, 0.0, 0.0),
+    )
+    with pytest.raises(ValueError, match=r"contact 'ball' has friction, but the machine has no gravity.*give the contact creep="):
+        _ = ball().system
+    assert ball(creep=0.01).system.forces is not None
+
+
 def test_a_machine_with_parameters_is_drawn():
     import jax
 

@@ -13,8 +13,6 @@ import numpy as np
 from dirax.bodies.frames import AnyFrame, Number, Vector, across, cross, scalar, unit, vector
 
 ORIGIN = (0.0, 0.0, 0.0)
-TINY_SPEED = 1e-3
-"""Speed of slipping, in the user's units, below which Coulomb friction is proportional to it."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,8 @@ class Contact:
 
     - `motion`: "rolls" without slipping, "skates" along `along` (3,) of the body's frame, or "slides" freely;
     - `spins`: whether it may turn about the normal;
-    - `drag`: force per speed of slipping, and `friction`: the coefficient of Coulomb's law, of what slides;
+    - `drag`: force per speed of slipping, and `friction`: the coefficient of Coulomb's law, of what slides; below the speed
+      `creep` it is proportional to the slipping: a thousandth of √(g ℓ), ℓ the largest length of the machine, unless given;
     - the ground is the plane through `ground` (3,) across `normal` (3,), or the surface over which its joint glides.
     """
 
@@ -69,6 +68,7 @@ class Contact:
     along: Vector = (1.0, 0.0, 0.0)
     drag: Number = 0.0
     friction: Number = 0.0
+    creep: Number = 0.0
     normal: Vector = (0.0, 0.0, 1.0)
     ground: Vector = ORIGIN
 
@@ -110,12 +110,14 @@ class Contact:
             found.append(cross(normal, frame.turn @ unit(self.along)) @ slip)
         return found if self.spins else [*found, normal @ frame.spin]
 
-    def force(self, frame: AnyFrame, normal: Any, pressure: Any, params: Any) -> Any:
+    def force(self, frame: AnyFrame, normal: Any, pressure: Any, creep: Any, params: Any) -> Any:
         """The force (3,) of drag and friction on what slides, under the normal force `pressure`."""
         slip = self.slip(frame, normal, params)
         slip = slip - (normal @ slip) * normal
-        limited = jnp.sqrt(slip @ slip + TINY_SPEED**2)
-        return -(scalar(self.drag, params) + scalar(self.friction, params) * pressure / limited) * slip
+        rate = scalar(self.drag, params)
+        if self.rubs:
+            rate += scalar(self.friction, params) * pressure / jnp.sqrt(slip @ slip + creep**2)
+        return -rate * slip
 
     @property
     def resists(self) -> bool:
@@ -130,7 +132,7 @@ class Contact:
 
 def wheel(body: str, radius: Number, axis: Vector = (0.0, 1.0, 0.0), tube: Number = 0.0, name: str = "", **more: Any) -> Contact:
     """A wheel or disc around `axis` of the body's frame, thin, or with a rim of radius `tube` around the circle of `radius`.
-    `more`: centre=, motion=, spins=, drag=, friction=, normal=, ground=, as of every contact here."""
+    `more`: centre=, motion=, spins=, drag=, friction=, creep=, normal=, ground=, as of every contact here."""
     return Contact(name or body, body, Round(radius, tube, axis), **more)
 
 

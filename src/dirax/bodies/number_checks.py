@@ -98,6 +98,7 @@ def _scalars(model: Any) -> Iterator[tuple[str, Any]]:
     for contact in model.contacts:
         yield f"the drag of contact {contact.name!r}", contact.drag
         yield f"the friction of contact {contact.name!r}", contact.friction
+        yield f"the creep of contact {contact.name!r}", contact.creep
     for force in model.forces:
         names = {Spring: ("stiffness", "length"), Damper: ("rate",), Motor: ("push",)}[type(force)]
         for name in names:

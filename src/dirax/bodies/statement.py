@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from dirax.bodies.forces import Spring
+from dirax.bodies.machine_units import creep, has_creep
 from dirax.geometry.maps import Midpoint, ProductMap
 from dirax.program.tracing import gradient
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -70,13 +71,20 @@ def _forces(model: Any) -> Callable | None:
                 f"contact {contact.name!r} has friction, but its joint keeps it on the ground, or the constraint is left out: "
                 "there is no normal force to see. Let the body hang on the ground by free(), or give the contact a drag."
             )
+        if contact.rubs and not has_creep(model, contact):
+            raise ValueError(
+                f"contact {contact.name!r} has friction, but the machine has no gravity or no length that says which speeds are "
+                "small: give the contact creep=, the speed of slipping below which friction is proportional to it."
+            )
+
+    small_speeds = lambda params: [creep(model, contact, params) if contact.rubs else 0.0 for contact in resisting]
 
     def forces(t, q, v, multipliers, params):
         frames, named = model.frames(q, v, params), (model.named(q), model.named(v))
         pressures = [-multipliers[places[f"{contact.name}: touches"]] if contact.rubs else 0.0 for contact in resisting]
         felt = [
-            contact.force(frames[contact.body], model.demands.normal(contact, q), jnp.maximum(pressure, 0.0), params)
-            for contact, pressure in zip(resisting, pressures, strict=True)
+            contact.force(frames[contact.body], model.demands.normal(contact, q), jnp.maximum(pressure, 0.0), small, params)
+            for contact, pressure, small in zip(resisting, pressures, small_speeds(params), strict=True)
         ]
 
         def power(w):

@@ -33,18 +33,22 @@ def with_tangent(value: Callable[..., Any], tangent: Callable[..., Array], *oper
     return given_p.bind(*map(jnp.asarray, operands), value=value, tangent=tangent, axes=())
 
 
-def implicit(residual: Callable, root: Array, values: Any, solve: Callable[[Array, Array], Array]) -> Array:
+def implicit(residual: Callable, root: Array, values: Any, solve: Callable[..., Array], *known: Array) -> Array:
     """`root` (k,), with its derivatives as the function of `values`, any pytree, that residual(root, values) = 0 makes of it.
 
-    `solve(matrix (k, k), right (k,))` is a solution of the linear system, differentiable itself. What `residual` captures is
-    differentiated by too.
+    `solve(matrix (k, k), right (k,), *known)` is a solution of the linear system, differentiable itself, but for what is `known`
+    of it. What `residual` captures is differentiated by too.
     """
     leaves, structure = jax.tree.flatten(values)
     closed, captured, _ = closed_over(lambda u, *leaves: residual(u, jax.tree.unflatten(structure, leaves)), [root, *leaves])
-    count = len(captured)
+    count, first = len(captured), 1 + len(known)
     left = lambda u, *operands: jaxpr_as_fun(closed)(*operands[:count], u, *operands[count:])[0]
-    tangent = lambda root, operands, along: implicit_tangent(left, root, operands[1:], along[1:], solve)
-    return with_tangent(lambda root, *_: root, tangent, jax.lax.stop_gradient(root), *captured, *leaves)
+
+    def tangent(root, operands, along):
+        solved = lambda matrix, right: solve(matrix, right, *operands[1:first])
+        return implicit_tangent(left, root, operands[first:], along[first:], solved)
+
+    return with_tangent(lambda root, *_: root, tangent, *map(jax.lax.stop_gradient, (root, *known)), *captured, *leaves)
 
 
 def implicit_tangent(residual: Callable, root: Array, operands: Sequence, along: Sequence, solve: Callable) -> Array:

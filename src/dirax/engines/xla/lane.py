@@ -119,7 +119,7 @@ def take_step(
         worst = jnp.where(status == OK, jnp.maximum(worst, largest), worst)
         if differentiable:
             args = passing(args, status == OK)
-            u = as_function(residual, u, args, linear_solver, jacobian if numerics.sparse else None)
+            u = as_function(residual, u, args, linear_solver, jacobian if numerics.sparse else None, sizes)
             new = stage.advance(u, *args)
         if increment is not None:
             new, left_out = compensated_sum(state, lost, increment(u, *args), new)

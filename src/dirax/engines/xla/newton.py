@@ -72,9 +72,10 @@ def as_function(
     args: tuple[Any, ...],
     linear_solver: AbstractLinearSolver | None = None,
     jacobian: Callable[..., Any] | None = None,
+    sizes: Float[Array, " k"] | None = None,
 ) -> Float[Array, " k"]:
     """`root`, with its derivatives as the function of args that residual(root, *args) = 0 makes of it; `jacobian` where the
-    solver takes another matrix than a dense one."""
+    solver takes another matrix than a dense one, `sizes` of the unknowns as above."""
     if root.shape[0] == 0:
         return root
 
@@ -89,12 +90,17 @@ def as_function(
 
         return jax.lax.custom_root(lambda u: residual(u, *args), root, lambda _, u: u, by_jacobian)
 
-    def solved(matrix, right):
-        factors = solver.factorise(jax.lax.stop_gradient(matrix))
-        solve, transposed = (lambda _, b, by=by: by(factors, b) for by in (solver.solve, solver.solve_transposed))
+    def solved(matrix, right, *present):
+        rows, unit = jax.lax.stop_gradient(matrix), 1.0
+        if present:
+            rows, unit = solver.in_units(rows, *present)
+        factors = solver.factorise(rows)
+        solve = lambda _, b: solver.solve(factors, unit * b)
+        transposed = lambda _, b: unit * solver.solve_transposed(factors, b)
         return jax.lax.custom_linear_solve(lambda x: matrix @ x, right, solve, transposed)
 
-    return implicit(lambda u, args: residual(u, *args), root, args, solved)
+    present = () if sizes is None else (jnp.abs(root) + sizes,)
+    return implicit(lambda u, args: residual(u, *args), root, args, solved, *present)
 
 
 def newton(
