@@ -79,12 +79,15 @@ class Runs:
         """Count seconds of runs with this width."""
         self._spent[width] += seconds
 
+    def is_quick(self, width: int) -> bool:
+        """Whether the code for a width, which has been made, is quick."""
+        return self._made[width][1].level == QUICK
+
     def quick_pays(self, width: int, seconds: float) -> bool:
         """Whether quick code is worth its compiling where what there is would run for so long from now on."""
-        if width not in self._made:
+        if width not in self._made or self.is_quick(width):
             return False
-        _, found = self._made[width]
-        return found.level != QUICK and self._spent[width] + seconds > PRICE * found.operations
+        return self._spent[width] + seconds > PRICE * self._made[width][1].operations
 
 
 class Kernels:

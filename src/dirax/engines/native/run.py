@@ -40,7 +40,8 @@ class Ready:
         made = nodes or kernels(p.equation, p.params, p.batch_params, p.compensated)
         self.made = made
         self.width = width_for(p.batch or 1) if nodes is None or nodes.wide else 1
-        _, cached = made.runs.kernel(self.width, self._steps(p))
+        kernel, cached = made.runs.kernel(self.width, self._steps(p))
+        self.quick = kernel if made.runs.is_quick(self.width) else None
         if p.often and isinstance(made, Kernels) and made.record.kept:
             made.of_sizes(self.width, often=True)
         self.first_unknowns = made.record.unknowns(0, p.equation.stages[0][0].unknowns)
@@ -61,7 +62,7 @@ class Ready:
     def __call__(self, p: Problem, progress: Progress | None = None) -> Outcome:
         """Run `p`, as `Native.run` has it."""
         entered, runs = time.perf_counter(), self.made.runs
-        kernel, ready = runs.kernel(self.width, self._steps(p))
+        kernel, ready = (self.quick, True) if self.quick else runs.kernel(self.width, self._steps(p))
         waited = 0.0 if ready else time.perf_counter() - entered
         places = places_of(p, self.made)
         lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
@@ -73,16 +74,18 @@ class Ready:
         try:
             while done < p.steps and (done == p.after or lanes.going):
                 count = min(count, p.steps - done)
-                tick, busy = time.perf_counter(), time.thread_time()
+                tick, busy = time.perf_counter(), 0.0 if self.quick else time.thread_time()
                 lanes.advance(kernel, done, done + count, threads)
                 done += count
                 rate = count / max(time.perf_counter() - tick, 1e-9)
-                busy = time.thread_time() - busy  # of one thread: another program may have the processor
-                runs.spent(self.width, busy)
-                if runs.quick_pays(self.width, busy * (p.steps - done) / count):
-                    tick = time.perf_counter()
-                    kernel, found = runs.kernel(self.width, math.inf)
-                    ready, waited = ready and found, waited + time.perf_counter() - tick
+                if not self.quick:
+                    busy = time.thread_time() - busy  # of one thread: another program may have the processor
+                    runs.spent(self.width, busy)
+                    if runs.quick_pays(self.width, busy * (p.steps - done) / count):
+                        tick = time.perf_counter()
+                        kernel, found = runs.kernel(self.width, math.inf)
+                        ready, waited = ready and found, waited + time.perf_counter() - tick
+                    self.quick = kernel if runs.is_quick(self.width) else None
                 count = max(1, int(rate * CHUNK_SECONDS))
                 threads = lanes.threads if threads > 1 or p.steps - done > rate * WORTH_THREADS else 1
                 if progress:

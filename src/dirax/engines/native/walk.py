@@ -1,5 +1,8 @@
 """A walk by a kernel: its record stays where it is in memory, and the kernel writes every row where it belongs."""
 
+import math
+import time
+
 import numpy as np
 
 from dirax.engines.contract import Problem
@@ -14,7 +17,8 @@ class KernelWalk(AbstractWalk):
     def __init__(self, p: Problem):
         super().__init__(p)
         made = kernels(p.equation, p.params, p.batch_params, p.compensated)
-        self.kernel, self.record = made.runs.kernel(1, p.steps)[0], made.record
+        self.runs, self.record = made.runs, made.record
+        self.kernel, _ = made.runs.kernel(1, p.steps)
         self._memory = np.zeros(self.record.size)
         self._params = np.array(made.step.parameters.flatten(p.params, None), float).ravel()
         self._outs = np.array([self.rows[saved.name].ctypes.data for saved in arrays_saved(p, made)], np.int64)
@@ -26,7 +30,11 @@ class KernelWalk(AbstractWalk):
         memory[record.state_size :] = 0.0
         memory[record.state] = state
         memory[self._unknowns] = unknowns
+        began = time.thread_time()
         self.kernel(*self._at, 1, t, h, 0, first, stop, 1, self.problem.max_iterations)
+        self.runs.spent(1, time.thread_time() - began)
+        if self.runs.quick_pays(1, 0.0):
+            self.kernel, _ = self.runs.kernel(1, math.inf)
         self.state, self.unknowns = memory[record.state].copy(), memory[self._unknowns].copy()
         completed, _, iterations, residual = memory[record.completed :].tolist()
         self.iterations += int(iterations)
