@@ -121,8 +121,8 @@ def test_pivots_of_masses_with_constraints_vanish_nowhere(random):
 
 
 def test_the_bicycle_is_eliminated_alike_wherever_it_heads(random):
-    """The pivots of its accelerations and multipliers, in the midst of a step of Method 2, at any yaw, roll and steer, and at a
-    pitch of zero, with which a constraint's entry by the pitch vanishes."""
+    """The pivots of its accelerations and multipliers, in the midst of a step of Method 2, upright and straight: entries of
+    constraints by pitch, roll and steer vanish, and others where it heads along an axis."""
     system, n, m, c = bicycle.MODEL.system, 9, 4, 2
     equation = dx.make_step_equation(dx.DiscreteDirac(constraints="resolve"), system, dx.Shape(n, m, c))
     program = step_program(equation, None, False)
@@ -131,8 +131,9 @@ def test_the_bicycle_is_eliminated_alike_wherever_it_heads(random):
     base = newton_corrections(g, program, 0).blocks[0]
     places = equation.unknown_layout.split(np.arange(equation.unknowns))
     (part,) = [one for one in base if set(places.a.tolist()) <= set(one.places)]
-    names, many = bicycle.MODEL.coordinates, 200
-    q = {name: random.uniform(-np.pi, np.pi, many) for name in names} | {"frame.pitch": np.zeros(many)}
+    names, many = bicycle.MODEL.coordinates, 201
+    q = {name: random.uniform(-1.0, 1.0, many) for name in names} | {"frame.yaw": np.linspace(0.0, 2.0 * np.pi, many)}
+    q |= {name: np.zeros(many) for name in ("frame.roll", "frame.pitch", "steer")}
     numbers = {str(g.value[node]): random.normal(size=many) for node in g.reachable(part.outputs) if g.op[node] == "input"}
     numbers |= {f"state{i}": q[name] for i, name in enumerate(names)} | {f"u{i}": np.zeros(many) for i in places.moved}
     numbers |= {f"size{i}": np.ones(many) for i in range(equation.unknowns)}
