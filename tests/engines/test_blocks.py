@@ -125,11 +125,12 @@ def test_the_bicycle_is_eliminated_alike_wherever_it_heads(random):
     constraints by pitch, roll and steer vanish, and others where it heads along an axis."""
     system, n, m, c = bicycle.MODEL.system, 9, 4, 2
     equation = dx.make_step_equation(dx.DiscreteDirac(constraints="resolve"), system, dx.Shape(n, m, c))
+    assert isinstance(equation, dx.StepEquation)
     program = step_program(equation, None, False)
     assert program.jacobians  # now the graph has them
     g = program.graph.copy()
     base = newton_corrections(g, program, 0).blocks[0]
-    places = equation.unknown_layout.split(np.arange(equation.unknowns))
+    places = equation.unknown_layout.split(jnp.arange(equation.unknowns))
     (part,) = [one for one in base if set(places.a.tolist()) <= set(one.places)]
     names, many = bicycle.MODEL.coordinates, 201
     q = {name: random.uniform(-1.0, 1.0, many) for name in names} | {"frame.yaw": np.linspace(0.0, 2.0 * np.pi, many)}
