@@ -11,9 +11,11 @@ from dirax import gallery
 from dirax.engines.blocks import FEWEST, blocks
 from dirax.engines.contract import Problem
 from dirax.engines.native.kernels import kernels
-from dirax.engines.newton_step import Factors
+from dirax.engines.newton_step import Factors, newton_corrections
 from dirax.engines.pivot_order import pivot_order, symmetric_signs
 from dirax.engines.policy import engine_of
+from dirax.engines.step_program import step_program
+from dirax.gallery import bicycle
 from dirax.program.graph import Graph
 
 
@@ -116,6 +118,27 @@ def test_pivots_of_masses_with_constraints_vanish_nowhere(random):
         *found, stable = g.evaluate(outputs, numbers)
         assert stable
         np.testing.assert_allclose(found, np.linalg.solve(dense, values), rtol=1e-11)
+
+
+def test_the_bicycle_is_eliminated_alike_wherever_it_heads(random):
+    """The pivots of its accelerations and multipliers, in the midst of a step of Method 2, upright and straight: entries of
+    constraints by pitch, roll and steer vanish, and others where it heads along an axis."""
+    system, n, m, c = bicycle.MODEL.system, 9, 4, 2
+    equation = dx.make_step_equation(dx.DiscreteDirac(constraints="resolve"), system, dx.Shape(n, m, c))
+    assert isinstance(equation, dx.StepEquation)
+    program = step_program(equation, None, False)
+    assert program.jacobians  # now the graph has them
+    g = program.graph.copy()
+    base = newton_corrections(g, program, 0).blocks[0]
+    places = equation.unknown_layout.split(jnp.arange(equation.unknowns))
+    (part,) = [one for one in base if set(places.a.tolist()) <= set(one.places)]
+    names, many = bicycle.MODEL.coordinates, 201
+    q = {name: random.uniform(-1.0, 1.0, many) for name in names} | {"frame.yaw": np.linspace(0.0, 2.0 * np.pi, many)}
+    q |= {name: np.zeros(many) for name in ("frame.roll", "frame.pitch", "steer")}
+    numbers = {str(g.value[node]): random.normal(size=many) for node in g.reachable(part.outputs) if g.op[node] == "input"}
+    numbers |= {f"state{i}": q[name] for i, name in enumerate(names)} | {f"u{i}": np.zeros(many) for i in places.moved}
+    numbers |= {f"size{i}": np.ones(many) for i in range(equation.unknowns)}
+    assert g.evaluate([part.stable], numbers)[0].all()
 
 
 def test_of_symmetric_matrices_half_is_eliminated():

@@ -72,3 +72,22 @@ def test_opposite_nodes_and_zeros():
     nothing = every.add(a, opposite)
     one, other, zero = without_equals(g, every, [a, opposite, nothing])
     assert other == g.neg(one) and zero == g.zero
+
+
+def test_nothing_finite_is_replaced_by_what_is_not():
+    """(y + y x²)/y, which was there before, is no stand-in for 1 + x², but that is for others like it, and 2 for (y + y)/y."""
+    g = Graph()
+    x, y = g.input("x"), g.input("y")
+    square, over = g.mul(x, x), g.recip(y)
+    quotient, two = g.mul(g.add(y, g.mul(y, square)), over), g.mul(g.add(y, y), over)
+    every = g.copy()
+    plain = every.add(every.one, square)
+    other = every.sub(every.mul(every.add(x, every.one), every.add(x, every.one)), every.add(x, x))
+    split = every.add(every.mul(every.mul(y, square), over), every.mul(y, over))
+    outputs = [quotient, plain, other, split, two, every.constant(2.0), every.mul(every.mul(y, every.constant(2.0)), over)]
+    found = without_equals(g, every, outputs)
+    assert found[0] == quotient and g.number(found[4]) == 2.0
+    assert found[1] == found[2] == found[3] != quotient and found[4] == found[5] == found[6]
+    numbers = {"x": np.array(0.7), "y": np.array(0.0)}
+    with np.errstate(all="ignore"):
+        assert np.isfinite(g.evaluate(found, numbers)).tolist() == [False, *[True] * 6]

@@ -9,34 +9,55 @@ circle; of other functions it is known alone that they are equal where their arg
 import math
 import random
 from collections.abc import Hashable, Iterable
+from functools import reduce
+from operator import or_
 
 from dirax.program.graph import Graph
 
 PRIME = 2**61 - 1
 
+TOTAL = frozenset(("add", "sub", "mul", "neg", "sin", "cos"))
+"""Operations whose values are finite wherever their operands are: they bring no nan into what holds them."""
+
 
 def without_equals(target: Graph, source: Graph, outputs: list[int]) -> list[int]:
     """The nodes of `target` that are equal to the `outputs` of `source`, a copy of it with more nodes: of nodes that are equal,
-    or opposite, one alone is taken over. Raises `GraphTooLarge`."""
+    or opposite, one alone is taken over, but none in place of another that is finite where it is not. Raises `GraphTooLarge`."""
     first, nodes = len(target), source.reachable(outputs)
-    values = values_modulo_prime(source, nodes)
+    values, risks = values_modulo_prime(source, nodes), _risks(source, nodes)
     found: dict[int, int] = {}
-    known: dict[int, int] = {0: target.zero}
+    known: dict[int, tuple[int, int]] = {}
     for node in nodes:
-        value = values[node]
-        if value in known:
-            found[node] = known[value]
+        value, risk = values[node], risks[node]
+        same, opposite = known.get(value), known.get(PRIME - value)
+        if source.is_constant(node):
+            found[node] = target.constant(source.value[node])
+        elif value == 0:
+            found[node] = target.zero
+        elif same is not None and not same[1] & ~risk:
+            found[node] = same[0]
         elif node < first:
             found[node] = node
-        elif (opposite := known.get(PRIME - value)) is not None:
-            found[node] = target.neg(opposite)
-        elif source.is_constant(node):
-            found[node] = target.constant(source.value[node])
+        elif opposite is not None and not opposite[1] & ~risk:
+            found[node] = target.neg(opposite[0])
         else:
             found[node] = target.make(source.op[node], *(found[a] for a in source.args[node]))
-        if not source.is_boolean(node):
-            known.setdefault(value, found[node])
+        if not source.is_boolean(node) and (same is None or (risk != same[1] and not risk & ~same[1])):
+            known[value] = found[node], risk
     return [found[node] for node in outputs]
+
+
+def _risks(g: Graph, nodes: Iterable[int]) -> dict[int, int]:
+    """For each of these nodes, of which operands come first, a bit for every node below it, and itself, that may be infinite or
+    nan where its own operands are finite."""
+    found: dict[int, int] = {}
+    own = 1
+    for node in nodes:
+        found[node] = reduce(or_, (found[a] for a in g.args[node]), 0)
+        if g.args[node] and g.op[node] not in TOTAL:
+            found[node] |= own
+            own <<= 1
+    return found
 
 
 def values_modulo_prime(g: Graph, nodes: Iterable[int]) -> dict[int, int]:
