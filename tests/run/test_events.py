@@ -1,6 +1,7 @@
 """Events: found to the last digits, none is missed, both engines, batches, ends, and what is refused."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -124,3 +125,13 @@ def test_many_steps_are_looked_through_as_few_are(scheme, monkeypatch):
     few, many = found
     assert len(few) > 200 and np.array_equal(few.t, many.t) and np.array_equal(few.q, many.q)
     assert np.array_equal(few.index, many.index) and np.array_equal(few.lane, many.lane)
+
+
+def test_an_entry_that_there_is_not_is_refused_and_one_looked_up_is_not():
+    free = dx.LagrangeDirac(lambda q, v: v @ v / 2)
+    start = {"q": [1.0, 0.0], "v": [0.0, 1.0], "step": 0.1, "steps": 5}
+    for event in (dx.Event(lambda q: q[7]), dx.Impact(lambda q: 2.0 + q[7])):
+        with pytest.raises(ValueError, match=r"events\[0\] reads an entry that its arguments do not have"):
+            dx.simulate(free, dx.LagrangeDAlembert(), events=[event], **start)
+    looked_up = dx.Event(lambda q: q[jnp.argmax(q)] - 0.5 + jnp.array([0.0, 1.0])[jnp.int64(q[0] > 7)])
+    assert not len(dx.simulate(free, dx.LagrangeDAlembert(), events=[looked_up], **start).events)

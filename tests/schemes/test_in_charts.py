@@ -105,3 +105,17 @@ def test_a_change_of_chart_leaves_the_guess_behind(engine):
     plain = dx.simulate(system, dx.DiscreteDirac(dx.RiemannianExp(dx.Sphere(3))), **start)
     assert charted.ok and len(np.unique(charted.chart, axis=0)) > 5
     np.testing.assert_allclose(charted.q, plain.q, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("made", "words"),
+    [
+        (lambda: dx.InCharts(dx.LagrangeDAlembert()), r"such as dx.SphereProjection\(\), but LagrangeDAlembert.* themselves"),
+        (lambda: dx.InCharts(dx.SphereProjection(), dx.Sphere(3)), r"atlas must be a dx.Atlas, but Sphere"),
+        (lambda: dx.Adjoint("midpoint"), r"such as dx.PlusLagrangeDirac\(\), but 'midpoint' was given\."),
+        (lambda: dx.SymmetricComposition(dx.PlusLagrangeDirac), "add parentheses"),
+    ],
+)
+def test_parts_that_are_none_are_refused_where_they_are_given(made, words):
+    with pytest.raises(TypeError, match=words):
+        made()

@@ -266,6 +266,13 @@ def _indexes(jaxpr) -> bool:
     return any(e.primitive.name in INDEXING for e in jaxpr.eqns) or any(map(_indexes, inner))
 
 
+def reads_outside(jaxpr: Any) -> bool:
+    """Whether an index of a closed jaxpr is outside of its array whatever the values are: JAX would read another entry."""
+    from dirax.program.evaluation.indices import reads_outside
+
+    return _indexes(jaxpr.jaxpr) and reads_outside(jaxpr)
+
+
 def _reads_inside(jaxpr, values) -> bool:
     from dirax.program.evaluation.indices import reads_inside
 

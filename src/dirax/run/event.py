@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from dirax.program.user_functions import reads_outside
 from dirax.text.representation import value_text
 
 KNOWN = ("t", "q", "v", "p", "x", "params")
@@ -55,6 +56,10 @@ class Event:
         own = getattr(self.function, "__name__", type(self.function).__name__).replace("<lambda>", "lambda")
         settings = f", direction={self.direction:+d}" * bool(self.direction) + ", terminal=True" * self.terminal
         return f"Event({own}({', '.join(self.arguments)}){settings})"
+
+
+class OutsideIndex(ValueError):
+    """A function reads an entry that there is not, of which JAX would make another one."""
 
 
 def names_of(function: Any, what: str, known: tuple[str, ...] = KNOWN) -> tuple[str, ...]:
@@ -115,7 +120,10 @@ def evaluated(event: Event, number: int, known: dict[str, Any], params: Any) -> 
     return found
 
 
-def captures_traced(function: Callable, *arguments: Any) -> tuple[Any, bool]:
-    """The shape of what a function returns, and whether it closes over values that JAX traces."""
+def captures_traced(what: str, function: Callable, *arguments: Any) -> tuple[Any, bool]:
+    """The shape of what a function returns, and whether it closes over values that JAX traces. Raises `OutsideIndex`."""
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
-    return shape, any(isinstance(value, Tracer) for value in closed.consts)
+    traced = any(isinstance(value, Tracer) for value in closed.consts)
+    if not traced and reads_outside(closed):
+        raise OutsideIndex(f"{what} reads an entry that its arguments do not have: check its indices.")
+    return shape, traced

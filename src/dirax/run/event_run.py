@@ -57,7 +57,8 @@ def _capture_traced(sol: Solution, events: tuple[Any, ...]) -> bool:
         if isinstance(event, Event):
             refuse_unknown(event, number, nodes)
             own = {name: known[name] for name in event.arguments if name in known}
-            if captures_traced(lambda own, number=number, event=event: evaluated(event, number, own, sol.params_of_one), own)[1]:
+            value = lambda own, number=number, event=event: evaluated(event, number, own, sol.params_of_one)
+            if captures_traced(f"the function of events[{number}]", value, own)[1]:
                 return True
     return False
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dirax.engines.contract import Outcome, Problem, finished
 from dirax.program.memo import Memo, Same
-from dirax.run.event import captures_traced
+from dirax.run.event import OutsideIndex, captures_traced
 from dirax.run.flight import Flight, alerted
 from dirax.run.impact import Impact, Numbers, gaps_of, jump
 from dirax.run.impact_search import ImpactSearch
@@ -145,7 +145,9 @@ def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tup
     traced = False
     for wall, number in zip(walls, numbers, strict=True):
         try:
-            found, seen = captures_traced(wall, t, q, own)
+            found, seen = captures_traced(f"the gap of events[{number}]", wall, t, q, own)
+        except OutsideIndex:
+            raise
         except Exception as error:
             raise TypeError(
                 f"the gap of events[{number}] could not be traced by JAX: {type(error).__name__}: "

@@ -31,8 +31,7 @@ class Composition(AbstractScheme):
     coefficients: tuple[float, ...]
 
     def __init__(self, scheme: AbstractScheme, coefficients: str | Sequence[float] = "suzuki4"):
-        if not isinstance(scheme, AbstractScheme):
-            raise TypeError(f"scheme must be a dirax scheme, but {scheme!r} was given.")
+        _check_scheme(scheme)
         if isinstance(coefficients, str):
             if coefficients not in COEFFICIENTS:
                 raise ValueError(
@@ -68,6 +67,9 @@ class Adjoint(AbstractScheme):
 
     scheme: AbstractScheme
 
+    def __check_init__(self):
+        _check_scheme(self.scheme)
+
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         return _adjoint_of(self.scheme, system, shape, "Adjoint takes a one-stage scheme: compose the parts' adjoints instead.")
 
@@ -88,6 +90,9 @@ class SymmetricComposition(AbstractScheme):
 
     scheme: AbstractScheme
 
+    def __check_init__(self):
+        _check_scheme(self.scheme)
+
     def step_equation(self, system: Any, shape: Shape) -> StepSequence:
         refusal = "SymmetricComposition takes a one-stage scheme."
         adjoint = _adjoint_of(self.scheme, system, shape, refusal, part=True)
@@ -99,6 +104,13 @@ class SymmetricComposition(AbstractScheme):
     @property
     def constraints_at_rows(self) -> bool:
         return self.scheme.constraints_at_rows
+
+
+def _check_scheme(scheme: Any) -> None:
+    """Raise `TypeError` for something that is no scheme."""
+    if not isinstance(scheme, AbstractScheme):
+        way = ": add parentheses." if isinstance(scheme, type) else "."
+        raise TypeError(f"scheme must be a dirax scheme such as dx.PlusLagrangeDirac(), but {scheme!r} was given{way}")
 
 
 def between_the_parts(scheme: AbstractScheme) -> str:

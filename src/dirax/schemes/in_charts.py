@@ -20,6 +20,7 @@ class InCharts(AbstractScheme):
     charts compatible with the manifold's retraction ([RL] Definition 6.2), left where half of the domain is used. The state is
     (m, r, p): the centre of the chart and the coordinates in it. Without one-forms and forces symplectic on T*Q; second order
     for a symmetric map. The saved p is the mean of the momenta before and after the impulse of the one-forms.
+    Raises `TypeError` for a map or an atlas that is none.
 
     `dx.PlusLagrangeDirac`, `dx.MinusLagrangeDirac` and `dx.LagrangeDAlembert` are the schemes of L_d and constraints of other
     kinds, a user's own among them, with the same charts.
@@ -27,6 +28,15 @@ class InCharts(AbstractScheme):
 
     map: AbstractDiscretizationMap
     atlas: Atlas | None = None
+
+    def __check_init__(self):
+        if not isinstance(self.map, AbstractDiscretizationMap):
+            raise TypeError(
+                f"map must be a discretization map such as dx.SphereProjection(), but {self.map!r} was given: the schemes of a "
+                "discrete Lagrangian, dx.LagrangeDAlembert() among them, step a dx.ManifoldLagrangian themselves."
+            )
+        if not isinstance(self.atlas, Atlas | None):
+            raise TypeError(f"atlas must be a dx.Atlas, but {self.atlas!r} was given.")
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
         return PairsInCharts(lagrangian_in_charts(system, self.map, self.map), step, shape, share=MOMENTA["mean"])

@@ -15,7 +15,18 @@ from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable
 def reads_inside(jaxpr: Any, values: tuple | None) -> bool:
     """Whether every index of a closed jaxpr is inside its array at these values, at any by default; False where that is not
     found."""
-    inside: list[bool] = []
+    found = _indices(jaxpr, values)
+    return found is not None and all(found)
+
+
+def reads_outside(jaxpr: Any) -> bool:
+    """Whether an index of a closed jaxpr is outside of its array whatever the values are."""
+    return False in (_indices(jaxpr, None) or ())
+
+
+def _indices(jaxpr: Any, values: tuple | None) -> list[bool | None] | None:
+    """Whether each index is inside its array, None where that depends on more than these values; None where not all are found."""
+    inside: list[bool | None] = []
 
     def watched(name: str) -> Callable:
         def read(interpreter: Interpreter, equation: Any, x: Nodes, *starts: Nodes):
@@ -33,15 +44,15 @@ def reads_inside(jaxpr: Any, values: tuple | None) -> bool:
             operands = [interpreter.constants(leaf) for leaf in jax.tree.leaves(values)]
         results = interpreter.run(jaxpr, *operands)
     except GraphTooLarge:
-        return False
-    return all(inside) and not any(isinstance(result, Unavailable) for result in results)
+        return None
+    return None if any(isinstance(result, Unavailable) for result in results) else inside
 
 
 def _unknown(graph: Graph, name: str, shape: tuple[int, ...]) -> Nodes:
     return np.array([graph.input(f"{name}_{i}") for i in range(math.prod(shape))], np.int64).reshape(shape)
 
 
-def _inside(interpreter: Interpreter, equation: Any, shape: tuple[int, ...], starts: tuple[Nodes, ...]) -> bool:
+def _inside(interpreter: Interpreter, equation: Any, shape: tuple[int, ...], starts: tuple[Nodes, ...]) -> bool | None:
     p = equation.params
     if equation.primitive.name == "gather":
         axes, indices = p["dimension_numbers"].start_index_map, starts[0]
@@ -49,4 +60,4 @@ def _inside(interpreter: Interpreter, equation: Any, shape: tuple[int, ...], sta
         axes, indices = range(len(shape)), np.stack(starts, axis=-1)
     known = interpreter.static(indices)
     last = np.array([shape[axis] - p["slice_sizes"][axis] for axis in axes])
-    return known is not None and bool(np.all((known >= 0) & (known <= last)))
+    return None if known is None else bool(np.all((known >= 0) & (known <= last)))
