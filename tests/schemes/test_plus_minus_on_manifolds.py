@@ -167,7 +167,7 @@ def test_on_a_group_left_invariant_systems_are_reduced_to_its_algebra(system, sc
     if system is BODY:  # the momentum map of left translations
         turned = lambda q, p: SO3.matrix(q) @ SO3.body_momentum(q, p)
         spatial = np.array([turned(q, p) for q, p in zip(jnp.asarray(whole.q[::10]), jnp.asarray(whole.p[::10]), strict=True)])
-        assert np.ptp(spatial, axis=0).max() < 1e-13
+        assert np.ptp(spatial, axis=0).max() < 3e-13  # roundoff of a step is ε/h of them
 
 
 def test_the_midpoint_equations_are_those_of_the_geodesic_map_in_any_atlas():
