@@ -18,8 +18,12 @@ gc.set_threshold(50_000, 20, 100)  # tracing makes many objects that live
 import hypothesis
 import jax
 
+from dirax.engines.native import kernels
+
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+kernels.FEW = 0  # code of few operations is compiled with little optimization too, which changes no bit
 
 hypothesis.settings.register_profile("dirax", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("dirax")
