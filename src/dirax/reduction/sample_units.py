@@ -43,21 +43,21 @@ def sample_units(value: Callable, constraints: Any, q: np.ndarray, v: np.ndarray
     @once
     def numbers(q, v, params):
         of_both = lambda both: value(both[:n], both[n:], params)
-        slope, both = gradient(of_both), jnp.concatenate([q, v])
+        by_both, both = gradient(of_both), jnp.concatenate([q, v])
         rows = [jnp.zeros((0, n))]
         if constraints is not None and constraints.any:
             rows.append(constraints.matrix(0.0, q, params))
-        return of_both(both), slope(both), jacobian(slope)(both), jnp.concatenate(rows)
+        return of_both(both), by_both(both), jacobian(by_both)(both), jnp.concatenate(rows)
 
-    value, slope, bend, rows = (np.asarray(a) for a in evaluated(numbers, q, v, params))
-    if not all(np.all(np.isfinite(a)) for a in (value, slope, bend, rows)):
+    size, slope, bend, rows = (np.asarray(a) for a in evaluated(numbers, q, v, params))
+    if not all(np.all(np.isfinite(a)) for a in (size, slope, bend, rows)):
         return SampleUnits.plain(n)
     time, energy, first = n, n + 1, n + 2
     places, rates = np.tile(np.arange(n), 2), np.repeat([0.0, 1.0], n)
     terms = Terms(first + len(rows))
     one = np.zeros(1, int)
-    if value != 0.0:
-        terms.add(value[None], one, (energy + one, 1.0))
+    if size != 0.0:
+        terms.add(size[None], one, (energy + one, 1.0))
     i = np.flatnonzero(slope)
     terms.add(slope[i], 0 * i, (energy + 0 * i, 1.0), (places[i], -1.0), (time + 0 * i, rates[i]))
     i, j = np.nonzero(bend)

@@ -92,7 +92,7 @@ def check_invariance(
 
 def units_of(system: Any, q: np.ndarray, v: np.ndarray, params: Any) -> SampleUnits:
     """The units at a point of a system with a Lagrangian in coordinates; 1 for any other."""
-    form = with_lagrangian(system)
+    form: Any = with_lagrangian(system)
     in_coordinates = isinstance(form, AbstractSystem) and form.lagrangian_form() is form
     if not in_coordinates:
         return SampleUnits.plain(q.size)
