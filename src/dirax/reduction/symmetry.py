@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -93,14 +93,17 @@ def check_invariance(
 def units_of(system: Any, q: np.ndarray, v: np.ndarray, params: Any) -> SampleUnits:
     """The units at a point of a system with a Lagrangian in coordinates; 1 for any other."""
     form: Any = with_lagrangian(system)
-    in_coordinates = isinstance(form, AbstractSystem) and form.lagrangian_form() is form
-    if not in_coordinates:
+    if getattr(form, "lagrangian_form", lambda: None)() is not form:
         return SampleUnits.plain(q.size)
     return sample_units(lambda q, v, params: form.lagrangian.at(0.0, q, v, params), form.constraints, q, v, params)
 
 
-def sampled_near(q: np.ndarray, v: np.ndarray, units: SampleUnits, radius: float, samples: int) -> tuple[np.ndarray, ...]:
-    """Times, points and velocities, (1 + samples, …) each: (q, v) at t = 0, and random ones within `radius`, in these units."""
+Samples: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Times (1 + samples,), points and velocities, (1 + samples, n) each."""
+
+
+def sampled_near(q: np.ndarray, v: np.ndarray, units: SampleUnits, radius: float, samples: int) -> Samples:
+    """(q, v) at t = 0, and random points and velocities within `radius` of them at random times, in these units."""
     random = np.random.default_rng(0)
     away = lambda unit: np.concatenate([np.zeros((1, q.size)), radius * unit * random.uniform(-1, 1, (samples, q.size))])
     return units.time * times(1 + samples), q + away(units.q), v + away(units.v)
