@@ -11,6 +11,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "dirax"
 
 # A module may import from its own room and from those before it. "__init__" is the package itself: its public names.
 ROOMS = (
+    "interruption",
     "float64",
     "text",
     "numerics",

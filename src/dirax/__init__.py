@@ -7,6 +7,10 @@ engines, solution, run, diagnostics, sweeps, show, bodies, gallery, cli. The pub
 JAX with them, are imported where the first of them is used.
 """
 
+from dirax.interruption import end_where_program
+
+end_where_program()
+
 import ast
 from functools import cache
 from importlib import import_module

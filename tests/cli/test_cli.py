@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -339,3 +340,38 @@ sys.meta_path.insert(0, Interrupts())
 """
     status, out, err = ended(program("run", "kepler", before=before))
     assert (status, out, err.strip()) == (130, "", "dirax: interrupted.")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("moment", ["ast", "dirax.float64", "dirax.cli", "dirax.cli.terminal"])
+@pytest.mark.parametrize("started", ["module", "script"])
+def test_an_interruption_while_the_package_is_loaded(moment, started, tmp_path):
+    """Before the commands can see to it, of `python -m dirax` and of the script `dirax`."""
+    interrupts = f"""
+import os, signal, sys
+class Interrupts:
+    def find_spec(self, name, path=None, target=None):
+        if name == {moment!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupts())
+sys.modules.pop("ast", None)
+"""
+    (tmp_path / "sitecustomize.py").write_text(interrupts)
+    (tmp_path / "dirax").write_text("from dirax.cli import main\nmain()\n")
+    (tmp_path / "bin").mkdir()
+    script = (tmp_path / "dirax").rename(tmp_path / "bin" / "dirax")
+    path = os.pathsep.join([str(tmp_path), str(Path(dx.__file__).parents[1])])
+    command = ["-m", "dirax"] if started == "module" else [str(script)]
+    process = subprocess.Popen(
+        [sys.executable, *command, "list"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": path},
+    )
+    status, out, err = ended(process)
+    assert (status, out, err.strip()) == (130, "", "dirax: interrupted.")
+
+
+def test_another_program_keeps_its_own_interruptions():
+    code = "import signal, dirax; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "True"

@@ -122,7 +122,7 @@ def test_mistakes():
     ):
         run(DISK, dx.reduce(DISK.system, dx.LinearConnection([0, 1])), DiscreteRouth(), 3)
     dragged = dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v: -v * q[0])
-    with pytest.raises(ValueError, match=r"forces f\(t, q, v\) move: f has the part -0\.\d+ along q\[1\] at"):
+    with pytest.raises(ValueError, match=r"forces f\(t, q, v\) move: f has the part -?0\.\d+ along q\[1\] at"):
         dx.simulate(dx.reduce(dragged, dx.LinearConnection([1])), DiscreteRouth(), q=[0.0, 0.0], v=[0.1, 0.2], step=0.1, steps=3)
     drifting = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 + v[0] * v[1])
     with pytest.raises(ValueError, match=r"singular value at the initial data: the group inertia .* rank 0 of 1"):

@@ -123,3 +123,21 @@ def test_small_units_hide_no_asymmetry():
                 dx.simulate(reduced, dx.DiscreteRouth(), **start)
         else:
             assert dx.simulate(reduced, dx.DiscreteRouth(), **start).ok
+
+
+@pytest.mark.parametrize("unit", [(1.0, 1.0, 1.0), (2.0**-33, 2.0**-80, 2.0**-40), (2.0**33, 2.0**80, 2.0**10)])
+def test_symmetries_in_other_units(unit):
+    """Of lengths and an angle: with lengths of 1e-10, a potential of the angle alone was too small beside ∂L/∂x to be seen."""
+    length, mass, time = unit
+    energy = mass * length**2 / time**2
+
+    def lagrangian(q, v):
+        kinetic = mass * (1.3 * v[0] ** 2 + 0.7 * v[2] ** 2 + 0.6 * length**2 * v[1] ** 2) / 2
+        return kinetic - energy * (0.3 * jnp.cos(q[0] / length) + 0.2 * jnp.sin(q[1]))
+
+    system, sizes = dx.LagrangeDirac(lagrangian), np.array([length, 1.0, length])
+    q, v = np.array([0.3, 0.4, 0.5]) * sizes, np.array([0.1, 0.2, 0.3]) * sizes / time
+    assert cyclic_coordinates(system, q, v) == (2,) == cyclic_coordinates(system, 0 * q)
+    assert [bool(check_invariance(system, Translations([i]), q=q, v=v)) for i in range(3)] == [False, False, True]
+    sliding = GroupAction(lambda g, q: q + g[0] * np.array([0.0, 0.0, length]), 1)
+    assert check_invariance(system, sliding, q=q)

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -284,8 +285,8 @@ def test_derivatives_in_other_units(engine):
     def derivatives(units: Units, by: Callable):
         q, time = np.array([units.of(d) for d in straight.coordinates]), units.of(TIME)
         params = {name: value * units.of(d) for name, (value, d) in straight.params.items()}
-        settings = {"q": np.array(straight.data["q"]) * q, "step": straight.step * time, "steps": 8, "engine": engine}
-        given = settings | {"check_initial": False}
+        given: dict[str, Any] = {"q": np.array(straight.data["q"]) * q, "step": straight.step * time, "steps": 8}
+        given |= {"engine": engine, "check_initial": False}
         end = lambda v, m: dx.simulate(system, dx.DiscreteDirac(), v=v, params=params | {"m": m}, **given).q[-1]
         by_v, by_m = by(end, (0, 1))(jnp.array(straight.data["v"]) * q / time, jnp.array(params["m"]))
         return np.asarray(by_v) / q[:, None] * q / time, np.asarray(by_m) / q * units.of(MASS)

@@ -11,19 +11,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from dirax.interruption import INTERRUPTED
+from dirax.interruption import end as end_now
+
 SIMPLER = {"─": "-", "–": "-", "—": "-", "−": "-", "…": "...", "’": "'", "≤": "<=", "≥": ">=", "·": "."}
 """What takes the place of signs that an encoding lacks; Greek letters are written out, others lose their accents."""
-
-
-INTERRUPTED = 128 + signal.SIGINT
-"""The exit status of a program that was interrupted, as shells give it."""
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
     """After Ctrl-C inside the block the exit status is INTERRUPTED, whatever became of the interruption, and there is no
     traceback; after the block Ctrl-C ends the process at once."""
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # such as in the background: nothing is heard
+    # another handler, such as in the background: nothing is heard
+    if signal.getsignal(signal.SIGINT) not in (signal.default_int_handler, end_now):
         yield
         return
     heard = False

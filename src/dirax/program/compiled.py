@@ -11,8 +11,8 @@ from dirax.program.alarms import without_alarms
 from dirax.program.memo import Memo
 
 KEPT = 96
-"""Functions kept in memory: those of some thirty systems on the xla engine, whose executables take 140 memory maps and up to
-ten megabytes a system, of the 65 530 maps that a process may have."""
+"""Functions kept in memory: a run on the xla engine has one, whose executable takes 130 memory maps and four megabytes or more,
+of the 65 530 maps that a process may have."""
 
 _jitted: Memo[Callable] = Memo(KEPT)
 

@@ -15,7 +15,8 @@ from dirax.program.memo import Memo
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.actions import AbstractAction, Translations
 from dirax.reduction.connection import AbstractConnection
-from dirax.reduction.symmetry import discrete_invariance, invariance, times
+from dirax.reduction.sample_units import SampleUnits
+from dirax.reduction.symmetry import discrete_invariance, invariance, sampled_near, units_of
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
@@ -52,7 +53,7 @@ class AbstractReducedSystem(AbstractSystem):
         """Whether μ is a constant of the motion whatever the functions."""
 
     @abstractmethod
-    def sampled(self, data: Data) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def sampled(self, data: Data, params: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times, points and velocities, (1 + SAMPLES, …) each: the initial data, at t = 0, and random ones near them."""
 
     @abstractmethod
@@ -109,7 +110,7 @@ class AbstractReducedSystem(AbstractSystem):
         concrete; empty where nothing does."""
         if self.system.forces is None and self.system.one_forms is None:
             return ""
-        t, q, v = self.sampled(data)
+        t, q, v = self.sampled(data, params)
         parts, sizes = (np.asarray(a) for a in evaluated(self._parts_along, t, q, v, params))
         largest = np.max(np.where(np.isfinite(sizes), sizes, 0.0), axis=0)
         defects = np.abs(parts) / np.where(largest > 0, largest, 1.0)[:, None]
@@ -191,12 +192,14 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
         """G = ∂g/∂q of invariant holonomic constraints has no part along the group."""
         return self.system.forces is None and self.system.one_forms is None
 
-    def sampled(self, data: Data) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def sampled(self, data: Data, params: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        q, units = np.asarray(data["q"] if "q" in data else data["q0"]), self._units(data, params)
+        v = np.asarray(data["v"]) if "v" in data else units.v
+        return sampled_near(q, v, units, NEARBY, SAMPLES)
+
+    def _units(self, data: Data, params: Any) -> SampleUnits:
         q = np.asarray(data["q"] if "q" in data else data["q0"])
-        v = np.asarray(data["v"]) if "v" in data else np.ones_like(q)
-        random = np.random.default_rng(0)
-        nearby = lambda a: np.concatenate([a[None], a + NEARBY * random.uniform(-1, 1, (SAMPLES, a.size))])
-        return times(1 + SAMPLES), nearby(q), nearby(v)
+        return units_of(self.system, q, np.asarray(data["v"]) if "v" in data else np.zeros_like(q), params)
 
     def named(self, generator: int) -> str:
         return f"q[{self.connection.fibre[generator]}]"
@@ -226,8 +229,8 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
 
     def refuse_asymmetric(self, functions: dict[str, UserFunction], data: Data, h: float, params: Any) -> None:
         """Raise `ValueError` where functions of ([t, ]q0, q1, h[, params]) are not invariant, at data that must be concrete."""
-        t, q, v = self.sampled(data)
-        found = discrete_invariance(functions, self.action, t, q, q + h * v, h, params)
+        t, q, v = self.sampled(data, params)
+        found = discrete_invariance(functions, self.action, t, q, q + h * v, h, params, self._units(data, params))
         if not found.ok:
             worst = self.connection.fibre[found.generator]
             raise ValueError(
@@ -238,7 +241,7 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
 
     def refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]
-        found = invariance(self.system, self.action, *self.sampled(data), params)
+        found = invariance(self.system, self.action, *self.sampled(data, params), params, self._units(data, params))
         if not found.ok:
             worst = self.connection.fibre[found.generator]
             what = {"lagrangian": f"∂L/∂q[{worst}]", "one_forms": "the motion of its one-forms out of their span"}

@@ -40,7 +40,7 @@ class ReducedManifoldLagrangian(AbstractReducedSystem):
     def conserves_momentum(self) -> bool:
         return self.connection.abelian and self.system.forces is None and self.system.one_forms is None
 
-    def sampled(self, data: Data) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def sampled(self, data: Data, params: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """In coordinates of the manifold at the first point."""
         manifold, random = self.system.manifold, np.random.default_rng(0)
         q = jnp.asarray(data["q"] if "q" in data else data["q0"])
@@ -88,7 +88,7 @@ class ReducedManifoldLagrangian(AbstractReducedSystem):
         return sizes
 
     def refuse_asymmetry(self, data: Data, params: Any) -> None:
-        found = invariance(self.system, self.action, *self.sampled(data), params)
+        found = invariance(self.system, self.action, *self.sampled(data, params), params)
         if not found.ok:
             raise ValueError(
                 f"the {found.of} is not invariant under left translations by {self.named(found.generator)}: its derivative "
@@ -98,7 +98,7 @@ class ReducedManifoldLagrangian(AbstractReducedSystem):
 
     def refuse_asymmetric(self, functions: dict[str, UserFunction], data: Data, h: float, params: Any) -> None:
         """Raise `ValueError` where functions of ([t, ]q0, q1, h[, params]) are not invariant, at data that must be concrete."""
-        t, q, v = self.sampled(data)
+        t, q, v = self.sampled(data, params)
         ends = lambda q, v: jax.vmap(self.connection.manifold.retraction)(q, h * v)
         found = discrete_invariance(functions, self.action, t, q, np.asarray(evaluated(ends, q, v)), h, params)
         if not found.ok:

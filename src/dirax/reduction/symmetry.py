@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.numerics.ranks import numerical_rank
-from dirax.numerics.tolerances import SYMMETRY_DEFECT
+from dirax.numerics.tolerances import SYMMETRY_DEFECT, TINY
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.memo import Same
 from dirax.program.user_functions import UserFunction
 from dirax.reduction.actions import AbstractAction
+from dirax.reduction.sample_units import SampleUnits, sample_units
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
 
@@ -64,25 +65,48 @@ def check_invariance(
     """Whether L, the constraints and the forces of a Lagrangian system, or with `discrete_lagrangian(q0, q1, h[,
     params])` and `step` that function, are invariant under an action; and where not.
 
-    Looked at: `q` (n,) with `v` (n,) at t = 0, and `samples` random points within `radius` of them at other times; the group
-    being connected, the derivative along its generators decides. Points where L is not finite are left out. Raises
-    `ValueError` for an action that is none, or does not fit q.
+    Looked at: `q` (n,) with `v` (n,) at t = 0, and `samples` random points within `radius` of them at other times, in units that
+    the numbers of L at (q, v) say (1 where lengths, masses and times are near 1); the group being connected, the derivative
+    along its generators decides. Points where L is not finite are left out. Raises `ValueError` for an action that is none, or
+    does not fit q.
     """
     if not isinstance(action, AbstractAction):
         raise TypeError(f"action must be one such as dx.Translations([0]) or dx.GroupAction(…), but {action!r} was given.")
-    q, v = checked_state(q, np.ones_like if v is None else v)
+    given = v is not None
+    q, v = checked_state(q, v if given else np.zeros_like)
     action.check(jnp.asarray(q))
     if discrete_lagrangian is None:
         check_lagrangian(system, q, v, params)
-    random = np.random.default_rng(0)
-    near = lambda point: np.concatenate([point[None], point + radius * random.uniform(-1, 1, (samples, q.size))])
     if discrete_lagrangian is None:
-        return invariance(system, action, times(1 + samples), near(q), near(v), params)
+        units = units_of(system, q, v, params)
+        t, points, rates = sampled_near(q, v if given else units.v, units, radius, samples)
+        return invariance(system, action, t, points, rates, params, units)
     if step is None:
         raise ValueError("discrete_lagrangian needs step=, the h that it is called with.")
     ld = UserFunction(discrete_lagrangian, "discrete_lagrangian", ("q0", "q1", "h"), timed=True)
-    q0, v = near(q), near(v)
-    return discrete_invariance({"discrete_lagrangian": ld}, action, times(1 + samples), q0, q0 + step * v, step, params)
+    value = lambda q, v, params: ld(*ld.given(0.0, q, q + step * v, step, params))
+    units, functions = sample_units(value, None, q, v, params), {"discrete_lagrangian": ld}
+    t, points, rates = sampled_near(q, v if given else units.v, units, radius, samples)
+    return discrete_invariance(functions, action, t, points, points + step * rates, step, params, units)
+
+
+def units_of(system: Any, q: np.ndarray, v: np.ndarray, params: Any) -> SampleUnits:
+    """The units at a point of a system with a Lagrangian in coordinates; 1 for any other."""
+    form: Any = with_lagrangian(system)
+    if getattr(form, "lagrangian_form", lambda: None)() is not form:
+        return SampleUnits.plain(q.size)
+    return sample_units(lambda q, v, params: form.lagrangian.at(0.0, q, v, params), form.constraints, q, v, params)
+
+
+Samples: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Times (1 + samples,), points and velocities, (1 + samples, n) each."""
+
+
+def sampled_near(q: np.ndarray, v: np.ndarray, units: SampleUnits, radius: float, samples: int) -> Samples:
+    """(q, v) at t = 0, and random points and velocities within `radius` of them at random times, in these units."""
+    random = np.random.default_rng(0)
+    away = lambda unit: np.concatenate([np.zeros((1, q.size)), radius * unit * random.uniform(-1, 1, (samples, q.size))])
+    return units.time * times(1 + samples), q + away(units.q), v + away(units.v)
 
 
 def times(count: int) -> np.ndarray:
@@ -119,19 +143,30 @@ def check_lagrangian(system: Any, q: np.ndarray, v: np.ndarray, params: Any) -> 
 
 
 def discrete_invariance(
-    functions: dict[str, UserFunction], action: AbstractAction, t: Any, q0: Any, q1: Any, h: float, params: Any
+    functions: dict[str, UserFunction],
+    action: AbstractAction,
+    t: Any,
+    q0: Any,
+    q1: Any,
+    h: float,
+    params: Any,
+    units: SampleUnits | None = None,
 ) -> Invariance:
     """Whether functions of ([t, ]q0, q1, h[, params]) by name are invariant, at given t, q0 and q1 (samples, …)."""
 
     def moving(function):
         return lambda g, t, q0, q1: function(*function.given(t, action(g, q0), action(g, q1), h, params))
 
-    return _worst({name: moving(function) for name, function in functions.items()}, action, t, q0, q1)
+    units = units or SampleUnits.plain(q0.shape[-1])
+    return _worst({name: moving(function) for name, function in functions.items()}, action, t, q0, q1, units)
 
 
-def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, params: Any) -> Invariance:
-    """`check_invariance` at given times (samples,), points q and velocities v, (samples, n)."""
-    system = with_lagrangian(system)
+def invariance(
+    system: Any, action: AbstractAction, t: Any, q: Any, v: Any, params: Any, units: SampleUnits | None = None
+) -> Invariance:
+    """`check_invariance` at given times (samples,), points q and velocities v, (samples, n), with derivatives compared in these
+    `units`, 1 where they are not given."""
+    system, units = with_lagrangian(system), units or SampleUnits.plain(q.shape[-1])
     constraints: Any = getattr(system, "constraints", None)
 
     def pulled_back(g, t, q, v):
@@ -147,12 +182,13 @@ def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, para
         """W(Φ_g q) TΦ_g, less its part in the span of W(q); with affine constraints [W b] likewise."""
         there, _, derivative = pulled_back(g, t, q, v)
         moved = affine_rows(constraints, t, there, params)
-        moved = jnp.hstack([moved[:, : q.size] @ derivative, moved[:, q.size :]])
+        moved = jnp.hstack([moved[:, : q.size] @ derivative, moved[:, q.size :]]) * columns(moved, units)
         if _sees_multipliers(system):
             return moved
-        fixed = affine_rows(constraints, t, q, params)
+        fixed = affine_rows(constraints, t, q, params) * columns(moved, units)
         largest = jnp.max(jnp.abs(fixed), axis=1, keepdims=True)  # the unit of each
-        return off_span(moved, fixed) / jnp.where(largest > 0.0, largest, 1.0)
+        largest = jnp.where(largest > 0.0, largest, 1.0)
+        return off_span(moved / largest, fixed / largest)
 
     def holonomic(g, t, q, v):
         return constraints.position_defect(t, action(g, q), params)
@@ -165,7 +201,12 @@ def invariance(system: Any, action: AbstractAction, t: Any, q: Any, v: Any, para
     for moved in (one_forms, holonomic, forces):
         if getattr(system, moved.__name__, None) is not None:
             functions[moved.__name__] = moved
-    return _worst(functions, action, t, q, v)
+    return _worst(functions, action, t, q, v, units)
+
+
+def columns(rows: Float[Array, "m r"], units: SampleUnits) -> Float[np.ndarray, "1 r"]:
+    """The units of the columns of W, or of [W b]."""
+    return (units.q if rows.shape[1] == units.q.size else np.append(units.q, units.time))[None]
 
 
 def affine_rows(constraints: Constraints, t: Any, q: Float[Array, " n"], params: Any) -> Float[Array, "m r"]:
@@ -193,26 +234,33 @@ def forces_at(system: Any, t: Any, q: Float[Array, " n"], v: Float[Array, " n"],
     return jnp.stack([system.forces_at(jnp.asarray(sign * random))(t, q, v, params) for sign in (1, -1)])
 
 
-def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: Any, v: Any) -> Invariance:
-    """The largest change of the functions (g, t, q, v) at g = 0, relative to their sizes and those of their derivatives."""
+def _worst(functions: dict[str, Callable], action: AbstractAction, t: Any, q: Any, v: Any, units: SampleUnits) -> Invariance:
+    """The largest change of the functions (g, t, q, v) at g = 0, relative to their sizes, to those of their derivatives, and to
+    how far points are moved."""
     zero, worst = jnp.zeros(action.dimension()), None
     for name, moved in functions.items():
 
-        def at(t, q, v, moved=moved):
-            rate = jax.jacfwd(moved)(zero, t, q, v)
-            value, slope = moved(zero, t, q, v), jax.jacfwd(moved, argnums=2)(zero, t, q, v)
-            size = jnp.maximum(jnp.max(jnp.abs(value)), jnp.max(jnp.abs(slope)))
-            return jnp.max(jnp.abs(jnp.reshape(rate, (-1, zero.shape[0]))), axis=0), size
+        def at(t, q, v, moved=moved, unit=units.q if name == "forces" else np.ones(1)):
+            """The largest rate of change along each generator, that in units, the size in units, and how fast points move."""
+            value = jnp.ravel(moved(zero, t, q, v))
+            weights = jnp.tile(unit, value.size // unit.size)[:, None]
+            rate = jnp.reshape(jax.jacfwd(moved)(zero, t, q, v), (value.size, zero.size))
+            slope = jnp.reshape(jax.jacfwd(moved, argnums=2)(zero, t, q, v), (value.size, q.size)) * units.q[None]
+            size = jnp.maximum(jnp.max(jnp.abs(weights[:, 0] * value)), jnp.max(jnp.abs(weights * slope)))
+            speed = jnp.max(jnp.abs(jax.jacfwd(action)(zero, q)) / units.q[:, None], axis=0)
+            return jnp.max(jnp.abs(rate), axis=0), jnp.max(jnp.abs(weights * rate), axis=0), size, speed
 
         samples = [np.asarray(a, float) for a in (t, q, v)]
         found = in_numpy(at, samples, Same(at), for_few=True)  # quicker than to compile it
-        defect, size = map(np.asarray, found or jax.jit(jax.vmap(at))(*samples))
-        known = np.isfinite(defect) & np.isfinite(size)[:, None]
+        defect, scaled, size, speed = map(np.asarray, found or jax.jit(jax.vmap(at))(*samples))
+        known = np.isfinite(scaled) & np.isfinite(size)[:, None]
         # one-forms less their span are 0 where they are looked at, and in their own units; the others have theirs
         there = size[np.isfinite(size) & (size > 0.0)]
         unit = np.median(there) if there.size else 1.0
         size = np.maximum(size, 1.0 if name == "one_forms" else unit)
-        relative = np.where(known, defect / np.where(known, size[:, None], 1.0), 0.0)
+        fastest = np.max(np.where(np.isfinite(speed), speed, 0.0), axis=0)
+        scale = size[:, None] * np.where(fastest > 0.0, fastest, 1.0)
+        relative = np.where(known, scaled / np.where(known, scale, 1.0), 0.0)
         row, column = np.unravel_index(int(np.argmax(relative)), relative.shape)
         largest = float(relative[row, column])
         if worst is None or largest > worst.relative:
@@ -228,40 +276,51 @@ def translation_symmetries(
     """Directions d, the rows of a (k, n) matrix with orthonormal rows, in which neither L nor constraints nor forces change
     (of the one-forms, their span; forces that see the multipliers are those of fixed ones, and then the one-forms themselves).
 
-    Found from ∂L/∂q at `samples` random points within `radius` of (q, v); `cyclic_coordinates` are those along the axes.
+    Found from ∂L/∂q at `samples` random points within `radius` of (q, v), in units as those of `check_invariance`;
+    `cyclic_coordinates` are those along the axes.
     """
     system = with_lagrangian(system)
     q, v = checked_state(q, np.zeros_like if v is None else v)
     check_lagrangian(system, q, v, params)
-    random = np.random.default_rng(0)
-    points = [c + radius * random.uniform(-1, 1, (samples, q.size)) for c in (q, v)]
-
+    units, random = units_of(system, q, v, params), np.random.default_rng(0)
+    points = [c + radius * unit * random.uniform(-1, 1, (samples, q.size)) for c, unit in ((q, units.q), (v, units.v))]
     constraints = system.constraints
 
     def at(t, q, v):
-        along = [lambda q: system.lagrangian.at(t, q, v, params)]
+        """The functions and their slopes, in units of the coordinates, side by side."""
+        along = [lambda q: system.lagrangian.at(t, q, v, params)[None]]
         if system.one_forms is not None:
-            fixed = affine_rows(constraints, t, q, params)
-            rows = lambda q: affine_rows(constraints, t, q, params)
-            along.append(rows if _sees_multipliers(system) else lambda q: off_span(rows(q), fixed))
+            rows = lambda q: affine_rows(constraints, t, q, params) * columns(affine_rows(constraints, t, q, params), units)
+            fixed, moved = rows(q), rows
+            if not _sees_multipliers(system):
+                largest = jnp.max(jnp.abs(fixed), axis=1, keepdims=True)
+                unit = jnp.where(largest > 0.0, largest, 1.0)
+                fixed, moved = fixed / unit, lambda q: off_span(rows(q) / unit, fixed / unit)
+            along.append(lambda q: jnp.concatenate([moved(q), jax.lax.stop_gradient(fixed)]))
         if system.holonomic is not None:
             along.append(lambda q: constraints.position_defect(t, q, params))
         if system.forces is not None:
-            along.append(lambda q: forces_at(system, t, q, v, params))
-        inside = jnp.full((1, q.size), along[0](q))  # not finite where L is not
-        return jnp.concatenate([*(jnp.reshape(jax.jacfwd(function)(q), (-1, q.size)) for function in along), inside])
+            along.append(lambda q: forces_at(system, t, q, v, params) * units.q[None])
+        values = [jnp.reshape(function(q), (-1, 1)) for function in along]
+        slopes = [jnp.reshape(jax.jacfwd(function)(q), (-1, q.size)) * units.q[None] for function in along]
+        return [jnp.hstack(pair) for pair in zip(values, slopes, strict=True)]
 
-    points = [np.asarray(a, float) for a in (random.uniform(0, 1, samples), *points)]
-    found = in_numpy(at, points, Same(at), for_few=True)
-    slopes = np.asarray(jax.jit(jax.vmap(at))(*points) if found is None else found)
-    slopes = slopes[np.all(np.isfinite(slopes), axis=(1, 2))]
-    unit = np.max(np.abs(slopes[:, -1]), initial=0.0)  # the size of L at the points, of which its derivatives are part
-    slopes = slopes[:, :-1].reshape(-1, q.size)
-    if not len(slopes):
+    points = [np.asarray(a, float) for a in (units.time * random.uniform(0, 1, samples), *points)]
+    found = in_numpy(at, points, Same(at), for_few=True) or jax.jit(jax.vmap(at))(*points)
+    tables = [np.asarray(table) for table in found]
+    finite = np.all([np.all(np.isfinite(table), axis=(1, 2)) for table in tables], axis=0)
+    if not np.any(finite):
         raise ValueError("L is finite at none of the points around q: choose q inside its domain, or a smaller radius.")
-    _, values, directions = np.linalg.svd(slopes, full_matrices=True)
-    rank = int(numerical_rank(values, SYMMETRY_DEFECT, least=unit))
-    return directions[rank:]
+    sizes = [np.max(np.abs(table[finite]), initial=0.0) for table in tables]  # each function has its own unit
+    slopes = [table[finite, :, 1:].reshape(-1, q.size) / (size or 1.0) for table, size in zip(tables, sizes, strict=True)]
+    _, values, directions = np.linalg.svd(np.concatenate(slopes), full_matrices=True)
+    rank = int(numerical_rank(values, SYMMETRY_DEFECT, least=1.0))
+    return _orthonormal(directions[rank:] * units.q)
+
+
+def _orthonormal(rows: np.ndarray) -> np.ndarray:
+    """Orthonormal rows with the same span, of independent ones."""
+    return np.linalg.qr((rows / np.max(np.abs(rows), axis=1, keepdims=True, initial=TINY)).T)[0].T
 
 
 def cyclic_coordinates(system: Any, q: Any, v: Any = None, params: Any = None, **sampling: Any) -> tuple[int, ...]:

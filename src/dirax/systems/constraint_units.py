@@ -80,7 +80,7 @@ class Terms:
         self.rows: list[np.ndarray] = []
         self.equations: list[np.ndarray] = []
 
-    def add(self, values: np.ndarray, equations: np.ndarray | None, *units: tuple[Any, float]) -> None:
+    def add(self, values: np.ndarray, equations: np.ndarray | None, *units: tuple[Any, float | np.ndarray]) -> None:
         """Values, the equations in which they stand, if in any, and for each the units, as places and powers, it is made of."""
         rows = np.zeros((len(values), self.count))
         for places, power in units:
