@@ -98,3 +98,16 @@ def test_the_reason_of_a_singular_first_step():
         dx.simulate(
             held, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"), q=[1.0, 0.0, 0.0], v=[0.0, 0.0, 0.0], step=0.1, steps=5
         )
+
+
+def test_a_trajectory_that_leaves_the_manifold():
+    """L = (v0 + sin(q0) v1)²/2 − |q|²/2: two-point methods have modes off M_f that grow, from data on it, whatever the step."""
+    curved = dx.LagrangeDirac(lambda q, v: (v[0] + jnp.sin(q[0]) * v[1]) ** 2 / 2 - q @ q / 2)
+    u, s, c = 0.3, np.sin(1.0), np.cos(1.0)
+    q1 = s - c * u**2  # c u² − s q0 + q1 = 0 is the secondary constraint
+    v = np.linalg.solve([[1, s], [-s * u * u - c - s, 1 + 2 * c * c * u * u]], [u, 2 * c * u])
+    with pytest.warns(RuntimeWarning, match=r"leaves the final manifold .*constraint_algorithm"):
+        sol = dx.simulate(curved, dx.PlusLagrangeDirac(), q=[1.0, q1], v=v, step=0.01, steps=100)
+    assert np.abs(sol.q).max() > 10  # of a motion that stays below 1.1
+    line = dx.verify(sol)["final manifold"]
+    assert line.verdict == "VIOLATED" and "leaves the final manifold" in line.explanation

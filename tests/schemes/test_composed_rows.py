@@ -177,3 +177,61 @@ def test_the_engines_agree_in_batches_and_where_a_run_fails():
     for name in one.fields:
         np.testing.assert_allclose(one.fields[name], other.fields[name], atol=1e-12)
         np.testing.assert_array_equal(np.asarray(one.fields[name])[0], alone.fields[name])
+
+
+MIDPOINT = dx.LagrangeDAlembert()
+SKATE = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] / 2, lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]]))
+SKATING = {"q": [0.0, 0.0, 0.0], "v": [1.0, 0.0, 1.0]}
+
+
+def skated(t):
+    """(p, ∫λ dt) of the skate, which turns by φ = t and goes with u = 1 − sin(t)/2 along (cos t, sin t)."""
+    u = 1 - np.sin(t) / 2
+    return np.stack([u * np.cos(t), u * np.sin(t), np.ones_like(t)], axis=1), 1 - np.cos(t) - t
+
+
+def test_method_1_has_its_order_in_momenta_and_multipliers_too():
+    """What is off the constraint in p changes its sign in every plain step, and stayed of order 2."""
+    systems = SKATE, dx.NonholonomicMechanics(lambda q: jnp.eye(3), lambda q: q[0] / 2, lambda q: SKATE.one_forms(q, None))
+    for system, (name, order) in zip(systems, [("suzuki4", 4), ("kahan-li6", 6)], strict=True):
+        errors = []
+        for steps in (5, 10):
+            sol = dx.simulate(system, dx.Composition(dx.DiscreteDirac(), name), **SKATING, step=2 / steps, steps=steps)
+            p, impulse = skated(np.asarray(sol.t))
+            found = np.cumsum(np.asarray(sol.multipliers)[:, 0]) * sol.step
+            errors.append([np.abs(sol.p - p).max() + 1e-15, np.abs(found - impulse[1:]).max(), np.ptp(sol.energy()) + 1e-15])
+        slopes = np.log2(np.array(errors[0]) / np.array(errors[1]))
+        assert errors[1][0] < 1e-13 or slopes[0] > order - 0.5
+        assert slopes[1] > order - 0.6, (errors, slopes)
+        assert errors[1][2] < 1e-12
+
+
+def test_the_adjoint_of_the_midpoint_scheme_is_itself():
+    """With one-forms its p was the one before the jump at a node, of order 1."""
+    one, other = (dx.simulate(SKATE, s, **SKATING, step=0.02, steps=50) for s in (MIDPOINT, dx.Adjoint(MIDPOINT)))
+    for name in one.fields:
+        np.testing.assert_allclose(one.fields[name], other.fields[name], atol=1e-14)
+
+
+BEAD = dx.DiracSystem(
+    dx.induced_dirac(None, 2),
+    lambda x: x[2:] @ x[2:] / 2 + x[1],
+    holonomic=lambda x: jnp.array([(x[0] ** 2 + 2 * x[1] ** 2 - 2) / 2]),
+)
+
+
+def test_steps_that_leave_the_constraints_of_a_system_in_x_do_not_compose():
+    port = lambda more: dx.PortHamiltonian(
+        lambda x: x @ x / 2 + x[0] ** 4 / 4 + more * x[2] ** 4,
+        J=jnp.array([[0, 1.0, 0], [-1, 0, 0], [0, 0, 0]]),
+        B=lambda x: jnp.array([[0.0], [1.0], [1.0]]),
+        closed=True,
+    )
+    scheme, run = dx.Composition(dx.DiscreteDirac(), "suzuki4"), {"step": 0.1, "steps": 2}
+    for system, x in ((BEAD, [0.0, -1.0, 0.8, 0.0]), (port(1.0), [0.5, 0.2 + 4 * 0.2**3, -0.2])):
+        with pytest.raises(ValueError, match=r"leaves those of this \w+, by .* turns into its opposite.*constraints=\"resolve\""):
+            dx.simulate(system, dx.Composition(dx.DiscreteDirac(), "suzuki4"), x=x, **run)
+        assert dx.simulate(system, dx.Composition(dx.DiscreteDirac(), "suzuki4"), x=x, check_initial=False, **run).ok
+    assert dx.simulate(
+        port(0.0), dx.Composition(dx.DiscreteDirac(), "suzuki4"), x=[0.5, 0.2, -0.2], **run
+    ).ok  # y is linear: kept

@@ -73,9 +73,9 @@ def test_redundant_constraints_and_time():
 
 
 def test_first_order_in_q_and_p():
-    """Against the midpoint map with Suzuki's composition, of order 4."""
+    """Against the midpoint map in short steps, of order 2."""
     ends = []
-    for scheme, steps in ((LIFT, 200), (LIFT, 400), (dx.Composition(dx.DiscreteDirac()), 400)):
+    for scheme, steps in ((LIFT, 200), (LIFT, 400), (dx.DiscreteDirac(), 3200)):
         sol = dx.simulate(PARTS, scheme, x=np.concatenate([Q, P]), params=1.0, step=1.0 / steps, steps=steps)
         ends.append(sol.x[-1])
     for part in (slice(3), slice(3, 6)):

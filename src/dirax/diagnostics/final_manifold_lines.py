@@ -13,7 +13,8 @@ from dirax.numerics.ranks import rank_of_equations
 from dirax.numerics.tolerances import MANIFOLD_RANK
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
-from dirax.run.final_manifold import KEPT, MOST, chain_at
+from dirax.run.composition_premise import KEPT
+from dirax.run.final_manifold import MOST, chain_at, left_manifold
 from dirax.solution.solution import Solution
 from dirax.systems.constraint_chain import ConstraintChain
 
@@ -43,8 +44,18 @@ def final_manifold(sol: Solution, tolerance: float | None) -> Line | None:
         return Line(name, line.value, line.tolerance, VIOLATED, text)
     if "q0" not in sol.initial and np.max(values[:, 0]) > KEPT:
         return Line(name, line.value, line.tolerance, VIOLATED, f"the run starts off it by {np.max(values[:, 0]):.2g}; {text}")
+    if left := _left(sol, chain):
+        return Line(name, line.value, line.tolerance, VIOLATED, left)
     text = f"the scheme imposes it inside each step, and not at the rows, which are off by {line.value:.2g}"
     return Line(name, line.value, None, NOT_CHECKED, text)
+
+
+def _left(sol: Solution, chain: ConstraintChain) -> str:
+    """In words, that the first trajectory, about which the chain is, leaves M_f."""
+    q, p = (np.asarray(sol.fields[name]).reshape(-1, *np.shape(sol.fields[name])[-2:])[0] for name in ("q", "p"))
+    t = np.array([sol.time_of(row) for row in range(len(q))])
+    good = np.all(np.isfinite(q), axis=1)
+    return left_manifold(chain, t[good], q[good], p[good], initial_of_one(sol).get("v", np.zeros_like(q[0])), sol.params_of_one)
 
 
 def _chain_of(sol: Solution) -> ConstraintChain | None:

@@ -12,12 +12,13 @@ import numpy as np
 from dirax.engines.contract import Outcome, Problem
 from dirax.program.memo import Memo, patience
 from dirax.program.user_functions import is_traced, values_matter
+from dirax.run.composition_premise import refuse_leaving_final_manifold
 from dirax.run.event_run import run_with_events
 from dirax.run.final_manifold import (
     is_singular,
     projected_onto_manifold,
-    refuse_leaving_final_manifold,
     refuse_off_final_manifold,
+    warn_of_leaving,
 )
 from dirax.run.plan import AnyPlan, planned
 from dirax.run.premises import bytes_of
@@ -97,6 +98,8 @@ class Begun:
     redundant: tuple[int, ...]
     row0: dict | None
     traced: bool
+    singular: bool = field(default=False, kw_only=True)
+    """Whether the Lagrangian is singular."""
     plain: bool = field(default=False, kw_only=True)
     """Whether nothing of it needs the general way: no constraint is redundant, and no Lagrangian singular."""
     rows: dict[str, np.ndarray] | None = field(default=None, kw_only=True)
@@ -228,7 +231,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     def plan() -> AnyPlan | None:
         return planned(settings, given, shape, initial, start, problem) if plain else None
 
-    return Begun(case, problem, redundant, start.row0, traced, plan, plain=plain, save_every=asked)
+    return Begun(case, problem, redundant, start.row0, traced, plan, singular=singular, plain=plain, save_every=asked)
 
 
 def _run(
@@ -254,6 +257,8 @@ def _run(
     if found.redundant:
         outcome.notes["redundant_constraints"] = list(found.redundant)
     solution = solution_of(settings.system, settings.scheme, found.case, problem, outcome, found.row0, traced)
+    if found.singular and not traced:
+        warn_of_leaving(solution)
     if not traced:
         solution.continuation = Continuation(settings, kind, found, outcome.record, steps)
         getting_ready, compiling = ready - started, outcome.compile_seconds  # an engine may compile when it runs, too

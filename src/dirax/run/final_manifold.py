@@ -1,6 +1,7 @@
 """The final constraint manifold of a singular Lagrangian, as a premise: initial data on it, and steps that stay on it."""
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -8,22 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.step_program import linearized
 from dirax.numerics.equilibration import equilibrated
 from dirax.numerics.ranks import rank_of_equations
-from dirax.numerics.tolerances import MANIFOLD_RANK, TINY
+from dirax.numerics.tolerances import MANIFOLD_RANK
 from dirax.program.memo import Memo, Same
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
-from dirax.run.start import Initial, Start, completed
+from dirax.run.start import Initial, completed
 from dirax.run.validate import Case
 from dirax.systems.constraint_algorithm import constraint_algorithm
 from dirax.systems.constraint_chain import EMPTY, IRREGULAR, ConstraintChain
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
-
-KEPT = 1e-9
-"""How far off the manifold a step may take a point on it, relative to the state, where it keeps it."""
 
 UPDATES = 30
 """Updates of Newton's method in the step that is tried."""
@@ -127,7 +124,7 @@ def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any
     moved = slice(n, len(x) - chain.clock if q_alone else n if without_v else 2 * n)
     for _ in range(UPDATES if moved.stop > n else 0):
         value = np.asarray(chain.constraints(jnp.asarray(x), params))
-        slope = np.asarray(evaluated(_slope_of(chain), x, params)) * chain.units
+        slope = np.asarray(evaluated(slope_of(chain), x, params)) * chain.units
         change = np.linalg.lstsq(slope[:, moved], value, rcond=1e-10)[0]
         x[moved] -= change * chain.units[moved]
         if np.max(np.abs(change), initial=0.0) <= 1e-15 * (1 + np.max(np.abs(x / chain.units))):
@@ -138,7 +135,7 @@ def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any
 _slopes: Memo[Callable] = Memo(64)
 
 
-def _slope_of(chain: ConstraintChain) -> Callable:
+def slope_of(chain: ConstraintChain) -> Callable:
     """The derivative of the constraints of a chain as a function of (x, params)."""
     return _slopes.get(Same(chain), lambda: lambda x, params: jacobian(lambda x: chain.constraints(x, params))(x))
 
@@ -148,7 +145,7 @@ def projected_onto_manifold(system: AbstractSystem, case: Case, initial: Initial
     if case.two_points:
         return None
     found = []
-    for q, p, v, params in _lanes_of(case, initial):
+    for q, p, v, params in lanes_of(case, initial):
         chain = chain_at(system, q, v, case.t0, params)
         if chain is None or chain.empty:
             return None
@@ -170,7 +167,7 @@ def refuse_off_final_manifold(system: AbstractSystem, case: Case, initial: Initi
 
 def _refuse_off(system: AbstractSystem, case: Case, initial: Initial, are: str, way: str) -> None:
     q_alone = are != "they are"
-    for lane, (q, p, v, params) in enumerate(_lanes_of(case, initial)):
+    for lane, (q, p, v, params) in enumerate(lanes_of(case, initial)):
         if _on_known_manifold(system, q, p, v, case.t0, params):
             continue
         chain = chain_at(system, q, v, case.t0, params)
@@ -198,65 +195,7 @@ def _on_known_manifold(system: AbstractSystem, q: Any, p: Any, v: Any, t: float,
     return values.size > 0 and bool(np.all(np.isfinite(values))) and not chain.off(x, params)
 
 
-def refuse_leaving_final_manifold(
-    system: AbstractSystem, equation: Any, shape: Shape, case: Case, initial: Initial, start: Start, singular: bool
-) -> None:
-    """Raise `ValueError` for a composition of steps that leave the final manifold of a singular Lagrangian: the order of a
-    composition is that of maps of the manifold to itself. Without constraints, whose forces are in the saved p."""
-    stages = equation.stages
-    if len(stages) < 2 or case.two_points or system.constraints.any or "p" not in stages[0][0].fields:
-        return
-    if not singular and system.final_relation(shape) is None:
-        return
-    q, _, v, params = next(_lanes_of(case, initial))
-    stage, fraction = stages[0]
-    first = lambda a: np.asarray(a)[0] if case.batch is not None else np.asarray(a)
-    row = _after(stage, first(start.state), first(start.guess[0]), case.t0, fraction * case.h, params)
-    if row is None:
-        return
-    missed = _off(system, row, q, v, case.t0, case.t0 + fraction * case.h, params, singular)
-    if missed > KEPT:
-        raise ValueError(
-            f"a composition raises the order of maps of the final manifold to itself, and a step of this scheme leaves that of "
-            f"this {type(system).__name__}, by {missed:.2g} relative to the state (p = α(q) is kept for one-forms α "
-            'that are linear): take constraints="resolve", or check_initial=False to run it at the order that it has.'
-        )
-
-
-def _off(system: AbstractSystem, row: dict, q, v, t0: float, t: float, params: Any, singular: bool) -> float:
-    """How far a row is off the final manifold, relative to the row."""
-    if not singular:
-        value = np.asarray(evaluated(system.initial_defect, {**row, "t": np.asarray(t)}, params))
-        return float(np.max(np.abs(value), initial=0.0) / (np.max(np.abs(row["p"])) or 1.0))
-    chain = chain_at(system, q, v, t0, params)
-    if chain is None or chain.empty:
-        return 0.0
-    x = on_chain(chain, row["q"], row["p"], v, t, params)
-    value, slope = np.abs(np.asarray(chain.constraints(x, params))), np.asarray(evaluated(_slope_of(chain), x, params))
-    scale = np.max(np.abs(slope * chain.units), axis=1) * np.max(np.abs(x / chain.units))
-    return float(np.max(value / np.where(scale > 0, scale, 1.0), initial=0.0))
-
-
-def _after(stage: Any, state: np.ndarray, u: np.ndarray, t: float, h: float, params: Any) -> dict[str, np.ndarray] | None:
-    """The row after one step of a stage, by Newton's method in numbers; None where it has none."""
-    one = lambda a: np.asarray(a, float)[None]
-    for _ in range(UPDATES):
-        found = linearized(stage, params, False, one(u), one(state), one(t), one(h))
-        if found is None or not all(np.all(np.isfinite(a)) for a in found):
-            return None
-        try:
-            change = np.linalg.solve(found[1][0], found[0][0])
-        except np.linalg.LinAlgError:
-            return None
-        u = u - change
-        if np.max(np.abs(change) / np.maximum(np.abs(u), TINY), initial=0.0) <= 1e-14:
-            break
-    end = stage.advance(jnp.asarray(u), jnp.asarray(state), t, h, params)
-    row = stage.unpack(end, jnp.asarray(u), t + h, h, params)
-    return {name: np.asarray(row[name]) for name in ("q", "p")}
-
-
-def _lanes_of(case: Case, initial: Initial) -> Iterator[tuple[Any, Any, Any, Any]]:
+def lanes_of(case: Case, initial: Initial) -> Iterator[tuple[Any, Any, Any, Any]]:
     """(q, p, v, params) of every trajectory."""
     data = initial.data
     arrays = [np.asarray(data[name]) for name in ("q", "p", "v")]
@@ -264,3 +203,49 @@ def _lanes_of(case: Case, initial: Initial) -> Iterator[tuple[Any, Any, Any, Any
         params = jax.tree.map(lambda leaf, lane=lane: leaf[lane], case.params) if case.batch_params else case.params
         q, p, v = (a[lane] if case.batch is not None else a for a in arrays)
         yield q, p, v, params
+
+
+LOOKED_AT, FEWEST_ROWS = 64, 16
+"""Rows of a trajectory that are looked at, evenly spread, and how many a trajectory must have."""
+
+FAR, GROWN, VISIBLE = 0.3, 30.0, 1e-3
+"""A trajectory has left M_f where in its last quarter the constraints are off by `FAR` of their terms and more than in its first
+quarter, or by `GROWN` times as much and visibly."""
+
+
+def left_manifold(chain: ConstraintChain, t: np.ndarray, q: np.ndarray, p: np.ndarray, v: Any, params: Any) -> str:
+    """In words, that the rows (rows, n) of a trajectory leave the final manifold; "" where they do not."""
+    if len(t) < FEWEST_ROWS:
+        return ""
+    rows = np.unique(np.linspace(0, len(t) - 1, LOOKED_AT).astype(int))
+    x = [on_chain(chain, q[i], p[i], v, t[i], params) for i in rows]
+    slope = np.max([np.abs(np.asarray(evaluated(slope_of(chain), point, params)) * chain.units) for point in x[:2]], axis=(0, 2))
+    size = slope * max(float(np.max(np.abs(point / chain.units))) for point in x[:2])
+    values = np.abs([np.asarray(chain.constraints(jnp.asarray(point), params)) for point in x])
+    off = np.max(values / np.where(size > 0, size, 1.0), axis=1, initial=0.0)
+    few = len(rows) // 4
+    early, late = float(np.nanmax(off[:few])), float(np.nanmax(off[-few:]))
+    if not (late > max(FAR, 3.0 * early) or late > max(VISIBLE, GROWN * early)):
+        return ""
+    return (
+        f"the trajectory leaves the final manifold of its singular Lagrangian: the constraints of M_f are off by {early:.2g} of "
+        f"their terms at first, and by {late:.2g} at t = {t[-1]:.6g}. Steps of T*Q have motions off M_f that are none of the "
+        "system, and here they grow, whatever the step: simulate dx.constraint_algorithm(system, near=…).resolved() by "
+        "dx.DiscreteDirac() instead"
+    )
+
+
+def warn_of_leaving(sol: Any) -> None:
+    """Warn of the first trajectory of a run with a singular Lagrangian that leaves its final manifold."""
+    if not {"q", "p"} <= sol.fields.keys() or sol.q.shape[-1] > MOST:
+        return
+    for lane in range(sol.batch or 1):
+        one = sol if sol.batch is None else sol[lane]
+        q, p, t = np.asarray(one.q), np.asarray(one.p), np.asarray(one.t)
+        v = one.initial.get("v", np.zeros_like(q[0]))
+        chain = chain_at(sol.system, q[0], v, float(t[0]), one.params)
+        if chain is None or chain.empty or len(chain.coordinates) - chain.clock != 2 * q.shape[1]:
+            continue
+        if text := left_manifold(chain, t, q, p, v, one.params):
+            warnings.warn(text + (f" (trajectory {lane})." if sol.batch is not None else "."), RuntimeWarning, stacklevel=4)
+            return

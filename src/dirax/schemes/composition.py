@@ -21,8 +21,10 @@ class Composition(AbstractScheme):
     which with check_initial=False stay at the order of the scheme.
 
     A saved row is the whole step's: impulses of its parts are summed, rates are means. Parts of a discrete Lagrange–d'Alembert
-    scheme with constraints end at the momentum whose velocity satisfies them, so that p and the multipliers have the order of
-    q; a Lagrangian that is singular on the constraint distribution determines no such momentum, and is refused at the start.
+    scheme or of Method 1 on a Lagrangian with constraints end at the momentum whose velocity satisfies them, so that p and the
+    multipliers have the order of q; a Lagrangian that is singular on the constraint distribution determines no such momentum,
+    and is refused at the start. So are Method 1 and discrete gradients of systems in x that leave their constraints: what is off
+    them changes its sign in every step, and stays of second order. Method 2 composes to the order that is named.
 
     Raises `ValueError` for unknown names and for numbers that do not sum to 1.
     """

@@ -6,7 +6,7 @@ from dirax.geometry.cotangent_lift import CotangentLift, cotangent_lift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
 from dirax.geometry.projected_map import ProjectedMap
 from dirax.geometry.spaces import Euclidean
-from dirax.schemes.blm_method_1_step import MethodOneStep
+from dirax.schemes.blm_method_1_step import MethodOnePart, MethodOneStep
 from dirax.schemes.blm_method_2_step import NonholonomicStep, ProjectedThetaStep
 from dirax.schemes.constraint_manifold_premise import where_the_constraints_hold
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
@@ -87,13 +87,9 @@ class DiscreteDirac(AbstractScheme):
             if self._looks_ahead(system):
                 return LookAheadStep(system.phase_space_form(), shape, relation).equation()
             return discretized_relation(relation, shape.n, self.map)
-        lagrangian, theta = system.lagrangian_form(), _theta_of(self.map)
-        if lagrangian is not None and theta is not None:
-            return MethodOneStep(lagrangian, shape, ThetaLift(theta, shape.n)).equation()
-        lagrangian = system.manifold_form() if lagrangian is None else lagrangian
-        if lagrangian is not None:
-            return MethodOneStep(lagrangian, shape, lift_of(_map_on_q(self.map), lagrangian, shape.n)).equation()
-        return None
+        if system.lagrangian_form() is None and system.manifold_form() is None:
+            return None
+        return _method_one(self.map, system, shape).equation()
 
     def _looks_ahead(self, system: AbstractSystem) -> bool:
         """Whether the constraint at the base point (q_1, p_0) restricts the state alone: its force is one of the step ahead."""
@@ -110,7 +106,10 @@ class DiscreteDirac(AbstractScheme):
                 "with constraints the states of the lift of dx.Theta(1.0) are other ones for every step size, so that steps of "
                 "different sizes do not compose: compose dx.DiscreteDirac() with the midpoint map."
             )
-        return self
+        lagrangian = system.lagrangian_form()
+        if self.constraints == "resolve" or lagrangian is None or system.relation_form(shape) is not None:
+            return self
+        return _Part(self.map) if shape.m + shape.c else self
 
     def _resolved(self, system: AbstractSystem, shape: Shape) -> StepEquation | None:
         """Method 2."""
@@ -163,6 +162,25 @@ class DiscreteDirac(AbstractScheme):
     @property
     def constraints_at_rows(self) -> bool:
         return self.constraints == "resolve"
+
+
+class _Part(AbstractScheme):
+    """Method 1 whose steps end at the momentum projected onto the constraints."""
+
+    map: AbstractDiscretizationMap
+
+    def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
+        equation = MethodOnePart(_method_one(self.map, system, shape)).equation()
+        return equation if self.map.base_fraction == 0.5 else nothing_grows(system, equation)
+
+
+def _method_one(map: AbstractDiscretizationMap, system: AbstractSystem, shape: Shape) -> MethodOneStep:
+    """The step of a system with a Lagrangian form, or one on a manifold."""
+    lagrangian, theta = system.lagrangian_form(), _theta_of(map)
+    if lagrangian is not None and theta is not None:
+        return MethodOneStep(lagrangian, shape, ThetaLift(theta, shape.n))
+    lagrangian = system.manifold_form() if lagrangian is None else lagrangian
+    return MethodOneStep(lagrangian, shape, lift_of(_map_on_q(map), lagrangian, shape.n))
 
 
 def _map_on_q(map: AbstractDiscretizationMap) -> AbstractDiscretizationMap:

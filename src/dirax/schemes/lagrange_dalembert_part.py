@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 
 from dirax.schemes.abstract_step import AbstractStep
-from dirax.schemes.constraint_rows import ConstraintRows
+from dirax.schemes.constraint_rows import ConstraintRows, projection
 from dirax.schemes.labels import Labels
 from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
 from dirax.schemes.layout import Layout
@@ -65,10 +65,8 @@ class LagrangeDAlembertPart(AbstractStep):
         v, multipliers, end_v, _ = self.unknowns.split(u)
         q, p, _ = self.state.split(state)
         q1, p1 = self.end(u, state, t, h, params)
-        missed = self.inner.system.legendre(q1, end_v, params, t + h) - p1
-        left = self.rows.velocity_defect(t + h, q1, end_v, params)
         balance = self.inner.equations(v, multipliers, q, p, t, h, params, self.of_constraints(u))
-        return jnp.concatenate([balance, missed, left])
+        return jnp.concatenate([balance, projection(self.inner.system, self.rows, t + h, q1, end_v, p1, params)])
 
     def advance(self, u, state, t, h, params):
         work = self.inner.state.split(self.inner.advance(self.of_inner(u), state, t, h, params, self.of_constraints(u)))

@@ -81,8 +81,10 @@ class LagrangeDAlembert(AbstractScheme):
         return LagrangeDAlembertStep(lagrangian, shape, self.discrete_lagrangian, self.constraint, self.momentum)
 
     def adjoint(self, system: Any) -> "LagrangeDAlembert":
-        """That of L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h)."""
-        return LagrangeDAlembert(mirrored(self.discrete_lagrangian, -1.0), mirrored(self.constraint, 1.0), "incoming")
+        """That of L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h); the mean of the momenta before
+        and after the jump at a node is that of the adjoint too."""
+        momentum = "mean" if self.momentum == "mean" else "incoming"
+        return LagrangeDAlembert(mirrored(self.discrete_lagrangian, -1.0), mirrored(self.constraint, 1.0), momentum)
 
     def part(self, system: Any, shape: Shape) -> AbstractScheme:
         return _part(self, self, system, shape)
