@@ -230,8 +230,6 @@ def test_steps_that_leave_the_constraints_of_a_system_in_x_do_not_compose():
     scheme, run = dx.Composition(dx.DiscreteDirac(), "suzuki4"), {"step": 0.1, "steps": 2}
     for system, x in ((BEAD, [0.0, -1.0, 0.8, 0.0]), (port(1.0), [0.5, 0.2 + 4 * 0.2**3, -0.2])):
         with pytest.raises(ValueError, match=r"leaves those of this \w+, by .* turns into its opposite.*constraints=\"resolve\""):
-            dx.simulate(system, dx.Composition(dx.DiscreteDirac(), "suzuki4"), x=x, **run)
-        assert dx.simulate(system, dx.Composition(dx.DiscreteDirac(), "suzuki4"), x=x, check_initial=False, **run).ok
-    assert dx.simulate(
-        port(0.0), dx.Composition(dx.DiscreteDirac(), "suzuki4"), x=[0.5, 0.2, -0.2], **run
-    ).ok  # y is linear: kept
+            dx.simulate(system, scheme, x=x, **run)
+        assert dx.simulate(system, scheme, x=x, check_initial=False, **run).ok
+    assert dx.simulate(port(0.0), scheme, x=[0.5, 0.2, -0.2], **run).ok  # y is linear, and is kept
