@@ -53,9 +53,9 @@ class Auto(AbstractEngine):
         run = self.prepared(problem)
         return lambda problem: WalkByRuns(problem, run)
 
-    def _native(self, problem: Problem) -> tuple[AbstractEngine | None, str | None]:
+    def _native(self, problem: Problem, traced: bool = False) -> tuple[AbstractEngine | None, str | None]:
         """The native engine, or why it does not take the problem."""
-        reason = policy.kept_from_native(problem)
+        reason = policy.kept_from_native(problem, traced)
         if reason is None:
             try:
                 native = policy.engine_of("native", most_operations=policy.most_operations(problem))
@@ -68,12 +68,12 @@ class Auto(AbstractEngine):
         return None, reason
 
     def run_traced(self, problem: Problem) -> Outcome:
-        """The same, for smaller systems: their derivatives are compiled, too."""
-        reason = policy.kept_from_native(problem, traced=True)
-        if reason is None:
+        """The same."""
+        native, reason = self._native(problem, traced=True)
+        if native is not None:
             try:
-                return policy.engine_of("native").run_traced(problem)
-            except (ImportError, UnsupportedPrimitive) as error:
+                return native.run_traced(problem)
+            except UnsupportedPrimitive as error:
                 reason = str(error)
         engine, notes = self._by_arrays(problem)
         outcome = engine.run_traced(problem)

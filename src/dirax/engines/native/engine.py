@@ -31,10 +31,9 @@ class Native(AbstractEngine):
                 return None
             made = kernels(problem.equation, problem.params, problem.batch_params, problem.compensated)
             if self.most_operations is not None:
-                made.check()
                 most = max(self.most_operations, int(policy.SCALARS_FOR_ARRAYS * made.step.array_operations))
-                if made.operations > most:
-                    return f"{made.operations} scalar operations a step, more than {most}"
+                if (written := made.written) > most:
+                    return f"{written} scalar operations to be written out, more than {most}"
         except UnsupportedPrimitive as error:
             return str(error)
         return None

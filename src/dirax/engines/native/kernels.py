@@ -57,10 +57,11 @@ class Linked(NamedTuple):
 
 
 class Runs:
-    """The compiled `run` of a step by width: at first ready soon, and quick when that pays."""
+    """The compiled `run` of a step by width: at first ready soon, and quick when that pays. `repeated`: how often, in the mean,
+    an equation is solved in a step, which is compiled once."""
 
-    def __init__(self, linked: Callable[[int, tuple[int, ...]], Linked]):
-        self._linked = linked
+    def __init__(self, linked: Callable[[int, tuple[int, ...]], Linked], repeated: float = 1.0):
+        self._linked, self._repeated = linked, repeated
         self._made: dict[int, tuple[Any, Linked]] = {}
         self._spent: defaultdict[int, float] = defaultdict(float)
 
@@ -87,7 +88,7 @@ class Runs:
         """Whether quick code is worth its compiling where what there is would run for so long from now on."""
         if width not in self._made or self.is_quick(width):
             return False
-        return self._spent[width] + seconds > PRICE * self._made[width][1].operations
+        return self._spent[width] + seconds > PRICE * self._made[width][1].operations / self._repeated
 
 
 class Kernels:
@@ -104,7 +105,7 @@ class Kernels:
         """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
         self.places: Any = None
         self.digest = _digest(self)
-        self.runs = Runs(self._run)
+        self.runs = Runs(self._run, len(step.stages) / len(step.equations))
         self._of_sizes: dict[int, Any] = {}
         self._linearizations: dict[tuple[bool, int], Any] = {}
 
@@ -143,6 +144,11 @@ class Kernels:
     def check(self) -> None:
         """Raise `UnsupportedPrimitive` for a step with too many operations."""
         self._planned()
+
+    @property
+    def written(self) -> int:
+        """The scalar operations that are written out. Raises `UnsupportedPrimitive` where they are too many."""
+        return count_operations(self._planned(), once=True)
 
     def _library(self, name: str, width: int, text: Callable[[], str], *more: str, levels: tuple[int, ...] = (QUICK,)) -> Linked:
         """The linked code that exports `name`."""
@@ -205,10 +211,11 @@ def too_large(error: GraphTooLarge) -> UnsupportedPrimitive:
     return UnsupportedPrimitive("the step as a whole", f"has {error}", "a larger system than the native engine is for")
 
 
-def count_operations(plan: Plan) -> int:
-    """Scalar operations of a step with two Newton updates a stage, one of either kind."""
+def count_operations(plan: Plan, once: bool = False) -> int:
+    """Scalar operations of a step with two Newton updates a stage, one of either kind; `once`: of each equation once, which is
+    what is compiled."""
     total = 0
-    for index, _ in plan.stages:
+    for index in range(len(plan.equations)) if once else (index for index, _ in plan.stages):
         e, c = plan.equations[index], plan.corrections[index]
         solved = [node for parts in c.blocks for one in parts for node in (*one.change, *one.again, one.stable)]
         needed = plan.graph.reachable([*e.guess, *e.residual, *e.advance, *solved])

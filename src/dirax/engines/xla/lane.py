@@ -199,9 +199,25 @@ def parts_of_row(equation) -> int:
 
 def unpacked_row(equation, packed, t0, h, first_step, params) -> dict:
     """The named arrays of the row."""
-    t, at, rows = t0 + (first_step + packed[-1]) * h, 0, []
+    t, at, parts = t0 + (first_step + packed[-1]) * h, 0, []
     for stage, fraction in equation.stages[: parts_of_row(equation)]:
         middle, end = at + stage.state_size, at + stage.state_size + stage.unknowns
-        rows.append(stage.unpack(packed[at:middle], packed[middle:end], t, fraction * h, params))
+        parts.append((stage, packed[at:middle], packed[middle:end], t, fraction * h))
         t, at = t + fraction * h, end
-    return composed_row(equation, rows)
+    return composed_row(equation, _rows_of_parts(parts, params))
+
+
+def _rows_of_parts(parts: list[tuple], params) -> list[dict]:
+    """The rows of (stage, state, u, t, h), in order; those of equal stages side by side, so that each is written out once."""
+    rows: list[Any] = [None] * len(parts)
+    for stage in {id(part[0]): part[0] for part in parts}.values():
+        own = [i for i, part in enumerate(parts) if part[0] is stage]
+        one = lambda state, u, t, h, stage=stage: stage.unpack(state, u, t, h, params)
+        if len(own) == 1:
+            rows[own[0]] = one(*parts[own[0]][1:])
+            continue
+        given = (jnp.stack([jnp.asarray(a) for a in each]) for each in zip(*(parts[i][1:] for i in own), strict=True))
+        together = jax.vmap(one)(*given)
+        for place, i in enumerate(own):
+            rows[i] = {name: values[place] for name, values in together.items()}
+    return rows
