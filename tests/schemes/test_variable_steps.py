@@ -212,3 +212,22 @@ def test_more_bad_input():
     falls = dx.VariableSteps(dx.Collocation(2), lambda q: 0.3 - q @ q)
     ended = dx.simulate(EXAMPLE.system, falls, step=0.01, steps=50, **RUN)
     assert not ended.ok and "density has come down" in ended.message
+
+
+def test_the_local_frequency_does_not_depend_on_units():
+    """A length beside an angle, and a circuit of charge and flux: the clock is the same in any units, to the last bit."""
+    arm = dx.LagrangeDirac(
+        lambda q, v, l: (v[0] ** 2 + l**2 * v[1] ** 2) / 2 - q[0] ** 2 / 2 - 0.4 * l * q[0] * q[1] - l**2 * q[1] ** 2
+    )
+    circuit = dx.PortHamiltonian(
+        lambda x, f: f * x[0] ** 2 / 2 + x[1] ** 2 / f / 2,
+        J=jnp.array([[0.0, 1.0], [-1.0, 0.0]]),
+        R=lambda x, f: jnp.diag(jnp.stack([0.0 * f, 0.3 * f])),
+    )
+    run = {"step": 0.05, "steps": 20}
+    for system, start in ((arm, lambda l: {"q": [l, 0.0], "v": [0.0, 0.3]}), (circuit, lambda f: {"x": [1.0, 0.0]})):
+        one, other = (dx.simulate(system, SCHEME_OF_LOCAL_FREQUENCY, params=u, **start(u), **run) for u in (1.0, 2.0**-20))
+        np.testing.assert_array_equal(one.t, other.t)
+
+
+SCHEME_OF_LOCAL_FREQUENCY = dx.VariableSteps(dx.Collocation(2))

@@ -22,8 +22,9 @@ class VariableSteps(AbstractScheme):
 
     `density(q[, params])` or `density(t, q[, params])` is a positive number, of x instead of q where the system has points x;
     the more of it, the shorter the steps: h = step/ρ(q), up to an error that step² sets. Where none is given, it is the local
-    frequency √‖∂a/∂q‖, a(q) the acceleration from rest (for Kepler's problem a multiple of |q|^(−3/2)); √‖(∂f/∂x)²‖ of systems
-    ẋ = f(x). It vanishes where forces do not change from place to place, and then one has to be given.
+    frequency √‖∂a/∂q‖, a(q) the acceleration from rest, ‖·‖ in the metric of the masses (for Kepler's problem a multiple of
+    |q|^(−3/2)); of systems ẋ = f(x) it is √‖S‖, S = (∂f/∂x)², ‖S‖² = Σ |S_ij S_ji|. It vanishes where forces do not change
+    from place to place, and then one has to be given.
 
         scheme = dx.VariableSteps(dx.Collocation(4), density=lambda q: (q @ q) ** -0.75)
 
