@@ -294,3 +294,5 @@ def test_the_command_line_shows_and_clears_it(folder, monkeypatch):
     folder.write_text("")
     refused = call()
     assert refused.exit_code == 1 and "kernel cache is not used" in refused.stderr
+    monkeypatch.setenv("DIRAX_CACHE", str(folder))
+    assert all("DIRAX_CACHE to a folder, or to off" in call(*options).stderr for options in ((), ("--clear",)))

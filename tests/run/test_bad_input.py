@@ -69,6 +69,28 @@ def test_dtypes_of_initial_data():
     complaint(TypeError, "q must hold real numbers", "<U1", q=["a", "b"])
 
 
+def test_numbers_that_are_none():
+    """NumPy takes a masked number for what lies under it, and seconds for whole numbers."""
+    masked = np.ma.array([5.0, 0.0], mask=[True, False])
+    complaint(ValueError, "q has no number at [0]", "masked", "filled", q=masked)
+    complaint(ValueError, "params has no number at [0]", params=masked)
+    assert dx.simulate(OSCILLATOR, PLUS, **(GOOD | {"q": np.ma.array([1.0, 0.0])})).ok
+    seconds = np.array([1, 2], "timedelta64[s]")
+    complaint(TypeError, "q must hold real numbers", "timedelta64[s]", q=seconds)
+    complaint(TypeError, "params must be a pytree of numbers", "timedelta64[s]", params=seconds)
+    complaint(ValueError, "step must be a positive finite number", "timedelta64", step=seconds[0])
+
+
+def test_numbers_too_large_for_a_float():
+    complaint(ValueError, "step must be a positive finite number", "1329 bits", step=10**400)
+    complaint(ValueError, "t0 must be a finite number", "1329 bits", t0=10**400)
+    complaint(ValueError, "steps must be a whole number ≥ 1", "16610 bits", steps=-(10**5000))
+
+
+def test_dictionaries_of_params_without_an_order():
+    complaint(TypeError, "params has a dictionary with the keys 1, 'k'", "by texts", params=[{"a": {1: 1.0, "k": 1.0}}])
+
+
 def test_shapes_of_user_functions():
     vector = dx.LagrangeDirac(lambda q, v: v * v)
     complaint(ValueError, "lagrangian(q, v) must return a scalar", "shape (2,)", "sum or index", system=vector)

@@ -164,6 +164,63 @@ def test_data_off_the_constraint_are_off_it_in_any_units():
             moving.run(units, dx.LagrangeDAlembert(), "native")
 
 
+def bead():
+    """A bead of mass 1 on a circle of the radius l, in (q, p)."""
+    circle = lambda x, l: jnp.stack([x[:2] @ x[:2] - l**2])
+    return dx.DiracSystem(dx.induced_dirac(None, 2), lambda x, l: x[2:] @ x[2:] / 2 + l * x[1], holonomic=circle)
+
+
+def on_sphere():
+    """A particle on the unit sphere that does not move along one axis: only times have units."""
+    return dx.ManifoldLagrangian(lambda q, v: v @ v / 2, dx.Sphere(3), one_forms=lambda q: jnp.array([[0.0, 1.0, 0.0]]))
+
+
+SKATE = lambda q: jnp.stack([jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0 * q[2]])])
+SIDEWAYS, FREE = lambda q: jnp.array([[0.0, 1.0]]), lambda x: x[2:] @ x[2:] / 2
+ENERGY = lambda x: x[3:] @ x[3:] / 2
+C, S = np.cos(0.3), np.sin(0.3)
+EAST, FLAT = np.zeros(3), np.array([1.0, 1.0, 0.3])
+HALF = lambda q: jnp.stack([-q[1], q[0]]) / 2
+DEFECTS = {  # system, scheme, data in a unit l that are on the constraint, and off it, and those that have no unit
+    "dirac": (bead(), dx.DiscreteDirac(), {"x": [S, -C, 0.7 * C, 0.7 * S]}, {"x": [0.6, -0.7, 0.8, 0.6]}, {}),
+    "skate": (dx.DiracSystem(dx.induced_dirac(SKATE, 3), ENERGY), dx.DiscreteDirac(), {"x": [0, 0, 0, 0.5, 0, 0.2]},
+              {"x": [0, 0, 0, 0.5, 0.2, 0.2]}, {}),
+    "hamilton": (dx.HamiltonDirac(lambda q, p: p @ p / 2, SKATE), dx.PlusHamiltonDirac(), {"p": [0.5, 1e-17, 0.2]},
+                 {"p": [0.5, 0.2, 0.2]}, {"q": EAST}),
+    "phase space": (dx.PhaseSpaceLagrangian(HALF, lambda q: q @ q / 2), dx.DiscreteDirac(), {"q": [1.0, 0.2], "p": [-0.1, 0.5]},
+                    {"q": [1.0, 0.2], "p": [0.3, 0.3]}, {}),
+    "implicit": (dx.ImplicitSystem(lambda x: jnp.diag(jnp.array([1.0, 0.0])), lambda x: jnp.stack([-x[1], 3 * x[1] - x[0]])),
+                 dx.DiscreteDirac(), {"x": [0.3, 0.1]}, {"x": [1.0, 1.5]}, {}),
+    "port": (dx.PortHamiltonian(lambda x: x @ x, np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 0]]), B=np.array([[3.0], [0], [-1]]),
+                                closed=True), dx.DiscreteDirac(), {"x": [0.1, 1.0, 0.3]}, {"x": [0.1, 1.0, 0.31]}, {}),
+    "generalized": (dx.GeneralizedDiracSystem(dx.induced_dirac(SIDEWAYS, 2), dx.LagrangianSubmanifold.from_hamiltonian(FREE)),
+                    dx.DiscreteDirac(), {"x": [0, 0, 0.5, 0]}, {"x": [0, 0, 0.5, 0.2]}, {}),
+    "lie algebra": (dx.EulerPoincare(dx.SE2(), lambda xi: xi @ (FLAT * xi) / 2, [[0.0, 1.0, 0.0]]), dx.DiscreteEulerPoincare(),
+                    {"x": [0.5, 1e-17, 0.06]}, {"x": [0.5, 0.2, 0.06]}, {}),
+    "metric": (dx.NonholonomicMechanics(lambda q: jnp.eye(3), lambda q: 0.0 * q[0], SKATE), dx.DiscreteDirac(),
+               {"v": [0.5, 0, 0.2]}, {"v": [0.5, 0.2, 0.2]}, {"q": EAST}),
+    "sphere": (on_sphere(), dx.DiscreteDirac(dx.SphereProjection()), {"v": [0.0, 0.0, 0.5]}, {"v": [0.0, 0.2, 0.5]},
+               {"q": [1.0, 0, 0]}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_initial_data_of_every_system_are_judged_by_their_terms(name):
+    """Defects were compared with 1: those of 1e-10 m were none, and roundoff of 1e9 m was one."""
+    system, scheme, on, off, rest = DEFECTS[name]
+    first = {"params": 1.0} if name == "dirac" else {}
+    run = dx.prepare(system, scheme, **on, **rest, **first, step=0.02, steps=1)
+    for l in (1e-10, 1.5e11):
+        more, scaled = {n: l for n in first}, lambda data, l=l: {n: np.array(a) * l for n, a in data.items()}
+        run(**scaled(on), **rest, **more, step=0.02 / max(l, 1.0))
+        for project in (False, True) if name in ("skate", "implicit", "port") else (False,):
+            with pytest.raises(ValueError, match="off the constraint") as error:
+                dx.simulate(system, scheme, **scaled(off), **rest, **more, step=0.02, steps=1, project=project)
+            assert ("constraint_algorithm" in str(error.value)) == ("project=True" not in str(error.value))
+        with pytest.raises(ValueError, match="off the constraint"):
+            run(**scaled(off), **rest, **more)
+
+
 def test_a_corrupted_trajectory_is_found_in_any_units():
     for units in (Units(), Units(length=-50)):
         sol = SLEIGH.run(units, dx.LagrangeDAlembert(), "native")

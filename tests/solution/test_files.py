@@ -1,6 +1,7 @@
 """Files: exact round trips, named dimensions and units, no code from a file, nothing lost, one clear sentence of error."""
 
 import json
+import os
 import pickle
 import shutil
 import signal
@@ -326,6 +327,10 @@ def test_paths(tmp_path, batch):
         batch.save(tmp_path / "nowhere" / "run.nc")
     with pytest.raises(FileNotFoundError, match=r"there is no file .*run\.nc: check the path"):
         dx.load(tmp_path / "run.nc")
+    for path in (None, 5, b"run.nc"):
+        for action in (dx.load, batch.save):
+            with pytest.raises(TypeError, match=rf'path must be a text .* such as "run\.zarr", but {path!r} was given'):
+                action(path)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -459,6 +464,12 @@ def edited(path, change):
         ("save_every", -5),
         ("save_every", 0),
         ("save_every", 2.0),
+        ("save_every", 10**30),
+        ("save_every", 5),  # every second was
+        ("step", 1e30),
+        ("step", 0.011),
+        ("batch_params", -1),
+        ("batch_params", 2),
         ("ok", '"maybe"'),
         ("message", '{"0": 3}'),
         ("batch_params", "no"),
@@ -532,6 +543,43 @@ def test_stores_with_links_and_codecs_of_another_kind(tmp_path, batch):
     for change in ({"shape": [-1]}, {"shape": 3}, {"chunk_grid": None}, {"attributes": []}, {"data_type": ["float64"]}):
         (good / "q" / "zarr.json").write_text(json.dumps(node | change))
         assert one_sentence(good)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="other systems have no pipes among files")
+@pytest.mark.parametrize("place", ["zarr.json", "q/zarr.json", "q/c/0/0/0"])
+def test_pipes_and_devices_are_not_read(place, tmp_path, batch):
+    """They may have no end: one that is read waits for ever, or takes all memory."""
+    path = batch.save(tmp_path / "run.zarr")
+    (path / place).unlink()
+    os.mkfifo(path / place)
+    assert f"{place} is a pipe" in one_sentence(path)
+    (path / place).unlink()
+    (path / place).symlink_to("/dev/zero")
+    assert f"{place} is a link" in one_sentence(path)
+
+
+def test_a_description_and_a_chunk_have_no_more_bytes_than_belong_there(tmp_path, batch):
+    path = batch.save(tmp_path / "run.zarr")
+    for place in ("q/c/0/0/0", "zarr.json"):
+        os.truncate(path / place, 2**40)  # a file that is empty on the disk
+        assert "bytes" in one_sentence(path)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("name", ["q", "time", "energy", "initial_v"])
+def test_numbers_of_another_type_are_not_taken_for_floats(name, ending, tmp_path, batch):
+    """The same bytes as whole numbers have the same checksum: q was 4607182418800017408."""
+    path = batch.save(tmp_path / f"run{ending}")
+    if ending == ".zarr":
+        file = path / name / "zarr.json"
+        file.write_text(file.read_text().replace('"float64"', '"int64"'))
+    else:
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "r+") as store:
+            values = store[name][()].view(np.int64)
+            del store[name], store.attrs[saving.SEAL]
+            store[name] = values
+    assert f"variable {name} holds int64, and dirax writes float64 there" in one_sentence(path)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

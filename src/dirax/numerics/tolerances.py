@@ -91,6 +91,10 @@ FRAME_DEFECT = 1e-9
 CONSTRAINT_DEFECT = 1e-9
 """Of constraints at initial data and at nodes, relative to the sizes of their terms."""
 
+SOLVED_ROUNDOFF = 1e-6
+"""How much of the largest unknown of linear equations counts in every other one where CONSTRAINT_DEFECT compares what they leave:
+together they are the roundoff of a decomposition."""
+
 ON_MANIFOLD = 1e-10
 """Of conditions at a point that Gauss–Newton has put on their zeros, relative to their derivative and to the point."""
 

@@ -41,15 +41,26 @@ def pseudo_inverse(matrix: Float[Array, "k l"], tolerance: float) -> Float[Array
 
 def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> Float[Array, "l k"]:
     """The pseudo-inverse of a matrix with rows and columns scaled to unit size."""
-    return scaled_inverse_p.bind(matrix)[0] if binds(matrix) else equilibrated_inverse(jnp, matrix)[0]
+    return scaled_inverse(matrix)[0]
 
 
-def equilibrated_inverse(xp: ModuleType, matrix: Any) -> tuple[Any, Any]:
-    """The same by JAX, or by NumPy with leading axes; and the units (…, l) of the unknowns that the scales stand for."""
+def scaled_inverse(
+    matrix: Float[Array, "k l"], tolerance: float = EQUATION_RANK
+) -> tuple[Float[Array, "l k"], Float[Array, " l"]]:
+    """The same, with singular values below `tolerance` counting as zero, and the units of the unknowns that the scales stand
+    for."""
+    if not binds(matrix):
+        return equilibrated_inverse(jnp, matrix, tolerance)
+    inverse, units = scaled_inverse_p.bind(matrix, tolerance=tolerance)
+    return inverse, units
+
+
+def equilibrated_inverse(xp: ModuleType, matrix: Any, tolerance: float = EQUATION_RANK) -> tuple[Any, Any]:
+    """The same by JAX, or by NumPy with leading axes."""
     sizes = xp.abs(lax.stop_gradient(matrix) if xp is jnp else matrix)  # units have no derivative, which would be ∞ at zero
     rows, columns = balancing_scales(sizes, xp)
     scaled = matrix / rows / columns
-    inverse = xp.linalg.pinv(scaled, EQUATION_RANK) if xp is jnp else pseudo_inverses(scaled, EQUATION_RANK, _by_either_scale)
+    inverse = xp.linalg.pinv(scaled, tolerance) if xp is jnp else pseudo_inverses(scaled, tolerance, _by_either_scale)
     turned = lambda a: xp.swapaxes(a, -1, -2)
     return inverse / turned(columns) / turned(rows), 1.0 / columns[..., 0, :]
 
@@ -153,4 +164,8 @@ pseudo_inverse_p = plain_primitive(
     lambda matrix, tolerance: [jnp.linalg.pinv(matrix, tolerance)],
     _turned,
 )
-scaled_inverse_p = plain_primitive("dirax_scaled_inverse", lambda matrix: [equilibrated_inverse(jnp, matrix)[0]], _turned)
+scaled_inverse_p = plain_primitive(
+    "dirax_scaled_inverse",
+    lambda matrix, tolerance: list(equilibrated_inverse(jnp, matrix, tolerance)),
+    lambda matrix, **_: [*_turned(matrix), ShapedArray(matrix.shape[1:], matrix.dtype)],
+)

@@ -6,11 +6,13 @@ Accuracy and Stability of Numerical Algorithms, §3.3): in units of half a last 
     E(x) = |x| of an operand,   E(f(a, …)) = Σ |∂f/∂a| E(a) + |f(a, …)|.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
@@ -25,6 +27,13 @@ from dirax.program.tracing import closed_over, operand
 EXACT = frozenset(("neg", "abs", "max", "min", "select", "sign", "floor", "ceil", "round", "trunc"))
 """Operations that do not round."""
 
+BY_NODES = 2**15
+"""Numbers of a function's arguments, times those of its value, up to which the sizes of its terms are found operation by
+operation."""
+
+DIRECTIONS = 16
+"""Directions in which a larger one is moved."""
+
 
 def rounding(function: Callable, *values: Array, errors: tuple[Array, ...] | None = None) -> Array:
     """The size of the terms of `function(*values)`, an array of floats of the shape of its value: the value is known up to a few
@@ -32,6 +41,20 @@ def rounding(function: Callable, *values: Array, errors: tuple[Array, ...] | Non
     jaxpr, captured, _ = closed_over(function, list(values))
     errors = tuple(jnp.abs(a) for a in values) if errors is None else errors
     return rounding_p.bind(*map(operand, (*captured, *values, *errors)), jaxpr=jaxpr)[0]
+
+
+def sizes_of_terms(function: Callable, *values: Array, errors: tuple[Array, ...]) -> Array:
+    """`rounding`; of a function of many numbers from its size and how it moves along some directions, which is at most that."""
+    count = sum(a.size for a in values) * math.prod(jax.eval_shape(function, *values).shape)
+    if count <= BY_NODES:
+        return rounding(function, *values, errors=errors)
+    signs = np.random.default_rng(0)
+    drawn = tuple(signs.choice([-1.0, 1.0], (DIRECTIONS, *a.shape)) for a in values)
+
+    def moved(signs):
+        return jnp.abs(jax.jvp(function, values, tuple(s * e for s, e in zip(signs, errors, strict=True)))[1])
+
+    return jnp.abs(function(*values)) + jnp.max(jax.vmap(moved)(drawn), axis=0)
 
 
 def rounding_nodes(g: Graph, outputs: list[int], errors: dict[int, int] | None = None) -> list[int]:
@@ -95,8 +118,10 @@ def _of(g: Graph, nodes: Nodes, operands: list[Nodes], given: list[Nodes]) -> No
     """The nodes of E, with those `given` for the last of the operands."""
     flat = lambda arrays: [node for array in arrays for node in array.ravel().tolist()]
     values = flat(operands)
-    errors = {node: g.make("abs", node) for node in values}
-    errors |= dict(zip(values[len(values) - len(flat(given)) :], flat(given), strict=True))
+    known: dict[int, int] = {}
+    for node, error in zip(values[len(values) - len(flat(given)) :], flat(given), strict=True):
+        known[node] = g.make("max", known[node], error) if node in known else error  # one node may stand in several operands
+    errors = {node: g.make("abs", node) for node in values} | known
     found = dict(zip(nodes.ravel().tolist(), rounding_nodes(g, nodes.ravel().tolist(), errors), strict=True))
     return elementwise(lambda node: found[node], nodes)
 

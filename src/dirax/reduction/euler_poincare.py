@@ -19,6 +19,7 @@ from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.lie_poisson import LiePoisson, checked_point
 from dirax.systems.constraints import no_constraint
 from dirax.systems.forms import EnergyForm
+from dirax.systems.magnitudes import as_large_as_kinetic
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem, refuse_start
 
@@ -221,6 +222,12 @@ class EulerPoincare(AbstractSystem):
             return no_constraint()
         return self.constraint_forms(self.space.split(data["x"])[1], params) @ data["v"]
 
+    def sizes_of_data(self, data: Data, params: Any) -> Data:
+        """Each component of ξ as large as the kinetic energy makes it."""
+        a, xi = self.space.split(data["x"])[1], data["v"]
+        largest = jnp.abs(xi) + as_large_as_kinetic(lambda xi: self.legendre(xi, a, params), xi)
+        return {name: jnp.abs(value) for name, value in data.items()} | {"v": largest}
+
     def energy_at(self, row: Data, params: Any) -> Float[Array, ""]:
         """⟨μ, ξ⟩ − l(ξ, a)."""
         return self._energy(*self.space.split(row["x"]), params)
@@ -231,6 +238,10 @@ class EulerPoincare(AbstractSystem):
             return no_constraint()
         momentum, a = self.space.split(row["x"])
         return self.constraint_forms(a, params) @ self.inverse_legendre(momentum, a, params)
+
+    @property
+    def projected(self) -> str:
+        return "the momentum by the forces of the constraint"
 
     @property
     def dual(self) -> SemidirectProduct:

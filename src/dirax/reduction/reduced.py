@@ -157,12 +157,19 @@ class AbstractReducedSystem(AbstractSystem):
     def initial_defect(self, data: Data, params: Any) -> Float[Array, " m"]:
         return self.system.initial_defect(data, params)
 
+    def initial_terms(self, data: Data, params: Any) -> Float[Array, " m"]:
+        return self.system.initial_terms(data, params)
+
     def energy_at(self, row: Data, params: Any) -> Float[Array, ""]:
         """The energy of the unreduced system, which the group coordinate does not change."""
         return self.system.energy_at(self.unreduced_row(row), params)
 
     def constraint_at(self, row: Data, params: Any) -> Float[Array, " m"]:
         return self.system.constraint_at(self.unreduced_row(row), params)
+
+    @property
+    def projected(self) -> str:
+        return self.system.projected
 
     @property
     def energy_changes(self) -> str:

@@ -1,6 +1,6 @@
 """simulate(): validate → discretize → start → engine → Solution; prepare(): the same, again and again with other numbers.
 
-simulate.py, prepare.py   what a user calls; settings.py and validate.py the form of the arguments
+simulate.py, prepare.py   what a user calls; settings.py, validate.py, scalars.py their form
 carry_out.py              the walk, and what goes on with it; traced_run.py the same under JAX's transformations
 plan.py, batch_plan.py    the short way of a run, or of a batch, of a kind that is known; premises.py what both ask
 step_search.py            tolerance= in place of step=

@@ -76,18 +76,26 @@ def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Star
     bad = ~np.all(np.abs(defect) <= CONSTRAINT_DEFECT * size, axis=-1)
     if np.any(bad):
         lane = int(np.argmax(bad))
-        way = (
-            "choose q1 on the discrete constraint, or pass check_initial=False to take the points as they are"
-            if start.row0 is not None
-            else "pass project=True to project them, or check_initial=False to take them as they are"
-            if not projected
-            else "project=True, which moves q across the constraint by its forces, found no place on it: begin nearer to it"
-        )
+        way = _way_onto_constraint(system, start.row0 is not None, projected)
         more = system.explain(_lanes(start.state, 1)[lane])
         raise ValueError(
             f"the initial data{_which(bad)} are off the constraint, whose residual is "
             f"{np.array2string(defect[lane], precision=4)} (largest {worst[lane]:.3g}); {way}.{more and f' {more}.'}"
         )
+
+
+def _way_onto_constraint(system: AbstractSystem, two_points: bool, projected: bool) -> str:
+    if two_points:
+        return "choose q1 on the discrete constraint, or pass check_initial=False to take the points as they are"
+    if not system.projected:
+        return (
+            f"nothing projects the data of this {type(system).__name__}: begin on its constraint manifold, where "
+            "dx.constraint_algorithm(system, near=x).project(x) finds a point, or pass check_initial=False to take them as they "
+            "are"
+        )
+    if projected:
+        return f"project=True, which moves {system.projected}, found no place on it: begin nearer to it"
+    return "pass project=True to project them, or check_initial=False to take them as they are"
 
 
 def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool, lagrangian: bool) -> None:

@@ -10,14 +10,13 @@ import jax
 from dirax.engines.engine import AbstractEngine
 from dirax.run.event import Event, checked_events
 from dirax.run.impact import Impact
+from dirax.run.scalars import count, flag
 from dirax.run.validate import (
     MOST_ITERATIONS,
     Case,
     check_kinds,
     checked_store,
-    count,
     engine_from,
-    flag,
     validated_case,
 )
 from dirax.schemes.step import AbstractScheme

@@ -136,15 +136,13 @@ class _Completion(eqx.Module):
         system, complete = self.system, self.system.complete({**data, "t": t0}, params, self.project)
         defect = system.initial_defect({**complete, "t": t0}, params)
         q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if self.two_points else (complete.get("q"), complete.get("v"))
-        size, form = jnp.ones(defect.shape), system.lagrangian_form()
-        small = system.constraints.any and defect.size * system.point(complete).size <= LARGEST_MATRIX
-        if small and form is not None and v is not None:
-            size = form.initial_terms({**complete, "v": v, "t": t0}, params)
-        elif v is not None:
-            size = jnp.maximum(size, jnp.max(jnp.abs(v), initial=0.0))
+        size = defect
+        if defect.size or (self.two_points and system.constraints.any):
+            known = {**complete, **({} if v is None else {"v": v}), "t": t0}
+            size = system.initial_terms(*jax.tree.map(jax.lax.stop_gradient, (known, params)))
         lagrangian = None if q is None or v is None else system.lagrangian_value(t0, q, v, params)
         constraints = None
-        if small:
+        if system.constraints.any and defect.size * system.point(complete).size <= LARGEST_MATRIX:
             constraints = system.constraints.matrix(t0, system.point(complete), params)
         return Initial(complete, defect, size, lagrangian, constraints)
 

@@ -16,6 +16,7 @@ import numpy as np
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.policy import ENGINES, engine_of
 from dirax.program.user_functions import check_finite, is_traced
+from dirax.run.scalars import finite, is_number, is_real, positive
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.atomic_files import checked_name
 from dirax.systems.system import AbstractSystem
@@ -25,9 +26,6 @@ ROOM = 4
 
 FEW = 32
 """Numbers up to which Python is quicker than NumPy to see whether they are finite."""
-
-MOST_COUNTED = 2**63 - 1
-"""The largest number of steps: engines count them in 64 bits."""
 
 MOST_ITERATIONS = 1_000_000
 """Of Newton's method in a step: what has not converged by then goes round in circles, and a compiled loop hears no Ctrl-C."""
@@ -88,8 +86,14 @@ def validated_case(given: dict[str, Any], params: Any, batch_params: bool, step:
 
 def params_of_case(params: Any) -> Any:
     """The params with arrays for leaves; dataclasses in them become pytrees. Raises `TypeError` and `ValueError` for leaves that
-    are no finite numbers."""
-    _register_dataclasses(params)
+    are no finite numbers, and for dictionaries whose keys have no order."""
+    try:
+        _register_dataclasses(params)
+    except (TypeError, ValueError):
+        if (keys := _without_order(params)) is None:
+            raise
+        text = f"params has a dictionary with the keys {keys:.60}, which have no order: name all of them by texts."
+        raise TypeError(text) from None
     leaves, structure = jax.tree.flatten(params)
     plain = [plain_floats(leaf) for leaf in leaves]
     if not any([leaf is None for leaf in plain]):
@@ -97,6 +101,17 @@ def params_of_case(params: Any) -> Any:
     params = _arrays(params)
     check_finite("params", params)
     return params
+
+
+def _without_order(params: Any) -> str | None:
+    """The keys of a dictionary in params that cannot be sorted, as JAX has to; None where there is none."""
+    inside = params.values() if isinstance(params, dict) else params if isinstance(params, list | tuple) else ()
+    if isinstance(params, dict):
+        try:
+            sorted(params)
+        except TypeError:
+            return ", ".join(map(repr, params))
+    return next((keys for part in inside if (keys := _without_order(part)) is not None), None)
 
 
 def _register_dataclasses(params: Any) -> None:
@@ -173,12 +188,19 @@ def _real_array(name: str, value: Any) -> Any:
     except ValueError as error:
         reason = str(error).split(". ")[0].rstrip(".")
         raise ValueError(f"{name} must be an array of numbers, but it could not be made one: {reason}.") from error
-    if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+    _refuse_masked(value, name)
+    if not is_real(array.dtype):
         raise TypeError(f"{name} must hold real numbers, but its dtype is {array.dtype}.")
     if array.ndim not in (1, 2) or 0 in array.shape:
         raise ValueError(f"{name} must have shape (n,), or (B, n) for a batch of B trajectories, but its shape is {array.shape}.")
     check_finite(name, array)
     return array.astype(np.float64)
+
+
+def _refuse_masked(value: Any, name: str) -> None:
+    if isinstance(value, np.ma.MaskedArray) and np.any(np.ma.getmaskarray(value)):
+        where = np.argwhere(np.ma.getmaskarray(value))[0].tolist()
+        raise ValueError(f"{name} has no number at {where}, where it is masked: give one, by {name}.filled(…) for instance.")
 
 
 def plain_floats(value: Any) -> np.ndarray | None:
@@ -236,49 +258,6 @@ def _memory() -> int:
         return 0
 
 
-def finite(value, name: str):
-    """The number, or the traced value as it is; raises `ValueError` for anything that is not one finite number."""
-    if type(value) is float and math.isfinite(value):
-        return value
-    if is_traced(value):
-        return value
-    if not _is_number(value) or np.ndim(value) != 0 or not np.isfinite(value):
-        raise ValueError(f"{name} must be a finite number, but {value!r} was given.")
-    return float(value)
-
-
-def positive(value, name: str):
-    """The same for a positive number."""
-    if type(value) is float and 0.0 < value < math.inf:
-        return value
-    if not is_traced(value) and (not _is_number(value) or np.ndim(value) != 0 or not 0 < value < np.inf):
-        raise ValueError(f"{name} must be a positive finite number, but {value!r} was given.")
-    return value if is_traced(value) else float(value)
-
-
-def count(value, name: str, most: int = MOST_COUNTED) -> int:
-    """The whole number; raises `ValueError` for anything else, below 1 and above `most`."""
-    if type(value) is int and 1 <= value <= most:
-        return value
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ValueError(f"{name} must be a whole number ≥ 1, but {value!r:.80} was given.")
-    if value > most:
-        bound = "2⁶³ − 1, which is what 64 bits count" if most == MOST_COUNTED else f"{most}"
-        raise ValueError(f"{name} must be at most {bound}, but {_shown(int(value))} was given.")
-    return int(value)
-
-
-def flag(value, name: str) -> bool:
-    """True or False; raises `TypeError` for anything else."""
-    if not isinstance(value, bool | np.bool_):
-        raise TypeError(f"{name} must be True or False, but {value!r:.80} was given.")
-    return bool(value)
-
-
-def _shown(value: int) -> str:
-    return str(value) if abs(value) < 10**21 else f"a number of {value.bit_length()} bits"
-
-
 def refuse_clock_that_stands(t0: Any, h: Any, steps: int) -> None:
     """Raise `ValueError` for a step that is no normal number, and for one that is less than the times of the run are apart in
     floats: t + h = t, or another step."""
@@ -300,12 +279,6 @@ def refuse_clock_that_stands(t0: Any, h: Any, steps: int) -> None:
         )
 
 
-def _is_number(leaf) -> bool:
-    if isinstance(leaf, np.ndarray | np.generic | jax.Array):
-        return jnp.issubdtype(leaf.dtype, jnp.number)
-    return isinstance(leaf, int | float) and not isinstance(leaf, bool)
-
-
 def _is_boolean(leaf) -> bool:
     return isinstance(leaf, bool) or jnp.issubdtype(getattr(leaf, "dtype", object), jnp.bool_)
 
@@ -313,11 +286,12 @@ def _is_boolean(leaf) -> bool:
 def _arrays(params):
     """The pytree with arrays for its leaves: NumPy's where they can be, for JAX's start JAX and compile what takes a part."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
-        if not _is_number(leaf) and not _is_boolean(leaf):
+        if not is_number(leaf) and not _is_boolean(leaf):
             raise TypeError(
                 f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {leaf!r:.60}: "
                 "use such a value in the system's functions directly."
             )
+        _refuse_masked(leaf, f"params{jax.tree_util.keystr(path)}")
         if isinstance(leaf, int) and not -(2**63) <= leaf < 2**63:
             raise ValueError(
                 f"params{jax.tree_util.keystr(path)} is a whole number of {leaf.bit_length()} bits, and arrays hold 64: write "

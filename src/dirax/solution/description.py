@@ -15,7 +15,7 @@ import numpy as np
 from dirax.program.user_functions import is_traced
 from dirax.schemes.step import Field
 from dirax.solution.plain_forms import NotPlain, encode_params, encode_scheme
-from dirax.solution.stored_events import KINDS, arrays_of, record_of
+from dirax.solution.stored_events import KINDS, WHOLE_ARRAYS, arrays_of, record_of
 from dirax.solution.trajectory import Trajectory
 from dirax.text.tables import plain
 
@@ -75,7 +75,10 @@ def describe(
         rows = "time" if entry["place"] == "node" else "interval"
         dims = _dimensions(entry["name"], entry["dims"], entry["shape"], sizes)
         about = {"long_name": entry["description"] or entry["name"], "units": _unit(units, entry["name"])}
-        variables[entry["variable"]] = Variable((*lead, rows, *dims), np.asarray(sol.fields[entry["name"]]), about)
+        values = np.asarray(sol.fields[entry["name"]])
+        if values.dtype != np.float64:
+            entry["dtype"] = "int8" if values.dtype == bool else values.dtype.name
+        variables[entry["variable"]] = Variable((*lead, rows, *dims), values, about)
     quantities = _derived(sol, variables) if derived else {}
     for name, values in quantities.items():
         inner = values.shape[len(lead) + 1 :]
@@ -123,6 +126,12 @@ def layout_of(fields: Mapping[str, Field]) -> list[dict[str, Any]]:
         variable = RENAMED.get(name, f"{name}_field" if name in TAKEN else name)
         layout.append({"name": name, "variable": variable, **vars_of(info)})
     return layout
+
+
+def type_of(variable: str, layout: Sequence[Mapping[str, Any]]) -> str:
+    """The type of the numbers that a file has in an array: that of a field, and float64 but for what is whole."""
+    fields = {entry["variable"]: entry.get("dtype", "float64") for entry in layout}
+    return fields.get(variable, "int8" if variable == "ok" else "int64" if variable in WHOLE_ARRAYS else "float64")
 
 
 def vars_of(info: Field) -> dict[str, Any]:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from dirax.schemes.step import COMPOSED
-from dirax.solution.description import DERIVED, FORMAT
+from dirax.solution.description import DERIVED, FORMAT, type_of
 from dirax.solution.saving import MOVED
-from dirax.solution.stored import Unreadable
+from dirax.solution.stored import TYPES, Unreadable
 from dirax.solution.stored_events import shapes_in
 
 Kinds = Mapping[str, tuple[tuple[int, ...], np.dtype]]
@@ -64,6 +64,8 @@ def file_record(about: Mapping[str, Any], kinds: Kinds) -> FileRecord:
         scheme=json.loads(about["scheme_settings"]),
         params=_of_kind("params", about["params"], str) if "params" in about else None,
     )
+    if about["batch_params"] not in (0, 1) or (record.batch_params and not batched):
+        raise Unreadable(f"it says that batch_params is {about['batch_params']}, which dirax does not write there")
     _check_numbers(record)
     for entry in record.fields:
         _check_entry(entry)
@@ -96,8 +98,8 @@ def _names(name: str, values: list) -> list[str]:
 def _check_numbers(record: FileRecord) -> None:
     if not (isfinite(record.step) and record.step > 0):
         raise Unreadable(f"its step is {record.step}, not a positive number")
-    if record.save_every < 1:
-        raise Unreadable(f"it says that every {record.save_every}th step was saved")
+    if not 1 <= record.save_every < 2**63:
+        raise Unreadable(f"it says that every {record.save_every:.6g}th step was saved")
     if record.batched and not all(type(text) is str for text in record.message.values()):
         raise Unreadable("its messages are no texts")
     if not set(record.derived) <= set(DERIVED):
@@ -116,6 +118,7 @@ def _check_entry(entry: Any) -> None:
         and entry["place"] in ("node", "step")
         and named(entry["dims"])
         and entry.get("composed", "") in ("", *COMPOSED)
+        and entry.get("dtype", "float64") in TYPES
     ):
         raise Unreadable("it describes a field as dirax does not")
 
@@ -159,6 +162,9 @@ def _check_shapes(record: FileRecord, kinds: Kinds) -> None:
         if name in kinds and kinds[name][0] != shape:
             raise Unreadable(f"its variable {name:.60} has the shape {kinds[name][0]} instead of {shape}")
     known = {*wanted, *record.derived, *starts, *of_events}
+    for name in known & kinds.keys():
+        if kinds[name][1].name != (dtype := type_of(name, record.fields)):
+            raise Unreadable(f"its variable {name:.60} holds {kinds[name][1]}, and dirax writes {dtype} there")
     for name in kinds:
         if name not in known and not name.startswith(MOVED):
             raise Unreadable(f"its variable {name:.60} is not one that dirax wrote")

@@ -14,7 +14,7 @@ from dirax.solution.file_record import FileRecord, file_record
 from dirax.solution.netcdf import open_netcdf
 from dirax.solution.plain_forms import decode_params, decode_scheme
 from dirax.solution.run_store import is_growing, open_growing
-from dirax.solution.saving import MOVED, SEAL, checked_ending, seal
+from dirax.solution.saving import MOVED, SEAL, checked_ending, path_of, seal
 from dirax.solution.solution import Solution
 from dirax.solution.stored import Stored, Unreadable, checksum, reading
 from dirax.solution.stored_events import events_in
@@ -23,6 +23,9 @@ from dirax.solution.zarr_store import open_store
 
 MOST_ATTRIBUTE = 2**28
 """Bytes of a single attribute."""
+
+SLACK, ROUNDINGS = 1e-6, 8
+"""Part of a step, and last places of a time, by which saved times may be off those of their steps."""
 
 NOT_OURS = "its description is not one that dirax wrote"
 
@@ -35,15 +38,16 @@ def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params
     as for `dx.verify`; energies and constraint residuals are in the file. `params` replaces the stored parameters.
     Loading never executes anything from the file, and takes no more memory than its numbers need.
 
-    Raises `FileNotFoundError`, or `ValueError` for a file that dirax did not write, cannot read, or that is damaged.
+    Raises `FileNotFoundError`, `TypeError` for what is no path, or `ValueError` for a file that dirax did not write, cannot read,
+    or that is damaged.
     """
-    path = Path(path)
+    path = path_of(path)
     ending = checked_ending(path)
     if not _exists(path):
         raise FileNotFoundError(f"there is no file {path}: check the path.")
-    if ending == ".zarr" and is_sweep(path):
-        return opened(path)
     try:
+        if ending == ".zarr" and is_sweep(path):
+            return opened(path)
         sol = reading("it cannot be read, being damaged or incomplete", _read, path, ending, params)
     except Unreadable as error:
         raise ValueError(f"{path} cannot be loaded: {str(error).rstrip('.')}.") from error
@@ -105,7 +109,7 @@ def _read(path: Path, ending: str, params: Any) -> Solution:
             if name not in stored.later and sums.get(name) != checksum(values):
                 raise Unreadable(f"its variable {name} is not what was saved: the file is damaged, incomplete or was edited")
             arrays[name] = values
-    _check_times(arrays)
+    _check_times(arrays, said)
     return reading(NOT_OURS, _solution, said, arrays, params)
 
 
@@ -120,12 +124,17 @@ def _moved(stored: Stored) -> dict[str, str]:
     return found
 
 
-def _check_times(arrays: dict[str, np.ndarray]) -> None:
+def _check_times(arrays: dict[str, np.ndarray], said: FileRecord) -> None:
+    """Rows are as many steps apart as the file says: the last one, and where the first step was given the second, are fewer."""
     t = arrays["time"]
-    if not np.all(np.isfinite(t)) or np.any(np.diff(t) < 0):
+    gaps = np.diff(t)
+    if not np.all(np.isfinite(t)) or np.any(gaps < 0):
         raise Unreadable("its times do not increase")
     if "interval" in arrays and not np.array_equal(arrays["interval"], t[:-1]):
         raise Unreadable("its steps do not begin at its times")
+    most, slack = said.save_every * said.step, SLACK * said.step + ROUNDINGS * np.spacing(np.max(np.abs(t)))
+    if np.any(gaps > most + slack) or np.any(gaps[:-1] < said.step - slack) or np.any(gaps[1:-1] < most - slack):
+        raise Unreadable(f"its times are not those of steps of {said.step:.6g} of which every {said.save_every}th was saved")
 
 
 def _solution(said: FileRecord, arrays: dict[str, np.ndarray], params: Any) -> Solution:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from dirax.solution.atomic_files import checked_place, placed
-from dirax.solution.description import Description, Variable, describe
+from dirax.solution.description import Description, Variable, describe, type_of
 from dirax.solution.netcdf import write_netcdf
-from dirax.solution.stored import checksum
+from dirax.solution.stored import TYPES, checksum
 from dirax.solution.trajectory import Trajectory
 from dirax.solution.zarr_store import is_store, write_store
 
@@ -41,15 +41,24 @@ def save(
     leaves an older file as it was. `units` and `coordinates` as in `sol.to_xarray`.
 
     Raises `FileExistsError` unless `overwrite`, `FileNotFoundError` where the folder does not exist, `ValueError` for
-    another ending or too long a name, and for a solution inside `jax.grad`, `jit` or `vmap`.
+    another ending or too long a name, and for a solution inside `jax.grad`, `jit` or `vmap`; `TypeError` for what is no path, and
+    for arrays of other numbers than files hold.
     """
-    path = Path(path)
+    path = path_of(path)
     write, is_one = FORMATS[checked_ending(path)]
     checked_place(path, overwrite, is_one)
     variables, attributes = file_form(describe(sol, units, coordinates))
     with placed(path, overwrite, is_one) as beside:
         write(beside, variables, attributes)
     return path
+
+
+def path_of(path: Any) -> Path:
+    """The path; `TypeError` for what is none."""
+    try:
+        return Path(path)
+    except TypeError:
+        raise TypeError(f'path must be a text or a pathlib.Path such as "run.zarr", but {path!r:.60} was given.') from None
 
 
 def checked_ending(path: Path) -> str:
@@ -68,7 +77,8 @@ def seal(attributes: Mapping[str, Any]) -> int:
 def file_form(said: Description) -> tuple[dict[str, Variable], dict[str, Any]]:
     """Numbers only: names of coordinates stay in the attributes, long attributes become bytes; with checksums."""
     variables = {**said.variables, **{name: axis for name, axis in said.axes.items() if name != "coordinate"}}
-    variables = {name: _numbers(variable) for name, variable in variables.items()}
+    layout = json.loads(said.attributes["fields"])
+    variables = {name: _numbers(variable, name, type_of(name, layout)) for name, variable in variables.items()}
     attributes = dict(said.attributes)
     for name, value in said.attributes.items():
         if isinstance(value, str) and len(value.encode()) > LONGEST_ATTRIBUTE:
@@ -79,6 +89,8 @@ def file_form(said: Description) -> tuple[dict[str, Variable], dict[str, Any]]:
     return variables, attributes
 
 
-def _numbers(variable: Variable) -> Variable:
-    values = variable.values
-    return Variable(variable.dims, values.astype(np.int8), variable.about) if values.dtype == bool else variable
+def _numbers(variable: Variable, name: str, dtype: str) -> Variable:
+    values = variable.values.astype(np.int8) if variable.values.dtype == bool else variable.values
+    if values.dtype != dtype or dtype not in TYPES:
+        raise TypeError(f"the array {name} holds {values.dtype}, which files do not hold there: convert it by astype(float).")
+    return Variable(variable.dims, values, variable.about)

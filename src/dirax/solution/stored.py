@@ -1,8 +1,11 @@
 """What a file of dirax holds, before its arrays are read: attributes, sizes, and a way to each array."""
 
+import os
+import stat
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,6 +32,20 @@ class Stored:
 def checksum(values: np.ndarray) -> int:
     """The CRC-32 of the bytes of an array."""
     return zlib.crc32(np.ascontiguousarray(values).data)
+
+
+def plain_bytes(file: Path, where: Any, most: int) -> bytes:
+    """The bytes of a file that a store calls `where`. Raises `Unreadable` for one with more than `most`, and for a link, a
+    pipe or a device, which may have no end, before any is read; `FileNotFoundError` for none."""
+    status = os.lstat(file)
+    if stat.S_ISLNK(status.st_mode):
+        raise Unreadable(f"its entry {where} is a link, which dirax does not write")
+    if not stat.S_ISREG(status.st_mode):
+        raise Unreadable(f"its entry {where} is a pipe, a device or a folder in the place of a file")
+    if status.st_size > most:
+        raise Unreadable(f"its entry {where} has {status.st_size} bytes, and dirax writes at most {most} there")
+    with open(file, "rb") as opened:
+        return opened.read(status.st_size)
 
 
 def reading(problem: str, read: Callable, *arguments: Any) -> Any:

@@ -14,6 +14,10 @@ WHOLE = ("index", "direction", "lane")
 """What is a whole number of each event."""
 
 
+WHOLE_ARRAYS = frozenset(f"{kind}_{part}" for kind in KINDS for part in WHOLE)
+"""The names of their arrays."""
+
+
 def arrays_of(kind: str, found: Events) -> dict[str, np.ndarray]:
     """The arrays of some events by the names that they have in a file; none of no events."""
     if not len(found):

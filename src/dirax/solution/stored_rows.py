@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.solution.stored import Unreadable, checksum
+from dirax.solution.stored import Unreadable, checksum, plain_bytes
 from dirax.solution.zarr_store import chunk_file
 
 
@@ -109,7 +109,8 @@ def read_block(folder: Path, index: int, shape: tuple[int, ...], axis: int) -> n
     if 0 in shape:
         return np.empty(shape)
     try:
-        data = chunk_file(folder, tuple(index if i == axis else 0 for i in range(len(shape)))).read_bytes()
+        file = chunk_file(folder, tuple(index if i == axis else 0 for i in range(len(shape))))
+        data = plain_bytes(file, file.relative_to(folder.parent), 8 * int(np.prod(shape)))
     except FileNotFoundError:
         raise Unreadable(f"a part of its variable {folder.name} is missing: the store is incomplete") from None
     if len(data) != 8 * int(np.prod(shape)):

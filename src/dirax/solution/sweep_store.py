@@ -5,6 +5,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dirax.solution.stored import plain_bytes
+from dirax.solution.zarr_store import LONGEST_NODE, NODE
+
 if TYPE_CHECKING:
     from xarray import Dataset
 
@@ -25,7 +28,7 @@ def is_sweep(path: Path) -> bool:
 
 def group_of(path: Path) -> dict[str, Any]:
     """The description of a store of zarr, with those of its arrays. Raises `OSError` and `ValueError` for anything else."""
-    return json.loads((path / "zarr.json").read_bytes())
+    return json.loads(plain_bytes(path / NODE, NODE, LONGEST_NODE))
 
 
 def attributes_of(path: Path) -> dict[str, Any]:
@@ -52,4 +55,6 @@ def opened(path: Path) -> "Dataset":
     import xarray as xr
 
     attributes_of(path)
+    for node in path.glob(f"*/{NODE}"):
+        plain_bytes(node, node.relative_to(path), LONGEST_NODE)
     return xr.open_zarr(path, chunks={} if find_spec("dask") else None)  # type: ignore[arg-type]

@@ -5,6 +5,7 @@ library does, and so that the sizes of arrays are known, and nothing but numbers
 """
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from itertools import product
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from dirax.solution.description import Variable
-from dirax.solution.stored import TYPES, Stored, Unreadable, reading
+from dirax.solution.stored import TYPES, Stored, Unreadable, plain_bytes, reading
 
 CHUNK = 2**23
 """Bytes of a chunk; longer arrays are cut along their longest axis."""
@@ -25,6 +26,9 @@ SMALL = 2**20
 
 NODE = "zarr.json"
 """The file that describes an array or a group."""
+
+LONGEST_NODE = 2**28
+"""Bytes of such a file, at most."""
 
 LITTLE = {"name": "bytes", "configuration": {"endian": "little"}}
 BYTES = {"name": "bytes"}
@@ -111,17 +115,17 @@ def _compress(data: bytes) -> bytes:
 
 def open_store(path: Path) -> Stored:
     """Attributes, sizes and arrays of a zarr store. Raises `Unreadable` for one with anything that dirax does not write."""
-    if not is_store(path):
+    if not os.path.lexists(path / NODE):
         raise Unreadable("it is not a zarr store of format 3 (it has no zarr.json)")
     nodes: dict[str, dict[str, Any]] = {}
     for file in sorted(path.rglob("*")):
         where = file.relative_to(path)
-        if file.is_symlink():
-            raise Unreadable(f"its entry {where} is a link, which dirax does not write")
+        if file.is_symlink() or not (file.is_dir() or file.is_file()):
+            plain_bytes(file, where, 0)  # says what it is
         if file.name in (".zarray", ".zgroup", ".zmetadata"):
             raise Unreadable(f"it is a zarr store of format 2 ({where}), which dirax does not write")
         if file.name == "zarr.json":
-            node = reading(f"{where} is damaged", json.loads, file.read_bytes())
+            node = reading(f"{where} is damaged", json.loads, plain_bytes(file, where, LONGEST_NODE))
             nodes[where.parent.as_posix()] = reading(f"{where} is not one that dirax wrote", _checked_node, node, str(where))
     group = nodes.pop(".")
     if group["node_type"] != "group":
@@ -168,9 +172,9 @@ def _read_array(folder: Path, node: dict[str, Any]) -> np.ndarray:
     parts = {}
     for index in _chunks(shape, chunk):
         file = chunk_file(folder, index)
-        if not file.is_file():
+        if not file.exists():
             raise Unreadable(f"a part of its variable {folder.name} is missing: the file is incomplete")
-        data = file.read_bytes()
+        data = plain_bytes(file, file.relative_to(folder.parent), size + size // 128 + 1024)  # what zstd may add
         for _ in range(compressed):
             data = _decompress(data, size)
         if len(data) != size:

@@ -11,7 +11,8 @@ import jax
 import numpy as np
 
 from dirax.engines.engine import AbstractEngine
-from dirax.run.validate import check_kinds, count, engine_from, finite, positive
+from dirax.run.scalars import count, finite, positive
+from dirax.run.validate import check_kinds, engine_from
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.flushed_files import Hold, StoreError
 from dirax.solution.sweep_store import opened

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data, Numbers
+from dirax.numerics.tolerances import SOLVED_ROUNDOFF
 from dirax.program.roots import FEWEST_SPARSE, nearest_root
 from dirax.program.sparse_matrix import SparseMatrix
 from dirax.program.user_functions import UserFunction
@@ -194,17 +195,33 @@ class Circuit(AbstractSystem):
         m = len(self.nodes) + len(self.elements("V")) + len(self.elements("T"))
         laws = lambda z: self.relation(x, z[:n], z[n:], t, params)
         found = nearest_root(laws, jnp.zeros(n + m))
-        return {"x": x, "velocity": found[:n], "defect": laws(found)}
+        return {"x": x, "velocity": found[:n], "potentials": found[n:]}
 
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " r"]:
         """What is left of the laws where no currents and potentials satisfy them."""
-        return data["defect"]
+        return self.relation(data["x"], data["velocity"], data["potentials"], data.get("t", 0.0), params)
+
+    def sizes_of_data(self, data: Data, params: Any) -> Data:
+        """Currents and voltages that are zero up to roundoff of the others."""
+        c, n = len(self.elements("C")), len(self.nodes)
+        rates, rest = data["velocity"], data["potentials"]
+        largest = lambda *parts: jnp.max(jnp.abs(jnp.concatenate(parts)), initial=0.0)
+        current, voltage = (SOLVED_ROUNDOFF * largest(*pair) for pair in ((rates[:c], rest[n:]), (rates[c:], rest[:n])))
+        of = lambda a, first, second: jnp.concatenate([jnp.abs(a[0]) + first, jnp.abs(a[1]) + second])
+        sizes = {name: jnp.abs(a) for name, a in data.items()}
+        velocity = of((rates[:c], rates[c:]), current, voltage)
+        return sizes | {"velocity": velocity, "potentials": of((rest[:n], rest[n:]), voltage, current)}
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         return self.energy(row["x"])
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " r"]:
-        return self.complete({"x": row["x"], "t": jnp.asarray(row.get("t", 0.0))}, params, False)["defect"]
+        now = {"x": row["x"], "t": jnp.asarray(row.get("t", 0.0))}
+        return self.initial_defect(self.complete(now, params, False) | now, params)
+
+    @property
+    def projected(self) -> str:
+        return ""
 
     @property
     def energy_changes(self) -> str:

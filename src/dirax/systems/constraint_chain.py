@@ -222,6 +222,12 @@ class ResolvedSystem(AbstractSystem):
         """φ(x)."""
         return self.chain.constraints(data["x"], params)
 
+    def initial_terms(self, data: Data, params: Any) -> Float[Numbers, " m"]:
+        """The largest derivative of each in the units of the chain, times the size of x in them, as in `ConstraintChain.off`."""
+        x, units = data["x"], self.chain.units
+        slopes = jacobian(lambda x: self.chain.constraints(x, params))(x) * units[None]
+        return jnp.max(jnp.abs(slopes), axis=1, initial=0.0) * (1.0 + jnp.max(jnp.abs(x) / units))
+
     def final_manifold(self, shape: Shape) -> FinalManifold:
         """M_f, projected onto by the nearest point."""
         chain = self.chain

@@ -4,16 +4,20 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dirax.numerics.arrays import Numbers
+from dirax.numerics.arrays import Data, Numbers
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.roots import nearest_root
-from dirax.program.rounding import rounding
+from dirax.program.rounding import rounding, sizes_of_terms
 from dirax.program.tracing import along, jacobian
 from dirax.program.user_functions import UserFunction
+
+LARGEST = 2**18
+"""Entries of a matrix of the constraints up to which the sizes of their terms are found from it."""
 
 
 def no_constraint() -> Float[Numbers, "0"]:
@@ -149,6 +153,23 @@ class Constraints(eqx.Module):
         rows = jnp.abs(self.holonomic_matrix(t, q, params))
         position = position if size is None else position + rows @ size
         return jnp.concatenate([first, position, rows @ fastest + moved])
+
+    def initial_terms(self, data: Data, params: Any, terms: Callable) -> Float[Numbers, " k"]:
+        """The sizes of the terms of `defect` at initial data q, v, by `terms`(t, q, v, params); of two points q0, q1 with the
+        velocity v between them those of g(q0), and of the constraints (W v + b, g) of their step."""
+        t, v = data.get("t", 0.0), data["v"]
+        if jax.eval_shape(lambda: self.defect(t, v, v, params)).size * v.size > LARGEST:
+            terms = self._terms_of_many
+        if "q0" not in data:
+            return terms(t, data["q"], v, params)
+        first, step = (terms(t, data[q], v, params) for q in ("q0", "q1"))
+        m, c = self.sizes(v, params)
+        return jnp.concatenate([first[m : m + c], step[: m + c]])
+
+    def _terms_of_many(self, t, q, v, params):
+        """The same of many coordinates, which count as moving as fast as the fastest of them."""
+        fastest = jnp.broadcast_to(jnp.max(jnp.abs(v)), v.shape)
+        return sizes_of_terms(lambda q, v: self.defect(t, q, v, params), q, v, errors=(jnp.abs(q), fastest))
 
     def nearest_velocity(
         self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], lifted: Float[Numbers, "n k"], params: Any

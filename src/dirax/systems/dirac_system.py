@@ -13,7 +13,7 @@ from dirax.geometry.representations import KERNEL_PAIRS
 from dirax.geometry.structures import DiracStructure, Induced
 from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import BRACKET_DEFECT, RATE_RANK
-from dirax.program.linear_solves import pseudo_inverse, solve
+from dirax.program.linear_solves import scaled_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
@@ -21,6 +21,7 @@ from dirax.systems.constraints import Constraints
 from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
 from dirax.systems.hamilton_dirac import HamiltonDirac
 from dirax.systems.implicit_form import energy_of_x, names, point_of
+from dirax.systems.magnitudes import as_large_as_energy, of_solution
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -252,12 +253,16 @@ class DiracSystem(AbstractSystem):
         x = self.point(data)
         if project and self.holonomic is not None and self.is_graph:
             x = self.project(x, params)
-        matrix, right = self.equations(x, params)
-        rows = self.holonomic_matrix(x, params)
+        matrix, right = self._rates(x, params)
+        rates = scaled_inverse(matrix, RATE_RANK)[0] @ right
+        return {"x": x, "velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
+
+    def _rates(self, x, params):
+        """The linear equations of (ẋ, λ) with G ẋ = 0 among them."""
+        (matrix, right), rows = self.equations(x, params), self.holonomic_matrix(x, params)
         count = rows.shape[0]
         matrix = jnp.concatenate([matrix, jnp.concatenate([rows, jnp.zeros((count, count))], axis=1)])
-        rates = pseudo_inverse(matrix, RATE_RANK) @ jnp.concatenate([right, jnp.zeros(count)])
-        return {"x": x, "velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
+        return matrix, jnp.concatenate([right, jnp.zeros(count)])
 
     def project(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
         """A point of M_f near x, for a graph D: g = 0 nearest in x, then {g, H} = 0 along the forces if the brackets vanish."""
@@ -276,6 +281,16 @@ class DiracSystem(AbstractSystem):
             return jnp.concatenate([self.holonomic(x, params), self.tangency_defect(x, params)])
         return jnp.concatenate([self.holonomic(x, params), self.relation(x, data["velocity"], data["multipliers"], 0.0, params)])
 
+    def sizes_of_data(self, data: Data, params: Any) -> Data:
+        """Each coordinate as large as all of the energy makes it, and rates that are zero up to roundoff of the others."""
+        x = data["x"]
+        largest = jnp.abs(x) + as_large_as_energy(lambda x: self.differential(x, params), x)
+        sizes = {name: jnp.abs(a) for name, a in data.items()} | {"x": largest}
+        if self.holonomic is not None and self.is_graph:
+            return sizes
+        rates = of_solution(self._rates(x, params)[0], jnp.concatenate([data["velocity"], data["multipliers"]]), RATE_RANK)
+        return sizes | {"velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
+
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(x)."""
         return self.hamiltonian(row["x"], params)
@@ -283,6 +298,10 @@ class DiracSystem(AbstractSystem):
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
         """The defect of x, as in `initial_defect`."""
         return self.initial_defect(self.complete({"x": row["x"]}, params, False), params)
+
+    @property
+    def projected(self) -> str:
+        return "x across the constraint by its forces" if self.holonomic is not None and self.is_graph else ""
 
     @property
     def constrains_differential(self) -> bool:

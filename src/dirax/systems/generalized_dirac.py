@@ -11,10 +11,11 @@ from dirax.geometry.lagrangian_submanifolds import LagrangianSubmanifold
 from dirax.geometry.structures import DiracStructure
 from dirax.numerics.arrays import Data, Numbers
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import gradient
+from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import is_traced
 from dirax.systems.forms import ImplicitForm, RelationForm
 from dirax.systems.implicit_form import names
+from dirax.systems.magnitudes import as_large_as_energy, of_solution
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -132,6 +133,16 @@ class GeneralizedDiracSystem(AbstractSystem):
         """What of (F ẋ + E ∂F/∂x, ∂F/∂s) no ẋ and s make zero: x is on M_0 where it vanishes."""
         return self.relation(data["x"], data["velocity"], data["guess"], 0.0, params)
 
+    def sizes_of_data(self, data: Data, params: Any) -> Data:
+        """Each number of (x, s) as large as all of F makes it, and of (ẋ, s) those that are zero up to roundoff of the others."""
+        x, s = data["x"], data["guess"]
+        N, both, found = x.shape[0], jnp.concatenate([x, s]), jnp.concatenate([data["velocity"], s])
+        slope = gradient(lambda z: self.submanifold.family(z[:N], z[N:], params))
+        energetic = as_large_as_energy(slope, both)
+        solved = of_solution(jacobian(lambda u: self.relation(x, u[:N], u[N:], 0.0, params))(found), found)
+        sizes = {name: jnp.abs(a) for name, a in data.items()}
+        return sizes | {"x": sizes["x"] + energetic[:N], "velocity": solved[:N], "guess": solved[N:] + energetic[N:]}
+
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """F(x, s) for the s over x."""
         found = self.complete({"x": row["x"]}, params, False)
@@ -140,6 +151,10 @@ class GeneralizedDiracSystem(AbstractSystem):
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " N+k"]:
         """The defect of x, as in `initial_defect`."""
         return self.initial_defect(self.complete({"x": row["x"]}, params, False), params)
+
+    @property
+    def projected(self) -> str:
+        return ""
 
     @property
     def constrains_differential(self) -> bool:

@@ -12,6 +12,7 @@ from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import RelationForm
+from dirax.systems.magnitudes import as_large_as_kinetic
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem, refuse_start
 
@@ -92,6 +93,12 @@ class HamiltonDirac(AbstractSystem):
         """W ∂H/∂p."""
         return self.momentum_defect(data.get("t", 0.0), data["q"], data["p"], params)
 
+    def sizes_of_data(self, data: Data, params: Any) -> Data:
+        """Each momentum as large as the kinetic energy makes it."""
+        t, q, p = data.get("t", 0.0), data["q"], data["p"]
+        velocity = lambda p: self.slopes(t, q, p, params)[1]
+        return {name: jnp.abs(a) for name, a in data.items()} | {"p": jnp.abs(p) + as_large_as_kinetic(velocity, p)}
+
     def momentum_defect(
         self, t: Any, q: Float[Numbers, " n"], p: Float[Numbers, " n"], params: Any = None
     ) -> Float[Numbers, " m"]:
@@ -99,6 +106,10 @@ class HamiltonDirac(AbstractSystem):
         if self.one_forms is None:
             return jnp.zeros(0)
         return self.constraints.one_forms_at(t, q, params) @ self.slopes(t, q, p, params)[1]
+
+    @property
+    def projected(self) -> str:
+        return "p by the forces of the constraint"
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(q, p)."""

@@ -11,6 +11,7 @@ from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.user_functions import UserFunction
 from dirax.systems.forms import ImplicitForm, RelationForm
 from dirax.systems.implicit_form import energy_of_x, names, point_of
+from dirax.systems.magnitudes import of_solution
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -82,11 +83,18 @@ class ImplicitSystem(AbstractSystem):
         x = data["x"]
         matrix, f = self.equations(x, params)
         velocity = scaled_pseudo_inverse(matrix) @ f
-        return {"x": x, "velocity": velocity[: x.size], "defect": matrix @ velocity - f}
+        return {"x": x, "velocity": velocity[: x.size], "multipliers": velocity[x.size :]}
 
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " r"]:
         """The part of f that no (ẋ, u) reaches: x is on M_0 where it vanishes."""
-        return data["defect"]
+        return self.relation(data["x"], data["velocity"], data["multipliers"], 0.0, params)
+
+    def sizes_of_data(self, data: Data, params: Any) -> Data:
+        """Rates that are zero up to roundoff of the others."""
+        x, names = data["x"], ("velocity", "multipliers")
+        rates = of_solution(self.equations(x, params)[0], jnp.concatenate([data[name] for name in names]))
+        sizes = {name: jnp.abs(a) for name, a in data.items()}
+        return sizes | {"velocity": rates[: x.size], "multipliers": rates[x.size :]}
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(x); NaN for a system stated without one."""
@@ -94,3 +102,7 @@ class ImplicitSystem(AbstractSystem):
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " r"]:
         return self.initial_defect(self.complete({"x": row["x"]}, params, False), params)
+
+    @property
+    def projected(self) -> str:
+        return ""

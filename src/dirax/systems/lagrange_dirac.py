@@ -18,6 +18,7 @@ from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import Constraints, no_constraint
 from dirax.systems.forms import ImplicitForm
 from dirax.systems.implicit_lagrangian import implicit_lagrangian
+from dirax.systems.magnitudes import as_large
 from dirax.systems.system import AbstractSystem, refuse_start
 
 
@@ -236,13 +237,7 @@ class LagrangeDirac(AbstractSystem):
 
     def initial_terms(self, data: Data, params: Any) -> Float[Numbers, " k"]:
         """The sizes of the terms of `initial_defect`; for two points, of it and of the constraints of their step."""
-        t = data.get("t", 0.0)
-        if "q0" not in data:
-            return self.constraint_terms(t, data["q"], data["v"], params)
-        first, step = (self.constraint_terms(t, data[q], data["v"], params) for q in ("q0", "q1"))
-        m = self.constraints.one_forms_at(t, data["q0"], params).shape[0]
-        c = (first.shape[0] - m) // 2
-        return jnp.concatenate([first[m : m + c], step[: m + c]])
+        return self.constraints.initial_terms(data, params, self.constraint_terms)
 
     def speeds(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " n"]:
         """How fast each coordinate would be that had the kinetic energy alone; 0 where L is degenerate in it."""
@@ -250,9 +245,8 @@ class LagrangeDirac(AbstractSystem):
 
     def _as_large(self, t, q, v, x, params):
         """How large each coordinate would be that alone had the length of x in the kinetic metric; 0 where that is degenerate."""
-        metric = jnp.abs(jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v))
-        along, own = jnp.abs(x) @ metric @ jnp.abs(x), jnp.diagonal(metric)
-        return jnp.sqrt(jnp.where(own > 0.0, along / jnp.where(own > 0.0, own, 1.0), 0.0))
+        metric = jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v)
+        return as_large(metric, x)
 
     def constraint_terms(self, t: Any, q: Float[Numbers, " n"], v: Float[Numbers, " n"], params: Any) -> Float[Numbers, " k"]:
         """The sizes of the terms of (W v + b, g, G v + ∂g/∂t), for each coordinate as fast as the kinetic energy makes it, and
@@ -272,6 +266,10 @@ class LagrangeDirac(AbstractSystem):
         if not self.constraints.any:
             return no_constraint()
         return self.constraints.defect(row.get("t", 0.0), row["q"], self._velocity(row, params), params)
+
+    @property
+    def projected(self) -> str:
+        return "q across the constraint by its forces"
 
     @property
     def energy_changes(self) -> str:

@@ -19,6 +19,7 @@ from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.systems.constraints import Constraints, no_constraint
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.magnitudes import as_large
 from dirax.systems.system import AbstractSystem, refuse_start
 
 
@@ -199,6 +200,15 @@ class ManifoldLagrangian(AbstractSystem):
             return no_constraint() if self.holonomic is None else self.constraints.position_defect(t, data["q0"], params)
         return self.constraints.defect(t, data["q"], data["v"], params)
 
+    def initial_terms(self, data: Data, params: Any) -> Float[Numbers, " k"]:
+        return self.constraints.initial_terms(data, params, self._constraint_terms)
+
+    def _constraint_terms(self, t, q, v, params):
+        """Those of (W v + b, g, G v + ∂g/∂t) for components of v, and of q, as large as the kinetic energy makes them."""
+        metric = jacobian(gradient(lambda v: self.lagrangian(q, v, params)))(v)
+        speed, size = (as_large(metric, a) for a in (v, q))
+        return self.constraints.terms(t, q, v, speed, params, size)
+
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy at the saved point and momentum."""
         return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params), params)
@@ -210,6 +220,10 @@ class ManifoldLagrangian(AbstractSystem):
             return off
         v = self.inverse_legendre(q, row["p"], params)
         return jnp.concatenate([off, self.constraints.defect(row.get("t", 0.0), q, v, params)])
+
+    @property
+    def projected(self) -> str:
+        return "q across the constraint by its forces"
 
     @property
     def energy_changes(self) -> str:

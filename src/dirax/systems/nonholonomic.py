@@ -128,6 +128,9 @@ class NonholonomicMechanics(AbstractSystem):
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " m"]:
         return self.lagrange_dirac().initial_defect(data, params)
 
+    def initial_terms(self, data: Data, params: Any) -> Float[Numbers, " k"]:
+        return self.lagrange_dirac().initial_terms(data, params)
+
     def hamiltonian(
         self, q: Float[Numbers, " n"], p: Float[Numbers, " n"], params: Any = None, t: Any = 0.0
     ) -> Float[Numbers, ""]:
@@ -182,6 +185,10 @@ class NonholonomicMechanics(AbstractSystem):
         """(μ g⁻¹p + b, g, G g⁻¹p + ∂g/∂t) at the node."""
         q, t = row["q"], row.get("t", 0.0)
         return self.constraints.defect(t, q, self.velocity(q, row["p"], params, t), params)
+
+    @property
+    def projected(self) -> str:
+        return "q across the constraint by its forces"
 
     @property
     def energy_changes(self) -> str:

@@ -17,6 +17,7 @@ from dirax.program.user_functions import UserFunction, is_traced
 from dirax.systems.constraints import no_constraint
 from dirax.systems.forms import EnergyForm, ImplicitForm, Observed, RelationForm
 from dirax.systems.implicit_form import in_time, names, point_of, uses_time, without_time
+from dirax.systems.magnitudes import as_large_as_energy
 from dirax.systems.port_matrices import constituent, matrix_function, refuse_unless_dissipative, refuse_unless_skew
 from dirax.systems.port_structures import closed_structure, structure_of
 from dirax.systems.shape import Shape
@@ -242,12 +243,21 @@ class PortHamiltonian(AbstractSystem):
             return no_constraint()
         return self.closed_matrix(data["x"], params).T @ self.differential(data["x"], params)
 
+    def sizes_of_data(self, data: Data, params: Any) -> Data:
+        """Each coordinate as large as all of the energy makes it."""
+        largest = jnp.abs(data["x"]) + as_large_as_energy(lambda x: self.differential(x, params), data["x"])
+        return {name: jnp.abs(a) for name, a in data.items()} | {"x": largest}
+
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(x)."""
         return self.hamiltonian(row["x"], params)
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " m"]:
         return self.initial_defect({"x": row["x"]}, params)
+
+    @property
+    def projected(self) -> str:
+        return ""
 
     @property
     def energy_changes(self) -> str:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from dirax.geometry.semidirect import SemidirectProduct
 from dirax.numerics.arrays import Data, Numbers
+from dirax.program.rounding import sizes_of_terms
 from dirax.program.tracing import gradient, jacobian
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
@@ -65,6 +66,15 @@ class AbstractSystem(eqx.Module):
     @abstractmethod
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " k"]:
         """By how much completed initial data violate the constraints, one number a constraint."""
+
+    def initial_terms(self, data: Data, params: Any) -> Float[Numbers, " k"]:
+        """The sizes of the terms of `initial_defect`, however they cancel: what it is compared with, whatever the units."""
+        return defect_terms(self, data, params)
+
+    def sizes_of_data(self, data: Data, params: Any) -> Data:
+        """How large each of the completed data counts as in these terms: |a|, and more where a zero may be one up to a rounding
+        of what it could be."""
+        return {name: jnp.abs(a) for name, a in data.items()}
 
     @abstractmethod
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
@@ -175,6 +185,11 @@ class AbstractSystem(eqx.Module):
             f"inputs= drives an open dx.PortHamiltonian system, but the system is a {type(self).__name__}: leave it out."
         )
 
+    @property
+    def projected(self) -> str:
+        """What `complete` moves with `project`, in words that follow "project=True, which moves"; "" where it moves nothing."""
+        return "the data"
+
     def explain(self, x: Numbers) -> str:
         """Which constraint the point x is off, and the way back, in words for a message; "" where there is no more to say."""
         return ""
@@ -199,6 +214,13 @@ class AbstractSystem(eqx.Module):
     def dual(self) -> SemidirectProduct | None:
         """The dual of a Lie algebra or of a semidirect product that the points x are of; None for other systems."""
         return None
+
+
+def defect_terms(system: AbstractSystem, data: Data, params: Any) -> Float[Numbers, " k"]:
+    """The sizes of the terms of the `initial_defect` of a system, of data as large as its `sizes_of_data`."""
+    values, errors = ({n: jnp.asarray(a, float) for n, a in d.items()} for d in (data, system.sizes_of_data(data, params)))
+    defect = lambda *values: system.initial_defect(dict(zip(data, values, strict=True)), params)
+    return sizes_of_terms(defect, *values.values(), errors=tuple(errors[name] for name in data))
 
 
 def refuse_start(system: AbstractSystem, data: Data, *kinds: str) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from dirax.numerics.newton import damped_step, sizes_of_unknowns
+from dirax.numerics.tolerances import EQUATION_RANK
 from dirax.program.evaluation.in_numpy import Slopes, Values
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
@@ -135,7 +136,7 @@ def while_(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operan
 
 @numpy_rule("dirax_solve")
 def solved_by_numpy(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes, right: Nodes) -> list[Nodes]:
-    return made.between([matrix, right], [right.shape], lambda operands: [_solved(*operands)])
+    return made.between([matrix, right], [right.shape], lambda operands: [_solved(*operands)], "solve")
 
 
 def _solved(matrices: np.ndarray, sides: np.ndarray) -> np.ndarray:
@@ -160,12 +161,13 @@ def pseudo_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any,
 
 @numpy_rule("dirax_scaled_inverse")
 def scaled_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
-    return made.between([matrix], [v.aval.shape for v in equation.outvars], lambda operands: [_inverted(*operands)[0]])
+    tolerance, shapes = equation.params["tolerance"], [v.aval.shape for v in equation.outvars]
+    return made.between([matrix], shapes, lambda operands: _inverted(*operands, tolerance), ("scaled inverse", tolerance))
 
 
-def _inverted(matrices: np.ndarray) -> list[np.ndarray]:
+def _inverted(matrices: np.ndarray, tolerance: float = EQUATION_RANK) -> list[np.ndarray]:
     """The scaled pseudo-inverses and the units of their rows; of a matrix that all entries have, once."""
-    inverted = lambda a: list(equilibrated_inverse(np, a))
+    inverted = lambda a: list(equilibrated_inverse(np, a, tolerance))
     if len(matrices) > 1 and np.all(matrices == matrices[:1]):
         return [np.repeat(a, len(matrices), axis=0) for a in _of_finite(inverted, matrices[:1])]
     return _of_finite(inverted, matrices)
