@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from dirax.engines.step_program import StepProgram, step_program
-from dirax.numerics.equilibration import condition_number
+from dirax.numerics.equilibration import balanced_inverse, condition_number
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Values
 from dirax.program.evaluation.noise import Noise
@@ -126,19 +126,22 @@ class StepsInNumbers:
         terms = np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u))
         return np.where(solved, np.max(terms, axis=1, initial=0.0), np.nan)
 
-    def differentiated(self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def differentiated(
+        self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: Noise | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The derivatives (states, s, s) of the states after steps by those before, and the largest condition number of the
         equations of each. With r(u, x) = 0 and x' = a(u, x), ∂x'/∂x = ∂_x a − ∂_u a (∂_u r)⁻¹ ∂_x r."""
         count, size = made.states[0].shape
         jacobians, conditions = np.broadcast_to(np.eye(size), (count, size, size)), np.ones(count)
         for (index, fraction), u, states in zip(self.program.stages, made.unknowns, made.states, strict=True):
             e, k = self.program.equations[index], u.shape[1]
-            known = self._values(index, u, states, (t, np.full(count, fraction * h), params))
+            known = self._values(index, u, states, (t, np.full(count, fraction * h), params), noise)
             slopes = known.slopes([*e.residual, *e.advance], [*e.unknowns, *e.state])
+            slopes = noise.off(slopes) if noise else slopes  # for what is made of them by matrices
             by_u, by_state = slopes[:, :, :k], slopes[:, :, k:]
             step = by_state[:, k:]
             if k:
-                step = step - by_u[:, k:] @ (_inverses(by_u[:, :k]) @ by_state[:, :k])
+                step = step - by_u[:, k:] @ (balanced_inverse(by_u[:, :k]) @ by_state[:, :k])
                 regular = np.all(np.isfinite(by_u), axis=(1, 2))
                 conditions[regular] = np.maximum(conditions[regular], condition_number(by_u[regular, :k]))
             jacobians, t = step @ jacobians, t + fraction * h

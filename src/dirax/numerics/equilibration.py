@@ -168,8 +168,9 @@ def _inverted(matrices: np.ndarray) -> np.ndarray:
 
 
 def condition_number(matrix: Any, xp: ModuleType = np) -> Any:
-    """That of the equilibrated matrix, ≥ 1."""
-    values = xp.linalg.svd(equilibrated(matrix, xp)[0], compute_uv=False)
+    """That of matrices whose rows and columns have units of their own, ≥ 1."""
+    rows, columns = geometric_scales(xp.abs(matrix), xp)
+    values = xp.linalg.svd(matrix / rows / columns, compute_uv=False)
     return values[..., 0] / values[..., -1]
 
 
