@@ -70,3 +70,18 @@ def test_a_billionth_that_a_step_loses_is_found_in_any_units():
         run = dx.simulate(system, Damped(), q=[l, 0.3], v=[0.0, 0.1], params=l, step=0.1, steps=10)
         line = dx.verify(run)["symplecticity of one step"]
         assert line.verdict == "VIOLATED" and 0.5e-9 < line.value < 1e-9, line  # of {θ', p_θ'} = 1 − loss
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_steps_by_collocation_are_solved_whatever_the_mass(engine):
+    run = lambda m: dx.simulate(KEPLER, dx.Collocation(2), q=[1.0, 0.0], v=[0.0, 1.2], params=m, step=0.1, steps=9, engine=engine)
+    lines = [dx.verify(run(m))["steps solved"] for m in (1.0, 2.0**-30, 2.0**60)]
+    assert lines[0].verdict == "ok" and 0.0 < lines[0].value < 1e-15 and len({line.value for line in lines}) == 1
+
+
+@pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.LagrangeDAlembert()])
+def test_steps_at_an_equilibrium_are_solved(scheme):
+    """The force 0.981 − 0.981 leaves speeds of a rounding, to which nothing is relative."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 2.943 * q[0] ** 2 + 0.981 * q[0])
+    line = dx.verify(dx.simulate(system, scheme, q=[1 / 6], v=[0.0], step=0.1, steps=40))["steps solved"]
+    assert line.verdict == "ok" and line.value < 1e-15

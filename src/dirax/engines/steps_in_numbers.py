@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dirax.engines.stage_look import SLOPES, TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
 from dirax.numerics.equilibration import balanced_inverse, condition_number
 from dirax.numerics.tolerances import EPSILON
@@ -116,15 +117,17 @@ class StepsInNumbers:
         after = self._read(known, self.program.equations[self.program.stages[0][0]].advance)
         return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
 
-    def sizes(self, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, h: float, params: np.ndarray) -> np.ndarray:
-        """The size (states,) of the terms of the first stage's equations at their solutions: the largest Σ |∂r/∂u_j| |u_j|; NaN
-        where there is none."""
+    def sizes(
+        self, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, h: float, params: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The sizes (states, k) of the terms of the first stage's equations at their solutions, and those that they give the
+        unknowns, |∂r/∂u|⁻¹ terms; NaN where there is no solution."""
         index, fraction = self.program.stages[0]
-        at = t, np.full(len(t), fraction * h), params
-        u, solved = self._solved(index, guesses[0], states, at, None)
-        slopes, _ = self._linearized(index, self._values(index, u, states, at))
-        terms = np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u))
-        return np.where(solved, np.max(terms, axis=1, initial=0.0), np.nan)
+        h = np.full(len(t), fraction * h)
+        u, solved = self._solved(index, guesses[0], states, (t, h, params), None)
+        slopes, terms = stage_look(self.program, 0)(u, states, t, h, params, np.abs(u), (SLOPES, TERMS))
+        of_unknowns = np.einsum("rij,rj->ri", np.abs(balanced_inverse(slopes[:, :, : u.shape[1]])), terms)
+        return tuple(np.where(solved[:, None], sizes, np.nan) for sizes in (terms, of_unknowns))
 
     def differentiated(
         self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: Noise | None = None
