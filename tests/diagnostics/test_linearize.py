@@ -153,3 +153,29 @@ def test_linear_equations_in_other_units(units):
             dx.linearize(pendulums, hanging | {"q": np.array([0.6, -0.8, 0.6, -1.8]) * unit[0]}, params=params)
     for plain, scaled in zip(*found.values(), strict=True):
         assert scaled.eigenvalues * units[2] == pytest.approx(plain.eigenvalues, rel=1e-9, abs=1e-9)
+
+
+def coupled(q, v, p):
+    """A distance and an angle."""
+    strain = q[0] ** 2 + 0.6 * p["l"] * q[0] * q[1] + 2.0 * (p["l"] * q[1]) ** 2
+    return (p["m"] * v[0] ** 2 + p["J"] * v[1] ** 2 - p["k"] * strain) / 2
+
+
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.PlusLagrangeDirac(), dx.Collocation(2)])
+def test_a_step_about_zero_in_other_units(scheme):
+    """A distance and an angle at rest, where no number says how large they are: μ = exp(iωh) of det(K − ω²M) = 0, up to h²."""
+    rates = np.sqrt(np.linalg.eigvals(np.linalg.solve(np.diag([1.3, 0.4]), [[2.0, 0.6], [0.6, 4.0]])))
+    for l in (1.0, 2.0**-20, 2.0**-30, 2.0**50):
+        params = {"m": 1.3, "J": 0.4 * l**2, "k": 2.0, "l": l}
+        found = dx.linearize(dx.LagrangeDirac(coupled), {"q": np.zeros(2), "v": np.zeros(2)}, scheme, step=1e-3, params=params)
+        assert found.stable and np.abs(found.multipliers) == pytest.approx(np.ones(4), abs=1e-11)
+        assert np.sort(found.eigenvalues.imag) == pytest.approx(np.sort([*rates, *-rates]), rel=1e-5)
+        modes = found.modes[:, np.argmax(found.eigenvalues.imag)]
+        assert np.abs(modes[0] / modes[1] / l) == pytest.approx(0.6 / (1.3 * rates.max() ** 2 - 2.0), rel=1e-5)
+
+
+def test_a_weight_that_falls_from_zero_is_at_no_equilibrium_in_any_units():
+    falling = dx.LagrangeDirac(lambda q, v, g: v @ v / 2 - g * q[0])
+    for g in (9.8, 2.0**-60, 2.0**60):
+        with pytest.raises(ValueError, match="no relative equilibrium"):
+            dx.linearize(falling, {"q": np.zeros(1), "v": np.zeros(1)}, params=g)

@@ -30,7 +30,8 @@ ORDER_STEPS = 64
 
 @dataclass(frozen=True)
 class Entry:
-    """One scheme's row. `error` is at the end of the stretch over which the order was measured; None is not known.
+    """One scheme's row. `error` is the largest, relative as in `dx.convergence`, over the stretch over which the order was
+    measured; None is not known.
 
     `drift` is the verdict on the energy, less the work of the forces ("bounded", "drifts", "not checked"), `slope`
     its least-squares slope per unit of time.
@@ -99,7 +100,7 @@ class Comparison:
             xscale="log",
             yscale="log",
             xlabel="time of the run (µs)",
-            ylabel="largest error",
+            ylabel="largest error, relative",
             title=self.title.replace(", errors", "\nerrors"),
         )
         ax.legend()

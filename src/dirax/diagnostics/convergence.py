@@ -22,7 +22,7 @@ REFINEMENT = 16
 """A refined reference has so many times smaller steps than the smallest measured ones."""
 
 PLATEAU = 100.0
-"""Errors below so many units of roundoff growth, ε·max|y|·√steps, are not used."""
+"""Errors below so many units of roundoff growth, ε·√steps, are not used."""
 
 STILL_FALLING = 0.9
 """A smaller step must bring the error below this fraction of that before, or the plateau has begun."""
@@ -37,13 +37,18 @@ motion makes of that."""
 USABLE = 3
 """Step sizes that a slope needs."""
 
+RESOLVED = 0.5
+"""Error of the smallest step, relative to the largest size of a coordinate, from which on that is not a size of its motion: the
+coordinate is zero throughout, or roundoff."""
+
 
 @dataclass(frozen=True)
 class Slope:
     """The measured order of one quantity: the slope of log(error) over log(h), its standard error, and what it rests on.
 
-    `errors` holds the largest error over the common times for each step size, `used` says which ones the slope rests on;
-    `end_errors` are those at the last common time. Where fewer than three can be used, the order is NaN, and none are.
+    `errors` holds the largest error over the common times for each step size, of each coordinate relative to its largest size
+    in the reference, `used` says which ones the slope rests on; `end_errors` are those at the last common time. Where fewer than
+    three can be used, the order is NaN, and none are.
     """
 
     order: float
@@ -124,7 +129,7 @@ class Convergence:
             xscale="log",
             yscale="log",
             xlabel="step $h$",
-            ylabel="largest error",
+            ylabel="largest error, relative",
             title=f"{self.title}\nerrors against {self.reference}",
         )
         ax.set_xticks(self.step_sizes, [f"{h:.3g}" for h in self.step_sizes])
@@ -146,7 +151,8 @@ def convergence(
     """Measure the order of `scheme` on `system` over runs to `time` with the given step sizes (at least three).
 
     `run`: initial data, `params` and the other keywords of `dx.simulate`, without step and steps. Every step size must
-    divide the largest, and the largest `time`; errors are the largest over the common times. `reference`: a function
+    divide the largest, and the largest `time`; errors are the largest over the common times, of each coordinate relative to its
+    largest size in the reference, or of one that is zero throughout, to that of the others. `reference`: a function
     t (rows,) -> q (rows, n), or -> a dict of such arrays by name; a scheme, run with 16 times smaller steps than the
     smallest; or None for the explicit equations of motion, solved by extrapolation to roundoff. Where the system has none, it is
     `scheme` itself so refined (the slope then allows for the reference's own error), and so always for multipliers. Before an
@@ -193,7 +199,7 @@ def convergence(
     for name, (distance, needed) in apart.items():
         notes.append(
             f"{name}: {type(scheme).__name__} does not come to the explicit equations of motion: with steps of "
-            f"{h[-1] / REFINEMENT:.3g} it is off by {number(distance)}, where {number(needed)} was to be expected of it."
+            f"{h[-1] / REFINEMENT:.3g} it is off by {number(distance)} of its size, where {number(needed)} was to be expected."
         )
     names = list(quantities) if quantities is not None else [name for name in measured[0] if name in expected]
     missing = [name for name in names if name not in measured[0] or name not in expected]
@@ -204,11 +210,11 @@ def convergence(
         )
     slopes = {}
     for name in names:
-        errors = np.array([np.max(np.abs(m[name] - expected[name])) for m in measured])
-        at_end = np.array([np.max(np.abs((m[name] - expected[name])[..., -1, :])) for m in measured])
+        relative = [_relative(m[name], expected[name], measured[-1][name]) for m in measured]
+        errors = np.array([np.max(one) for one in relative])
+        at_end = np.array([np.max(one[..., -1, :]) for one in relative])
         finest = h[-1] / REFINEMENT if name in own else None
-        size = max(float(np.max(np.abs(expected[name]))), np.finfo(float).tiny)
-        used = _above_plateau(errors, np.finfo(float).eps * size * np.sqrt(time / h) * PLATEAU)
+        used = _above_plateau(errors, np.finfo(float).eps * np.sqrt(time / h) * PLATEAU)
         if np.sum(used) >= USABLE:
             slope = _slope(h[used], errors[used], finest)
         else:
@@ -224,17 +230,24 @@ def convergence(
     return Convergence(title, h, slopes, label, tuple(notes), None if explicit is None else not apart)
 
 
+def _relative(found: np.ndarray, expected: np.ndarray, finest: np.ndarray) -> np.ndarray:
+    """The errors (…, rows, n) of each coordinate, relative to its largest size in the reference; `finest` is what the smallest
+    step gives."""
+    over_rows = tuple(range(expected.ndim - 1))
+    sizes, left = (np.max(np.abs(a), axis=over_rows) for a in (expected, finest - expected))
+    resolved = (sizes > 0.0) & (left <= RESOLVED * sizes)
+    of_all = np.max(sizes, where=resolved, initial=0.0) or np.max(sizes, initial=0.0) or 1.0
+    return np.abs(found - expected) / np.where(resolved, sizes, of_all)
+
+
 def _apart(measured: list, refined: dict, explicit: dict, h: np.ndarray) -> dict[str, tuple[float, float]]:
     """The quantities in which the scheme refined is further from the explicit solution than a scheme of first order would be:
     (how far, how far that is at most), by name."""
     found = {}
     for name in refined.keys() & explicit.keys():
-        distance = float(np.max(np.abs(refined[name] - explicit[name])))
-        last = float(np.max(np.abs(measured[-1][name] - explicit[name])))
-        size = float(np.max(np.abs(explicit[name]), initial=np.finfo(float).tiny))
-        needed = max(
-            APART * last, PLATEAU * np.finfo(float).eps * size * np.sqrt(REFINEMENT * len(explicit[name])), SOLVED * size
-        )
+        finest = measured[-1][name]
+        distance, last = (float(np.max(_relative(a, explicit[name], finest))) for a in (refined[name], finest))
+        needed = max(APART * last, PLATEAU * np.finfo(float).eps * np.sqrt(REFINEMENT * len(explicit[name])), SOLVED)
         if not distance <= needed:
             found[name] = distance, needed
     return dict(sorted(found.items(), reverse=True))

@@ -71,10 +71,12 @@ class Equations:
         """The derivatives of ∂L/∂v by q and by v."""
         return jacobian(lambda q, v: self.system.legendre(q, v, params, self.t), (0, 1))(q, v)
 
-    def energy(self, q: Any, v: Any, params: Any) -> tuple[Any, Any]:
-        """The size of the terms of L, and ∂²L/∂v²."""
+    def sizes(self, q: Any, v: Any, u: Any, params: Any) -> tuple[Any, Any, Any]:
+        """The sizes of the terms of L, and of the forces (n,) where nothing is accelerated, and ∂²L/∂v²."""
         lagrangian = lambda q, v: jnp.reshape(self.system.lagrangian.at(self.t, q, v, params), ())
-        return rounding(lagrangian, q, v), self.momentum(q, v, params)[1]
+        forces = lambda q, v: self(q, v, jnp.zeros_like(q), u, params)[: q.shape[0]]
+        of_forces = jnp.maximum(rounding(forces, q, v), jnp.abs(forces(q, v)))
+        return rounding(lagrangian, q, v), of_forces, self.momentum(q, v, params)[1]
 
     def tangent(self, z: Any, params: Any) -> Any:
         """The derivative of all constraints on (q, v)."""
@@ -133,8 +135,8 @@ def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generato
         lifted.append(np.concatenate([value, slope @ v]))
         slopes.append((slope, bend))
     symmetric = np.stack(lifted, axis=1) if lifted else np.zeros((2 * n, 0))
-    energy, metric = (np.asarray(a) for a in evaluated(equations.energy, q, v, params))
-    units, rate = _units(energy, metric, v, derivative)
+    energy, forces, metric = (np.asarray(a) for a in evaluated(equations.sizes, q, v, w[n:], params))
+    units, rate = _units(energy, forces, metric, v, derivative)
     field, symmetric = np.concatenate([v, w[:n]]) / units / rate, symmetric / units[:, None]
     if lifted:
         sizes = power_of_two(np.abs(symmetric).max(axis=0))
@@ -154,16 +156,22 @@ def linearized_lagrangian(system: LagrangeDirac, at: Mapping[str, Any], generato
     return FieldAt(scaled_matrix(derivative, units) / rate, tangent, symmetric, residual, units, rate)
 
 
-def _units(energy: np.ndarray, metric: np.ndarray, v: np.ndarray, derivative: np.ndarray) -> tuple[np.ndarray, float]:
+def _units(
+    energy: np.ndarray, forces: np.ndarray, metric: np.ndarray, v: np.ndarray, derivative: np.ndarray
+) -> tuple[np.ndarray, float]:
     """Units (2n,) of (q, v), and a rate: that of the fastest small motion, and the speeds at which a motion along each coordinate
-    has the `energy` that L has terms of, with the distances that these go in that time. They do not depend on how near to zero
-    the place happens to be.
+    has the `energy` that L has terms of, or that `forces` of these sizes give in that time, with the distances that it goes
+    then. They do not depend on how near to zero the place happens to be; where nothing has a size, one energy is as good as
+    another.
     """
     n, sizes = v.size, np.abs(np.diag(metric))
     rate = np.abs(np.linalg.eigvals(derivative)).max(initial=0.0)
     rate = float(power_of_two(np.asarray(rate))) if rate > 0.0 else 1.0
-    energy = energy + np.abs(v) @ np.abs(metric) @ np.abs(v)
-    speeds = np.sqrt(np.divide(energy, sizes, out=np.zeros(n), where=sizes > 0.0))
+    over_masses = lambda a: np.divide(a, sizes, out=np.zeros(n), where=sizes > 0.0)
+    energy = energy + np.abs(v) @ np.abs(metric) @ np.abs(v) + np.max(over_masses((forces / rate) ** 2), initial=0.0)
+    if energy == 0.0:
+        energy = next(iter(sizes[sizes > 0.0]), 0.0)
+    speeds = np.sqrt(over_masses(energy))
     return filled(np.concatenate([speeds / rate, speeds]), derivative / rate), rate
 
 

@@ -12,6 +12,7 @@ from dirax.engines.sizes import sizes_near
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.xla.lane import first_lane, take_step
 from dirax.numerics.equilibration import condition_number
+from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.linear_solves import solve
@@ -22,13 +23,17 @@ from dirax.solution.solution import Solution
 MAX_ITERATIONS = 50
 
 
-def differentiated_steps(sol: Solution, states: np.ndarray, guesses: np.ndarray, t: np.ndarray) -> DifferentiatedStep:
+def differentiated_steps(
+    sol: Solution, states: np.ndarray, guesses: np.ndarray, t: np.ndarray, noise: Noise | None = None
+) -> DifferentiatedStep:
     """The steps from states (B, rows, s) at times (B, rows), from first guesses (B, rows, k): arrays (B, rows, …), NaN where a
-    step has no solution. By their scalar program, where there is one; nothing is compiled then."""
+    step has no solution. By their scalar program, where there is one; nothing is compiled then. `noise`: of the arithmetic; of
+    the states alone, where the step is compiled."""
     lanes, rows, size = states.shape
     try:
         steps = StepsInNumbers.of(sol.equation, sol.given_params, sol.batch_params)
     except (UnsupportedPrimitive, GraphTooLarge):
+        states = noise.off(states) if noise else states
         items = (states, guesses, t) if sol.batch is not None else (states[0], guesses[0], t[0])
         flat = over_rows(eqx.Partial(_by_jax, Same(sol.equation), sol.step), sol, items)
         jacobians = flat[..., size:-1].reshape(lanes, rows, size, size)
@@ -37,8 +42,8 @@ def differentiated_steps(sol: Solution, states: np.ndarray, guesses: np.ndarray,
     params = steps.parameters(sol.given_params, sol.batch if sol.batch_params else None, of_states)
     joined = lambda a: a.reshape(lanes * rows, *a.shape[2:])
     given = joined(states), [joined(guesses)] * len(sol.equation.stages), joined(t)
-    made = steps.step(*given, sol.step, params)
-    jacobians, conditions = steps.differentiated(made, joined(t), sol.step, params)
+    made = steps.step(*given, sol.step, params, noise)
+    jacobians, conditions = steps.differentiated(made, joined(t), sol.step, params, noise)
     good = np.where(made.good, 1.0, np.nan)
     apart = lambda a: a.reshape(lanes, rows, *a.shape[1:])
     return DifferentiatedStep(apart(made.after * good[:, None]), apart(jacobians * good[:, None, None]), apart(conditions))

@@ -1,6 +1,8 @@
 """How far rounding moves a judged number, where it misses its tolerance: the sizes of terms do not show what cancels inside
 of them, nor what a system of equations makes of it."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -30,6 +32,11 @@ def with_rounding(terms: np.ndarray, most: np.ndarray, function: eqx.Partial, so
 def moved_by_rounding(values: np.ndarray, function: eqx.Partial, sol: Solution, items: tuple) -> np.ndarray:
     """By how much rounding moves the values of `function` at the items, OFTEN times at random (OFTEN, B, rows, …), in units of
     what an operation is off; 0 where one is not finite."""
-    many = np.stack([over_rows(function, sol, items, noise=Noise(DISTURBANCE, seed)) for seed in range(OFTEN)])
+    return differences_by_rounding(values, lambda noise: over_rows(function, sol, items, noise=noise))
+
+
+def differences_by_rounding(values: np.ndarray, again: Callable[[Noise], np.ndarray]) -> np.ndarray:
+    """The same of values that are computed `again` with noise."""
+    many = np.stack([again(Noise(DISTURBANCE, seed)) for seed in range(OFTEN)])
     with np.errstate(invalid="ignore"):
         return np.nan_to_num((many - values) / DISTURBANCE, nan=0.0, posinf=0.0, neginf=0.0)

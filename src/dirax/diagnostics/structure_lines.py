@@ -8,10 +8,11 @@ import numpy as np
 from dirax.diagnostics.one_step import differentiated_steps
 from dirax.diagnostics.power_balance import keeps_books
 from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
-from dirax.diagnostics.rounding import with_rounding
+from dirax.diagnostics.rounding import differences_by_rounding, with_rounding
 from dirax.diagnostics.rows import consecutive, over_rows, sampled_rows, shape_of
 from dirax.diagnostics.symplecticity_of_many import symplecticity_of_many
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
+from dirax.program.evaluation.noise import Noise
 from dirax.program.memo import Same
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
 from dirax.solution.solution import Solution
@@ -136,17 +137,29 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     same = Same(sol.equation)
     begun = over_rows(eqx.Partial(_begun, form, same), sol, (items,), few=True)
     size, t = sol.equation.stages[0][0].state_size, np.atleast_2d(items["t"][..., -1])
-    step = differentiated_steps(sol, begun[..., :size], begun[..., size:], t)
-    taken = step if sol.batch is not None else jax.tree.map(lambda a: a[0], step)
-    values = over_rows(eqx.Partial(_changed, form, same), sol, (items, taken), few=True)
-    defect, condition = values[..., 0], float(np.max(values[..., -1], where=np.isfinite(values[..., -1]), initial=1.0))
+
+    def stepped(noise: Noise | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The terms (B, rows, numbers, 2, entries) of the form, and the condition of the steps."""
+        step = differentiated_steps(sol, begun[..., :size], begun[..., size:], t, noise)
+        taken = step if sol.batch is not None else jax.tree.map(lambda a: a[0], step)
+        terms = over_rows(eqx.Partial(_terms_of_form, form, same), sol, (items, taken), few=True, noise=noise)
+        return np.array(terms.reshape(*terms.shape[:-2], -1)), step.condition
+
+    terms, conditions = stepped()
+    condition = float(np.max(conditions, where=np.isfinite(conditions), initial=1.0))
+    limit = roundoff_limit(tolerance, size * condition)
+    values = _of_terms(terms)
+    if np.any(values[..., 0] > limit):
+        moved = differences_by_rounding(terms, lambda noise: stepped(noise)[0])
+        terms[..., 1, :] = np.maximum(terms[..., 1, :], np.max(np.abs(moved), axis=0)[..., 0, :])
+        values = _of_terms(terms)
+    defect = values[..., 0]
     if not np.any(np.isfinite(defect)):
         return Line(name, None, None, NOT_CHECKED, "the step could not be solved again from the saved rows")
     lane, row = worst_place(defect)
     text = form.told(
         values[lane, row], f"worst of {len(rows)} steps at t = {sol.time_of(rows[row], lane):.6g}{of_lane(sol, lane)}"
     )
-    limit = roundoff_limit(tolerance, sol.equation.stages[0][0].state_size * condition)
     line = judged(sol, name, np.max(np.where(np.isfinite(defect), defect, 0.0), axis=1), limit, text)
     if line.verdict == VIOLATED and (excuse := form.excuse(values[lane, row])):
         line = Line(name, line.value, limit, NOT_CHECKED, text + excuse)
@@ -158,8 +171,14 @@ def _begun(form: AbstractStepForm, same: Same, rows, params):
     return jnp.concatenate(form.begins(same.object, rows, params))
 
 
-def _changed(form: AbstractStepForm, same: Same, rows, step, params):
-    return form.defect(step, same.object, rows, params)
+def _terms_of_form(form: AbstractStepForm, same: Same, rows, step, params):
+    return form.terms(step, same.object, rows, params)
+
+
+def _of_terms(terms: np.ndarray) -> np.ndarray:
+    """The numbers (B, rows, numbers) of terms: the largest of what is missed, each relative to the size of its terms."""
+    missed, sizes = np.abs(terms[..., 0, :]), terms[..., 1, :]
+    return np.max(np.divide(missed, sizes, out=missed.copy(), where=sizes > 0.0), axis=-1)
 
 
 def _unsaved(reads: tuple[str, ...], sol: Solution) -> str:

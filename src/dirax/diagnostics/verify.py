@@ -46,7 +46,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
       are advected, its part that leaves them alone): 32 ε · steps, the most that 32 roundings a step add up to (a random
       walk gives √steps of that);
     - symplecticity of one step (of Euler–Poincaré and Lie–Poisson systems: whether it is a Poisson map), and φ*Ω = Ω + dβ
-      where there are constraints ([PY] §3.2): 32 ε · 2n · the condition number of the step's equations, at a few steps;
+      where there are constraints ([PY] §3.2): 32 ε · 2n · the condition number of the step's equations, at a few steps, of
+      each entry of the form;
     - variable steps: a step and the step back, 32 ε of what it would be off if every operation were;
     - runs with impacts: momentum maps over the run, and the energy where no wall changes it, all else in the longest flight
       between two of them;

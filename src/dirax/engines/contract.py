@@ -33,6 +33,9 @@ OK, NOT_CONVERGED, NOT_FINITE = 0, 1, 2
 TOO_LARGE = "Newton's method is too large for this engine"
 """In the note on an iteration that did not converge, and is the only one that the engine has for the step."""
 
+FIXED_POINT, ALL_UNKNOWNS = "fixed point of the", "Newton of all unknowns"
+"""In the note on an iteration that begins as one of rates, and that goes on with the equations of all nodes."""
+
 Progress = Callable[[int, int], None]
 """Called with (steps done, steps in all)."""
 
@@ -114,8 +117,9 @@ class Outcome:
     fields, with one row less for step fields. `completed` (B,) counts good steps; `status` is one of the outcomes above;
     `closing` is the row at each trajectory's last good step; `last_state` and `last_unknowns` are the state there and the
     unknowns before it, for the message. `iterations` (B,) are updates of Newton's method, `max_residual` (B,) the largest
-    entry of the residual that any good step left. `notes` go to `Solution.stats`. `record` is what the engine needs to go on
-    after the last step, a tuple of NumPy arrays; None where it would begin anew.
+    entry of the residual that any good step left, or of the last change of the rates where a fixed point of these was
+    iterated. `notes` go to `Solution.stats`. `record` is what the engine needs to go on after the last step, a tuple of NumPy
+    arrays; None where it would begin anew.
     """
 
     fields: dict[str, Any]

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from dirax.engines.stage_look import SLOPES, TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
-from dirax.numerics.equilibration import condition_number
+from dirax.numerics.equilibration import balanced_inverse, condition_number
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Values
 from dirax.program.evaluation.noise import Noise
@@ -116,29 +117,34 @@ class StepsInNumbers:
         after = self._read(known, self.program.equations[self.program.stages[0][0]].advance)
         return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
 
-    def sizes(self, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, h: float, params: np.ndarray) -> np.ndarray:
-        """The size (states,) of the terms of the first stage's equations at their solutions: the largest Σ |∂r/∂u_j| |u_j|; NaN
-        where there is none."""
+    def sizes(
+        self, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, h: float, params: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The sizes (states, k) of the terms of the first stage's equations at their solutions, and those that they give the
+        unknowns, |∂r/∂u|⁻¹ terms; NaN where there is no solution."""
         index, fraction = self.program.stages[0]
-        at = t, np.full(len(t), fraction * h), params
-        u, solved = self._solved(index, guesses[0], states, at, None)
-        slopes, _ = self._linearized(index, self._values(index, u, states, at))
-        terms = np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u))
-        return np.where(solved, np.max(terms, axis=1, initial=0.0), np.nan)
+        h = np.full(len(t), fraction * h)
+        u, solved = self._solved(index, guesses[0], states, (t, h, params), None)
+        slopes, terms = stage_look(self.program, 0)(u, states, t, h, params, np.abs(u), (SLOPES, TERMS))
+        of_unknowns = np.einsum("rij,rj->ri", np.abs(balanced_inverse(slopes[:, :, : u.shape[1]])), terms)
+        return tuple(np.where(solved[:, None], sizes, np.nan) for sizes in (terms, of_unknowns))
 
-    def differentiated(self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def differentiated(
+        self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: Noise | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The derivatives (states, s, s) of the states after steps by those before, and the largest condition number of the
         equations of each. With r(u, x) = 0 and x' = a(u, x), ∂x'/∂x = ∂_x a − ∂_u a (∂_u r)⁻¹ ∂_x r."""
         count, size = made.states[0].shape
         jacobians, conditions = np.broadcast_to(np.eye(size), (count, size, size)), np.ones(count)
         for (index, fraction), u, states in zip(self.program.stages, made.unknowns, made.states, strict=True):
             e, k = self.program.equations[index], u.shape[1]
-            known = self._values(index, u, states, (t, np.full(count, fraction * h), params))
+            known = self._values(index, u, states, (t, np.full(count, fraction * h), params), noise)
             slopes = known.slopes([*e.residual, *e.advance], [*e.unknowns, *e.state])
+            slopes = noise.off(slopes) if noise else slopes  # for what is made of them by matrices
             by_u, by_state = slopes[:, :, :k], slopes[:, :, k:]
             step = by_state[:, k:]
             if k:
-                step = step - by_u[:, k:] @ (_inverses(by_u[:, :k]) @ by_state[:, :k])
+                step = step - by_u[:, k:] @ (balanced_inverse(by_u[:, :k]) @ by_state[:, :k])
                 regular = np.all(np.isfinite(by_u), axis=(1, 2))
                 conditions[regular] = np.maximum(conditions[regular], condition_number(by_u[regular, :k]))
             jacobians, t = step @ jacobians, t + fraction * h

@@ -81,28 +81,31 @@ def _remembered(exponents: bytes, k: int, l: int) -> tuple[np.ndarray, np.ndarra
 
 
 NOISE = 20
-"""An entry that is smaller than others of its row, and of its column, by so many powers of two does not count: it may be the
+"""An entry that is smaller than others of its row, and of its column, by so many powers of two hardly counts: it may be the
 roundoff of zero."""
+
+WEAK = 2.0**-20
+"""What it counts: where nothing else connects two parts of a matrix, it says their units."""
 
 
 def _mean_exponents(exponents: Any, xp: ModuleType) -> tuple[Any, Any]:
     """The exponents of `geometric_scales` from those of the entries (…, k, l)."""
-    rows, columns = _least_squares(exponents, xp)
+    rows, columns = _least_squares(exponents, 1.0, xp)
     scaled = xp.where(exponents > NOTHING, exponents - rows - columns, NOTHING)
     largest = lambda axis: xp.max(scaled, axis=axis, keepdims=True)
     noise = (scaled < largest(-1) - NOISE) & (scaled < largest(-2) - NOISE)
     if xp is np and not np.any(noise & (exponents > NOTHING)):
         return rows, columns
-    return _least_squares(xp.where(noise, NOTHING, exponents), xp)
+    return _least_squares(exponents, xp.where(noise, WEAK, 1.0), xp)
 
 
-def _least_squares(exponents: Any, xp: ModuleType) -> tuple[Any, Any]:
-    """Whole numbers near the r_i and c_j for which Σ (e_ij − r_i − c_j)² is least."""
-    there = (exponents > NOTHING).astype(float)
+def _least_squares(exponents: Any, weights: Any, xp: ModuleType) -> tuple[Any, Any]:
+    """Whole numbers near the r_i and c_j for which Σ w_ij (e_ij − r_i − c_j)² is least; a row has a weight of 1."""
+    there = xp.where(exponents > NOTHING, weights, 0.0)
     logs = xp.where(exponents > NOTHING, exponents, 0).astype(float)
     turned, sums = (lambda a: xp.swapaxes(a, -1, -2)), (lambda a, axis: xp.sum(a, axis=axis, keepdims=True))
     in_rows, in_columns = (xp.maximum(sums(there, axis), 1.0) for axis in (-1, -2))
-    means, coupled = sums(logs, -2) / in_columns, (there / in_columns) @ turned(there)
+    means, coupled = sums(there * logs, -2) / in_columns, (there / in_columns) @ turned(there)
     one = xp.broadcast_to(xp.eye(logs.shape[-2]), coupled.shape)
     connected = _connected(coupled + one, xp)
     # the scales of rows that are connected may have a common factor: with the sum of their logarithms zero the equations have
@@ -168,8 +171,9 @@ def _inverted(matrices: np.ndarray) -> np.ndarray:
 
 
 def condition_number(matrix: Any, xp: ModuleType = np) -> Any:
-    """That of the equilibrated matrix, ≥ 1."""
-    values = xp.linalg.svd(equilibrated(matrix, xp)[0], compute_uv=False)
+    """That of matrices whose rows and columns have units of their own, ≥ 1."""
+    rows, columns = geometric_scales(xp.abs(matrix), xp)
+    values = xp.linalg.svd(matrix / rows / columns, compute_uv=False)
     return values[..., 0] / values[..., -1]
 
 

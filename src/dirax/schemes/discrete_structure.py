@@ -142,9 +142,9 @@ class AbstractStepForm(eqx.Module):
         """
 
     @abstractmethod
-    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, " numbers"]:
-        """(by how much the change in that step differs from what it is to be, …, the condition of the step), the first
-        relative to the size of the form after the step; numbers in between are for `told`."""
+    def terms(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "numbers 2 s s"]:
+        """(by how much each entry of the form differs from what it is to be after that step, and the size of the terms that
+        make it), each of which has units of its own; and pairs like it for the other numbers of `told` and `excuse`."""
 
     def excuse(self, numbers: Any) -> str:
         """Why the change is not what it is to be, where nothing says that it is in this case; empty where it is."""

@@ -117,7 +117,7 @@ class FormInCharts(AbstractStepForm):
         state, guess = FormOnPairs(pairs).begins(equation, local, where)
         return jnp.concatenate([where[1], state]), guess
 
-    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, " numbers"]:
+    def terms(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "numbers 2 s s"]:
         pairs, local, where = self.pairs.in_coordinates(rows, 1, params)
         size, d = where[1].shape[0], self.pairs.local.manifold.dimension
         here = self.pairs.local.chart(where[1])
@@ -128,4 +128,4 @@ class FormInCharts(AbstractStepForm):
 
         after, jacobian, condition = step
         moved = jax.jacfwd(coordinates)(after) @ jacobian[:, size:]
-        return FormOnPairs(pairs).defect(DifferentiatedStep(coordinates(after), moved, condition), equation, local, where)
+        return FormOnPairs(pairs).terms(DifferentiatedStep(coordinates(after), moved, condition), equation, local, where)

@@ -12,7 +12,7 @@ from dirax.geometry.charts import RetractionChart
 from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.geometry.structures import canonical_two_form
 from dirax.numerics.arrays import Data
-from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm, DifferentiatedStep, nonzero
+from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm, DifferentiatedStep
 from dirax.systems.shape import Shape
 
 CONSTANT = 1e-13
@@ -46,32 +46,29 @@ class RowForm(AbstractStepForm):
         return ""
 
 
-class CanonicalForm(RowForm):
-    """JᵀΩJ = Ω for J = ∂(q', p')/∂(q, p): the step is symplectic.
+def pulled_back(form: Array, jacobian: Array) -> Array:
+    """JᵀωJ."""
+    return jacobian.T @ form @ jacobian
 
-    Relative to ‖|J|ᵀ|Ω||J|‖; entries are the largest ones after q and p were brought to balanced units, q → q√s, p → p/√s.
-    """
+
+def with_sizes(change: Array, form: Array, jacobian: Array) -> Float[Array, "2 s s"]:
+    """The change of a form JᵀωJ, with the sizes |J|ᵀ|ω||J| of its terms."""
+    return jnp.stack([change, pulled_back(jnp.abs(form), jnp.abs(jacobian))])
+
+
+class CanonicalForm(RowForm):
+    """JᵀΩJ = Ω for J = ∂(q', p')/∂(q, p): the step is symplectic."""
 
     @property
     def reads(self) -> tuple[str, ...]:
         return ("q", "p")
 
     def told(self, numbers: Any, place: str) -> str:
-        return f"‖JᵀΩJ − Ω‖/‖JᵀΩJ‖, {place}"
+        return f"the worst entry of JᵀΩJ − Ω, {place}"
 
-    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2"]:
-        """(‖JᵀΩJ − Ω‖/‖JᵀΩJ‖, condition number)."""
-        _, jacobian, condition = step
-        n = jacobian.shape[0] // 2
-        form = canonical_two_form(n)
-        by_momentum, by_position = jnp.max(jnp.abs(jacobian[:n, n:])), jnp.max(jnp.abs(jacobian[n:, :n]))
-        both = (by_momentum > 0) & (by_position > 0)
-        unit = jnp.where(both, (nonzero(by_position) / nonzero(by_momentum)) ** 0.25, 1.0)
-        units = jnp.concatenate([jnp.full(n, unit), jnp.full(n, 1 / unit)])
-        jacobian = jacobian * units[:, None] / units[None, :]
-        defect = jnp.max(jnp.abs(jacobian.T @ form @ jacobian - form))
-        size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(form) @ jnp.abs(jacobian))
-        return jnp.stack([defect / size, condition])
+    def terms(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "1 2 s s"]:
+        form = canonical_two_form(step.jacobian.shape[0] // 2)
+        return with_sizes(pulled_back(form, step.jacobian) - form, form, step.jacobian)[None]
 
 
 class CanonicalPoints(CanonicalForm):
@@ -98,49 +95,46 @@ class FormOfPoints(RowForm):
             return "; it changes from point to point, and such methods preserve constant ones ([BLM] Proposition 6.3)"
         return "" if self.theta in (0.5, None) else f"; the map with θ = {self.theta} is not symplectic ([BLM] Remark 6.4)"
 
-    def at_both_ends(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> tuple[Array, Array, Array, Array]:
-        """(the form at x, that at Φ(x), ∂Φ/∂x, how much the form changes relative to its size)."""
+    def at_both_ends(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> tuple[Array, Array, Array]:
+        """(the form at x, that at Φ(x), ∂Φ/∂x)."""
         (state, _), (after, jacobian, _) = self.begins(equation, rows, params), step
         n = rows[self.names[0]].shape[-1]
-        before, there = self.form(state[:n], params), self.form(after[:n], params)
-        moved = jnp.max(jnp.abs(there - before)) / nonzero(jnp.max(jnp.abs(there)))
-        return before, there, jacobian[:n, :n], moved
+        return self.form(state[:n], params), self.form(after[:n], params), jacobian[:n, :n]
 
 
 class TwoFormOfPoints(FormOfPoints):
     """Jᵀω(Φ(x))J = ω(x) for a two-form ω on points x: of a phase-space Lagrangian dα on its final manifold, which the
     midpoint rule preserves where dα is constant ([BLM] Proposition 6.3, printed: iff α is linear), and no other θ map
-    (Remark 6.4). Relative to ‖|J|ᵀ|ω||J|‖.
-    """
+    (Remark 6.4)."""
 
     def told(self, numbers: Any, place: str) -> str:
-        return f"‖Jᵀ(ω∘Φ)J − ω‖/‖JᵀωJ‖ of the two-form ω whose graph D is, {place}"
+        return f"the worst entry of Jᵀ(ω∘Φ)J − ω of the two-form ω whose graph D is, {place}"
 
-    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "3"]:
-        """(‖Jᵀ(ω∘Φ)J − ω‖/‖JᵀωJ‖, ‖ω∘Φ − ω‖/‖ω‖, condition number)."""
-        before, there, jacobian, moved = self.at_both_ends(step, equation, rows, params)
-        size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(there) @ jnp.abs(jacobian))
-        return jnp.stack([jnp.max(jnp.abs(jacobian.T @ there @ jacobian - before)) / nonzero(size), moved, step.condition])
+    def terms(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2 2 s s"]:
+        """Those of Jᵀ(ω∘Φ)J − ω, and those of Jᵀ(ω∘Φ − ω)J."""
+        before, there, jacobian = self.at_both_ends(step, equation, rows, params)
+        pairs = pulled_back(there, jacobian) - before, pulled_back(there - before, jacobian)
+        return jnp.stack([with_sizes(change, there, jacobian) for change in pairs])
 
 
 class BivectorOfPoints(FormOfPoints):
-    """JΛ(x)Jᵀ = Λ(Φ(x)) for the bivector Λ whose graph D is: a Poisson map, of a Poisson Λ. Relative to ‖|J||Λ||J|ᵀ‖."""
+    """JΛ(x)Jᵀ = Λ(Φ(x)) for the bivector Λ whose graph D is: a Poisson map, of a Poisson Λ."""
 
     def told(self, numbers: Any, place: str) -> str:
-        return f"‖JΛJᵀ − Λ∘Φ‖/‖JΛJᵀ‖ of the bivector Λ whose graph D is, {place}"
+        return f"the worst entry of JΛJᵀ − Λ∘Φ of the bivector Λ whose graph D is, {place}"
 
-    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "3"]:
-        """(‖JΛJᵀ − Λ∘Φ‖/‖JΛJᵀ‖, ‖Λ∘Φ − Λ‖/‖Λ‖, condition number)."""
-        before, there, jacobian, moved = self.at_both_ends(step, equation, rows, params)
-        size = jnp.max(jnp.abs(jacobian) @ jnp.abs(before) @ jnp.abs(jacobian).T)
-        return jnp.stack([jnp.max(jnp.abs(jacobian @ before @ jacobian.T - there)) / nonzero(size), moved, step.condition])
+    def terms(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2 2 s s"]:
+        """Those of JΛJᵀ − Λ∘Φ, and those of J(Λ∘Φ − Λ)Jᵀ."""
+        before, there, jacobian = self.at_both_ends(step, equation, rows, params)
+        pairs = pulled_back(before, jacobian.T) - there, pulled_back(there - before, jacobian.T)
+        return jnp.stack([with_sizes(change, before, jacobian.T) for change in pairs])
 
 
 class LiePoissonForm(BivectorOfPoints):
     """The same for a Lie–Poisson bivector and steps of the group, which preserve it though it is not constant."""
 
     def told(self, numbers: Any, place: str) -> str:
-        return f"‖JΛJᵀ − Λ‖/‖JΛJᵀ‖ of the Lie–Poisson bivector, {place}"
+        return f"the worst entry of JΛJᵀ − Λ of the Lie–Poisson bivector, {place}"
 
     def excuse(self, numbers: Any) -> str:
         return ""
@@ -150,7 +144,7 @@ class ChartedForm(RowForm):
     """The canonical two-form of T*Q of a manifold Q in R^N, of which a state (m, r, p) has coordinates in a chart at m.
 
     The saved (q, p) pull dq ∧ dp back to the coordinates (r, p), from both ends of the step: K'ᵀΩK' = KᵀΩK with
-    K = ∂(q, p)/∂(r, p) and K' = ∂(q', p')/∂(r, p), at a fixed centre m. Relative to ‖|K'|ᵀ|Ω||K'|‖.
+    K = ∂(q, p)/∂(r, p) and K' = ∂(q', p')/∂(r, p), at a fixed centre m.
     """
 
     @property
@@ -158,7 +152,7 @@ class ChartedForm(RowForm):
         return ("q", "p")
 
     def told(self, numbers: Any, place: str) -> str:
-        return f"‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖ of (q, p) by the coordinates of a chart, {place}"
+        return f"the worst entry of K'ᵀΩK' − KᵀΩK of (q, p) by the coordinates of a chart, {place}"
 
     def ends(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> tuple[Array, Array]:
         """K at the state that the step starts from, and K'."""
@@ -172,12 +166,10 @@ class ChartedForm(RowForm):
 
         return jax.jacfwd(saved)(state)[:, size:], (jax.jacfwd(saved)(step.state) @ step.jacobian)[:, size:]
 
-    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2"]:
-        """(‖K'ᵀΩK' − KᵀΩK‖/‖K'ᵀΩK'‖, condition number)."""
+    def terms(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "1 2 s s"]:
         first, last = self.ends(step, equation, rows, params)
         form = canonical_two_form(rows["q"].shape[1])
-        change = last.T @ form @ last - first.T @ form @ first
-        return jnp.stack([jnp.max(jnp.abs(change)) / jnp.max(jnp.abs(last).T @ jnp.abs(form) @ jnp.abs(last)), step.condition])
+        return with_sizes(pulled_back(form, last) - pulled_back(form, first), form, last)[None]
 
 
 class AmbientForm(ChartedForm):

@@ -11,6 +11,7 @@ from dirax.numerics.ranks import significant
 from dirax.numerics.tolerances import PAIR_RANK
 from dirax.program.tracing import jacobian as jacobian_of
 from dirax.schemes.discrete_structure import AbstractStepForm, DifferentiatedStep, nonzero
+from dirax.schemes.step_forms import pulled_back
 
 
 class FormOnPairs(AbstractStepForm):
@@ -47,8 +48,8 @@ class FormOnPairs(AbstractStepForm):
         guess = jnp.concatenate([(q1 - q0) / self.pairs.step, multipliers])
         return jnp.concatenate([q1, self.pairs.slots(rows["t"][0], q0, q1, params)[1]]), guess
 
-    def defect(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "3"]:
-        """(defect of φ*Ω = Ω + dβ, ‖φ*Ω − Ω‖, both relative; condition number)."""
+    def terms(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2 2 s s"]:
+        """Those of φ*Ω − Ω − dβ, and those of φ*Ω − Ω."""
         pairs, (q0, q1), (before, t) = self.pairs, rows["q"], rows["t"]
         n = q0.shape[0]
         d1 = lambda t, a, b: pairs.slots(t, a, b, params)[0]
@@ -67,7 +68,7 @@ class FormOnPairs(AbstractStepForm):
             return jnp.block([[zero, mixed], [-mixed.T, zero]])
 
         z = jnp.concatenate([q0, q1])
-        of_pair, (after, of_state, condition) = jacobian_of(state_of)(z), step
+        of_pair, (after, of_state, _) = jacobian_of(state_of)(z), step
         q2, q2_of_pair = after[:n], of_state[:n] @ of_pair
         jacobian = jnp.concatenate([jnp.eye(2 * n)[n:], q2_of_pair])  # of φ
         of_z, of_q2 = jacobian_of(sum_at_q1, argnums=(0, 1))(z, q2)
@@ -75,18 +76,28 @@ class FormOnPairs(AbstractStepForm):
         turning = projector_slope(lambda q: pairs.matrix(t, q, params), q1, sum_at_q1(z, q2))
         beta = jnp.concatenate([jnp.zeros((n, 2 * n)), force.at[:, n:].add(turning)])  # ∂_j β_i
         two_form, two_form_after = lagrangian_two_form(before, z), lagrangian_two_form(t, jnp.concatenate([q1, q2]))
-        change = jacobian.T @ two_form_after @ jacobian - two_form
+        change = pulled_back(two_form_after, jacobian) - two_form
         dbeta = beta.T - beta  # (dβ)_ij = ∂_i β_j − ∂_j β_i
 
         def constraints_of_pair(z):
             first = pairs.system.constraints.position_defect(before, z[:n], params)
             return jnp.concatenate([pairs.constraint(before, z[:n], z[n:], params), first])
 
-        constraint_matrix = jacobian_of(constraints_of_pair)(z)
+        units = _units(two_form[:n, n:])
+        constraint_matrix = jacobian_of(constraints_of_pair)(z) * units[None]
         constraint_matrix = constraint_matrix / nonzero(jnp.max(jnp.abs(constraint_matrix), axis=1, keepdims=True))
         _, values, right = jnp.linalg.svd(constraint_matrix, full_matrices=True)
         kept = jnp.concatenate([significant(values, PAIR_RANK, xp=jnp), jnp.zeros(right.shape[0] - values.shape[0], bool)])
         tangent = jnp.where(kept, 0.0, right.T)  # without the normal vectors, as many as there are independent constraints
-        restricted = lambda form: jnp.max(jnp.abs(tangent.T @ form @ tangent))
-        size = jnp.max(jnp.abs(jacobian).T @ jnp.abs(two_form_after) @ jnp.abs(jacobian)) + jnp.max(jnp.abs(beta))
-        return jnp.stack([restricted(change - dbeta) / size, restricted(change) / size, condition])
+        sizes = pulled_back(jnp.abs(two_form_after), jnp.abs(jacobian)) + jnp.abs(beta) + jnp.abs(beta).T
+        scaled = lambda form: form * units[None] * units[:, None]
+        size = jnp.full_like(sizes, jnp.max(scaled(sizes)))  # entries have one unit, and belong to no coordinates
+        return jnp.stack([jnp.stack([pulled_back(scaled(form), tangent), size]) for form in (change - dbeta, change)])
+
+
+def _units(mixed: Array) -> Array:
+    """Units (2n,) of two points in which every coordinate has the same mass, of the slope of p0 by q1; relative to the first."""
+    masses = jnp.abs(jnp.diag(mixed))
+    masses = jnp.where(masses > 0.0, masses, jnp.max(masses))
+    units = jnp.sqrt(nonzero(masses[0]) / nonzero(masses))
+    return jnp.concatenate([units, units])

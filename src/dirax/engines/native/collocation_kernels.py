@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.engines.contract import FIXED_POINT
 from dirax.engines.native.kernels import Linked, Runs, linked, source_digest, too_large
 from dirax.engines.native.loops.collocation_loop import collocation_module
 from dirax.engines.native.loops.collocation_plan import CollocationPlan, MeanPlan, TracedMean, TracedRelation, depends
@@ -72,7 +73,7 @@ class CollocationKernels:
         side = f"{plan.tableau.stages} nodes side by side"
         if isinstance(plan, MeanPlan):
             side = f"{len(plan.quadrature.points)} points of the quadrature side by side, then {side}"
-        return {"iteration": f"fixed point of the {kind}, {side}"}
+        return {"iteration": f"{FIXED_POINT} {kind}, {side}"}
 
     def _run(self, width: int, levels: tuple[int, ...]) -> Linked:
         """The code of `run` for a width, which is compiled in little time, and so is quick at once."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, OK, TOO_LARGE, Outcome, Problem, Progress, finished
+from dirax.engines.contract import ALL_UNKNOWNS, NOT_CONVERGED, OK, TOO_LARGE, Outcome, Problem, Progress, finished
 from dirax.engines.native.collocation_kernels import CollocationKernels, collocation_kernels
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
@@ -179,5 +179,5 @@ def _by_newton(lanes: Lanes | OneLane, made: CollocationKernels) -> list[str]:
         own[:, record.sizes(i, stage.unknowns)] = 0.0
     lanes.put(stuck, own)
     with_present_sizes(lanes, whole)
-    others.append(f"Newton of all unknowns, {counted(len(stuck), 'trajectory', 'trajectories')}")
+    others.append(f"{ALL_UNKNOWNS}, {counted(len(stuck), 'trajectory', 'trajectories')}")
     return others

@@ -1,0 +1,87 @@
+"""The lines of verify() in other units: the same verdicts, and the same numbers relative to their terms."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.schemes.step import explicit_step
+
+POLAR = dx.LagrangeDirac(lambda q, v, l: (v[0] ** 2 + q[0] ** 2 * v[1] ** 2) / 2 - (q[0] - l) ** 2)
+QUOTIENT = dx.reduce(POLAR, dx.LinearConnection(fibre=[1]))
+KEPLER = dx.LagrangeDirac(lambda q, v, m: m * (v @ v) / 2 + m / jnp.sqrt(q @ q))
+TOP = dx.LiePoisson(
+    dx.SO3(), lambda mu, a, m: mu @ (mu / jnp.array([1.0, 2.0, 3.0])) / 2 / m + m * a[0] + 0.3 * m * a[1] ** 2, advected=3
+)
+
+
+def about_a_length(system, scheme):
+    """A distance and an angle."""
+    return lambda l: dx.simulate(system, scheme, q=[l, 0.0], v=[0.1 * l, 0.8], params=l, step=0.05, steps=10)
+
+
+def of_a_mass(m):
+    x = np.array([0.3 * m, 0.9 * m, -0.4 * m, 0.6, 0.0, 0.8])
+    return dx.simulate(TOP, dx.DiscreteEulerPoincare(), x=x, params=m, step=0.05, steps=10)
+
+
+SYMPLECTIC = {
+    "lagrange": about_a_length(POLAR, dx.LagrangeDAlembert()),
+    "routh": about_a_length(QUOTIENT, dx.DiscreteRouth()),
+    "quotient": about_a_length(QUOTIENT, dx.PlusLagrangeDirac()),
+    "lie-poisson": of_a_mass,
+}
+
+
+@pytest.mark.parametrize("kind", SYMPLECTIC)
+def test_a_step_preserves_its_form_in_any_units(kind):
+    found = [dx.verify(SYMPLECTIC[kind](unit))["symplecticity of one step"] for unit in (1.0, 2.0**20, 2.0**-9, 1e7)]
+    assert all(line.verdict == "ok" and line.value < 1e-14 for line in found), found
+    assert len({line.value for line in found[:3]}) == 1
+
+
+class Damped(dx.AbstractScheme):
+    """Symplectic Euler for a distance and an angle, of which the momentum of the angle loses its billionth part in a step."""
+
+    loss: float = eqx.field(static=True, default=1e-9)
+
+    def step_equation(self, system, shape):
+        def advance(u, state, t, h, l):
+            q, p = state[:2], state[2:]
+            p = p * jnp.array([1.0, 1.0 - self.loss]) - h * jnp.stack([q[0], l**2 * jnp.sin(q[1])])
+            return jnp.concatenate([q + h * p / jnp.stack([1.0, l**2]), p])
+
+        return dx.StepEquation(
+            start=lambda data, h, params: (jnp.concatenate([data["q"], data["p"]]), jnp.zeros(0)),
+            residual=explicit_step,
+            advance=advance,
+            unpack=lambda state, u, t, h, params: {"q": state[:2], "p": state[2:]},
+            state_size=4,
+            unknowns=0,
+            fields={"q": dx.Field((2,)), "p": dx.Field((2,))},
+            canonical=True,
+        )
+
+
+def test_a_billionth_that_a_step_loses_is_found_in_any_units():
+    system = dx.LagrangeDirac(lambda q, v, l: (v[0] ** 2 + l**2 * v[1] ** 2 - q[0] ** 2) / 2 + l**2 * jnp.cos(q[1]))
+    for l in (1.0, 2.0**-33, 2.0**20):
+        run = dx.simulate(system, Damped(), q=[l, 0.3], v=[0.0, 0.1], params=l, step=0.1, steps=10)
+        line = dx.verify(run)["symplecticity of one step"]
+        assert line.verdict == "VIOLATED" and 0.5e-9 < line.value < 1e-9, line  # of {θ', p_θ'} = 1 − loss
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_steps_by_collocation_are_solved_whatever_the_mass(engine):
+    run = lambda m: dx.simulate(KEPLER, dx.Collocation(2), q=[1.0, 0.0], v=[0.0, 1.2], params=m, step=0.1, steps=9, engine=engine)
+    lines = [dx.verify(run(m))["steps solved"] for m in (1.0, 2.0**-30, 2.0**60)]
+    assert lines[0].verdict == "ok" and 0.0 < lines[0].value < 1e-15 and len({line.value for line in lines}) == 1
+
+
+@pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.LagrangeDAlembert()])
+def test_steps_at_an_equilibrium_are_solved(scheme):
+    """The force 0.981 − 0.981 leaves speeds of a rounding, to which nothing is relative."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 2.943 * q[0] ** 2 + 0.981 * q[0])
+    line = dx.verify(dx.simulate(system, scheme, q=[1 / 6], v=[0.0], step=0.1, steps=40))["steps solved"]
+    assert line.verdict == "ok" and line.value < 1e-15

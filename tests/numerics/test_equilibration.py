@@ -1,0 +1,35 @@
+"""Scales of rows and columns: with other units, by powers of two, the scaled matrix is the same to the last bit."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dirax.numerics.equilibration import balanced_inverse, condition_number, geometric_scales
+
+COUPLED = np.array([[1.3, 1.5e-7], [1.5e-7, 0.4]])
+SADDLE = np.array([[2.0, 0.0, 1.0], [0.0, 3e-9, 1e-3], [1.0, 1e-3, 0.0]])
+TRIANGULAR = np.array([[1.0, 3e-13, 0.0], [0.0, 0.7, 5.0], [0.0, 4.0, -0.3]])
+
+
+@pytest.mark.parametrize("matrix", [COUPLED, SADDLE, TRIANGULAR])
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_scaled_matrices_in_other_units(matrix, xp):
+    """A weak entry, that alone connects two parts of a matrix, says how their units are to each other."""
+
+    def scaled(matrix):
+        rows, columns = geometric_scales(xp.abs(xp.asarray(matrix)), xp)
+        return np.asarray(matrix / rows / columns)
+
+    units = np.array([2.0**-40, 2.0**55, 2.0**3])[: len(matrix)]
+    for other in (matrix * units, matrix * units[:, None], matrix * units * units[:, None]):
+        np.testing.assert_array_equal(scaled(other), scaled(matrix))
+
+
+def test_an_inverse_keeps_its_small_entries_in_other_units():
+    (a, b), (_, c) = COUPLED
+    exact = np.array([[c, -b], [-b, a]]) / (a * c - b * b)
+    for unit in (1.0, 2.0**30, 2.0**-100):
+        units = np.array([1.0, unit])
+        found = balanced_inverse(COUPLED * units * units[:, None])
+        np.testing.assert_allclose(found * units * units[:, None], exact, rtol=1e-14)
+        assert condition_number(COUPLED * units * units[:, None]) == condition_number(COUPLED)
