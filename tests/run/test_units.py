@@ -296,3 +296,46 @@ def test_derivatives_in_other_units(engine):
         for units in GRADIENT_UNITS:
             for found, wanted in zip(derivatives(units, by), plain, strict=True):
                 np.testing.assert_array_equal(found, wanted)
+
+
+SKATE = lambda q: jnp.stack([jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0 * q[2]])])
+SMALL = ((1e-9, 1.0), (1.0, 1e-20))
+"""A length and a mass: those of MEMS, and of molecules."""
+
+
+@pytest.mark.parametrize(("length", "mass"), SMALL)
+def test_inertias_of_small_machines(length, mass):
+    """Moments of inertia of 1e-19 beside masses of 1 are not roundoff: on a circle, from the closed form."""
+    skate = dx.NonholonomicMechanics(lambda q, P: jnp.diag(jnp.stack([P["m"], P["m"], P["J"]])), lambda q, P: 0 * q[0], SKATE)
+    inertia = 0.4 * mass * length**2
+    settings = {"step": 0.05, "steps": 20, "params": {"m": mass, "J": inertia}}
+    sol = dx.simulate(skate, dx.DiscreteDirac(), q=[0, 0, 0], v=[0.5 * length, 0, 1.0], **settings)
+    np.testing.assert_allclose(sol.q[-1] / [length, length, 1], [0.5 * np.sin(1.0), 0.5 - 0.5 * np.cos(1.0), 1.0], rtol=1e-3)
+    body = dx.EulerPoincare(
+        dx.SE2(), lambda xi, P: P["J"] * xi[0] ** 2 / 2 + P["m"] * (xi[1:] @ xi[1:]) / 2, one_forms=[[0.0, 0.0, 1.0]]
+    )
+    x = np.array([inertia, mass * length, 0.0])
+    sol = dx.simulate(body, dx.DiscreteEulerPoincare(), x=x, **settings)
+    np.testing.assert_allclose(sol.x[-1], x, rtol=1e-12, atol=1e-12 * mass * length)
+
+
+def test_orbits_that_are_small_are_free():
+    """In polar coordinates: at a radius of 1e-9 the angle has the inertia 1e-18, and at the origin none."""
+    particle = dx.LagrangeDirac(lambda q, v, l: (v[0] ** 2 + q[0] ** 2 * v[1] ** 2) / 2 - (q[0] - l) ** 2)
+    reduced = dx.reduce(particle, dx.LinearConnection(fibre=[1]))
+    run = lambda l, r: dx.simulate(
+        reduced, dx.DiscreteRouth(), q=[r * l, 0], v=[0.1 * l, 0.8], step=0.05, steps=20, params=l
+    )  # fmt: skip
+    for length in (1.0, 2.0**-30):
+        with pytest.raises(ValueError, match="orbits of the group are not free"):
+            run(length, 0.0)
+    np.testing.assert_allclose(run(2.0**-30, 1.0).x * 2.0**30, run(1.0, 1.0).x, rtol=1e-13)
+
+
+def test_a_metric_that_is_not_definite_is_none_in_any_units():
+    for length in (1.0, 2.0**-33, 2.0**40):
+        for metric, wrong in (([[1.0, 2.0], [2.0, 1.0]], "positive definite"), ([[1.0, 0.5], [0.3, 1.0]], "symmetric")):
+            scaled = jnp.array(metric) * jnp.outer(*2 * [jnp.array([1.0, length])])
+            system = dx.NonholonomicMechanics(lambda q, g=scaled: g, lambda q: 0 * q[0], lambda q: jnp.array([[1.0, 0.0]]))
+            with pytest.raises(ValueError, match=f"not {wrong}"):
+                dx.simulate(system, dx.DiscreteDirac(), q=[0, 0], v=[0, 1], step=0.1, steps=3)
