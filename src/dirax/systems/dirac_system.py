@@ -137,6 +137,11 @@ class DiracSystem(AbstractSystem):
         return self.structure.representation in ("two_form", "bivector")
 
     @property
+    def explicit(self) -> bool:
+        """Whether D is stated as the graph of a bivector, or is canonical: velocities follow from covectors by no equations."""
+        return self.canonical or self.structure.representation == "bivector"
+
+    @property
     def canonical(self) -> bool:
         """Whether D is the canonical symplectic structure of T*Q in (q, p)."""
         return isinstance(self.structure.evaluate, Induced) and self.structure.evaluate.one_forms is None
@@ -179,10 +184,14 @@ class DiracSystem(AbstractSystem):
 
     def tangency_defect(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " c"]:
         """The part of {g, H} that no λ takes away by its brackets {g_i, g_j} λ: all of it where they vanish."""
+        return self.hidden_defect(x, params) - self.brackets(x, params) @ self.held(x, params)
+
+    def held(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " c"]:
+        """The λ that take {g, H} away by the brackets {g_i, g_j} λ; zero where these vanish."""
         hidden, brackets = self.hidden_defect(x, params), self.brackets(x, params)
         size = jnp.sum(self.holonomic_matrix(x, params) ** 2)
         normal = brackets.T @ brackets + (BRACKET_DEFECT * size) ** 2 * jnp.eye(hidden.shape[0])
-        return hidden - brackets @ solve(normal, brackets.T @ hidden)
+        return solve(normal, brackets.T @ hidden)
 
     def constrained_field(self, x: Float[Numbers, " N"], params: Any = None) -> tuple[Float[Numbers, " N"], Float[Numbers, " c"]]:
         """(ẋ, λ) at a point of M_f = {g = 0, {g, H} = 0}, where the brackets {g_i, g_j} are zero: λ keeps {g, H} = 0."""
@@ -252,6 +261,12 @@ class DiracSystem(AbstractSystem):
         x = self.point(data)
         if project and self.holonomic is not None and self.is_graph:
             x = self.project(x, params)
+        if self.explicit:
+            rate, held = self.hamiltonian_vector(x, self.differential(x, params), params), jnp.zeros(0)
+            if self.holonomic is not None:
+                held = self.held(x, params)
+                rate = rate - self.forces(x, params) @ held
+            return {"x": x, "velocity": rate, "multipliers": held}
         matrix, right = self.equations(x, params)
         rows = self.holonomic_matrix(x, params)
         count = rows.shape[0]
