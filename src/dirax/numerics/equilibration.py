@@ -174,9 +174,10 @@ def _inverted(matrices: np.ndarray) -> np.ndarray:
 
 
 def condition_number(matrix: Any, xp: ModuleType = np) -> Any:
-    """That of the equilibrated matrix, ≥ 1."""
+    """That of the equilibrated matrix, ≥ 1; infinite for a singular one."""
     values = xp.linalg.svd(equilibrated(matrix, xp)[0], compute_uv=False)
-    return values[..., 0] / values[..., -1]
+    largest, least = values[..., 0], values[..., -1]
+    return xp.where(least == 0.0, xp.inf, largest / _nonzero(xp, least))
 
 
 def _largest(xp: ModuleType, matrix: Any, axis: int) -> Any:
