@@ -105,3 +105,11 @@ def test_the_reason_of_a_singular_first_step():
         dx.simulate(
             held, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"), q=[1.0, 0.0, 0.0], v=[0.0, 0.0, 0.0], step=0.1, steps=5
         )
+
+
+@pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.Collocation(3, nodes="lobatto"), dx.EnergyCollocation(2)])
+def test_collocation_of_a_singular_lagrangian_names_its_premise(scheme):
+    coupled = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - (q[0] ** 2 + q[0] * q[1] + 2 * q[1] ** 2) / 2)
+    start = {"q": [1.0, -0.25], "v": [0.0, 0.0]}
+    with pytest.raises(ValueError, match=r"collocation takes regular Lagrangians, and ∂²L/∂v² is singular .*\.resolved\(\)"):
+        dx.simulate(coupled, scheme, **start, step=0.1, steps=6)
