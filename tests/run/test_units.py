@@ -365,3 +365,18 @@ def test_small_masses_beside_constraints_of_a_hamiltonian(scheme):
     plain = run(Units())
     for units in (Units(mass=-80), Units(mass=-120), Units(length=-33, mass=101, time=25)):
         np.testing.assert_allclose(run(units), plain, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "units", [Units(length=-33, mass=-87, time=-40), Units(length=40, mass=-80, time=-20), Units(-33, 101, 25)]
+)
+def test_the_constraint_algorithm_beside_small_forces(units):
+    """A skate on the plane: velocities and forces in rows of their own, and an angle that stands in the one-form alone."""
+    hamiltonian = lambda x, P: (x[3] ** 2 + x[4] ** 2) / P["m"] / 2 + x[5] ** 2 / 2 / P["J"]
+    skate = dx.DiracSystem(dx.induced_dirac(SKATE, 3), hamiltonian)
+    length, mass, time = (units.of(d) for d in (LENGTH, MASS, TIME))
+    size = np.array([length, length, 1.0, *2 * [mass * length / time], mass * length**2 / time])
+    chain = dx.constraint_algorithm(skate, np.array([0, 0, 0, 0.5, 0, 0.4]) * size, {"m": mass, "J": 0.4 * mass * length**2})
+    assert (chain.verdict, chain.dimension) == ("determined", 5)
+    field = np.asarray(chain.field(chain.point)) / size * time
+    np.testing.assert_allclose(field, [0.5, 0.0, 1.0, 0.0, 0.5, 0.0], atol=1e-12)

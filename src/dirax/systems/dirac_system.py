@@ -114,6 +114,9 @@ class DiracSystem(AbstractSystem):
 
     def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
         x = point_of(near, ("x",), self)
+        phase = self.phase_space_form()
+        if phase is not None and phase.constraints.any:  # rows of F add velocities to forces, which have other units
+            return phase.implicit_form(x, params)._replace(about="q̇ = ∂H/∂p, ṗ = −∂H/∂q + Wᵀu, W q̇ = 0")
         c = sum(self.sizes({"x": jnp.asarray(x)}, params)[1:])
 
         def equations(x, params):
