@@ -32,19 +32,6 @@ def equilibrated(matrix: Any, xp: ModuleType = np, rounds: int = ROUNDS) -> tupl
     return matrix, units
 
 
-def balancing_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
-    """Scales (…, k, 1) and (…, 1, l) by which the rows and the columns of a matrix with entries of these `sizes` are to be
-    divided: by square roots from both sides at once (Ruiz 2001), which treats equations and unknowns alike, so that a
-    pseudo-inverse in these units does not depend on which of them were called rows."""
-    *lead, k, l = sizes.shape
-    rows, columns = xp.ones((*lead, k, 1)), xp.ones((*lead, 1, l))
-    for _ in range(ROUNDS):
-        left = sizes / rows / columns
-        rows = rows * xp.sqrt(_nonzero(xp, _maximum(xp, left, -1)))
-        columns = columns * xp.sqrt(_nonzero(xp, _maximum(xp, left, -2)))
-    return rows, columns
-
-
 def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """Powers of two (…, k, 1) and (…, 1, l) by which rows and columns of a matrix with entries of these `sizes` are to be
     divided so that the geometric mean of those that are not zero is about 1 in each (Curtis and Reid 1972).
@@ -87,13 +74,21 @@ roundoff of zero."""
 
 def _mean_exponents(exponents: Any, xp: ModuleType) -> tuple[Any, Any]:
     """The exponents of `geometric_scales` from those of the entries (…, k, l)."""
-    rows, columns = _least_squares(exponents, xp)
-    scaled = xp.where(exponents > NOTHING, exponents - rows - columns, NOTHING)
-    largest = lambda axis: xp.max(scaled, axis=axis, keepdims=True)
-    noise = (scaled < largest(-1) - NOISE) & (scaled < largest(-2) - NOISE)
-    if xp is np and not np.any(noise & (exponents > NOTHING)):
-        return rows, columns
-    return _least_squares(xp.where(noise, NOTHING, exponents), xp)
+
+    def without_noise(exponents):
+        rows, columns = _least_squares(exponents, xp)
+        scaled = xp.where(exponents > NOTHING, exponents - rows - columns, NOTHING)
+        largest = lambda axis: xp.max(scaled, axis=axis, keepdims=True)
+        noise = (scaled < largest(-1) - NOISE) & (scaled < largest(-2) - NOISE)
+        return xp.where(noise, NOTHING, exponents), rows, columns
+
+    if xp is np:
+        left, *found = without_noise(exponents)
+        return tuple(found) if np.array_equal(left, exponents) else _least_squares(left, xp)
+    from jax import lax  # imported when it is used
+
+    begun = exponents, exponents[..., :1], exponents[..., :1, :]
+    return lax.fori_loop(0, 2, lambda _, found: without_noise(found[0]), begun)[1:]  # which is compiled once
 
 
 def _least_squares(exponents: Any, xp: ModuleType) -> tuple[Any, Any]:
