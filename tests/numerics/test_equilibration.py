@@ -33,3 +33,10 @@ def test_an_inverse_keeps_its_small_entries_in_other_units():
         found = balanced_inverse(COUPLED * units * units[:, None])
         np.testing.assert_allclose(found * units * units[:, None], exact, rtol=1e-14)
         assert condition_number(COUPLED * units * units[:, None]) == condition_number(COUPLED)
+
+
+def test_the_condition_of_singular_matrices_is_infinite():
+    """Without a warning, which is an error here."""
+    matrices = np.array([np.eye(2), [[1.0, 1.0], [1.0, -1.0]], [[1.0, 0.0], [2.0**-90, 0.0]], np.zeros((2, 2))])
+    for xp in (np, jnp):
+        np.testing.assert_allclose(condition_number(xp.asarray(matrices), xp), [1.0, 1.0, np.inf, np.inf], rtol=1e-12)

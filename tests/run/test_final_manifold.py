@@ -36,6 +36,13 @@ def test_each_trajectory_of_a_batch():
     np.testing.assert_allclose(sol.q[0], sol.q[1], atol=1e-14)
 
 
+def test_what_ran_before_decides_nothing():
+    """Lengths of 1e-10 after lengths of 1: the manifold that is known from the run before is not measured in its units."""
+    for length in (1.0, 2.0**-33):
+        with pytest.raises(ValueError, match="off its final constraint manifold"):
+            dx.simulate(FLAT, dx.DiscreteDirac(), **(OFF | {"q": np.array([1.0, 0.7]) * length}))
+
+
 def test_each_of_two_points():
     """Two points give no momentum: each is on the manifold if a point of it lies over it."""
     for q0, q1, wrong in (((1.0, 0.7), (1.0, -0.7), "q0="), ((1.0, 0.0), (0.99, 0.1), "q1=")):
@@ -111,3 +118,11 @@ def test_a_trajectory_that_leaves_the_manifold():
     assert np.abs(sol.q).max() > 10  # of a motion that stays below 1.1
     line = dx.verify(sol)["final manifold"]
     assert line.verdict == "VIOLATED" and "leaves the final manifold" in line.explanation
+
+
+@pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.Collocation(3, nodes="lobatto"), dx.EnergyCollocation(2)])
+def test_collocation_of_a_singular_lagrangian_names_its_premise(scheme):
+    coupled = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - (q[0] ** 2 + q[0] * q[1] + 2 * q[1] ** 2) / 2)
+    start = {"q": [1.0, -0.25], "v": [0.0, 0.0]}
+    with pytest.raises(ValueError, match=r"collocation takes regular Lagrangians, and ∂²L/∂v² is singular .*\.resolved\(\)"):
+        dx.simulate(coupled, scheme, **start, step=0.1, steps=6)

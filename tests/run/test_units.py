@@ -353,3 +353,87 @@ def test_derivatives_in_other_units(engine):
         for units in GRADIENT_UNITS:
             for found, wanted in zip(derivatives(units, by), plain, strict=True):
                 np.testing.assert_array_equal(found, wanted)
+
+
+SKATE = lambda q: jnp.stack([jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0 * q[2]])])
+SMALL = ((1e-9, 1.0), (1.0, 1e-20))
+"""A length and a mass: those of MEMS, and of molecules."""
+
+
+@pytest.mark.parametrize(("length", "mass"), SMALL)
+def test_inertias_of_small_machines(length, mass):
+    """Moments of inertia of 1e-19 beside masses of 1 are not roundoff: on a circle, from the closed form."""
+    skate = dx.NonholonomicMechanics(lambda q, P: jnp.diag(jnp.stack([P["m"], P["m"], P["J"]])), lambda q, P: 0 * q[0], SKATE)
+    inertia = 0.4 * mass * length**2
+    settings = {"step": 0.05, "steps": 20, "params": {"m": mass, "J": inertia}}
+    sol = dx.simulate(skate, dx.DiscreteDirac(), q=[0, 0, 0], v=[0.5 * length, 0, 1.0], **settings)
+    np.testing.assert_allclose(sol.q[-1] / [length, length, 1], [0.5 * np.sin(1.0), 0.5 - 0.5 * np.cos(1.0), 1.0], rtol=1e-3)
+    body = dx.EulerPoincare(
+        dx.SE2(), lambda xi, P: P["J"] * xi[0] ** 2 / 2 + P["m"] * (xi[1:] @ xi[1:]) / 2, one_forms=[[0.0, 0.0, 1.0]]
+    )
+    x = np.array([inertia, mass * length, 0.0])
+    sol = dx.simulate(body, dx.DiscreteEulerPoincare(), x=x, **settings)
+    np.testing.assert_allclose(sol.x[-1], x, rtol=1e-12, atol=1e-12 * mass * length)
+
+
+def test_orbits_that_are_small_are_free():
+    """In polar coordinates: at a radius of 1e-9 the angle has the inertia 1e-18, and at the origin none."""
+    particle = dx.LagrangeDirac(lambda q, v, l: (v[0] ** 2 + q[0] ** 2 * v[1] ** 2) / 2 - (q[0] - l) ** 2)
+    reduced = dx.reduce(particle, dx.LinearConnection(fibre=[1]))
+    run = lambda l, r: dx.simulate(
+        reduced, dx.DiscreteRouth(), q=[r * l, 0], v=[0.1 * l, 0.8], step=0.05, steps=20, params=l
+    )  # fmt: skip
+    for length in (1.0, 2.0**-30):
+        with pytest.raises(ValueError, match="orbits of the group are not free"):
+            run(length, 0.0)
+    np.testing.assert_allclose(run(2.0**-30, 1.0).x * 2.0**30, run(1.0, 1.0).x, rtol=1e-13)
+
+
+def test_a_metric_that_is_not_definite_is_none_in_any_units():
+    for length in (1.0, 2.0**-33, 2.0**40):
+        for metric, wrong in (([[1.0, 2.0], [2.0, 1.0]], "positive definite"), ([[1.0, 0.5], [0.3, 1.0]], "symmetric")):
+            scaled = jnp.array(metric) * jnp.outer(*2 * [jnp.array([1.0, length])])
+            system = dx.NonholonomicMechanics(lambda q, g=scaled: g, lambda q: 0 * q[0], lambda q: jnp.array([[1.0, 0.0]]))
+            with pytest.raises(ValueError, match=f"not {wrong}"):
+                dx.simulate(system, dx.DiscreteDirac(), q=[0, 0], v=[0, 1], step=0.1, steps=3)
+
+
+PLANE_OF_PHASES = dx.DiracSystem(
+    dx.induced_dirac(None, 2),
+    lambda x, P: x[2:] @ x[2:] / P["m"] / 2 + P["m"] * P["g"] * x[1],
+    holonomic=lambda x, P: jnp.stack([x[:2] @ x[:2] - P["l"] ** 2]),
+)
+"""The pendulum of above by its Hamiltonian."""
+
+
+@pytest.mark.parametrize("scheme", [dx.DiscreteDirac(constraints="resolve"), dx.DiscreteGradient()], ids=["method 2", "gradient"])
+def test_small_masses_beside_constraints_of_a_hamiltonian(scheme):
+    """Initial velocities by a pseudo-inverse had an error of 1e-16 in forces too, which moved momenta of 1e-25 anywhere."""
+
+    def run(units):
+        length, mass, time = (units.of(d) for d in (LENGTH, MASS, TIME))
+        size = np.array([length, length, *2 * [mass * length / time]])
+        params = {"m": mass, "l": length, "g": 9.8 * length / time**2}
+        settings = {"step": 0.02 * time, "steps": 20, "engine": "native"}
+        sol = dx.simulate(PLANE_OF_PHASES, scheme, x=np.array([0.6, -0.8, 0.8, 0.6]) * size, params=params, **settings)
+        assert sol.ok
+        return sol.x / size
+
+    plain = run(Units())
+    for units in (Units(mass=-80), Units(mass=-120), Units(length=-33, mass=101, time=25)):
+        np.testing.assert_allclose(run(units), plain, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "units", [Units(length=-33, mass=-87, time=-40), Units(length=40, mass=-80, time=-20), Units(-33, 101, 25)]
+)
+def test_the_constraint_algorithm_beside_small_forces(units):
+    """A skate on the plane: velocities and forces in rows of their own, and an angle that stands in the one-form alone."""
+    hamiltonian = lambda x, P: (x[3] ** 2 + x[4] ** 2) / P["m"] / 2 + x[5] ** 2 / 2 / P["J"]
+    skate = dx.DiracSystem(dx.induced_dirac(SKATE, 3), hamiltonian)
+    length, mass, time = (units.of(d) for d in (LENGTH, MASS, TIME))
+    size = np.array([length, length, 1.0, *2 * [mass * length / time], mass * length**2 / time])
+    chain = dx.constraint_algorithm(skate, np.array([0, 0, 0, 0.5, 0, 0.4]) * size, {"m": mass, "J": 0.4 * mass * length**2})
+    assert (chain.verdict, chain.dimension) == ("determined", 5)
+    field = np.asarray(chain.field(chain.point)) / size * time
+    np.testing.assert_allclose(field, [0.5, 0.0, 1.0, 0.0, 0.5, 0.0], atol=1e-12)

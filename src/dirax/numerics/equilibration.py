@@ -32,19 +32,6 @@ def equilibrated(matrix: Any, xp: ModuleType = np, rounds: int = ROUNDS) -> tupl
     return matrix, units
 
 
-def balancing_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
-    """Scales (…, k, 1) and (…, 1, l) by which the rows and the columns of a matrix with entries of these `sizes` are to be
-    divided: by square roots from both sides at once (Ruiz 2001), which treats equations and unknowns alike, so that a
-    pseudo-inverse in these units does not depend on which of them were called rows."""
-    *lead, k, l = sizes.shape
-    rows, columns = xp.ones((*lead, k, 1)), xp.ones((*lead, 1, l))
-    for _ in range(ROUNDS):
-        left = sizes / rows / columns
-        rows = rows * xp.sqrt(_nonzero(xp, _maximum(xp, left, -1)))
-        columns = columns * xp.sqrt(_nonzero(xp, _maximum(xp, left, -2)))
-    return rows, columns
-
-
 def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """Powers of two (…, k, 1) and (…, 1, l) by which rows and columns of a matrix with entries of these `sizes` are to be
     divided so that the geometric mean of those that are not zero is about 1 in each (Curtis and Reid 1972).
@@ -90,13 +77,21 @@ WEAK = 2.0**-20
 
 def _mean_exponents(exponents: Any, xp: ModuleType) -> tuple[Any, Any]:
     """The exponents of `geometric_scales` from those of the entries (…, k, l)."""
-    rows, columns = _least_squares(exponents, 1.0, xp)
-    scaled = xp.where(exponents > NOTHING, exponents - rows - columns, NOTHING)
-    largest = lambda axis: xp.max(scaled, axis=axis, keepdims=True)
-    noise = (scaled < largest(-1) - NOISE) & (scaled < largest(-2) - NOISE)
-    if xp is np and not np.any(noise & (exponents > NOTHING)):
-        return rows, columns
-    return _least_squares(exponents, xp.where(noise, WEAK, 1.0), xp)
+
+    def weighted(weights):
+        rows, columns = _least_squares(exponents, weights, xp)
+        scaled = xp.where(exponents > NOTHING, exponents - rows - columns, NOTHING)
+        largest = lambda axis: xp.max(scaled, axis=axis, keepdims=True)
+        noise = (scaled < largest(-1) - NOISE) & (scaled < largest(-2) - NOISE)
+        return xp.where(noise & (exponents > NOTHING), WEAK, 1.0), rows, columns
+
+    if xp is np:
+        weights, *found = weighted(1.0)
+        return tuple(found) if np.all(weights == 1.0) else _least_squares(exponents, weights, xp)
+    from jax import lax  # imported when it is used
+
+    begun = xp.ones(exponents.shape), exponents[..., :1], exponents[..., :1, :]
+    return lax.fori_loop(0, 2, lambda _, found: weighted(found[0]), begun)[1:]  # which is compiled once
 
 
 def _least_squares(exponents: Any, weights: Any, xp: ModuleType) -> tuple[Any, Any]:
@@ -128,6 +123,12 @@ def _connected(adjacent: Any, xp: ModuleType) -> Any:
             break
         found = (found @ found > 0.0).astype(float)
     return found
+
+
+def diagonal_units(matrix: Any, xp: ModuleType = np) -> Any:
+    """The units (k,) of coordinates in which a symmetric matrix has ±1 on its diagonal, or zero: in these a positive definite one
+    is as well conditioned as in any, up to a factor k (van der Sluis 1969)."""
+    return xp.sqrt(_nonzero(xp, xp.abs(xp.diagonal(matrix))))
 
 
 LEAST_SIZE, BETWEEN = 2.0**-400, 0.7310585786300049
@@ -171,10 +172,11 @@ def _inverted(matrices: np.ndarray) -> np.ndarray:
 
 
 def condition_number(matrix: Any, xp: ModuleType = np) -> Any:
-    """That of matrices whose rows and columns have units of their own, ≥ 1."""
+    """That of matrices whose rows and columns have units of their own, ≥ 1; infinite for a singular one."""
     rows, columns = geometric_scales(xp.abs(matrix), xp)
     values = xp.linalg.svd(matrix / rows / columns, compute_uv=False)
-    return values[..., 0] / values[..., -1]
+    largest, least = values[..., 0], values[..., -1]
+    return xp.where(least == 0.0, xp.inf, largest / _nonzero(xp, least))
 
 
 def _largest(xp: ModuleType, matrix: Any, axis: int) -> Any:

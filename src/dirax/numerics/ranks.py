@@ -10,6 +10,7 @@ from jaxtyping import ArrayLike
 
 from dirax.numerics.equilibration import equilibrated, geometric_scales
 from dirax.numerics.tolerances import EQUATION_RANK, RANK_GAP, RANK_ROUNDOFF, STRUCTURE_RANK, TINY
+from dirax.numerics.transversals import transversal_scales
 
 
 class UndecidableRank(ValueError):
@@ -35,12 +36,24 @@ def rank_of_equations(matrices: np.ndarray, tolerance: float = EQUATION_RANK) ->
     _, values, vt = np.linalg.svd(scaled)
     ranks = numerical_rank(values, tolerance)
     directions = vt[:, -1] * units[:, 0]
-    if np.any(low := ranks < matrices.shape[2]):  # largest entries cannot balance a saddle point with small masses
-        rows, columns = geometric_scales(np.abs(matrices[low]))
-        balanced, _ = equilibrated(matrices[low] / rows / columns)
-        ranks[low] = np.maximum(ranks[low], numerical_rank(np.linalg.svd(balanced)[1], tolerance))
+    for scales in (_geometric, _transversal):  # largest entries cannot balance a saddle point with small masses
+        if np.any(low := ranks < matrices.shape[2]):
+            balanced, _ = equilibrated(scales(matrices[low]))
+            ranks[low] = np.maximum(ranks[low], numerical_rank(np.linalg.svd(balanced)[1], tolerance))
     directions /= np.max(np.abs(directions), axis=1, keepdims=True)
     return ranks, directions
+
+
+def _geometric(matrices: np.ndarray) -> np.ndarray:
+    rows, columns = geometric_scales(np.abs(matrices))
+    return matrices / rows / columns
+
+
+def _transversal(matrices: np.ndarray) -> np.ndarray:
+    if matrices.shape[1] != matrices.shape[2]:
+        return matrices
+    each = [(matrix, *transversal_scales(matrix)) for matrix in matrices]
+    return np.stack([matrix / rows / columns for matrix, rows, columns in each])
 
 
 SURE = 1e8

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from dirax.geometry.lie_group import AbstractLieGroup, Algebra
 from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.numerics.arrays import Data
-from dirax.numerics.tolerances import INERTIA_RANK
+from dirax.numerics.ranks import rank_of_equations
+from dirax.numerics.tolerances import INERTIA_RANK, ONE_FORM_RANK
 from dirax.program.legendre import constrained_velocity, moves
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
@@ -173,11 +174,9 @@ class EulerPoincare(AbstractSystem):
         inertia, forms = map(np.asarray, evaluated(self._inertia_and_forms, momentum, a, params))
         if not (np.all(np.isfinite(inertia)) and np.all(np.isfinite(forms))):
             return  # the first step says where
-        if np.linalg.matrix_rank(forms) < len(forms):
-            raise ValueError(f"one_forms must be independent, but A = {forms.tolist()} has rank {np.linalg.matrix_rank(forms)}.")
-        size = np.max(np.abs(inertia)) or 1.0
-        rank = int(np.linalg.matrix_rank(inertia / size, tol=INERTIA_RANK, hermitian=True))
-        if rank < len(inertia):
+        if len(forms) and (rank := rank_of_equations(forms[None], ONE_FORM_RANK)[0][0]) < len(forms):
+            raise ValueError(f"one_forms must be independent, but A = {forms.tolist()} has rank {rank}.")
+        if (rank := rank_of_equations(inertia[None], INERTIA_RANK)[0][0]) < len(inertia):
             raise ValueError(
                 f"the inertia ∂²l/∂ξ² is singular at the initial data: it has rank {rank} of {len(inertia)}, so that μ does not "
                 "determine ξ. Give every direction of the algebra an inertia, or take a smaller group."

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data, Numbers
+from dirax.numerics.equilibration import diagonal_units
 from dirax.numerics.tolerances import INERTIA_RANK, SYMMETRY_DEFECT
 from dirax.program.memo import Memo
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
@@ -248,7 +249,8 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
 
     def refuse_asymmetry(self, data, params) -> None:
         q = data["q"] if "q" in data else data["q0"]
-        found = invariance(self.system, self.action, *self.sampled(data, params), params, self._units(data, params))
+        units = self._units(data, params)
+        found = invariance(self.system, self.action, *self.sampled(data, params), params, units)
         if not found.ok:
             worst = self.connection.fibre[found.generator]
             what = {"lagrangian": f"∂L/∂q[{worst}]", "one_forms": "the motion of its one-forms out of their span"}
@@ -257,7 +259,7 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
                 f"the {found.of} is not invariant under translation of q[{worst}]: {what} = {found.defect:.3g} at "
                 f"q = {found.q}, v = {found.v}, at or near the initial data; take that coordinate out of fibre."
             )
-        inertia, nearby = group_inertia_ranks(self.system, self.connection, q, params)
+        inertia, nearby = group_inertia_ranks(self.system, self.connection, q, units.q, params)
         if inertia < nearby:
             raise ValueError(
                 f"the orbits of the group are not free at the initial point q = {np.asarray(q)}: the group inertia has rank "
@@ -265,15 +267,18 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
             )
 
 
-def group_inertia_ranks(system: LagrangeDirac, connection: AbstractConnection, q: Numbers, params: Any) -> tuple[int, int]:
-    """Ranks of ∂²L/∂ġ² at rest at q and at a point near it: a generator that vanishes at q has no inertia there only."""
+def group_inertia_ranks(
+    system: LagrangeDirac, connection: AbstractConnection, q: Numbers, units: Numbers, params: Any
+) -> tuple[int, int]:
+    """Ranks of ∂²L/∂ġ² at rest at q and at a point near it, in these `units` (n,) of the coordinates: a generator that vanishes
+    at q has no inertia there only."""
     fibre = list(connection.fibre)
     whole = jax.hessian(lambda v, q: system.lagrangian.at(0.0, q, v, params))
-    away = np.asarray(q) + 0.1 * np.random.default_rng(0).uniform(0.5, 1.0, q.shape)
+    away = np.asarray(q) + 0.1 * units * np.random.default_rng(0).uniform(0.5, 1.0, q.shape)
     rest = np.zeros(np.shape(q))
     here, nearby = (np.asarray(evaluated(whole, rest, np.asarray(at)))[np.ix_(fibre, fibre)] for at in (q, away))
     if not (np.all(np.isfinite(here)) and np.all(np.isfinite(nearby))):
         return len(fibre), len(fibre)
-    size = max(np.max(np.abs(nearby)), 1e-300)
-    ranks = [int(np.linalg.matrix_rank(block / size, tol=INERTIA_RANK, hermitian=True)) for block in (here, nearby)]
-    return ranks[0], ranks[1]
+    own = diagonal_units(nearby)
+    at_q, near = (int(np.linalg.matrix_rank(a / own / own[:, None], tol=INERTIA_RANK, hermitian=True)) for a in (here, nearby))
+    return at_q, near

@@ -11,7 +11,7 @@ import numpy as np
 
 from dirax.numerics.equilibration import equilibrated
 from dirax.numerics.ranks import rank_of_equations
-from dirax.numerics.tolerances import MANIFOLD_RANK
+from dirax.numerics.tolerances import MANIFOLD_RANK, ON_MANIFOLD
 from dirax.program.memo import Memo, Same
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
@@ -185,14 +185,17 @@ def _refuse_off(system: AbstractSystem, case: Case, initial: Initial, are: str, 
 
 
 def _on_known_manifold(system: AbstractSystem, q: Any, p: Any, v: Any, t: float, params: Any) -> bool:
-    """Whether a point is on the final manifold by the chain that was first found for the system, elsewhere."""
-    key = Same(system), jax.tree.structure(params), *(np.shape(leaf) for leaf in jax.tree.leaves(params))
+    """Whether a point is on the final manifold beyond doubt, by the chain that was first found for the system, elsewhere: in no
+    units but those of the point, since those of the chain belong to other data. Zeros among params may make it another one."""
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(params)]
+    key = Same(system), jax.tree.structure(params), *((leaf.shape, (leaf != 0).tobytes()) for leaf in leaves)
     chain = _chains.get(key, lambda: chain_at(system, q, v, t, params))
     if chain is None or chain.empty:
         return False
     x = on_chain(chain, q, p, v, t, params)
-    values = np.asarray(chain.constraints(x, params))  # none of a trajectory that is regular, which says nothing of others
-    return values.size > 0 and bool(np.all(np.isfinite(values))) and not chain.off(x, params)
+    value, slope = np.asarray(chain.constraints(x, params)), np.asarray(evaluated(slope_of(chain), x, params))
+    terms = np.abs(slope) @ np.abs(x)
+    return value.size > 0 and bool(np.all(np.abs(value) <= ON_MANIFOLD * terms))  # none says nothing of other points
 
 
 def lanes_of(case: Case, initial: Initial) -> Iterator[tuple[Any, Any, Any, Any]]:

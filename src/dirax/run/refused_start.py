@@ -8,6 +8,7 @@ import numpy as np
 from dirax.numerics.ranks import rank_of_equations
 from dirax.numerics.tolerances import CONSTRAINT_DEFECT, TINY
 from dirax.run.start import Initial, SparseJacobians, Start, direction
+from dirax.schemes.collocation_step import AT_NODE
 from dirax.schemes.lagrangian_step import METHOD_2
 from dirax.systems.system import AbstractSystem
 
@@ -36,6 +37,10 @@ def refuse_bad_start(
     _refuse_outside_the_domain(initial)
     if check_constraint:
         _refuse_off_constraint(system, initial, start, projected)
+    if singular and not system.constraints.any and labels[0].startswith(AT_NODE.format(0)):
+        raise ValueError(
+            f"collocation takes regular Lagrangians, and ∂²L/∂v² is singular at the initial data: it {FINAL_MANIFOLD}."
+        )
     if start.jacobian is not None:
         _refuse_singular_step(start, labels, singular, initial.lagrangian is not None)
 

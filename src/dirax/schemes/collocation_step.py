@@ -18,6 +18,8 @@ from dirax.schemes.step import Field, StepEquation
 from dirax.systems.forms import RelationForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
+AT_NODE = "equation {} at node"
+
 
 @dataclass(frozen=True, eq=False)
 class CollocationStep(AbstractStep):
@@ -40,7 +42,7 @@ class CollocationStep(AbstractStep):
 
     @property
     def labels(self) -> Labels:
-        return sum((Labels.numbered(f"equation {{}} at node {j + 1}", self.n) for j in range(self.tableau.stages)), Labels())
+        return sum((Labels.numbered(f"{AT_NODE} {j + 1}", self.n) for j in range(self.tableau.stages)), Labels())
 
     def nodes(self, u, state, t, h, params) -> tuple[list, list, list, list]:
         """(time, y, a, ḃ) at every node."""

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from dirax.program.tracing import once
 from dirax.schemes.abstract_step import AbstractStep
+from dirax.schemes.collocation_step import AT_NODE
 from dirax.schemes.collocation_tables import Quadrature, Tableau
 from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
@@ -90,7 +91,7 @@ class EnergyCollocationStep(AbstractStep):
 
     @property
     def labels(self) -> Labels:
-        nodes = [(f"equation {{}} at node {j + 1}", 0, self.moving) for j in range(self.tableau.stages)]
+        nodes = [(f"{AT_NODE} {j + 1}", 0, self.moving) for j in range(self.tableau.stages)]
         points = [(f"velocity {{}} at point {k + 1}", 0, self.inner) for k in range(len(self.quadrature.points) + 1)]
         return Labels([*nodes, *points])
 

@@ -1,9 +1,9 @@
 """Units in which the constraint algorithm measures: of the coordinates x, of the time, of the multipliers u and of the equations.
 
 They are powers of two that bring the numbers of A(x) (ẋ, u) = b(x) at one point near 1, as far as their products go: with e the
-logarithms of the entries, of the slopes ∂b/∂x, of b and of x itself,
+logarithms of the entries, of the slopes ∂A/∂x and ∂b/∂x, of b and of x itself,
 
-    A_ij: r_i − x_j + τ,   A_ik: r_i − u_k,   ∂b_i/∂x_j: r_i − x_j,   b_i: r_i,   x_j: x_j
+    A_ij: r_i − x_j + τ,   A_ik: r_i − u_k,   ∂A_ij/∂x_k: r_i − x_j + τ − x_k,   ∂b_i/∂x_j: r_i − x_j,   b_i: r_i,   x_j: x_j
 
 are least squares for the logarithms r, x, u, τ of the units. In other units of the system, by powers of two, all numbers of the
 search are the same to the last bit. What these do not determine is like coordinates of the same letter, and where all of them
@@ -13,6 +13,7 @@ are undetermined (a point where all of x is zero) near 1.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from dirax.numerics.equilibration import NOISE, ODD
@@ -32,6 +33,10 @@ along two axes are not to be measured differently because of the point."""
 
 MOST = 400
 """Coordinates and multipliers up to which their units are looked for: one matrix of all of them."""
+
+
+FEW = 2**16
+"""Slopes of the entries of A up to which they are looked at."""
 
 
 class Units(NamedTuple):
@@ -54,9 +59,12 @@ def natural_units(form: ImplicitForm, params) -> Units:
     plain = Units(np.ones(size), 1.0, np.ones(matrix.shape[1] - size), np.ones(count))
     if matrix.shape[1] > MOST:
         return plain
-    slope = once(lambda x, params: jacobian(lambda x: form.equations(x, params)[1])(x))
-    slopes = np.asarray(evaluated(slope, form.point, params))
-    if not all(np.all(np.isfinite(a)) for a in (matrix, right, slopes)):
+    first = 0 if matrix.size * size <= FEW else matrix.shape[1]
+    columns = lambda x, params: jnp.column_stack(form.equations(x, params))[:, first:]
+    slope = once(lambda x, params: jacobian(lambda x: columns(x, params))(x))
+    both = np.asarray(evaluated(slope, form.point, params))
+    turning, slopes = both[:, :-1], both[:, -1]
+    if not all(np.all(np.isfinite(a)) for a in (matrix, right, both)):
         return plain
     unknowns = matrix.shape[1] + 1  # x, τ and u, before the equations
     i, j = np.nonzero(matrix)
@@ -64,6 +72,10 @@ def natural_units(form: ImplicitForm, params) -> Units:
     terms = Terms(unknowns + count)
     terms.add(matrix[i, j][rates], i[rates], (unknowns + i[rates], 1.0), (j[rates], -1.0), (size, 1.0))
     terms.add(matrix[i, j][~rates], i[~rates], (unknowns + i[~rates], 1.0), (j[~rates] + 1, -1.0))
+    for of_rates in (True, False):  # an angle may stand in A alone
+        e, f, g = np.nonzero(turning[:, :size] if of_rates else turning[:, size:])
+        unit = ((f, -1.0), (size, 1.0)) if of_rates else ((size + 1 + f, -1.0),)
+        terms.add(turning[e, f if of_rates else size + f, g], e, (unknowns + e, 1.0), *unit, (g, -1.0))
     terms.add(slopes[k, l], k, (unknowns + k, 1.0), (l, -1.0))
     terms.add(right[m], m, (unknowns + m, 1.0))
     terms.add(form.point[there], None, (there, 1.0))

@@ -115,6 +115,9 @@ class DiracSystem(AbstractSystem):
 
     def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
         x = point_of(near, ("x",), self)
+        phase = self.phase_space_form()
+        if phase is not None and phase.constraints.any:  # rows of F add velocities to forces, which have other units
+            return phase.implicit_form(x, params)._replace(about="q̇ = ∂H/∂p, ṗ = −∂H/∂q + Wᵀu, W q̇ = 0")
         c = sum(self.sizes({"x": jnp.asarray(x)}, params)[1:])
 
         def equations(x, params):
@@ -136,6 +139,11 @@ class DiracSystem(AbstractSystem):
     def is_graph(self) -> bool:
         """Whether D is stated as the graph of a two-form or of a bivector, so that every covector has one velocity."""
         return self.structure.representation in ("two_form", "bivector")
+
+    @property
+    def explicit(self) -> bool:
+        """Whether D is stated as the graph of a bivector, or is canonical: velocities follow from covectors by no equations."""
+        return self.canonical or self.structure.representation == "bivector"
 
     @property
     def canonical(self) -> bool:
@@ -180,10 +188,14 @@ class DiracSystem(AbstractSystem):
 
     def tangency_defect(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " c"]:
         """The part of {g, H} that no λ takes away by its brackets {g_i, g_j} λ: all of it where they vanish."""
+        return self.hidden_defect(x, params) - self.brackets(x, params) @ self.held(x, params)
+
+    def held(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " c"]:
+        """The λ that take {g, H} away by the brackets {g_i, g_j} λ; zero where these vanish."""
         hidden, brackets = self.hidden_defect(x, params), self.brackets(x, params)
         size = jnp.sum(self.holonomic_matrix(x, params) ** 2)
         normal = brackets.T @ brackets + (BRACKET_DEFECT * size) ** 2 * jnp.eye(hidden.shape[0])
-        return hidden - brackets @ solve(normal, brackets.T @ hidden)
+        return solve(normal, brackets.T @ hidden)
 
     def constrained_field(self, x: Float[Numbers, " N"], params: Any = None) -> tuple[Float[Numbers, " N"], Float[Numbers, " c"]]:
         """(ẋ, λ) at a point of M_f = {g = 0, {g, H} = 0}, where the brackets {g_i, g_j} are zero: λ keeps {g, H} = 0."""
@@ -253,6 +265,12 @@ class DiracSystem(AbstractSystem):
         x = self.point(data)
         if project and self.holonomic is not None and self.is_graph:
             x = self.project(x, params)
+        if self.explicit:
+            rate, held = self.hamiltonian_vector(x, self.differential(x, params), params), jnp.zeros(0)
+            if self.holonomic is not None:
+                held = self.held(x, params)
+                rate = rate - self.forces(x, params) @ held
+            return {"x": x, "velocity": rate, "multipliers": held}
         matrix, right = self._rates(x, params)
         rates = scaled_inverse(matrix, RATE_RANK)[0] @ right
         return {"x": x, "velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dirax.numerics.arrays import Data, Numbers
+from dirax.numerics.equilibration import diagonal_units
 from dirax.numerics.tolerances import METRIC_RANK
 from dirax.program.linear_solves import scaled_pseudo_inverse, solve
 from dirax.program.roots import nearest_root
@@ -205,8 +206,7 @@ class LagrangeDirac(AbstractSystem):
     def _lifted(self, q, v, rows, params, t):
         """metric⁻¹ rowsᵀ in the metric ∂²L/∂v² where it is positive definite and the Euclidean one elsewhere."""
         hessian = jacobian(gradient(lambda v: self.lagrangian.at(t, q, v, params)))(v)
-        own = jnp.diagonal(hessian)  # with which coordinates have no units
-        units = jnp.sqrt(jnp.where(own > 0.0, own, 1.0))
+        units = diagonal_units(hessian, jnp)
         values = jnp.linalg.eigvalsh(hessian / units[:, None] / units[None])
         regular = values[0] > METRIC_RANK * jnp.abs(values[-1])
         return solve(jnp.where(regular, hessian, jnp.eye(q.shape[0])), rows.T)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dirax.numerics.arrays import Data, Numbers
+from dirax.numerics.equilibration import diagonal_units
 from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.program.linear_solves import solve
 from dirax.program.user_functions import UserFunction, evaluated, is_traced
@@ -197,14 +198,15 @@ class NonholonomicMechanics(AbstractSystem):
 
 def _check_metric(metric: np.ndarray) -> None:
     """Raise `ValueError` for a metric that is not symmetric and positive definite; not finite ones are refused later."""
-    scale = np.abs(metric).max()
-    if not np.isfinite(scale):
+    if not np.all(np.isfinite(metric)):
         return
-    if (defect := np.abs(metric - metric.T).max()) > STRUCTURE_DEFECT * scale:
+    units = diagonal_units(metric)
+    scaled, defect = metric / units / units[:, None], np.abs(metric - metric.T).max()
+    if np.abs(scaled - scaled.T).max() > STRUCTURE_DEFECT * np.abs(scaled).max():
         raise ValueError(f"metric is not symmetric at the initial point: max |g − gᵀ| = {defect:.3g}; return (g + gᵀ)/2.")
-    lowest = float(np.linalg.eigvalsh(metric)[0])
-    if lowest <= STRUCTURE_DEFECT * scale:
+    lowest = float(np.linalg.eigvalsh(scaled)[0])
+    if lowest <= STRUCTURE_DEFECT:
         raise ValueError(
-            f"metric is not positive definite at the initial point: its lowest eigenvalue is {lowest:.3g}. A degenerate kinetic "
-            "energy belongs in dx.LagrangeDirac, whose Lagrangian may be singular."
+            f"metric is not positive definite at the initial point: its lowest eigenvalue is {lowest:.3g} in units with "
+            "±1 on its diagonal. A degenerate kinetic energy belongs in dx.LagrangeDirac, whose Lagrangian may be singular."
         )
