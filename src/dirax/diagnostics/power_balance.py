@@ -75,7 +75,8 @@ def _whole_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
     supplied, dissipated = work[..., 0], work[..., 1]
     missing = np.abs(energy - energy[..., :1] - supplied + dissipated)
     sizes = energy_scale + np.abs(supplied) + np.abs(dissipated)
-    line = _line("books of the energy", float(np.nanmax(relative_to(missing, sizes))), limit, "H − H(0) less supplied plus dissipated")
+    worst = float(np.nanmax(relative_to(missing, sizes)))
+    line = _line("books of the energy", worst, limit, "H − H(0) less supplied plus dissipated")
     line.details.update(
         imbalance=float(np.nanmax(missing)),
         supplied=float(np.ravel(supplied[..., -1])[0]),
