@@ -69,6 +69,16 @@ def test_batches_and_saved_rows():
     assert report["power balance of every step"].verdict == report["books of the energy"].verdict == "ok"
 
 
+@pytest.mark.parametrize("scheme", [dx.DiscreteGradient(), dx.DiscreteDirac(), dx.EnergyCollocation()])
+def test_a_system_at_rest_balances(scheme):
+    """Nothing is stored, supplied or dissipated: 0/0 was a violation."""
+    system = dx.PortHamiltonian(hamiltonian, J, B, R)
+    sol = dx.simulate(system, scheme, x=[0.0, 0.0], step=0.05, steps=20, inputs=lambda t, x: jnp.zeros(1))
+    report = dx.verify(sol)
+    assert np.all(np.asarray(sol.x) == 0.0) and report.ok
+    assert [line.value for line in report.lines if "balance" in line.quantity or "books" in line.quantity] in ([0.0], [0.0, 0.0])
+
+
 @pytest.mark.soak
 def test_books_over_a_million_steps():
     sol = driven(dx.DiscreteGradient(), steps=1_000_000, save_every=1000)

@@ -8,7 +8,7 @@ import numpy as np
 from dirax.diagnostics.replay_lines import moved_numbers
 from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line
 from dirax.diagnostics.rows import energy_of, over_rows
-from dirax.diagnostics.verdicts import roundoff_limit
+from dirax.diagnostics.verdicts import relative_to, roundoff_limit
 from dirax.solution.solution import Solution
 
 PORTS = 2
@@ -57,7 +57,7 @@ def _step_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
             text += "; stored is the change of H"
     if np.any(missed > limit * sizes):  # a difference quotient of H over a small Δx is off by more
         sizes = np.maximum(sizes, np.sum(moved_numbers(sol, "power")))
-    return _line(name, float(np.nanmax(missed / sizes)), limit, text)
+    return _line(name, float(np.nanmax(relative_to(missed, sizes))), limit, text)
 
 
 def _flow(sol: Solution) -> float:
@@ -75,7 +75,8 @@ def _whole_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
     supplied, dissipated = work[..., 0], work[..., 1]
     missing = np.abs(energy - energy[..., :1] - supplied + dissipated)
     sizes = energy_scale + np.abs(supplied) + np.abs(dissipated)
-    line = _line("books of the energy", float(np.nanmax(missing / sizes)), limit, "H − H(0) less supplied plus dissipated")
+    worst = float(np.nanmax(relative_to(missing, sizes)))
+    line = _line("books of the energy", worst, limit, "H − H(0) less supplied plus dissipated")
     line.details.update(
         imbalance=float(np.nanmax(missing)),
         supplied=float(np.ravel(supplied[..., -1])[0]),

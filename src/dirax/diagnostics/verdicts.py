@@ -10,7 +10,7 @@ import numpy as np
 
 from dirax.diagnostics.report import OK, VIOLATED, Line
 from dirax.diagnostics.rows import LARGE, over_rows, row_numbers, sampled_rows, times_at
-from dirax.numerics.tolerances import EPSILON
+from dirax.numerics.tolerances import EPSILON, TINY
 from dirax.solution.solution import Solution
 
 ROUNDINGS = 32
@@ -53,6 +53,11 @@ def relative_changes(values: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray,
     """The largest change of values (B, rows, c) since the first row, (B,), and the same relative to a scale (B,)."""
     change = np.nanmax(np.abs(values - values[:, :1]), axis=(1, 2))
     return change, np.divide(change, scale, out=np.zeros_like(change), where=scale > 0)
+
+
+def relative_to(missed: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """missed/sizes, 0 where nothing is missed, of things at rest too, whose terms are all zero."""
+    return np.divide(missed, np.maximum(sizes, TINY), out=np.zeros_like(missed), where=missed != 0.0)
 
 
 def worst_place(values: np.ndarray) -> tuple[int, int]:

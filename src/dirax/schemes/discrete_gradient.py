@@ -23,7 +23,8 @@ class DiscreteGradient(AbstractScheme):
     `kind`: "gonzalez", dH(x̄) corrected along the step, in the metric |∂²H/∂x_i²|, in which charges
     and fluxes do not mix whatever their units (the Euclidean one from 128 coordinates on); or "mean-value", the mean of dH over
     the step by Gauss–Legendre quadrature with `nodes` points, corrected in the same way by what the quadrature leaves. What
-    roundoff takes from the balance in one step is given back in the next, so that it does not add up over many.
+    roundoff takes from the balance in one step is given back in the next, so that it does not add up over many; the change of H
+    that the roundoff of H hides, in short steps or beside a large constant, is found from dH by a finer quadrature.
 
     Saved with x: `work` (2,), the energy supplied through the ports and the energy dissipated since the start; per step
     `power` (3,), the rates at which energy is stored, supplied and dissipated.

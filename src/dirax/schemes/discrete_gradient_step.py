@@ -1,8 +1,11 @@
 """One step with an exact energy balance: the discrete gradient, and the balance that is carried along."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
 
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.roots import FEWEST_SPARSE
@@ -12,13 +15,17 @@ from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 from dirax.systems.forms import EnergyForm, RelationForm
 
-NOISE = 5e-12
-"""How much of dH the correction may be, relative, where it is roundoff of H only. It fades out for steps so short that it
-would be more: dividing roundoff by such a step would push a system that comes to rest."""
+NOISE = 5e-14
+"""How much of dH the correction may be, relative, where it is roundoff of H only. For steps so short that it would be more, the
+change of H is found from dH: dividing roundoff of H by such a step would push a system that comes to rest."""
 FADED = 1e-6
 """Of a step for which |dH||Δx| is less than this of what roundoff blurs, the correction is below one rounding of dH."""
-TINY = 1e-290
-"""Squares below this leave the range of double precision where they are divided by."""
+STRAIGHT = 2.0**-30
+"""Where dH changes by less than this of itself within a step, its mean is dH(x̄), by far more than roundoff."""
+FINER = {False: 5, True: 3}
+"""Points of Gauss' rule for the change of H of short steps; fewer in sparse steps, where each costs as much as all else."""
+TINY = 1e-150
+"""Squares below this leave the range of double precision where they are divided by, and derivatives of that are taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +36,8 @@ class DiscreteGradientStep(AbstractStep):
     ∇̄H is the mean of dH at the `points` of the step (0 to 1) with these `weights`, corrected along the step in the metric of the
     second derivatives of H. That is a number times Δx which depends on all of x: of many coordinates it is an unknown with an
     equation of its own, and the other equations are sparse, in the Euclidean metric, since a diagonal of second derivatives costs
-    as many gradients as there are coordinates.
+    as many gradients as there are coordinates. What is corrected is the change of H less ⟨mean, Δx⟩, of short steps, where the
+    roundoff of H hides it, by a finer quadrature of dH.
     """
 
     relation: RelationForm
@@ -79,9 +87,12 @@ class DiscreteGradientStep(AbstractStep):
         if self.sparse:
             return mean + self.unknowns.split(u).correction * change, middle
         missing, blurred = self._missing(u, state, h, params)
-        along, share = _along(change, self._metric(middle, params), mean, blurred)
-        instead, _ = _along(change, jnp.ones(self.n), mean, blurred)
-        return mean + missing * (along + (1.0 - share) * instead), middle
+        along = _Along.of(change, self._metric(middle, params), mean, blurred)
+        instead = _Along.of(change, jnp.ones(self.n), mean, blurred)
+        finer = self._finer(u, state, h, params, jnp.where(along.seen, along.steepest, instead.steepest))
+        by_dh = jnp.where(along.seen, along.direction, instead.direction)
+        by_h = along.share * along.direction + (1.0 - along.share) * instead.share * instead.direction
+        return mean + finer * by_dh + (missing - finer) * by_h, middle
 
     @once
     def _mean(self, u, state, h, params):
@@ -103,12 +114,28 @@ class DiscreteGradientStep(AbstractStep):
         stored = (self.energy.hamiltonian(state.x + change, params) - state.first) - gained
         return stored - mean @ change, EPSILON * (jnp.abs(state.first) + jnp.abs(gained)) / NOISE
 
+    def _finer(self, u, state, h, params, steepest):
+        """∫⟨dH, Δx⟩ over the step less ⟨mean, Δx⟩, up to the error of a quadrature and the roundoff of dH; 0 where dH hardly
+        changes (STRAIGHT), with ⟨dH, Δx⟩ at most `steepest`."""
+        if len(self.points) + 1 >= FINER[self.sparse]:  # as fine by itself
+            return jnp.zeros(())
+        mean, middle, change = self._mean(u, state, h, params)
+        points, weights = np.polynomial.legendre.leggauss(FINER[self.sparse])
+        rule = [(s / 2, w / 2) for s, w in zip(points.tolist(), weights.tolist(), strict=True) if s / 2 + 0.5 not in self.points]
+        more = jnp.stack([w * ((self.energy.differential(middle + s * change, params) - mean) @ change) for s, w in rule])
+        bent = jnp.sum(jnp.abs(more))
+        on = (bent > TINY) & (bent > STRAIGHT**2 * steepest)  # which a change of roundoff is not
+        straight = (STRAIGHT * jnp.where(on, steepest, 0.0) / jnp.where(on, bent, 1.0)) ** 2
+        return jnp.where(on, jnp.sum(more), 0.0) / (1.0 + straight * straight)
+
     def _factor(self, u, state, h, params):
         """What the mean of dH is corrected by, over Δx: the correction in the Euclidean metric."""
         mean, _, change = self._mean(u, state, h, params)
         missing, blurred = self._missing(u, state, h, params)
-        length, _, share = _share(change, jnp.ones(self.n), mean, blurred)
-        return missing * (share * (2.0 - share) / length / length)
+        along = _Along.of(change, jnp.ones(self.n), mean, blurred)
+        finer = self._finer(u, state, h, params, along.steepest)
+        whole = finer + (missing - finer) * (along.share * (2.0 - along.share))
+        return jnp.where(along.seen, whole, 0.0) / along.squared
 
     def _metric(self, x, params):
         """|∂²H/∂x_i²|, shape (n,): in this metric charges and fluxes do not mix, whatever their units."""
@@ -169,27 +196,32 @@ class DiscreteGradientStep(AbstractStep):
         return state, self.unknowns.join(velocity=data["velocity"])
 
 
-def _along(change, metric, gradient, blurred):
-    """(a G Δx with ⟨a G Δx, Δx⟩ = φ in a diagonal metric G, φ): φ is 1, and fades out where |∇̄H||Δx| in this metric is lost in
-    what is `blurred`, or G does not see Δx.
+class _Along(NamedTuple):
+    """The direction of a step in a diagonal metric G: |Δx|², GΔx/|Δx|² (⟨·, Δx⟩ = 1), whether G sees Δx, |∇̄H||Δx|, which ⟨∇̄H, Δx⟩
+    is at most, and the share φ of the roundoff of H that may be divided by Δx: 1, and less where |∇̄H||Δx| is lost in it.
 
     Zero for Δx → 0, where what is missing is of higher order than |Δx|: a system at rest has the discrete gradient dH.
     """
-    length, along, share = _share(change, metric, gradient, blurred)
-    return share / length * along, share
 
+    squared: Array
+    direction: Array
+    seen: Array
+    steepest: Array
+    share: Array
 
-def _share(change, metric, gradient, blurred):
-    """(|Δx|, G Δx/|Δx|, φ) of `_along`."""
-    seen = metric > TINY
-    squared = metric @ (change * change)
-    steep = (gradient * gradient) @ jnp.where(seen, 1.0 / jnp.where(seen, metric, 1.0), 0.0)
-    on = (squared > TINY) & (steep > TINY)
-    length, slope = jnp.sqrt(jnp.where(on, squared, 1.0)), jnp.sqrt(jnp.where(on, steep, 1.0))
-    on = on & (length * slope > FADED * blurred)
-    hidden = jnp.where(on, blurred / length / slope, 0.0)
-    share = jnp.where(on, 1.0, 0.0) / jnp.sqrt(1.0 + (hidden * hidden) ** 2)
-    return length, metric * change / length, share
+    @staticmethod
+    def of(change, metric, gradient, blurred) -> "_Along":
+        """Of a step Δx, with what is `blurred` by the roundoff of H."""
+        diagonal = metric > TINY
+        squared = metric @ (change * change)
+        steep = (gradient * gradient) @ jnp.where(diagonal, 1.0 / jnp.where(diagonal, metric, 1.0), 0.0)
+        seen = (squared > TINY) & (steep > TINY)
+        squared, steep = jnp.where(seen, squared, 1.0), jnp.where(seen, steep, 1.0)
+        steepest = jnp.sqrt(squared) * jnp.sqrt(steep)
+        clear = seen & (steepest > FADED * blurred)
+        hidden = jnp.where(clear, blurred, 0.0) / steepest
+        share = jnp.where(clear, 1.0, 0.0) / jnp.sqrt(1.0 + (hidden * hidden) ** 2)
+        return _Along(squared, jnp.where(seen, metric * change, 0.0) / squared, seen, jnp.where(seen, steepest, 0.0), share)
 
 
 def _add(total, lost, term):
