@@ -8,6 +8,7 @@ import numpy as np
 from dirax.numerics.ranks import rank_of_equations
 from dirax.numerics.tolerances import CONSTRAINT_DEFECT, TINY
 from dirax.run.start import Initial, SparseJacobians, Start, direction
+from dirax.schemes.adjoint_step import ADJOINT
 from dirax.schemes.lagrangian_step import METHOD_2
 from dirax.systems.system import AbstractSystem
 
@@ -122,6 +123,13 @@ def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool, l
             way = (
                 "The Lagrangian is singular (∂²L/∂v²), and a part of a composition ends at the momentum of a velocity on the "
                 "constraints, which such a Lagrangian does not determine: take the scheme by itself, with smaller steps"
+            )
+        elif labels[0].startswith(ADJOINT):
+            way = (
+                "The step is the inverse of the scheme's step back, and not all components of a state have one: the states of "
+                "the scheme are those of a manifold, on which p satisfies the constraints, or q lies. A self-adjoint scheme, "
+                "one of the midpoint say, is its own adjoint: take it by itself, or in dx.Composition. dx.LagrangeDAlembert and "
+                'its cases, and dx.DiscreteDirac(dx.Theta(θ), "resolve") in coordinates, have adjoints of their own'
             )
         matrix = "its matrix ([PY] (21))"
         if not lagrangian:

@@ -9,6 +9,8 @@ from dirax.schemes.growth_premise import NothingGrows
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field, StepEquation
 
+ADJOINT = "adjoint: "
+
 
 @dataclass(frozen=True, eq=False)
 class AdjointStep(AbstractStep):
@@ -30,7 +32,7 @@ class AdjointStep(AbstractStep):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        return (*(f"adjoint: component {i} of the state" for i in range(self.inner.state_size)), *self.inner.labels)
+        return (*(f"{ADJOINT}component {i} of the state" for i in range(self.inner.state_size)), *self.inner.labels)
 
     @property
     def canonical(self) -> bool:

@@ -101,8 +101,15 @@ class DiscreteDirac(AbstractScheme):
         return form is not None and form.constraints.any
 
     def adjoint(self, system: AbstractSystem) -> "DiscreteDirac | None":
-        """With constraints, that of the lift of dx.Theta(1.0) is the lift of dx.Theta(0.0), whose states are all of M_0."""
-        return DiscreteDirac(cotangent_lift(Theta(0.0))) if self._looks_ahead(system) else None
+        """With constraints, that of the lift of dx.Theta(1.0) is the lift of dx.Theta(0.0), whose states are all of M_0; and of
+        Method 2, whose states are those of M_f alone, that of θ is that of 1 − θ."""
+        if self.constraints == "discretize":
+            return DiscreteDirac(cotangent_lift(Theta(0.0))) if self._looks_ahead(system) else None
+        theta = _theta_of(self.map)
+        if theta is None or system.manifold_form() is not None:
+            return None
+        back = Theta(1.0 - theta)
+        return DiscreteDirac(cotangent_lift(back) if isinstance(self.map, CotangentLift) else back, self.constraints)
 
     def part(self, system: AbstractSystem, shape: Shape) -> AbstractScheme:
         if self._looks_ahead(system):
