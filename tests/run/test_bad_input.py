@@ -291,6 +291,21 @@ def test_a_lagrangian_singular_together_with_its_constraints():
     assert dx.simulate(bound, PLUS, q=[0.0, 1.0], v=[1.0, 0.0], step=0.1, steps=2).ok  # the constraint makes it regular
 
 
+def test_a_projection_that_a_singular_lagrangian_does_not_determine():
+    """q2 = q0 whatever the motion, which Method 1 finds; the velocity that belongs to p on the circle is not determined."""
+    rod = dx.LagrangeDirac(
+        lambda q, v: (v[0] ** 2 + v[1] ** 2) / 2 - q[1] - q[2] ** 2 / 2 + q[2] * q[0],
+        holonomic=lambda q: jnp.array([(q[0] ** 2 + q[1] ** 2 - 1) / 2]),
+    )
+    start = {"q": [0.6, -0.8, 0.6], "v": [0.4, 0.3, 0.4], "step": 0.01, "steps": 3}
+    with pytest.raises(
+        ValueError, match=r"rank 7 of 8.*this scheme saves.*take dx\.DiscreteDirac\(\), which projects nothing\.$"
+    ):
+        dx.simulate(rod, dx.LagrangeDAlembert(), **start)
+    solution = dx.simulate(rod, dx.DiscreteDirac(), **start)
+    assert solution.ok and solution.q[1:, 2] + solution.q[:-1, 2] == pytest.approx(solution.q[1:, 0] + solution.q[:-1, 0])
+
+
 def test_singular_only_in_one_trajectory_of_a_batch():
     stiff = dx.LagrangeDirac(lambda q, v, params: v[0] ** 2 / 2 + params * v[1] ** 2 / 2)
     batch = {"q": np.zeros((3, 2)), "v": np.ones((3, 2)), "params": np.array([1.0, 1.0, 0.0]), "batch_params": True}
