@@ -70,7 +70,8 @@ class DiscreteDirac(AbstractScheme):
         equation = self._resolved(system, shape) if resolve else self._discretized(system, shape)
         flat = isinstance(_map_on_q(self.map).manifold(shape.n), Euclidean)
         if equation is not None and not resolve and flat and self.map.base_fraction != 0.5 and not self._looks_ahead(system):
-            equation = nothing_grows(system, equation)
+            lagrangian = system.relation_form(shape) is None
+            equation = nothing_grows(system, equation, lagrangian and _theta_of(self.map) == 1.0 and shape.m + shape.c > 0)
         if equation is None and not resolve:
             equation = self._resolved(system, shape)  # all that is known of the system is its final manifold
         if equation is None:
