@@ -474,6 +474,27 @@ def test_a_wrong_key_of_params():
     complaint(TypeError, "KeyError: 'k'", "params has the keys 'K', 'm'", system=system, params={"m": 1.0, "K": 2.0})
 
 
+@pytest.mark.parametrize(
+    ("params", "read", "said"),
+    [
+        ((1.0, 2.0), 3, "params is a tuple of length 2."),
+        ([1.0, 2.0], "k", "params is a list of length 2."),
+        (np.ones(2), "k", "params is an array of shape (2,)."),
+        (3.0, "k", "params is a number."),
+    ],
+)
+def test_an_entry_that_params_do_not_have(params, read, said):
+    system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params[read] * q @ q)
+    complaint(TypeError, said, system=system, params=params)
+
+
+def test_other_errors_than_of_entries_say_nothing_of_params():
+    system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params[0] * q @ jnp.zeros(5))
+    with pytest.raises(TypeError, match="lagrangian") as found:
+        dx.simulate(system, PLUS, **GOOD, params=[1.0])
+    assert "params" not in str(found.value)
+
+
 def test_method_2_of_a_singular_lagrangian_needs_its_final_manifold():
     """A coil and three capacitors, with Kirchhoff's laws of two nodes as one-forms ([PY] §7)."""
     circuit = dx.LagrangeDirac(
