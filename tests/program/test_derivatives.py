@@ -11,6 +11,9 @@ from jax.extend.core import jaxpr_as_fun
 import dirax as dx
 from dirax.geometry.squared_angles import arc_over_sine, norm, radial
 from dirax.program.evaluation.functions import in_numpy, program_of
+from dirax.program.evaluation.in_numpy import Values
+from dirax.program.graph_derivatives import gradient as gradient_of_nodes
+from dirax.program.graph_derivatives import jacobian as derivatives_of_nodes
 from dirax.program.roots import nearest_root
 from dirax.program.rules import by_numpy
 from dirax.program.tracing import along, closed_over, gradient, jacobian, once
@@ -211,3 +214,58 @@ def test_derivatives_of_a_root_of_first_and_second_order():
     assert by_jax(jax.jacfwd(root, 1), a, b) == pytest.approx(slope, rel=1e-14)
     assert by_jax(jax.grad(jax.grad(root, 1), 1), a, b) == pytest.approx(-6 * u * slope**3, rel=1e-13)
     assert jax.jit(jax.vmap(jax.grad(root, 1), (None, 0)))(a, jnp.array([b, b])) == pytest.approx([slope] * 2, rel=1e-14)
+
+
+CONTACTS = {
+    "where": lambda x: jnp.where(x > 0.5, x - 0.5, 0.0),
+    "maximum": lambda x: jnp.maximum(x - 0.5, 0.0) / 1.5,
+    "minimum": lambda x: -jnp.minimum(0.5 - x, 0.0),
+    "two": lambda x: jnp.maximum(x - 0.5, 0.0) + 2.0 * jnp.maximum(x - 0.7, 0.0),
+}
+
+
+@pytest.mark.parametrize("contact", CONTACTS)
+@pytest.mark.parametrize("power", [1.5, 2.5, 3.5, 2.3])
+def test_the_stiffness_of_a_contact_is_zero_in_free_flight(contact, power):
+    """The function is constant there, and so are its derivatives, of any order that JAX itself finds for the first."""
+    gap = CONTACTS[contact]
+    made, _ = program_of(gradient(lambda x: gap(x) ** power), [jax.ShapeDtypeStruct((), np.float64)], (contact, power))
+    (force,), (x,) = (nodes.ravel().tolist() for nodes in (*made.results, *made.inputs))
+    (row,) = derivatives_of_nodes(made.graph, [force], [x])
+    (backward,) = gradient_of_nodes(made.graph, {force: made.graph.one}, [x])
+    (third,) = derivatives_of_nodes(made.graph, [row[0]], [x]) if 0 in row else ({},)
+    nodes = [row.get(0, made.graph.zero), backward, third.get(0, made.graph.zero)]
+    with np.errstate(all="ignore"):
+        assert np.array(made.graph.evaluate(nodes, {made.graph.value[x]: np.float64(0.0)})) == pytest.approx(np.zeros(3), abs=0)
+    numbers = Values(made.graph, 1)
+    numbers.bind(made.inputs[0], np.zeros((1, 1)))
+    assert numbers.slopes([force], [x]).item() == 0.0
+
+
+@pytest.mark.parametrize("power", [1.5, 2.5, 3.5])
+def test_half_powers_have_the_slope_of_a_power_at_zero_and_elsewhere(power):
+    """(c|x|)^p, of which x = 0 is an edge of the root alone."""
+    made, _ = program_of(lambda x: (3.0 * jnp.abs(x)) ** power, [jax.ShapeDtypeStruct((), np.float64)], power)
+    (row,) = derivatives_of_nodes(made.graph, made.results[0].ravel().tolist(), made.inputs[0].ravel().tolist())
+    for x in (0.0, 0.7, -2.0):
+        (found,) = made.graph.evaluate([row[0]], {made.graph.value[made.inputs[0].item()]: np.float64(x)})
+        assert found == pytest.approx(power * 3.0**power * abs(x) ** (power - 1) * np.sign(x), rel=1e-15)
+
+
+def test_the_norm_has_no_derivative_at_zero():
+    """Its square is zero there with its slope, but it is not constant near by: ∞·0 is no number."""
+    made, _ = program_of(lambda q: jnp.sqrt(q @ q), [jax.ShapeDtypeStruct((2,), np.float64)], "norm")
+    (row,) = derivatives_of_nodes(made.graph, made.results[0].ravel().tolist(), made.inputs[0].tolist())
+    with np.errstate(all="ignore"):
+        assert np.isnan(
+            made.graph.evaluate([row[0]], dict.fromkeys(map(made.graph.value.get, made.inputs[0].tolist()), np.float64(0)))
+        )
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_a_hertz_contact_flies_freely(engine):
+    """V = 200 max(x − ½, 0)^2.5: no force acts where the contact is open."""
+    potential = lambda x: 200.0 * jnp.maximum(x - 0.5, 0.0) ** 2.5
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - potential(q[0]))
+    solution = dx.simulate(system, dx.LagrangeDAlembert(), q=[0.0], v=[1.0], step=0.01, steps=3, engine=engine)
+    assert solution.ok and solution.q[:, 0] == pytest.approx(solution.t, abs=1e-15)

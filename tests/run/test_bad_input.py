@@ -313,6 +313,21 @@ def test_a_lagrangian_singular_together_with_its_constraints():
     assert dx.simulate(bound, PLUS, q=[0.0, 1.0], v=[1.0, 0.0], step=0.1, steps=2).ok  # the constraint makes it regular
 
 
+def test_a_projection_that_a_singular_lagrangian_does_not_determine():
+    """q2 = q0 whatever the motion, which Method 1 finds; the velocity that belongs to p on the circle is not determined."""
+    rod = dx.LagrangeDirac(
+        lambda q, v: (v[0] ** 2 + v[1] ** 2) / 2 - q[1] - q[2] ** 2 / 2 + q[2] * q[0],
+        holonomic=lambda q: jnp.array([(q[0] ** 2 + q[1] ** 2 - 1) / 2]),
+    )
+    start = {"q": [0.6, -0.8, 0.6], "v": [0.4, 0.3, 0.4], "step": 0.01, "steps": 3}
+    with pytest.raises(
+        ValueError, match=r"rank 7 of 8.*this scheme saves.*take dx\.DiscreteDirac\(\), which projects nothing\.$"
+    ):
+        dx.simulate(rod, dx.LagrangeDAlembert(), **start)
+    solution = dx.simulate(rod, dx.DiscreteDirac(), **start)
+    assert solution.ok and solution.q[1:, 2] + solution.q[:-1, 2] == pytest.approx(solution.q[1:, 0] + solution.q[:-1, 0])
+
+
 def test_singular_only_in_one_trajectory_of_a_batch():
     stiff = dx.LagrangeDirac(lambda q, v, params: v[0] ** 2 / 2 + params * v[1] ** 2 / 2)
     batch = {"q": np.zeros((3, 2)), "v": np.ones((3, 2)), "params": np.array([1.0, 1.0, 0.0]), "batch_params": True}
@@ -479,6 +494,27 @@ def test_more_rows_than_memory():
 def test_a_wrong_key_of_params():
     system = dx.LagrangeDirac(lambda q, v, params: params["m"] * v @ v / 2 - params["k"] * q @ q)
     complaint(TypeError, "KeyError: 'k'", "params has the keys 'K', 'm'", system=system, params={"m": 1.0, "K": 2.0})
+
+
+@pytest.mark.parametrize(
+    ("params", "read", "said"),
+    [
+        ((1.0, 2.0), 3, "params is a tuple of length 2."),
+        ([1.0, 2.0], "k", "params is a list of length 2."),
+        (np.ones(2), "k", "params is an array of shape (2,)."),
+        (3.0, "k", "params is a number."),
+    ],
+)
+def test_an_entry_that_params_do_not_have(params, read, said):
+    system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params[read] * q @ q)
+    complaint(TypeError, said, system=system, params=params)
+
+
+def test_other_errors_than_of_entries_say_nothing_of_params():
+    system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params[0] * q @ jnp.zeros(5))
+    with pytest.raises(TypeError, match="lagrangian") as found:
+        dx.simulate(system, PLUS, **GOOD, params=[1.0])
+    assert "params" not in str(found.value)
 
 
 def test_method_2_of_a_singular_lagrangian_needs_its_final_manifold():

@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dirax as dx
+from dirax.engines.stage_in_numbers import in_numbers
 from dirax.schemes.composition_coefficients import COEFFICIENTS
 
 MOST_STAGES = 125
@@ -183,6 +184,54 @@ def test_adjoints_of_the_lagrange_dalembert_family():
     q0, q1 = jnp.array([1.0, 2.0]), jnp.array([0.5, 1.0])
     assert own.discrete_lagrangian(q0, q1, 0.1, None) == pytest.approx((q0 @ q0 - q1 @ q1) / 0.1 * -1 / -1)
     assert np.asarray(own.constraint(q0, q1, 0.1, None)) == pytest.approx(-0.1 * np.asarray(q1))
+
+
+TURNED = dx.LagrangeDirac(
+    lambda q, v: v @ v / 2 * (1 + 0.3 * q[0] ** 2) + (v @ v) ** 2 / 8 - q[0] + 0.2 * q[1] * v[2],
+    lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]]),
+)
+ON_SPHERE = dx.LagrangeDirac(lambda q, v: v @ v / 2 * (2 + q[0]) - q[1], holonomic=lambda q: jnp.array([(q @ q - 1) / 2]))
+
+
+@pytest.mark.parametrize("theta", [0.5, 0.3, 0.0])
+@pytest.mark.parametrize(
+    "system, shape, q, v",
+    [
+        (TURNED, dx.Shape(3, 1), [0.1, 0.0, 0.3], [np.cos(0.3), np.sin(0.3), 1.0]),
+        (ON_SPHERE, dx.Shape(3, 0, 1), [0.0, 0.6, 0.8], [0.3, 0.8, -0.6]),
+    ],
+    ids=["one-form", "holonomic"],
+)
+def test_the_adjoint_of_method_2_undoes_a_backward_step_on_the_constraint_manifold(theta, system, shape, q, v):
+    """Off it the inverse does not exist: the adjoint is the method of 1 − θ, and for the midpoint the method itself."""
+    scheme = dx.DiscreteDirac(dx.Theta(theta), "resolve")
+    forward, adjoint = (dx.make_step_equation(s, system, shape) for s in (scheme, dx.Adjoint(scheme)))
+    data = system.complete({"q": jnp.array(q), "v": jnp.array(v)}, None, False)
+    state, u = forward.start(data, -0.1, None)
+    back = stepped(forward, state, u, -0.1)
+    assert np.abs(stepped(adjoint, back, adjoint.start(data, 0.1, None)[1], 0.1) - state).max() < 1e-13
+    assert scheme.adjoint(system) == scheme or theta != 0.5
+
+
+def stepped(equation, state, u, h):
+    """`newton_step` with nothing compiled."""
+    of_step, state, u = in_numbers(equation, None), np.asarray(state), np.asarray(u)
+    for _ in range(15):
+        residual, matrix = of_step.linearized(u, state, 0.0, h)
+        u = u - np.linalg.solve(matrix, residual)
+    return of_step.advance(u, state, 0.0, h)
+
+
+def test_method_2_is_made_symmetric():
+    scheme = dx.SymmetricComposition(dx.DiscreteDirac(dx.Theta(0.3), "resolve"))
+    solution = dx.simulate(TURNED, scheme, q=[0.0, 0, 0], v=[1.0, 0, 1], step=0.01, steps=3)
+    assert solution.ok and np.abs(solution.constraint_residual()).max() < 1e-15
+
+
+def test_an_inverse_that_is_none_of_all_states_is_refused_as_such():
+    ball = dx.ManifoldLagrangian(lambda q, v: v @ v / 2 - q[2], dx.Sphere(3))
+    with pytest.raises(ValueError, match=r"inverse of the scheme's step back.*is its own adjoint"):
+        dx.simulate(ball, dx.Adjoint(dx.DiscreteDirac(dx.SphereProjection())), q=[1.0, 0, 0], v=[0.0, 1, 0], step=0.1, steps=1)
 
 
 def test_plus_scheme_made_symmetric_is_of_second_order_on_the_disk(disk_at_end):

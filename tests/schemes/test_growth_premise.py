@@ -29,6 +29,29 @@ def test_what_grows_is_refused_and_what_decays_runs(system, start, grows, decays
             dx.simulate(system, scheme, **run)
 
 
+@pytest.mark.parametrize(("system", "start"), [CASES[0][:2], CASES[1][:2]], ids=["holonomic", "one-forms"])
+def test_a_base_point_at_an_end(system, start):
+    """θ = 1: W(q_1) ∂H/∂p(q_1, p_0) = 0 has no force in it. What is off it at θ = 0 is gone after a step."""
+    run = start | {"step": 1 / 160, "steps": 3}
+    first, last = dx.DiscreteDirac(dx.Theta(0.0)), dx.DiscreteDirac(dx.Theta(1.0))
+    for scheme in (last, dx.SymmetricComposition(last), dx.Composition(last, (0.5, 0.5))):
+        with pytest.raises(
+            ValueError, match=r"forces of the constraints of this LagrangeDirac.*leave the forces free.*dx\.Midpoint"
+        ):
+            dx.simulate(system, scheme, **run)
+    for scheme in (dx.Adjoint(first), dx.SymmetricComposition(first)):
+        with pytest.raises(ValueError, match="without bound, whatever its size"):
+            dx.simulate(system, scheme, **run)
+    assert dx.simulate(system, first, **run).ok and dx.simulate(system, dx.Adjoint(last), **run).ok
+
+
+def test_the_adjoint_of_what_grows_decays():
+    start = CASES[0][1] | {"step": 1 / 160, "steps": 160}
+    solution = dx.simulate(PENDULUM, dx.Adjoint(dx.DiscreteDirac(dx.Theta(0.7))), **start)
+    expected = dx.simulate(PENDULUM, dx.DiscreteDirac(dx.Theta(0.3)), **start)
+    np.testing.assert_allclose(solution.q, expected.q, rtol=0, atol=1e-12)
+
+
 def test_regular_systems_have_nothing_that_grows():
     stiff = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 1e6 * q @ q)
     for theta in (0.0, 0.3, 0.7, 1.0):

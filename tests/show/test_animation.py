@@ -41,6 +41,8 @@ def test_html_is_a_report_and_other_endings_are_refused(tmp_path, monkeypatch):
     assert "<title>Mathematical pendulum</title>" in page.read_text("utf-8")
     with pytest.raises(ValueError, match=r"path must end in \.gif or \.webp or \.mp4 or \.html"):
         PENDULUM.animate(tmp_path / "swing.avi")
+    with pytest.raises(ValueError, match="has 305 bytes: choose one of at most 255"):
+        PENDULUM.animate(tmp_path / ("x" * 300 + ".webp"))
     with pytest.raises(ValueError, match="must be positive"):
         PENDULUM.animate(tmp_path / "swing.gif", seconds=0)
 

@@ -86,6 +86,7 @@ def test_scenes_take_their_places_by_name(sol, tmp_path):
     [
         ({"path": "x.pdf"}, ValueError, r"must end in \.html"),
         ({"path": "none/x.html"}, FileNotFoundError, "does not exist"),
+        ({"path": "x" * 300 + ".html"}, ValueError, "has 305 bytes: choose one of at most 255"),
         ({"solutions": 3}, TypeError, "got a int"),
         ({"solutions": []}, TypeError, "got a list"),
         ({"names": ["a", "b"]}, ValueError, "one string for each of 1"),

@@ -41,6 +41,7 @@ class Graph:
         self.value: dict[int, float | bool | str] = {}
         self.limit = limit
         self.slopes: dict[int, list[int | None]] = {}
+        self.at_rest: dict[int, int] = {}
         self._known: dict[tuple, int] = {}
         self.zero, self.one = self.constant(0.0), self.constant(1.0)
         self.false, self.true = self.constant(False), self.constant(True)
@@ -52,7 +53,7 @@ class Graph:
         """A graph of the same nodes, to which others can be added."""
         other = Graph(limit)
         other.op, other.args, other.value = self.op.copy(), self.args.copy(), self.value.copy()
-        other.slopes, other._known = self.slopes.copy(), self._known.copy()
+        other.slopes, other.at_rest, other._known = self.slopes.copy(), self.at_rest.copy(), self._known.copy()
         return other
 
     # ------------------------------------------------------------------ leaves
@@ -234,6 +235,32 @@ class Graph:
             whole = math.floor(c)
             return self.mul(self.power(x, whole), self.make("sqrt", x))
         return self._plain("pow", x, y)
+
+    def half_power(self, node: int) -> tuple[int, int, int] | None:
+        """(√(c·x), x, n ≥ 1) where a node is xⁿ·√(c·x), None for any other."""
+        if self.op[node] != "mul":
+            return None
+        for root, factor in (self.args[node], self.args[node][::-1]):
+            if self.op[root] == "sqrt":
+                x = self._without_factor(self.args[root][0])
+                if n := self._degree(factor, x):
+                    return root, x, n
+        return None
+
+    def _without_factor(self, a: int) -> int:
+        """x where a is −x or c·x."""
+        if self.op[a] == "neg" or (self.op[a] == "mul" and self.is_constant(self.args[a][0])):
+            return self.args[a][-1]
+        return a
+
+    def _degree(self, a: int, x: int) -> int:
+        """n where a is xⁿ, a product; zero for any other."""
+        if a == x or self.op[a] != "mul":
+            return int(a == x)
+        first, second = self.args[a]
+        n = self._degree(first, x)
+        m = self._degree(second, x) if n else 0
+        return n + m if m else 0
 
     # ------------------------------------------------------------------ logic
 

@@ -1,7 +1,9 @@
 """Derivatives of nodes of the scalar graph, as nodes of it; those of one operation are in `operations/`."""
 
-from dirax.program.graph import Graph
-from dirax.program.operations import OPERATIONS
+import functools
+
+from dirax.program.graph import CONSTANT, Graph
+from dirax.program.operations import OPERATIONS, WITH_EDGE
 
 
 def partials(g: Graph, node: int) -> list[int | None]:
@@ -11,6 +13,37 @@ def partials(g: Graph, node: int) -> list[int | None]:
         return list(g.slopes[node])
     rule = OPERATIONS[op].derivative
     return [None] * len(args) if rule is None else rule(g, node, *args)
+
+
+def slopes(g: Graph, node: int) -> list[tuple[int, int]]:
+    """The nodes on which a node depends, each with the derivative by it; by which it has none is left out.
+
+    No ∞·0 is made at an edge of the domain: a power xⁿ·√x, which is a product, is a power here, and where an operand does not
+    move, the derivative by it is zero.
+    """
+    if (power := g.half_power(node)) is not None:
+        root, x, n = power
+        return [(x, g.mul(g.constant(n + 0.5), g.mul(g.power(x, n - 1), root)))]
+    found = [(a, slope) for a, slope in zip(g.args[node], partials(g, node), strict=True) if slope is not None]
+    if g.op[node] in WITH_EDGE:
+        return [(a, g.select(at_rest(g, a), g.zero, slope)) for a, slope in found]
+    return found
+
+
+def at_rest(g: Graph, node: int) -> int:
+    """The condition, a node, that a node is on a branch, of a choice or a maximum, where it is constant."""
+    known = g.at_rest
+    for a in g.reachable([node], known):
+        op, args = g.op[a], g.args[a]
+        if op in CONSTANT:
+            known[a] = g.true
+        elif op in ("select", "max", "min"):
+            x, y = args[-2:]
+            first = args[0] if op == "select" else g.make("le", *((y, x) if op == "max" else (x, y)))
+            known[a] = g.select(first, known[x], known[y]) if known[x] != known[y] else known[x]
+        else:
+            known[a] = functools.reduce(functools.partial(g.make, "and"), (known[x] for x in args), g.true if args else g.false)
+    return known[node]
 
 
 def jacobian(g: Graph, outputs: list[int], inputs: list[int]) -> list[dict[int, int]]:
@@ -32,9 +65,7 @@ def _chain(g: Graph, node: int, rows: dict[int, dict[int, int]]) -> dict[int, in
         yes, no = rows[args[1]], rows[args[2]]
         return {j: g.select(args[0], yes.get(j, g.zero), no.get(j, g.zero)) for j in sorted({*yes, *no})}
     total: dict[int, int] = {}
-    for a, slope in zip(args, partials(g, node), strict=True):
-        if slope is None:
-            continue
+    for a, slope in slopes(g, node):
         for j, inner in rows[a].items():
             term = g.mul(slope, inner)
             total[j] = g.add(total[j], term) if j in total else term
@@ -47,8 +78,8 @@ def gradient(g: Graph, seeds: dict[int, int], inputs: list[int]) -> list[int]:
     for node in reversed(g.reachable(seeds)):
         if node not in flow or not g.args[node]:
             continue
-        for a, slope in zip(g.args[node], partials(g, node), strict=True):
-            if slope is not None and (term := g.mul(slope, flow[node])) != g.zero:
+        for a, slope in slopes(g, node):
+            if (term := g.mul(slope, flow[node])) != g.zero:
                 flow[a] = g.add(flow[a], term) if a in flow else term
     return [flow.get(node, g.zero) for node in inputs]
 

@@ -17,7 +17,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
 from dirax.program.graph import Graph, GraphTooLarge
-from dirax.program.graph_derivatives import partials
+from dirax.program.graph_derivatives import slopes
 from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive, elementwise, rule
 from dirax.program.memo import Memo, Same
 from dirax.program.primitives import plain_primitive
@@ -78,8 +78,8 @@ def _error(g: Graph, node: int, error: dict[int, int]) -> int:
     if g.op[node] == "select":
         return g.select(args[0], error[args[1]], error[args[2]])
     total = g.zero
-    for a, slope in zip(args, partials(g, node), strict=True):
-        if slope is not None and error[a] != g.zero:
+    for a, slope in slopes(g, node):
+        if error[a] != g.zero:
             total = g.add(total, g.mul(g.make("abs", slope), error[a]))
     return total if g.op[node] in EXACT or total == g.zero else g.add(total, g.make("abs", node))
 

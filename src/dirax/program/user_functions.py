@@ -2,6 +2,7 @@
 called uniformly."""
 
 import inspect
+import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,6 +29,9 @@ NO_MULTIPLIERS = (
 INDEXING = ("dynamic_slice", "gather")
 """What JAX turns an index into when it is not known to be inside the array."""
 
+
+INDEX = re.compile(r"\bind(ex|ices|exing|exed)\b")
+"""What the messages of Python and of JAX have that are about an index."""
 
 _shapes: Memo[tuple[jax.ShapeDtypeStruct, Any]] = Memo(512)
 
@@ -133,9 +137,10 @@ class UserFunction(eqx.Module):
         try:
             jaxpr, out = jax.make_jaxpr(lambda *v: self(*v), return_shape=True)(*values)
         except Exception as error:
+            way = _way_out(error, values[-1] if self.takes_params else None)
             raise TypeError(
                 f"{self._call} could not be traced by JAX on float64 arrays of shapes {_shapes_of(values)}"
-                f"{self._without_params(values)}: {type(error).__name__}: {_first_line(error)}{_way_out(error, values[-1])}"
+                f"{self._without_params(values)}: {type(error).__name__}: {_first_line(error)}{way}"
             ) from error
         if not isinstance(out, jax.ShapeDtypeStruct) or out.dtype != jnp.float64:
             what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
@@ -288,13 +293,33 @@ def _first_line(message: Any) -> str:
 
 
 def _way_out(error: Exception, params: Any) -> str:
-    if isinstance(error, KeyError) and isinstance(params, dict):
-        return f"; params has the keys {', '.join(map(repr, params))}." if params else "; params has no keys."
+    if params is not None and _of_entries(error, params):
+        return f"; params {_what_it_is(params)}."
     if isinstance(error, jax.errors.TracerArrayConversionError):
         return "; write it with jax.numpy instead of numpy."
     if isinstance(error, jax.errors.ConcretizationTypeError):
         return "; write it without Python's if and float(), e.g. with jnp.where."
     return "."
+
+
+def _of_entries(error: Exception, params: Any) -> bool:
+    """Whether an error may be about an entry that params do not have."""
+    if isinstance(error, KeyError):
+        return isinstance(params, dict)
+    said, kind = str(error), f"'{type(params).__name__}'"
+    return isinstance(error, IndexError) or (
+        isinstance(error, TypeError | AttributeError) and (INDEX.search(said) is not None or kind in said)
+    )
+
+
+def _what_it_is(params: Any) -> str:
+    if isinstance(params, dict):
+        return f"has the keys {', '.join(map(repr, params))}" if params else "has no keys"
+    if isinstance(params, list | tuple):
+        return f"is a {type(params).__name__} of length {len(params)}"
+    if not hasattr(params, "shape"):
+        return f"is a {type(params).__name__}"
+    return f"is an array of shape {params.shape}" if params.shape else "is a number"
 
 
 def is_traced(*trees: Any) -> bool:

@@ -8,7 +8,9 @@ import numpy as np
 from dirax.numerics.ranks import rank_of_equations
 from dirax.numerics.tolerances import CONSTRAINT_DEFECT, TINY
 from dirax.run.start import Initial, SparseJacobians, Start, direction
+from dirax.schemes.adjoint_step import ADJOINT
 from dirax.schemes.collocation_step import AT_NODE
+from dirax.schemes.lagrange_dalembert_step import PROJECTION
 from dirax.schemes.lagrangian_step import METHOD_2
 from dirax.systems.system import AbstractSystem
 
@@ -131,10 +133,20 @@ def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool, l
         )
         if singular and labels[0].endswith(METHOD_2):
             way = f"This is since the Lagrangian is singular (∂²L/∂v²), and this scheme {FINAL_MANIFOLD}"
-        elif singular and len(start.guess) > 1 and any(label.startswith("projection") for label in labels):
+        elif singular and _projection_alone(jacobian[lane], labels):
+            composed = len(start.guess) > 1
+            ends = "a part of a composition ends at" if composed else "this scheme saves, with holonomic constraints,"
+            alone = ", or without holonomic constraints the scheme by itself, with smaller steps" * composed
             way = (
-                "The Lagrangian is singular (∂²L/∂v²), and a part of a composition ends at the momentum of a velocity on the "
-                "constraints, which such a Lagrangian does not determine: take the scheme by itself, with smaller steps"
+                f"The Lagrangian is singular (∂²L/∂v²), and {ends} the momentum of a velocity on the constraints, which such a "
+                f"Lagrangian does not determine: take dx.DiscreteDirac(), which projects nothing{alone}"
+            )
+        elif labels[0].startswith(ADJOINT):
+            way = (
+                "The step is the inverse of the scheme's step back, and not all components of a state have one: the states of "
+                "the scheme are those of a manifold, on which p satisfies the constraints, or q lies. A self-adjoint scheme, "
+                "one of the midpoint say, is its own adjoint: take it by itself, or in dx.Composition. dx.LagrangeDAlembert and "
+                'its cases, and dx.DiscreteDirac(dx.Theta(θ), "resolve") in coordinates, have adjoints of their own'
             )
         matrix = "its matrix ([PY] (21))"
         if not lagrangian:
@@ -150,6 +162,13 @@ def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool, l
             f"initial data{_which(ranks < unknowns)}, and leaves the direction "
             f"{free} of the unknowns free. {way}."
         )
+
+
+def _projection_alone(jacobian: np.ndarray, labels: Sequence[str]) -> bool:
+    """Whether the equations of a step have a unique solution without those of the projection of its momentum, which are the last
+    and have unknowns of their own."""
+    steps = sum(not label.startswith(PROJECTION) for label in labels)
+    return steps < len(labels) and int(rank_of_equations(jacobian[None, :steps, :steps])[0][0]) == steps
 
 
 def _refuse_singular_sparse_step(jacobians: SparseJacobians, labels: Sequence[str]) -> None:

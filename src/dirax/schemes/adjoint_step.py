@@ -9,6 +9,8 @@ from dirax.schemes.growth_premise import NothingGrows
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field, StepEquation
 
+ADJOINT = "adjoint: "
+
 
 @dataclass(frozen=True, eq=False)
 class AdjointStep(AbstractStep):
@@ -30,7 +32,7 @@ class AdjointStep(AbstractStep):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        return (*(f"adjoint: component {i} of the state" for i in range(self.inner.state_size)), *self.inner.labels)
+        return (*(f"{ADJOINT}component {i} of the state" for i in range(self.inner.state_size)), *self.inner.labels)
 
     @property
     def canonical(self) -> bool:
@@ -72,6 +74,5 @@ class AdjointStep(AbstractStep):
         return self.unknowns.replace(previous, inner=self.inner.guess(state + h * increment, inner, -h, params))
 
     def check(self, data, h, params):
-        self.inner.check(data, -h, params)
-        if isinstance(self.inner.check, NothingGrows):
-            self.inner.check.of_adjoint(data, -h, params)
+        check = self.inner.check
+        (check.of_adjoint if isinstance(check, NothingGrows) else check)(data, -h, params)

@@ -63,8 +63,9 @@ class Adjoint(AbstractScheme):
 
     A scheme is self-adjoint where it equals its adjoint. A discrete Lagrange–d'Alembert or Routh scheme has one of the same
     family, with L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h): with constraints its p matters
-    only modulo the forces Wᵀμ, so that the inverse as a map of (q, p) does not exist. The unknowns of any other scheme are
-    its own and the increment of the state.
+    only modulo the forces Wᵀμ, so that the inverse as a map of (q, p) does not exist. Nor does it for Method 2, whose states are
+    on the final manifold: in coordinates the adjoint of that of θ is that of 1 − θ. The unknowns of any other scheme are its own
+    and the increment of the state.
     """
 
     scheme: AbstractScheme

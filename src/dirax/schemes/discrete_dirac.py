@@ -70,7 +70,8 @@ class DiscreteDirac(AbstractScheme):
         equation = self._resolved(system, shape) if resolve else self._discretized(system, shape)
         flat = isinstance(_map_on_q(self.map).manifold(shape.n), Euclidean)
         if equation is not None and not resolve and flat and self.map.base_fraction != 0.5 and not self._looks_ahead(system):
-            equation = nothing_grows(system, equation)
+            lagrangian = system.relation_form(shape) is None
+            equation = nothing_grows(system, equation, lagrangian and _theta_of(self.map) == 1.0 and shape.m + shape.c > 0)
         if equation is None and not resolve:
             equation = self._resolved(system, shape)  # all that is known of the system is its final manifold
         if equation is None:
@@ -97,8 +98,15 @@ class DiscreteDirac(AbstractScheme):
         return form is not None and form.constraints.any
 
     def adjoint(self, system: AbstractSystem) -> "DiscreteDirac | None":
-        """With constraints, that of the lift of dx.Theta(1.0) is the lift of dx.Theta(0.0), whose states are all of M_0."""
-        return DiscreteDirac(cotangent_lift(Theta(0.0))) if self._looks_ahead(system) else None
+        """With constraints, that of the lift of dx.Theta(1.0) is the lift of dx.Theta(0.0), whose states are all of M_0; and of
+        Method 2, whose states are those of M_f alone, that of θ is that of 1 − θ."""
+        if self.constraints == "discretize":
+            return DiscreteDirac(cotangent_lift(Theta(0.0))) if self._looks_ahead(system) else None
+        theta = _theta_of(self.map)
+        if theta is None or system.manifold_form() is not None:
+            return None
+        back = Theta(1.0 - theta)
+        return DiscreteDirac(cotangent_lift(back) if isinstance(self.map, CotangentLift) else back, self.constraints)
 
     def part(self, system: AbstractSystem, shape: Shape) -> AbstractScheme:
         if self._looks_ahead(system):

@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.tolerances import TINY
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.schemes.step import StepEquation
@@ -17,37 +18,47 @@ SHORT = 1e-6
 GROWTH = 1e-4
 """Factors up to 1 + GROWTH are those of the motion in such a step."""
 
+BOUNDLESS = 1e6
+"""Factors from which on one is that of a division by zero."""
+
+WAY_OUT = 'Take dx.Midpoint(), a map with the base point on its other side, or constraints="resolve".'
+
 
 class NothingGrows:
     """The check of an equation, called with (data, h, params), which refuses one with a mode that no step h is too short for.
 
     A base point at the fraction θ of a step has the momentum (1 − θ)p_k + θp_{k+1}, or the coordinates x of another space
     (1 − θ)x_k + θx_{k+1}, where a constraint at the base point says what it is: p_{k+1} = … − (1 − θ)/θ p_k, whatever h.
-    With `inverse` it is the check of the adjoint.
+    With `inverse` it is the check of the adjoint; `at_end` says that a constraint at the base point restricts p_k alone.
     """
 
-    def __init__(self, system: AbstractSystem, equation: StepEquation, inverse: bool = False):
-        self.system, self.equation, self.inverse = system, equation, inverse
+    def __init__(self, system: AbstractSystem, equation: StepEquation, at_end: bool = False, inverse: bool = False):
+        self.system, self.equation, self.at_end, self.inverse = system, equation, at_end, inverse
         self.slopes = _slopes_of(system, equation)
 
     @property
     def of_adjoint(self) -> "NothingGrows":
         """The check of the adjoint of the equation, which has the inverse factors."""
-        return NothingGrows(self.system, self.equation, not self.inverse)
+        return NothingGrows(self.system, self.equation, self.at_end, not self.inverse)
 
     def __call__(self, data: dict[str, Any], h: Any, params: Any) -> None:
-        if not self.inverse:
-            self.equation.check(data, h, params)
+        self.equation.check(data, h, params)
         if "q0" in data:
             return
+        of_system = f"the constraints of this {type(self.system).__name__}"
+        if self.at_end and not self.inverse:
+            raise ValueError(
+                f"a step of this scheme has the forces of {of_system} after its base point alone, which is its end with the "
+                f"momentum of its beginning: the constraints there restrict that one and leave the forces free. {WAY_OUT}"
+            )
         data = {name: np.asarray(a) for name, a in data.items()}
         whole = np.asarray(evaluated(self.slopes, data, np.asarray(float(h)), params))
         factor = self._largest(whole)
         if factor > 1.0 + GROWTH:
+            by = f"by −{factor:.3g}" if factor < BOUNDLESS else "without bound"
             raise ValueError(
-                f"a step of this scheme multiplies what is off the constraints of this {type(self.system).__name__} by "
-                f"−{factor:.3g}, whatever its size: their forces are those of a base point that is not in the middle of the "
-                'step. Take dx.Midpoint(), a map with the base point on its other side, or constraints="resolve".'
+                f"a step of this scheme multiplies what is off {of_system} {by}, whatever its size: their forces are those of a "
+                f"base point that is not in the middle of the step. {WAY_OUT}"
             )
 
     def _largest(self, whole: np.ndarray) -> float:
@@ -58,10 +69,12 @@ class NothingGrows:
             return 0.0  # outside the domain, which the first step tells
         try:
             step = then_x - then_u @ np.linalg.solve(by_u, by_x)
-            step = np.linalg.inv(step) if self.inverse else step
         except np.linalg.LinAlgError:  # a singular step is refused as such
             return 0.0
-        return float(np.max(np.abs(np.linalg.eigvals(step)))) if np.all(np.isfinite(step)) else 0.0
+        if not np.all(np.isfinite(step)):
+            return 0.0
+        sizes = np.abs(np.linalg.eigvals(step))
+        return float(1.0 / max(np.min(sizes), TINY) if self.inverse else np.max(sizes))
 
 
 def _slopes_of(system: AbstractSystem, equation: StepEquation):
@@ -81,6 +94,7 @@ def _slopes_of(system: AbstractSystem, equation: StepEquation):
     return slopes
 
 
-def nothing_grows(system: AbstractSystem, equation: StepEquation) -> StepEquation:
-    """The equation, which refuses initial data at which a step multiplies what is off a constraint by more than 1."""
-    return dataclasses.replace(equation, check=NothingGrows(system, equation))
+def nothing_grows(system: AbstractSystem, equation: StepEquation, at_end: bool) -> StepEquation:
+    """The equation, which refuses initial data at which a step multiplies what is off a constraint by more than 1, and any
+    where its forces are `at_end` of it."""
+    return dataclasses.replace(equation, check=NothingGrows(system, equation, at_end))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows, projection
 from dirax.schemes.labels import Labels
-from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
+from dirax.schemes.lagrange_dalembert_step import PROJECTION, LagrangeDAlembertStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 
@@ -48,7 +48,7 @@ class LagrangeDAlembertPart(AbstractStep):
     @property
     def labels(self) -> Labels:
         n, count = self.inner.shape.n, self.rows.count
-        return self.inner.labels[: n + count] + Labels.numbered("projection of the momentum {}", n + count)
+        return self.inner.labels[: n + count] + Labels.numbered(PROJECTION + " {}", n + count)
 
     @property
     def canonical(self) -> bool:

@@ -24,6 +24,8 @@ MOMENTA = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}
 """The share of the constraint force at a node that is taken off its incoming momentum p_k before p is saved, by the name of
 the momentum."""
 
+PROJECTION = "projection of the momentum"
+
 
 @dataclass(frozen=True, eq=False)
 class LagrangeDAlembertStep(AbstractStep):
@@ -109,7 +111,7 @@ class LagrangeDAlembertStep(AbstractStep):
     def labels(self) -> Labels:
         balance = Labels.numbered("discrete Lagrange–d'Alembert equation {}", self.shape.n)
         projected = self.shape.n + self.rows.holonomic if self.projects else 0
-        return balance + self.rows.labels() + Labels.numbered("projection of the momentum {}", projected)
+        return balance + self.rows.labels() + Labels.numbered(PROJECTION + " {}", projected)
 
     @property
     def canonical(self) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from dirax.show import frames, series
 from dirax.show.drawing import Drawing
 from dirax.show.report import checked_path, checked_solutions, report
+from dirax.solution.atomic_files import placed
 from dirax.solution.solution import Solution
 from dirax.solution.style import INK, style
 
@@ -59,14 +60,9 @@ def animate(
     from matplotlib import rc_context
 
     count = max(2, round(seconds * frames_per_second))
-    beside = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
-        with style(), rc_context({"animation.ffmpeg_path": encoder} if encoder else {}):
-            drawing, times = drawn(several, scene, count, size)
-            _write(beside, drawing, times, str(several[0].metadata.get("units", {}).get("t", "")), frames_per_second)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    with placed(path, overwrite) as beside, style(), rc_context({"animation.ffmpeg_path": encoder} if encoder else {}):
+        drawing, times = drawn(several, scene, count, size)
+        _write(beside, drawing, times, str(several[0].metadata.get("units", {}).get("t", "")), frames_per_second)
     return path
 
 

@@ -16,6 +16,7 @@ from dirax.program.user_functions import is_traced
 from dirax.show import frames, page, series
 from dirax.show.arrays import Arrays
 from dirax.show.series import Run
+from dirax.solution.atomic_files import checked_place, placed
 from dirax.solution.solution import Solution
 
 SMALL = 1500
@@ -46,8 +47,8 @@ def report(
     `names`: what to call the solutions, by default their schemes. `symmetries`: generators ξ(q) -> (n,) by name, as for
     `dx.verify`. `exact(t, params=…, **initial) -> (rows, n)`: a closed solution drawn beside; the gallery's own unless False.
 
-    Raises `TypeError` for something that is not a Solution, `ValueError` for an ending other than .html, solutions of
-    different sizes or inside `jax.grad`, `jit` or `vmap`, `FileNotFoundError` where the folder does not exist,
+    Raises `TypeError` for something that is not a Solution, `ValueError` for an ending other than .html, too long a name,
+    solutions of different sizes or inside `jax.grad`, `jit` or `vmap`, `FileNotFoundError` where the folder does not exist,
     `FileExistsError` for a file that exists with overwrite=False.
 
         sol.report("disk.html")
@@ -57,12 +58,8 @@ def report(
     checked_path(path, (".html", ".htm"), overwrite)
     several = checked_solutions(solutions)
     text = html(several, scene=scene, names=names, title=title, symmetries=symmetries, exact=exact, verdicts=verdicts)
-    beside = path.with_name(f".{path.name}.part")
-    try:
+    with placed(path, overwrite) as beside:
         beside.write_text(text, encoding="utf-8")
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
     return path
 
 
@@ -121,10 +118,7 @@ def checked_path(path: Path, endings: Sequence[str], overwrite: bool) -> None:
     """Raise before the work for a path that cannot be written."""
     if path.suffix not in endings:
         raise ValueError(f"path must end in {' or '.join(e for e in endings if e != '.htm')}, but {str(path)!r} was given.")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"the folder {path.parent} does not exist: create it before writing {path.name}.")
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists: pass overwrite=True to replace it, or choose another path.")
+    checked_place(path, overwrite)
 
 
 def checked_solutions(solutions: Any) -> list[Solution]:

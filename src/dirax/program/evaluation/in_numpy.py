@@ -8,7 +8,7 @@ import numpy as np
 from dirax.program.evaluation.row_tape import RowTape
 from dirax.program.evaluation.tape import FEWEST_NODES, Tape
 from dirax.program.graph import Graph, Order
-from dirax.program.graph_derivatives import partials
+from dirax.program.graph_derivatives import slopes
 from dirax.program.interpreter import Nodes
 
 LANES = 1024
@@ -119,7 +119,7 @@ class Slopes:
             if graph.op[node] == "select":
                 moving.add(node)
                 self.terms.append((node, None))
-            elif terms := [(a, f) for a, f in zip(args, partials(graph, node), strict=True) if f is not None and a in moving]:
+            elif terms := [(a, f) for a, f in slopes(graph, node) if a in moving]:
                 moving.add(node)
                 self.terms.append((node, terms))
         self.nodes, self.inputs, self.more, self.graph = nodes, inputs, list(more), graph

@@ -30,6 +30,8 @@ COMMUTATIVE = frozenset(name for name, operation in OPERATIONS.items() if operat
 BOOLEAN = frozenset({"bool", *(name for name, operation in OPERATIONS.items() if operation.boolean)})
 """The operations, and the constants, that are truth values."""
 
+WITH_EDGE = frozenset(name for name, operation in OPERATIONS.items() if operation.edge)
+
 
 def evaluate_one(op: str, *values):
     """The value of one operation on constants."""

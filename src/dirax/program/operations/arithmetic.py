@@ -56,7 +56,7 @@ OPERATIONS = (
         exact=abs,
         c="fabs",
     ),
-    elementary("sqrt", np.sqrt, lax.sqrt, lambda g, x, f: g.mul(g.constant(0.5), g.recip(f))),
+    elementary("sqrt", np.sqrt, lax.sqrt, lambda g, x, f: g.mul(g.constant(0.5), g.recip(f)), edge=True),
     Operation(name="max", numpy=np.maximum, jax=lax.max, derivative=_larger, c="fmax", commutative=True),
     Operation(name="min", numpy=np.minimum, jax=lax.min, derivative=_smaller, c="fmin", commutative=True),
     Operation(

@@ -42,6 +42,8 @@ OPERATIONS = (
     elementary("cosh", np.cosh, lax.cosh, lambda g, x, f: g.make("sinh", x)),
     elementary("tanh", np.tanh, lax.tanh, lambda g, x, f: g.sub(g.one, square(g, f))),
     elementary("asinh", np.arcsinh, lax.asinh, lambda g, x, f: g.recip(root(g, g.add(square(g, x), g.one))), formula=_asinh),
-    elementary("acosh", np.arccosh, lax.acosh, lambda g, x, f: g.recip(root(g, g.sub(square(g, x), g.one))), formula=_acosh),
+    elementary(
+        "acosh", np.arccosh, lax.acosh, lambda g, x, f: g.recip(root(g, g.sub(square(g, x), g.one))), formula=_acosh, edge=True
+    ),
     elementary("atanh", np.arctanh, lax.atanh, lambda g, x, f: g.recip(g.sub(g.one, square(g, x))), formula=_atanh),
 )

@@ -16,6 +16,6 @@ def _power(g: Builder, node: int, x: int, y: int) -> list[int | None]:
 OPERATIONS = (
     elementary("log", np.log, lax.log, lambda g, x, f: g.recip(x)),
     elementary("log1p", np.log1p, lax.log1p, lambda g, x, f: g.recip(g.add(g.one, x))),
-    Operation(name="pow", numpy=np.power, jax=lax.pow, derivative=_power, c="pow"),
-    elementary("cbrt", np.cbrt, lax.cbrt, lambda g, x, f: g.recip(g.mul(g.constant(3.0), square(g, f)))),
+    Operation(name="pow", numpy=np.power, jax=lax.pow, derivative=_power, c="pow", edge=True),
+    elementary("cbrt", np.cbrt, lax.cbrt, lambda g, x, f: g.recip(g.mul(g.constant(3.0), square(g, f))), edge=True),
 )

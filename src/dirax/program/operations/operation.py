@@ -49,6 +49,8 @@ class Operation:
     """Whether its values are truth values."""
     stepwise: bool = False
     """Whether its derivative is zero wherever there is one."""
+    edge: bool = False
+    """Whether its value is finite somewhere where its derivative is not."""
 
 
 def elementary(name: str, numpy: Callable, jax: Callable, slope: Callable[[Builder, int, int], int], **more: Any) -> Operation:
