@@ -177,10 +177,10 @@ def _refuse_off(system: AbstractSystem, case: Case, initial: Initial, are: str, 
         singular = f"the Lagrangian is singular at the initial data{which} (∂²L/∂v²), and"
         if chain.verdict == EMPTY:
             raise ValueError(f"{singular} no motion passes through them: {chain.explanation[:-1].split(': ')[0]}.")
-        if off := chain.off(on_chain(chain, q, p, v, case.t0, params, q_alone), params):
+        if off := chain.off_level(on_chain(chain, q, p, v, case.t0, params, q_alone), params):
             raise ValueError(
-                f"{singular} {are} off its final constraint manifold: {off.split('. ')[0]}; {way}, or check_initial=False to "
-                "take them as they are."
+                f"{singular} {are} off its final constraint manifold: {off}; {way}, or check_initial=False to take them as "
+                "they are."
             )
 
 
@@ -192,7 +192,7 @@ def _on_known_manifold(system: AbstractSystem, q: Any, p: Any, v: Any, t: float,
         return False
     x = on_chain(chain, q, p, v, t, params)
     values = np.asarray(chain.constraints(x, params))  # none of a trajectory that is regular, which says nothing of others
-    return values.size > 0 and bool(np.all(np.isfinite(values))) and not chain.off(x, params)
+    return values.size > 0 and bool(np.all(np.isfinite(values))) and not chain.off_level(x, params)
 
 
 def lanes_of(case: Case, initial: Initial) -> Iterator[tuple[Any, Any, Any, Any]]:
