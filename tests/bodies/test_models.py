@@ -181,6 +181,7 @@ BALL = b.gliding("ground", "a", lambda x, y: 0.1 * x * x, 0.5)
         (lambda: of_one(b.Body("a")), "joint 'a' moves nothing that has a mass"),
         (lambda: of_one(forces=[b.Spring(1.0)]), "'spring' acts nowhere"),
         (lambda: of_one(forces=[b.Motor("a", lambda t: t)]), r"push of 'motor' must be a function of \(t, q, v\)"),
+        (lambda: of_one(forces=[b.Motor("a", lambda q, v, t: t)]), r"takes \(q, v, t\), where q stands in the place of t"),
         (lambda: of_one(contacts=[b.tip("a", motion="roll")]), "must be one of rolls, skates, slides, but it is 'roll'"),
         (lambda: of_one(contacts=[b.ball_contact("a", -1.0)]), "negative radius"),
         (lambda: of_one(joint=WHEEL, contacts=[b.wheel("a", 0.4)]), "not the wheel of radius 0.5 and tube 0"),

@@ -546,3 +546,22 @@ def test_half_a_recurrence_of_a_chain_is_no_drift():
         sol = gallery.get("oscillator-chain").simulate(steps=2000 * times, save_every=times)
         verdicts.append(energy_line(sol).verdict)
     assert verdicts == ["not checked", "not checked", "bounded"]
+
+
+def test_the_plot_has_a_bar_a_line_in_the_colour_of_its_verdict():
+    """The bars end at the measured values; zero, infinity and nothing have a place on a logarithmic axis, too."""
+    cases = [(1e-16, 1e-14, "ok"), (0.0, 1e-14, "ok"), (0.5, 1e-3, "VIOLATED"), (1e-5, 1e-2, "bounded"), (2.0, 1e-2, "drifts")]
+    cases += [(np.inf, 1e-14, "VIOLATED"), (np.nan, 1e-14, "VIOLATED"), (None, None, "not checked"), (None, None, "ok")]
+    lines = tuple(Line(f"line {k}", *case, "why") for k, case in enumerate(cases))
+    ax = Report("scheme on system: 9 steps", lines).plot()
+    left, right = ax.get_xlim()
+    assert ax.get_xscale() == "log" and [label.get_text() for label in ax.get_yticklabels()] == [line.quantity for line in lines]
+    bars = {round(bar.get_y() + bar.get_height() / 2): bar for bar in ax.patches}
+    ends = [bars[k].get_x() + bars[k].get_width() for k in range(9)]
+    assert ends == pytest.approx([1e-16, left, 0.5, 1e-5, 2.0, right, left, left, left])
+    shades = {verdict: {bars[k].get_facecolor() for k, case in enumerate(cases) if case[2] == verdict} for _, _, verdict in cases}
+    assert all(len(shade) == 1 for shade in shades.values()) and len(set.union(*shades.values())) == 5
+    assert ax.lines[0].get_xdata()[:7] == pytest.approx([tolerance for _, tolerance, _ in cases[:7]])
+    assert {text.xy[1]: text.get_text() for text in ax.texts} == {1: "0", 6: "VIOLATED", 7: "not checked", 8: "ok"}
+    assert ax.get_yticklabels()[7].get_color() != ax.get_yticklabels()[0].get_color()
+    assert Report("nothing measured", lines[7:]).plot(ax) is ax

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import dirax as dx
 from dirax.program.user_functions import UserFunction, check_finite, is_traced
 
 Q = jnp.array([1.0, 2.0])
@@ -101,3 +102,47 @@ def test_finite_values_pass_and_traced_ones_are_not_looked_at():
 def test_tracers_are_recognized_anywhere_in_a_tree():
     assert not is_traced({"a": (1.0, Q)}, None)
     assert jax.jit(lambda x: is_traced({"a": (1.0, [x])}))(Q).item() is True
+
+
+@pytest.mark.parametrize(
+    "function, arguments, timed, word, place",
+    [
+        (lambda q, v, params: -params * v, ("t", "q", "v"), False, "q", "t"),  # no t
+        (lambda q, v, t: v, ("t", "q", "v"), False, "q", "t"),
+        (lambda t, v, q: v, ("t", "q", "v"), False, "v", "q"),
+        (lambda v, q: v @ q, ("q", "v"), True, "v", "q"),
+        (lambda q, p: p @ p, ("q", "v"), True, "p", "v"),
+        (lambda q, v: v @ v, ("q", "p"), True, "v", "p"),
+        (lambda q, t: q, ("q",), True, "t", "params"),
+        (lambda q, v, t=0.0: v @ v, ("q", "v"), True, "t", "params"),  # it would always be 0.0
+        (lambda x, t: x @ x, ("x",), False, "t", "params"),
+        (lambda params, x: x @ x, ("x",), False, "params", "x"),
+        (lambda h, q0, q1: h, ("q0", "q1", "h"), True, "h", "q0"),
+        (functools.partial(lambda k, v, q: k * v, 4.0), ("q", "v"), True, "v", "q"),
+    ],
+)
+def test_names_of_the_interface_in_other_places_are_refused(function, arguments, timed, word, place):
+    with pytest.raises(TypeError, match=rf"must have the signature force\(.* where {word} stands in the place of {place}: put"):
+        UserFunction(function, "force", arguments, timed)
+
+
+@pytest.mark.parametrize(
+    "function, arguments, timed",
+    [
+        (lambda t, q, v, p: p * v, ("t", "q", "v"), False),  # params of another name
+        (lambda q, v, x: x * v, ("q", "v"), True),
+        (lambda t, q, v, k: k * v, ("q", "v"), True),
+        (lambda a, b: b @ b, ("q", "v"), True),
+        (lambda x: x @ x, ("q",), True),
+        (lambda q: q @ q, ("x",), False),
+        (lambda x0, x1, h: h, ("q0", "q1", "h"), True),
+        (lambda q, v, p=2.0: p * v, ("q", "v"), True),  # an option of the user's own
+    ],
+)
+def test_other_names_are_free(function, arguments, timed):
+    UserFunction(function, "force", arguments, timed)
+
+
+def test_forces_without_the_time_are_no_longer_forces_of_other_arguments():
+    with pytest.raises(TypeError, match=r"forces\(t, q, v\[, params\]\).*<lambda> takes \(q, v, params\)"):
+        dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2, forces=lambda q, v, params: -params * v)

@@ -27,6 +27,13 @@ def test_data_off_the_final_manifold(scheme):
     assert line.verdict == "VIOLATED" and "jumps from one solution of the discrete equations to the other" in line.explanation
 
 
+def test_the_values_of_all_constraints_are_said():
+    """L = −q²/2 + q1 has ∂L/∂q = (−1, 1) there instead of 0: numbers that end in dots do not end the sentence."""
+    system = dx.LagrangeDirac(lambda q, v: -q @ q / 2 + q[1])
+    with pytest.raises(ValueError, match=r"2 new constraints there have the values \[ *1\. -1\.\]; pass project=True to project"):
+        dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0, 0.0], v=[0.0, 1.0], step=0.01, steps=10)
+
+
 def test_each_trajectory_of_a_batch():
     q = np.array([[1.0, 0.0], [1.0, 0.2]])
     run = {"q": q, "v": np.zeros((2, 2)), "step": 0.1, "steps": 3}

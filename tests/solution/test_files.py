@@ -10,7 +10,9 @@ import sys
 import tracemalloc
 import zipfile
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -200,6 +202,34 @@ def test_a_scheme_from_before_a_setting_and_a_module_had_their_names_comes_back(
         decode_scheme(old | {"settings": {}})
 
 
+class Spring(NamedTuple):
+    stiffness: float
+
+
+@jax.tree_util.register_dataclass
+@dataclass
+class Weight:
+    mass: Any
+    springs: tuple
+
+
+def test_params_of_a_class_are_numbers_by_name_in_a_file(tmp_path):
+    system = dx.LagrangeDirac(lambda q, v, params: params.mass * (v @ v) / 2 - params.springs[0].stiffness * (q @ q))
+    params = Weight(jnp.asarray(2.0), (Spring(np.float64(3.0)), None))
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.0], params=params, step=0.1, steps=2)
+    for ending in (".zarr", ".nc"):
+        path = sol.save(tmp_path / f"run{ending}")
+        loaded = dx.load(path)
+        assert loaded.params == {"mass": 2.0, "springs": ({"stiffness": 3.0}, None)}
+        assert loaded.metadata["params_code"] == "Weight"
+        for place in (path, loaded.save(tmp_path / f"again{ending}")):
+            with pytest.raises(ValueError, match=r"made of Weight, which is code that no file holds: pass params=.*\.params\.$"):
+                dx.load(place, system=system)
+        again = dx.load(path, system=system, params=params)
+        assert again.equation is sol.equation and "params_code" not in again.metadata
+        assert dx.verify(again)["steps replayed"].verdict == "ok"
+
+
 def test_nested_schemes_and_parameter_trees_come_back(tmp_path):
     system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["k"][0] @ q**2)
     scheme = dx.Composition(dx.LagrangeDAlembert("midpoint"), "yoshida4")
@@ -213,6 +243,8 @@ def test_nested_schemes_and_parameter_trees_come_back(tmp_path):
     sol.params = {"k": lambda x: x}
     path = sol.save(tmp_path / "code.zarr")
     assert dx.load(path).params is None
+    with pytest.raises(ValueError, match=r"made of <function .*lambda.*no file holds: pass params=…\.$"):
+        dx.load(path, system=system)
     assert "lambda" in xr.open_zarr(path, consolidated=False).attrs["params_not_stored"]
 
 

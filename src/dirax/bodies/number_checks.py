@@ -11,6 +11,7 @@ from dirax.bodies.forces import Damper, Motor, Spring
 from dirax.bodies.joints import Joint
 from dirax.bodies.motion import Glide, Shift, Slide, Turn
 from dirax.bodies.parts import Body
+from dirax.program.signatures import refuse_other_places
 
 KINDS = {"bodies": (Body,), "joints": (Joint,), "contacts": (Contact,), "forces": (Spring, Damper, Motor)}
 MOTIONS = ("rolls", "skates", "slides")
@@ -49,8 +50,11 @@ def check_numbers(model: Any) -> None:
             raise ValueError(f"contact {contact.name!r} has a negative radius among {sizes}.")
         _check_its_joint(model, contact)
     for force in model.forces:
-        if isinstance(force, Motor) and callable(force.push) and len(inspect.signature(force.push).parameters) not in (3, 4):
+        if not isinstance(force, Motor) or not callable(force.push):
+            continue
+        if len(inspect.signature(force.push).parameters) not in (3, 4):
             raise ValueError(f"the push of {force.name!r} must be a function of (t, q, v) or of (t, q, v, params).")
+        refuse_other_places(force.push, f"the push of {force.name!r}", "push(t, q, v[, params])", ("t", "q", "v"))
 
 
 def _check_all(model: Any, what: str, values: Any) -> None:

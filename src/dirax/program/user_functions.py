@@ -1,7 +1,6 @@
 """User functions: plain JAX-traceable callables, with or without a leading `t` and a trailing `params`, checked once and
 called uniformly."""
 
-import inspect
 import re
 import threading
 from collections.abc import Callable, Iterator
@@ -18,10 +17,10 @@ from jax.extend.core import jaxprs_in_params
 
 from dirax.program.compiled import compiled
 from dirax.program.memo import Memo
+from dirax.program.signatures import parameters_of, refuse_other_places, takes_params, takes_time
 from dirax.program.tracing import once
 from dirax.text.representation import value_text
 
-POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 NO_MULTIPLIERS = (
     "forces that see the multipliers are for dx.LagrangeDAlembert, its (+) and (−) cases and their compositions, and for "
     'dx.DiscreteDirac(constraints="resolve")'
@@ -60,8 +59,8 @@ class UserFunction(eqx.Module):
 
     A `timed` function may have the time as its first argument, which is then called `t`: `at(t, *arguments, params)` calls
     it either way, and `f(t, *arguments, params)` is its call where it takes time.
-    Raises `TypeError` at construction when the function is not callable or its signature takes neither the named
-    arguments nor the named arguments and `params`.
+    Raises `TypeError` at construction when the function is not callable, its signature takes neither the named
+    arguments nor the named arguments and `params`, or it has these names in other places.
     """
 
     function: Callable = eqx.field(static=True)
@@ -78,13 +77,14 @@ class UserFunction(eqx.Module):
                 f"{name} must be a function {expected}, but {value_text(function)} was given: "
                 "wrap the value in a function, e.g. a lambda."
             )
-        if "multipliers" not in arguments and "multipliers" in _parameters_of(function):
+        if "multipliers" not in arguments and "multipliers" in parameters_of(function):
             raise TypeError(
                 f"{name} cannot see the multipliers here, where it is {expected}: {NO_MULTIPLIERS} of a dx.LagrangeDirac."
             )
-        self.takes_time = timed and _takes_time(function, len(arguments))
+        self.takes_time = timed and takes_time(function, len(arguments))
         self.arguments = ("t", *arguments) if self.takes_time else tuple(arguments)
-        self.takes_params = _takes_params(function, name, expected, len(self.arguments))
+        self.takes_params = takes_params(function, name, expected, len(self.arguments))
+        refuse_other_places(function, name, expected, self.arguments)
         self.function, self.name = _hashable(function), name
 
     def __call__(self, *values: Any):
@@ -178,26 +178,9 @@ class UserFunction(eqx.Module):
     def _without_params(self, values) -> str:
         if not self.takes_params or values[-1] is not None:
             return ""
-        last = _parameters_of(self.function)[len(self.arguments) :][:1]
+        last = parameters_of(self.function)[len(self.arguments) :][:1]
         takes = f"its argument {last[0]} stands for" if last and last[0] != "params" else "it takes"
         return f" and params=None ({takes} params, which were not given: pass params=…)"
-
-
-def _parameters_of(function: Callable) -> tuple[str, ...]:
-    try:
-        return tuple(inspect.signature(function).parameters)
-    except (TypeError, ValueError):
-        return ()
-
-
-def _takes_time(function: Callable, count: int) -> bool:
-    """Whether the first argument is called `t` and `count` others follow."""
-    try:
-        parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):
-        return False
-    positional = [p for p in parameters if p.kind in POSITIONAL]
-    return len(positional) > count and positional[0].name == "t"
 
 
 def evaluated(function: Callable, *values: Any) -> Any:
@@ -232,28 +215,6 @@ class _Indexing(eqx.Module):
 
     def __call__(self, *values: Any):
         return checkify.checkify(lambda *v: self.function(*v), errors=checkify.index_checks)(*values)
-
-
-def _takes_params(function: Callable, name: str, expected: str, count: int) -> bool:
-    try:
-        parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):
-        return False
-    if any(p.kind is p.VAR_POSITIONAL for p in parameters):
-        return False
-    positional = [p for p in parameters if p.kind in POSITIONAL]
-    keywords = [p for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is p.empty]
-    required = [p for p in positional if p.default is p.empty] + keywords
-    if not keywords:
-        if len(required) == count + 1:
-            return True
-        if len(required) <= count <= len(positional):
-            return len(positional) > count and positional[count].name == "params"
-    raise TypeError(
-        f"{name} must have the signature {expected}, but {getattr(function, '__name__', 'it')} takes "
-        f"{len(required)} argument{'s' if len(required) != 1 else ''}"
-        f" ({', '.join(p.name for p in required) or 'none'})."
-    )
 
 
 def _hashable(function: Callable) -> Callable:

@@ -177,10 +177,10 @@ def _refuse_off(system: AbstractSystem, case: Case, initial: Initial, are: str, 
         singular = f"the Lagrangian is singular at the initial data{which} (∂²L/∂v²), and"
         if chain.verdict == EMPTY:
             raise ValueError(f"{singular} no motion passes through them: {chain.explanation[:-1].split(': ')[0]}.")
-        if off := chain.off(on_chain(chain, q, p, v, case.t0, params, q_alone), params):
+        if off := chain.off_level(on_chain(chain, q, p, v, case.t0, params, q_alone), params):
             raise ValueError(
-                f"{singular} {are} off its final constraint manifold: {off.split('. ')[0]}; {way}, or check_initial=False to "
-                "take them as they are."
+                f"{singular} {are} off its final constraint manifold: {off}; {way}, or check_initial=False to take them as "
+                "they are."
             )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from dirax.program.user_functions import is_traced
 from dirax.schemes.step import Field
-from dirax.solution.plain_forms import NotPlain, encode_params, encode_scheme
+from dirax.solution.plain_forms import NotPlain, code_of_params, encode_params, encode_scheme
 from dirax.solution.stored_events import KINDS, WHOLE_ARRAYS, arrays_of, record_of
 from dirax.solution.trajectory import Trajectory
 from dirax.text.tables import plain
@@ -27,6 +27,9 @@ RENAMED = {"constraint": "constraint_residual"}
 
 TAKEN = {"time", "interval", "trajectory", "coordinate", "energy", "ok"}
 """Names that a field cannot have in a description."""
+
+PARAMS_CODE = "params_code"
+"""What of the params is code, such as their class, in the metadata of a file."""
 
 DERIVED = ("energy", "constraint_residual")
 
@@ -208,6 +211,8 @@ def _attributes(sol: Trajectory, layout, derived: list[str], metadata: dict[str,
         installed = version("dirax")
     except PackageNotFoundError:
         installed = "unknown"
+    params, code = _params(sol)
+    metadata = {**metadata, **({PARAMS_CODE: code} if code else {})}
     text = lambda value, name: repr(value) if value is not None else str(sol.metadata.get(name, ""))
     batched = sol.batch is not None
     attributes = {
@@ -232,8 +237,13 @@ def _attributes(sol: Trajectory, layout, derived: list[str], metadata: dict[str,
     }
     if events := {kind: record_of(found) for kind in KINDS if (found := getattr(sol, kind)) is not None}:
         attributes["events"] = json.dumps(events)
+    return attributes | params
+
+
+def _params(sol: Trajectory) -> tuple[dict[str, str], str]:
+    """The attribute of params, and what of them is code."""
     try:
-        attributes["params"] = json.dumps(encode_params(sol.params))
+        record = encode_params(sol.params)
     except NotPlain as value:
-        attributes["params_not_stored"] = str(value)
-    return attributes
+        return {"params_not_stored": str(value)}, str(value)
+    return {"params": json.dumps(record)}, code_of_params(record)

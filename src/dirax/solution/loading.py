@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from dirax.schemes.step import Field, Shape, make_step_equation
+from dirax.solution.description import PARAMS_CODE
 from dirax.solution.file_record import FileRecord, file_record
 from dirax.solution.netcdf import open_netcdf
 from dirax.solution.plain_forms import decode_params, decode_scheme
@@ -35,7 +36,8 @@ def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params
     rows that are whole of a run that `dx.simulate(…, to=path)` writes or wrote, which are read where they are indexed.
 
     Code is not stored: `system` (and `scheme`, if it is not one of dirax with plain settings) supply it where it is needed,
-    as for `dx.verify`; energies and constraint residuals are in the file. `params` replaces the stored parameters.
+    as for `dx.verify`; energies and constraint residuals are in the file. `params` replaces the stored parameters: of a class of
+    your own the file has the numbers, as a dict by the names of its fields, and with `system` they have to be given.
     Loading never executes anything from the file, and takes no more memory than its numbers need.
 
     Raises `FileNotFoundError`, `TypeError` for what is no path, or `ValueError` for a file that dirax did not write, cannot read,
@@ -51,6 +53,11 @@ def load(path: str | os.PathLike, system: Any = None, scheme: Any = None, params
         sol = reading("it cannot be read, being damaged or incomplete", _read, path, ending, params)
     except Unreadable as error:
         raise ValueError(f"{path} cannot be loaded: {str(error).rstrip('.')}.") from error
+    if params is None and system is not None and (code := sol.metadata.get(PARAMS_CODE)):
+        numbers = f", made of the numbers in the file, dx.load({str(path)!r}).params" if sol.params is not None else ""
+        raise ValueError(
+            f"the params of the run in {path} were made of {code}, which is code that no file holds: pass params=…{numbers}."
+        )
     return with_code(sol, system, scheme)
 
 
@@ -142,7 +149,10 @@ def _solution(said: FileRecord, arrays: dict[str, np.ndarray], params: Any) -> S
     if said.batched:
         ok = arrays["ok"].astype(bool)
         message = [said.message.get(str(lane), "") for lane in range(len(ok))]
-    if params is None and said.params is not None:
+    metadata = said.metadata
+    if params is not None:
+        metadata = {name: about for name, about in metadata.items() if name != PARAMS_CODE}
+    elif said.params is not None:
         params = decode_params(json.loads(said.params))
     sol = Solution(
         t=arrays["time"],
@@ -161,7 +171,7 @@ def _solution(said: FileRecord, arrays: dict[str, np.ndarray], params: Any) -> S
         batch_params=said.batch_params,
         initial={name: arrays[f"initial_{name}"] for name in said.initial},
         derived={name: arrays[name] for name in said.derived},
-        metadata=said.metadata,
+        metadata=metadata,
     )
     for kind, record in said.events.items():
         setattr(sol, kind, events_in(kind, record, arrays))

@@ -1,6 +1,7 @@
 """What was run, as plain data that goes into a file: parameters and schemes. Reading it back executes nothing but dirax."""
 
 import dataclasses
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -24,7 +25,12 @@ class NotPlain(Exception):
 
 
 def encode_params(value: Any) -> Any:
-    """A tree of dicts, lists, tuples, numbers and arrays as JSON data; `NotPlain` for anything else in it."""
+    """A tree of numbers and arrays as JSON data, what is of another class than dict, list and tuple by the names of its fields;
+    `NotPlain` for anything in it that is none."""
+    return _encode(value, _encode_fields)
+
+
+def _encode(value: Any, encode_other: Callable[[Any], Any]) -> Any:
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         array = np.asarray(value)
         if array.dtype.name not in DTYPES or array.dtype.kind == "c":
@@ -33,14 +39,35 @@ def encode_params(value: Any) -> Any:
     if type(value) in PLAIN:
         return {"plain": value}
     if type(value) in (list, tuple):
-        return {type(value).__name__: [encode_params(v) for v in value]}
+        return {type(value).__name__: [_encode(v, encode_other) for v in value]}
     if type(value) is dict and all(type(key) is str for key in value):
-        return {"dict": {key: encode_params(v) for key, v in value.items()}}
-    raise NotPlain(repr(value))
+        return {"dict": {key: _encode(v, encode_other) for key, v in value.items()}}
+    return encode_other(value)
+
+
+def _encode_fields(value: Any) -> Any:
+    """A dataclass, a NamedTuple or any other tree that JAX knows, by the names of what it holds."""
+    children = jax.tree_util.tree_flatten_with_path(value, is_leaf=lambda part: part is not value)[0]
+    named = {jax.tree_util.keystr(path, simple=True): child for path, child in children}
+    if len(named) < len(children) or any(not path for path, _ in children):
+        raise NotPlain(repr(value))
+    return {"fields": {name: encode_params(child) for name, child in named.items()}, "of": type(value).__qualname__}
+
+
+def code_of_params(record: Any) -> str:
+    """The first class in the data of `encode_params`, which are without its code; "" where they are whole."""
+    match record:
+        case {"fields": dict(), "of": str(name)}:
+            return name
+        case {"list": list(parts)} | {"tuple": list(parts)}:
+            return next(filter(None, map(code_of_params, parts)), "")
+        case {"dict": dict(parts)}:
+            return next(filter(None, map(code_of_params, parts.values())), "")
+    return ""
 
 
 def decode_params(record: Any) -> Any:
-    """The tree that `encode_params` described, arrays as JAX arrays; `ValueError` for a record of another form."""
+    """The tree that `encode_params` described, with JAX arrays, and dicts for other classes; `ValueError` for another record."""
     match record:
         case {"array": values, "dtype": str(dtype), "shape": list(shape)} if dtype in DTYPES:
             return jnp.asarray(np.array(values, dtype=dtype).reshape(shape))
@@ -50,7 +77,7 @@ def decode_params(record: Any) -> Any:
             return [decode_params(v) for v in values]
         case {"tuple": list(values)}:
             return tuple(decode_params(v) for v in values)
-        case {"dict": dict(values)}:
+        case {"dict": dict(values)} | {"fields": dict(values)}:
             return {key: decode_params(v) for key, v in values.items()}
     raise ValueError("a parameter has an unknown form")
 
@@ -67,9 +94,13 @@ def _encode_setting(value: Any) -> Any:
     if type(value) is tuple:
         return {"settings": [_encode_setting(v) for v in value]}
     try:
-        return encode_params(value)
+        return _encode(value, _refused)
     except NotPlain as text:
         return {"text": str(text)}
+
+
+def _refused(value: Any) -> Any:
+    raise NotPlain(repr(value))
 
 
 def decode_scheme(record: Any) -> AbstractScheme | None:

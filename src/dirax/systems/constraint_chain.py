@@ -128,17 +128,22 @@ class ConstraintChain:
 
     def off(self, x: Float[Numbers, " N"], params: Any = None) -> str:
         """The first level that x is off, the values of its constraints and the nearest point of M_f, in words; "" on M_f."""
+        if not (off := self.off_level(x, params)):
+            return ""
+        where = np.asarray(self.project(x, params))
+        distance = np.linalg.norm(where - np.asarray(x))
+        return f"{off}. The nearest point of M_f is {np.array2string(where, precision=6)}, at distance {distance:.3g}"
+
+    def off_level(self, x: Float[Numbers, " N"], params: Any = None) -> str:
+        """The first level that x is off and the values of its constraints, in words; "" on M_f."""
         params = self._with(params)
         for level in self.levels:
             value, slope = map(np.asarray, self._at(once(_with_slope, level.constraints), x, params))
             slope, size = np.abs(slope * self.units).max(initial=0.0), np.abs(np.asarray(x) / self.units).max()
             if np.abs(value).max(initial=0.0) > OFF_MANIFOLD * slope * (1.0 + size):
-                where = np.asarray(self.project(x, params))
                 return (
                     f"x is off M_{level.number}: its {level.count} new constraint{'s' * (level.count > 1)} there "
-                    f"{'have the values' if level.count > 1 else 'has the value'} {np.array2string(value, precision=4)}. "
-                    f"The nearest point of M_f is {np.array2string(where, precision=6)}, at distance "
-                    f"{np.linalg.norm(where - np.asarray(x)):.3g}"
+                    f"{'have the values' if level.count > 1 else 'has the value'} {np.array2string(value, precision=4)}"
                 )
         return ""
 
