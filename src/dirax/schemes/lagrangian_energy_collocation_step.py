@@ -8,7 +8,7 @@ import numpy as np
 from dirax.program.legendre import constrained_velocity
 from dirax.program.linear_solves import solve
 from dirax.program.roots import FEWEST_SPARSE
-from dirax.program.tracing import along, gradient, once
+from dirax.program.tracing import along, gradient, jacobian, once
 from dirax.schemes.energy_collocation_step import EnergyCollocationStep, given_back
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
@@ -26,9 +26,9 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
     H does not change along D° = im Wᵀ where b = 0, so that it is a function on D*. With the multipliers ν of the extremum,
     ∂L/∂v = p + Wᵀν, its derivatives are ∂H/∂p = v and ∂H/∂q = −∂L/∂q + ∂⟨ν, W v + b⟩/∂q, and the motion is
 
-        q̇ = v,   ṗ = P (−∂H/∂q + f + ∂⟨ν, W q̇ + b⟩/∂q − d(Wᵀν)/dt|_ν),   P = 1 − Wᵀ(W Wᵀ)⁻¹W,
+        q̇ = v,   ṗ = P (−∂H/∂q + f + ∂⟨ν, W q̇ + b⟩/∂q − d(Wᵀν)/dt|_ν),   P = 1 − Wᵀ(W S Wᵀ)⁻¹W S,
 
-    with the derivative along q̇ at fixed ν. The terms in ν are −⟨∂L/∂v − p, [X, Y]⟩ for fields X, Y in D: where p = ∂L/∂v, as
+    with the derivative along q̇ at fixed ν, and S the inverses of the masses ∂²L/∂v_i², so that units drop out. The terms in ν are −⟨∂L/∂v − p, [X, Y]⟩ for fields X, Y in D: where p = ∂L/∂v, as
     at the start of every step, they vanish, and along the step they make of the bracket of vector fields of D that of [PY],
     −⟨∂L/∂v, [X, Y]⟩ (Celledoni, Farré Puiggalí, Høiseth, Martín de Diego 2019), without a frame of D. q̇ is projected
     onto W q̇ + b = 0 at the nodes, and p is made ∂L/∂v at the end of the step, where this changes nothing on D.
@@ -109,9 +109,10 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         n, q = self.n, a[: self.n]
         slope, velocity, multipliers = mean[:n], mean[n : 2 * n], mean[2 * n : 2 * n + len(self.shape.kept)]
         rows, offset = self.constraint(t, q, params)
-        inside = self._projection(rows)
-        missing = rows @ velocity + offset
-        rate = velocity - rows.T @ solve(rows @ rows.T, missing) if len(rows) else velocity
+        mobile = rows * self._mobility(t, q, velocity, params) if len(rows) else rows  # W S
+        inside = lambda vector: vector - rows.T @ solve(mobile @ rows.T, mobile @ vector) if len(rows) else vector
+        outside = lambda missing: mobile.T @ solve(mobile @ rows.T, missing) if len(rows) else jnp.zeros(n)
+        rate = velocity - outside(rows @ velocity + offset)
         pull = jnp.zeros(n)
         if len(rows):
             reaction = lambda t, q: self.constraint(t, q, params)[0].T @ multipliers
@@ -126,7 +127,7 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         if self.working:
             work = force @ rate
             if self.system.energy_changes:
-                own = inside(velocity)
+                own = velocity - outside(rows @ velocity)
                 work = slope @ (rate - own) + own @ (pull + force) + (mean[-1] if self.system.depends_on_time else 0.0)
             out.append(work[None])
         return jnp.concatenate([*out, jnp.zeros(2)])
@@ -135,10 +136,11 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         q, p = a[: self.n], a[self.n :]
         return p - gradient(lambda v: self.system.lagrangian.at(t, q, v, params))(inner)
 
-    @staticmethod
-    def _projection(rows):
-        """α ↦ P α."""
-        return lambda vector: vector - rows.T @ solve(rows @ rows.T, rows @ vector) if len(rows) else vector
+    def _mobility(self, t, q, v, params):
+        """1/|∂²L/∂v_i²|, the diagonal S; 1 for a coordinate without a mass of its own."""
+        lagrangian = lambda v: self.system.lagrangian.at(t, q, v, params)
+        mass = jnp.abs(jnp.diagonal(jacobian(gradient(lagrangian))(v)))
+        return jnp.where(mass > 0.0, 1.0 / jnp.where(mass > 0.0, mass, 1.0), 1.0)
 
     def lifted(self, place, rate, t, params):
         """p becomes ∂L/∂v, and the work that of this p."""
