@@ -240,6 +240,25 @@ def test_bad_arguments(arguments, words):
         dx.Collocation(**arguments)
 
 
+TURN = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("system", "start"),
+    [
+        (dx.circuit([("V", 1, 0, jnp.sin), ("R", 1, 2, 1.0), ("C", 2, 0, 1.0)]), {"x": [0.0]}),
+        (dx.circuit([("L", 1, 0, 1.0), ("C", 1, 0, 1.0)]), {"x": [1.0, 0.0]}),
+        (dx.PortHamiltonian(lambda x: x @ x / 2, TURN, [[1.0], [0.0]], closed=True), {"x": [0.0, 1.0]}),
+        (dx.HamiltonDirac(lambda q, p: p @ p / 2, lambda q: jnp.array([[1.0, -1.0]])), {"q": [1.0, 1.0], "p": [0.5, 0.5]}),
+    ],
+)
+@pytest.mark.parametrize("nodes", ["gauss", "lobatto"])
+def test_where_constraints_are_not_kept_a_scheme_is_named_that_keeps_them(system, start, nodes):
+    with pytest.raises(TypeError, match=r"does not keep the constraints of a \w+, which here are \d: take dx.DiscreteDirac\(\)"):
+        dx.simulate(system, dx.Collocation(2, nodes), **start, step=0.1, steps=2)
+    assert dx.simulate(system, dx.DiscreteDirac(), **start, step=0.1, steps=2).ok
+
+
 def test_systems_that_it_does_not_step_are_refused():
     constrained = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[q[1], -1.0]]))
     with pytest.raises(TypeError, match="does not keep constraints"):

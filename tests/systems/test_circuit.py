@@ -110,3 +110,27 @@ def test_data_of_the_wrong_length_and_off_the_laws():
         dx.simulate(system, MIDPOINT, x=[0.0, 1.0], step=0.1, steps=2)
     with pytest.raises(ValueError, match="off the constraint"):
         dx.simulate(system, MIDPOINT, x=[1.0], step=0.1, steps=2)
+
+
+@pytest.mark.parametrize(
+    ("netlist", "message"),
+    [
+        ([("V", 1, 0, 1.0), ("V", 1, 0, 2.0), ("C", 1, 0, 1.0)], r"\('V', 1, 0, 2\.0\) contradicts .* node 1 is at 1 of node 0"),
+        ([("V", 2, 1, 0.5), ("V", 1, 0, 1.0), ("V", 0, 2, 1.5), ("C", 1, 0, 1.0)], r"node 0 is at -1\.5 of node 2"),
+        (
+            [("I", 0, 1, 2.0), ("I", 1, 0, 0.5), ("C", 2, 0, 1.0)],
+            r"nodes \[1\] of the circuit, into which 1\.5 flows",
+        ),
+        ([("I", 0, 1, 2.0), ("R", 1, 2, 1.0), ("C", 3, 0, 1.0)], r"nodes \[1, 2\] of the circuit, into which 2 flows"),
+    ],
+)
+def test_sources_that_contradict_each_other(netlist, message):
+    with pytest.raises(ValueError, match=f"{message}.*no initial data help"):
+        dx.circuit(netlist)
+
+
+def test_sources_that_agree_are_not_refused():
+    dx.circuit([("V", 1, 0, 0.1), ("V", 2, 1, 0.2), ("V", 2, 0, 0.3), ("C", 1, 0, 1.0)])
+    dx.circuit([("V", 1, 0, 1.0), ("V", 1, 0, jnp.cos), ("C", 1, 0, 1.0)])  # what functions are is not looked at
+    dx.circuit([("I", 0, 1, 2.0), ("I", 1, 0, 2.0), ("I", 1, 2, 1.0), ("R", 2, 0, 1.0), ("R", 1, 0, 1.0)])
+    dx.circuit([("I", 0, 1, 2.0), ("T", (1, 0), (2, 0), 3.0), ("L", 2, 0, 1.0)])

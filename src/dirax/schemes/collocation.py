@@ -100,7 +100,12 @@ class Collocation(AbstractScheme):
 
     def _constrained(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         lagrangian = system.lagrangian_form()
-        if self.nodes == "gauss" or lagrangian is None:
+        if lagrangian is None:
+            raise TypeError(
+                f"dx.Collocation does not keep the constraints of a {type(system).__name__}, which here are {shape.m + shape.c}: "
+                f"take dx.DiscreteDirac({'' if system.manifold_form() is None else 'map'})."
+            )
+        if self.nodes == "gauss":
             raise TypeError(
                 f"dx.Collocation at Gauss nodes does not keep constraints, of which the system has {shape.m + shape.c}: take "
                 'nodes="lobatto" for Lagrangians, dx.EnergyCollocation() for nonholonomic ones, or '

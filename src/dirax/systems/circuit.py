@@ -13,6 +13,7 @@ from dirax.numerics.tolerances import SOLVED_ROUNDOFF
 from dirax.program.roots import FEWEST_SPARSE, nearest_root
 from dirax.program.sparse_matrix import SparseMatrix
 from dirax.program.user_functions import UserFunction
+from dirax.systems.circuit_sources import refuse_contradictions
 from dirax.systems.forms import RelationForm
 from dirax.systems.implicit_system import ImplicitSystem
 from dirax.systems.shape import Shape
@@ -51,9 +52,9 @@ def circuit(netlist: Sequence[Element]) -> "ImplicitSystem | Circuit":
         rectifier = dx.circuit([("V", 1, 0, jnp.sin), ("R", 1, 2, lambda u: 1e-6 * jnp.expm1(20 * u)), ("C", 2, 0, 1.0),
                                 ("R", 2, 0, 5.0)])
 
-    Raises `ValueError` for unknown kinds, values that are not positive, resistors that give energy, and parts that are not
-    connected to the ground; `TypeError` for what is no number and no function of one number where it has to be one, and for
-    nodes that are no whole numbers.
+    Raises `ValueError` for unknown kinds, values that are not positive, resistors that give energy, parts that are not
+    connected to the ground, and constant sources that contradict each other; `TypeError` for what is no number and no function
+    of one number where it has to be one, and for nodes that are no whole numbers.
     """
     if not isinstance(netlist, list | tuple) or not netlist:
         raise TypeError(f"netlist must be a list of elements {ELEMENT}, but {netlist!r:.100} was given.")
@@ -73,6 +74,7 @@ class Circuit(AbstractSystem):
         self.netlist = tuple(netlist)
         self.nodes = tuple(sorted({node for pair in _pairs(netlist) for node in pair} - {GROUND}))
         _refuse_islands(netlist, self.nodes)
+        refuse_contradictions(netlist, GROUND)
 
     def elements(self, kind: str) -> list[Element]:
         """The elements of a kind, in the order of the list."""
