@@ -28,10 +28,11 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
 
         q̇ = v,   ṗ = P (−∂H/∂q + f + ∂⟨ν, W q̇ + b⟩/∂q − d(Wᵀν)/dt|_ν),   P = 1 − Wᵀ(W S Wᵀ)⁻¹W S,
 
-    with the derivative along q̇ at fixed ν, and S the inverses of the masses ∂²L/∂v_i², so that units drop out. The terms in ν are −⟨∂L/∂v − p, [X, Y]⟩ for fields X, Y in D: where p = ∂L/∂v, as
-    at the start of every step, they vanish, and along the step they make of the bracket of vector fields of D that of [PY],
-    −⟨∂L/∂v, [X, Y]⟩ (Celledoni, Farré Puiggalí, Høiseth, Martín de Diego 2019), without a frame of D. q̇ is projected
-    onto W q̇ + b = 0 at the nodes, and p is made ∂L/∂v at the end of the step, where this changes nothing on D.
+    with the derivative along q̇ at fixed ν, and S the inverses of the masses ∂²L/∂v_i², so that units drop out. The terms in ν
+    are −⟨∂L/∂v − p, [X, Y]⟩ for fields X, Y in D: where p = ∂L/∂v, as at the start of every step, they vanish, and along the
+    step they make of the bracket of vector fields of D that of [PY], −⟨∂L/∂v, [X, Y]⟩ (Celledoni, Farré Puiggalí, Høiseth,
+    Martín de Diego 2019), without a frame of D. q̇ is projected onto W q̇ + b = 0 at the nodes, and p is made ∂L/∂v at the end
+    of the step, where this changes nothing on D.
 
     Of many coordinates without constraints the velocities at the points and at the end are unknowns, with p = ∂L/∂v.
     """
@@ -109,7 +110,7 @@ class LagrangianEnergyCollocation(EnergyCollocationStep):
         n, q = self.n, a[: self.n]
         slope, velocity, multipliers = mean[:n], mean[n : 2 * n], mean[2 * n : 2 * n + len(self.shape.kept)]
         rows, offset = self.constraint(t, q, params)
-        mobile = rows * self._mobility(t, q, velocity, params) if len(rows) else rows  # W S
+        mobile = rows * self._mobility(t, q, velocity, params)[None] if len(rows) else rows  # W S
         inside = lambda vector: vector - rows.T @ solve(mobile @ rows.T, mobile @ vector) if len(rows) else vector
         outside = lambda missing: mobile.T @ solve(mobile @ rows.T, missing) if len(rows) else jnp.zeros(n)
         rate = velocity - outside(rows @ velocity + offset)
