@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.numerics.arrays import Data, Numbers
+from dirax.numerics.arrays import Data
 from dirax.numerics.equilibration import diagonal_units
 from dirax.numerics.tolerances import INERTIA_RANK, SYMMETRY_DEFECT
 from dirax.program.memo import Memo
@@ -268,7 +268,7 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
 
 
 def group_inertia_ranks(
-    system: LagrangeDirac, connection: AbstractConnection, q: Numbers, units: Numbers, params: Any
+    system: LagrangeDirac, connection: AbstractConnection, q: Any, units: np.ndarray, params: Any
 ) -> tuple[int, int]:
     """Ranks of ∂²L/∂ġ² at rest at q and at a point near it, in these `units` (n,) of the coordinates: a generator that vanishes
     at q has no inertia there only."""
