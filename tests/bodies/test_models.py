@@ -154,6 +154,12 @@ def rods(*names):
         (rods("a"), [b.revolute("ground", "arm")], "joint 'arm' is at body 'arm', but the bodies are a, ground"),
         (rods("a"), [b.fixed("ground", "a")], "nothing can move"),
         ([b.Body("a", -1.0)], [b.revolute("ground", "a")], "negative mass"),
+        (
+            [b.Body("a", 1.0, (1.0, 0.1, 0.1))],
+            [b.free("ground", "a")],
+            r"no body has the moments of inertia \[0.1 0.1 1. \] of 'a'",
+        ),
+        ([b.Body("a", 1.0, np.diag([0.0, 0.1, 1.0]))], [b.free("ground", "a")], "larger than the other two together"),
     ],
 )
 def test_mistakes_get_one_error_each(bodies, joints, message):

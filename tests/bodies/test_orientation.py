@@ -115,7 +115,7 @@ def test_an_attitude_is_the_quaternion_from_the_ground():
 @pytest.mark.parametrize(
     "body, joints, message",
     [
-        ({"inertia": (0.1, 0.2, 0.0)}, [], "moments of inertia across it differ"),
+        ({"inertia": (0.1, 0.2, 0.15)}, [], "moments of inertia across it differ"),
         ({"centre": (0.1, 0, 0.4)}, [], "mass centre is beside it"),
         ({}, [b.revolute("rod", "arm")], "'arm' is revolute, which holds more of it"),
         ({}, [b.ball("rod", "arm", at=(0.1, 0, 0))], "'arm' is beside it"),

@@ -16,6 +16,17 @@ def test_a_pendulum_down_and_up():
     assert np.abs(up.modes[1] / up.modes[0]) == pytest.approx([2.0, 2.0])
 
 
+def test_it_prints_eigenvalues_multipliers_and_whether_it_is_stable():
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 4.0 * jnp.cos(q[0]))
+    down = str(dx.linearize(system, {"q": [0.0], "v": [0.0]}))
+    assert "equations of small motions: stable" in down and "2i\n" in down and down.endswith("− 2i") and "multiplier" not in down
+    stepped = dx.linearize(system, {"q": [np.pi], "v": [0.0]}, dx.LagrangeDAlembert(), step=0.1)
+    growing = (1 + 0.1) / (1 - 0.1)  # of the midpoint rule, for the rate 2: (1 + hλ/2)/(1 − hλ/2)
+    lines = repr(stepped).splitlines()
+    assert "of a step of 0.1: unstable" in lines[0] and lines[1].split() == ["eigenvalue", "multiplier", "its", "size"]
+    assert lines[3].split() == [f"{np.log(growing) / 0.1:.6g}", f"{growing:.6g}", f"{growing:.6g}"]
+
+
 def test_a_rod_with_its_length_as_a_constraint_swings_as_fast():
     """In x and y with x² + y² = 1 the tension counts: the frequency is √g, and there are two directions of four."""
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.0 * q[1], holonomic=lambda q: jnp.array([q @ q - 1.0]))

@@ -365,12 +365,15 @@ def test_a_wrong_case_names_the_point(tmp_path):
             study(tmp_path / "wrong.zarr", case=function)
     with pytest.raises(TypeError, match="case takes mass, but the axes in over are g, angle"):
         study(tmp_path / "wrong.zarr", case=lambda mass: {})
+    with pytest.raises(TypeError, match="case takes g, and not angle, so that all points along angle would be the same"):
+        study(tmp_path / "wrong.zarr", case=lambda g: {"q": [0.5, 0.0], "v": [0.0, 0.0], "params": {"g": g}})
     assert not (tmp_path / "wrong.zarr").exists()
 
 
 @pytest.mark.parametrize(
     "function",
     [
+        lambda rng: {"q": rng.normal(size=2), "v": [0.0, 0.0], "params": {"g": 1.0}},
         lambda sample, rng: {"q": rng.normal(size=2), "v": [0.0, 0.0], "params": {"g": 1.0}},
         lambda sample, key: {"q": jax.random.normal(key, (2,)), "v": [0.0, 0.0], "params": {"g": 1.0}},
     ],

@@ -11,6 +11,9 @@ from dirax.bodies.parts import Body
 
 GROUND = "ground"
 
+MEASURED = 1e-6
+"""Relative to the largest moment of inertia: what measured ones may be off."""
+
 
 def sorted_tree(bodies: Sequence[Body], joints: Sequence[Joint]) -> tuple[Joint, ...]:
     """The joints of the tree, parents first. Raises `ValueError` for a body that has no way to the ground, or two of them."""
@@ -102,6 +105,11 @@ def check_masses(model: Any) -> None:
         size = max(abs(moments).max(), 1e-300)
         if mass < 0 or moments[0] < -1e-9 * size:
             raise ValueError(f"body {body.name!r} has a negative mass or moment of inertia: {mass:g}, {moments}.")
+        if moments[1] > 1e-9 * size and moments[2] - moments[0] - moments[1] > MEASURED * size:
+            raise ValueError(
+                f"no body has the moments of inertia {moments} of {body.name!r}: none is larger than the other two together. Of "
+                "one that turns in a plane state the moment across it alone, (0, 0, J)."
+            )
         if mass == 0 and np.any(inertia != 0):
             raise ValueError(
                 f"body {body.name!r} has no mass, but moments of inertia {moments}: a body without mass has none. Give it a "

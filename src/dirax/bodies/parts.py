@@ -17,7 +17,8 @@ class Body:
     """A rigid body.
 
     - `mass`; `centre` (3,), the mass centre in the body's frame, its origin by default;
-    - `inertia` about the mass centre, in the axes of the body's frame: three principal moments, or the matrix (3, 3).
+    - `inertia` about the mass centre, in the axes of the body's frame: three principal moments, or the matrix (3, 3);
+      none is larger than the others together, but for (0, 0, J) of a body in a plane.
 
     The body's frame is where its joint puts it. Units are the user's.
     """

@@ -11,6 +11,7 @@ from dirax.diagnostics.linearized_step import linearized_step
 from dirax.numerics.tolerances import TINY
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
+from dirax.text.tables import text_table
 
 AT_REST = 1e-7
 """Size of the acceleration in the moving frame, relative to its terms, that an equilibrium may have."""
@@ -54,6 +55,19 @@ class Linearization:
         values = np.linalg.eigvals(self.matrix)
         return _sorted(values if self.step is None else np.log(values.astype(complex)) / self.step)
 
+    def __str__(self) -> str:
+        """The eigenvalues, one a row, the multipliers of a step beside them, and whether no small motion grows."""
+        rows, header = [(_complex(value),) for value in self.eigenvalues], ("eigenvalue",)
+        if self.step is not None:
+            multipliers = np.exp(self.eigenvalues * self.step)
+            rows = [(*row, _complex(value), f"{abs(value):.6g}") for row, value in zip(rows, multipliers, strict=True)]
+            header = ("eigenvalue", "multiplier", "its size")
+        of = "" if self.step is None else f" of a step of {self.step:.6g}"
+        title = f"{len(self.matrix)} linear equations of small motions{of}: {'stable' if self.stable else 'unstable'}"
+        return text_table(header, rows, f"{title}, at a place with the residual {self.residual:.2g}")
+
+    __repr__ = __str__
+
     @property
     def modes(self) -> np.ndarray:
         """The eigenvectors (N, d), in the coordinates of the state and in the order of `eigenvalues`."""
@@ -66,6 +80,12 @@ class Linearization:
         """Whether no small motion grows, up to roundoff of multiple eigenvalues (1e-6)."""
         sizes = np.abs(self.eigenvalues) if self.step is not None else np.abs(self.matrix)
         return bool(self.eigenvalues[0].real <= 1e-6 * sizes.max()) if len(self.matrix) else True
+
+
+def _complex(value: complex) -> str:
+    if value.imag == 0:
+        return f"{value.real:.6g}"
+    return f"{value.real:.6g} {'+' if value.imag > 0 else '−'} {abs(value.imag):.6g}i"
 
 
 def _order(values: Any) -> np.ndarray:

@@ -45,7 +45,7 @@ class Case:
 
     @classmethod
     def of(cls, function: Callable, axes: Sequence[str], seed: int) -> "Case":
-        """A user's function. Raises `TypeError` for one that does not take the axes' names."""
+        """A user's function. Raises `TypeError` for one that does not take the axes' names, all of them unless it is random."""
         if not callable(function):
             raise TypeError(f"case must be a function of {', '.join(axes)}, but {function!r:.60} was given.")
         known = (*axes, *RANDOM)
@@ -58,7 +58,14 @@ class Case:
                 f"case takes {', '.join(unknown)}, but the axes in over are {', '.join(axes)}; it may take key or rng, too, for "
                 "random numbers of its point."
             )
-        return cls(function, tuple(p.name for p in named if p.name in known), seed)
+        names = tuple(p.name for p in named if p.name in known)
+        idle = ", ".join(name for name in axes if name not in names)
+        if idle and not set(RANDOM).intersection(names):
+            raise TypeError(
+                f"case takes {', '.join(names) or 'nothing'}, and not {idle}, so that all points along {idle} would be the same: "
+                f"let case take {idle} too, or leave {idle} out of over."
+            )
+        return cls(function, names, seed)
 
     def chosen(self, values: Values) -> "Case":
         """The same with the fastest way that agrees with single calls at these points. Raises `PointError`."""
