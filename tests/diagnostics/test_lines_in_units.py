@@ -85,3 +85,15 @@ def test_steps_at_an_equilibrium_are_solved(scheme):
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 2.943 * q[0] ** 2 + 0.981 * q[0])
     line = dx.verify(dx.simulate(system, scheme, q=[1 / 6], v=[0.0], step=0.1, steps=40))["steps solved"]
     assert line.verdict == "ok" and line.value < 1e-15
+
+
+@pytest.mark.parametrize("scheme", [dx.DiscreteDirac(), dx.DiscreteGradient()])
+def test_steps_are_replayed_in_any_units(scheme):
+    """The momentum of a top of 1e-25 beside its direction of size 1: steps were taken again with a billionth of their digits."""
+    found = []
+    for m in (1.0, 2.0**-80, 2.0**40):
+        x = np.array([0.3 * m, 0.9 * m, -0.4 * m, 0.6, 0.0, 0.8])
+        found.append(dx.verify(dx.simulate(TOP, scheme, x=x, params=m, step=0.05, steps=10)))
+    for line in [report["steps replayed"] for report in found]:
+        assert line.verdict == "ok" and line.value < 1e-15, line
+    assert len({report["symplecticity of one step"].verdict for report in found}) == 1

@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.engines.stage_look import SLOPES, TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
-from dirax.numerics.equilibration import balanced_inverse, condition_number
+from dirax.numerics.equilibration import balanced_inverse, condition_number, geometric_scales
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Values
 from dirax.program.evaluation.noise import Noise
@@ -262,12 +262,15 @@ class StepsInNumbers:
 
 
 def _inverses(matrices: np.ndarray) -> np.ndarray:
-    """The inverses (rows, k, k), NaN where there is none."""
+    """The inverses (rows, k, k) of matrices whose rows and columns have units in common; NaN where there is none."""
     with np.errstate(all="ignore"):
+        rows, columns = geometric_scales(np.max(np.abs(matrices), axis=0, where=np.isfinite(matrices), initial=0.0))
+        scaled = matrices / rows / columns
         try:
-            return np.linalg.inv(matrices)
+            found = np.linalg.inv(scaled)
         except np.linalg.LinAlgError:
-            return np.stack([_inverse(matrix) for matrix in matrices])
+            found = np.stack([_inverse(matrix) for matrix in scaled])
+    return found / columns.T / rows.T
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
