@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dirax.solution.style import BLUE, INK, ORANGE, SKY, VERMILION, new_figure, style
+from dirax.solution.style import BLUE, INK, ORANGE, SKY, VERMILION, given_or_new, style
 from dirax.text.tables import html_table, number, plain, text_table
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class Report:
     def plot(self, ax: "Axes | None" = None) -> "Axes":
         """A bar a line on a logarithmic axis, as long as the measured value and of the colour of its verdict, with a mark at the
         tolerance; what was not checked is named in grey."""
-        ax = new_figure(size=(7.2, 1.2 + 0.27 * len(self.lines)))[1] if ax is None else ax
+        ax = given_or_new(ax, size=(7.2, 1.2 + 0.27 * len(self.lines)))
         rows, values, tolerances = np.arange(len(self.lines)), _sizes(self.lines, "value"), _sizes(self.lines, "tolerance")
         numbers = np.concatenate([values, tolerances])
         logs = np.log10(numbers[np.isfinite(numbers) & (numbers > 0)])

@@ -74,6 +74,6 @@ def save_figure(figure: "Figure", path: Any) -> None:
     figure.savefig(path)
 
 
-def given_or_new(ax: "Axes | None", **kind: Any) -> "Axes":
-    """The Axes that were given, or those of a new figure."""
-    return new_figure(subplot_kw=kind)[1] if ax is None else ax
+def given_or_new(ax: "Axes | None", size: tuple[float, float] = (5.6, 3.6), **kind: Any) -> "Axes":
+    """The Axes that were given, or those of a new figure of this size."""
+    return new_figure(size=size, subplot_kw=kind)[1] if ax is None else ax
