@@ -168,10 +168,10 @@ def _units(
     rate = np.abs(np.linalg.eigvals(derivative)).max(initial=0.0)
     rate = float(power_of_two(np.asarray(rate))) if rate > 0.0 else 1.0
     over_masses = lambda a: np.divide(a, sizes, out=np.zeros(n), where=sizes > 0.0)
-    energy = energy + np.abs(v) @ np.abs(metric) @ np.abs(v) + np.max(over_masses((forces / rate) ** 2), initial=0.0)
-    if energy == 0.0:
-        energy = next(iter(sizes[sizes > 0.0]), 0.0)
-    speeds = np.sqrt(over_masses(energy))
+    whole = float(energy + np.abs(v) @ np.abs(metric) @ np.abs(v) + np.max(over_masses((forces / rate) ** 2), initial=0.0))
+    if whole == 0.0:
+        whole = next(iter(sizes[sizes > 0.0].tolist()), 0.0)
+    speeds = np.sqrt(over_masses(whole))
     return filled(np.concatenate([speeds / rate, speeds]), derivative / rate), rate
 
 

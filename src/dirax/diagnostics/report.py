@@ -88,7 +88,7 @@ class Report:
     def plot(self, ax: "Axes | None" = None) -> "Axes":
         """A bar a line on a logarithmic axis, as long as the measured value and of the colour of its verdict, with a mark at the
         tolerance; what was not checked is named in grey."""
-        ax = given_or_new(ax, size=(7.2, 1.2 + 0.27 * len(self.lines)))
+        axes = given_or_new(ax, size=(7.2, 1.2 + 0.27 * len(self.lines)))
         rows, values, tolerances = np.arange(len(self.lines)), _sizes(self.lines, "value"), _sizes(self.lines, "tolerance")
         numbers = np.concatenate([values, tolerances])
         logs = np.log10(numbers[np.isfinite(numbers) & (numbers > 0)])
@@ -97,25 +97,25 @@ class Report:
             chosen = np.array([line.verdict == verdict for line in self.lines], bool)
             ends = np.clip(np.nan_to_num(values[chosen], posinf=right), left, right)
             if np.any(chosen):
-                ax.barh(rows[chosen], ends - left, left=left, height=0.62, color=colour, label=verdict)
+                axes.barh(rows[chosen], ends - left, left=left, height=0.62, color=colour, label=verdict)
             for row in rows[chosen & ~(values > 0)]:
                 text = "0" if values[row] == 0 else verdict
-                ax.annotate(text, (left, row), (4, 0), textcoords="offset points", va="center", color=colour)
-        ax.plot(tolerances, rows, "|", color=INK, ms=13, mew=1.6, label="tolerance")
-        ax.set(
+                axes.annotate(text, (left, row), (4, 0), textcoords="offset points", va="center", color=colour)
+        axes.plot(tolerances, rows, "|", color=INK, ms=13, mew=1.6, label="tolerance")
+        axes.set(
             xscale="log",
             xlim=(left, right),
             ylim=(len(self.lines) - 0.5, -0.5),
             xlabel="measured",
             title=self.title.replace(": ", "\n", 1),
         )
-        ax.set_yticks(rows, [line.quantity for line in self.lines])
-        for label, line in zip(ax.get_yticklabels(), self.lines, strict=True):
+        axes.set_yticks(rows, [line.quantity for line in self.lines])
+        for label, line in zip(axes.get_yticklabels(), self.lines, strict=True):
             label.set_color(COLOUR_OF[NOT_CHECKED] if line.verdict == NOT_CHECKED else INK)
-        ax.tick_params(axis="y", length=0)
-        ax.grid(visible=False, axis="y")
-        ax.legend(loc="upper left", bbox_to_anchor=(1, 1))
-        return ax
+        axes.tick_params(axis="y", length=0)
+        axes.grid(visible=False, axis="y")
+        axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
+        return axes
 
 
 def _sizes(lines: tuple[Line, ...], name: str) -> np.ndarray:

@@ -123,11 +123,12 @@ class StepsInNumbers:
         """The sizes (states, k) of the terms of the first stage's equations at their solutions, and those that they give the
         unknowns, |∂r/∂u|⁻¹ terms; NaN where there is no solution."""
         index, fraction = self.program.stages[0]
-        h = np.full(len(t), fraction * h)
-        u, solved = self._solved(index, guesses[0], states, (t, h, params), None)
-        slopes, terms = stage_look(self.program, 0)(u, states, t, h, params, np.abs(u), (SLOPES, TERMS))
+        parts = np.full(len(t), fraction * h)
+        u, solved = self._solved(index, guesses[0], states, (t, parts, params), None)
+        slopes, terms = stage_look(self.program, 0)(u, states, t, parts, params, np.abs(u), (SLOPES, TERMS))
         of_unknowns = np.einsum("rij,rj->ri", np.abs(balanced_inverse(slopes[:, :, : u.shape[1]])), terms)
-        return tuple(np.where(solved[:, None], sizes, np.nan) for sizes in (terms, of_unknowns))
+        known = lambda sizes: np.where(solved[:, None], sizes, np.nan)
+        return known(terms), known(of_unknowns)
 
     def differentiated(
         self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: Noise | None = None

@@ -99,7 +99,7 @@ def step_constraints(rows: ConstraintRows, wd: Callable) -> Callable:
 
 
 def projection(
-    system: AbstractSystem, rows: ConstraintRows, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], p: Array, params: Any
+    system: Any, rows: ConstraintRows, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], p: Array, params: Any
 ) -> Float[Array, " n+k"]:
-    """Zero where p = ∂L/∂v(t, q, v) and v satisfies the constraints of velocities."""
+    """Of a system with a Lagrangian, zero where p = ∂L/∂v(t, q, v) and v satisfies the constraints of velocities."""
     return jnp.concatenate([system.legendre(q, v, params, t) - p, rows.velocity_defect(t, q, v, params)])

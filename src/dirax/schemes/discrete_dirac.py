@@ -179,7 +179,7 @@ class _Part(AbstractScheme):
 
     def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         equation = MethodOnePart(_method_one(self.map, system, shape)).equation()
-        return equation if self.map.base_fraction == 0.5 else nothing_grows(system, equation)
+        return equation if self.map.base_fraction == 0.5 else nothing_grows(system, equation, _theta_of(self.map) == 1.0)
 
 
 def _method_one(map: AbstractDiscretizationMap, system: AbstractSystem, shape: Shape) -> MethodOneStep:

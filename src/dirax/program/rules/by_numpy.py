@@ -162,7 +162,7 @@ def pseudo_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any,
 @numpy_rule("dirax_scaled_inverse")
 def scaled_inverse(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes) -> list[Nodes]:
     tolerance, shapes = equation.params["tolerance"], [v.aval.shape for v in equation.outvars]
-    return made.between([matrix], shapes, lambda operands: _inverted(*operands, tolerance), ("scaled inverse", tolerance))
+    return made.between([matrix], shapes, lambda operands: _inverted(operands[0], tolerance), ("scaled inverse", tolerance))
 
 
 def _inverted(matrices: np.ndarray, tolerance: float = EQUATION_RANK) -> list[np.ndarray]:
