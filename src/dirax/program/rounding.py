@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from dirax.program.graph import Graph, GraphTooLarge
 from dirax.program.graph_derivatives import slopes
-from dirax.program.interpreter import Interpreter, Nodes, Unavailable, UnsupportedPrimitive, elementwise, rule
+from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, UnsupportedPrimitive, elementwise, rule
 from dirax.program.memo import Memo, Same
 from dirax.program.primitives import plain_primitive
 from dirax.program.scalar_program import ScalarProgram
@@ -27,7 +27,7 @@ from dirax.program.tracing import closed_over, operand
 EXACT = frozenset(("neg", "abs", "max", "min", "select", "sign", "floor", "ceil", "round", "trunc"))
 """Operations that do not round."""
 
-BY_NODES = 2**15
+BY_NODES = 2**12
 """Numbers of a function's arguments, times those of its value, up to which the sizes of its terms are found operation by
 operation."""
 
@@ -130,7 +130,9 @@ def _of(g: Graph, nodes: Nodes, operands: list[Nodes], given: list[Nodes]) -> No
 def _rule(interpreter: Interpreter, equation: Any, *operands: Nodes):
     jaxpr = equation.params["jaxpr"]
     count = len(jaxpr.in_avals)
-    (value,) = interpreter.run(jaxpr, *operands[:count])
+    # a product that is no graph would hide its terms
+    within = Interpreter(interpreter.graph, {**interpreter.rules, "dot_general": RULES["dot_general"]})
+    (value,) = within.run(jaxpr, *operands[:count])
     if isinstance(value, Unavailable):
         return [value]
     return [_of(interpreter.graph, value, list(operands[:count]), list(operands[count:]))]

@@ -37,6 +37,6 @@ def of_solution(
     matrix: Float[Numbers, "k l"], solution: Float[Numbers, " l"], tolerance: float = EQUATION_RANK
 ) -> Float[Numbers, " l"]:
     """The sizes of the unknowns of linear equations that `scaled_inverse` solved: those that are zero come out as roundoff of
-    the others, in the units in which it was found."""
-    units = scaled_inverse(matrix, tolerance)[1]
+    the others, in the units in which it was found; of many in one unit."""
+    units = scaled_inverse(matrix, tolerance)[1] if solution.size <= MOST else jnp.ones_like(solution)
     return jnp.abs(solution) + SOLVED_ROUNDOFF * units * jnp.max(jnp.abs(solution) / units, initial=0.0)
