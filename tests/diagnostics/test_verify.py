@@ -537,6 +537,19 @@ def test_a_residual_is_judged_against_the_size_of_its_terms():
         assert dx.verify(sol)["steps solved"].verdict == "VIOLATED"
 
 
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Composition(dx.LagrangeDAlembert(), "yoshida4")])
+def test_short_steps_of_light_bodies_are_solved(scheme):
+    """A constraint over a step of 1e-6 is known to ε|q|²/h, while the momenta of light bodies are small beside that."""
+    mass, start = jnp.repeat(jnp.array([1.0, 1e-6]), 2), np.array([0.6, -0.8, 0.68, -0.86])
+    rods = lambda q: jnp.stack([q[:2] @ q[:2] - 1.0, (q[2:] - q[:2]) @ (q[2:] - q[:2]) - 1e-2])
+    chain = dx.LagrangeDirac(lambda q, v: mass @ (v * v) / 2 - 9.81 * mass[::2] @ q[1::2], holonomic=rods)
+    sol = dx.simulate(chain, scheme, q=start, v=np.zeros(4), step=1e-6, steps=30)
+    line = dx.verify(sol)["steps solved"]
+    assert np.max(np.abs(rods(sol.q[-1]))) < 1e-15 and line.verdict == "ok" and line.value < 1e-15
+    sol.stats["max_residual"] = 1.0
+    assert dx.verify(sol)["steps solved"].verdict == "VIOLATED"
+
+
 def test_half_a_recurrence_of_a_chain_is_no_drift():
     """The error of the energy follows the modes: it goes up over 2000 steps, and comes back."""
     verdicts = []

@@ -4,6 +4,7 @@ import numpy as np
 
 from dirax.diagnostics.replay import CannotReplay, Replay
 from dirax.diagnostics.verdicts import spread
+from dirax.program.graph import GraphTooLarge
 from dirax.solution.solution import Solution
 
 ROWS = 4
@@ -11,15 +12,15 @@ ROWS = 4
 
 
 def residual_size(sol: Solution) -> float | None:
-    """The largest Σ |∂r/∂u_j| |u_j| of the first part of a step that leaves a saved row; None where no step can be started
-    from one, and for explicit schemes."""
-    if sol.system is None or sol.equation is None or not sol.equation.stages[0][0].unknowns:
+    """The size of the terms of the steps that leave saved rows, the largest; None where no step can be started from one, and for
+    explicit schemes."""
+    if sol.system is None or sol.equation is None or not any(stage.unknowns for stage, _ in sol.equation.stages):
         return None
     try:
         replay = Replay.of(sol)
         rows = spread(int(replay.ends[0]) + 1, ROWS)
         at = replay.resumed(np.zeros_like(rows), rows)
-    except CannotReplay:
+        sizes = replay.steps.sizes(at.states, at.guesses, at.t, float(sol.step), at.params)
+    except (CannotReplay, GraphTooLarge):
         return None
-    sizes = replay.steps.sizes(at.states, at.guesses, at.t, float(sol.step), at.params)
     return float(np.max(sizes, where=np.isfinite(sizes), initial=0.0)) or None

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
 from dirax.numerics.equilibration import condition_number
 from dirax.numerics.tolerances import EPSILON
@@ -117,14 +118,17 @@ class StepsInNumbers:
         return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
 
     def sizes(self, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, h: float, params: np.ndarray) -> np.ndarray:
-        """The size (states,) of the terms of the first stage's equations at their solutions: the largest Σ |∂r/∂u_j| |u_j|; NaN
-        where there is none."""
-        index, fraction = self.program.stages[0]
-        at = t, np.full(len(t), fraction * h), params
-        u, solved = self._solved(index, guesses[0], states, at, None)
-        slopes, _ = self._linearized(index, self._values(index, u, states, at))
-        terms = np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u))
-        return np.where(solved, np.max(terms, axis=1, initial=0.0), np.nan)
+        """The size (states,) of the terms of a step's equations at their solutions, however they cancel, the largest of all its
+        parts: what a rounding of each operation and of each unknown does to a residual; NaN where there is no solution."""
+        made, sizes, seen = self.step(states, guesses, t, h, params), np.zeros(len(t)), set()
+        for stage, ((index, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
+            if u.shape[1] and (index, fraction) not in seen:  # parts of the same length have terms of the same size
+                seen.add((index, fraction))
+                at = u, state, t, np.full(len(t), fraction * h), params, np.abs(u)
+                (terms,) = stage_look(self.program, stage)(*at, only=(TERMS,))
+                sizes = np.maximum(sizes, np.max(terms, axis=1))
+            t = t + fraction * h
+        return np.where(made.good, sizes, np.nan)
 
     def differentiated(self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The derivatives (states, s, s) of the states after steps by those before, and the largest condition number of the
