@@ -76,7 +76,8 @@ class _Ways:
 
     def jump(self, least: float) -> np.ndarray:
         """Where (B, K) the energy has a jump of more than `least`, at one time."""
-        low, width, half = np.zeros(self.shape), 1.0, np.zeros(self.shape)
+        low, width = np.zeros(self.shape), 1.0
+        left = half = np.zeros(self.shape)
         for i in range(TIMES):
             s = low[..., None] + width * np.linspace(0.0, 1.0, PIECES + 1)
             pieces = _changes(self.energy(s))
