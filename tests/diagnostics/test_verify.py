@@ -519,14 +519,49 @@ def test_a_report_escapes_html_and_knows_its_lines():
         report["energy"]
 
 
-def test_steps_across_a_jump_of_the_lagrangian_are_told():
-    run = {"q": [1.2, 0.0], "v": [0.0, 1.0], "step": 0.01, "steps": 500}
-    for wall in (lambda q: jnp.floor(2 * q), lambda q: jnp.where(q > 0.3, 1e-3, 0.0)):
-        system = dx.LagrangeDirac(lambda q, v, wall=wall: v @ v / 2 - q @ q / 2 - wall(q[0]))
-        line = dx.verify(dx.simulate(system, dx.LagrangeDAlembert(), **run))["energy"]
-        assert line.verdict == "VIOLATED" and "the Lagrangian has a jump there" in line.explanation
-    smooth = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2 - q[0] ** 4)
-    assert dx.verify(dx.simulate(smooth, dx.LagrangeDAlembert(), **run))["energy"].verdict != "VIOLATED"
+STAIR = lambda q, v: v @ v / 2 - jnp.where(q[0] > 0.5, 2.0, 0.0)
+JUMPS = {
+    "in the first step": (STAIR, 0.49, {}),
+    "in the second step": (STAIR, 0.47, {}),
+    "in the last step but one": (STAIR, 0.5 - 0.02 * 398.5, {}),
+    "in the last step": (STAIR, 0.5 - 0.02 * 399.5, {}),
+    "two in neighbouring steps": (
+        lambda q, v: v @ v / 2 - jnp.where(q[0] > 0.5, 0.5, 0.0) - jnp.where(q[0] > 0.52, 0.5, 0.0),
+        0.0,
+        {},
+    ),
+    "hit exactly": (lambda q, v: v @ v / 2 - jnp.sign(q[0]), -0.25, {"step": 2.0**-6}),
+    "between rows": (STAIR, 0.0, {"save_every": 4}),
+    "small": (lambda q, v: v @ v / 2 - q @ q / 2 - jnp.where(q[0] > 0.3, 1e-3, 0.0), -1.2, {}),
+    "many": (lambda q, v: v @ v / 2 - q @ q / 2 - jnp.floor(2 * q[0]), 1.2, {}),
+    "beside time": (lambda t, q, v: STAIR(q, v) - jnp.sin(t) * q[0], 0.0, {}),
+    "that moves": (lambda t, q, v: v @ v / 2 - jnp.where(q[0] < 2 * t - 0.505, 2.0, 0.0), 0.0, {}),
+}
+NONE = {
+    "a stiff spring": (lambda q, v: v @ v / 2 - 50.0 * jnp.maximum(jnp.abs(q[0]) - 0.5, 0.0) ** 2, 0.0, {"step": 0.01}),
+    "a stiffer spring": (lambda q, v: v @ v / 2 - 5e5 * jnp.maximum(jnp.abs(q[0]) - 0.5, 0.0) ** 2, 0.0, {"step": 0.001}),
+    "a kink": (lambda q, v: v @ v / 2 - 5.0 * jnp.abs(q[0] - 0.313), 0.2, {"save_every": 3}),
+    "a switch": (lambda t, q, v: v @ v / 2 - jnp.where(t > 0.513, 2.0, 0.0) * q[0], 0.3, {}),
+    "smooth": (lambda q, v: v @ v / 2 - q @ q / 2 - q[0] ** 4, 1.2, {}),
+}
+
+
+@pytest.mark.parametrize("where", [*JUMPS, *NONE])
+def test_steps_across_a_jump_of_the_lagrangian_are_told(where):
+    """The state moves on as if nothing were there: the energy that is stored in the stairs is by hand."""
+    lagrangian, start, more = (JUMPS | NONE)[where]
+    run = {"step": 0.02, "steps": 400} | more
+    line = energy_line(dx.simulate(dx.LagrangeDirac(lagrangian), dx.LagrangeDAlembert(), q=[start], v=[1.0], **run))
+    told = line.verdict == "VIOLATED" and "has a jump there" in line.explanation
+    assert told == (where in JUMPS), line
+
+
+def test_which_trajectories_of_a_batch_go_across_a_jump_is_told():
+    sol = dx.simulate(
+        dx.LagrangeDirac(STAIR), dx.LagrangeDAlembert(), q=[[0.6], [0.0], [0.7]], v=[[1.0], [1.0], [2.0]], step=0.02, steps=60
+    )
+    line = energy_line(sol)
+    assert line.verdict == "VIOLATED" and line.value == 2.0 and "(trajectory 1)" in line.explanation
 
 
 def test_a_residual_is_judged_against_the_size_of_its_terms():
@@ -537,6 +572,19 @@ def test_a_residual_is_judged_against_the_size_of_its_terms():
         assert line.verdict == "ok" and 0 <= line.value < 1e-13
         sol.stats["max_residual"] = 1e-3 * unit
         assert dx.verify(sol)["steps solved"].verdict == "VIOLATED"
+
+
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Composition(dx.LagrangeDAlembert(), "yoshida4")])
+def test_short_steps_of_light_bodies_are_solved(scheme):
+    """A constraint over a step of 1e-6 is known to ε|q|²/h, while the momenta of light bodies are small beside that."""
+    mass, start = jnp.repeat(jnp.array([1.0, 1e-6]), 2), np.array([0.6, -0.8, 0.68, -0.86])
+    rods = lambda q: jnp.stack([q[:2] @ q[:2] - 1.0, (q[2:] - q[:2]) @ (q[2:] - q[:2]) - 1e-2])
+    chain = dx.LagrangeDirac(lambda q, v: mass @ (v * v) / 2 - 9.81 * mass[::2] @ q[1::2], holonomic=rods)
+    sol = dx.simulate(chain, scheme, q=start, v=np.zeros(4), step=1e-6, steps=30)
+    line = dx.verify(sol)["steps solved"]
+    assert np.max(np.abs(rods(sol.q[-1]))) < 1e-15 and line.verdict == "ok" and line.value < 1e-15
+    sol.stats["max_residual"] = 1.0
+    assert dx.verify(sol)["steps solved"].verdict == "VIOLATED"
 
 
 def test_half_a_recurrence_of_a_chain_is_no_drift():

@@ -5,22 +5,17 @@ from typing import Any
 import numpy as np
 
 from dirax.diagnostics.drift import judge
+from dirax.diagnostics.energy_jumps import energy_jump
 from dirax.diagnostics.power_balance import balances, has_power, keeps_books
-from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Line
+from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, Line
 from dirax.diagnostics.rows import LARGE, at_rows, energy_at, energy_of, row_numbers
 from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled_terms, spread, steps_of
 from dirax.numerics.tolerances import EPSILON
 from dirax.schemes.step import CLOCK
 from dirax.solution.solution import Solution
 
-JUMP = 1000.0
-"""A change in one step that is so many times those of two steps before and after it is a jump."""
-
 SITES = 64
 """Numbers of each field that show how fast a large system moves."""
-
-NOTICED = 1e-9
-"""Changes below this, relative to the energy, are none."""
 
 
 def energy_less_work(sol: Solution) -> tuple[np.ndarray, bool, str]:
@@ -45,7 +40,7 @@ def energy_line(sol: Solution) -> Line:
         return Line(name, None, None, NOT_CHECKED, "the system states no energy")
     size = energy_scale(sol, energy)
     roundoff = ROUNDINGS * EPSILON * steps_of(sol) * size
-    if not changes and (jump := _jump(sol, energy, roundoff)):
+    if jump := energy_jump(sol, energy, size):
         return jump
     if changes:
         change = float(np.nanmax(np.abs(energy - energy[:, :1])))
@@ -65,27 +60,6 @@ def energy_line(sol: Solution) -> Line:
     others = sorted({f.verdict for f in found} - {worst.verdict})
     text += "".join(f"; {details['verdicts'].count(other)} of {len(found)} {other}" for other in others)
     return Line(name, abs(worst.drift), worst.told, worst.verdict, text, details)
-
-
-def _jump(sol: Solution, energy: np.ndarray, roundoff: float) -> Line | None:
-    """The line of a trajectory whose energy jumps within one step, against its neighbours: L has a jump there, or the step is
-    too long; None where it does not, and where rows are not consecutive steps."""
-    if sol.save_every != 1 or energy.shape[1] < 6:
-        return None
-    change = np.abs(np.diff(energy, axis=1))
-    change = np.where(np.isfinite(change), change, 0.0)
-    around = np.maximum(np.maximum(change[:, :-4], change[:, 1:-3]), np.maximum(change[:, 3:-1], change[:, 4:]))
-    size = float(np.nanmax(np.abs(energy)))
-    jumps = change[:, 2:-2] > JUMP * np.maximum(around, max(roundoff / steps_of(sol), NOTICED * size))
-    if not np.any(jumps):
-        return None
-    lane, step = (int(i) for i in np.unravel_index(int(np.argmax(np.where(jumps, change[:, 2:-2], 0.0))), jumps.shape))
-    by, others = change[lane, step + 2], around[lane, step]
-    text = (
-        f"jumps by {by:.3g} within the step from t = {sol.time_of(step + 2, lane):.6g}{of_lane(sol, lane)}, next to changes of "
-        f"{others:.2g}, in {np.sum(jumps)} steps: the Lagrangian has a jump there, which no step sees, or the step is too long"
-    )
-    return Line("energy", float(by), float(JUMP * others), VIOLATED, text)
 
 
 def port_lines(sol: Solution, tolerance: float | None) -> list[Line]:

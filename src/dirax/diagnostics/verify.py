@@ -38,8 +38,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
       a second are enough for, and the line says so;
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
-    - steps solved: the largest residual of a run, relative to the terms of its equations, which Newton's method brings to
-      their roundoff;
+    - steps solved: the largest residual of a run, relative to the terms of its equations, however they cancel, which Newton's
+      method brings to their roundoff;
     - final manifold of a singular Lagrangian: 32 ε where a scheme keeps it, and violated where the run starts off it, or jumps
       across it from one solution of the discrete equations to the other;
     - momentum maps, and of Euler–Poincaré and Lie–Poisson systems the Casimirs and the spatial momentum (where quantities
@@ -54,7 +54,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     - systems with ports ([BLM] §7.1): the power balance of every step and, with a discrete gradient, the books over the run,
       H − H(0) less what was supplied plus what was dissipated: 32 ε, however many steps;
     - energy: "bounded" or "drifts", told apart by windowed means (`dirax.diagnostics.drift`); a drift below
-      32 ε · steps · (|E| + |∂E| |row|) is roundoff. The tolerance shown is the drift that could have been told.
+      32 ε · steps · (|E| + |∂E| |row|) is roundoff. The tolerance shown is the drift that could have been told. Violated where
+      the energy has a jump between two rows (L or H has one there), which kinks and stiff springs are told from.
 
     A run on the quotient by an abelian symmetry has the structure of the motion that `dx.reconstruct` gives, and μ besides.
     A batch is judged by its worst trajectory, a failed run by the part that was computed, and what cannot be checked says

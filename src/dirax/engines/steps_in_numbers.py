@@ -120,15 +120,22 @@ class StepsInNumbers:
     def sizes(
         self, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, h: float, params: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The sizes (states, k) of the terms of the first stage's equations at their solutions, and those that they give the
-        unknowns, |∂r/∂u|⁻¹ terms; NaN where there is no solution."""
-        index, fraction = self.program.stages[0]
-        parts = np.full(len(t), fraction * h)
-        u, solved = self._solved(index, guesses[0], states, (t, parts, params), None)
-        slopes, terms = stage_look(self.program, 0)(u, states, t, parts, params, np.abs(u), (SLOPES, TERMS))
-        of_unknowns = np.einsum("rij,rj->ri", np.abs(balanced_inverse(slopes[:, :, : u.shape[1]])), terms)
-        known = lambda sizes: np.where(solved[:, None], sizes, np.nan)
-        return known(terms), known(of_unknowns)
+        """The sizes (states,) of the terms of a step's equations at their solutions, however they cancel, the largest of all its
+        parts: what a rounding of each operation and of each unknown does to a residual; and of those that they give the unknowns,
+        |∂r/∂u|⁻¹ terms. NaN where there is no solution."""
+        made, seen = self.step(states, guesses, t, h, params), set()
+        of_equations, of_unknowns = np.zeros(len(t)), np.zeros(len(t))
+        for stage, ((index, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
+            if u.shape[1] and (index, fraction) not in seen:  # parts of the same length have terms of the same size
+                seen.add((index, fraction))
+                at = u, state, t, np.full(len(t), fraction * h), params, np.abs(u)
+                slopes, terms = stage_look(self.program, stage)(*at, only=(SLOPES, TERMS))
+                moved = np.einsum("rij,rj->ri", np.abs(balanced_inverse(slopes[:, :, : u.shape[1]])), terms)
+                of_equations = np.maximum(of_equations, np.max(terms, axis=1))
+                of_unknowns = np.maximum(of_unknowns, np.max(moved, axis=1))
+            t = t + fraction * h
+        known = lambda sizes: np.where(made.good, sizes, np.nan)
+        return known(of_equations), known(of_unknowns)
 
     def differentiated(
         self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: Noise | None = None
