@@ -32,6 +32,20 @@ def equilibrated(matrix: Any, xp: ModuleType = np, rounds: int = ROUNDS) -> tupl
     return matrix, units
 
 
+def balancing_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
+    """Scales (…, k, 1) and (…, 1, l) by which the rows and the columns of a matrix with entries of these `sizes` are to be
+    divided: by square roots from both sides at once (Ruiz 2001), which treats equations and unknowns alike, so that a
+    pseudo-inverse in these units does not depend on which of them were called rows. After so few rounds a row that is the
+    roundoff of zero stays small."""
+    *lead, k, l = sizes.shape
+    rows, columns = xp.ones((*lead, k, 1)), xp.ones((*lead, 1, l))
+    for _ in range(ROUNDS):
+        left = sizes / rows / columns
+        rows = rows * xp.sqrt(_nonzero(xp, _maximum(xp, left, -1)))
+        columns = columns * xp.sqrt(_nonzero(xp, _maximum(xp, left, -2)))
+    return rows, columns
+
+
 def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """Powers of two (…, k, 1) and (…, 1, l) by which rows and columns of a matrix with entries of these `sizes` are to be
     divided so that the geometric mean of those that are not zero is about 1 in each (Curtis and Reid 1972).

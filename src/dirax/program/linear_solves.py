@@ -1,6 +1,7 @@
 """Linear equations of a few unknowns: with one solution, and with the smallest of many."""
 
 import math
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -11,7 +12,8 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, batching
 from jaxtyping import Array, Float
 
-from dirax.numerics.equilibration import geometric_scales
+from dirax.numerics.equilibration import balancing_scales, geometric_scales
+from dirax.numerics.ranks import numerical_rank
 from dirax.numerics.tolerances import EQUATION_RANK
 from dirax.program.primitives import binds, each, plain_primitive
 
@@ -38,8 +40,7 @@ def pseudo_inverse(matrix: Float[Array, "k l"], tolerance: float) -> Float[Array
 
 
 def scaled_pseudo_inverse(matrix: Float[Array, "k l"]) -> Float[Array, "l k"]:
-    """The pseudo-inverse of a matrix with rows and columns scaled to unit size, by powers of two: of least size in units that the
-    matrix itself says, so that in other ones, by powers of two, it is the same to the last bit."""
+    """The pseudo-inverse of a matrix with rows and columns scaled to unit size."""
     return scaled_inverse(matrix)[0]
 
 
@@ -57,17 +58,17 @@ def scaled_inverse(
 def equilibrated_inverse(xp: ModuleType, matrix: Any, tolerance: float = EQUATION_RANK) -> tuple[Any, Any]:
     """The same by JAX, or by NumPy with leading axes."""
     sizes = xp.abs(lax.stop_gradient(matrix) if xp is jnp else matrix)  # units have no derivative, which would be ∞ at zero
-    rows, columns = geometric_scales(sizes, xp)
+    rows, columns = balancing_scales(sizes, xp)
     scaled = matrix / rows / columns
-    inverse = xp.linalg.pinv(scaled, tolerance) if xp is jnp else pseudo_inverses(scaled, tolerance)
+    inverse = xp.linalg.pinv(scaled, tolerance) if xp is jnp else pseudo_inverses(scaled, tolerance, _by_either_scale)
     turned = lambda a: xp.swapaxes(a, -1, -2)
     return inverse / turned(columns) / turned(rows), 1.0 / columns[..., 0, :]
 
 
-def pseudo_inverses(matrices: np.ndarray, tolerance: float) -> np.ndarray:
+def pseudo_inverses(matrices: np.ndarray, tolerance: float, of_doubtful: Callable = np.linalg.pinv) -> np.ndarray:
     """Pseudo-inverses in NumPy with leading axes; singular values below `tolerance`, relative to the largest, count as zero.
 
-    Where surely none does, they are found without them, which is much faster.
+    Where surely none does, they are found without them, which is much faster; the others by `of_doubtful(matrices, tolerance)`.
     """
     flat = matrices.reshape(math.prod(matrices.shape[:-2]), *matrices.shape[-2:])
     size = lambda a: np.max(np.sum(np.abs(a), axis=-1), axis=-1, initial=0.0)
@@ -77,8 +78,21 @@ def pseudo_inverses(matrices: np.ndarray, tolerance: float) -> np.ndarray:
         found = _of_full_rank(flat / unit) / unit  # no square overflows, or is lost
         doubtful = ~(sizes * size(found) <= SURELY_REGULAR)
     if np.any(doubtful):
-        found[doubtful] = np.linalg.pinv(flat[doubtful], tolerance)
+        found[doubtful] = of_doubtful(flat[doubtful], tolerance)
     return found.reshape(*matrices.shape[:-2], *found.shape[1:])
+
+
+def _by_either_scale(matrices: np.ndarray, tolerance: float) -> np.ndarray:
+    """Those of matrices (B, k, l), divided by geometric means where these have more rank, or both have all: largest entries
+    cannot balance a saddle point with small masses, and geometric means raise the roundoff of zero."""
+    found, least = np.linalg.pinv(matrices, tolerance), min(matrices.shape[1:])
+    rank = lambda a: numerical_rank(np.linalg.svd(a, compute_uv=False), tolerance)
+    for i, own in enumerate(rank(matrices).tolist()):
+        rows, columns = geometric_scales(np.abs(matrices[i]))
+        balanced = matrices[i] / rows / columns
+        if rank(balanced) > own or own == least == rank(balanced):
+            found[i] = np.linalg.pinv(balanced, tolerance) / columns.T / rows.T
+    return found
 
 
 def _of_full_rank(matrices: np.ndarray) -> np.ndarray:

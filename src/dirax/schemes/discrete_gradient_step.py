@@ -91,7 +91,7 @@ class DiscreteGradientStep(AbstractStep):
         instead = _Along.of(change, jnp.ones(self.n), mean, blurred)
         finer = self._finer(u, state, h, params, jnp.where(along.seen, along.steepest, instead.steepest))
         by_dh = jnp.where(along.seen, along.direction, instead.direction)
-        by_h = along.share * along.direction + (1.0 - along.share) * instead.share * instead.direction
+        by_h = jnp.where(along.seen, along.share * along.direction, instead.share * instead.direction)
         return mean + finer * by_dh + (missing - finer) * by_h, middle
 
     @once
