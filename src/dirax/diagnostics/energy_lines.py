@@ -5,14 +5,17 @@ from typing import Any
 import numpy as np
 
 from dirax.diagnostics.drift import judge
-from dirax.diagnostics.energy_jumps import energy_jump
+from dirax.diagnostics.energy_jumps import NOTICED, energy_jump
 from dirax.diagnostics.power_balance import balances, has_power, keeps_books
-from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, Line
+from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Line
 from dirax.diagnostics.rows import LARGE, at_rows, energy_at, energy_of, row_numbers
 from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled_terms, spread, steps_of
 from dirax.numerics.tolerances import EPSILON
 from dirax.schemes.step import CLOCK
 from dirax.solution.solution import Solution
+
+BY_WALLS = 10.0
+"""A change in a step that a wall divides is one by the wall where it is so many times that of any other step."""
 
 SITES = 64
 """Numbers of each field that show how fast a large system moves."""
@@ -42,6 +45,8 @@ def energy_line(sol: Solution) -> Line:
     roundoff = ROUNDINGS * EPSILON * steps_of(sol) * size
     if jump := energy_jump(sol, energy, size):
         return jump
+    if not changes and (kicked := _changed_by_walls(sol, energy, size)):
+        return kicked
     if changes:
         change = float(np.nanmax(np.abs(energy - energy[:, :1])))
         return Line(name, change, None, NOT_CHECKED, f"the system {changes}; it changed by {change:.3g}")
@@ -60,6 +65,24 @@ def energy_line(sol: Solution) -> Line:
     others = sorted({f.verdict for f in found} - {worst.verdict})
     text += "".join(f"; {details['verdicts'].count(other)} of {len(found)} {other}" for other in others)
     return Line(name, abs(worst.drift), worst.told, worst.verdict, text, details)
+
+
+def _changed_by_walls(sol: Solution, energy: np.ndarray, size: float) -> Line | None:
+    """The line of a run whose energy (B, rows) is another one after a wall, that does no work, than before; None for others."""
+    if sol.impacts is None or not len(sol.impacts) or sol.save_every != 1:
+        return None
+    change = np.nan_to_num(np.abs(np.diff(energy, axis=1)))
+    for lane in range(len(change)):
+        after = np.searchsorted(sol.times[lane], sol.impacts.t[sol.impacts.lane == lane], side="right")
+        divided = np.unique(np.clip(after - 1, 0, change.shape[1] - 1))
+        allowed = max(BY_WALLS * float(np.max(np.delete(change[lane], divided), initial=0.0)), NOTICED * size)
+        by = float(np.max(change[lane, divided], initial=0.0))
+        if by > allowed:
+            row = int(divided[np.argmax(change[lane, divided])])
+            step = f"the step from t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
+            text = f"changes by {by:.3g} in {step}, in which a wall was hit that does no work"
+            return Line("energy", by, allowed, VIOLATED, text)
+    return None
 
 
 def port_lines(sol: Solution, tolerance: float | None) -> list[Line]:
