@@ -7,13 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data
-from dirax.schemes.abstract_step import AbstractStep
-from dirax.schemes.constraint_rows import ConstraintRows, projection
 from dirax.schemes.labels import Labels
 from dirax.schemes.lagrangian_step import LagrangianStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.map_lift import Base, Lift, ThetaLift
-from dirax.schemes.step import Field
+from dirax.schemes.part_of_step import PartOfStep
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +79,7 @@ class MethodOneStep(LagrangianStep):
 
 
 @dataclass(frozen=True, eq=False)
-class MethodOnePart(AbstractStep):
+class MethodOnePart(PartOfStep):
     """The step of `inner` as a part of a composed step, from a momentum on the constraints to one on them, by a symmetric
     projection (Hairer 2000): it leaves p_k + [W; G](q_k)ᵀσ, and from where it arrives [W; G](q_{k+1})ᵀσ is taken off,
 
@@ -94,29 +92,12 @@ class MethodOnePart(AbstractStep):
     inner: MethodOneStep
 
     @property
-    def rows(self) -> ConstraintRows:
-        """The constraints that enter the equations."""
-        return self.inner.rows
-
-    @property
-    def state(self) -> Layout:
-        return self.inner.state
-
-    @property
     def unknowns(self) -> Layout:
         return Layout(inner=self.inner.unknowns.size, end_v=self.inner.shape.n, sigma=self.rows.count)
 
     @property
-    def fields(self) -> dict[str, Field]:
-        return self.inner.fields
-
-    @property
     def labels(self) -> Labels:
         return self.inner.labels + Labels.numbered("projection of the momentum {}", self.inner.shape.n + self.rows.count)
-
-    @property
-    def canonical(self) -> bool:
-        return self.inner.canonical
 
     def pushed(self, state: Array, sigma: Array, t: Any, params: Any) -> Float[Array, " s"]:
         """The state with p + [W; G](q)ᵀσ."""
@@ -127,7 +108,7 @@ class MethodOnePart(AbstractStep):
         inner, end_v, sigma = self.unknowns.split(u)
         q1, p1, _ = self.state.split(self.advance(u, state, t, h, params))
         missed = self.inner.residual(inner, self.pushed(state, sigma, t, params), t, h, params)
-        return jnp.concatenate([missed, projection(self.inner.system, self.rows, t + h, q1, end_v, p1, params)])
+        return jnp.concatenate([missed, self.projection(t + h, q1, end_v, p1, params)])
 
     def advance(self, u, state, t, h, params):
         inner, _, sigma = self.unknowns.split(u)

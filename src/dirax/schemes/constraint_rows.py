@@ -96,10 +96,3 @@ def step_constraints(rows: ConstraintRows, wd: Callable) -> Callable:
         return jnp.concatenate([wd(t, q, v, h, params), end]) if rows.m else end
 
     return both
-
-
-def projection(
-    system: Any, rows: ConstraintRows, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], p: Array, params: Any
-) -> Float[Array, " n+k"]:
-    """Of a system with a Lagrangian, zero where p = ∂L/∂v(t, q, v) and v satisfies the constraints of velocities."""
-    return jnp.concatenate([system.legendre(q, v, params, t) - p, rows.velocity_defect(t, q, v, params)])

@@ -4,16 +4,14 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 
-from dirax.schemes.abstract_step import AbstractStep
-from dirax.schemes.constraint_rows import ConstraintRows, projection
 from dirax.schemes.labels import Labels
 from dirax.schemes.lagrange_dalembert_step import PROJECTION, LagrangeDAlembertStep
 from dirax.schemes.layout import Layout
-from dirax.schemes.step import Field
+from dirax.schemes.part_of_step import PartOfStep
 
 
 @dataclass(frozen=True, eq=False)
-class LagrangeDAlembertPart(AbstractStep):
+class LagrangeDAlembertPart(PartOfStep):
     """The step of `inner` from a momentum on the constraints to one on them:
 
         p_k + D1 L_d = [W; G](q_k)ᵀμ,   w_d = 0,   g(q_{k+1}) = 0,
@@ -28,31 +26,14 @@ class LagrangeDAlembertPart(AbstractStep):
     inner: LagrangeDAlembertStep
 
     @property
-    def rows(self) -> ConstraintRows:
-        """The constraints that enter the equations."""
-        return self.inner.rows
-
-    @property
-    def state(self) -> Layout:
-        return self.inner.state
-
-    @property
     def unknowns(self) -> Layout:
         n, count = self.inner.shape.n, self.rows.count
         return Layout(v=n, multipliers=count, end_v=n, sigma=count)
 
     @property
-    def fields(self) -> dict[str, Field]:
-        return self.inner.fields
-
-    @property
     def labels(self) -> Labels:
         n, count = self.inner.shape.n, self.rows.count
         return self.inner.labels[: n + count] + Labels.numbered(PROJECTION + " {}", n + count)
-
-    @property
-    def canonical(self) -> bool:
-        return self.inner.canonical
 
     def end(self, u, state, t, h, params):
         """(q_{k+1}, p_{k+1})."""
@@ -66,7 +47,7 @@ class LagrangeDAlembertPart(AbstractStep):
         q, p, _ = self.state.split(state)
         q1, p1 = self.end(u, state, t, h, params)
         balance = self.inner.equations(v, multipliers, q, p, t, h, params, self.of_constraints(u))
-        return jnp.concatenate([balance, projection(self.inner.system, self.rows, t + h, q1, end_v, p1, params)])
+        return jnp.concatenate([balance, self.projection(t + h, q1, end_v, p1, params)])
 
     def advance(self, u, state, t, h, params):
         work = self.inner.state.split(self.inner.advance(self.of_inner(u), state, t, h, params, self.of_constraints(u)))

@@ -11,6 +11,9 @@ SOLVE_LIMIT = 12
 """Largest matrix that a user's function may factor; one of constants may be as large as it likes, since nothing of its factors is
 left to be computed."""
 
+MOST_SIDE_BY_SIDE = 4 * SOLVE_LIMIT**2
+"""Equations up to which it is looked how they fall apart, as those of a vmapped solve do: twenty points of ten each are 200."""
+
 
 def solve_triangular(g: Graph, matrix: np.ndarray, b: np.ndarray, lower: bool, unit: bool) -> np.ndarray:
     """x with matrix x = b, (n, r)."""
@@ -67,7 +70,7 @@ def custom_linear_solve(interpreter: Interpreter, equation: Any, *operands):
         return [lost] * len(equation.outvars)
     shapes, sizes = [s.shape for s in sides], [s.size for s in sides]
     n = sum(sizes)
-    if n > SOLVE_LIMIT**2:
+    if n > MOST_SIDE_BY_SIDE:
         raise Unsupported(f"solves {n} equations at once")
     columns = []
     for k in range(n):
