@@ -50,7 +50,7 @@ def plot_trajectory(
     """
     chosen = [index_of(sol, each) for each in (x, y, z) if each is not None]
     space = len(chosen) == 3
-    ax = given_or_new(ax, **({"projection": "3d"} if space else {}))
+    ax = given_or_new(ax, projection="3d") if space else given_or_new(ax)
     if space and not hasattr(ax, "set_zlabel"):
         raise ValueError('ax must have the projection "3d" for a path in space: figure.add_subplot(projection="3d").')
     lanes = _lanes(sol, position(sol))
