@@ -203,7 +203,8 @@ def structural_defect(structure, equation, q0, q1):
     form, rows = structure.step_form, {"q": jnp.stack([q0, q1]), "t": jnp.array([-h, 0.0])}
 
     def defect(rows):
-        step = differentiated_step(equation, h, *form.begins(equation, rows, None), rows["t"][-1], None)
+        state, guess = form.begins(equation, rows, None)
+        step = differentiated_step(equation, h, state, (guess,), rows["t"][-1], None)
         return form.terms(step, equation, rows, None)
 
     return eqx.filter_jit(defect)(rows)
@@ -613,3 +614,20 @@ def test_the_plot_has_a_bar_a_line_in_the_colour_of_its_verdict():
     assert {text.xy[1]: text.get_text() for text in ax.texts} == {1: "0", 6: "VIOLATED", 7: "not checked", 8: "ok"}
     assert ax.get_yticklabels()[7].get_color() != ax.get_yticklabels()[0].get_color()
     assert Report("nothing measured", lines[7:]).plot(ax) is ax
+
+
+def test_steps_whose_parts_have_unknowns_of_their_own_are_measured():
+    """The adjoint of a step has the increment of the state among its unknowns."""
+    pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.cos(q[0]))
+    run = {"q": [0.3], "v": [0.2], "step": 0.02, "steps": 20}
+    line = dx.verify(dx.simulate(pendulum, dx.SymmetricComposition(dx.DiscreteDirac()), **run))["symplecticity of one step"]
+    assert line.verdict == "ok" and line.value < line.tolerance
+
+
+def test_what_keeps_no_form_keeps_none_composed():
+    pendulum = dx.DiracSystem(dx.induced_dirac(None, 1), lambda x: x[1] ** 2 / 2 - jnp.cos(x[0]))
+    gradient = dx.DiscreteGradient()
+    for scheme in (dx.Composition(gradient, [0.5, 0.5]), dx.SymmetricComposition(gradient), dx.Adjoint(gradient)):
+        report = dx.verify(dx.simulate(pendulum, scheme, x=[0.3, 0.2], step=0.2, steps=20))
+        line = report["symplecticity of one step"]
+        assert line.verdict == "not checked" and "keep the energy" in line.explanation

@@ -1,5 +1,6 @@
 """The derivative of single steps, each at the solution of its equations."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -24,24 +25,25 @@ MAX_ITERATIONS = 50
 
 
 def differentiated_steps(
-    sol: Solution, states: np.ndarray, guesses: np.ndarray, t: np.ndarray, noise: Noise | None = None
+    sol: Solution, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, noise: Noise | None = None
 ) -> DifferentiatedStep:
-    """The steps from states (B, rows, s) at times (B, rows), from first guesses (B, rows, k): arrays (B, rows, …), NaN where a
-    step has no solution. By their scalar program, where there is one; nothing is compiled then. `noise`: of the arithmetic; of
-    the states alone, where the step is compiled."""
+    """The steps from states (B, rows, s) at times (B, rows), from first guesses (B, rows, k) of every part: arrays (B, rows, …),
+    NaN where a step has no solution. By their scalar program, where there is one; nothing is compiled then. `noise`: of the
+    arithmetic; of the states alone, where the step is compiled."""
     lanes, rows, size = states.shape
     try:
         steps = StepsInNumbers.of(sol.equation, sol.given_params, sol.batch_params)
     except (UnsupportedPrimitive, GraphTooLarge):
         states = noise.off(states) if noise else states
-        items = (states, guesses, t) if sol.batch is not None else (states[0], guesses[0], t[0])
+        items = states, tuple(guesses), t
+        items = items if sol.batch is not None else jax.tree.map(lambda a: a[0], items)
         flat = over_rows(eqx.Partial(_by_jax, Same(sol.equation), sol.step), sol, items)
         jacobians = flat[..., size:-1].reshape(lanes, rows, size, size)
         return DifferentiatedStep(flat[..., :size], jacobians, flat[..., -1])
     of_states = np.repeat(np.arange(lanes), rows)
     params = steps.parameters(sol.given_params, sol.batch if sol.batch_params else None, of_states)
     joined = lambda a: a.reshape(lanes * rows, *a.shape[2:])
-    given = joined(states), [joined(guesses)] * len(sol.equation.stages), joined(t)
+    given = joined(states), [joined(guess) for guess in guesses], joined(t)
     made = steps.step(*given, sol.step, params, noise)
     jacobians, conditions = steps.differentiated(made, joined(t), sol.step, params, noise)
     good = np.where(made.good, 1.0, np.nan)
@@ -49,17 +51,17 @@ def differentiated_steps(
     return DifferentiatedStep(apart(made.after * good[:, None]), apart(jacobians * good[:, None, None]), apart(conditions))
 
 
-def _by_jax(same: Same, h: Any, state, guess, t, params):
-    step = differentiated_step(same.object, h, state, guess, t, params)
+def _by_jax(same: Same, h: Any, state, guesses, t, params):
+    step = differentiated_step(same.object, h, state, guesses, t, params)
     return jnp.concatenate([step.state, step.jacobian.ravel(), step.condition[None]])
 
 
-def differentiated_step(equation: Any, h: Any, state, guess, t, params) -> DifferentiatedStep:
-    """One step solved by the engine's Newton method, differentiated by the implicit function theorem; NaN where it fails.
+def differentiated_step(equation: Any, h: Any, state, guesses, t, params) -> DifferentiatedStep:
+    """One step solved by the engine's Newton method from a guess for each part, differentiated by the implicit function theorem;
+    NaN where it fails.
 
     With r(u, x) = 0 and x' = a(u, x) of each stage, ∂x'/∂x = ∂_x a − ∂_u a (∂_u r)⁻¹ ∂_x r.
     """
-    guesses = (guess,) * len(equation.stages)
     lane, sizes = first_lane(state, guesses), sizes_near(equation, state, guesses, t, h, params)
     after, unknowns, _ = take_step(equation, lane, t, h, params, sizes, MAX_ITERATIONS, differentiable=False)
     jacobian, condition = jnp.eye(state.shape[0]), jnp.ones(())

@@ -15,6 +15,7 @@ from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, 
 from dirax.program.evaluation.noise import Noise
 from dirax.program.memo import Same
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
+from dirax.schemes.step import StepSequence
 from dirax.solution.solution import Solution
 
 SAMPLED_STEPS = 8
@@ -137,10 +138,12 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     same = Same(sol.equation)
     begun = over_rows(eqx.Partial(_begun, form, same), sol, (items,), few=True)
     size, t = sol.equation.stages[0][0].state_size, np.atleast_2d(items["t"][..., -1])
+    counts = [stage.unknowns for stage, _ in sol.equation.stages]
+    guesses = np.split(begun[..., size:], np.cumsum(counts)[:-1], axis=-1)
 
     def stepped(noise: Noise | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The terms (B, rows, numbers, 2, entries) of the form, and the condition of the steps."""
-        step = differentiated_steps(sol, begun[..., :size], begun[..., size:], t, noise)
+        step = differentiated_steps(sol, begun[..., :size], guesses, t, noise)
         taken = step if sol.batch is not None else jax.tree.map(lambda a: a[0], step)
         terms = over_rows(eqx.Partial(_terms_of_form, form, same), sol, (items, taken), few=True, noise=noise)
         return np.array(terms.reshape(*terms.shape[:-2], -1)), step.condition
@@ -168,7 +171,13 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
 
 
 def _begun(form: AbstractStepForm, same: Same, rows, params):
-    return jnp.concatenate(form.begins(same.object, rows, params))
+    """The first state, and a first guess for each part, equal ones for equal equations."""
+    state, first = form.begins(same.object, rows, params)
+    stages, guesses = same.object.stages, {id(same.object.stages[0][0]): first}
+    for stage, fraction in stages:
+        if id(stage) not in guesses:
+            guesses[id(stage)] = form.begins(StepSequence(((stage, fraction),)), rows, params)[1]
+    return jnp.concatenate([state, *(guesses[id(stage)] for stage, _ in stages)])
 
 
 def _terms_of_form(form: AbstractStepForm, same: Same, rows, step, params):

@@ -54,6 +54,10 @@ class Composition(AbstractScheme):
         return between_the_parts(self)
 
     @property
+    def keeps_no_form(self) -> str:
+        return self.scheme.keeps_no_form
+
+    @property
     def constraints_at_rows(self) -> bool:
         return self.scheme.constraints_at_rows
 
@@ -84,6 +88,10 @@ class Adjoint(AbstractScheme):
         return adjoint.discrete_structure(system, shape, step)
 
     @property
+    def keeps_no_form(self) -> str:
+        return self.scheme.keeps_no_form
+
+    @property
     def constraints_at_rows(self) -> bool:
         return self.scheme.constraints_at_rows
 
@@ -103,6 +111,10 @@ class SymmetricComposition(AbstractScheme):
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
         return between_the_parts(self)
+
+    @property
+    def keeps_no_form(self) -> str:
+        return self.scheme.keeps_no_form
 
     @property
     def constraints_at_rows(self) -> bool:

@@ -52,7 +52,8 @@ class DiscreteGradient(AbstractScheme):
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
         return "the discrete gradient that (x₁ − x₀)/h is paired with in D is not saved; its balance is measured instead"
 
-    def step_form(self, system: Any, shape: Shape, step: Any) -> str:
+    @property
+    def keeps_no_form(self) -> str:
         return "discrete gradients keep the energy, and not the two-form or bivector of D"
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:

@@ -87,7 +87,8 @@ class EnergyCollocation(AbstractScheme):
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
         return "energy-preserving collocation is no discrete Dirac structure; its energy is measured instead"
 
-    def step_form(self, system: Any, shape: Shape, step: Any) -> str:
+    @property
+    def keeps_no_form(self) -> str:
         return "energy-preserving collocation keeps the energy, and no two-form or bivector"
 
     def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:

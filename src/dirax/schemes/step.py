@@ -250,8 +250,15 @@ class AbstractScheme(eqx.Module):
 
     def step_form(self, system: Any, shape: Shape, step: Any) -> AbstractStepForm | str:
         """The form on its states whose change in one step is known; or why none is."""
+        if self.keeps_no_form:
+            return self.keeps_no_form
         equation = make_step_equation(self, system, shape)
         return form_of_steps(system, shape, step, equation, self.discrete_structure(system, shape, step))
+
+    @property
+    def keeps_no_form(self) -> str:
+        """Why its steps keep no two-form and no bivector, whatever the system; empty for those that may."""
+        return ""
 
     @property
     def constraints_at_rows(self) -> bool:
