@@ -19,6 +19,7 @@ from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import LEAST_SIZE, balanced_inverse, power_of_two
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.rounding import rounding
+from dirax.schemes.step import first_of_each
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def close_sizes(at: Entries) -> list[np.ndarray]:
 
     stages, guesses, state, end = at.stages, at.guesses, at.state, at.state
     h = [fraction * at.h for _, fraction in stages]
-    for i in _first_of_each(stages):
+    for i in first_of_each(stages):
         stage_look(at.program, i).runs += 1
         ((residual, slopes),) = look(i, guesses[i], (end, SHORT), only=(RESIDUAL, SLOPES))
         ((end,),) = look(i, _updated(residual, slopes, guesses[i], np), (end, SHORT), only=(END,))
@@ -94,7 +95,7 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
             return jax.vmap(at)(jnp.stack(xs))
 
         end, found = state, []
-        for i in _first_of_each(equation.stages):
+        for i in first_of_each(equation.stages):
             stage, fraction = equation.stages[i]
             (residual,), (slopes,) = linear(i, guess[i], [end], [SHORT])
             end = stage.advance(_updated(residual, slopes, guess[i], jnp), end, t, SHORT * fraction * h, params)
@@ -109,11 +110,6 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params, t
     return one(*given) if axes is None else jax.vmap(one, in_axes=axes)(*given)
-
-
-def _first_of_each(stages: tuple) -> list[int]:
-    """The number of the first stage with each of the equations."""
-    return [i for i, (stage, _) in enumerate(stages) if all(stage is not other for other, _ in stages[:i])]
 
 
 def _updated(residual: Any, slopes: Any, u: Any, xp: ModuleType) -> Any:

@@ -16,6 +16,7 @@ from dirax.program.user_functions import evaluated
 from dirax.run.final_manifold import chain_at, on_chain, slope_of
 from dirax.run.start import Initial, Start
 from dirax.run.validate import Case
+from dirax.schemes.step import first_of_each
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -71,10 +72,7 @@ step turns what it is off into its opposite."""
 
 def _off_constraints(system: AbstractSystem, stages: tuple, state: np.ndarray, guesses: list, case: Case, params: Any) -> float:
     """By how much of its terms a step leaves a constraint to which the next one comes back; 0 for none."""
-    parts: list[tuple[Any, np.ndarray]] = []
-    for (stage, _), u in zip(stages, guesses, strict=True):
-        if all(stage is not other for other, _ in parts):
-            parts.append((stage, u))
+    parts = [(stages[i][0], guesses[i]) for i in first_of_each(stages)]
 
     def after(states: np.ndarray, t: float, h: float) -> np.ndarray:
         for stage, u in parts:

@@ -242,11 +242,13 @@ def warn_of_leaving(sol: Any) -> None:
     """Warn of the first trajectory of a run with a singular Lagrangian that leaves its final manifold."""
     if not {"q", "p"} <= sol.fields.keys() or sol.q.shape[-1] > MOST:
         return
-    for lane in range(sol.batch or 1):
+    chain = None
+    for lane in lanes_asked(sol.batch or 1).tolist():
         one = sol if sol.batch is None else sol[lane]
         q, p, t = np.asarray(one.q), np.asarray(one.p), np.asarray(one.t)
         v = one.initial.get("v", np.zeros_like(q[0]))
-        chain = chain_at(sol.system, q[0], v, float(t[0]), one.params)
+        if chain is None or sol.batch_params:  # that of one trajectory serves all with its params: to find one takes a while
+            chain = chain_at(sol.system, q[0], v, float(t[0]), one.params)
         if chain is None or chain.empty or len(chain.coordinates) - chain.clock != 2 * q.shape[1]:
             continue
         if text := left_manifold(chain, t, q, p, v, one.params):

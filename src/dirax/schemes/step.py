@@ -202,6 +202,11 @@ class StepSequence(eqx.Module):
         return f"StepSequence({counted(len(self.stages), 'stage')} of h·({fractions}); first {self.first!r})"
 
 
+def first_of_each(stages: Sequence[tuple[StepEquation, float]]) -> list[int]:
+    """The number of the first stage with each of the equations."""
+    return [i for i, (stage, _) in enumerate(stages) if all(stage is not other for other, _ in stages[:i])]
+
+
 def needs_every_part(equation: "StepEquation | StepSequence") -> bool:
     """Whether a row takes more than the first part of a step."""
     return len(equation.stages) > 1 and any(field.rule != "first" for field in equation.fields.values())

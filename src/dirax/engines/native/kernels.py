@@ -145,7 +145,7 @@ class Kernels:
         """Raise `UnsupportedPrimitive` for a step with too many operations."""
         self._planned()
 
-    @property
+    @functools.cached_property
     def written(self) -> int:
         """The scalar operations that are written out. Raises `UnsupportedPrimitive` where they are too many."""
         return count_operations(self._planned(), once=True)
