@@ -33,6 +33,22 @@ def field_of(system: RandomSystem):
     return jax.jit(field), jax.jit(jax.vmap(momentum, in_axes=(0, 0, 0, None)))
 
 
+@functools.lru_cache(maxsize=64)
+def rows_of(system: RandomSystem):
+    """((t, q, params) ↦ the independent rows, and all rows that multipliers of dirax belong to), over rows of (t, q)."""
+
+    def every(t, q, params):
+        rows = [jnp.zeros((0, system.kind.n))]
+        if system.kind.m:
+            rows.append(system.one_forms(q, params))
+        if system.kind.c:
+            rows.append(jax.jacfwd(lambda q: system.position(t, q, params))(q))
+        return jnp.concatenate(rows)
+
+    both = lambda t, q, params: (system.velocity_rows(t, q, params)[0], every(t, q, params))
+    return jax.jit(jax.vmap(both, in_axes=(0, 0, None)))
+
+
 def motion(system: RandomSystem, params: dict, start: dict, t: np.ndarray) -> dict[str, np.ndarray]:
     """q, p, work and the multipliers λ at the times."""
     n, k = system.kind.n, int(system.kind.m > 0) + int(system.kind.c > 0)
