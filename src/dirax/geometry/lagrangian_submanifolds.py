@@ -65,8 +65,11 @@ class LagrangianSubmanifold(eqx.Module):
         """The rank of [∂²F/∂s∂x, ∂²F/∂s∂s] at a concrete point, k for a Morse family."""
         if not self.parameters:
             return 0
-        slopes = jax.jacfwd(lambda x, s: self.defect(x, s, params), argnums=(0, 1))(jnp.asarray(x, float), jnp.asarray(s, float))
-        return int(jnp.linalg.matrix_rank(jnp.concatenate(slopes, axis=1)))
+        return int(jnp.linalg.matrix_rank(self.slopes(jnp.asarray(x, float), jnp.asarray(s, float), params)))
+
+    def slopes(self, x: Float[Array, " N"], s: Float[Array, " k"], params: Any = None) -> Float[Array, "k N+k"]:
+        """[∂²F/∂s∂x, ∂²F/∂s∂s]."""
+        return jnp.concatenate(jax.jacfwd(lambda x, s: self.defect(x, s, params), argnums=(0, 1))(x, s), axis=1)
 
     def tangent(self, x: Float[Array, " N"], s: Float[Array, " k"], params: Any = None) -> Float[Array, "two_N N"]:
         """A basis, by columns, of the tangent space of 𝓛 at a point of it: (δx, δα) with δ(∂F/∂s) = 0."""

@@ -16,11 +16,12 @@ from dirax.numerics.tolerances import INERTIA_RANK, ONE_FORM_RANK
 from dirax.program.legendre import constrained_velocity, moves
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
-from dirax.program.user_functions import UserFunction, evaluated, is_traced
+from dirax.program.user_functions import UserFunction
 from dirax.reduction.lie_poisson import LiePoisson, checked_point
 from dirax.systems.constraints import no_constraint
 from dirax.systems.forms import EnergyForm
 from dirax.systems.magnitudes import as_large_as_kinetic
+from dirax.systems.premise import Premise
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem, refuse_start
 
@@ -166,12 +167,14 @@ class EulerPoincare(AbstractSystem):
                     f"one_forms must have shape (m, d) = (m, {d}), 0 < m < {d}, one row a constraint on ξ, but it has {shape}."
                 )
             m = shape[0]
-        if not is_traced(data, params):
-            self._refuse_singular(momentum, a, params)
         return self.space.size, m
 
-    def _refuse_singular(self, momentum, a, params) -> None:
-        inertia, forms = map(np.asarray, evaluated(self._inertia_and_forms, momentum, a, params))
+    def premise(self, data: Data, params: Any) -> Premise:
+        """The inertia is regular, and the one-forms are independent."""
+        return Premise(self._inertia_and_forms, self._refuse_singular)
+
+    def _refuse_singular(self, found) -> None:
+        inertia, forms = found
         if not (np.all(np.isfinite(inertia)) and np.all(np.isfinite(forms))):
             return  # the first step says where
         if len(forms) and (rank := rank_of_equations(forms[None], ONE_FORM_RANK)[0][0]) < len(forms):
@@ -182,8 +185,9 @@ class EulerPoincare(AbstractSystem):
                 "determine ξ. Give every direction of the algebra an inertia, or take a smaller group."
             )
 
-    def _inertia_and_forms(self, momentum, a, params):
+    def _inertia_and_forms(self, data, params):
         """∂²l/∂ξ² at the ξ of μ, and A."""
+        momentum, a = self.space.split(self._on_the_dual(data, params)["x"])
         xi = self.inverse_legendre(momentum, a, params)
         return jacobian(lambda xi: self.legendre(xi, a, params))(xi), self.constraint_forms(a, params)
 

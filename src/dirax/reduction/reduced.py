@@ -1,6 +1,7 @@
 """Systems on the quotient by an abelian symmetry, and the way back."""
 
 from abc import abstractmethod
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -20,6 +21,7 @@ from dirax.reduction.sample_units import SampleUnits
 from dirax.reduction.symmetry import discrete_invariance, invariance, sampled_near, units_of
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.premise import Premise
 from dirax.systems.system import AbstractSystem
 
 NEARBY, SAMPLES = 0.3, 8
@@ -141,12 +143,18 @@ class AbstractReducedSystem(AbstractSystem):
     def refuse_asymmetry(self, data: Data, params: Any) -> None:
         """Raise `ValueError` where the group is no symmetry of the system, at or near initial data, which must be concrete."""
 
-    def refuse_asymmetry_once(self, data: Data, params: Any) -> None:
-        """The same of values that were not looked at before; of traced ones nothing is asked."""
+    @property
+    def premise_of_params(self) -> bool:
+        """The symmetry."""
+        return True
+
+    def check(self, data: Data, params: Any) -> None:
+        """Raise `ValueError` where the premise does not hold, or the group is no symmetry, at values not looked at before."""
         if not is_traced(data, params):
             values = [(str(name), np.asarray(a).tobytes()) for name, a in sorted(data.items())]
             leaves = [(str(where), np.asarray(a).tobytes()) for where, a in jax.tree_util.tree_leaves_with_path(params)]
             _symmetric.get((self, *values, *leaves), lambda: self.refuse_asymmetry(data, params))
+        super().check(data, params)
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         """Those of the unreduced system, of a saved row too."""
@@ -232,8 +240,30 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
     def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
         sizes = self.system.sizes(data, params)
         self.connection.check(sizes[0])
-        self.refuse_asymmetry_once(data, params)
         return sizes
+
+    def premise(self, data: Data, params: Any) -> Premise:
+        """The orbits of the group are free where a run begins: a generator that vanishes there has no inertia there only."""
+        away = 0.1 * self._units(data, params).q * np.random.default_rng(0).uniform(0.5, 1.0, self.point(data).shape)
+        return Premise(_Inertias(self.system, self.connection, tuple(away.tolist())), self._refuse_fixed_points)
+
+    def _refuse_fixed_points(self, found):
+        q, here, nearby = found
+        if not (np.all(np.isfinite(here)) and np.all(np.isfinite(nearby))):
+            return
+        own = diagonal_units(nearby)
+
+        def rank(inertia):
+            scaled = inertia / own / own[:, None]
+            if len(scaled) == 1:
+                return int(abs(scaled[0, 0]) > INERTIA_RANK)
+            return int(np.linalg.matrix_rank(scaled, tol=INERTIA_RANK, hermitian=True))
+
+        if rank(here) < rank(nearby):
+            raise ValueError(
+                f"the orbits of the group are not free at the initial point q = {q}: the group inertia has rank {rank(here)} "
+                f"there and {rank(nearby)} nearby. Start elsewhere, or use coordinates that do not end there."
+            )
 
     def refuse_asymmetric(self, functions: dict[str, UserFunction], data: Data, h: float, params: Any) -> None:
         """Raise `ValueError` where functions of ([t, ]q0, q1, h[, params]) are not invariant, at data that must be concrete."""
@@ -248,7 +278,6 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
             )
 
     def refuse_asymmetry(self, data, params) -> None:
-        q = data["q"] if "q" in data else data["q0"]
         units = self._units(data, params)
         found = invariance(self.system, self.action, *self.sampled(data, params), params, units)
         if not found.ok:
@@ -259,26 +288,18 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
                 f"the {found.of} is not invariant under translation of q[{worst}]: {what} = {found.defect:.3g} at "
                 f"q = {found.q}, v = {found.v}, at or near the initial data; take that coordinate out of fibre."
             )
-        inertia, nearby = group_inertia_ranks(self.system, self.connection, q, units.q, params)
-        if inertia < nearby:
-            raise ValueError(
-                f"the orbits of the group are not free at the initial point q = {np.asarray(q)}: the group inertia has rank "
-                f"{inertia} there and {nearby} nearby. Start elsewhere, or use coordinates that do not end there."
-            )
 
 
-def group_inertia_ranks(
-    system: LagrangeDirac, connection: AbstractConnection, q: Any, units: np.ndarray, params: Any
-) -> tuple[int, int]:
-    """Ranks of ∂²L/∂ġ² at rest at q and at a point near it, in these `units` (n,) of the coordinates: a generator that vanishes
-    at q has no inertia there only."""
-    fibre = list(connection.fibre)
-    whole = jax.hessian(lambda v, q: system.lagrangian.at(0.0, q, v, params))
-    away = np.asarray(q) + 0.1 * units * np.random.default_rng(0).uniform(0.5, 1.0, q.shape)
-    rest = np.zeros(np.shape(q))
-    here, nearby = (np.asarray(evaluated(whole, rest, np.asarray(at)))[np.ix_(fibre, fibre)] for at in (q, away))
-    if not (np.all(np.isfinite(here)) and np.all(np.isfinite(nearby))):
-        return len(fibre), len(fibre)
-    own = diagonal_units(nearby)
-    at_q, near = (int(np.linalg.matrix_rank(a / own / own[:, None], tol=INERTIA_RANK, hermitian=True)) for a in (here, nearby))
-    return at_q, near
+@dataclass(frozen=True)
+class _Inertias:
+    """(data, params) ↦ q, and ∂²L/∂ġ² at rest at q and at the point `away` from it."""
+
+    system: LagrangeDirac
+    connection: AbstractConnection
+    away: tuple[float, ...]
+
+    def __call__(self, data: Data, params: Any) -> tuple[Array, Array, Array]:
+        q, t, fibre = self.system.point(data), data.get("t", 0.0), np.array(self.connection.fibre)
+        rest, away = jnp.zeros_like(q), jnp.asarray(self.away)
+        here, nearby = (jnp.asarray(self.system.velocity_hessian(t, at, rest, params))[fibre][:, fibre] for at in (q, q + away))
+        return q, here, nearby

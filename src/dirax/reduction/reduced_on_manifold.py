@@ -83,9 +83,7 @@ class ReducedManifoldLagrangian(AbstractReducedSystem):
         return self.action.momentum_map(whole["q"], whole["p"])
 
     def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
-        sizes = self.system.sizes(data, params)
-        self.refuse_asymmetry_once(data, params)
-        return sizes
+        return self.system.sizes(data, params)
 
     def refuse_asymmetry(self, data: Data, params: Any) -> None:
         found = invariance(self.system, self.action, *self.sampled(data, params), params)

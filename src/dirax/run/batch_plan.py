@@ -13,7 +13,7 @@ from dirax.numerics.tolerances import CONSTRAINT_DEFECT
 from dirax.program.evaluation.functions import program_at
 from dirax.program.scalar_program import ScalarProgram
 from dirax.run.final_manifold import lanes_asked
-from dirax.run.premises import SURELY_REGULAR, Regular, asks_hessian, checks_of, scales_of
+from dirax.run.premises import SURELY_REGULAR, KeptPremise, Regular, asks_hessian, checks_of, scales_of
 from dirax.run.settings import Settings
 from dirax.run.start import Initial, Start, program_of_beginning, program_of_completion
 from dirax.run.validate import Case
@@ -36,7 +36,7 @@ class BatchPlan:
         self.jacobian = _scales(start.jacobian) if self.unknowns else None
         self.asks_hessian = asks_hessian(settings.system, shape, case)
         self.hessian: ScalarProgram | None = None
-        self.regular = Regular(None if case.batch_params else case.params)
+        self.regular, self.premise = Regular(None if case.batch_params else case.params), KeptPremise(settings.system, case)
 
     @property
     def whole(self) -> bool:
@@ -45,6 +45,8 @@ class BatchPlan:
 
     def problem(self, case: Case, steps: int, save_every: int) -> Problem | None:
         """The problem of a case; None where a premise is in doubt."""
+        if not self.premise.holds(case, self.regular):
+            return None
         size = case.batch or 1
         repeated = lambda leaf: np.broadcast_to(np.asarray(leaf), (size, *np.shape(leaf)))
         leaves = jax.tree.leaves(case.params)

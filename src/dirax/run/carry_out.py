@@ -21,7 +21,7 @@ from dirax.run.final_manifold import (
     warn_of_leaving,
 )
 from dirax.run.plan import AnyPlan, planned
-from dirax.run.premises import bytes_of
+from dirax.run.premises import bytes_of, check_premise
 from dirax.run.progress import reported, reporting
 from dirax.run.redundancy import redundant_constraints
 from dirax.run.refused_start import refuse_bad_start
@@ -187,6 +187,8 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     # discretize: constraints that follow from others at the completed data are left out of the equation
     with values_matter() as by_values:
         shape, redundant, singular = Shape(*system.sizes(data, own)), (), False
+    if not case.traced:
+        check_premise(system, case)
     initial = completed(system, case, settings.project, by_jax)
     if not (traced := case.traced or is_traced(initial)):
         redundant = redundant_constraints(system, initial.constraints, data, own, case.t0)

@@ -13,7 +13,7 @@ from dirax.numerics.tolerances import CONSTRAINT_DEFECT
 from dirax.program.evaluation.functions import program_at
 from dirax.program.evaluation.in_floats import Floats
 from dirax.run.batch_plan import BatchPlan
-from dirax.run.premises import SURELY_REGULAR, Regular, asks_hessian, checks_of, scales_of
+from dirax.run.premises import SURELY_REGULAR, KeptPremise, Regular, asks_hessian, checks_of, scales_of
 from dirax.run.settings import Settings
 from dirax.run.start import (
     Initial,
@@ -56,7 +56,7 @@ class Plan:
         self.asks_hessian = asks_hessian(settings.system, shape, case)
         self.hessian: Floats | None = None
         self.places = _places(initial.data)
-        self.regular = Regular(case.params)
+        self.regular, self.premise = Regular(case.params), KeptPremise(settings.system, case)
 
     @property
     def whole(self) -> bool:
@@ -65,6 +65,8 @@ class Plan:
 
     def problem(self, case: Case, steps: int, save_every: int) -> Problem | None:
         """The problem of a case; None where a premise is in doubt."""
+        if not self.premise.holds(case, self.regular):
+            return None
         leaves = jax.tree.leaves(case.params)
         data = [x for name in sorted(case.data) for x in case.data[name].tolist()]
         last = [*(x for leaf in leaves for x in leaf.ravel().tolist()), case.h, case.t0]

@@ -1,5 +1,6 @@
 """What the plans of single runs and of batches ask alike, so that the general way need not be asked."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -7,7 +8,9 @@ import jax
 import numpy as np
 
 from dirax.numerics.equilibration import equilibrated
-from dirax.run.final_manifold import MOST
+from dirax.program.evaluation.functions import program_at
+from dirax.program.evaluation.in_floats import Floats
+from dirax.run.final_manifold import MOST, lanes_asked
 from dirax.run.validate import Case
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.step import Shape, nothing_to_check
@@ -34,6 +37,58 @@ class Regular:
         if len(self._known) > REMEMBERED:
             self._known.clear()
         self._known.add(bytes_of(params))
+
+
+def check_premise(system: AbstractSystem, case: Case) -> None:
+    """Raise `ValueError` where the premise of the system does not hold in a trajectory of those that are asked."""
+    for lane in lanes_asked(case.batch or 1).tolist():
+        data, params = case.of(lane)
+        data["t"] = np.asarray(case.t0)
+        system.check(data, params)
+
+
+class KeptPremise:
+    """The premise of a system for a plan: by a program in floats, and asked anew for other numbers only."""
+
+    def __init__(self, system: AbstractSystem, case: Case):
+        data, params = case.of(0)
+        found = system.premise(data, params)
+        self.premise, self.of_params = found, system.premise_of_params
+        self.program: Floats | None = None
+        if found is None:
+            return
+        values = self._values(case, 0)
+        program = program_at(found.numbers, values)
+        numbers = jax.eval_shape(found.numbers, *values)
+        leaves, self.structure = jax.tree.flatten(numbers)
+        ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves]).tolist()
+        self.places = [(slice(end - math.prod(leaf.shape), end), leaf.shape) for end, leaf in zip(ends, leaves, strict=True)]
+        self.program, self.known = program and program.in_floats, None
+
+    def holds(self, case: Case, regular: Regular) -> bool:
+        """Whether it holds; False where the general way is to say so. Raises `ValueError` where it does not hold."""
+        if self.premise is None and not self.of_params:
+            return True
+        if self.of_params and (case.batch_params or case.params not in regular):
+            return False
+        return all([self._holds(case, lane) for lane in ([0] if case.batch is None else lanes_asked(case.batch).tolist())])
+
+    def _holds(self, case: Case, lane: int) -> bool:
+        if self.premise is None or self.program is None:
+            return False
+        try:
+            found = self.program([x for leaf in jax.tree.leaves(self._values(case, lane)) for x in leaf.ravel().tolist()])
+        except (ArithmeticError, ValueError):  # what Python's floats do not have
+            return False
+        if found != self.known:
+            arrays = [np.array(found[place]).reshape(shape) for place, shape in self.places]
+            self.premise.refuse(jax.tree.unflatten(self.structure, arrays))
+            self.known = found
+        return True
+
+    def _values(self, case: Case, lane: int) -> tuple[dict[str, Any], Any]:
+        data, params = case.of(lane) if case.batch is not None else (case.data, case.params)
+        return {**data, "t": np.asarray(case.t0)}, params
 
 
 def bytes_of(params: Any) -> tuple:

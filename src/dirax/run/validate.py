@@ -55,8 +55,12 @@ class Case:
     @property
     def first(self) -> tuple[dict[str, Any], Any]:
         """Data and parameters of the first trajectory."""
-        params = jax.tree.map(lambda leaf: leaf[0], self.params) if self.batch_params else self.params
-        return {name: a[0] if a.ndim == 2 else a for name, a in self.data.items()}, params
+        return self.of(0)
+
+    def of(self, lane: int) -> tuple[dict[str, Any], Any]:
+        """Data and parameters of one trajectory."""
+        params = jax.tree.map(lambda leaf: leaf[lane], self.params) if self.batch_params else self.params
+        return {name: a[lane] if a.ndim == 2 else a for name, a in self.data.items()}, params
 
     @property
     def two_points(self) -> bool:

@@ -107,6 +107,7 @@ def discrete_constraint_algorithm(
     check_finite("near", given)
     data = {name: jnp.asarray(value, float) for name, value in given.items()}
     equation = make_step_equation(scheme, system, Shape(*system.sizes(data, params)))
+    system.check(data, params)
     if not isinstance(equation, StepEquation):
         raise TypeError(
             "the discrete constraint algorithm takes one equation a step, but the scheme is a composition of several."

@@ -16,12 +16,13 @@ from dirax.numerics.tolerances import BRACKET_DEFECT, RATE_RANK
 from dirax.program.linear_solves import scaled_inverse, solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
-from dirax.program.user_functions import UserFunction, evaluated, is_traced
+from dirax.program.user_functions import UserFunction, evaluated
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
 from dirax.systems.hamilton_dirac import HamiltonDirac
 from dirax.systems.implicit_form import energy_of_x, names, point_of
 from dirax.systems.magnitudes import as_large_as_energy, of_solution
+from dirax.systems.premise import Premise
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -119,6 +120,7 @@ class DiracSystem(AbstractSystem):
         if phase is not None and phase.constraints.any:  # rows of F add velocities to forces, which have other units
             return phase.implicit_form(x, params)._replace(about="q̇ = ∂H/∂p, ṗ = −∂H/∂q + Wᵀu, W q̇ = 0")
         c = sum(self.sizes({"x": jnp.asarray(x)}, params)[1:])
+        self.check({"x": jnp.asarray(x)}, params)
 
         def equations(x, params):
             matrix, right = self.equations(x, params)
@@ -244,7 +246,7 @@ class DiracSystem(AbstractSystem):
         return jnp.concatenate([data["q"], data["p"]])
 
     def sizes(self, data: Data, params: Any) -> tuple[int, ...]:
-        """(N, 0), or (N, 0, c) with holonomic constraints. Raises `ValueError` where the structure at x is none."""
+        """(N, 0), or (N, 0, c) with holonomic constraints."""
         x = self.point(data)
         out = self.hamiltonian.shape(x, params)
         if out.shape != ():
@@ -255,10 +257,14 @@ class DiracSystem(AbstractSystem):
                 f"the Dirac structure has dimension {F.shape[0]}, but x has {x.size} entries"
                 + (f": {self.structure.ports} ports are open; connect them by `compose`." if self.structure.ports else ".")
             )
-        if not is_traced(x, params):  # whether the matrices are those of a Dirac structure is seen in numbers alone
-            matrices = evaluated(self.structure.evaluate, x, params)
-            KERNEL_PAIRS[self.structure.representation](*(np.asarray(matrix) for matrix in matrices))
         return (x.size, 0) if self.holonomic is None else (x.size, *self.constraints.sizes(x, params))
+
+    def premise(self, data: Data, params: Any) -> Premise:
+        """The matrices are those of a Dirac structure."""
+        return Premise(self._structure_matrices, lambda matrices: KERNEL_PAIRS[self.structure.representation](*matrices))
+
+    def _structure_matrices(self, data, params):
+        return self.structure.evaluate(self.point(data), params)
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         """x, ẋ and λ; `project` moves x to M_f where D is a graph."""

@@ -12,10 +12,10 @@ from dirax.geometry.structures import DiracStructure
 from dirax.numerics.arrays import Data, Numbers
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian
-from dirax.program.user_functions import is_traced
 from dirax.systems.forms import ImplicitForm, RelationForm
 from dirax.systems.implicit_form import names
 from dirax.systems.magnitudes import as_large_as_energy, of_solution
+from dirax.systems.premise import Premise
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -67,6 +67,7 @@ class GeneralizedDiracSystem(AbstractSystem):
         named = near if isinstance(near, dict) else {"x": near}
         given: Data = {name: jnp.asarray(value, dtype=float) for name, value in named.items()}
         N, k = self.sizes(given, params)
+        self.check(given, params)
         found = self.complete(given, params, False)
 
         def equations(z, params):
@@ -113,14 +114,23 @@ class GeneralizedDiracSystem(AbstractSystem):
         N = self.structure.n or jax.eval_shape(lambda x: self.structure.kernel(x, params), x)[0].shape[0]
         if x.shape[0] != N:
             raise ValueError(f"the Dirac structure has dimension {N}, but x has {x.shape[0]} entries.")
-        if not is_traced(data, params):
-            found = self.complete(data, params, False)
-            if (rank := self.submanifold.morse_rank(found["x"], found["guess"], params)) < k:
-                raise ValueError(
-                    f"F(x, s) is no Morse family at the initial point x = {np.asarray(found['x'])}, s = "
-                    f"{np.asarray(found['guess'])}: [∂²F/∂s∂x, ∂²F/∂s∂s] has rank {rank} of {k} there; leave out parameters."
-                )
         return x.shape[0], k
+
+    def premise(self, data: Data, params: Any) -> Premise:
+        """F(x, s) is a Morse family: [∂²F/∂s∂x, ∂²F/∂s∂s] has full rank."""
+        return Premise(self._slopes, self._refuse)
+
+    def _slopes(self, data, params):
+        found = self.complete(data, params, False)
+        return found["x"], found["guess"], self.submanifold.slopes(found["x"], found["guess"], params)
+
+    def _refuse(self, found):
+        x, s, slopes = found
+        if len(s) and (rank := np.linalg.matrix_rank(slopes)) < len(s):
+            raise ValueError(
+                f"F(x, s) is no Morse family at the initial point x = {x}, s = {s}: [∂²F/∂s∂x, ∂²F/∂s∂s] has rank {rank} of "
+                f"{len(s)} there; leave out parameters."
+            )
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         """x, ẋ and the parameters s as the first `guess` of the multipliers."""

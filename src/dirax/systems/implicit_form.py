@@ -20,6 +20,7 @@ def of_relation(system: Any, near: Any, params: Any) -> ImplicitForm:
     if not isinstance(at, dict) or "x" in at or set(at) == {"q", "p"}:
         x = point_of(at, ("x",), system)
         shape = Shape(*system.sizes({"x": jnp.asarray(x)}, params))
+        system.check({"x": jnp.asarray(x)}, params)
         form = system.relation_form(shape)
     if form is None or x is None:
         raise TypeError(

@@ -12,11 +12,12 @@ from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.equilibration import diagonal_units
 from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.program.linear_solves import solve
-from dirax.program.user_functions import UserFunction, evaluated, is_traced
+from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import ImplicitForm
 from dirax.systems.implicit_lagrangian import implicit_lagrangian
 from dirax.systems.lagrange_dirac import LagrangeDirac
+from dirax.systems.premise import Premise
 from dirax.systems.system import AbstractSystem, refuse_start
 
 
@@ -116,12 +117,17 @@ class NonholonomicMechanics(AbstractSystem):
         metric = self.metric.shape(*self.metric.given(t, q, params))
         if metric.shape != (n, n):
             raise ValueError(f"metric must return shape ({n}, {n}), but it returned shape {metric.shape}.")
-        if not is_traced(q, params):
-            _check_metric(np.asarray(evaluated(self.metric, *self.metric.given(t, q, params))))
         potential = self.potential.shape(*self.potential.given(t, q, params))
         if potential.shape != ():
             raise ValueError(f"potential must return a scalar, but it returned shape {potential.shape}.")
         return self.lagrange_dirac().sizes(data, params)
+
+    def premise(self, data: Data, params: Any) -> Premise:
+        """The metric is symmetric and positive definite."""
+        return Premise(self._metric_at, _check_metric)
+
+    def _metric_at(self, data, params):
+        return self.metric.at(data.get("t", 0.0), self.point(data), params)
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         return self.lagrange_dirac().complete(data, params, project)

@@ -13,13 +13,20 @@ from dirax.geometry.subspaces import PontryaginSubspace
 from dirax.numerics.arrays import Data, Numbers
 from dirax.program.sparse_matrix import SparseMatrix
 from dirax.program.tracing import gradient
-from dirax.program.user_functions import UserFunction, is_traced
+from dirax.program.user_functions import UserFunction
 from dirax.systems.constraints import no_constraint
 from dirax.systems.forms import EnergyForm, ImplicitForm, Observed, RelationForm
 from dirax.systems.implicit_form import in_time, names, point_of, uses_time, without_time
 from dirax.systems.magnitudes import as_large_as_energy
-from dirax.systems.port_matrices import constituent, matrix_function, refuse_unless_dissipative, refuse_unless_skew
+from dirax.systems.port_matrices import (
+    ConstantFunction,
+    constituent,
+    matrix_function,
+    refuse_unless_dissipative,
+    refuse_unless_skew,
+)
 from dirax.systems.port_structures import closed_structure, structure_of
+from dirax.systems.premise import Premise
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -158,6 +165,7 @@ class PortHamiltonian(AbstractSystem):
         self._refuse_dissipation()
         x = jnp.asarray(x, dtype=float)
         self.sizes({"x": x}, params)
+        self.check({"x": x}, params)
         return structure_of(self, x, params)
 
     def closed_dirac_structure(self) -> DiracStructure:
@@ -183,6 +191,7 @@ class PortHamiltonian(AbstractSystem):
         near, t = without_time(near)
         x = point_of(near, ("x",), self)
         n, m = self.sizes({"x": jnp.asarray(x)}, params)
+        self.check({"x": jnp.asarray(x)}, params)
 
         def equations(t, x, params):
             dh = self.differential(x, params)
@@ -224,11 +233,21 @@ class PortHamiltonian(AbstractSystem):
                 raise ValueError(
                     f"inputs must return shape ({len(unclosed)},), one number an open port, but it returned shape {shape}."
                 )
-        if not is_traced(x, params):
-            refuse_unless_skew(self.J, x, params)
-            if self.R is not None:
-                refuse_unless_dissipative(self.R, x, params)
         return size, len(closed)
+
+    def premise(self, data: Data, params: Any) -> Premise:
+        """J is skew, and R symmetric and positive semidefinite."""
+        return Premise(self._matrices, self._refuse)
+
+    def _matrices(self, data, params):
+        """Those of J and R that depend on x, or may."""
+        given = {"J": self.J, "R": self.R}
+        return {name: f(data["x"], params) for name, f in given.items() if f is not None and not isinstance(f, ConstantFunction)}
+
+    def _refuse(self, matrices):
+        refuse_unless_skew(self.J, matrices.get("J"))
+        if self.R is not None:
+            refuse_unless_dissipative(self.R, matrices.get("R"))
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         x = data["x"]

@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.numerics.arrays import Numbers
 from dirax.numerics.tolerances import STRUCTURE_DEFECT, TINY
 from dirax.program.sparse_matrix import SparseMatrix
-from dirax.program.user_functions import UserFunction, evaluated
+from dirax.program.user_functions import UserFunction
 
 
 def matrix_function(value: Any, name: str) -> UserFunction:
@@ -50,17 +49,17 @@ def constituent(function: UserFunction | None):
     return None if function is None else function.function
 
 
-def refuse_unless_skew(J: UserFunction, x: Numbers, params: Any) -> None:
-    """Raise `ValueError` where J is not skew at x, with the defect."""
-    matrix, where = _matrix_at(J, x, params)
+def refuse_unless_skew(J: UserFunction, found: np.ndarray | None) -> None:
+    """Raise `ValueError` where J, `found` unless it is a constant one, is not skew, with the defect."""
+    matrix, where = _matrix_of(J, found)
     if (skewness := _largest(matrix + matrix.T)) > STRUCTURE_DEFECT * max(_largest(matrix), TINY):
         raise ValueError(f"J is not skew{where}: max |J + Jᵀ| = {skewness:.3g}; put its symmetric part into R.")
 
 
-def refuse_unless_dissipative(R: UserFunction, x: Numbers, params: Any) -> None:
-    """Raise `ValueError` where R is not symmetric positive semidefinite at x, with the defect; of a sparse one what follows from
-    its symmetry and its diagonal, row by row."""
-    matrix, where = _matrix_at(R, x, params)
+def refuse_unless_dissipative(R: UserFunction, found: np.ndarray | None) -> None:
+    """Raise `ValueError` where R, `found` unless it is a constant one, is not symmetric positive semidefinite, with the defect;
+    of a sparse one what follows from its symmetry and its diagonal, row by row."""
+    matrix, where = _matrix_of(R, found)
     scale = max(_largest(matrix), TINY)
     if (defect := _largest(matrix - matrix.T)) > STRUCTURE_DEFECT * scale:
         raise ValueError(f"R is not symmetric{where}: max |R − Rᵀ| = {defect:.3g}.")
@@ -71,11 +70,11 @@ def refuse_unless_dissipative(R: UserFunction, x: Numbers, params: Any) -> None:
         raise ValueError(f"R is not positive semidefinite{where}: {what}; dissipation must not create energy.")
 
 
-def _matrix_at(function: UserFunction, x: Numbers, params: Any) -> tuple[Any, str]:
-    """The matrix at x, one of SciPy where it is sparse, and where this is, in words."""
+def _matrix_of(function: UserFunction, found: np.ndarray | None) -> tuple[Any, str]:
+    """The matrix, one of SciPy where it is sparse, and where this is, in words."""
     if isinstance(function, ConstantFunction):
         return function(None).matrix, ""
-    return np.asarray(evaluated(function, x, params)), " at the initial point"
+    return found, " at the initial point"
 
 
 def _largest(matrix: Any) -> float:

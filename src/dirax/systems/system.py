@@ -12,9 +12,11 @@ from dirax.geometry.semidirect import SemidirectProduct
 from dirax.numerics.arrays import Data, Numbers
 from dirax.program.rounding import sizes_of_terms
 from dirax.program.tracing import gradient, jacobian
+from dirax.program.user_functions import is_traced
 from dirax.systems.constraints import Constraints
 from dirax.systems.forms import EnergyForm, FinalManifold, ImplicitForm, RelationForm
 from dirax.systems.implicit_form import of_relation
+from dirax.systems.premise import Premise
 from dirax.systems.shape import Shape
 from dirax.text.representation import module_html, module_text
 
@@ -168,6 +170,21 @@ class AbstractSystem(eqx.Module):
         return self.constraints.nearest_velocity(t, q, v, self.constraints.matrix(t, q, params).T, params)
 
     # ------------------------------------------------------------------ the rest
+
+    def premise(self, data: Data, params: Any) -> Premise | None:
+        """What has to hold of numbers at initial data beside their shapes, for runs that begin near these, which are concrete;
+        None for a system that presupposes nothing of the kind."""
+        return None
+
+    def check(self, data: Data, params: Any) -> None:
+        """Raise `ValueError` where the premise does not hold at initial data; of traced ones nothing is asked."""
+        if not is_traced(data, params) and (premise := self.premise(data, params)):
+            premise.check(data, params)
+
+    @property
+    def premise_of_params(self) -> bool:
+        """Whether there is a premise of the functions themselves too, which other params may break: `check` asks it."""
+        return False
 
     def lagrangian_value(self, t: Any, q: Numbers, v: Numbers, params: Any) -> Float[Numbers, ""] | None:
         """L(t, q, v), by which data outside its domain are found; None for a system without a Lagrangian."""
