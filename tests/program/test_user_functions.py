@@ -126,6 +126,21 @@ def test_names_of_the_interface_in_other_places_are_refused(function, arguments,
         UserFunction(function, "force", arguments, timed)
 
 
+def keyword_params(q, v, *, params=None):
+    return v @ v
+
+
+def keyword_time(q, v, *, t=0.0):
+    return v @ v
+
+
+@pytest.mark.parametrize(("function", "word"), [(keyword_params, "params"), (keyword_time, "t")])
+def test_what_is_taken_by_keyword_alone_would_never_be_given(function, word):
+    with pytest.raises(TypeError, match=rf"takes {word} by keyword alone, so that it would never be given: take the \* before"):
+        UserFunction(function, "force", ("q", "v"), True)
+    UserFunction(functools.partial(function, **{word: 1.0}), "force", ("q", "v"), True)  # bound by the user
+
+
 @pytest.mark.parametrize(
     "function, arguments, timed",
     [

@@ -25,7 +25,7 @@ REDUCED = dx.reduce(
     ),
     dx.LinearConnection(fibre=[1]),
 )
-SUSLOV = dx.EulerPoincare(dx.SO3(), lambda xi, params: xi @ (params["inertia"] * xi) / 2)
+BODY = dx.EulerPoincare(dx.SO3(), lambda xi, params: xi @ (params["inertia"] * xi) / 2)
 
 CASES = {
     "skewness": (PORT, dx.DiscreteGradient(), {"x": [0.3, 0.2], "params": {"a": -1.0}}, {"params": {"a": -1.1}}, "J is not skew"),
@@ -53,7 +53,7 @@ CASES = {
         *({"params": {"k": 1.0, "e": 0.1}}, "not invariant"),
     ),
     "inertia": (
-        *(SUSLOV, dx.DiscreteEulerPoincare(), {"x": [0.3, 0.1, 0.2], "params": {"inertia": np.array([1.0, 2.0, 3.0])}}),
+        *(BODY, dx.DiscreteEulerPoincare(), {"x": [0.3, 0.1, 0.2], "params": {"inertia": np.array([1.0, 2.0, 3.0])}}),
         *({"params": {"inertia": np.array([1.0, 0.0, 3.0])}}, "singular"),
     ),
 }

@@ -1,5 +1,6 @@
 """Signatures of user functions: whether they take the time and params, and whether their names stand where they are given."""
 
+import functools
 import inspect
 from collections.abc import Callable, Sequence
 
@@ -48,6 +49,14 @@ def refuse_other_places(function: Callable, name: str, expected: str, arguments:
 
     Other names are free, and what stands for params may have any that is not one of the arguments."""
     words, given = WORDS.union(arguments), _positional(function)
+    bound = function.keywords if isinstance(function, functools.partial) else {}
+    for parameter in _parameters(function) or ():
+        if parameter.kind is parameter.KEYWORD_ONLY and parameter.name in words and parameter.name not in bound:
+            raise TypeError(
+                f"{name} must have the signature {expected}, whose arguments are given by place, but "
+                f"{getattr(function, '__name__', 'it')} takes {parameter.name} by keyword alone, so that it would never be given: "
+                "take the * before it away."
+            )
     for wanted, word in zip((*arguments, "params"), given, strict=False):
         if word != wanted and (word in words or RIVALS.get(word) == wanted):
             raise TypeError(
