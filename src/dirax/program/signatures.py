@@ -54,8 +54,8 @@ def refuse_other_places(function: Callable, name: str, expected: str, arguments:
         if parameter.kind is parameter.KEYWORD_ONLY and parameter.name in words and parameter.name not in bound:
             raise TypeError(
                 f"{name} must have the signature {expected}, whose arguments are given by place, but "
-                f"{getattr(function, '__name__', 'it')} takes {parameter.name} by keyword alone, so that it would never be given: "
-                "take the * before it away."
+                f"{getattr(function, '__name__', 'it')} takes {parameter.name} by keyword alone, so that it would never be "
+                "given: take the * before it away."
             )
     for wanted, word in zip((*arguments, "params"), given, strict=False):
         if word != wanted and (word in words or RIVALS.get(word) == wanted):

@@ -23,7 +23,7 @@ from dirax.run.final_manifold import (
 from dirax.run.plan import AnyPlan, planned
 from dirax.run.premises import bytes_of, check_premise
 from dirax.run.progress import reported, reporting
-from dirax.run.redundancy import redundant_constraints
+from dirax.run.redundancy import redundant_constraints, redundant_in_numbers
 from dirax.run.refused_start import refuse_bad_start
 from dirax.run.result import solution_of
 from dirax.run.settings import Settings, kind_of
@@ -116,6 +116,8 @@ def carried_out(
     settings: Settings, case: Case, steps: int, save_every: int, progress: Any, kind: Kind | None = None, entered: float = 0.0
 ) -> Solution:
     """The Solution of a run. Raises `ValueError` for data that a premise excludes."""
+    if case.traced and settings.system.constraints.any:
+        case = replace(case, redundant=redundant_in_numbers(settings.system, case, settings.project))
     if settings.events:
         return run_with_events(carried_out, _begun, settings, case, steps, save_every, progress, kind, entered)
     began, progress = time.perf_counter(), reported(progress)
@@ -186,7 +188,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     data, own = case.first
     # discretize: constraints that follow from others at the completed data are left out of the equation
     with values_matter() as by_values:
-        shape, redundant, singular = Shape(*system.sizes(data, own)), (), False
+        shape, redundant, singular = Shape(*system.sizes(data, own)), case.redundant, False
     if not case.traced:
         check_premise(system, case)
     initial = completed(system, case, settings.project, by_jax)

@@ -1,8 +1,9 @@
 """Constraints that follow from others: found where a run begins, left out of its equations, and reported."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,6 +12,9 @@ from dirax.numerics.tolerances import CONSTRAINT_DEFECT
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import at_values
 from dirax.program.memo import Same
+from dirax.program.user_functions import constant_entries, is_traced
+from dirax.run.start import completed
+from dirax.run.validate import Case
 from dirax.systems.constraints import Constraints
 from dirax.systems.system import AbstractSystem
 
@@ -48,6 +52,39 @@ def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, par
     return tuple(row for row in range(total) if row not in kept)
 
 
+def redundant_in_numbers(system: AbstractSystem, case: Case, project: bool) -> tuple[int, ...]:
+    """The same of a case with traced values, as far as numbers that JAX knows decide it: all of them under `jax.grad`, and of
+    constraints that depend on none that are traced under any transformation; none where that is not so."""
+    known = replace(case, **{name: jax.tree.map(_number, getattr(case, name)) for name in ("data", "params", "h", "t0")})
+    if not known.traced:
+        data, params = known.first
+        return redundant_constraints(system, completed(system, known, project).constraints, data, params, known.t0)
+    several = known.batch_params or any(np.ndim(a) == 2 for a in known.data.values())
+    if project or several or case.two_points:
+        return ()
+    leaves, structure = jax.tree.flatten((known.t0, *known.first))
+    moving = [leaf for leaf in leaves if is_traced(leaf)]
+
+    def constraints(*moving):
+        rest = iter(moving)
+        t, data, params = jax.tree.unflatten(structure, [next(rest) if is_traced(leaf) else leaf for leaf in leaves])
+        q = system.point(data)
+        matrix, still = system.constraints.matrix(t, q, params), jnp.zeros_like(q)
+        return jnp.concatenate([matrix, system.constraints.defect(t, q, still, params)[: len(matrix), None]], axis=1)
+
+    found = constant_entries(constraints, *moving)
+    if found is None or np.any(np.isnan(found)):
+        return ()
+    t0, data, params = jax.tree.unflatten(structure, [np.ones(np.shape(leaf)) if is_traced(leaf) else leaf for leaf in leaves])
+    return redundant_constraints(system, found[:, :-1], data, params, t0)
+
+
+def _number(leaf: Any) -> Any:
+    """What `jax.grad` traces as what it is; other values as they are."""
+    number = jax.lax.stop_gradient(leaf) if is_traced(leaf) else leaf
+    return np.asarray(number)[()] if isinstance(number, jax.Array) and not is_traced(number) else number
+
+
 def _independent(matrices: np.ndarray, rows: list[int]) -> list[int]:
     """Those of the rows (of matrices (1, m, n)) that do not follow from the ones before: most of many, so that the next one that
     does is looked for in steps that double, and then between the last two."""
@@ -75,8 +112,7 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
             f"constraint {zero[0]} (in the order of the multipliers: one_forms, then holonomic) has no direction at the "
             f"initial data{where}: its row of [W; ∂g/∂q] is zero there. Leave it out, or start elsewhere."
         )
-    q = jnp.asarray(system.point(data))
-    values = np.asarray(q, float), params, np.asarray(t0, float)
+    values = np.asarray(system.point(data), float), params, np.asarray(t0, float)
     nearby = _Nearby(Same(system))
     found = at_values(nearby, values)
     near, left, terms = map(np.asarray, compiled(nearby)(*values) if found is None else found[0])

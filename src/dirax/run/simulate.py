@@ -67,7 +67,9 @@ def simulate(
 
     Constraints of a Lagrangian system that follow from others where the run begins are left out of its equations:
     `sol.stats["redundant_constraints"]` numbers them in the order of `sol.multipliers`, where theirs are zero, and their
-    residual is saved with the others. Under a JAX transformation none are looked for.
+    residual is saved with the others. Under a JAX transformation they are found from the numbers that JAX knows: under `jax.grad`
+    always, under `jit` and `vmap` where the constraints depend on no traced value. A run whose redundant constraints are not
+    found fails.
 
     Raises `ValueError` or `TypeError`, naming the argument, for wrong shapes, dtypes and arities, values that are not
     finite, `step` ≤ 0, `step` and `tolerance` both or neither, `steps` < 1, data off the constraints, constraints that

@@ -48,7 +48,7 @@ def carried_by_jax(carried: Callable[[Case], Carried], settings: Settings, case:
     moves = tuple(isinstance(leaf, Tracer) or np.asarray(leaf).dtype.kind == "f" for leaf in leaves)
     value = lambda leaf: (np.asarray(leaf).dtype.char, np.asarray(leaf).tobytes())
     kept = tuple(() if m else value(leaf) for m, leaf in zip(moves, leaves, strict=True))
-    shapes = tuple(map(np.shape, leaves)), case.batch, case.batch_params
+    shapes = tuple(map(np.shape, leaves)), case.batch, case.batch_params, case.redundant
     kind = _kinds.get((settings.key, structure, moves, kept, shapes, others), lambda: _kind(carried, case, leaves, moves))
     arrays, more = kind.arrays([leaf for leaf, m in zip(leaves, moves, strict=True) if m])
     problem = kind.problem.with_numbers(params=case.params, h=case.h, t0=case.t0)

@@ -51,6 +51,8 @@ class Case:
     t0: Any
     batch: int | None = None
     batch_params: bool = False
+    redundant: tuple[int, ...] = ()
+    """Of a case with traced values: the constraints that are known to follow from others."""
 
     @property
     def first(self) -> tuple[dict[str, Any], Any]:
