@@ -9,6 +9,7 @@ import numpy as np
 from dirax.diagnostics.linearized_field import FieldAt, linearized_chain, linearized_lagrangian
 from dirax.diagnostics.linearized_step import linearized_step
 from dirax.numerics.tolerances import TINY
+from dirax.program.captured import functions_in, refuse_changed
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
 from dirax.text.tables import text_table
@@ -124,6 +125,7 @@ def linearize(
     generators = list(symmetries.values()) if isinstance(symmetries, Mapping) else list(symmetries)
     if (scheme is None) != (step is None):
         raise ValueError("a scheme is linearized with its step: give scheme= and step= together, or neither.")
+    refuse_changed(functions_in([system, scheme]))
     wanted = ("x",) if system.lagrangian_form() is None else ("q", "v")
     if not isinstance(at, Mapping) or not set(wanted) <= set(at):
         given = f"{', '.join(map(str, at)) or 'nothing'} was given" if isinstance(at, Mapping) else f"{at!r:.80} was given"

@@ -15,6 +15,7 @@ from jax.core import Tracer
 from jax.experimental import checkify
 from jax.extend.core import jaxprs_in_params
 
+from dirax.program.captured import Captured, as_stated, refuse_changed
 from dirax.program.compiled import compiled
 from dirax.program.memo import Memo
 from dirax.program.signatures import parameters_of, refuse_other_places, takes_params, takes_time
@@ -68,6 +69,7 @@ class UserFunction(eqx.Module):
     arguments: tuple[str, ...] = eqx.field(static=True)
     takes_params: bool = eqx.field(static=True)
     takes_time: bool = eqx.field(static=True)
+    captured: Captured = eqx.field(static=True)
 
     def __init__(self, function: Callable, name: str, arguments: tuple[str, ...], timed: bool = False):
         expected = f"{name}({', '.join(arguments)}[, params])"
@@ -85,7 +87,7 @@ class UserFunction(eqx.Module):
         self.arguments = ("t", *arguments) if self.takes_time else tuple(arguments)
         self.takes_params = takes_params(function, name, expected, len(self.arguments))
         refuse_other_places(function, name, expected, self.arguments)
-        self.function, self.name = _hashable(function), name
+        self.name, (self.captured, self.function) = name, as_stated(_hashable(function))
 
     def __call__(self, *values: Any):
         *args, params = values
@@ -94,6 +96,7 @@ class UserFunction(eqx.Module):
                 f"{self._call} is not called with its {len(self.arguments)} arguments here, but with {len(args)}"
                 + (f": {NO_MULTIPLIERS}." if "multipliers" in self.arguments else "; params, which may be None, come last.")
             )
+        refuse_changed([(self.name, self.captured)])
         return once(self.function)(*args, *((params,) if self.takes_params else ()))
 
     def at(self, t: Any, *values: Any):

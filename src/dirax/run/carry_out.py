@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Outcome, Problem
+from dirax.program.captured import Captured, functions_in, refuse_changed
 from dirax.program.memo import Memo, patience
 from dirax.program.user_functions import is_traced, values_matter
 from dirax.run.composition_premise import refuse_leaving_final_manifold
@@ -53,6 +54,8 @@ class Kind:
     plan: AnyPlan | None = None
     engine: Callable | None = None
     starts: dict[tuple, "Begun"] = field(default_factory=dict)
+    reads: list[tuple[str, Captured]] = field(default_factory=list)
+    """What their functions read from outside."""
 
     def again(self, case: Case, steps: int, save_every: int, asked: int) -> "Begun | None":
         """The start of a run from the same numbers, of so many steps."""
@@ -86,7 +89,11 @@ def kind_for(settings: Settings, case: Case) -> Kind | None:
     values are traced."""
     if not case.plain:
         return None
-    return _kinds.get((settings.key, kind_of(case)), Kind)
+    return _kinds.get((settings.key, kind_of(case)), lambda: Kind(reads=_reads(settings)))
+
+
+def _reads(settings: Settings) -> list[tuple[str, Captured]]:
+    return list(functions_in([settings.system, settings.scheme]))
 
 
 @dataclass
@@ -123,6 +130,7 @@ def carried_out(
     began, progress = time.perf_counter(), reported(progress)
     every = _checked_times(case, steps, save_every)
     kind = None if settings.to is not None else kind or kind_for(settings, case)
+    refuse_changed(_reads(settings) if kind is None else kind.reads)
     if kind is None and case.traced:
         problem, outcome, row0 = carried_by_jax(_by_jax(settings, steps, every), settings, case, steps, every)
         return solution_of(settings.system, settings.scheme, case, problem, outcome, row0, True)

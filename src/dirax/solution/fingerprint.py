@@ -1,6 +1,5 @@
 """Fingerprints: what a store on the disk belongs to, by digests of functions, by their program or their code, and of values."""
 
-import dis
 import hashlib
 import json
 import re
@@ -13,6 +12,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
+from dirax.program.captured import reads
 from dirax.solution.plain_forms import encode_scheme
 
 ADDRESS = re.compile(r"0x[0-9a-fA-F]+")
@@ -190,17 +190,10 @@ def _add_function(add: Callable[[bytes], None], function: types.FunctionType, se
             _add_code(add, cell.cell_contents, seen)
         except ValueError:  # not yet filled
             add(b"empty")
-    for name in sorted(_names(code)):
+    for name in sorted(reads(code).globals):
         if name in function.__globals__:
             add(name.encode())
             _add_code(add, function.__globals__[name], seen)
-
-
-def _names(code: types.CodeType) -> set[str]:
-    """The global names that code reads, that of functions inside it too."""
-    own = {i.argval for i in dis.get_instructions(code) if i.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
-    inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
-    return own.union(*map(_names, inner))
 
 
 def _add_instructions(add: Callable[[bytes], None], code: types.CodeType, seen: set[int]) -> None:

@@ -7,6 +7,7 @@ conditions, and are not asked again.
 
 from typing import Any
 
+from dirax.program.captured import functions_in, refuse_changed
 from dirax.program.user_functions import check_finite, is_traced
 from dirax.systems.constraint_chain import ConstraintChain
 from dirax.systems.constraint_search import Search
@@ -33,4 +34,5 @@ def constraint_algorithm(system: AbstractSystem, near: Any, params: Any = None, 
     if not isinstance(system, AbstractSystem):
         raise TypeError(f"system must be a dirax system, but {system!r:.80} was given: state it as dx.ImplicitSystem(E, f, B).")
     check_finite("near", near)
+    refuse_changed(functions_in(system))
     return Search(system.implicit_form(near, params), params, radius).run()

@@ -1,0 +1,147 @@
+"""What user functions read from outside of their arguments: a system has the values of when it was stated, or says so."""
+
+import functools
+import pickle
+
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.program.captured import Captured
+
+MIDPOINT = dx.LagrangeDAlembert()
+stiffness = 1.0
+
+
+def end(system, **more):
+    """q after a unit of time from q = 1 at rest: cos √k, up to the error of the scheme."""
+    return dx.simulate(system, MIDPOINT, q=[1.0], v=[0.0], step=0.001, steps=1000, **more).q[-1, 0]
+
+
+def by_global(q, v):
+    return v @ v / 2 - stiffness * q @ q / 2
+
+
+class Spring:
+    k = 1.0
+
+    def lagrangian(self, q, v):
+        return v @ v / 2 - self.potential(q)
+
+    def potential(self, q):
+        return self.k * q @ q / 2
+
+
+class Called(Spring):
+    def __call__(self, q, v):
+        return self.lagrangian(q, v)
+
+
+def _cell():
+    k = 1.0
+
+    def lagrangian(q, v):
+        return v @ v / 2 - k * q @ q / 2
+
+    def change():
+        nonlocal k
+        k = 4.0
+
+    return lagrangian, change
+
+
+def _array():
+    k = np.array([1.0])
+    return (lambda q, v: v @ v / 2 - k @ (q * q) / 2), lambda: k.__setitem__(0, 4.0)
+
+
+def _attribute(kind=Spring):
+    spring = kind()
+    return (spring if kind is Called else spring.lagrangian), lambda: setattr(spring, "k", 4.0)
+
+
+def _dictionary():
+    own = {"k": 1.0}
+    return (lambda q, v: v @ v / 2 - own["k"] * q @ q / 2), lambda: own.update(k=4.0)
+
+
+def _inside_another():
+    own = {"k": 1.0}
+    potential = lambda q: own["k"] * q @ q / 2
+    return functools.partial(lambda a, q, v: a * v @ v / 2 - potential(q), 1.0), lambda: own.update(k=4.0)
+
+
+WAYS = {
+    **{"cell": _cell, "array": _array, "attribute": _attribute, "object": lambda: _attribute(Called)},
+    **{"dictionary": _dictionary, "inside another": _inside_another},
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_changed_value_is_seen_by_a_new_system_and_said_of_the_old_one(way):
+    function, change = WAYS[way]()
+    system = dx.LagrangeDirac(function)
+    run = dx.prepare(system, MIDPOINT, q=[1.0], v=[0.0], step=0.1, steps=2)
+    assert end(system) == pytest.approx(np.cos(1.0), abs=1e-6)
+    change()
+    for late in (lambda: end(system), lambda: end(system, engine="xla"), run, lambda: system.energy(np.ones(1), np.ones(1))):
+        with pytest.raises(ValueError, match=r"lagrangian reads .*, which was .*1\..* when it was stated and is .*4\..* now"):
+            late()
+    assert end(dx.LagrangeDirac(function)) == pytest.approx(np.cos(2.0), abs=1e-6)
+
+
+def test_a_value_that_comes_back_is_the_system_of_before(monkeypatch):
+    system = dx.LagrangeDirac(by_global)
+    before = end(system)
+    monkeypatch.setitem(globals(), "stiffness", 4.0)
+    other = dx.LagrangeDirac(by_global)
+    assert other != system and end(other) == pytest.approx(np.cos(2.0), abs=1e-6)
+    with pytest.raises(ValueError, match=r"reads stiffness, which was 1\.0 when it was stated and is 4\.0 now.*params"):
+        dx.constraint_algorithm(system, {"q": [1.0], "v": [0.0]})
+    monkeypatch.setitem(globals(), "stiffness", 1.0)
+    assert dx.LagrangeDirac(by_global) == system and end(system) == before
+
+
+def test_what_is_the_same_value_is_no_change(monkeypatch):
+    calls = []
+
+    def lagrangian(q, v):
+        calls.append(1)  # a record of its own
+        return v @ v / 2 - stiffness * q @ q / 2
+
+    system = dx.LagrangeDirac(lagrangian)
+    end(system)
+    monkeypatch.setitem(globals(), "stiffness", float("1.0"))
+    assert calls and not system.lagrangian.captured.changed()
+    assert pickle.loads(pickle.dumps(Captured(by_global))).watched[0].before == 1.0
+
+
+def test_functions_that_were_defined_anew_alike_are_the_same(monkeypatch):
+    make = lambda power: lambda q: q**power
+    one = make(2)
+    helpers = {"V": one}
+    reads = Captured(lambda q, v: helpers["V"](q))
+    helpers["V"] = make(2)
+    assert not reads.changed()
+    helpers["V"] = make(3)
+    assert reads.changed()
+
+
+def test_forces_and_schemes_are_looked_at_too():
+    own = {"c": 0.1}
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v: -own["c"] * v)
+    end(system)
+    own["c"] = 0.2
+    with pytest.raises(ValueError, match="forces reads own"):
+        end(system)
+
+
+def test_discrete_lagrangians_of_schemes_are_looked_at_too():
+    own = {"c": 1.0}
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2)
+    scheme = dx.LagrangeDAlembert(lambda q0, q1, h: own["c"] * (q1 - q0) @ (q1 - q0) / (2 * h))
+    run = lambda: dx.simulate(system, scheme, q=[1.0], v=[0.0], step=0.1, steps=2)
+    assert run().ok
+    own["c"] = 2.0
+    with pytest.raises(ValueError, match="reads own"):
+        run()
