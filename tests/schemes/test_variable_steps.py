@@ -156,6 +156,55 @@ def test_the_local_frequency_is_the_density_of_kepler():
     np.testing.assert_allclose(of_points.step_density, 4.0 * 2**0.25, rtol=1e-12)  # ‖(4J)²‖^(1/2)
 
 
+def hamiltonian(x):
+    return x @ x / 2 + 0.25 * x[0] ** 4 + 0.15 * (x[0] * x[1]) ** 2 + 0.2 * x[0] * x[2]
+
+
+def two_form(x):
+    upper = jnp.array([[0, 0.3 * x[2], 1 + 0.2 * x[0] ** 2, 0], [0, 0, 0.1, 1], [0, 0, 0, 0.2], [0, 0, 0, 0]])
+    return upper - upper.T
+
+
+def of_points(x):
+    return 1.0 + x[0] ** 2
+
+
+@pytest.mark.parametrize(
+    ("system", "start"),
+    [
+        (dx.DiracSystem(dx.DiracStructure.from_two_form(two_form), hamiltonian), {"x": [0.4, 0.3, -0.2, 0.5]}),
+        (
+            dx.PhaseSpaceLagrangian(lambda q: jnp.array([q[1] + q[1] ** 3, 0.0]), lambda q: q @ q / 2 + 0.3 * q[0] ** 3),
+            {"q": [0.4, 0.3]},
+        ),
+    ],
+)
+def test_steps_of_a_two_form_run_natively_and_are_checked(system, start):
+    sol = dx.simulate(system, dx.VariableSteps(dx.DiscreteDirac(), of_points), **start, step=0.05, steps=40)
+    assert sol.stats["engine"] == "native"
+    name = "x" if "x" in sol.fields else "q"
+    rows = sol.fields[name]
+    np.testing.assert_allclose(sol.step_density, [of_points(row) for row in rows], rtol=1e-3)
+    report = dx.verify(sol)
+    assert report.ok and report["steps replayed"].verdict == report["steps taken back"].verdict == "ok"
+    damaged = np.array(rows)
+    damaged[20, 1] *= 1.001
+    assert dx.verify(sol.replace(fields={**sol.fields, name: damaged}))["steps replayed"].verdict == "VIOLATED"
+
+
+def test_degenerate_two_forms_are_refused_with_the_way_out():
+    """H = (x² + a⁴/2)/2 with ω = da ∧ db in a and b alone: ẋ is determined up to the other two coordinates."""
+    turn = np.random.default_rng(0).normal(size=(4, 4))
+    flat = np.zeros((4, 4))
+    flat[0, 1], flat[1, 0] = 1.0, -1.0
+    for basis in (np.eye(4), turn):
+        form = basis.T @ flat @ basis
+        system = dx.DiracSystem(dx.DiracStructure.from_two_form(lambda x, form=form: jnp.asarray(form)), hamiltonian)
+        with pytest.raises(ValueError, match=r"determine ẋ.*from_kernel"):
+            dx.simulate(system, dx.VariableSteps(dx.DiscreteDirac(), of_points), x=[0.4, 0.3, -0.2, 0.5], step=0.05, steps=5,
+                        check_initial=False)  # fmt: skip
+
+
 def test_time_is_that_of_the_system():
     """q̇ = v, L = v²/2 + q cos t: q(t) = 1 − cos t from rest."""
     driven = dx.LagrangeDirac(lambda t, q, v: v @ v / 2 + q[0] * jnp.cos(t))

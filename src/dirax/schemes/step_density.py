@@ -26,7 +26,7 @@ class LocalFrequency:
             slope, mass = jacobian(lambda q: self._acceleration(t, q, params))(place), self._mass(t, place, params)
             size = jnp.sum(slope * (mass @ solve(mass, slope.T).T))  # tr(M⁻¹ AᵀM A), M symmetric
         else:
-            rate = jacobian(lambda x: self.system.complete({"x": x, "t": t}, params, False)["velocity"])(place)
+            rate = jacobian(lambda x: self.system.velocity_at({"x": x, "t": t}, params))(place)
             slope = rate @ rate
             size = jnp.sum(jnp.abs(slope * slope.T))
         return jnp.abs(size) ** 0.25

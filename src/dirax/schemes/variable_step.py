@@ -7,11 +7,15 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.program.legendre import constrained_velocity, moves
+from dirax.program.legendre import moves
 from dirax.program.tracing import along
+from dirax.program.user_functions import evaluated
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import CLOCK, STEP_DENSITY, Field, StepEquation
+
+SAME_RATE = 1e-6
+"""Relative distance of two ẋ, the smallest and that of an elimination, that are the same unless there are many."""
 
 
 class Place(NamedTuple):
@@ -70,18 +74,7 @@ class VariableStep(AbstractStep):
         row = self.row(own, time, params)
         at = lambda t, place: jnp.log(self.density(t, place, params))
         place = row["q" if "q" in row else "x"]
-        return along(at, (jnp.asarray(time, float), place), (jnp.ones(()), self.rate(row, time, params)))
-
-    def rate(self, row, time, params):
-        """q̇ or ẋ at a row."""
-        form = self.system.lagrangian_form()
-        if form is None or "p" not in row:
-            complete = self.system.complete({**row, "t": time}, params, False)
-            return complete["v" if "q" in row else "velocity"]
-        q, rest = row["q"], jnp.zeros_like(row["q"])
-        rows = form.constraints.matrix(time, q, params)
-        offset = form.constraints.velocity_defect(time, q, rest, params)
-        return constrained_velocity(lambda v: form.lagrangian.at(time, q, v, params), row["p"], rows, offset, rest)[0]
+        return along(at, (jnp.asarray(time, float), place), (jnp.ones(()), self.system.velocity_at({**row, "t": time}, params)))
 
     # ------------------------------------------------------------------------------------------ the step
 
@@ -125,16 +118,28 @@ class VariableStep(AbstractStep):
     def _first_density(self, data, params):
         return self.density(jnp.asarray(data["t"], float), data["q" if "q" in self.inner.fields else "x"], params)
 
+    def _completed(self, data, params):
+        """Completed initial data with the time, and q̇ or ẋ there as steps find it."""
+        complete = {**self.system.complete(data, params, False), "t": data["t"]}
+        row = {name: complete[name] for name in ("q", "p", "x") if name in self.inner.fields and name in complete}
+        return complete, self.system.velocity_at({**row, "t": data["t"]}, params)
+
     def check(self, data, h, params):
-        complete = self.system.complete({**data, "t": data.get("t", 0.0)}, params, False)
-        density = self._first_density({**complete, "t": data.get("t", 0.0)}, params)
+        complete, rate = evaluated(self._completed, {**data, "t": data.get("t", 0.0)}, params)
+        density = self._first_density(complete, params)
         if not (np.isfinite(density) and density > 0.0):
             raise ValueError(
                 f"density must be positive and finite along the motion, but it is {float(density):.6g} where the run begins: "
                 "give another one, dx.VariableSteps(scheme, density=lambda q: …)."
             )
         self.inner.check(data, h / float(density), params)
-        own, u = self.inner.start({**complete, "t": data.get("t", 0.0)}, h / density, params)
+        known = complete.get("velocity", rate)
+        if rate.shape == known.shape and not np.max(np.abs(rate - known)) <= SAME_RATE * np.max(np.abs(known)):
+            raise ValueError(
+                "dx.VariableSteps takes two-forms that determine ẋ, but that of the system is degenerate where the run begins: "
+                "state it by dx.DiracStructure.from_kernel(F, E) with F = ωᵀ and E = −1, of which the smallest ẋ is taken."
+            )
+        own, u = self.inner.start(complete, h / density, params)
         if moves(lambda step: tuple(self.row(own, 0.0, params, step).values()), jnp.append(u, h)):
             raise TypeError(
                 "dx.VariableSteps takes schemes whose q and p at a row do not depend on the step that leaves it, such as "

@@ -281,6 +281,14 @@ class DiracSystem(AbstractSystem):
         rates = scaled_inverse(matrix, RATE_RANK)[0] @ right
         return {"x": x, "velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
 
+    def velocity_at(self, row: Data, params: Any) -> Float[Numbers, " N"]:
+        """ẋ: of a two-form without constraints by one elimination, not finite where that is degenerate. In odd dimensions it is
+        so everywhere, and the smallest ẋ is taken."""
+        x = row["x"]
+        if self.structure.representation == "two_form" and self.holonomic is None and x.shape[0] % 2 == 0:
+            return self.hamiltonian_vector(x, self.differential(x, params), params)
+        return self.complete(row, params, False)["velocity"]
+
     def _rates(self, x, params):
         """The linear equations of (ẋ, λ) with G ẋ = 0 among them."""
         (matrix, right), rows = self.equations(x, params), self.holonomic_matrix(x, params)

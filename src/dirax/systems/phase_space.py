@@ -86,6 +86,9 @@ class PhaseSpaceLagrangian(AbstractSystem):
         p = p if project or "p" not in data else data["p"]
         return {"q": q, "v": velocity, "p": p, "x": q, "velocity": velocity}
 
+    def velocity_at(self, row: Data, params: Any) -> Float[Numbers, " n"]:
+        return self.dirac_system().velocity_at({"x": self.point(row)}, params)
+
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " n"]:
         """p − α(q): the primary constraints."""
         if "q0" in data:

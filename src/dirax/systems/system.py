@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from dirax.geometry.semidirect import SemidirectProduct
 from dirax.numerics.arrays import Data, Numbers
+from dirax.program.legendre import constrained_velocity
 from dirax.program.rounding import sizes_of_terms
 from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import is_traced
@@ -85,6 +86,16 @@ class AbstractSystem(eqx.Module):
     @abstractmethod
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
         """The constraints at one saved row (its node fields, and the time `t`), zero where they hold."""
+
+    def velocity_at(self, row: Data, params: Any) -> Numbers:
+        """q̇, or ẋ of a row without q, at one row (its node fields, and the time `t`), for schemes that ask for it in a step; by
+        default the q̇ of p of a system with a Lagrangian."""
+        form = self.lagrangian_form()
+        if form is None or "p" not in row:
+            return self.complete(row, params, False)["v" if "q" in row else "velocity"]
+        t, q, rest = row["t"], row["q"], jnp.zeros_like(row["q"])
+        rows, offset = form.constraints.matrix(t, q, params), form.constraints.velocity_defect(t, q, rest, params)
+        return constrained_velocity(lambda v: form.lagrangian.at(t, q, v, params), row["p"], rows, offset, rest)[0]
 
     # ------------------------------------------------------------------ the forms in which it can be discretized
 

@@ -140,7 +140,9 @@ class Emitter:
         return a if self.width == 1 else self.body.put(f"extractelement {kind or self.real} {a}, i64 {lane}")
 
     def pack(self, scalars: Sequence[str]) -> str:
-        """A vector of this width from scalar doubles."""
+        """A value of this width from scalar doubles."""
+        if self.width == 1:
+            return scalars[0]
         value = "poison"
         for lane, scalar in enumerate(scalars):
             value = self.body.put(f"insertelement {self.real} {value}, double {scalar}, i64 {lane}")

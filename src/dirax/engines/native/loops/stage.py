@@ -161,21 +161,22 @@ def _write(
     block: Block, inside: Region, saving: list[tuple[int, str, list[int]]], row: str, is_first: str = "", weight: str = ""
 ) -> None:
     """Write fields into a row, of the array of which this is the number. With `is_first` what stands there is added to where that
-    does not hold, after multiplying by the number `weight` if there is one."""
+    does not hold, after multiplying by the number `weight` if there is one: what stands there is read for all lanes before any is
+    written, since lanes that fill up a block write where another one does."""
     e, graph = block.emitter, block.plan.graph
-    b, scalar = e.body, Emitter(e.body, 1)
+    b = e.body
     for f, _, nodes in saving:
         bytes_ = b.put(f"mul i64 {row}, {8 * len(nodes)}")
-        for lane in range(e.width):
-            address = b.load("ptr", b.at("ptr", "%outs", f * e.width + lane))
-            target = b.at("i8", address, bytes_)
-            for j, node in enumerate(nodes):
-                value = inside.value(node)
-                if graph.is_boolean(node):
-                    value = e.select(value, e.const(1.0), e.const(0.0))
-                value, place = e.extract(value, lane), b.at("double", target, j)
-                if is_first:
-                    value = scalar.mul(weight, value) if weight else value
-                    before = b.load("double", place)
-                    value = b.put(f"select i1 {is_first}, double {value}, double {scalar.add(before, value)}")
-                b.store("double", value, place)
+        addresses = [b.load("ptr", b.at("ptr", "%outs", f * e.width + lane)) for lane in range(e.width)]
+        targets = [b.at("i8", address, bytes_) for address in addresses]
+        for j, node in enumerate(nodes):
+            value, places = inside.value(node), [b.at("double", target, j) for target in targets]
+            if graph.is_boolean(node):
+                value = e.select(value, e.const(1.0), e.const(0.0))
+            if is_first:
+                value = e.mul(e.splat(weight), value) if weight else value
+                before = e.pack([b.load("double", place) for place in places])
+                total = e.add(before, value)
+                value = b.put(f"select i1 {is_first}, {e.real} {value}, {e.real} {total}")
+            for lane, place in enumerate(places):
+                b.store("double", e.extract(value, lane), place)
