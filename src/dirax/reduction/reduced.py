@@ -18,7 +18,7 @@ from dirax.program.user_functions import UserFunction, evaluated, is_traced
 from dirax.reduction.actions import AbstractAction, Translations
 from dirax.reduction.connection import AbstractConnection
 from dirax.reduction.sample_units import SampleUnits
-from dirax.reduction.symmetry import discrete_invariance, invariance, sampled_near, units_of
+from dirax.reduction.symmetry import discrete_invariance, forces_at, invariance, sampled_near, units_of
 from dirax.systems.constraints import Constraints
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.premise import Premise
@@ -120,7 +120,7 @@ class AbstractReducedSystem(AbstractSystem):
         where, row, column = np.unravel_index(int(np.argmax(np.where(np.isfinite(defects), defects, 0.0))), defects.shape)
         if not defects[where, row, column] > SYMMETRY_DEFECT:
             return ""
-        forces = row == parts.shape[1] - 1
+        forces = row >= self.constraints.sizes(jnp.asarray(q[0]), params)[0]
         what = "the forces f(t, q, v) move" if forces else "the forces of the constraints move"
         part = (
             f"{'f' if forces else f'one-form {row}'} has the part {parts[where, row, column]:.3g} along {self.named(int(column))}"
@@ -129,15 +129,39 @@ class AbstractReducedSystem(AbstractSystem):
         return f"{what}: {part} at {at}, at or near the initial data"
 
     def _parts_along(self, t, q, v, params):
-        """The parts of the rows of W and of f along the group, (samples, m + 1, k), and the sizes of the rows."""
-        system = self.system
+        """The parts of the rows of W and of f along the group, (samples, rows, k), and the sizes of the rows."""
 
         def at(t, q, v):
-            forces = jnp.zeros_like(q) if system.forces is None else system.forces(t, q, v, params)
-            rows = jnp.concatenate([self.constraints.one_forms_at(t, q, params), forces[None]])
+            rows = self.constraints.one_forms_at(t, q, params)
+            if self.system.forces is not None:
+                rows = jnp.concatenate([rows, forces_at(self.system, t, q, v, params)])
             return self.along(q, rows), jnp.max(jnp.abs(rows), axis=1)
 
         return jax.vmap(at)(t, q, v)
+
+    def refuse_moved_one_forms(self, data: Data, params: Any) -> None:
+        """Raise `ValueError` where the group leaves the span of the one-forms alone but not these themselves, at or near initial
+        data, which must be concrete: impulses at several points then are those of different one-forms, and have no sum."""
+        if self.system.one_forms is None:
+            return
+        t, q, _ = self.sampled(data, params)
+        moved, sizes = (np.asarray(a) for a in evaluated(self._moved_one_forms, t, q, params))
+        worst = np.max(np.where(np.isfinite(moved), moved, 0.0) / np.where(sizes > 0, sizes, 1.0), axis=0)
+        if np.max(worst, initial=0.0) > SYMMETRY_DEFECT:
+            raise ValueError(
+                f"one-form {int(np.argmax(worst))} is moved by the group, which leaves the span of the one-forms alone: the "
+                "impulses of a composed step, at several points of an orbit, have no sum on the quotient. State the one-forms so "
+                "that each is invariant, or step the unreduced system."
+            )
+
+    def _moved_one_forms(self, t, q, params):
+        """By how much each one-form differs from that at the origin of the orbit, (samples, m), and how large it is."""
+
+        def at(t, q):
+            rows, fixed = (self.at_identity(q, self.constraints.one_forms_at(t, q, params)) for q in (q, self.origin_of(q)))
+            return jnp.max(jnp.abs(rows - fixed), axis=1), jnp.max(jnp.abs(rows), axis=1)
+
+        return jax.vmap(at)(t, q)
 
     @abstractmethod
     def refuse_asymmetry(self, data: Data, params: Any) -> None:

@@ -69,16 +69,20 @@ class LagrangeDAlembert(AbstractScheme):
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         return _equation(self, system, shape)
 
-    def step_on_q(self, system: AbstractSystem, shape: Shape) -> LagrangeDAlembertStep:
-        """The step of a system on Q; raises `TypeError` for one that has no Lagrangian form, or whose motion is known to lie
-        on a smaller manifold than T*Q: two-point methods have modes off it, that grow."""
+    def step_on_q(
+        self, system: AbstractSystem, shape: Shape, part: bool = False
+    ) -> LagrangeDAlembertStep | LagrangeDAlembertPart:
+        """The step of a system on Q, or a `part` of a composed step; raises `TypeError` for one that has no Lagrangian form, or
+        whose motion is known to lie on a smaller manifold than T*Q: two-point methods have modes off it, that grow."""
         lagrangian = system.lagrangian_form()
         if lagrangian is None or system.final_relation(shape) is not None:
             raise TypeError(
                 "this scheme discretizes a dx.LagrangeDirac or dx.NonholonomicMechanics system (a Lagrangian with constraints), "
                 f"but a {type(system).__name__} was given: use dx.DiscreteDirac for the others."
             )
-        return LagrangeDAlembertStep(lagrangian, shape, self.discrete_lagrangian, self.constraint, self.momentum)
+        step = LagrangeDAlembertStep(lagrangian, shape, self.discrete_lagrangian, self.constraint, self.momentum)
+        # forces that see the multipliers are given those of both ends, which are of the order of the step
+        return LagrangeDAlembertPart(step) if part or lagrangian.forces_see_multipliers else step
 
     def adjoint(self, system: Any) -> "LagrangeDAlembert":
         """That of L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h); the mean of the momenta before
@@ -87,7 +91,7 @@ class LagrangeDAlembert(AbstractScheme):
         return LagrangeDAlembert(mirrored(self.discrete_lagrangian, -1.0), mirrored(self.constraint, 1.0), momentum)
 
     def part(self, system: Any, shape: Shape) -> AbstractScheme:
-        return _part(self, self, system, shape)
+        return _part(self, self, shape)
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
         return _structure(self, system, shape, step)
@@ -130,7 +134,7 @@ class PlusLagrangeDirac(AbstractScheme):
         return self.lagrange_dalembert.adjoint(system)
 
     def part(self, system: Any, shape: Shape) -> AbstractScheme:
-        return _part(self, self.lagrange_dalembert, system, shape)
+        return _part(self, self.lagrange_dalembert, shape)
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
         return _structure(self.lagrange_dalembert, system, shape, step, "+")
@@ -167,7 +171,7 @@ class MinusLagrangeDirac(AbstractScheme):
         return self.lagrange_dalembert.adjoint(system)
 
     def part(self, system: Any, shape: Shape) -> AbstractScheme:
-        return _part(self, self.lagrange_dalembert, system, shape)
+        return _part(self, self.lagrange_dalembert, shape)
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> AbstractDiscreteStructure | str:
         return _structure(self.lagrange_dalembert, system, shape, step, "-")
@@ -179,31 +183,28 @@ class _Part(AbstractScheme):
     scheme: LagrangeDAlembert
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
-        if system.manifold_form() is not None:
-            return _in_charts(self.scheme, system, shape, part=True).equation()
-        return LagrangeDAlembertPart(self.scheme.step_on_q(system, shape)).equation()
+        return _equation(self.scheme, system, shape, part=True)
 
 
-def _part(scheme: AbstractScheme, general: LagrangeDAlembert, system: AbstractSystem, shape: Shape) -> AbstractScheme:
-    """A scheme as a part of a composed step. Without constraints, and on a quotient by a symmetry, it is the scheme itself."""
-    return _Part(general) if shape.m + shape.c and system.quotient_form() is None else scheme
+def _part(scheme: AbstractScheme, general: LagrangeDAlembert, shape: Shape) -> AbstractScheme:
+    """A scheme as a part of a composed step. Without constraints it is the scheme itself."""
+    return _Part(general) if shape.m + shape.c else scheme
 
 
-def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, sign: int = +1) -> StepEquation:
-    """The discrete Lagrange–d'Alembert equations of a system on Q, in charts of Q, or on the quotient by its symmetry."""
-    if system.manifold_form() is not None:
-        return _in_charts(scheme, system, shape).equation()
+def _equation(
+    scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, sign: int = +1, part: bool = False
+) -> StepEquation:
+    """The discrete Lagrange–d'Alembert equations of a system on Q or in charts of Q, or on the quotient by its symmetry."""
     quotient = system.quotient_form()
-    if quotient is not None and quotient.unreduced().manifold_form() is not None:
-        return ReducedStepInCharts(quotient, _in_charts(scheme, quotient.unreduced(), shape)).equation()
-    if quotient is None:
-        step = scheme.step_on_q(system, shape)
-        # forces that see the multipliers are given those of both ends, which are of the order of the step
-        return (LagrangeDAlembertPart(step) if step.system.forces_see_multipliers else step).equation()
-    return LagrangePoincareDiracStep(quotient, scheme.step_on_q(quotient.unreduced(), shape), sign).equation()
+    whole = system if quotient is None else quotient.unreduced()
+    if whole.manifold_form() is not None:
+        in_charts = _in_charts(scheme, whole, shape, part)
+        return (in_charts if quotient is None else ReducedStepInCharts(quotient, in_charts)).equation()
+    step = scheme.step_on_q(whole, shape, part)
+    return (step if quotient is None else LagrangePoincareDiracStep(quotient, step, sign)).equation()
 
 
-def _in_charts(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, part: bool = False) -> StepInCharts:
+def _in_charts(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, part: bool) -> StepInCharts:
     local = lagrangian_in_charts(system, scheme.discrete_lagrangian, scheme.constraint)
     return StepInCharts(local, Atlas(local.manifold), shape, scheme.momentum, part)
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from dirax.program.user_functions import UserFunction
 from dirax.reduction.reduced import ReducedLagrangeDirac
 from dirax.schemes.abstract_step import AbstractStep
+from dirax.schemes.lagrange_dalembert_part import LagrangeDAlembertPart
 from dirax.schemes.lagrange_dalembert_step import LagrangeDAlembertStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.quotient_state import Quotient
@@ -28,8 +29,13 @@ class LagrangePoincareDiracStep(AbstractStep):
     """
 
     system: ReducedLagrangeDirac
-    unreduced: LagrangeDAlembertStep
+    unreduced: LagrangeDAlembertStep | LagrangeDAlembertPart
     sign: int = +1
+
+    @property
+    def plain(self) -> LagrangeDAlembertStep:
+        """The step on Q, where that is a part of a composed step without its projection."""
+        return self.unreduced.inner if isinstance(self.unreduced, LagrangeDAlembertPart) else self.unreduced
 
     @cached_property
     def quotient(self) -> Quotient:
@@ -112,7 +118,9 @@ class LagrangePoincareDiracStep(AbstractStep):
         return self.lowered(state, g), self.unknowns.join(rate=rate, vertical=vertical, **layout.rest(u, "v"))
 
     def check(self, data, h, params):
-        own = {"discrete_lagrangian": self.unreduced.rule, "constraint": self.unreduced.constraint}
+        own = {"discrete_lagrangian": self.plain.rule, "constraint": self.plain.constraint}
         own = {name: function for name, function in own.items() if isinstance(function, UserFunction)}
         if own:
             self.system.refuse_asymmetric(own, data, h, params)
+        if self.plain is not self.unreduced:
+            self.system.refuse_moved_one_forms(data, params)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.layout import Layout
-from dirax.schemes.step import Field
+from dirax.schemes.step import Field, Shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,6 +17,11 @@ class PartOfStep(AbstractStep):
     """The step of `inner`, on a system with a Lagrangian and constraints, with the same state and saved arrays."""
 
     inner: Any  # a LagrangeDAlembertStep or a MethodOneStep
+
+    @property
+    def shape(self) -> Shape:
+        """The sizes of the system."""
+        return self.inner.shape
 
     @property
     def rows(self) -> ConstraintRows:

@@ -171,3 +171,5 @@ class ReducedStepInCharts(AbstractStep):
         own = {name: function for name, function in own.items() if isinstance(function, UserFunction)}
         if own:
             self.system.refuse_asymmetric(own, data, h, params)
+        if self.unreduced.part:
+            self.system.refuse_moved_one_forms(data, params)

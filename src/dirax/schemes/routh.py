@@ -45,6 +45,11 @@ class DiscreteRouth(AbstractScheme):
         return LagrangeDAlembert(self.discrete_lagrangian, self.constraint, self.momentum)
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
+        return self.equation(system, shape)
+
+    def equation(self, system: Any, shape: Shape, part: bool = False) -> StepEquation:
+        """The Routh equations, also of a `part` of a composed step; raises `TypeError` for a system that is no quotient in
+        coordinates."""
         quotient = system.quotient_form()
         if quotient is None:
             raise TypeError(
@@ -56,10 +61,22 @@ class DiscreteRouth(AbstractScheme):
                 "dx.DiscreteRouth steps quotients in coordinates, but this one is of a system on a manifold, in charts: step it "
                 "by dx.LagrangeDAlembert, whose trajectory that of Routh's equations is."
             )
-        unreduced = self.lagrange_dalembert.step_on_q(quotient.unreduced(), shape)
+        unreduced = self.lagrange_dalembert.step_on_q(quotient.unreduced(), shape, part)
         return RouthStep(LagrangePoincareDiracStep(quotient, unreduced)).equation()
+
+    def part(self, system: Any, shape: Shape) -> AbstractScheme:
+        return _Part(self) if shape.m + shape.c else self
 
     def adjoint(self, system: Any) -> "DiscreteRouth":
         """The Routh equations of the adjoint on Q × Q."""
         adjoint = self.lagrange_dalembert.adjoint(system)
         return DiscreteRouth(adjoint.discrete_lagrangian, adjoint.constraint, adjoint.momentum)
+
+
+class _Part(AbstractScheme):
+    """Routh's equations whose steps end at the projected momentum."""
+
+    scheme: DiscreteRouth
+
+    def step_equation(self, system: Any, shape: Shape) -> StepEquation:
+        return self.scheme.equation(system, shape, part=True)

@@ -42,14 +42,15 @@ class RouthStep(AbstractStep):
         return self.reduced.quotient
 
     @property
-    def projects(self) -> bool:
-        """Whether the saved momentum is projected, for holonomic constraints."""
-        return self.reduced.unreduced.projects
+    def projected(self) -> str:
+        """The velocity among the unknowns that belongs to a projected momentum: to the saved one, for holonomic constraints, or
+        to that at the end of a part of a composed step; empty where none does."""
+        return next((name for name in ("saved_v", "end_v") if self.reduced.unknowns.get(name, (0,)) != (0,)), "")
 
     @cached_property
     def discrete_lagrangian(self) -> ReducedDiscreteLagrangian:
         """l_d as a function of (t, x, ẋ, γ, h, params)."""
-        on_q = self.reduced.unreduced
+        on_q = self.reduced.plain
         return ReducedDiscreteLagrangian(self.system, on_q.shape.n, on_q.rule)
 
     @property
@@ -58,8 +59,9 @@ class RouthStep(AbstractStep):
 
     @property
     def unknowns(self) -> Layout:
-        s, of_q = self.quotient.s, self.reduced.unreduced.rows
-        return Layout(rate=s, multipliers=of_q.count, saved_rate=s if self.projects else 0, sigma=of_q.holonomic)
+        s, whole = self.quotient.s, self.reduced.unknowns
+        rest = {"multipliers": whole["multipliers"], "projected_rate": s if self.projected else 0, "sigma": whole["sigma"]}
+        return Layout(rate=s, **rest)
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -69,7 +71,7 @@ class RouthStep(AbstractStep):
     def labels(self) -> tuple[str, ...]:
         own = (f"discrete Routh equation {i}, {REGULAR}" for i in range(self.quotient.s))
         of_constraints = self.reduced.labels[self.reduced.unknowns.place("multipliers")]
-        projected = range(self.unknowns.size - self.unknowns.place("saved_rate").start)
+        projected = range(self.unknowns.size - self.unknowns.place("projected_rate").start)
         return (*own, *of_constraints, *(f"projection of the momentum {i}" for i in projected))
 
     # ------------------------------------------------------------------------------------------------ the eliminated part
@@ -80,7 +82,7 @@ class RouthStep(AbstractStep):
         return vertical_velocity(lambda gamma, t, x, rate, h, params: l.momentum(t, x, rate, gamma, h, params), self.quotient.k)
 
     @cached_property
-    def _saved_vertical(self):
+    def _projected_vertical(self):
         system, connection, k = self.system.unreduced(), self.system.connection, self.quotient.k
 
         def momentum(along, t, x, rate, params):
@@ -99,17 +101,20 @@ class RouthStep(AbstractStep):
         x, _, mu, *_ = self.state.split(state)
         gamma, u = self.vertical(u, state, t, h, params), self.unknowns.split(u)
         parts = {"rate": u.rate, "vertical": gamma, "multipliers": u.multipliers, "sigma": u.sigma}
-        if self.projects:
-            guess = self.quotient.group_rate(x, u.saved_rate, gamma, h)
-            along = self._saved_vertical(mu, guess, t, x, u.saved_rate, params)
-            parts["saved_v"] = self.system.connection.join(u.saved_rate, along)
+        if self.projected:
+            t, x = (t + h, x + h * u.rate) if self.projected == "end_v" else (t, x)
+            guess = self.quotient.group_rate(x, u.projected_rate, gamma, h)
+            along = self._projected_vertical(mu, guess, t, x, u.projected_rate, params)
+            parts[self.projected] = self.system.connection.join(u.projected_rate, along)
         return self.reduced.unknowns.join(**parts)
 
     def kept(self, whole):
         """What is kept of the unknowns, or of the equations, of the reduced step."""
-        whole = self.reduced.unknowns.split(whole)
-        saved = {"saved_rate": self.system.connection.split(whole.saved_v)[0]} if self.projects else {}
-        return self.unknowns.join(rate=whole.rate, multipliers=whole.multipliers, sigma=whole.sigma, **saved)
+        whole = self.reduced.unknowns.split(whole)._asdict()
+        kept = {name: whole[name] for name in ("rate", "multipliers", "sigma")}
+        if self.projected:
+            kept["projected_rate"] = self.system.connection.split(whole[self.projected])[0]
+        return self.unknowns.join(**kept)
 
     def before(self, state):
         """The state of the reduced step."""

@@ -45,6 +45,8 @@ class VariableSteps(AbstractScheme):
         self.density = density if given else UserFunction(density, "density", ("q",), timed=True)  # type: ignore[assignment]
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
+        if system.quotient_form() is not None:
+            raise TypeError("dx.VariableSteps takes systems that are not reduced: step the system that dx.reduce was given.")
         # momenta that are means over both steps at a row are those of equal steps: as in compositions
         inner = make_step_equation(self.scheme.part(system, shape), system, shape)
         if not isinstance(inner, StepEquation):
