@@ -186,7 +186,10 @@ class _Part(AbstractScheme):
 
 def _part(scheme: AbstractScheme, general: LagrangeDAlembert, system: AbstractSystem, shape: Shape) -> AbstractScheme:
     """A scheme as a part of a composed step. Without constraints, and on a quotient by a symmetry, it is the scheme itself."""
-    return _Part(general) if shape.m + shape.c and system.quotient_form() is None else scheme
+    if not shape.m + shape.c or system.quotient_form() is not None:
+        return scheme
+    # it begins and ends at one momentum, and saves no mean of two
+    return _Part(LagrangeDAlembert(general.discrete_lagrangian, general.constraint, "incoming"))
 
 
 def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, sign: int = +1) -> StepEquation:
@@ -199,7 +202,8 @@ def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, s
     if quotient is None:
         step = scheme.step_on_q(system, shape)
         # forces that see the multipliers are given those of both ends, which are of the order of the step
-        return (LagrangeDAlembertPart(step) if step.system.forces_see_multipliers else step).equation()
+        seen = step.system.forces_see_multipliers
+        return _part(scheme, scheme, system, shape).step_equation(system, shape) if seen else step.equation()
     return LagrangePoincareDiracStep(quotient, scheme.step_on_q(quotient.unreduced(), shape), sign).equation()
 
 
