@@ -238,7 +238,7 @@ def test_saved_momenta(momentum, share):
     """p_k as it arrives, p_k − Wᵀμ as it leaves, and their mean."""
     equation = dx.make_step_equation(dx.LagrangeDAlembert("left", "left", momentum), CURVED, Shape(3, 1))
     q, p, mu = np.array([0.3, 0.7, -0.4]), np.array([1.0, 2.0, 3.0]), 0.8
-    saved = equation.unpack(np.append(q, p), np.array([0.1, 0.2, 0.3, mu]), 0.0, 0.1, None)
+    saved = equation.unpack(equation.state_layout.join(q=q, p=p), np.array([0.1, 0.2, 0.3, mu]), 0.0, 0.1, None)
     np.testing.assert_allclose(saved["p"], p - share * mu * curved_form(q), atol=1e-15)
 
 
@@ -249,9 +249,9 @@ def test_step_equation_is_the_equations(rule, base):
     equation = dx.make_step_equation(dx.LagrangeDAlembert(rule, base, momentum="mean"), CURVED, Shape(3, 1))
     everything = jax.jit(
         lambda q, p, v, mu, h: (
-            equation.residual(jnp.append(v, mu), jnp.append(q, p), 0.0, h, None),
-            equation.advance(jnp.append(v, mu), jnp.append(q, p), 0.0, h, None),
-            equation.unpack(jnp.append(q, p), jnp.append(v, mu), 0.0, h, None),
+            equation.residual(jnp.append(v, mu), equation.state_layout.join(q=q, p=p), 0.0, h, None),
+            equation.advance(jnp.append(v, mu), equation.state_layout.join(q=q, p=p), 0.0, h, None),
+            equation.unpack(equation.state_layout.join(q=q, p=p), jnp.append(v, mu), 0.0, h, None),
         )
     )
 
@@ -264,7 +264,7 @@ def test_step_equation_is_the_equations(rule, base):
         at = {"left": q, "right": q1, "midpoint": (q + q1) / 2}[base]
         close = lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=4e-13 / h)  # q1 − q0 is rounded here, not there
         close(residual, np.append(p + d1 - mu * curved_form(q), curved_form(at) @ v))
-        close(state, np.append(q1, d2))
+        close(state, equation.state_layout.join(q=q1, p=d2))
         close(saved["p"], p - mu * curved_form(q) / 2)
         close(saved["multipliers"], [mu])
         close(saved["constraint"], [curved_form(at) @ v])

@@ -33,7 +33,9 @@ class LagrangeDAlembertStep(AbstractStep):
     impulses of forces.
 
     The state is (q, p, work); the unknowns are v with q_{k+1} = q_k + h v, the multipliers (μ, λ), and with holonomic
-    constraints those of the projection of the saved momentum: the velocity v̂ that belongs to it, and σ.
+    constraints those of the projection of the saved momentum: the velocity v̂ that belongs to it, and σ. Where the saved momentum
+    is the mean of those before and after the impulse Wᵀμ, the given one makes both halves of a μ at the first row equal: what
+    the impulse there has beyond this μ is the part `beyond` of the first state.
     Raises `ValueError` for a w_d without one-forms.
     """
 
@@ -62,7 +64,7 @@ class LagrangeDAlembertStep(AbstractStep):
     @cached_property
     def work(self) -> WorkOfForces:
         """The state with the work of the forces."""
-        return WorkOfForces(self.system, self.shape.n)
+        return WorkOfForces(self.system, self.shape.n, **({"beyond": self.rows.nonholonomic} if 0.0 < self.share < 1.0 else {}))
 
     @cached_property
     def derivatives(self):
@@ -115,7 +117,7 @@ class LagrangeDAlembertStep(AbstractStep):
 
     @property
     def canonical(self) -> bool:
-        return not self.work.size
+        return self.state.size == 2 * self.shape.n
 
     # -------------------------------------------------------------------------------------------------- the equations
 
@@ -153,7 +155,7 @@ class LagrangeDAlembertStep(AbstractStep):
         return jnp.concatenate([missed, self.rows.hidden(t, q, saved_v, params)])
 
     def residual(self, u, state, t, h, params):
-        u, (q, p, _) = self.unknowns.split(u), self.state.split(state)
+        u, (q, p, *_) = self.unknowns.split(u), self.state.split(state)
         missed = self.equations(u.v, u.multipliers, q, p, t, h, params)
         if not self.projects:
             return missed
@@ -170,11 +172,11 @@ class LagrangeDAlembertStep(AbstractStep):
         )
 
     def unpack(self, state, u, t, h, params):
-        u, (q, p, _) = self.unknowns.split(u), self.state.split(state)
+        u, (q, p, _, *beyond) = self.unknowns.split(u), self.state.split(state)
         row = {"q": q, "p": self.saved_momentum(u.multipliers, u.sigma, q, p, t, params)}
         if self.shape.m + self.shape.c:
-            constraint = self.step_constraint(t, q, u.v, h, params)
-            row |= {"multipliers": self.rows.all(u.multipliers), "constraint": constraint}
+            impulses = u.multipliers + jnp.concatenate([*beyond, jnp.zeros(self.rows.holonomic)]) if beyond else u.multipliers
+            row |= {"multipliers": self.rows.all(impulses), "constraint": self.step_constraint(t, q, u.v, h, params)}
         return row | self.work.row(state)
 
     @property
@@ -189,8 +191,7 @@ class LagrangeDAlembertStep(AbstractStep):
             return self._start_from_two_points(data["q0"], (data["q1"] - data["q0"]) / h, t, h, params)
         q, p, v = data["q"], data["p"], data["v"]
         if self.share or self.projects:
-            p, u = self._incoming_momentum(q, p, v, t, h, params)
-            return self.work.start(q, p), u
+            return self._start_at_saved_momentum(q, p, v, t, h, params)
         return self.work.start(q, p), self.unknowns.join(v=v)
 
     def resume(self, data, h, params):
@@ -213,39 +214,41 @@ class LagrangeDAlembertStep(AbstractStep):
         saved_v, sigma = end.split(nearest_root(projection, end.join(saved_v=v)))
         return self.work.start(q, p), self.unknowns.join(v=v, saved_v=saved_v, sigma=sigma)
 
-    def _incoming_momentum(self, q, p, v, t, h, params) -> tuple[Float[Array, " n"], Float[Array, " k"]]:
-        """The incoming momentum whose saved momentum is p, with the unknowns of the step that leaves it.
+    def _start_at_saved_momentum(self, q, p, v, t, h, params) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
+        """The first state, with the incoming momentum whose saved momentum is p, and the unknowns of the step that leaves it.
 
-        λ is that of the leaving step and of one that would arrive at (q, p): the whole impulse, of second order here too.
+        The impulses at (q, p) are those of the leaving step and of one that would arrive there: of second order here too. Where
+        L or the forces are not defined before, it is a step of −h, whose impulses are nearly the opposite ones.
         """
-        step = Layout(v=self.shape.n, multipliers=self.rows.count)
-        both = Layout(leaving=step.size, arriving=step.size * self.projects)
-        guess = both.join(leaving=step.join(v=v), **({"arriving": step.join(v=v)} if self.projects else {}))
+        rows, share, step = self.rows, self.share, Layout(v=self.shape.n, multipliers=self.rows.count)
+        guess = step.join(v=v)
+        defined = jnp.all(jnp.isfinite(self._arriving(*step.split(guess), q, p, t, h, params)))
+        back, sign = jnp.where(defined, h, -h), jnp.where(defined, 1.0, -1.0)
+        leaves = lambda u: self.equations(*step.split(u), q, p, t, h, params)
+        arrives = lambda u: self._arriving(*step.split(u), q, p, t, back, params)
 
-        def equations(u):
-            leaving, arriving = both.split(u)
-            leaving = step.split(leaving)
-            missed = self.equations(leaving.v, leaving.multipliers, q, p, t, h, params)
-            if not self.projects:
-                return missed
-            arriving = step.split(arriving)
-            return jnp.concatenate([missed, self._arriving(arriving.v, arriving.multipliers, q, p, t, h, params)])
+        def solved(equations, guess):
+            found = nearest_root(equations, guess)
+            return jnp.where(jnp.all(jnp.isfinite(found)), found, guess)
 
-        found = nearest_root(equations, guess)
-        found = both.split(jnp.where(jnp.all(jnp.isfinite(found)), found, guess))
-        rows, share, leaving = self.rows, self.share, step.split(found.leaving)
+        if self.projects:
+            both = lambda u: jnp.concatenate([leaves(u[: step.size]), arrives(u[step.size :])])
+            leaving, arriving = jnp.split(solved(both, jnp.tile(guess, 2)), 2)
+        else:
+            leaving = solved(leaves, guess)
+            arriving = solved(arrives, guess) if "beyond" in self.state else guess
+        (v1, mu), mu0 = step.split(leaving), sign * step.split(arriving).multipliers
         # with incoming p + s/(1−s) Wᵀμ the multiplier is μ/(1−s), and its share is taken off again; at s = 1 nothing is added
-        mu = leaving.multipliers[: rows.nonholonomic]
-        jump = share / (1.0 - share) * mu if share < 1.0 else 0.0 * mu
-        if not self.projects:
-            return p + rows.force(t, q, jump, params), self.unknowns.join(v=leaving.v, multipliers=mu + jump)
-        sigma = step.split(found.arriving).multipliers[rows.nonholonomic :]
-        jump = jnp.concatenate([jump, sigma])
-        u = self.unknowns.join(v=leaving.v, multipliers=leaving.multipliers + jump, saved_v=v, sigma=sigma)
-        return p + rows.force(t, q, jump, params), u
+        own, sigma = mu[: rows.nonholonomic], mu0[rows.nonholonomic :]
+        jump = share / (1.0 - share) * own if share < 1.0 else 0.0 * own
+        beyond = {"beyond": mu0[: rows.nonholonomic] - jump} if "beyond" in self.state else {}
+        projected = {"saved_v": v, "sigma": sigma} if self.projects else {}
+        added = jnp.concatenate([jump, sigma])
+        state = self.work.start(q, p + rows.force(t, q, added, params), **beyond)
+        return state, self.unknowns.join(v=v1, multipliers=mu + added, **projected)
 
     def _arriving(self, v, multipliers, q, p, t, h, params):
-        """The equations of (v, μ, σ) for a step from q − h v on the constraints to (q, p)."""
+        """The equations of (v, μ, λ) for a step from q − h v on the constraints to (q, p)."""
         rows, before = self.rows, q - h * v
         missed = p - self.slots(t - h, before, v, h, params)[1] + rows.force(t, q, multipliers, params)
         g = rows.constraints.position_defect(t - h, before, params) / h

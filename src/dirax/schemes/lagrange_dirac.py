@@ -80,9 +80,11 @@ class LagrangeDAlembert(AbstractScheme):
                 "this scheme discretizes a dx.LagrangeDirac or dx.NonholonomicMechanics system (a Lagrangian with constraints), "
                 f"but a {type(system).__name__} was given: use dx.DiscreteDirac for the others."
             )
-        step = LagrangeDAlembertStep(lagrangian, shape, self.discrete_lagrangian, self.constraint, self.momentum)
         # forces that see the multipliers are given those of both ends, which are of the order of the step
-        return LagrangeDAlembertPart(step) if part or lagrangian.forces_see_multipliers else step
+        part = part or lagrangian.forces_see_multipliers
+        momentum = _momentum(self, part)
+        step = LagrangeDAlembertStep(lagrangian, shape, self.discrete_lagrangian, self.constraint, momentum)
+        return LagrangeDAlembertPart(step) if part else step
 
     def adjoint(self, system: Any) -> "LagrangeDAlembert":
         """That of L_d*(q0, q1, h) = −L_d(q1, q0, −h) and w_d*(q0, q1, h) = w_d(q1, q0, −h); the mean of the momenta before
@@ -191,6 +193,11 @@ def _part(scheme: AbstractScheme, general: LagrangeDAlembert, shape: Shape) -> A
     return _Part(general) if shape.m + shape.c else scheme
 
 
+def _momentum(scheme: LagrangeDAlembert, part: bool) -> str:
+    """The momentum that is saved: a part of a composed step begins and ends at one, and saves no mean of two."""
+    return "incoming" if part else scheme.momentum
+
+
 def _equation(
     scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, sign: int = +1, part: bool = False
 ) -> StepEquation:
@@ -206,7 +213,7 @@ def _equation(
 
 def _in_charts(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, part: bool) -> StepInCharts:
     local = lagrangian_in_charts(system, scheme.discrete_lagrangian, scheme.constraint)
-    return StepInCharts(local, Atlas(local.manifold), shape, scheme.momentum, part)
+    return StepInCharts(local, Atlas(local.manifold), shape, _momentum(scheme, part), part)
 
 
 def _structure(

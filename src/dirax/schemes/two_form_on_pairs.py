@@ -44,9 +44,10 @@ class FormOnPairs(AbstractStepForm):
 
     def begins(self, equation: Any, rows: Data, params: Any) -> tuple[Float[Array, " s"], Float[Array, " k"]]:
         q0, q1 = rows["q"]
-        multipliers = jnp.zeros(equation.stages[0][0].unknowns - q0.shape[0])
-        guess = jnp.concatenate([(q1 - q0) / self.pairs.step, multipliers])
-        return jnp.concatenate([q1, self.pairs.slots(rows["t"][0], q0, q1, params)[1]]), guess
+        first = equation.stages[0][0]
+        guess = jnp.concatenate([(q1 - q0) / self.pairs.step, jnp.zeros(first.unknowns - q0.shape[0])])
+        of_start = jnp.zeros(first.state_size - first.state_layout.place("p").stop)
+        return jnp.concatenate([q1, self.pairs.slots(rows["t"][0], q0, q1, params)[1], of_start]), guess
 
     def terms(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "2 2 s s"]:
         """Those of φ*Ω − Ω − dβ, and those of φ*Ω − Ω."""
@@ -69,7 +70,7 @@ class FormOnPairs(AbstractStepForm):
 
         z = jnp.concatenate([q0, q1])
         of_pair, (after, of_state, _) = jacobian_of(state_of)(z), step
-        q2, q2_of_pair = after[:n], of_state[:n] @ of_pair
+        q2, q2_of_pair = after[:n], of_state[:n, : 2 * n] @ of_pair
         jacobian = jnp.concatenate([jnp.eye(2 * n)[n:], q2_of_pair])  # of φ
         of_z, of_q2 = jacobian_of(sum_at_q1, argnums=(0, 1))(z, q2)
         force = pairs.annihilator(t, q1, params) @ (of_z + of_q2 @ q2_of_pair)

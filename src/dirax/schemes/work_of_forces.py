@@ -11,22 +11,23 @@ from dirax.schemes.step import Field
 class WorkOfForces:
     """The state (q, p, work) of a Lagrangian system with n coordinates; without forces `work` is empty.
 
-    The work is that since the start, so that E_N − E_0 − work is what the method itself changes.
+    The work is that since the start, so that E_N − E_0 − work is what the method itself changes. `of_start` are the names and
+    lengths of further parts, which belong to the first state: they are zero after a step.
     """
 
-    def __init__(self, system: Any, n: int):
+    def __init__(self, system: Any, n: int, **of_start: int):
         self.forces = getattr(system, "forces", None)
         self.size = int(self.forces is not None)
-        self.layout = Layout(q=n, p=n, work=self.size)
+        self.layout = Layout(q=n, p=n, work=self.size, **of_start)
 
     @property
     def fields(self) -> dict[str, Field]:
         """What is saved of it."""
         return {"work": Field((), "node", (), "work of the forces since the start")} if self.size else {}
 
-    def start(self, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " s"]:
+    def start(self, q: Float[Array, " n"], p: Float[Array, " n"], **of_start: Array) -> Float[Array, " s"]:
         """The first state."""
-        return self.layout.join(q=q, p=p)
+        return self.layout.join(q=q, p=p, **of_start)
 
     def after(
         self, state: Array, end: list[Array], t: Any, q: Array, v: Array, h: Any, params: Any, forces: Any = None
