@@ -103,19 +103,21 @@ class LagrangePoincareDiracStep(AbstractStep):
         return {"x": here.x, "w": w, "mu": mu, "g": here.g, "vertical": vertical} | row
 
     def start(self, data, h, params):
-        return self._begun(self.unreduced.start(data, h, params), h)
+        return self._begun(self.unreduced.start, data, h, params)
 
     def resume(self, data, h, params):
-        return self._begun(self.unreduced.resume(data, h, params), h)
+        return self._begun(self.unreduced.resume, data, h, params)
 
-    def _begun(self, on_q, h):
-        """The state and the unknowns of those on Q."""
-        state, u = on_q
+    def _begun(self, begin, data, h, params):
+        """The state and the unknowns of those on Q, begun at group coordinate 0: one-forms may turn along the group."""
         connection, layout = self.system.connection, self.unreduced.unknowns
+        _, first = connection.split(data["q"] if "q" in data else data["q0"])
+        origin = connection.join(jnp.zeros(self.quotient.s), first)
+        state, u = begin({name: a - origin if name in ("q", "q0", "q1") else a for name, a in data.items()}, h, params)
         x, g = connection.split(self.unreduced.state.split(state).q)
         rate, along = connection.split(layout.split(u).v)
         vertical = self.quotient.vertical(x, rate, along, h)
-        return self.lowered(state, g), self.unknowns.join(rate=rate, vertical=vertical, **layout.rest(u, "v"))
+        return self.lowered(state, first + g), self.unknowns.join(rate=rate, vertical=vertical, **layout.rest(u, "v"))
 
     def check(self, data, h, params):
         own = {"discrete_lagrangian": self.plain.rule, "constraint": self.plain.constraint}
