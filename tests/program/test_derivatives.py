@@ -269,3 +269,14 @@ def test_a_hertz_contact_flies_freely(engine):
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - potential(q[0]))
     solution = dx.simulate(system, dx.LagrangeDAlembert(), q=[0.0], v=[1.0], step=0.01, steps=3, engine=engine)
     assert solution.ok and solution.q[:, 0] == pytest.approx(solution.t, abs=1e-15)
+
+
+def test_a_loop_of_unknown_length_is_differentiated_forwards():
+    def potential(q):
+        until = lambda s: s[0] < 3.0 + jnp.abs(q[0])
+        return jax.lax.while_loop(until, lambda s: (s[0] + 1.0, jnp.sin(s[1]) + q[0]), (0.0, q[1]))[1]
+
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - potential(q))
+    plain = dx.LagrangeDirac(lambda q, v: v @ v / 2 - (jnp.sin(jnp.sin(jnp.sin(jnp.sin(q[1]) + q[0]) + q[0]) + q[0]) + q[0]))
+    run = lambda system: dx.simulate(system, dx.LagrangeDAlembert(), q=[0.3, 0.2], v=[0.1, 0.0], step=0.01, steps=5)
+    np.testing.assert_allclose(run(system).p, run(plain).p, rtol=1e-13)

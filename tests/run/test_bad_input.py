@@ -566,3 +566,13 @@ def test_numbers_of_diagnostics_that_say_nothing():
         dx.compare(OSCILLATOR, [PLUS], step=0.1, steps=3, repeats=0, **data)
     with pytest.raises(ValueError, match="tolerance must be a number"):
         dx.verify(dx.simulate(OSCILLATOR, PLUS, **GOOD), tolerance=np.nan)
+
+
+def test_32_bit_floats_are_refused_by_name():
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(ValueError, match=r'set to 32-bit floats since dirax was imported.*update\("jax_enable_x64", True\)'):
+            dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.0], step=0.1, steps=2)
+    finally:
+        jax.config.update("jax_enable_x64", True)

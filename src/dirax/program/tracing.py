@@ -72,7 +72,7 @@ def _has_hash(value: Any) -> bool:
 
 def gradient(function: Callable, argnums: int | tuple[int, ...] = 0) -> Callable:
     """`jax.grad(function, argnums)`."""
-    return _derivative(function, argnums, jax.grad)
+    return _derivative(function, argnums, _gradient_by_jax)
 
 
 def jacobian(function: Callable, argnums: int | tuple[int, ...] = 0, reverse: bool = False) -> Callable:
@@ -109,7 +109,7 @@ def _derivative(function: Callable, argnums: int | tuple[int, ...], by_jax: Call
         if not is_tracing():
             return by_jax(function, argnums)(*values)
         traced = _Traced(function, values)
-        if not traced.is_plain or (by_jax is jax.grad and traced.result.shape):
+        if not traced.is_plain or (by_jax is _gradient_by_jax and traced.result.shape):
             return by_jax(function, argnums)(*values)
         chosen = (argnums,) if isinstance(argnums, int) else tuple(argnums)
         starts = np.cumsum([0, *(len(jax.tree.leaves(value)) for value in values)])
@@ -119,6 +119,20 @@ def _derivative(function: Callable, argnums: int | tuple[int, ...], by_jax: Call
         return found[0] if isinstance(argnums, int) else tuple(found)
 
     return derivative
+
+
+def _gradient_by_jax(function: Callable, argnums: int | tuple[int, ...]) -> Callable:
+    """`jax.grad`, and in forward mode of what has a loop of unknown length, which JAX does not take backwards."""
+
+    def found(*values):
+        try:
+            return jax.grad(function, argnums)(*values)
+        except ValueError as error:
+            if "while_loop" not in str(error):
+                raise
+            return jax.jacfwd(function, argnums)(*values)
+
+    return found
 
 
 def operand(value: Any) -> Any:

@@ -53,6 +53,11 @@ def stated(
 ) -> tuple[Settings, Case, int, int]:  # fmt: skip
     """The settings and the case that the arguments of `simulate` state, steps and save_every; raises as it does."""
     check_kinds(system, scheme)
+    if not jax.config.jax_enable_x64:
+        raise ValueError(
+            "JAX has been set to 32-bit floats since dirax was imported, and structure is kept to the roundoff of 64-bit ones: "
+            'say jax.config.update("jax_enable_x64", True).'
+        )
     on, steps, save_every = engine_from(engine), count(steps, "steps"), count(save_every, "save_every")
     max_iterations = count(max_iterations, "max_iterations", MOST_ITERATIONS)
     events = checked_events(events, (Event, Impact))
