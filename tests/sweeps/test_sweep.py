@@ -413,6 +413,51 @@ def test_ways_to_write_keep_have_one_result(done, tmp_path, keep):
     assert np.isclose(data.error.values[2, 11], np.abs(sol.energy() - sol.energy()[0]).max(), rtol=1e-6, atol=1e-15)
 
 
+TANK = dx.LagrangeDirac(lambda q, v: 1e-9 * v @ v / 2 - q @ q / 2e-12)
+"""An oscillator of a nanohenry and a picofarad."""
+
+
+@pytest.mark.parametrize("scale", [2.0**-50, 1.0])
+@pytest.mark.parametrize("points", [2, 6, 64])
+@pytest.mark.parametrize("rows", [2, 6, 7])
+def test_no_axis_is_taken_for_that_of_the_points_whatever_the_units(tmp_path, scale, points, rows):
+    charges = np.linspace(1.0, 3.0, points)
+
+    def kept(keep):
+        data = dx.sweep(
+            TANK,
+            dx.LagrangeDAlembert(),
+            over={"charge": charges},
+            case=lambda charge: {"q": [scale * charge, 0.0], "v": [0.0, 0.0]},
+            keep=keep,
+            step=1e-11,
+            steps=rows - 1,
+            to=tmp_path / "tanks.zarr",
+            overwrite=True,
+            progress=False,
+        )
+        return {name: array.values[..., 0] for name, array in data.data_vars.items() if name not in ("status", "message")}
+
+    ends = kept(lambda sol: {"first": sol.q[0], "last": sol.q[-1]})
+    assert np.array_equal(ends["first"], scale * charges)
+    assert np.allclose(ends["last"], charges * ends["last"][0], rtol=1e-9, atol=0.0)
+    early = kept(lambda sol: {"early": sol.q[:50]})["early"]
+    assert np.array_equal(early[:, 0], ends["first"]) and np.array_equal(early[:, -1], ends["last"])
+
+
+def test_another_value_of_what_a_case_closes_over_is_noticed_in_any_units():
+    scale = 1e-15
+
+    def case(charge):
+        return {"q": [1.0, scale * charge], "v": [0.0, 0.0]}
+
+    values = {"charge": np.linspace(1.0, 3.0, 6)}
+    for _ in range(2):
+        data, _ = Case.of(case, ("charge",), 0).chosen(values).at(values)
+        assert np.allclose(data["q"][:, 1], scale * values["charge"], rtol=1e-12, atol=0.0)
+        scale *= 5.0
+
+
 def test_a_wrong_keep_is_one_error(tmp_path):
     with pytest.raises(ValueError, match=r"keep fails for the trajectory at g = 0\.5, angle = 0\.0: KeyError"):
         study(tmp_path / "wrong.zarr", keep=lambda sol: {"x": sol.fields["x"]})

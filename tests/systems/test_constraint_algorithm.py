@@ -334,3 +334,41 @@ def test_the_freedom_that_is_left_out_turns_with_the_point():
     for angle in np.linspace(0, np.pi, 5):
         x = np.array([np.cos(angle), np.sin(angle), 1.0])
         np.testing.assert_allclose(chain.field(x), [np.sin(angle), -np.cos(angle), 0.0], atol=1e-12)
+
+
+POLAR = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 + jnp.sin(q[0]) ** 2 * v[1] ** 2 / 2 + jnp.cos(q[0]))
+"""The spherical pendulum in angles: ∂²L/∂v² = diag(1, sin²θ), of rank 1 at the pole alone."""
+
+
+def crossing(force, unit):
+    """L = (ẋ² + x²ẏ²)/2 + … with ∂²L/∂v² of rank 1 on the line x = 0 alone, y in other units."""
+    kinetic = lambda q, v: (v[0] ** 2 + (q[0] * v[1] / unit) ** 2) / 2
+    return {
+        "potential": dx.LagrangeDirac(lambda q, v: kinetic(q, v) - (q[0] ** 2 + (q[1] / unit) ** 2) / 2),
+        "friction": dx.LagrangeDirac(kinetic, forces=lambda t, q, v: -v / jnp.array([1.0, unit**2])),
+        "driven": dx.LagrangeDirac(lambda t, q, v: kinetic(q, v) + q[1] / unit * jnp.sin(t)),
+    }[force]
+
+
+@pytest.mark.parametrize("force", ["potential", "friction", "driven"])
+@pytest.mark.parametrize("unit", [1.0, 2.0**-40])
+def test_a_hessian_that_loses_rank_at_the_point_alone_is_irregular(force, unit):
+    """It was taken for one of that rank everywhere: gauge freedom, or a final manifold that is none."""
+    found = [
+        constraint_algorithm(crossing(force, unit), {"q": [x, 0.2 * unit], "v": [0.3, 0.1 * unit]}) for x in (0.0, 1e-3, 1e-2)
+    ]
+    assert [chain.verdict for chain in found] == ["irregular", "determined", "determined"]
+    assert "it is not constant" in found[0].explanation
+
+
+def test_a_hessian_whose_kernel_turns_has_one_rank():
+    system = dx.LagrangeDirac(lambda q, v: ((v[0] * jnp.cos(q[2]) + v[1] * jnp.sin(q[2])) ** 2 + v[2] ** 2) / 2)
+    for angle in (0.0, 1e-8, 0.7):
+        chain = constraint_algorithm(system, {"q": [0.1, 0.2, angle], "v": [0.3, 0.1, 0.2]})
+        assert chain.verdict != "irregular" and "rank 2 of 3" in chain.explanation
+
+
+@pytest.mark.parametrize("scheme", [dx.DiscreteDirac(constraints="resolve"), dx.Collocation(2)])
+def test_schemes_do_not_send_to_a_final_manifold_that_is_none(scheme):
+    with pytest.raises(ValueError, match=r"is not found here: the rank of ∂²L/∂v² is 1 at the point and 2 around it"):
+        dx.simulate(POLAR, scheme, q=[0.0, 0.2], v=[0.3, 0.5], step=0.1, steps=10)

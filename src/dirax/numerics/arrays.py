@@ -1,4 +1,4 @@
-"""The arrays that signatures name: of NumPy where the numbers are known, of JAX where they are traced."""
+"""The arrays that signatures name: of NumPy where the numbers are known, of JAX where they are traced; and whether two agree."""
 
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -16,3 +16,10 @@ them alike."""
 
 Data: TypeAlias = dict[str, Numbers]
 """Initial data of one trajectory by name, or the fields of one saved row."""
+
+
+def agree(a: np.ndarray, b: np.ndarray, tolerance: float, axis: int | None = None) -> bool:
+    """Whether two arrays of one shape are closer than `tolerance` times the largest entry of the second, or the largest along
+    `axis`, whatever units that is in. Entries that are not finite must be the same."""
+    largest = np.max(np.abs(b), axis=axis, keepdims=True, initial=0.0, where=np.isfinite(b))
+    return a.shape == b.shape and np.allclose(a, b, rtol=0.0, atol=tolerance * largest, equal_nan=True)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ from dirax.run.composition_premise import refuse_leaving_final_manifold
 from dirax.run.event_run import run_with_events
 from dirax.run.final_manifold import (
     is_singular,
+    needed_at,
     projected_onto_manifold,
     refuse_off_final_manifold,
     warn_of_leaving,
@@ -216,7 +218,8 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     if not (traced := traced or is_traced(start)):
         for stage in dict.fromkeys(stage.check for stage, _ in equation.stages):
             stage(data, case.h, own)
-        refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial, settings.project, singular)
+        needed = partial(needed_at, system, case, initial) if singular else None
+        refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial, settings.project, needed)
         if check_initial and singular:
             refuse_off_final_manifold(system, case, initial)
         if check_initial:

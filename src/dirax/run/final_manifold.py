@@ -17,7 +17,7 @@ from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.start import Initial, completed
 from dirax.run.validate import Case
-from dirax.systems.constraint_algorithm import constraint_algorithm
+from dirax.systems.constraint_algorithm import constraint_algorithm, final_manifold_needed
 from dirax.systems.constraint_chain import EMPTY, IRREGULAR, ConstraintChain
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
@@ -112,6 +112,13 @@ def chain_at(system: AbstractSystem, q: Any, v: Any, t: float, params: Any) -> C
         return None if chain.verdict == IRREGULAR else chain
 
     return _chains.get((Same(system), given, jax.tree.structure(params)), found)
+
+
+def needed_at(system: AbstractSystem, case: Case, initial: Initial) -> str:
+    """What a scheme for regular Lagrangians says it needs at the data of the first trajectory, where this one is singular."""
+    near, complete = _at_either_point(system, case)[0] if case.two_points else (case, initial)
+    q, _, v, params = next(lanes_of(near, complete))
+    return final_manifold_needed(system, {"q": q, "v": v, "t": float(case.t0)}, params)
 
 
 def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any, q_alone: bool = False) -> Any:

@@ -7,11 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.equilibration import geometric_scales
 from dirax.numerics.ranks import rank_of_equations
 from dirax.numerics.tolerances import CONSTRAINT_DEFECT
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import at_values
 from dirax.program.memo import Same
+from dirax.program.tracing import jacobian
 from dirax.program.user_functions import constant_entries, is_traced
 from dirax.run.start import completed
 from dirax.run.validate import Case
@@ -21,6 +23,9 @@ from dirax.systems.system import AbstractSystem
 AWAY = 1e-3
 """How far from the initial point, relative to it, the rank of the constraints is compared."""
 
+TRIED = 8
+"""Multipliers, and velocities, at which forces are asked whether they see more of them than is determined."""
+
 
 def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, params: Any, t0: float) -> tuple[int, ...]:
     """The numbers of the constraints, in the order of `Solution.multipliers`, that follow from others, given the
@@ -28,7 +33,8 @@ def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, par
     A one-form that says what the derivative of a holonomic constraint says is left out before this, which holds positions too.
 
     Raises `ValueError` where constraints contradict each other, where their rank is larger near the initial point than
-    at it, where one of them has no direction, and where the trajectories of a batch differ in what is redundant.
+    at it, where one of them has no direction, where the trajectories of a batch differ in what is redundant, and where forces
+    see multipliers of which only the sum [W; G]ᵀμ is determined.
     """
     if matrices is None or not np.size(matrices):
         return ()
@@ -49,6 +55,7 @@ def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, par
             f"the constraints that follow from others are not the same in all trajectories of the batch (ranks from "
             f"{np.min(ranks)} to {np.max(ranks)} of {total}): run the trajectories in groups."
         )
+    _refuse_undetermined_forces(system, matrices[0], len(kept), data, params, t0)
     return tuple(row for row in range(total) if row not in kept)
 
 
@@ -131,6 +138,42 @@ def _refuse_singular_point(system, matrices, ranks, where, data, params, t0) -> 
             f"{total}, but have rank {nearby} nearby: a singular configuration, where the multipliers are not determined. "
             "Start elsewhere."
         )
+
+
+def _refuse_undetermined_forces(system, matrix, rank, data, params, t0) -> None:
+    """Raise where forces change with the multipliers μ along the null vectors N of [W; G]ᵀ, with `rank` rows that do not follow
+    from others: at velocities and multipliers of which none is zero."""
+    if not getattr(system, "forces_see_multipliers", False):
+        return
+    rows, columns = geometric_scales(np.abs(matrix))
+    null = np.linalg.svd(matrix / rows / columns)[0][:, rank:]
+    q, v = (np.asarray(a, float) for a in (system.point(data), data.get("v", 0.0)))
+    rng, size, slope = np.random.default_rng(0), np.max(np.abs(v)) or 1.0, _ForcesByMultipliers(Same(system))
+    for _ in range(TRIED):
+        moving = v + size * rng.uniform(-1.0, 1.0, len(q))
+        multipliers = rng.choice([-1.0, 1.0], len(rows)) * rng.uniform(0.5, 1.0, len(rows)) / rows[:, 0]
+        values = np.asarray(t0, float), q, moving, multipliers, params
+        found = at_values(slope, values)
+        by_unit = np.asarray(compiled(slope)(*values) if found is None else found[0]) / rows.T / columns.T
+        if np.max(np.abs(by_unit @ null)) > CONSTRAINT_DEFECT * np.max(np.abs(by_unit)):
+            raise ValueError(
+                f"the forces see multipliers that nothing determines: the constraints ({system.constraints.names}) have rank "
+                f"{rank} of {len(matrix)} at the initial data, so that of their multipliers μ only [W; ∂g/∂q]ᵀμ is known, and "
+                "not how they share it. Leave out the constraints that follow from others (support a body at three points), or let "
+                "the forces depend on [W; ∂g/∂q]ᵀμ alone."
+            )
+
+
+@dataclass(frozen=True)
+class _ForcesByMultipliers:
+    """(t, q, v, μ, params) ↦ ∂f/∂μ (n, k), at the velocity on the constraints that is nearest to v."""
+
+    same: Same
+
+    def __call__(self, t, q, v, multipliers, params):
+        system = self.same.object
+        v = system.project_velocity(q, v, params, t)
+        return jacobian(lambda multipliers: system.forces(t, q, v, multipliers, params))(multipliers)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Initial data that a premise of the system or of the scheme excludes: refused before the first step, with the premise."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,6 @@ from dirax.schemes.lagrange_dalembert_step import PROJECTION
 from dirax.schemes.lagrangian_step import METHOD_2
 from dirax.systems.system import AbstractSystem
 
-FINAL_MANIFOLD = (
-    'needs its final manifold: simulate dx.constraint_algorithm(system, near={"q": …, "v": …}).resolved() instead of the system, '
-    "from x=chain.point"
-)
-
 
 def refuse_bad_start(
     system: AbstractSystem,
@@ -27,11 +22,11 @@ def refuse_bad_start(
     labels: Sequence[str],
     check_constraint: bool,
     projected: bool,
-    singular: bool,
+    needed: Callable[[], str] | None,
 ) -> None:
     """Raise `ValueError` for functions that are not finite at the data, data off the constraints (with the residual), and a
     first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
-    the equations of the first step; `projected` says that the data have been moved, `singular` that the Lagrangian is."""
+    the equations of the first step; `projected` says that the data have been moved, `needed` what a singular Lagrangian needs."""
     if start.row0 is not None and "constraint" in start.row0:
         both = _lanes(initial.defect, 1), _lanes(start.row0["constraint"], 1)
         initial = initial._replace(defect=np.concatenate(both, axis=-1))
@@ -39,12 +34,10 @@ def refuse_bad_start(
     _refuse_outside_the_domain(initial)
     if check_constraint:
         _refuse_off_constraint(system, initial, start, projected)
-    if singular and not system.constraints.any and labels[0].startswith(AT_NODE.format(0)):
-        raise ValueError(
-            f"collocation takes regular Lagrangians, and ∂²L/∂v² is singular at the initial data: it {FINAL_MANIFOLD}."
-        )
+    if needed and not system.constraints.any and labels[0].startswith(AT_NODE.format(0)):
+        raise ValueError(f"collocation takes regular Lagrangians, and ∂²L/∂v² is singular at the initial data: it {needed()}.")
     if start.jacobian is not None:
-        _refuse_singular_step(start, labels, singular, initial.lagrangian is not None)
+        _refuse_singular_step(start, labels, needed, initial.lagrangian is not None)
 
 
 def _refuse_outside_the_domain(initial: Initial) -> None:
@@ -105,16 +98,16 @@ def _way_onto_constraint(system: AbstractSystem, two_points: bool, projected: bo
     return "pass project=True to project them, or check_initial=False to take them as they are"
 
 
-def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool, lagrangian: bool) -> None:
+def _refuse_singular_step(start: Start, labels: Sequence[str], needed: Callable[[], str] | None, lagrangian: bool) -> None:
     residual, sparse = _lanes(start.residual, 1), isinstance(start.jacobian, SparseJacobians)
     jacobian = start.jacobian.product[:, 0, :, None] if sparse else _lanes(start.jacobian, 2)
     rows = np.isfinite(residual) & np.all(np.isfinite(jacobian), axis=2)
     finite = np.all(rows, axis=1)
     if not np.all(finite):
-        if singular:
+        if needed:
             raise ValueError(
                 f"the first step is not finite at the initial data{_which(~finite)}, since the Lagrangian is singular (∂²L/∂v²), "
-                f"and this scheme {FINAL_MANIFOLD}."
+                f"and this scheme {needed()}."
             )
         row = int(np.argmin(rows[np.argmin(finite)]))
         raise ValueError(
@@ -131,9 +124,9 @@ def _refuse_singular_step(start: Start, labels: Sequence[str], singular: bool, l
             "The Lagrangian is singular together with its constraints: remove the coordinates that it does not determine, or "
             "choose another discrete Lagrangian"
         )
-        if singular and labels[0].endswith(METHOD_2):
-            way = f"This is since the Lagrangian is singular (∂²L/∂v²), and this scheme {FINAL_MANIFOLD}"
-        elif singular and _projection_alone(jacobian[lane], labels):
+        if needed and labels[0].endswith(METHOD_2):
+            way = f"This is since the Lagrangian is singular (∂²L/∂v²), and this scheme {needed()}"
+        elif needed and _projection_alone(jacobian[lane], labels):
             composed = len(start.guess) > 1
             ends = "a part of a composition ends at" if composed else "this scheme saves, with holonomic constraints,"
             alone = ", or without holonomic constraints the scheme by itself, with smaller steps" * composed

@@ -9,6 +9,7 @@ import numpy as np
 from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import evaluated
 from dirax.schemes.step import StepEquation
+from dirax.systems.constraint_algorithm import final_manifold_needed
 from dirax.systems.constraint_search import rank_of
 from dirax.systems.forms import RelationForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
@@ -25,9 +26,9 @@ def nothing_hidden_in_relation(system: AbstractSystem, form: RelationForm, equat
 
     def at(data, h, params):
         x = np.asarray(system.point(data))
-        return evaluated(matrix, x, np.asarray(data.get("t", 0.0), float), params), "the matrix of ẋ"
+        return evaluated(matrix, x, np.asarray(data.get("t", 0.0), float), params), "the matrix of ẋ", x
 
-    return _refusing(system, "x", at, equation)
+    return _refusing(system, at, equation)
 
 
 def nothing_hidden_in_lagrangian(system: LagrangeDirac | ManifoldLagrangian, equation: StepEquation) -> StepEquation:
@@ -44,23 +45,22 @@ def nothing_hidden_in_lagrangian(system: LagrangeDirac | ManifoldLagrangian, equ
         if "p" in data:
             return None
         q, v = (data["q0"], (data["q1"] - data["q0"]) / h) if "q0" in data else (data["q"], data["v"])
-        return evaluated(hessian, np.zeros(()), q, v, params), "∂²L/∂v²"
+        return evaluated(hessian, np.zeros(()), q, v, params), "∂²L/∂v²", {"q": q, "v": v}
 
-    return _refusing(system, '{"q": …, "v": …}', at, equation)
+    return _refusing(system, at, equation)
 
 
-def _refusing(system: AbstractSystem, near: str, at: Callable, equation: StepEquation) -> StepEquation:
+def _refusing(system: AbstractSystem, at: Callable, equation: StepEquation) -> StepEquation:
     def check(data, h, params):
         equation.check(data, h, params)
         if (found := at(data, h, params)) is None:
             return
-        matrix, what = np.asarray(found[0]), found[1]
+        matrix, what, near = np.asarray(found[0]), *found[1:]
         rank = rank_of(matrix)
         if rank < max(matrix.shape):
             raise ValueError(
-                f"Method 2 of this {type(system).__name__} needs its final manifold, since {what} has rank {rank} of "
-                f"{max(matrix.shape)} at the initial data: simulate dx.constraint_algorithm(system, near={near}).resolved() "
-                "instead of the system, from x=chain.point."
+                f"{what} has rank {rank} of {max(matrix.shape)} at the initial data, and Method 2 of this "
+                f"{type(system).__name__} {final_manifold_needed(system, near, params)}."
             )
 
     return dataclasses.replace(equation, check=check)

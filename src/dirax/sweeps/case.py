@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.arrays import agree
 from dirax.program.memo import Memo, Same
 from dirax.sweeps.axes import PointError, described, identities
 from dirax.sweeps.columns import Column, spread
@@ -26,7 +27,7 @@ BLOCK = 1024
 """Points for which a function of JAX is compiled; the last of a task are filled up, so that no result depends on their number."""
 
 SAME = 1e-12
-"""How far two ways of evaluation may differ, relative to the size of the numbers."""
+"""How far two ways of evaluation may differ, relative to the largest number of that entry at the points."""
 
 Values = Mapping[str, np.ndarray]
 Mode = Literal["scalars", "jax", "columns", "points"]
@@ -236,10 +237,7 @@ def _place(path: Any) -> str:
 def _same(a: Any, b: Any) -> bool:
     if a is None or jax.tree.structure(a) != jax.tree.structure(b):
         return False
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        if x.shape != y.shape or not np.allclose(x, y, rtol=SAME, atol=SAME, equal_nan=True):
-            return False
-    return True
+    return all(agree(x, y, SAME, axis=0) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def in_words(error: BaseException) -> str:

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
+from dirax.numerics.arrays import agree
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.interpreter import Interpreter, Nodes, Unsupported, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
@@ -17,7 +18,7 @@ from dirax.program.tracing import jacobian, of_one_result
 from dirax.solution.solution import Solution
 
 SAME = 1e-9
-"""How far it may be from `Solution.energy`, relative to the size of the energy."""
+"""How far it may be from `Solution.energy`, relative to the largest energy."""
 
 
 def energy_of(sol: Solution) -> np.ndarray:
@@ -38,7 +39,7 @@ def is_quick(sol: Solution) -> bool:
     """Whether the compiled code gives the energy of these trajectories."""
     try:
         made = _compiled(sol)
-        return made is not None and bool(np.allclose(made(sol), sol.energy(), rtol=SAME, atol=SAME, equal_nan=True))
+        return made is not None and agree(made(sol), np.asarray(sol.energy()), SAME)
     except (ImportError, OSError, RuntimeError):
         return False
 

@@ -1,11 +1,13 @@
 """A short run of some points before a sweep: the shapes of what is kept, how `case` and `keep` are to be called, the engine,
 and the time that a trajectory takes."""
 
+import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
 from dirax.engines.threads import at_most
@@ -20,7 +22,7 @@ POINTS = 64
 """Trajectories of the trial, spread over the points."""
 
 SINGLE = 6
-"""Points at which `case` and `keep` are compared with calls for single points."""
+"""Points at which `case` is compared with calls for single points, and about as many for `keep`."""
 
 SECONDS = 0.03
 """Least time of the trial's last run, from which the time of a step is known."""
@@ -62,9 +64,11 @@ def tried(system: Any, scheme: Any, axes: Axes, case: Case, keep: Keep, options:
             seconds += _overhead(run, numbers)
     finally:
         at_most.reset(token)
-    shown = _lengthened(sol[: min(SINGLE, len(numbers))], options)
-    keep = keep.chosen(shown, axes.at(numbers[: len(shown.ok)]))
-    return Trial(shown, case, keep, sol.stats["engine"], seconds)
+    sol = _lengthened(sol, options)
+    shown = np.arange(_unlike_shapes(sol)) % len(numbers)
+    sol = sol[shown]
+    keep = keep.chosen(sol, axes.at(numbers[shown]))
+    return Trial(sol, case, keep, sol.stats["engine"], seconds)
 
 
 def check_points(axes: Axes, case: Case) -> None:
@@ -114,6 +118,13 @@ def _first(run: Callable, axes: Axes, numbers: np.ndarray, few: np.ndarray, step
     if good:
         return np.array(good), run(np.array(good), steps), steps
     raise ValueError(f"all points that were tried are refused, the last one, {described(axes.at(few[-1:]))}, with: {reason}")
+
+
+def _unlike_shapes(sol: Solution) -> int:
+    """A number of trajectories that is none of the sizes of one, so that no function takes an axis for another."""
+    shapes = [np.shape(array)[1:] for array in sol.fields.values()] + list(map(np.shape, jax.tree.leaves(sol.params_of_one)))
+    sizes = {sol.rows}.union(*shapes)
+    return next(number for number in itertools.count(SINGLE) if number not in sizes)
 
 
 def _overhead(run: Callable, numbers: np.ndarray) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 
 from dirax.program.captured import functions_in, refuse_changed
 from dirax.program.user_functions import check_finite, is_traced
-from dirax.systems.constraint_chain import ConstraintChain
+from dirax.systems.constraint_chain import IRREGULAR, ConstraintChain
 from dirax.systems.constraint_search import Search
 from dirax.systems.system import AbstractSystem
 
@@ -36,3 +36,18 @@ def constraint_algorithm(system: AbstractSystem, near: Any, params: Any = None, 
     check_finite("near", near)
     refuse_changed(functions_in(system))
     return Search(system.implicit_form(near, params), params, radius).run()
+
+
+def final_manifold_needed(system: AbstractSystem, near: Any, params: Any) -> str:
+    """What a scheme says that refuses these data since it needs a final manifold: how to come to it, or why there is none."""
+    try:
+        chain = constraint_algorithm(system, near, params)
+    except (TypeError, ValueError):
+        chain = None
+    if chain is not None and chain.verdict == IRREGULAR:
+        return f"needs its final manifold, which is not found here: {chain.explanation[:-1]}"
+    point = ", ".join(f'"{name}": …' for name in near if name != "t") if isinstance(near, dict) else ""
+    return (
+        f"needs its final manifold: simulate dx.constraint_algorithm(system, near={f'{{{point}}}' if point else 'x'})"
+        ".resolved() instead of the system, from x=chain.point"
+    )

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.equilibration import geometric_scales
 from dirax.numerics.ranks import numerical_rank
-from dirax.numerics.tolerances import MANIFOLD_RANK, ON_MANIFOLD
+from dirax.numerics.tolerances import HESSIAN_RANK, MANIFOLD_RANK, ON_MANIFOLD
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import along, jacobian, once
 from dirax.program.user_functions import constant_entries, evaluated
@@ -116,6 +117,8 @@ class Search:
 
     def run(self) -> ConstraintChain:
         """Level after level; every end is a chain with its verdict."""
+        if larger := self._larger_rank_around():
+            return self.end(IRREGULAR, larger)
         while True:
             number = len(self.levels)
             points = self.points.around(self.x, self.phi_and_slope if self.parts else None)
@@ -149,6 +152,21 @@ class Search:
             if outcome is not None:
                 return outcome
             self.rows = [*(self.rows if rank > self.explicit.rank else ()), self.tangency(self.parts[-1])]
+
+    def _larger_rank_around(self) -> str:
+        """In words, that the Hessian, which the form takes for one of its rank at the point, has a larger one around it."""
+        if self.form.hessian is None:
+            return ""
+        around = Points(self.points.radius, self.points.moved).around(self.x)
+        matrices = np.array([np.asarray(evaluated(self.form.hessian, x, self.params)) for x in around])
+        if not np.all(np.isfinite(matrices)):
+            return ""
+        rows, columns = geometric_scales(np.max(np.abs(matrices), axis=0))
+        here, *others = numerical_rank(np.linalg.svd(matrices / rows / columns, compute_uv=False), HESSIAN_RANK).tolist()
+        return (max(others) > here) * (
+            f"the rank of ∂²L/∂v² is {here} at the point and {max(others)} around it: it is not constant, and the algorithm "
+            "does not apply across such a point. Give another `near`, or take other coordinates."
+        )
 
     def _off_manifold(self, rank: int, place: str) -> str:
         """A remark where conditions exist on the manifold only, because the rank is larger off it."""

@@ -153,4 +153,6 @@ def in_units(form: ImplicitForm, units: Units) -> ImplicitForm:
         matrix, right = form.equations(x * units.coordinates, params)
         return matrix * columns[None] / units.equations[:, None], right / units.equations
 
-    return form._replace(equations=equations, point=np.asarray(form.point) / units.coordinates)
+    own = form.hessian
+    hessian = None if own is None else lambda x, params: own(x * units.coordinates, params)
+    return form._replace(equations=equations, point=np.asarray(form.point) / units.coordinates, hessian=hessian)

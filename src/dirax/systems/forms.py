@@ -11,6 +11,7 @@ class ImplicitForm(NamedTuple):
 
     `equations(x, params)` gives (matrix, right), `energy(x, params)` a scalar. `multipliers` names the entries of u,
     `coordinates` those of x; with a `clock` the last of them is the time, ṫ = 1. `about` says in words what they are.
+    `hessian(x, params)` is ∂²L/∂v² where the form is made for one of constant rank.
     """
 
     equations: Callable
@@ -20,6 +21,7 @@ class ImplicitForm(NamedTuple):
     energy: Callable
     about: str
     clock: bool = False
+    hessian: Callable | None = None
 
 
 class Observed(NamedTuple):

@@ -92,9 +92,11 @@ def _on_cotangent_bundle(system: Any, x: np.ndarray, hessian: np.ndarray, params
     k = null.shape[1]
     J = canonical_two_form(n)  # as the Poisson matrix: (q̇, ṗ) = J dH
 
+    def mass(t, q, params):
+        return jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(jnp.zeros(n))
+
     def bordered(t, q, params):
-        mass = jacobian(gradient(lambda v: system.lagrangian.at(t, q, v, params)))(jnp.zeros(n))
-        return jnp.concatenate([jnp.concatenate([mass, null], axis=1), np.pad(null.T, ((0, 0), (0, k)))])
+        return jnp.concatenate([jnp.concatenate([mass(t, q, params), null], axis=1), np.pad(null.T, ((0, 0), (0, k)))])
 
     constant = constant_entries(bordered, t, x[:n], params)
     inverse = None if constant is None or np.any(np.isnan(constant)) else np.linalg.inv(constant)
@@ -127,7 +129,8 @@ def _on_cotangent_bundle(system: Any, x: np.ndarray, hessian: np.ndarray, params
 
     coordinates, multipliers = (*names("q", n), *names("p", n)), (*names("u", k), *names("λ", m + c))
     rank = f"Hessian of rank {n - k} of {n}" + (f": {k} primary constraint{'s' * (k > 1)}" if k else ", regular")
-    return in_time(timed, t, equations, x, coordinates, multipliers, hamiltonian, rank)
+    form = in_time(timed, t, equations, x, coordinates, multipliers, hamiltonian, rank)
+    return form._replace(hessian=lambda x, params: mass(x[-1] if timed else 0.0, x[:n], params))
 
 
 def _on_pontryagin_bundle(system: Any, x: np.ndarray, params, timed: bool, t: float, about: str) -> ImplicitForm:
