@@ -23,6 +23,7 @@ FUNCTIONS = {
     "filled": lambda i: X.at[:, i].get(mode="fill", fill_value=0.0),
     "along an axis": lambda i: jnp.take_along_axis(X, jnp.abs(i)[:, :1, None] % 5 + jnp.zeros((3, 4, 1), int), axis=2),
     "batch": lambda i: jax.vmap(lambda row, j: row[j])(X, i),
+    "one": lambda i: X.at[i[0, 1], i[1, 1], i[2, 0]].set(X[i[0, 1], i[0, 0], i[1, 0]]),
     "slice": lambda i: lax.dynamic_slice(X, (i[0, 1], i[1, 0], i[2, 1]), (2, 3, 1)),
     "slice put": lambda i: lax.dynamic_update_slice(X, -X[:2, :3, 2:3], (i[0, 1], i[1, 0], i[2, 1])),
     "set": lambda i: X.at[i[:, 0], i[:, 1]].set(-1.0),

@@ -61,7 +61,7 @@ def _places(
     strides = np.array([math.prod(shape[axis + 1 :]) for axis in range(len(shape))], np.int64)
     own = np.arange(1, math.prod(shape) + 1).reshape(shape)[tuple(map(slice, sizes))]
     own = own.squeeze(tuple({*single, *batching}))
-    alone = lambda a: a.reshape(*batch, *[1] * own.ndim)
+    alone = lambda a: np.reshape(a, (*batch, *[1] * own.ndim))
     places = alone(np.clip(starts, 0, last) @ strides) + own
     places = places if clips else np.where(alone(inside), places, 0)
     return np.moveaxis(places, range(len(batch), places.ndim), window_axes)
