@@ -73,8 +73,10 @@ def test_a_linear_circuit_is_the_same_as_a_function():
         (("R", 1, 1, 1.0), ValueError, "between two nodes"),
         (("L", 1, 0, -1.0), ValueError, "value > 0"),
         (("T", 1, 0, 1.0), ValueError, r"a transformer is \(T, \(a, b\), \(c, d\), ratio\)"),
-        (("C", 1, 0, lambda t: t), TypeError, "only R, V and I may be functions"),
-        (("V", 1, 0, "1"), TypeError, "a finite number, or a function"),
+        (("C", 1, 0, lambda t: t), TypeError, r"capacitance\(\[, params\]\), .* where t stands in the place of params"),
+        (("C", 1, 0, lambda: 1.0), TypeError, r"capacitance must be a number, the name of .* function capacitance\(params\)"),
+        (("T", (1, 0), (2, 0), "n"), TypeError, "only C, L, R, V and I may be functions, or names of params; .* was given"),
+        (("V", 1, 0, None), TypeError, "a finite number, or, but for T, the name of one of the params or a function"),
         (("R", 1, 0, lambda u: -u), ValueError, "has the sign of its voltage"),
         (("R", 1, 0, lambda u: u / (1 + 100 * u * u)), ValueError, "never falls"),
         (("C", 5, 6, 1.0), ValueError, "not connected to the ground"),
@@ -84,7 +86,7 @@ def test_a_linear_circuit_is_the_same_as_a_function():
         (("T", (1, 0), (2, 0), 0.0), ValueError, "ratio of a transformer is not zero"),
         (("V", 1, 0, math.sin), TypeError, r"voltage\(t\) could not be traced"),
         (("V", 1, 0, lambda t: jnp.stack([t, t])), TypeError, r"voltage\(t\) must return one number, .* shape \(2,\)"),
-        (("I", 1, 0, lambda t, phase: t + phase), TypeError, r"a function current\(t\), without params"),
+        (("I", 1, 0, lambda t, phase, more: t + phase), TypeError, r"current\(t\[, params\]\), but <lambda> takes 3 arguments"),
         (("R", 1, 0, lambda u: u if u > 0 else 0.0), TypeError, r"current\(u\) could not be traced .* jnp\.where"),
         (("R", 1, 0, lambda u: jnp.expm1(2000 * u)), ValueError, "it is inf"),
     ],
@@ -134,3 +136,87 @@ def test_sources_that_agree_are_not_refused():
     dx.circuit([("V", 1, 0, 1.0), ("V", 1, 0, jnp.cos), ("C", 1, 0, 1.0)])  # what functions are is not looked at
     dx.circuit([("I", 0, 1, 2.0), ("I", 1, 0, 2.0), ("I", 1, 2, 1.0), ("R", 2, 0, 1.0), ("R", 1, 0, 1.0)])
     dx.circuit([("I", 0, 1, 2.0), ("T", (1, 0), (2, 0), 3.0), ("L", 2, 0, 1.0)])
+
+
+OF_PARAMS = [
+    ("V", 1, 0, lambda t, params: params["amplitude"] * jnp.sin(t)),
+    ("R", 1, 2, "resistance"),
+    ("R", 2, 0, lambda u, params: u / params["load"]),
+    ("C", 2, 0, lambda params: params["tau"] / params["resistance"]),
+]
+VALUES = {"amplitude": 1.5, "resistance": 2.0, "load": 4.0, "tau": 0.7}
+
+
+def charge(t, amplitude, resistance, load, tau):
+    """q̇ = A sin(t)/R − q/T with 1/T = (1 + R/R')/τ, from q = 0."""
+    rate = (1 + resistance / load) / tau
+    return amplitude / resistance * (rate * np.sin(t) - np.cos(t) + np.exp(-rate * t)) / (1 + rate**2)
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_values_of_params(engine):
+    """A closed form; and the derivative of the last charge in each of the params against differences of runs."""
+    system = dx.circuit(OF_PARAMS)
+
+    def run(params):
+        return dx.simulate(system, MIDPOINT, x=[0.0], step=0.01, steps=200, params=params, engine=engine)
+
+    sol = run(VALUES)
+    np.testing.assert_allclose(sol.x[:, 0], charge(sol.t, **VALUES), atol=1e-5)
+    np.testing.assert_allclose(sol.energy(), sol.x[:, 0] ** 2 / (2 * 0.35), rtol=1e-14)
+    slopes = jax.grad(lambda params: run(params).x[-1, 0])({name: jnp.asarray(value) for name, value in VALUES.items()})
+    for name, value in VALUES.items():
+        more, less = (run(VALUES | {name: value * (1 + e)}).x[-1, 0] for e in (1e-4, -1e-4))
+        assert slopes[name] == pytest.approx((more - less) / (2e-4 * value), rel=1e-7)
+
+
+def test_a_sweep_over_params(tmp_path):
+    loads = [1.0, 2.0, 8.0]
+    case = lambda load: {"x": [0.0], "params": VALUES | {"load": load}}
+    given = dict(over={"load": loads}, case=case, step=0.01, steps=200, to=tmp_path / "loads.zarr")
+    data = dx.sweep(dx.circuit(OF_PARAMS), MIDPOINT, **given)
+    ends = [charge(2.0, **(VALUES | {"load": load})) for load in loads]
+    np.testing.assert_allclose(np.asarray(data["x"])[:, -1, 0], ends, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "message"),
+    [
+        ({"resistance": -1.0}, ValueError, r"value > 0\), but \('R', 1, 2, 'resistance'\) was given, and here it is -1"),
+        ({"load": -1.0}, ValueError, "diode-like resistor is zero at zero and has the sign"),
+        ({"tau": 0.0}, ValueError, "value > 0"),
+        ({"tau": jnp.ones(2)}, TypeError, r"capacitance\(\) must return one number"),
+        (None, TypeError, "pass params="),
+    ],
+)
+def test_params_that_are_no_values(changed, error, message):
+    with pytest.raises(error, match=message):
+        dx.simulate(dx.circuit(OF_PARAMS), MIDPOINT, x=[0.0], step=0.1, steps=2, params=changed and VALUES | changed)
+    with pytest.raises(TypeError, match="has the keys 'load'"):
+        dx.simulate(dx.circuit(OF_PARAMS[1:]), MIDPOINT, x=[0.0], step=0.1, steps=2, params={"load": 1.0})
+
+
+def test_functions_are_user_functions():
+    functions = dx.circuit([*OF_PARAMS, ("C", 1, 0, 1.0), DIODE]).functions
+    assert [f is not None and f.signature for f in functions] == [
+        "lambda(t, params)", "OfParams(params)", "lambda(u, params)", "lambda(params)", False, "lambda(u)",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("nodes", [3, 140])
+def test_the_laws_of_few_and_of_many_nodes(nodes):
+    """By their residual, written out: a chain of C to the ground and L between nodes, with a source and a transformer."""
+    chain = [element for n in range(1, nodes) for element in (("C", n, 0, 1.0 + n), ("L", n, n + 1, 2.0))]
+    system = dx.circuit([("I", 0, 1, jnp.cos), *chain, ("R", nodes, 0, 3.0), ("T", (1, 0), (nodes, 0), 4.0), ("V", 2, 0, 5.0)])
+    assert isinstance(system, dx.Circuit)
+    pairs = nodes - 1
+    x, v, e = (np.random.default_rng(i).normal(size=size) for i, size in enumerate((2 * pairs, 2 * pairs, nodes)))
+    left = np.asarray(system.relation(jnp.asarray(x), jnp.asarray(v), jnp.asarray([*e, 0.6, 0.7]), 0.3))
+    flow, into = x[pairs:] / 2.0, np.zeros(nodes)
+    into[:-1] += v[:pairs] + flow
+    into[1:] -= flow
+    into[0] += -np.cos(0.3) + 0.7
+    into[1] += 0.6
+    into[-1] += e[-1] / 3.0 - 4.0 * 0.7
+    voltages = v[pairs:] - (e[:-1] - e[1:]), x[:pairs] / (2.0 + np.arange(pairs)) - e[:-1], [5.0 - e[1]]
+    np.testing.assert_allclose(left, np.concatenate([into, *voltages, [4.0 * e[-1] - e[0]]]), atol=1e-13)

@@ -191,4 +191,4 @@ def sizes_near(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: 
     return jax.lax.stop_gradient(tuple(found))
 
 
-_compiled = compiled(sizes_at)
+_compiled = compiled(sizes_at, seldom=True)

@@ -143,4 +143,4 @@ def _not_below_others(layout: Layout, sizes: Any, xp: Any) -> Any:
     return xp.concatenate([xp.where(part > 0.0, part, 1.0) for part in floored])
 
 
-_compiled = compiled(_sizes)
+_compiled = compiled(_sizes, seldom=True)

@@ -56,12 +56,13 @@ def damped_step(change: Any, update: Callable, u: Any, units: Any, sizes: Any, x
         fraction = xp.where(searching, fraction / 2.0, fraction)
         return fraction, better | searching & improves(fraction)
 
-    unfinished = lambda carry: ~carry[1] & (carry[0] > SHORTEST) & (carry[0] * here > floor) & ~near
-    whole = xp.ones(here.shape)
-    with np.errstate(all="ignore"):
-        better = at_floor if xp is np and np.all(at_floor) else at_floor | improves(whole)
-        fraction, better = _repeated(xp, lambda carry: xp.any(unfinished(carry)), halve, (whole, better))
-        return xp.where(better[..., None], u - fraction[..., None] * change, u), better & ~at_floor
+    def unfinished(carry):
+        fraction, better = carry
+        return ~better & ((fraction > 1.0) | (fraction > SHORTEST) & (fraction * here > floor) & ~near)
+
+    with np.errstate(all="ignore"):  # begun at twice the step, so that XLA compiles `improves` once
+        fraction, better = _repeated(xp, lambda carry: xp.any(unfinished(carry)), halve, (xp.full(here.shape, 2.0), at_floor))
+        return xp.where(better[..., None], u - xp.minimum(fraction, 1.0)[..., None] * change, u), better & ~at_floor
 
 
 def sizes_of_unknowns(matrix: Any, inverse: Any, u: Any, residual: Any, xp: ModuleType = np) -> Any:

@@ -1,5 +1,6 @@
 """Where a run begins: initial data made complete by the system, then the first state and the first step of the equation."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -207,7 +208,7 @@ def begins_by_arrays(case: Case) -> bool:
     return max(np.shape(leaf)[-1] for leaf in case.data.values()) >= FEWEST_ARRAYS
 
 
-@compiled
+@functools.partial(compiled, seldom=True)
 def _compiled(one: Any, arguments: tuple, axes: tuple | None) -> Any:
     """One compiled function for all of it, reused by later runs of equal systems and schemes."""
     return (one if axes is None else jax.vmap(one, in_axes=axes))(*arguments)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,31 +14,36 @@ from dirax.numerics.tolerances import SOLVED_ROUNDOFF
 from dirax.program.roots import FEWEST_SPARSE, nearest_root
 from dirax.program.sparse_matrix import SparseMatrix
 from dirax.program.user_functions import UserFunction
+from dirax.systems.circuit_elements import (
+    ELEMENT,
+    GROUND,
+    TRIED,
+    Element,
+    check_element,
+    check_result,
+    check_values,
+    function_of,
+)
 from dirax.systems.circuit_sources import refuse_contradictions
 from dirax.systems.forms import RelationForm
 from dirax.systems.implicit_system import ImplicitSystem
+from dirax.systems.premise import Premise
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem, refuse_start
-
-GROUND = 0
-Element = tuple[str, Any, Any, Any]
-"""(kind, from, to, value): see `circuit`."""
-
-KINDS = ("C", "L", "R", "V", "I", "T")
-ELEMENT = "(C, L, R, V, I or T, node, other node, value)"
-TRIED = np.concatenate([-np.geomspace(1e-9, 1.0, 40)[::-1], [0.0], np.geomspace(1e-9, 1.0, 40)])
-"""Voltages at which a diode-like resistor is asked for its current."""
 
 
 def circuit(netlist: Sequence[Element]) -> "ImplicitSystem | Circuit":
     """The system of a list of elements (kind, node, other node, value); node 0 is the ground.
 
     - ("C", a, b, capacitance) and ("L", a, b, inductance), more than 0;
-    - ("R", a, b, resistance), more than 0, or ("R", a, b, current), a function of the voltage from a to b, such as a diode's:
+    - ("R", a, b, resistance), more than 0, or ("R", a, b, current), a function of the voltage u from a to b, such as a diode's:
       zero at zero, never of the other sign, and never smaller at a larger voltage;
     - ("V", a, b, voltage) of a at b, and ("I", a, b, current) from a through the source to b: numbers, or functions of
       the time t;
     - ("T", (a, b), (c, d), ratio): a transformer, u_ab = ratio · u_cd, without losses.
+
+    A value but that of T may also be the name of one of the params, or a function `lambda params: …`; functions of u and of t may
+    take params after it.
 
     x = (charges of the capacitors, fluxes of the inductors), in the order of the list; the potentials of the nodes in ascending
     order, then the currents of the voltage sources and of the transformers' first sides, are the multipliers (Kirchhoff's laws):
@@ -46,11 +52,12 @@ def circuit(netlist: Sequence[Element]) -> "ImplicitSystem | Circuit":
         φ̇ = Aᵀ_L e,   q/C = Aᵀ_C e,   V = Aᵀ_V e,   Aᵀ_T e = n A'ᵀ_T e.
 
     Loops of capacitors or voltage sources, and nodes with inductors or current sources alone, are found by the constraint
-    algorithm where all elements are linear and constant, as an `ImplicitSystem`, in circuits of less than 128 nodes. In larger
-    ones a step costs in proportion to the elements.
+    algorithm where resistors are linear; where all values are numbers, in circuits of less than 128 nodes, as those of an
+    `ImplicitSystem`. In larger ones a step costs in proportion to the elements.
 
         rectifier = dx.circuit([("V", 1, 0, jnp.sin), ("R", 1, 2, lambda u: 1e-6 * jnp.expm1(20 * u)), ("C", 2, 0, 1.0),
-                                ("R", 2, 0, 5.0)])
+                                ("R", 2, 0, "load")])
+        sol = dx.simulate(rectifier, dx.DiscreteDirac(), x=[0.0], step=0.02, steps=3000, params={"load": 5.0})
 
     Raises `ValueError` for unknown kinds, values that are not positive, resistors that give energy, parts that are not
     connected to the ground, and constant sources that contradict each other; `TypeError` for what is no number and no function
@@ -59,36 +66,43 @@ def circuit(netlist: Sequence[Element]) -> "ImplicitSystem | Circuit":
     if not isinstance(netlist, list | tuple) or not netlist:
         raise TypeError(f"netlist must be a list of elements {ELEMENT}, but {netlist!r:.100} was given.")
     for element in netlist:
-        _check(element)
+        check_element(element)
     made = Circuit(netlist)
     return made.implicit() if made.is_linear and not made.is_large else made
 
 
 class Circuit(AbstractSystem):
-    """A circuit with diode-like resistors, sources that change in time, or very many nodes; made by `dx.circuit`."""
+    """A circuit with values that are functions or of params, or with very many nodes; made by `dx.circuit`."""
 
     netlist: tuple[Element, ...] = eqx.field(static=True)
+    functions: tuple[UserFunction | None, ...]
+    """The values of the elements that are no numbers."""
     nodes: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, netlist: Sequence[Element]):
-        self.netlist = tuple(netlist)
+        hashable = lambda ends: tuple(ends) if isinstance(ends, list) else ends
+        self.netlist = tuple((kind, hashable(a), hashable(b), value) for kind, a, b, value in netlist)
+        self.functions = tuple(map(function_of, self.netlist))
         self.nodes = tuple(sorted({node for pair in _pairs(netlist) for node in pair} - {GROUND}))
         _refuse_islands(netlist, self.nodes)
-        refuse_contradictions(netlist, GROUND)
+        refuse_contradictions([(*e[:3], f or e[3]) for e, f in zip(self.netlist, self.functions, strict=True)], GROUND)
 
     def elements(self, kind: str) -> list[Element]:
         """The elements of a kind, in the order of the list."""
         return [element for element in self.netlist if element[0] == kind]
 
-    def values(self, kind: str) -> np.ndarray:
-        """The values of a kind of elements that have numbers."""
-        return np.array([element[3] for element in self.elements(kind)], dtype=float)
+    def count(self, kinds: str) -> int:
+        """How many elements of these kinds there are."""
+        return sum(element[0] in kinds for element in self.netlist)
 
-    def incidence(self, kind: str, side: int = 1) -> Any:
-        """+1 where an element of the kind leaves a node and −1 where it arrives, (nodes, elements); of a transformer's first or
-        second `side`. A `SparseMatrix` for very many nodes."""
-        chosen = self.elements(kind)
-        ends: list[Any] = [element[side] if kind == "T" else element[1:3] for element in chosen]
+    def values(self, kind: str, params: Any = None) -> Any:
+        """The numbers that a kind of elements has, or has at these params."""
+        return self._each(kind, lambda value, _: value(params), lambda values, _: values)
+
+    def incidence(self, kind: str, side: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes, elements of the kind, and +1 where an element leaves a node, −1 where it arrives; of a transformer's first or
+        second `side`."""
+        ends: list[Any] = [element[side] if kind == "T" else element[1:3] for element in self.elements(kind)]
         number = {node: row for row, node in enumerate(self.nodes)}
         entries = [
             (number[node], column, sign)
@@ -96,21 +110,49 @@ class Circuit(AbstractSystem):
             for node, sign in zip(pair, (1.0, -1.0), strict=True)
             if node != GROUND
         ]
-        rows, columns, signs = (np.array(part) for part in zip(*entries, strict=True)) if entries else (np.zeros(0, int),) * 3
-        shape = len(self.nodes), len(chosen)
-        if self.is_large:
-            return SparseMatrix((np.asarray(signs, float), (rows, columns)), shape)
-        matrix = np.zeros(shape)
-        matrix[rows, columns] = signs
-        return matrix
+        rows, columns, signs = zip(*entries, strict=True) if entries else ((), (), ())
+        return np.array(rows, int), np.array(columns, int), np.array(signs, float)
 
     @property
-    def transformers(self) -> Any:
-        """A_T − A'_T n: the currents of the nodes by those of the first sides."""
-        first, second = self.incidence("T"), self.incidence("T", 2)
-        if not self.is_large:
-            return first - second * self.values("T")
-        return SparseMatrix(first.matrix - second.matrix.multiply(self.values("T")[None, :]))
+    def resistors(self) -> Any:
+        """A_Rᵀ, (resistors, nodes): their voltages by the potentials."""
+        nodes, elements, signs = self.incidence("R")
+        return self._matrix(elements, nodes, signs, (self.count("R"), len(self.nodes)))
+
+    @property
+    def laws(self) -> Any:
+        """The matrix of Kirchhoff's laws: by rows the currents of the nodes, and the voltages of L, C, V and T; by columns the
+        currents of C, L, R, I, V and T, the voltages of L, C and V, and the potentials."""
+        row, column, entries = len(self.nodes), 0, []
+        potentials = self.count("CLRIVT") + self.count("LCV")
+        across: dict[str, Any] = {}
+        for kind in "CLRIVT":
+            nodes, elements, signs = self.incidence(kind)
+            if kind == "T":  # A_T − A'_T n
+                others, seconds, back = self.incidence("T", 2)
+                nodes, elements = np.concatenate([nodes, others]), np.concatenate([elements, seconds])
+                signs = np.concatenate([signs, -back * self.values("T")[seconds]])
+            across[kind] = nodes, elements, signs
+            entries.append((nodes, column + elements, signs))
+            column += self.count(kind)
+        for kind in "LCVT":
+            nodes, elements, signs = across[kind]
+            entries.append((row + elements, potentials + nodes, -signs))
+            if kind != "T":
+                own = np.arange(self.count(kind))
+                entries.append((row + own, column + own, np.ones(len(own))))
+                column += len(own)
+            row += self.count(kind)
+        rows, columns, values = map(np.concatenate, zip(*entries, strict=True))
+        return self._matrix(rows, columns, values, (row, potentials + len(self.nodes)))
+
+    def _matrix(self, rows: np.ndarray, columns: np.ndarray, entries: np.ndarray, shape: tuple[int, int]) -> Any:
+        """A matrix by its entries, of which those at one place add up; a `SparseMatrix` for very many nodes."""
+        if self.is_large:
+            return SparseMatrix((entries, (rows, columns)), shape)
+        matrix = np.zeros(shape)
+        np.add.at(matrix, (rows, columns), entries)
+        return matrix
 
     @property
     def is_large(self) -> bool:
@@ -119,84 +161,103 @@ class Circuit(AbstractSystem):
 
     @property
     def is_linear(self) -> bool:
-        """Whether no element is stated as a function."""
-        return not any(callable(element[3]) for element in self.netlist)
+        """Whether all elements are stated as numbers."""
+        return not any(self.functions)
 
     def implicit(self) -> ImplicitSystem:
         """The same as E ẋ = f(x) + B u, of linear and constant elements."""
-        values = {kind: self.values(kind) for kind in KINDS}
-        c, l, r, v = (self.incidence(kind) for kind in "CLRV")
-        i, t = self.incidence("I"), self.transformers
-        nc, nl, nv, nt, n = c.shape[1], l.shape[1], v.shape[1], t.shape[1], len(self.nodes)
-        E = np.zeros((n + nl + nc + nv + nt, nc + nl))
-        E[:n, :nc], E[n : n + nl, nc:] = c, np.eye(nl)
-        B = np.zeros((n + nl + nc + nv + nt, n + nv + nt))
-        B[:n, :n], B[:n, n : n + nv], B[:n, n + nv :] = -r @ np.diag(1 / values["R"]) @ r.T, -v, -t
-        B[n : n + nl, :n], B[n + nl : n + nl + nc, :n] = l.T, c.T
-        B[n + nl + nc : n + nl + nc + nv, :n], B[n + nl + nc + nv :, :n] = v.T, t.T
-        given = -i @ values["I"]
+        nc, nl, nv = map(self.count, "CLV")
+        ends = np.cumsum([nc, nl, self.count("R"), self.count("I"), nv + self.count("T"), nl, nc, nv])
+        c, l, r, i, branches, fluxes, charges, v, potentials = np.split(self.laws, ends, axis=1)
+        E = np.concatenate([c, fluxes], axis=1)
+        B = -np.concatenate([potentials + r @ (self.resistors / self.values("R")[:, None]), branches], axis=1)
+        of_x = -np.concatenate([charges / self.values("C"), l / self.values("L")], axis=1)
+        given = -(i @ self.values("I") + v @ self.values("V"))
 
         def stated(x):
             self.refuse_length(x)
             return jnp.asarray(E)
 
-        def f(x):
-            current, voltage = x[nc:] / values["L"], x[:nc] / values["C"]
-            nodes = -jnp.asarray(l) @ current
-            nodes = nodes + given if i.shape[1] else nodes
-            parts = [nodes, jnp.zeros(nl), -voltage, -jnp.asarray(values["V"])]
-            return jnp.concatenate([*parts, jnp.zeros(nt)] if nt else parts)
+        return ImplicitSystem(stated, lambda x: of_x @ x + given, lambda x: jnp.asarray(B), self.energy)
 
-        return ImplicitSystem(stated, f, lambda x: jnp.asarray(B), self.energy)
-
-    def energy(self, x: Float[Numbers, " N"]) -> Float[Numbers, ""]:
+    def energy(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, ""]:
         """That of the capacitors and inductors."""
-        c, l = self.values("C"), self.values("L")
+        c, l = self.values("C", params), self.values("L", params)
         return jnp.sum(x[: len(c)] ** 2 / c) / 2 + jnp.sum(x[len(c) :] ** 2 / l) / 2
 
-    def currents(self, voltages: Float[Numbers, " r"]) -> Float[Numbers, " r"]:
+    def currents(self, voltages: Float[Numbers, " r"], params: Any = None) -> Float[Numbers, " r"]:
         """The currents of the resistors at their voltages."""
-        return _each(self.elements("R"), lambda value, i: value(voltages[i]), lambda values, i: voltages[i] / values)
+        of_one = lambda value, i: value(voltages[i], params) if value.arguments else voltages[i] / value(params)
+        return self._each("R", of_one, lambda values, i: voltages[i] / values)
 
-    def source(self, kind: str, t: Any) -> Array:
+    def source(self, kind: str, t: Any, params: Any = None) -> Any:
         """The values of the sources at a time."""
-        return _each(self.elements(kind), lambda value, _: value(t), lambda values, _: jnp.asarray(values))
+        of_one = lambda value, _: value(t, params) if value.arguments else value(params)
+        return self._each(kind, of_one, lambda values, _: values)
+
+    def _each(self, kind: str, of_function: Callable, of_numbers: Callable) -> Any:
+        """A number of each element of a kind, in their order: by its function, or those with numbers at once."""
+        own = [f or e[3] for e, f in zip(self.netlist, self.functions, strict=True) if e[0] == kind]
+        functions = [i for i, value in enumerate(own) if callable(value)]
+        if not functions:
+            return of_numbers(np.array(own, float), slice(None))
+        parts: list[Any] = [jnp.stack([jnp.asarray(of_function(own[i], i), float) for i in functions])]
+        numbers = np.setdiff1d(np.arange(len(own)), functions)
+        if len(numbers):
+            parts.append(of_numbers(np.array([own[i] for i in numbers], float), numbers))
+        return jnp.concatenate(parts)[np.argsort([*functions, *numbers])] if len(numbers) else parts[0]
 
     def relation(self, x: Array, velocity: Array, multipliers: Array, t: Any, params: Any = None) -> Float[Numbers, " r"]:
         """Kirchhoff's laws: currents of the nodes; voltages of the inductors, capacitors, sources, transformers."""
-        array = (lambda matrix: matrix) if self.is_large else jnp.asarray
-        c, l, r, v, i = (array(self.incidence(kind)) for kind in "CLRVI")
-        sides = array(self.transformers)
-        nc, n, nv = c.shape[1], len(self.nodes), v.shape[1]
-        e, i_v, i_t = multipliers[:n], multipliers[n : n + nv], multipliers[n + nv :]
-        nodes = c @ velocity[:nc] + l @ (x[nc:] / self.values("L")) + r @ self.currents(r.T @ e) + i @ self.source("I", t)
-        nodes = nodes + v @ i_v + sides @ i_t
-        voltages = velocity[nc:] - l.T @ e, x[:nc] / self.values("C") - c.T @ e, self.source("V", t) - v.T @ e, sides.T @ e
-        return jnp.concatenate([nodes, *voltages])
+        c, n = self.count("C"), len(self.nodes)
+        e, branches = multipliers[:n], multipliers[n:]
+        inductors, resistors = x[c:] / self.values("L", params), self.currents(self.resistors @ e, params)
+        currents = velocity[:c], inductors, resistors, self.source("I", t, params), branches
+        voltages = velocity[c:], x[:c] / self.values("C", params), self.source("V", t, params)
+        return self.laws @ jnp.concatenate([*currents, *voltages, e])
 
     # ------------------------------------------------------------------ AbstractSystem
 
     def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         refuse_start(self, data, "x")
         self.refuse_length(data["x"])
-        return data["x"].shape[0], len(self.nodes) + len(self.elements("V")) + len(self.elements("T"))
+        for element, function in zip(self.netlist, self.functions, strict=True):
+            if function is not None and function.takes_params:
+                check_result(element, function, params)
+        return data["x"].shape[0], len(self.nodes) + self.count("VT")
 
     def refuse_length(self, x: Any) -> None:
         """Raise `ValueError` for data of another circuit."""
-        expected = len(self.elements("C")) + len(self.elements("L"))
+        expected = self.count("CL")
         if x.shape[0] != expected:
             raise ValueError(f"x are the charges and then the fluxes of the circuit, {expected} numbers, not {x.shape[0]}.")
 
+    def premise(self, data: Data, params: Any) -> Premise | None:
+        """What is stated of elements that are numbers holds at these params."""
+        return Premise(self._of_params, self._refuse) if self._asked else None
+
+    @property
+    def _asked(self) -> list[tuple[Element, UserFunction]]:
+        pairs = zip(self.netlist, self.functions, strict=True)
+        return [(e, f) for e, f in pairs if f is not None and f.takes_params and e[0] in "CLR"]
+
+    def _of_params(self, data: Data, params: Any) -> list[Any]:
+        at_all = lambda function: jax.vmap(lambda u: function(u, params))(jnp.asarray(TRIED))
+        return [at_all(function) if function.arguments else function(params) for _, function in self._asked]
+
+    def _refuse(self, found: list[Any]) -> None:
+        for (element, _), values in zip(self._asked, found, strict=True):
+            check_values(element, values)
+
     def relation_form(self, shape: Shape) -> RelationForm:
-        currents = [f"current of {kind} {i}" for kind in "VT" for i in range(len(self.elements(kind)))]
+        currents = [f"current of {kind} {i}" for kind in "VT" for i in range(self.count(kind))]
         labels = (*(f"potential of node {node}" for node in self.nodes), *currents)
         return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port")
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         x, t, n = data["x"], data.get("t", 0.0), data["x"].shape[0]
-        m = len(self.nodes) + len(self.elements("V")) + len(self.elements("T"))
-        laws = lambda z: self.relation(x, z[:n], z[n:], t, params)
-        found = nearest_root(laws, jnp.zeros(n + m))
+        left = lambda z: self.relation(x, z[:n], z[n:], t, params)
+        found = nearest_root(left, jnp.zeros(n + len(self.nodes) + self.count("VT")))
         return {"x": x, "velocity": found[:n], "potentials": found[n:]}
 
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " r"]:
@@ -205,7 +266,7 @@ class Circuit(AbstractSystem):
 
     def sizes_of_data(self, data: Data, params: Any) -> Data:
         """Currents and voltages that are zero up to roundoff of the others."""
-        c, n = len(self.elements("C")), len(self.nodes)
+        c, n = self.count("C"), len(self.nodes)
         rates, rest = data["velocity"], data["potentials"]
         largest = lambda *parts: jnp.max(jnp.abs(jnp.concatenate(parts)), initial=0.0)
         current, voltage = (SOLVED_ROUNDOFF * largest(*pair) for pair in ((rates[:c], rest[n:]), (rates[c:], rest[:n])))
@@ -215,7 +276,7 @@ class Circuit(AbstractSystem):
         return sizes | {"velocity": velocity, "potentials": of((rest[:n], rest[n:]), voltage, current)}
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
-        return self.energy(row["x"])
+        return self.energy(row["x"], params)
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " r"]:
         now = {"x": row["x"], "t": jnp.asarray(row.get("t", 0.0))}
@@ -227,79 +288,13 @@ class Circuit(AbstractSystem):
 
     @property
     def energy_changes(self) -> str:
-        sources = bool(self.elements("V") or self.elements("I"))
-        parts = ["has sources"] * sources + ["has resistors"] * bool(self.elements("R"))
+        parts = ["has sources"] * bool(self.count("VI")) + ["has resistors"] * bool(self.count("R"))
         return " and ".join(parts) and f"{' and '.join(parts)} that change its energy"
-
-
-def _check(element: Any) -> None:
-    given = f"{element!r:.100} was given"
-    if not isinstance(element, tuple | list) or len(element) != 4 or not isinstance(element[0], str) or element[0] not in KINDS:
-        raise ValueError(f"an element is {ELEMENT}, but {given}.")
-    kind, start, end, value = element
-    sides = (start, end) if kind == "T" else ((start, end),)
-    if not all(isinstance(ends, tuple | list) and len(ends) == 2 for ends in sides):
-        raise ValueError(f"a transformer is (T, (a, b), (c, d), ratio), but {given}.")
-    if not all(isinstance(node, int | np.integer) and not isinstance(node, bool) for ends in sides for node in ends):
-        raise TypeError(f"nodes are whole numbers, {GROUND} that of the ground, but {given}.")
-    if any(a == b for a, b in sides):
-        raise ValueError(f"an element is {ELEMENT} between two nodes, but {given}.")
-    if callable(value):
-        if kind not in "RVI":
-            raise TypeError(f"only R, V and I may be functions, of the voltage and of the time, but {given}.")
-        _check_function(value, "voltage" if kind == "V" else "current", "u" if kind == "R" else "t", given)
-        if kind == "R":
-            _check_current(value, given)
-        return
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
-        raise TypeError(f"the value of an element must be a finite number, or a function for R, V and I, but {given}.")
-    if kind in "CLR" and not value > 0:
-        raise ValueError(f"an element is (C, L, R, V, I or T, node, other node, value > 0), but {given}.")
-    if kind == "T" and value == 0:
-        raise ValueError(f"the ratio of a transformer is not zero, but {given}.")
-
-
-def _check_function(value: Callable, name: str, argument: str, given: str) -> None:
-    """Refuse what is no function of one number, with a number for result, that JAX can trace."""
-    try:
-        function = UserFunction(value, name, (argument,))
-        if function.takes_params:
-            raise TypeError(f"{name} must be a function {name}({argument}), without params.")
-        if shape := function.shape(np.float64(0.0), None).shape:
-            raise TypeError(f"{name}({argument}) must return one number, but it returned shape {shape}.")
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{str(error).rstrip('.')}; {given}.") from error
-
-
-def _check_current(current: Callable, given: str) -> None:
-    """Refuse a resistor that gives energy, or has a falling current."""
-    found = np.array([float(current(u)) for u in TRIED])
-    wrong = ~np.isfinite(found) | (np.sign(found) * TRIED < 0) | ((TRIED == 0) & (found != 0))
-    if np.any(wrong):
-        at = TRIED[int(np.argmax(wrong))]
-        raise ValueError(
-            f"the current of a diode-like resistor is zero at zero and has the sign of its voltage, but at {at:.3g} it is "
-            f"{found[int(np.argmax(wrong))]:.3g}: {given}."
-        )
-    if np.any(np.diff(found) < 0):
-        raise ValueError(f"the current of a diode-like resistor never falls with its voltage, but here it does: {given}.")
 
 
 def _pairs(netlist: Sequence[Element]) -> list[tuple[int, int]]:
     """The nodes that elements are between."""
     return [tuple(ends) for kind, *nodes, _ in netlist for ends in (nodes if kind == "T" else [nodes])]
-
-
-def _each(elements: Sequence[Element], of_function: Callable, of_numbers: Callable) -> Array:
-    """A number of each element: by its function, or those with numbers at once; both are given places in the list too."""
-    functions = [i for i, element in enumerate(elements) if callable(element[3])]
-    numbers = np.array([i for i, element in enumerate(elements) if not callable(element[3])], int)
-    found: list[Any] = [jnp.asarray(of_function(elements[i][3], i), float) for i in functions]
-    parts = [jnp.stack(found)] if found else []
-    parts += [of_numbers(np.array([elements[i][3] for i in numbers], float), numbers)] if len(numbers) else []
-    if not parts:
-        return jnp.zeros(0)
-    return jnp.concatenate(parts)[np.argsort([*functions, *numbers])] if len(parts) > 1 else parts[0]
 
 
 def _refuse_islands(netlist: Sequence[Element], nodes: Sequence[int]) -> None:

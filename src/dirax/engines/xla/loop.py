@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from dirax.engines.contract import OK, Problem
 from dirax.engines.xla.lane import Lane, Numerics, packed_row, parts_of_row, take_step, time_of, unpacked_row
-from dirax.program.compiled import compiled
+from dirax.program.compiled import compiled, known_options
 
 CHUNK_BYTES = 2**20
 """Largest buffer of saved rows on the device. Runs of more go through it several times; runs of less pay for all of it."""
@@ -68,17 +68,8 @@ def unpack_rows(equation, axes, packed, params, clock: Clock) -> dict:
 def compiled_chunk(platform: str, long: bool = False) -> Any:
     """`_chunk` compiled for a platform, with the options that this version of XLA knows; for `long` arrays with more of them."""
     options = {} if platform != "cpu" else QUICK_TO_COMPILE | (BY_ITSELF if long else {})
-    known = {name: value for name, value in options.items() if _is_known(name, value)}
+    known = known_options(options)
     return compiled(_chunk, compiler_options=known) if known else compiled(_chunk)
-
-
-@functools.cache
-def _is_known(name: str, value: Any) -> bool:
-    try:
-        jax.jit(lambda: 0.0, compiler_options={name: value}).lower().compile()
-    except jax.errors.JaxRuntimeError:
-        return False
-    return True
 
 
 def _chunk(

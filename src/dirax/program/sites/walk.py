@@ -14,7 +14,8 @@ from dirax.program.interpreter import RULES, Interpreter, Unsupported, check_dty
 from dirax.program.rules.reductions import FOLDS, factors_of_product
 from dirax.program.sites.courses import Course, NotBySites, taken_apart
 from dirax.program.sites.pieces import Expressions, Piece, Place, gathered, shared
-from dirax.program.sparsity.movement import MOVES, places_of_updates
+from dirax.program.sparsity.indexing import places_of_updates, read
+from dirax.program.sparsity.movement import MOVES
 from dirax.program.sparsity.movement import pad as padded
 from dirax.program.sparsity.values import evaluated
 from dirax.program.sparsity.walk import BY_ENTRY, CALLS, IN_NUMPY, iota
@@ -201,11 +202,11 @@ class _Walk:
     def _indexed(self, equation: Any, operands: list[Value]) -> Value:
         """Entries at places that are known."""
         given = 2 if equation.primitive.name == "dynamic_update_slice" else 1
-        if any(isinstance(o, list) for o in operands[given:]):
+        indices = [o for o in operands[given:] if isinstance(o, np.ndarray)]
+        if len(indices) < len(operands) - given:
             raise NotBySites(f"'{equation.primitive.name}' has indices that depend on values")
         pieces, numbers = self._one(operands[:given], equation.replace(invars=equation.invars[:given]))
-        options = {"fill_value": 0} if equation.primitive.name == "gather" else {}
-        (found,) = evaluated(equation, [*(1 + n for n in numbers), *operands[given:]], **options)
+        found = read(equation, [1 + n for n in numbers], indices)
         return self._taken(pieces, sum(n.size for n in numbers), found - 1, *(n.shape for n in numbers))
 
     def _scattered(self, equation: Any, value: Value, indices: Value, updates: Value) -> Value:

@@ -3,12 +3,12 @@
 import math
 from typing import Any
 
-import jax
 import numpy as np
 import scipy.sparse as sp
 
 from dirax.program.interpreter import RULES
-from dirax.program.sparsity.values import Dense, Value, evaluated, rows, union
+from dirax.program.sparsity.indexing import places_of_updates, read
+from dirax.program.sparsity.values import Dense, Value, rows, union
 
 MOVES = frozenset(
     (
@@ -52,8 +52,7 @@ def gathered(equation: Any, value: Value, *indices: Value) -> list[Value]:
         raise Dense(f"'{equation.primitive.name}' has indices that depend on values")
     shape = equation.invars[0].aval.shape
     numbers = np.arange(1, math.prod(shape) + 1).reshape(shape)
-    options = {"fill_value": 0} if equation.primitive.name == "gather" else {}
-    places = evaluated(equation, [numbers, *(i.known for i in indices)], **options)[0]
+    places = read(equation, [numbers], [i.known for i in indices])
     zero = np.append(False, value.zeros(shape))[places] if value.known is not None or value.zero is not None else None
     return [Value(None if value.sets is None else rows(value.sets, places), None, zero)]
 
@@ -84,15 +83,6 @@ def scattered(equation: Any, value: Value, indices: Value, updates: Value) -> li
     return [Value(kept, None, zero.reshape(shape))]
 
 
-def places_of_updates(equation: Any, indices: np.ndarray, shape: tuple[int, ...], given: tuple[int, ...]) -> np.ndarray:
-    """Where a scatter adds each of its updates, of shape `given`, in an array of `shape`, counted from 1; 0 for outside it."""
-    put = lambda updates: _scatter_add(equation, np.zeros(shape), indices, updates)
-    with jax.ensure_compile_time_eval():
-        numbers = jax.numpy.arange(1.0, math.prod(shape) + 1).reshape(shape)
-        found = jax.linear_transpose(put, jax.ShapeDtypeStruct(given, np.float64))(numbers)[0]
-        return np.asarray(found).ravel().astype(int)
-
-
 def updated(equation: Any, value: Value, updates: Value, *starts: Value) -> list[Value]:
     if any(s.known is None for s in starts):
         if value.sets is None and updates.sets is None:
@@ -101,7 +91,7 @@ def updated(equation: Any, value: Value, updates: Value, *starts: Value) -> list
     shapes = [v.aval.shape for v in equation.invars[:2]]
     size, count = map(math.prod, shapes)
     numbers = np.arange(1, size + 1).reshape(shapes[0]), np.arange(size + 1, size + count + 1).reshape(shapes[1])
-    places = evaluated(equation, [*numbers, *(s.known for s in starts)])[0]
+    places = read(equation, numbers, [s.known for s in starts])
     zero = np.concatenate([v.zeros(shape).ravel() for v, shape in zip((value, updates), shapes, strict=True)])[places - 1]
     if value.sets is None and updates.sets is None:
         return [Value(zero=zero)]
@@ -109,14 +99,6 @@ def updated(equation: Any, value: Value, updates: Value, *starts: Value) -> list
     empty = lambda rows: sp.csr_matrix((rows, unknowns), dtype=bool)
     both = [empty(n) if v.sets is None else v.sets for v, n in ((value, size), (updates, count))]
     return [Value(rows(sp.vstack(both, "csr"), places), None, zero)]
-
-
-def _scatter_add(equation: Any, zeros: np.ndarray, indices: np.ndarray, updates: Any) -> Any:
-    p = equation.params
-    return jax.lax.scatter_add(
-        jax.numpy.asarray(zeros), jax.numpy.asarray(indices), updates, p["dimension_numbers"],
-        indices_are_sorted=p["indices_are_sorted"], unique_indices=p["unique_indices"], mode=p["mode"],
-    )  # fmt: skip
 
 
 def pad(_: Any, equation: Any, x: np.ndarray, filler: np.ndarray) -> list[np.ndarray]:

@@ -74,8 +74,8 @@ def of_all(sets: Any, sizes: Sequence[int], message: str, batch: int = 1) -> lis
     return [Value(rows(sets, np.repeat(np.arange(1, batch + 1), size))) for size in sizes]
 
 
-def evaluated(equation: Any, operands: list[Any], **options: Any) -> list[np.ndarray]:
+def evaluated(equation: Any, operands: list[Any]) -> list[np.ndarray]:
     """The results of an equation for known operands, also while JAX traces."""
     with jax.ensure_compile_time_eval():
-        found = equation.primitive.bind(*map(jax.numpy.asarray, operands), **(equation.params | options))
+        found = equation.primitive.bind(*map(jax.numpy.asarray, operands), **equation.params)
     return [np.asarray(a) for a in (found if equation.primitive.multiple_results else [found])]

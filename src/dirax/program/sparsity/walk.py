@@ -49,6 +49,7 @@ IN_NUMPY: dict[str, Callable] = {
     "max": np.maximum, "min": np.minimum, "abs": np.abs, "convert_element_type": np.asarray, "copy": np.asarray,
     "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
     "and": np.bitwise_and, "or": np.bitwise_or, "not": np.invert, "square": np.square, "sqrt": np.sqrt,
+    "select_n": lambda which, *cases: np.choose(which, cases),
 }  # fmt: skip
 """What is evaluated where all numbers are known: masks, indices, constants of a linear part."""
 
