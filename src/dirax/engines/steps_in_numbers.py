@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
-from dirax.engines.stopping import CONTRACTING
+from dirax.engines.stopping import CONTRACTING, OWN
 from dirax.numerics.equilibration import balanced_inverse, condition_number
 from dirax.numerics.inverses import Inverses, applied, applied_sizes, inverted, no_inverses, unknown
 from dirax.numerics.tolerances import EPSILON
@@ -253,7 +253,8 @@ class StepsInNumbers:
             contracts = moved <= CONTRACTING * last[left]
             own[left] |= contracts & np.isfinite(last[left])
             stalled = own[left] & (moved >= last[left] / 2) & (moved < LEFT)
-            ended = (moved <= FOUND) | stalled | (fresh & np.isnan(moved))
+            found = _largest_ratio(change, np.maximum(np.abs(u[left]), OWN * size[left])) <= FOUND
+            ended = found | stalled | (fresh & np.isnan(moved))
             renewed[left] = ~fresh & ~contracts & ~(own[left] & (moved <= KEPT)) & ~ended
             last[left] = np.where(renewed[left], np.inf, moved)
             u[renewed] = safe[renewed]

@@ -18,10 +18,6 @@ MANY = 32
 """Matrices side by side that are many."""
 
 
-LARGE = 64
-"""Rows from which on a matrix is taken as one that is sparse."""
-
-
 def equilibrated(matrix: Any, xp: ModuleType = np, rounds: int = ROUNDS) -> tuple[Any, Any]:
     """The matrix (…, k, l) with rows, then columns, divided by their largest entries where these are not zero, several times
     over; and the units (…, 1, l) that this gives the unknowns: a solution of the scaled equations times them is one of the given.
@@ -116,38 +112,17 @@ def _least_squares(exponents: Any, weights: Any, xp: ModuleType) -> tuple[Any, A
     """Whole numbers near the r_i and c_j for which Σ w_ij (e_ij − r_i − c_j)² is least; a row has a weight of 1."""
     there = xp.where(exponents > NOTHING, weights, 0.0)
     logs = xp.where(exponents > NOTHING, exponents, 0).astype(float)
-    sums = lambda a, axis: xp.sum(a, axis=axis, keepdims=True)
+    turned, sums = (lambda a: xp.swapaxes(a, -1, -2)), (lambda a, axis: xp.sum(a, axis=axis, keepdims=True))
     in_rows, in_columns = (xp.maximum(sums(there, axis), 1.0) for axis in (-1, -2))
-    means = sums(there * logs, -2) / in_columns
-    solved = _row_logarithms if xp is not np or there.ndim > 2 or len(there) < LARGE else _row_logarithms_of_sparse
-    rows = solved(there, in_rows, in_columns, sums(there * (logs - means), -1), xp)
+    means, coupled = sums(there * logs, -2) / in_columns, (there / in_columns) @ turned(there)
+    one = xp.broadcast_to(xp.eye(logs.shape[-2]), coupled.shape)
+    connected = _connected(coupled + one, xp)
+    # the scales of rows that are connected may have a common factor: with the sum of their logarithms zero the equations have
+    # one solution, and with that of the first of them zero it moves with the units by whole numbers
+    rows = xp.linalg.solve(one * in_rows - coupled + connected, sums(there * (logs - means), -1))
+    rows = rows - xp.take_along_axis(rows, xp.argmax(connected, axis=-1)[..., None], axis=-2)
     columns = sums(there * (logs - rows), -2) / in_columns
     return tuple(xp.round(a - ODD).astype(int) for a in (rows, columns))
-
-
-def _row_logarithms(there: Any, in_rows: Any, in_columns: Any, right: Any, xp: ModuleType) -> Any:
-    """The r_i of least squares with the columns eliminated. The scales of rows that are connected may have a common factor: with
-    the sum of their logarithms zero the equations have one solution, and with that of the first of them zero it moves with the
-    units by whole numbers."""
-    coupled = (there / in_columns) @ xp.swapaxes(there, -1, -2)
-    one = xp.broadcast_to(xp.eye(coupled.shape[-1]), coupled.shape)
-    connected = _connected(coupled + one, xp)
-    rows = xp.linalg.solve(one * in_rows - coupled + connected, right)
-    return rows - xp.take_along_axis(rows, xp.argmax(connected, axis=-1)[..., None], axis=-2)
-
-
-def _row_logarithms_of_sparse(there: np.ndarray, in_rows: np.ndarray, in_columns: np.ndarray, right: np.ndarray, _) -> np.ndarray:
-    """The same of one large matrix with few entries."""
-    from scipy.sparse import csc_matrix, diags_array  # imported when they are used
-    from scipy.sparse.csgraph import connected_components
-    from scipy.sparse.linalg import splu
-
-    coupled = csc_matrix(there / in_columns) @ csc_matrix(there).T
-    _, parts = connected_components(coupled, directed=False)
-    _, first = np.unique(parts, return_index=True)
-    diagonal = in_rows[:, 0] + np.isin(np.arange(len(there)), first)
-    rows = splu(csc_matrix(diags_array(diagonal) - coupled)).solve(right)
-    return rows - rows[first][parts]
 
 
 ODD = 0.07

@@ -4,7 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from dirax.numerics.equilibration import LARGE, geometric_scales
+from dirax.numerics.equilibration import balancing_scales, geometric_scales
+
+LARGE = 64
+"""Rows from which on a matrix is factored and not inverted."""
 
 PROBES = 8
 """Vectors of random signs by which the sizes are found that a large inverse gives."""
@@ -26,7 +29,9 @@ def unknown(inverses: Inverses) -> np.ndarray:
 def inverted(matrices: np.ndarray) -> Inverses:
     """Those of matrices (matrices, k, k) whose rows and columns have units in common."""
     with np.errstate(all="ignore"):
-        rows, columns = geometric_scales(np.max(np.abs(matrices), axis=0, where=np.isfinite(matrices), initial=0.0))
+        sizes = np.max(np.abs(matrices), axis=0, where=np.isfinite(matrices), initial=0.0)
+        # geometric means follow the roundoff of zeros, of which large matrices have many
+        rows, columns = geometric_scales(sizes) if matrices.shape[-1] < LARGE else balancing_scales(sizes)
         scaled = matrices / rows / columns
         if matrices.shape[-1] >= LARGE:
             found = no_inverses(*matrices.shape[:2])
