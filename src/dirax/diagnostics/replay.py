@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.rows import over_rows, times_at
-from dirax.engines.steps_in_numbers import StepsInNumbers
+from dirax.engines.steps_in_numbers import Near, StepsInNumbers
 from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -41,6 +41,8 @@ class Again:
     unknowns: list[np.ndarray]
     begun: np.ndarray
     """The states that the steps left."""
+    near: Near
+    """By what the first of the steps from each row were solved."""
 
 
 @dataclass
@@ -224,28 +226,32 @@ class Replay:
 
     # ------------------------------------------------------------------------------------------ the steps
 
-    def again(self, at: Rows, noise: Noise | None = None, guesses: list[np.ndarray] | None = None) -> Again:
-        """The steps that leave these rows, up to the next saved ones."""
+    def again(
+        self, at: Rows, noise: Noise | None = None, guesses: list[np.ndarray] | None = None, near: Near | None = None
+    ) -> Again:
+        """The steps that leave these rows, up to the next saved ones, from these `guesses`, and `near` others, if they are given."""
         h, steps = float(self.sol.step), self.steps
-        made = steps.step(at.states, guesses or at.guesses, at.t, h, at.params, noise)
+        first = steps.nothing_near(len(at.rows)) if near is None else near
+        made = steps.step(at.states, guesses or at.guesses, at.t, h, at.params, noise, first)
         bad = ~made.good & (at.rows < self.ends[at.lanes])
         if np.any(bad) and guesses is None and noise is None:
-            other = self.resumed(at.lanes[bad], at.rows[bad])
-            made.put(bad, steps.step(at.states[bad], other.guesses, at.t[bad], h, at.params[bad]))
+            other, anew = self.resumed(at.lanes[bad], at.rows[bad]), steps.nothing_near(int(np.sum(bad)))
+            made.put(bad, steps.step(at.states[bad], other.guesses, at.t[bad], h, at.params[bad], near=anew))
+            first.put(bad, anew)
         here = steps.rows(made, at.t, h, at.params, noise)
         last, after, good = made, made.after.copy(), made.good.copy()
         unknowns = [u.copy() for u in made.unknowns]
-        left, bends = np.arange(len(at.rows)), [np.zeros_like(u) for u in made.unknowns]
+        left, bends, near = np.arange(len(at.rows)), [np.zeros_like(u) for u in made.unknowns], first
         for count in range(1, int(np.max(at.steps, initial=1))):
             on = (at.steps[left] > count) & last.good
             good[left[(at.steps[left] > count) & ~last.good]] = False
             before = [u[on] for u in last.unknowns]
             slopes = [b[on] for b in bends]
-            left, now = left[on], last.after[on]
+            left, now, near = left[on], last.after[on], near[on]
             if not len(left):
                 break
             t = at.t[left] + count * h
-            last = steps.step(now, [u + b for u, b in zip(before, slopes, strict=True)], t, h, at.params[left], noise)
+            last = steps.step(now, [u + b for u, b in zip(before, slopes, strict=True)], t, h, at.params[left], noise, near)
             bends = [u - b for u, b in zip(last.unknowns, before, strict=True)]
             after[left], good[left] = last.after, last.good
             for u, new in zip(unknowns, last.unknowns, strict=True):
@@ -253,11 +259,11 @@ class Replay:
         there = None
         if self.hides:
             t = at.t + at.steps * h
-            then = steps.step(after, unknowns, t, h, at.params, noise)
+            then = steps.step(after, unknowns, t, h, at.params, noise, first[:])
             there = steps.rows(then, t, h, at.params, noise)
             there = {name: np.where(_column(then.good & good, a), a, np.nan) for name, a in there.items()}
         here = {name: np.where(_column(made.good, a), a, np.nan) for name, a in here.items()}
-        return Again(here, np.where(good[:, None], after, np.nan), good, there, made.unknowns, made.states[0])
+        return Again(here, np.where(good[:, None], after, np.nan), good, there, made.unknowns, made.states[0], first)
 
     def of_given_points(self) -> Again:
         """Row 0 and the state at row 1 of every trajectory of a run from two points, in whose first step nothing was solved."""
@@ -274,7 +280,7 @@ class Replay:
         if self.hides:
             then = steps.step(made.after, [u], t + h, h, params)
             there = steps.rows(then, t + h, h, params)
-        return Again(steps.rows(made, t, h, params), made.after, made.good, there, [u], state)
+        return Again(steps.rows(made, t, h, params), made.after, made.good, there, [u], state, steps.nothing_near(batch))
 
     def params_of(self, lanes: np.ndarray) -> np.ndarray:
         """The numbers of the parameters of these trajectories, (entries, numbers)."""

@@ -206,10 +206,10 @@ class _Comparison:
     def _scales_at(self, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far the numbers that the steps of these entries say of their rows, and of the next ones, move, relative to what
         every operation is off."""
-        at, guesses = self.at[entries], [u[entries] for u in self.again.unknowns]
-        said = self._said(self.replay.again(at, guesses=guesses))
+        at, guesses, near = self.at[entries], [u[entries] for u in self.again.unknowns], self.again.near[entries]
+        said = self._said(self.replay.again(at, guesses=guesses, near=near))
         often = np.tile(np.arange(len(entries)), OFTEN)  # all disturbances at once: few entries take as long as one
-        many = self.replay.again(at[often], Noise(DISTURBANCE, 0), [u[often] for u in guesses])
+        many = self.replay.again(at[often], Noise(DISTURBANCE, 0), [u[often] for u in guesses], near[often])
         moved = []
         for one, off in zip(said, self._said(many), strict=True):
             off = np.abs(off.reshape(OFTEN, *one.shape) - one)

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from dirax.engines.stage_look import SLOPES, TERMS, stage_look
+from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
-from dirax.numerics.equilibration import balanced_inverse, condition_number, geometric_scales
+from dirax.engines.stopping import CONTRACTING, OWN
+from dirax.numerics.equilibration import balanced_inverse, condition_number
+from dirax.numerics.inverses import Inverses, applied, applied_sizes, inverted, no_inverses, unknown
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Values
 from dirax.program.evaluation.noise import Noise
@@ -22,13 +24,32 @@ FOUND = 8 * EPSILON
 """Relative updates below this are roundoff."""
 
 KEPT = 1e-5
-"""An update below this is made by the Jacobian of the one before."""
+"""After an update below this no other Jacobian is asked for."""
 
 SMALLEST = float(np.finfo(float).tiny) / EPSILON
 """Numbers below this do not have all their digits, and count as zero."""
 
 LEFT = 1e-6
 """The last update of a step that has a solution, however badly it is conditioned."""
+
+
+@dataclass
+class Near:
+    """By what the equations of steps are solved, of each stage: the inverses of its Jacobians near the solutions, where they are
+    known, and the sizes (states, k) of what its unknowns are made of. Steps leave here what they found, and begin with what is
+    here."""
+
+    inverses: list[Inverses]
+    sizes: list[np.ndarray]
+
+    def __getitem__(self, some: Any) -> "Near":
+        return Near([a[some] for a in self.inverses], [a[some] for a in self.sizes])
+
+    def put(self, some: np.ndarray, others: "Near") -> None:
+        """Take those of others in place of some."""
+        for own, other in ((self.inverses, others.inverses), (self.sizes, others.sizes)):
+            for array, values in zip(own, other, strict=True):
+                array[some] = values
 
 
 @dataclass
@@ -78,6 +99,11 @@ class StepsInNumbers:
         numbers = self.program.parameters.flatten(params, batch)
         return np.broadcast_to(numbers, (len(lanes), len(numbers))) if batch is None else numbers[lanes]
 
+    def nothing_near(self, states: int) -> Near:
+        """Nothing known of so many steps."""
+        sizes = [len(self.program.equations[index].unknowns) for index, _ in self.program.stages]
+        return Near([no_inverses(states, k) for k in sizes], [np.zeros((states, k)) for k in sizes])
+
     def step(
         self,
         states: np.ndarray,
@@ -86,12 +112,14 @@ class StepsInNumbers:
         h: float | np.ndarray,
         params: np.ndarray,
         noise: Noise | None = None,
+        near: Near | None = None,
     ) -> Attempts:
         """A step of each state (states, s), with one guess (states, k) a stage; h is one number, or one a state."""
         parts, h = [], np.broadcast_to(h, t.shape)
         for low in range(0, max(len(states), 1), LANES):
             some = slice(low, low + LANES)
-            parts.append(self._step(states[some], [g[some] for g in guesses], t[some], h[some], params[some], noise))
+            here = self.nothing_near(len(states[some])) if near is None else near[some]
+            parts.append(self._step(states[some], [g[some] for g in guesses], t[some], h[some], params[some], noise, here))
         join = np.concatenate
         return Attempts(
             [join(a) for a in zip(*(p.unknowns for p in parts), strict=True)],
@@ -100,11 +128,11 @@ class StepsInNumbers:
             join([p.good for p in parts]),
         )
 
-    def _step(self, states, guesses, t, h, params, noise) -> Attempts:
+    def _step(self, states, guesses, t, h, params, noise, near: Near) -> Attempts:
         unknowns, begun, good = [], [], np.ones(len(states), bool)
-        for (index, fraction), guess in zip(self.program.stages, guesses, strict=True):
+        for stage, ((index, fraction), guess) in enumerate(zip(self.program.stages, guesses, strict=True)):
             e, at = self.program.equations[index], (t, fraction * h, params)
-            u, solved = self._solved(index, guess, states, at, noise)
+            u, solved = self._solved(stage, guess, states, at, noise, near)
             known = self._values(index, u, states, at, noise)
             begun.append(states)
             unknowns.append(u)
@@ -123,19 +151,22 @@ class StepsInNumbers:
         """The sizes (states,) of the terms of a step's equations at their solutions, however they cancel, the largest of all its
         parts: what a rounding of each operation and of each unknown does to a residual; and of those that they give the unknowns,
         |∂r/∂u|⁻¹ terms. NaN where there is no solution."""
-        made, seen = self.step(states, guesses, t, h, params), set()
+        near, seen = self.nothing_near(len(t)), set()
+        made = self.step(states, guesses, t, h, params, near=near)
         of_equations, of_unknowns = np.zeros(len(t)), np.zeros(len(t))
         for stage, ((index, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
             if u.shape[1] and (index, fraction) not in seen:  # parts of the same length have terms of the same size
                 seen.add((index, fraction))
-                at = u, state, t, np.full(len(t), fraction * h), params, np.abs(u)
-                slopes, terms = stage_look(self.program, stage)(*at, only=(SLOPES, TERMS))
-                moved = np.einsum("rij,rj->ri", np.abs(balanced_inverse(slopes[:, :, : u.shape[1]])), terms)
+                terms = self._terms(stage, u, state, t, np.full(len(t), fraction * h), params)
                 of_equations = np.maximum(of_equations, np.max(terms, axis=1))
-                of_unknowns = np.maximum(of_unknowns, np.max(moved, axis=1))
+                of_unknowns = np.maximum(of_unknowns, np.max(applied_sizes(near.inverses[stage], terms), axis=1))
             t = t + fraction * h
         known = lambda sizes: np.where(made.good, sizes, np.nan)
         return known(of_equations), known(of_unknowns)
+
+    def _terms(self, stage: int, u, state, t, h, params) -> np.ndarray:
+        """The sizes (states, k) of the terms of a stage's equations, however they cancel."""
+        return stage_look(self.program, stage)(u, state, t, h, params, np.abs(u), only=(TERMS,))[0]
 
     def differentiated(
         self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: Noise | None = None
@@ -183,46 +214,56 @@ class StepsInNumbers:
             whole[name] = parts[0][name] if about.rule == "first" else np.stack(arrays, axis=1) if each else sum(arrays)
         return whole
 
-    def _solved(self, index: int, guess, states, at, noise) -> tuple[np.ndarray, np.ndarray]:
-        """The unknowns (states, k) of a stage by Newton's method, and where it has a solution."""
-        e = self.program.equations[index]
-        count, k = guess.shape
+    def _solved(self, stage: int, guess, states, at, noise, near: Near) -> tuple[np.ndarray, np.ndarray]:
+        """The unknowns (states, k) of a stage by Newton's method, and where it has a solution.
+
+        A Jacobian serves as long as updates by it contract. Those of one that does not, or of another step, are taken back."""
+        index = self.program.stages[stage][0]
+        e, (count, k) = self.program.equations[index], guess.shape
         if not k:
             return guess, np.ones(count, bool)
         known = self._values(index, guess, states, at)
         known.bind(_nodes(e.previous), guess)
-        u = self._read(known, e.guess)
+        safe = self._read(known, e.guess)
         known = known.without(self._depends[index])
-        known.bind(_nodes(e.unknowns), u)
-        fixed = None
-        inverse, size = np.zeros((count, k, k)), np.zeros((count, k))
-        last, left = np.full(count, np.inf), np.arange(count)
+        known.bind(_nodes(e.unknowns), safe)
+        fixed, u = None, safe.copy()
+        inverse, size = near.inverses[stage], near.sizes[stage]
+        last, left, renewed = np.full(count, np.inf), np.arange(count), unknown(inverse)
+        own = renewed.copy()  # the Jacobian is of these equations, or was seen to contract
         for _ in range(UPDATES):
             some = known if fixed is None else fixed.at(left) if len(left) < count else fixed.without(set())
             some.bind(_nodes(e.unknowns), u[left])
-            residual = None
-            if np.any(renewed := last[left] > KEPT):
-                if np.all(renewed):
-                    slopes, residual = self._linearized(index, some)
-                else:
-                    slopes, _ = self._linearized(index, some.at(np.flatnonzero(renewed)))
-                new = left[renewed]
-                inverse[new] = _inverses(slopes)
-                terms = np.einsum("rij,rj->ri", np.abs(slopes), np.abs(u[new]))
-                size[new] = np.einsum("rij,rj->ri", np.abs(inverse[new]), terms)
+            residual, fresh = None, renewed[left]
+            if np.all(fresh):
+                slopes, residual = self._linearized(index, some)
+                inverse[left] = inverted(slopes)
+            elif np.any(fresh):
+                inverse[left[fresh]] = inverted(self._linearized(index, some.at(np.flatnonzero(fresh)))[0])
             residual = self._read(some, e.residual, index) if residual is None else residual
-            change = np.einsum("rij,rj->ri", inverse[left], residual)
+            change = applied(inverse[left], residual)
             fixed = known.without(self._depends[index]) if fixed is None else fixed
             u[left] -= change
+            if np.any(fresh):
+                new = left[fresh]
+                safe[new], own[new] = u[new], True
+                terms = self._terms(stage, u[new], states[new], *(a[new] for a in at))
+                size[new] = np.nan_to_num(applied_sizes(inverse[new], terms), nan=0.0, posinf=0.0)
             moved = _largest_ratio(change, np.maximum(np.abs(u[left]), size[left]))
-            ended = (moved <= FOUND) | ((moved >= last[left] / 2) & (moved < LEFT)) | np.isnan(moved)
-            last[left] = moved
+            contracts = moved <= CONTRACTING * last[left]
+            own[left] |= contracts & np.isfinite(last[left])
+            stalled = own[left] & (moved >= last[left] / 2) & (moved < LEFT)
+            found = _largest_ratio(change, np.maximum(np.abs(u[left]), OWN * size[left])) <= FOUND
+            ended = found | stalled | (fresh & np.isnan(moved))
+            renewed[left] = ~fresh & ~contracts & ~(own[left] & (moved <= KEPT)) & ~ended
+            last[left] = np.where(renewed[left], np.inf, moved)
+            u[renewed] = safe[renewed]
             left = left[~ended]
             if not len(left):
                 break
         if noise:
             known = self._values(index, u, states, at, noise)
-            u = u - np.einsum("rij,rj->ri", inverse, self._read(known, e.residual))
+            u = u - applied(inverse, self._read(known, e.residual))
         return u, last < LEFT
 
     def _values(self, index: int, u, states, at, noise: Noise | None = None) -> Values:
@@ -267,25 +308,6 @@ class StepsInNumbers:
             if node not in moving and any(a in moving for a in args[node]):
                 moving.add(node)
         return moving
-
-
-def _inverses(matrices: np.ndarray) -> np.ndarray:
-    """The inverses (rows, k, k) of matrices whose rows and columns have units in common; NaN where there is none."""
-    with np.errstate(all="ignore"):
-        rows, columns = geometric_scales(np.max(np.abs(matrices), axis=0, where=np.isfinite(matrices), initial=0.0))
-        scaled = matrices / rows / columns
-        try:
-            found = np.linalg.inv(scaled)
-        except np.linalg.LinAlgError:
-            found = np.stack([_inverse(matrix) for matrix in scaled])
-    return found / columns.T / rows.T
-
-
-def _inverse(matrix: np.ndarray) -> np.ndarray:
-    try:
-        return np.linalg.inv(matrix)
-    except np.linalg.LinAlgError:
-        return np.full_like(matrix, np.nan)
 
 
 def _largest_ratio(values: np.ndarray, sizes: np.ndarray) -> np.ndarray:

@@ -1,0 +1,86 @@
+"""The inverses of many matrices side by side, to be applied to vectors: small ones as arrays, large ones by sparse factors."""
+
+from typing import Any
+
+import numpy as np
+
+from dirax.numerics.equilibration import balancing_scales, geometric_scales
+
+LARGE = 64
+"""Rows from which on a matrix is factored and not inverted."""
+
+PROBES = 8
+"""Vectors of random signs by which the sizes are found that a large inverse gives."""
+
+Inverses = np.ndarray
+"""(matrices, k, k), NaN where there is none; of large matrices objects (matrices,), None where nothing is known."""
+
+
+def no_inverses(count: int, k: int) -> Inverses:
+    """Those of which none is known."""
+    return np.full(count, None) if k >= LARGE else np.full((count, k, k), np.nan)
+
+
+def unknown(inverses: Inverses) -> np.ndarray:
+    """Which ones are not known, (matrices,)."""
+    return np.equal(inverses, None) if inverses.ndim == 1 else np.isnan(inverses[:, 0, 0])
+
+
+def inverted(matrices: np.ndarray) -> Inverses:
+    """Those of matrices (matrices, k, k) whose rows and columns have units in common."""
+    with np.errstate(all="ignore"):
+        sizes = np.max(np.abs(matrices), axis=0, where=np.isfinite(matrices), initial=0.0)
+        # geometric means follow the roundoff of zeros, of which large matrices have many
+        rows, columns = geometric_scales(sizes) if matrices.shape[-1] < LARGE else balancing_scales(sizes)
+        scaled = matrices / rows / columns
+        if matrices.shape[-1] >= LARGE:
+            found = no_inverses(*matrices.shape[:2])
+            found[:] = [_Factored(matrix, rows[:, 0], columns[0]) for matrix in scaled]
+            return found
+        try:
+            found = np.linalg.inv(scaled)
+        except np.linalg.LinAlgError:
+            found = np.stack([_inverse(matrix) for matrix in scaled])
+    return found / columns.T / rows.T
+
+
+def applied(inverses: Inverses, vectors: np.ndarray) -> np.ndarray:
+    """A⁻¹v of vectors (matrices, k)."""
+    if inverses.ndim > 1:
+        return np.einsum("rij,rj->ri", inverses, vectors)
+    return np.stack([inverse(v) for inverse, v in zip(inverses, vectors, strict=True)]) if len(vectors) else vectors
+
+
+def applied_sizes(inverses: Inverses, sizes: np.ndarray) -> np.ndarray:
+    """|A⁻¹|s of sizes (matrices, k); of large matrices about that: how far A⁻¹v goes for vectors of these sizes."""
+    if inverses.ndim > 1:
+        return np.einsum("rij,rj->ri", np.abs(inverses), sizes)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, sizes.shape[1]))
+    return np.max([np.abs(applied(inverses, one * sizes)) for one in signs], axis=0)
+
+
+class _Factored:
+    """v ↦ A⁻¹v of a matrix that is given divided by the scales of its rows and columns; NaN for a singular one."""
+
+    def __init__(self, matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray):
+        from scipy.sparse import csc_matrix  # imported when they are used
+        from scipy.sparse.linalg import splu
+
+        self.rows, self.columns, self.factors = rows, columns, None
+        if np.all(np.isfinite(matrix)):
+            try:
+                self.factors: Any = splu(csc_matrix(matrix))
+            except RuntimeError:  # it is singular
+                pass
+
+    def __call__(self, v: np.ndarray) -> np.ndarray:
+        if self.factors is None or not np.all(np.isfinite(v)):
+            return np.full_like(v, np.nan)
+        return self.factors.solve(v / self.rows) / self.columns
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
