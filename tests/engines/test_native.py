@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +16,14 @@ from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem
 from dirax.engines.native import Native
 from dirax.engines.native import kernels as of_steps
 from dirax.engines.native import run as driver
+from dirax.engines.native.ir.emitter import LONG, Body, Emitter, Module
+from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.kernels import QUICK, SOON, kernels
 from dirax.engines.native.loops.sizes import sizes_module
 from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.xla import Xla
 from dirax.program import machine_code as llvm
+from dirax.program.graph import Graph
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.schemes.step import Field, Shape, StepEquation, StepSequence, make_step_equation
 
@@ -374,6 +378,61 @@ def test_quick_code_is_compiled_once_it_pays(tmp_path, monkeypatch):
     lagrangian, _, scheme, q, v, h, *_ = SYSTEMS["harmonic oscillator"]
     dx.prepare(dx.LagrangeDirac(lagrangian), scheme, q=q, v=v, step=h, steps=1)
     assert levels[4:] == [QUICK, QUICK, SOON]
+
+
+def test_the_kernel_of_sizes_is_counted_among_what_is_compiled(monkeypatch):
+    """It is compiled once runs have spent a part of what that takes, by the operations that the step really has."""
+    monkeypatch.setenv("DIRAX_CACHE", "off")
+    monkeypatch.setattr(of_steps, "PRICE", 1e9)
+    p = problem("planar double pendulum", steps=20)
+    dx.clear_caches()
+    run = native.prepared(p)
+    run(p)
+    made = kernels(p.equation, p.params, p.batch_params)
+    made.sizing = 0.9 * of_steps.SIZING * made.operations
+    assert made.of_sizes(1) == (None, True)
+    made.sizing = 1.1 * of_steps.SIZING * made.operations
+    second, third = run(p), run(p)
+    assert second.compile_seconds > 0.0 == third.compile_seconds
+    assert_same_bits(second, third)
+
+
+def test_a_step_near_the_limit_of_nodes_has_its_sizes_and_derivatives(monkeypatch):
+    """The nodes that these need beside the step's own are not counted: whatever is asked of it after the first run is found."""
+    system = dx.LagrangeDirac(lambda q, v, params: params * (v @ v) / 2 - params * jnp.sum(jnp.cos(q)) - q[0] * q[1])
+    given = {"q": [1.0, 0.5], "v": [0.0, 0.5], "step": 0.01, "steps": 20}
+    run = lambda k, **more: dx.simulate(system, MIDPOINT, params=k, **given | more)
+    dx.clear_caches()
+    nodes: dict[of_steps.Kernels, int] = {}
+    planned = of_steps.Kernels._planned
+    with_its_nodes = lambda self: nodes.setdefault(self, len(planned(self).graph)) and planned(self)
+    monkeypatch.setattr(of_steps.Kernels, "_planned", with_its_nodes)
+    monkeypatch.setenv("DIRAX_CACHE", "off")
+    free = run(1.5), jax.grad(lambda k: jnp.sum(run(k).q ** 2))(1.5)
+    monkeypatch.setattr(of_steps, "NODE_LIMIT", max(nodes.values()))
+    monkeypatch.setattr(of_steps, "SIZING", 0.0)
+    dx.clear_caches()
+    for k in (1.0, 1.1, 1.2):
+        assert run(k).stats["engine"] == "native"
+    assert run(1.5).q.tobytes() == free[0].q.tobytes()
+    prepared = dx.prepare(system, MIDPOINT, params=1.0, **given)
+    assert prepared(params=1.5).q.tobytes() == free[0].q.tobytes()
+    assert run(1.5, q=np.tile([1.0, 0.5], (65, 1))).ok.all()
+    loss = lambda k: jnp.sum(run(k, engine="native").q ** 2)
+    assert jax.grad(loss)(1.5) == free[1] == jax.jit(jax.value_and_grad(loss))(1.5)[1]
+
+
+def test_long_code_is_in_short_blocks():
+    """LLVM takes a time that grows with the square of a block's length where code is to be ready soon."""
+    g, body = Graph(), Body(Module(fma=True))
+    last = x = g.input("x")
+    for _ in range(3 * LONG):
+        last = g.make("sqrt", g.add(last, x))
+    region = Region(Emitter(body, 1), g)
+    region.bind(x, "%x")
+    region.require([last])
+    assert len(body.lines) > 6 * LONG
+    assert max(len(block.splitlines()) for block in re.split(r"^\w+:$", "\n".join(body.lines), flags=re.MULTILINE)) < LONG + 5
 
 
 def compiled_levels(monkeypatch) -> list[int]:

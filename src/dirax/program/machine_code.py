@@ -67,6 +67,7 @@ def _compiler(triple: str, cpu: str, flags: str, level: int) -> tuple[Any, Any, 
     )
     passes = llvm.create_new_module_pass_manager()
     if level:
+        passes.add_simplify_cfg_pass()  # straight code is one block again
         passes.add_sroa_pass()
         passes.add_instruction_combine_pass()
         passes.add_simplify_cfg_pass()

@@ -39,12 +39,17 @@ FEW = 1000
 MANY = 400_000
 """Steps of a run for which code is QUICK from the beginning."""
 
+LARGE = 20_000
+"""Operations of a step from which on its derivatives have code that is ready SOON: a network of 2·40·40·1 in a Lagrangian has
+31 000, and the QUICK code of its cotangents takes ten seconds instead of one."""
+
 PRICE = 3e-5
 """Seconds for each operation of a step that runs spend with code that is ready SOON before it is worth while to have it QUICK:
 about a third of what compiling for that takes."""
 
-SIZING = 1e-5
-"""A part of the seconds that the kernel of sizes takes to compile (3e-5), for each operation and each column of the Jacobian."""
+SIZING = 1.5e-5
+"""Seconds for each operation of a step that runs spend on sizes without a kernel for them before it is worth while to have one:
+about a third of what its compilation takes."""
 
 
 class Linked(NamedTuple):
@@ -57,8 +62,7 @@ class Linked(NamedTuple):
 
 
 class Runs:
-    """The compiled `run` of a step by width: at first ready soon, and quick when that pays. `repeated`: how often, in the mean,
-    an equation is solved in a step, which is compiled once."""
+    """The compiled `run` of a step by width: at first ready soon, and quick when that pays; `repeated` as in `Kernels`."""
 
     def __init__(self, linked: Callable[[int, tuple[int, ...]], Linked], repeated: float = 1.0):
         self._linked, self._repeated = linked, repeated
@@ -105,7 +109,9 @@ class Kernels:
         """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
         self.places: Any = None
         self.digest = _digest(self)
-        self.runs = Runs(self._run, len(step.stages) / len(step.equations))
+        self.repeated = len(step.stages) / len(step.equations)
+        """How often, in the mean, an equation is solved in a step, which is compiled once."""
+        self.runs = Runs(self._run, self.repeated)
         self._of_sizes: dict[int, Any] = {}
         self._linearizations: dict[tuple[bool, int], Any] = {}
 
@@ -123,21 +129,24 @@ class Kernels:
         """The code of `run` for a width."""
         return self._library("run", width, lambda: kernel_module(self._planned(), width, llvm.has_fma()), levels=levels)
 
-    def of_sizes(self, width: int, often: bool = False) -> Any:
-        """The compiled `run` that finds the sizes; None where they are not written as nodes, and as long as runs have spent less
-        than a part of what its compilation takes, unless they are said to be found `often`."""
-        worth = often or self.sizing > SIZING * self.step.entries
-        if width not in self._of_sizes and worth and self.step.sizes_are_written:
-            text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
-            found = self._library("run", width, text, "sizes", levels=(SOON,))
-            self._of_sizes[width] = llvm.function(found.library, "run", SIGNATURE)
-        return self._of_sizes.get(width)
+    def of_sizes(self, width: int, often: bool = False) -> tuple[Any, bool]:
+        """The compiled `run` that finds the sizes, and whether it came from a cache; None where they are not written as nodes,
+        and as long as runs have spent less than a part of what its compilation takes, unless they are said to be found `often`.
+        """
+        worth = often or self.sizing > SIZING * self.operations / self.repeated
+        if width in self._of_sizes or not worth or not self.step.sizes_are_written:
+            return self._of_sizes.get(width), True
+        text = lambda: sizes_module(self._planned(), width, llvm.has_fma())
+        found = self._library("run", width, text, "sizes", levels=(SOON,))
+        self._of_sizes[width] = llvm.function(found.library, "run", SIGNATURE)
+        return self._of_sizes[width], found.cached
 
     def linearized(self, reverse: bool, width: int) -> Any:
-        """The compiled `linearized` for a width: tangents forward or cotangents backward. Raises `UnsupportedPrimitive`."""
+        """The compiled `linearized` for a width: tangents forward or cotangents backward."""
         if (reverse, width) not in self._linearizations:
             text = lambda: self._linearized(reverse).module(width, llvm.has_fma())
-            found = self._library("linearized", width, text, "backward" if reverse else "forward")
+            levels = (QUICK,) if self.operations <= LARGE else (QUICK, SOON)
+            found = self._library("linearized", width, text, "backward" if reverse else "forward", levels=levels)
             self._linearizations[reverse, width] = llvm.function(found.library, "linearized", LINEARIZED_SIGNATURE)
         return self._linearizations[reverse, width]
 
@@ -157,19 +166,18 @@ class Kernels:
         return found
 
     def _linearized(self, reverse: bool) -> LinearizedLoop:
+        """Of a step that has been planned, so that there is room for as many nodes as its derivatives need."""
         step, one = self.step, backward if reverse else forward
-        try:
-            g = self._graph()
-            linear = [one(g, e, step.shared, rows) for e, rows in zip(step.equations, step.jacobians, strict=True)]
-        except GraphTooLarge as error:
-            raise too_large(error) from None
+        jacobians, g = step.jacobians, step.graph.copy()
+        linear = [one(g, e, step.shared, rows) for e, rows in zip(step.equations, jacobians, strict=True)]
         return LinearizedLoop(g, step.shared, step.equations, linear, step.stages, reverse)
 
     def _planned(self) -> Plan:
         if self.plan is None:
             step = self.step
             try:
-                g = self._graph()
+                _ = step.jacobians
+                g = step.graph.copy(NODE_LIMIT)  # with its Jacobians
                 plan = self._plan(g)
                 plan.corrections = [newton_corrections(g, step, i, self.whole) for i in range(len(step.equations))]
                 if self.compensated:
@@ -182,11 +190,6 @@ class Kernels:
     def _plan(self, graph: Graph) -> Plan:
         step = self.step
         return Plan(graph, step.shared, step.equations, [], step.stages, self.rules, self.compensated)
-
-    def _graph(self) -> Graph:
-        """A graph of the step with its Jacobians, to which more can be added. Raises `GraphTooLarge`."""
-        _ = self.step.jacobians
-        return self.step.graph.copy(NODE_LIMIT)
 
 
 def linked(

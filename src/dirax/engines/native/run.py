@@ -68,7 +68,7 @@ class Ready:
         lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
         fields = lanes.fields
         if p.record is None and isinstance(self.made, Kernels):  # a fixed point finds its own
-            find_sizes(lanes, self.made)
+            waited += find_sizes(lanes, self.made)
         started, before, done, interrupted, threads = time.perf_counter(), waited, p.after, False, 1
         count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
         try:

@@ -21,11 +21,14 @@ _looked: Memo[tuple] = Memo(64)
 """What a closer look at single trajectories found, for runs that begin as others did."""
 
 
-def find_sizes(lanes: Lanes | OneLane, made: Kernels) -> None:
-    """Write the sizes into records that have none: by NumPy, until runs have spent so much on it that a kernel is compiled."""
+def find_sizes(lanes: Lanes | OneLane, made: Kernels) -> float:
+    """Write the sizes into records that have none: by NumPy, until runs have spent so much on it that a kernel is compiled.
+    Returns the seconds for which that was waited for."""
     if not lanes.record.kept:  # an explicit step
-        return
-    kernel = made.of_sizes(lanes.width)
+        return 0.0
+    entered = time.perf_counter()
+    kernel, ready = made.of_sizes(lanes.width)
+    waited = 0.0 if ready else time.perf_counter() - entered
     if kernel is not None:
         lanes.advance(kernel, 0, 0)
         look_closer(lanes)
@@ -34,6 +37,7 @@ def find_sizes(lanes: Lanes | OneLane, made: Kernels) -> None:
         lanes.record.put_sizes(table, sizes_of(lanes.problem))
         lanes.put(np.arange(len(table)), table)
         made.sizing += time.thread_time() - started
+    return waited
 
 
 def look_closer(lanes: Lanes | OneLane) -> None:

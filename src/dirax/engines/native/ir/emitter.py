@@ -4,6 +4,10 @@ import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+LONG = 1000
+"""Lines of a block after which straight code goes on in another one: LLVM takes a time that grows with the square of a block's
+length where code is to be ready soon."""
+
 
 class Module:
     """A module under construction: its functions and the intrinsics that they declare.
@@ -31,7 +35,7 @@ class Body:
     def __init__(self, module: Module):
         self.module, self.lines, self._count = module, [], 0
         self.entry: list[str] = []
-        self.block = "entry"
+        self.block, self._began = "entry", 0
 
     def fresh(self) -> str:
         self._count += 1
@@ -48,7 +52,14 @@ class Body:
     def label(self, name: str) -> None:
         """Begin a block, to which `block` then points."""
         self.lines.append(f"{name}:")
-        self.block = name
+        self.block, self._began = name, len(self.lines)
+
+    def go_on(self) -> None:
+        """Begin another block if this one is LONG, between two instructions of straight code."""
+        if len(self.lines) - self._began > LONG:
+            following = self.fresh()
+            self.branch(following)
+            self.label(following)
 
     def branch(self, target: str) -> None:
         self.line(f"br label %{target}")

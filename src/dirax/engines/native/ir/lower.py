@@ -87,6 +87,7 @@ class Region:
         waiting = sorted((n for n in missing if n not in fused), key=lambda n: (depth[n], g.op[n] not in CIRCULAR, n))
         done_circular = 0
         for node in waiting:
+            self.emitter.body.go_on()
             if g.op[node] in CIRCULAR:
                 if depth[node] > done_circular:
                     done_circular = depth[node]

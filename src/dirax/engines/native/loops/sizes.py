@@ -1,5 +1,7 @@
 """The kernel that finds the sizes of unknowns: it is called once a run, so little is spent on its machine code."""
 
+from dataclasses import replace
+
 from dirax.engines.first_sizes import FirstSizes, Linearized
 from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
@@ -16,6 +18,7 @@ EXPONENT = 0x7FF << 52
 def sizes_module(plan: Plan, width: int, fma: bool) -> str:
     """IR of a `run(lanes, params, outs, blocks, …)` that writes the sizes of every stage, at the state and the unknowns of a
     record, into lanes that have none. A lane in which they are in doubt has the outcome `DOUBTFUL`."""
+    plan = replace(plan, graph=plan.graph.copy())  # which has room for them, and the other kernels' graph stays as it is
     module = Module(fma, groups=False)
     add_far_reduction(module)
     _define_block(plan, module, width)
