@@ -1,5 +1,6 @@
 """Linear equations of small motions against those written by hand."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -190,3 +191,42 @@ def test_a_weight_that_falls_from_zero_is_at_no_equilibrium_in_any_units():
     for g in (9.8, 2.0**-60, 2.0**60):
         with pytest.raises(ValueError, match="no relative equilibrium"):
             dx.linearize(falling, {"q": np.zeros(1), "v": np.zeros(1)}, params=g)
+
+
+def leaning(q, v):
+    """Masses that depend on the place, in a field that pushes a one-form at its equilibrium."""
+    kinetic = (1 + 0.3 * q[0] ** 2) * v[0] ** 2 / 2 + v[1] ** 2 / 2 + 0.7 * v[2] ** 2 + 0.3 * q[1] * v[0] - 0.2 * q[0] * v[2]
+    return kinetic - q[0] ** 2 - q[1] ** 2 / 2 - 1.5 * q[2] ** 2 - 0.2 * q[0] * q[1] - 0.5 * q[0]
+
+
+def at_rest(system, one_form):
+    """q = (a, b, .3) with ∂L/∂q = Wᵀλ, by Newton's method for (a, b, λ)."""
+
+    def defect(z):
+        q = jnp.stack([z[0], z[1], 0.3])
+        return jax.grad(leaning)(q, jnp.zeros(3)) - one_form(q)[0] * z[2]
+
+    z = jnp.array([0.0, 0.0, -0.5])
+    for _ in range(20):
+        z = z - jnp.linalg.solve(jax.jacobian(defect)(z), defect(z))
+    return {"q": np.array([z[0], z[1], 0.3]), "v": np.zeros(3)}
+
+
+@pytest.mark.parametrize(
+    ("scheme", "error"),
+    [
+        (dx.Collocation(2, nodes="lobatto"), 2e-4),
+        (dx.Collocation(3, nodes="lobatto"), 1e-6),
+        (dx.EnergyCollocation(2), 1e-6),
+    ],
+)
+def test_steps_with_multipliers_or_the_energy_in_their_state(scheme, error):
+    """A constraint that pushes where the system is at rest, and depends on the place. The multiplier in the state of collocation
+    has an eigenvalue of its own, near 1 or −1, that is none of the system."""
+    one_form = lambda q: jnp.array([[0.4 + 0.3 * q[1], 0.2 * q[0], 1.0]])
+    system = dx.LagrangeDirac(leaning, one_form, forces=lambda t, q, v: -0.1 * v)
+    place = at_rest(system, one_form)
+    exact = dx.linearize(system, place).eigenvalues
+    found = dx.linearize(system, place, scheme, step=0.02)
+    assert found.stable and exact.shape == found.eigenvalues.shape == (5,)
+    np.testing.assert_allclose(found.eigenvalues, exact, atol=error)

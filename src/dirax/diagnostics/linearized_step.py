@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.linearized_field import FieldAt, equations_of, filled, scaled_matrix
@@ -24,7 +25,7 @@ INVARIANT = 1e-8
 """How far, relative to the step's derivative, it may lead out of the tangent space of the discrete constraints."""
 
 RANK = 1e-12
-"""Singular values of the motions along symmetries in a step, relative to the largest one, that count as zero."""
+"""Singular values of linear equations, relative to the largest one, that count as zero."""
 
 TRIES = 8
 STEPS = 30
@@ -33,8 +34,18 @@ STEPS = 30
 class _Stage:
     """One equation of a step, with its derivatives."""
 
-    def __init__(self, equation: Any, t: float, h: float):
-        self.equation, self.t, self.h = equation, t, h
+    def __init__(self, system: AbstractSystem, equation: Any, t: float, h: float):
+        self.system, self.equation, self.t, self.h = system, equation, t, h
+
+    def lift(self, q: Any, v: Any, params: Any) -> Any:
+        """The derivative by (q, v) of the state with which the scheme starts there."""
+
+        def begun(z):
+            (q, v), t = jnp.split(z, 2), jnp.asarray(self.t, float)
+            complete = self.system.complete({"q": q, "v": v, "t": t}, params, False)
+            return self.equation.start({**complete, "t": t}, self.h, params)[0]
+
+        return jacobian(begun)(jnp.concatenate([q, v]))
 
     def residual(self, u: Any, state: Any, params: Any) -> tuple[Any, Any, Any]:
         """r(u, state), with its derivatives by both."""
@@ -82,11 +93,15 @@ def linearized_step(
     began = begun(equation, case, initial)
     first = np.asarray(began.state)
     layout = equation.stages[0][0].state_layout
-    lift = _lift(system, layout, case)
-    state, matrix, time = first, np.eye(first.size), case.t0
-    for (stage, fraction), guess in zip(equation.stages, began.guess, strict=True):
-        state, slope = _stage(stage, time, fraction * h).step(state, np.asarray(guess), case.params)
-        matrix, time = slope @ matrix, time + fraction * h
+    stages, time = [], case.t0
+    for stage, fraction in equation.stages:
+        stages.append(_stage(system, stage, time, fraction * h))
+        time += fraction * h
+    lift = _lift(stages[0], layout, case)
+    state, matrix = first, np.eye(first.size)
+    for stage, guess in zip(stages, began.guess, strict=True):
+        state, slope = stage.step(state, np.asarray(guess), case.params)
+        matrix = slope @ matrix
     # lifts are tangent to the discrete constraints up to the forces of constraints, of which a step takes no notice
     units = np.max(np.abs(lift) * field.units, axis=1)
     energy = np.max(units[layout.place("p")] * field.units[shape.n :])
@@ -100,28 +115,47 @@ def linearized_step(
     moved = symmetric if symmetric.size else matrix @ lift @ straight[:, None]
     shares = np.linalg.lstsq(moved, change, rcond=RANK)[0]
     residual = np.abs(change - moved @ shares).max() / (1.0 + np.abs(first).max() + np.abs(change).max())
-    for _ in range(TRIES):
-        tangent = np.linalg.qr(tangent)[0]
+    return FieldAt(matrix, _kept(matrix, tangent), symmetric, residual, units, 1.0)
+
+
+def _kept(matrix: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+    """The space near the span of the columns of `tangent` that a step keeps; what is left after TRIES where there is none.
+
+    Images come to it where what lies across it dies away. Else, as with multipliers in the state, the span T leans to it by X in
+    directions Q across, M (T + Q X) = (T + Q X) B, which Newton's method finds: QᵀMQ X − X TᵀMT = −QᵀMT.
+    """
+    size, d = np.abs(matrix).max(), tangent.shape[1]
+    for attempt in range(2 * TRIES):
+        whole = np.linalg.qr(tangent, mode="complete")[0]
+        tangent, across = whole[:, :d], whole[:, d:]
         image = matrix @ tangent
-        if np.abs(image - tangent @ (tangent.T @ image)).max(initial=0.0) <= INVARIANT * np.abs(matrix).max():
+        outside = across.T @ image
+        if np.abs(across @ outside).max(initial=0.0) <= INVARIANT * size:
             break
-        tangent = image
-    return FieldAt(matrix, tangent, symmetric, residual, units, 1.0)
+        if attempt < TRIES:
+            tangent = image
+            continue
+        equations = np.kron(across.T @ matrix @ across, np.eye(d)) - np.kron(np.eye(len(outside)), (tangent.T @ image).T)
+        lean = np.linalg.lstsq(equations, -outside.ravel(), rcond=RANK)[0]
+        tangent = tangent + across @ lean.reshape(outside.shape)
+    return tangent
 
 
-def _stage(equation: Any, t: float, h: float) -> _Stage:
+def _stage(system: AbstractSystem, equation: Any, t: float, h: float) -> _Stage:
     """The same object for equal equations, so that they are traced once."""
-    return _stages.get((equation, t, h), lambda: _Stage(equation, t, h))
+    return _stages.get((system, equation, t, h), lambda: _Stage(system, equation, t, h))
 
 
-def _lift(system: AbstractSystem, layout: Layout, case: Case) -> np.ndarray:
-    """The derivative of the scheme's state by (q, v): q, and p = ∂L/∂v. Raises `TypeError` for a state without them."""
+def _lift(stage: _Stage, layout: Layout, case: Case) -> np.ndarray:
+    """The derivative of the scheme's state by (q, v): q, p = ∂L/∂v, and the rest, sums apart, as where the scheme starts. Raises
+    `TypeError` for a state without q and p."""
     q, v = case.data["q"], case.data["v"]
     if not {"q", "p"} <= layout.keys():
         raise TypeError(f"the state of this scheme is {layout!r}, but a linearization needs one of q and p.")
-    equations = equations_of(system.lagrangian_form(), case.t0)
-    by_q, by_v = (np.asarray(x) for x in evaluated(equations.momentum, q, v, case.params))
+    equations = equations_of(stage.system.lagrangian_form(), case.t0)
     lift = np.zeros((layout.size, 2 * q.size))
-    lift[layout.place("q"), : q.size] = np.eye(q.size)
-    lift[layout.place("p")] = np.concatenate([by_q, by_v], axis=1)
+    if any(np.prod(layout[name]) for name in layout.keys() - {"q", "p", *SUMS}):
+        lift[:] = evaluated(stage.lift, q, v, case.params)
+    lift[layout.place("q")] = np.eye(q.size, 2 * q.size)
+    lift[layout.place("p")] = np.concatenate(evaluated(equations.momentum, q, v, case.params), axis=1)
     return lift
