@@ -93,11 +93,11 @@ class MethodOnePart(PartOfStep):
 
     @property
     def unknowns(self) -> Layout:
-        return Layout(inner=self.inner.unknowns.size, end_v=self.inner.shape.n, sigma=self.rows.count)
+        return Layout(inner=self.inner.unknowns.size, end_v=self.inner.lift.dimension, sigma=self.rows.count)
 
     @property
     def labels(self) -> Labels:
-        return self.inner.labels + Labels.numbered("projection of the momentum {}", self.inner.shape.n + self.rows.count)
+        return self.inner.labels + Labels.numbered("projection of the momentum {}", self.inner.lift.dimension + self.rows.count)
 
     def pushed(self, state: Array, sigma: Array, t: Any, params: Any) -> Float[Array, " s"]:
         """The state with p + [W; G](q)ᵀσ."""
@@ -108,7 +108,16 @@ class MethodOnePart(PartOfStep):
         inner, end_v, sigma = self.unknowns.split(u)
         q1, p1, _ = self.state.split(self.advance(u, state, t, h, params))
         missed = self.inner.residual(inner, self.pushed(state, sigma, t, params), t, h, params)
-        return jnp.concatenate([missed, self.projection(t + h, q1, end_v, p1, params)])
+        return jnp.concatenate([missed, self.projected(t + h, self.state.split(state).q, q1, end_v, p1, params)])
+
+    def projected(self, t: Any, q0: Array, q1: Array, end_v: Array, p1: Array, params: Any) -> Array:
+        """`projection` at q1, on a manifold in tangent vectors there."""
+        lift = self.inner.lift
+        if isinstance(lift, ThetaLift) or lift.flat:
+            return self.projection(t, q1, end_v, p1, params)
+        tangents = lift.tangents(q0, q1)
+        covector, defect = jnp.split(self.projection(t, q1, tangents @ end_v, p1, params), [q1.size])
+        return jnp.concatenate([tangents.T @ covector, defect])
 
     def advance(self, u, state, t, h, params):
         inner, _, sigma = self.unknowns.split(u)
@@ -120,4 +129,4 @@ class MethodOnePart(PartOfStep):
 
     def start(self, data, h, params):
         state, u = self.inner.start(data, h, params)
-        return state, self.unknowns.join(inner=u, end_v=data["v"])
+        return state, self.unknowns.join(inner=u, end_v=self.inner.lift.components(data["q"], data["v"]))

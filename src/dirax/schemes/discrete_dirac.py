@@ -68,7 +68,7 @@ class DiscreteDirac(AbstractScheme):
     def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         resolve = self.constraints == "resolve"
         equation = self._resolved(system, shape) if resolve else self._discretized(system, shape)
-        flat = isinstance(_map_on_q(self.map).manifold(shape.n), Euclidean)
+        flat = _is_flat(self.map, shape)
         if equation is not None and not resolve and flat and self.map.base_fraction != 0.5 and not self._looks_ahead(system):
             lagrangian = system.relation_form(shape) is None
             equation = nothing_grows(system, equation, lagrangian and _theta_of(self.map) == 1.0 and shape.m + shape.c > 0)
@@ -114,7 +114,7 @@ class DiscreteDirac(AbstractScheme):
                 "with constraints the states of the lift of dx.Theta(1.0) are other ones for every step size, so that steps of "
                 "different sizes do not compose: compose dx.DiscreteDirac() with the midpoint map."
             )
-        lagrangian = system.lagrangian_form()
+        lagrangian = system.lagrangian_form() or system.manifold_form()
         if self.constraints == "resolve" or lagrangian is None or system.relation_form(shape) is not None:
             return self
         return _Part(self.map) if shape.m + shape.c else self
@@ -179,7 +179,9 @@ class _Part(AbstractScheme):
 
     def step_equation(self, system: AbstractSystem, shape: Shape) -> StepEquation:
         equation = MethodOnePart(_method_one(self.map, system, shape)).equation()
-        return equation if self.map.base_fraction == 0.5 else nothing_grows(system, equation, _theta_of(self.map) == 1.0)
+        if self.map.base_fraction == 0.5 or not _is_flat(self.map, shape):
+            return equation
+        return nothing_grows(system, equation, _theta_of(self.map) == 1.0)
 
 
 def _method_one(map: AbstractDiscretizationMap, system: AbstractSystem, shape: Shape) -> MethodOneStep:
@@ -189,6 +191,11 @@ def _method_one(map: AbstractDiscretizationMap, system: AbstractSystem, shape: S
         return MethodOneStep(lagrangian, shape, ThetaLift(theta, shape.n))
     lagrangian = system.manifold_form() if lagrangian is None else lagrangian
     return MethodOneStep(lagrangian, shape, lift_of(_map_on_q(map), lagrangian, shape.n))
+
+
+def _is_flat(map: AbstractDiscretizationMap, shape: Shape) -> bool:
+    """Whether a map is one of coordinates."""
+    return isinstance(_map_on_q(map).manifold(shape.n), Euclidean)
 
 
 def _map_on_q(map: AbstractDiscretizationMap) -> AbstractDiscretizationMap:

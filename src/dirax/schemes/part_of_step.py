@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from dirax.program.tracing import gradient
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows
 from dirax.schemes.layout import Layout
@@ -42,5 +43,5 @@ class PartOfStep(AbstractStep):
 
     def projection(self, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], p: Array, params: Any) -> Float[Array, " n+k"]:
         """Zero where p = ∂L/∂v(t, q, v) and v satisfies the constraints of velocities."""
-        momentum = self.inner.system.legendre(q, v, params, t)
+        momentum = gradient(lambda v: self.inner.system.lagrangian.at(t, q, v, params))(v)
         return jnp.concatenate([momentum - p, self.rows.velocity_defect(t, q, v, params)])
