@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from dirax.engines.engine import AbstractEngine
 from dirax.run.event import Event, checked_events
@@ -53,7 +54,7 @@ def stated(
 ) -> tuple[Settings, Case, int, int]:  # fmt: skip
     """The settings and the case that the arguments of `simulate` state, steps and save_every; raises as it does."""
     check_kinds(system, scheme)
-    if not jax.config.jax_enable_x64:
+    if jnp.result_type(float) != jnp.float64:
         raise ValueError(
             "JAX has been set to 32-bit floats since dirax was imported, and structure is kept to the roundoff of 64-bit ones: "
             'say jax.config.update("jax_enable_x64", True).'
