@@ -1,5 +1,7 @@
 """The power balance and the books of systems with ports, as `dx.verify` reports them."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -84,3 +86,22 @@ def test_books_over_a_million_steps():
     sol = driven(dx.DiscreteGradient(), steps=1_000_000, save_every=1000)
     line = dx.verify(sol)["books of the energy"]
     assert line.verdict == "ok" and line.value < 1e-14
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_a_resistance_that_becomes_negative_on_the_way_is_said(batch):
+    """R is asked for where a run begins; here it creates energy where x < 1/2, and every balance is kept."""
+    system = dx.PortHamiltonian(
+        lambda x: x @ x / 2,
+        J=jnp.array([[0.0, 1.0], [-1.0, 0.0]]),
+        R=lambda x: jnp.diag(jnp.stack([0.0 * x[0], 0.1 * (x[0] - 0.5)])),
+    )
+    start = np.array([[1.0, 0.0], [1.0, 0.2]]) if batch else np.array([1.0, 0.0])
+    sol = dx.simulate(system, dx.DiscreteGradient(), x=start, step=0.05, steps=400)
+    line = dx.verify(sol)["premise"]
+    assert line.verdict == "VIOLATED" and "R is not positive semidefinite: its lowest" in line.explanation
+    time = float(re.match("at t = ([0-9.]+)", line.explanation)[1])
+    row = round(time / 0.05)
+    assert (sol.x[0] if batch else sol.x)[row, 0] < 0.5
+    early = dx.simulate(system, dx.DiscreteGradient(), x=start, step=0.05, steps=10)
+    assert all(line.quantity != "premise" for line in dx.verify(early).lines)

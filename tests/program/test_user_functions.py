@@ -134,6 +134,15 @@ def keyword_time(q, v, *, t=0.0):
     return v @ v
 
 
+def keyword_velocity(q, *, v):
+    return v @ v
+
+
+def test_an_argument_that_is_needed_and_taken_by_keyword_alone():
+    with pytest.raises(TypeError, match=r"v by keyword alone: all are given by place, so take the \* before v away"):
+        UserFunction(keyword_velocity, "lagrangian", ("q", "v"), True)
+
+
 @pytest.mark.parametrize(("function", "word"), [(keyword_params, "params"), (keyword_time, "t")])
 def test_what_is_taken_by_keyword_alone_would_never_be_given(function, word):
     with pytest.raises(TypeError, match=rf"takes {word} by keyword alone, so that it would never be given: take the \* before"):

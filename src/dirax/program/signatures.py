@@ -37,10 +37,12 @@ def takes_params(function: Callable, name: str, expected: str, count: int) -> bo
             return True
         if len(required) <= count <= len(positional):
             return len(positional) > count and positional[count].name == "params"
+    alone = " and ".join(p.name for p in keywords)
     raise TypeError(
         f"{name} must have the signature {expected}, but {getattr(function, '__name__', 'it')} takes "
         f"{len(required)} argument{'s' if len(required) != 1 else ''}"
-        f" ({', '.join(p.name for p in required) or 'none'})."
+        f" ({', '.join(p.name for p in required) or 'none'})"
+        f"{alone and f', {alone} by keyword alone: all are given by place, so take the * before {alone} away'}."
     )
 
 

@@ -159,8 +159,8 @@ def _refuse_undetermined_forces(system, matrix, rank, data, params, t0) -> None:
             raise ValueError(
                 f"the forces see multipliers that nothing determines: the constraints ({system.constraints.names}) have rank "
                 f"{rank} of {len(matrix)} at the initial data, so that of their multipliers μ only [W; ∂g/∂q]ᵀμ is known, and "
-                "not how they share it. Leave out the constraints that follow from others (support a body at three points), or let "
-                "the forces depend on [W; ∂g/∂q]ᵀμ alone."
+                "not how they share it. Leave out the constraints that follow from others (support a body at three points), or "
+                "let the forces depend on [W; ∂g/∂q]ᵀμ alone."
             )
 
 

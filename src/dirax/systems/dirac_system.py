@@ -261,7 +261,8 @@ class DiracSystem(AbstractSystem):
 
     def premise(self, data: Data, params: Any) -> Premise:
         """The matrices are those of a Dirac structure."""
-        return Premise(self._structure_matrices, lambda matrices: KERNEL_PAIRS[self.structure.representation](*matrices))
+        of_structure = KERNEL_PAIRS[self.structure.representation]
+        return Premise(self._structure_matrices, lambda matrices: of_structure(*matrices), everywhere=True)
 
     def _structure_matrices(self, data, params):
         return self.structure.evaluate(self.point(data), params)

@@ -124,7 +124,7 @@ class NonholonomicMechanics(AbstractSystem):
 
     def premise(self, data: Data, params: Any) -> Premise:
         """The metric is symmetric and positive definite."""
-        return Premise(self._metric_at, _check_metric)
+        return Premise(self._metric_at, _check_metric, everywhere=True)
 
     def _metric_at(self, data, params):
         return self.metric.at(data.get("t", 0.0), self.point(data), params)

@@ -237,7 +237,7 @@ class PortHamiltonian(AbstractSystem):
 
     def premise(self, data: Data, params: Any) -> Premise:
         """J is skew, and R symmetric and positive semidefinite."""
-        return Premise(self._matrices, self._refuse)
+        return Premise(self._matrices, self._refuse, everywhere=True)
 
     def _matrices(self, data, params):
         """Those of J and R that depend on x, or may."""

@@ -1,4 +1,4 @@
-"""Premise: what has to hold of numbers at the initial data, whatever the scheme."""
+"""Premise: what has to hold of numbers at the initial data, or all along, whatever the scheme."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,10 +12,11 @@ from dirax.program.user_functions import evaluated, is_traced
 
 class Premise(NamedTuple):
     """`numbers(data, params)` are the arrays, traceable, of one trajectory; `refuse`, called with their values, raises
-    `ValueError` where what a system presupposes does not hold of them."""
+    `ValueError` where what a system presupposes does not hold of them: `everywhere`, or else where a run begins."""
 
     numbers: Callable[[Data, Any], Any]
     refuse: Callable[[Any], Any]
+    everywhere: bool = False
 
     def check(self, data: Data, params: Any) -> None:
         """Raise `ValueError` where it does not hold at these data and params, which must be concrete."""
