@@ -12,7 +12,7 @@ from dirax.gallery import hanging_chain, lc_ladder, oscillator_chain, sine_gordo
 
 
 def test_toda_keeps_its_eigenvalues_and_is_the_limit_of_small_amplitudes():
-    sites, toda = 400, oscillator_chain.toda_chain()
+    sites, toda = 160, oscillator_chain.toda_chain()
     run = {"v": np.zeros(sites), "step": 0.05, "steps": 40, "save_every": 10}
     changes = []
     for step in (0.1, 0.05):
