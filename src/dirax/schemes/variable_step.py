@@ -11,7 +11,7 @@ from dirax.program.legendre import constrained_velocity, moves
 from dirax.program.tracing import along
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.layout import Layout
-from dirax.schemes.step import CLOCK, STEP_DENSITY, Field, StepEquation
+from dirax.schemes.step import CLOCK, STEP_DENSITY, STEP_LENGTH, Field, StepEquation
 
 
 class Place(NamedTuple):
@@ -45,7 +45,10 @@ class VariableStep(AbstractStep):
     @property
     def fields(self) -> dict[str, Field]:
         density = Field((), "node", (), "step density z: the step that leaves the row is about step/z long")
-        return {**self.inner.fields, STEP_DENSITY: density, CLOCK: Field((), "node", (), "time")}
+        own = {STEP_DENSITY: density, CLOCK: Field((), "node", (), "time")}
+        if any(field.rule == "sum" for field in self.inner.fields.values()):
+            own[STEP_LENGTH] = Field((), "step", (), "length of the step, over which impulses are forces", "sum")
+        return self.inner.fields | own
 
     @property
     def labels(self):
@@ -100,7 +103,8 @@ class VariableStep(AbstractStep):
         own, density, time = state[:-2], state[-2], state[-1]
         only_nodes = all(field.place == "node" for field in self.inner.fields.values())
         length = jnp.nan if only_nodes else self.place(state, h, params).length
-        return {**self.inner.unpack(own, u, time, length, params), STEP_DENSITY: density, CLOCK: time}
+        row = {**self.inner.unpack(own, u, time, length, params), STEP_DENSITY: density, CLOCK: time}
+        return row | ({STEP_LENGTH: length} if STEP_LENGTH in self.fields else {})
 
     def guess(self, state, previous, h, params):
         at = self.place(state, h, params)
