@@ -33,9 +33,10 @@ class LagrangeDAlembertStep(AbstractStep):
     impulses of forces.
 
     The state is (q, p, work); the unknowns are v with q_{k+1} = q_k + h v, the multipliers (μ, λ), and with holonomic
-    constraints those of the projection of the saved momentum: the velocity v̂ that belongs to it, and σ. Where the saved momentum
-    is the mean of those before and after the impulse Wᵀμ, the given one makes both halves of a μ at the first row equal: what
-    the impulse there has beyond this μ is the part `beyond` of the first state.
+    constraints those of the projection of the saved momentum: the velocity v̂ that belongs to it, and σ. Where the mean of the
+    momenta before and after Wᵀμ is saved, the p that a run begins at determines the half of μ after it, and a first p_k at which
+    the half before it is the same. What that half is more, by a step that would arrive at p, is the part `beyond` of the first
+    state, which is added to μ where it is saved.
     Raises `ValueError` for a w_d without one-forms.
     """
 
