@@ -222,15 +222,18 @@ class LagrangeDAlembertStep(AbstractStep):
         L or the forces are not defined before, it is a step of −h, whose impulses are nearly the opposite ones.
         """
         rows, share, step = self.rows, self.share, Layout(v=self.shape.n, multipliers=self.rows.count)
-        guess = step.join(v=v)
-        defined = jnp.all(jnp.isfinite(self._arriving(*step.split(guess), q, p, t, h, params)))
-        back, sign = jnp.where(defined, h, -h), jnp.where(defined, 1.0, -1.0)
-        leaves = lambda u: self.equations(*step.split(u), q, p, t, h, params)
-        arrives = lambda u: self._arriving(*step.split(u), q, p, t, back, params)
 
         def solved(equations, guess):
             found = nearest_root(equations, guess)
             return jnp.where(jnp.all(jnp.isfinite(found)), found, guess)
+
+        def missed(equations, h):
+            return lambda u: equations(step.split(u).v, step.split(u).multipliers, q, p, t, h, params)
+
+        guess = step.join(v=v)
+        defined = jnp.all(jnp.isfinite(missed(self._arriving, h)(guess)))
+        sign = jnp.where(defined, 1.0, -1.0)
+        leaves, arrives = missed(self.equations, h), missed(self._arriving, sign * h)
 
         if self.projects:
             both = lambda u: jnp.concatenate([leaves(u[: step.size]), arrives(u[step.size :])])

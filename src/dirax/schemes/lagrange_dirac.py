@@ -189,10 +189,12 @@ class _Part(AbstractScheme):
 
 def _part(scheme: AbstractScheme, general: LagrangeDAlembert, system: AbstractSystem, shape: Shape) -> AbstractScheme:
     """A scheme as a part of a composed step. Without constraints, and on a quotient by a symmetry, it is the scheme itself."""
-    if not shape.m + shape.c or system.quotient_form() is not None:
-        return scheme
-    # it begins and ends at one momentum, and saves no mean of two
-    return _Part(LagrangeDAlembert(general.discrete_lagrangian, general.constraint, "incoming"))
+    return _projecting(general) if shape.m + shape.c and system.quotient_form() is None else scheme
+
+
+def _projecting(scheme: LagrangeDAlembert) -> _Part:
+    """The part: it begins and ends at one momentum, and saves no mean of two."""
+    return _Part(LagrangeDAlembert(scheme.discrete_lagrangian, scheme.constraint, "incoming"))
 
 
 def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, sign: int = +1) -> StepEquation:
@@ -205,8 +207,7 @@ def _equation(scheme: LagrangeDAlembert, system: AbstractSystem, shape: Shape, s
     if quotient is None:
         step = scheme.step_on_q(system, shape)
         # forces that see the multipliers are given those of both ends, which are of the order of the step
-        seen = step.system.forces_see_multipliers
-        return _part(scheme, scheme, system, shape).step_equation(system, shape) if seen else step.equation()
+        return _projecting(scheme).step_equation(system, shape) if step.system.forces_see_multipliers else step.equation()
     return LagrangePoincareDiracStep(quotient, scheme.step_on_q(quotient.unreduced(), shape), sign).equation()
 
 

@@ -102,9 +102,10 @@ class VariableStep(AbstractStep):
     def unpack(self, state, u, t, h, params):
         own, density, time = state[:-2], state[-2], state[-1]
         only_nodes = all(field.place == "node" for field in self.inner.fields.values())
-        length = jnp.nan if only_nodes else self.place(state, h, params).length
-        row = {**self.inner.unpack(own, u, time, length, params), STEP_DENSITY: density, CLOCK: time}
-        return row | ({STEP_LENGTH: length} if STEP_LENGTH in self.fields else {})
+        length = jnp.asarray(jnp.nan) if only_nodes else self.place(state, h, params).length
+        own_fields = {STEP_DENSITY: density, CLOCK: time, STEP_LENGTH: length}
+        row = self.inner.unpack(own, u, time, length, params) | own_fields
+        return {name: row[name] for name in self.fields}
 
     def guess(self, state, previous, h, params):
         at = self.place(state, h, params)
