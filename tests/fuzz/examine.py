@@ -1,7 +1,9 @@
 """What is asked of a scheme on a random system; `examine` returns what is wrong, in words."""
 
+import itertools
 import zlib
 from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,17 +14,29 @@ from dirax.diagnostics.replay_lines import replayed
 from fuzz.reference import motion, rows_of
 from fuzz.systems import Kind, RandomSystem
 
+
+class Promise(NamedTuple):
+    """A scheme with its order, and that of its multipliers as forces at a place in the step, 0 where it begins, from a row on."""
+
+    scheme: Any
+    order: int
+    of_multipliers: int = 2
+    place: float = 0.0
+    first_row: int = 0
+
+
 LAGRANGE = dx.LagrangeDAlembert()
 SCHEMES = {
-    "midpoint": (LAGRANGE, 2),
-    "trapezoidal": (dx.LagrangeDAlembert("trapezoidal"), 2),
-    "plus": (dx.PlusLagrangeDirac(), 1),
-    "minus": (dx.MinusLagrangeDirac(), 1),
-    "Method 1": (dx.DiscreteDirac(), 2),
-    "Method 2": (dx.DiscreteDirac(constraints="resolve"), 2),
-    "suzuki4": (dx.Composition(LAGRANGE, "suzuki4"), 4),
-    "symmetric": (dx.SymmetricComposition(dx.PlusLagrangeDirac()), 2),
-    "collocation": (dx.Collocation(2), 4),
+    "midpoint": Promise(LAGRANGE, 2),
+    "trapezoidal": Promise(dx.LagrangeDAlembert("trapezoidal"), 2),
+    "plus": Promise(dx.PlusLagrangeDirac(), 1, of_multipliers=1, first_row=1),
+    "minus": Promise(dx.MinusLagrangeDirac(), 1, of_multipliers=1, first_row=1),
+    "mean minus": Promise(dx.MinusLagrangeDirac(momentum="mean"), 1, of_multipliers=1),
+    "Method 1": Promise(dx.DiscreteDirac(), 2, of_multipliers=1, place=0.5),
+    "Method 2": Promise(dx.DiscreteDirac(constraints="resolve"), 2, place=0.5),
+    "suzuki4": Promise(dx.Composition(LAGRANGE, "suzuki4"), 4, place=0.5),
+    "symmetric": Promise(dx.SymmetricComposition(dx.PlusLagrangeDirac()), 2, place=0.5),
+    "collocation": Promise(dx.Collocation(2), 4, place=0.5),
 }
 STEP, STEPS = 0.05, 12
 FLOOR = 3e-11
@@ -37,9 +51,9 @@ DAMAGE = 1e-6
 def examine(system: RandomSystem, name: str, params: dict, start: dict, deep: bool = False) -> list[str]:
     """All that is wrong with a scheme on a system; `deep` damages each field, not one of them, and asks of derivatives and of
     the other engine too."""
-    scheme, order = SCHEMES[name]
+    promise = SCHEMES[name]
     run = lambda h, steps, **more: dx.simulate(
-        system.system, scheme, **({"params": params, "step": h, "steps": steps} | start | more)
+        system.system, promise.scheme, **({"params": params, "step": h, "steps": steps} | start | more)
     )
     try:
         sols = [run(STEP / 2**i, STEPS * 2**i) for i in range(3)]
@@ -47,7 +61,7 @@ def examine(system: RandomSystem, name: str, params: dict, start: dict, deep: bo
         return [f"refused: {refused}"]
     if not all(sol.ok for sol in sols):
         return [f"failed: {next(sol.message for sol in sols if not sol.ok)}"]
-    wrong = [f"order: {text}" for text in _orders(system, sols, order, motion(system, params, start, np.asarray(sols[0].t)))]
+    wrong = [f"order: {text}" for text in _orders(system, sols, promise, params, start)]
     report = dx.verify(sols[1])
     wrong += [f"false alarm: {line.quantity}: {line.explanation}" for line in report.lines if line.verdict == "VIOLATED"]
     if (line := report["steps replayed"]).verdict != "ok":
@@ -73,13 +87,27 @@ def damaged(sol: dx.Solution) -> Iterator[tuple[str, dx.Solution]]:
         yield f"{field}{list(map(int, place))}", sol.replace(fields=sol.fields | {field: changed})
 
 
-def _orders(system: RandomSystem, sols: list, order: int, exact: dict) -> Iterator[str]:
+def _orders(system: RandomSystem, sols: list, promise: Promise, params: dict, start: dict) -> Iterator[str]:
     """Quantities whose errors do not fall as they should."""
+    t = np.asarray(sols[0].t)
+    forces_at = [t[promise.first_row : -1] + promise.place * sol.step for sol in sols]
+    times, back = np.unique(np.concatenate([t, *forces_at]), return_inverse=True)
+    exact = {name: a[back] for name, a in motion(system, params, start, times).items()}
+    at_rows, *at_places = ({name: a[part] for name, a in exact.items()} for part in _parts([t, *forces_at]))
     for field in ("q", "p", "work", "multipliers"):
         if field not in sols[0].fields or not np.size(exact[field]):
             continue
-        errors = [_error(system, field, sol, exact[field], 2**i) for i, sol in enumerate(sols)]
-        wanted = 1 if field == "multipliers" else order  # of impulses, compared with forces at nodes
+        if field == "multipliers":
+            wanted = promise.of_multipliers
+            errors = [
+                _error_of_forces(system, sol, at, s, 2**i, promise.first_row)
+                for i, (sol, at, s) in enumerate(zip(sols, at_places, forces_at, strict=True))
+            ]
+        else:
+            wanted = promise.order
+            errors = [
+                float(np.max(np.abs(np.asarray(sol.fields[field])[:: 2**i] - at_rows[field]))) for i, sol in enumerate(sols)
+            ]
         if (
             errors[2] > FLOOR
             and np.log2(errors[1] / errors[2]) < wanted - SLACK
@@ -88,15 +116,19 @@ def _orders(system: RandomSystem, sols: list, order: int, exact: dict) -> Iterat
             yield f"{field} has errors {', '.join(f'{e:.2g}' for e in errors)}, order {wanted} expected"
 
 
-def _error(system: RandomSystem, field: str, sol, exact: np.ndarray, every: int) -> float:
-    values = np.asarray(sol.fields[field])
-    if field != "multipliers":
-        return float(np.max(np.abs(values[::every] - exact)))
-    rows = np.arange(every, len(values), every)
-    impulse = sol.step if sol.field_info[field].rule == "sum" else 1.0
-    independent, all_rows = map(np.asarray, rows_of(system)(np.asarray(sol.t)[rows], np.asarray(sol.q)[rows], sol.params))
-    force = np.einsum("tmn,tm->tn", all_rows, values[rows] / impulse)  # whichever of them follow from others
-    wanted = np.einsum("tmn,tm->tn", independent, exact[rows // every])
+def _parts(arrays: list) -> list[slice]:
+    """Where these arrays are in their concatenation."""
+    ends = np.cumsum([0, *map(len, arrays)]).tolist()
+    return [slice(*pair) for pair in itertools.pairwise(ends)]
+
+
+def _error_of_forces(system: RandomSystem, sol, exact: dict, t: np.ndarray, every: int, first_row: int) -> float:
+    """How far the forces of the constraints in every so many steps are from those of the motion at these times."""
+    values = np.asarray(sol.multipliers)[first_row * every :: every]
+    impulse = sol.step if sol.field_info["multipliers"].rule == "sum" else 1.0
+    independent, all_rows = map(np.asarray, rows_of(system)(t, exact["q"], sol.params))
+    force = np.einsum("tmn,tm->tn", all_rows, values / impulse)  # whichever of them follow from others
+    wanted = np.einsum("tmn,tm->tn", independent, exact["multipliers"])
     return float(np.max(np.abs(np.abs(force) - np.abs(wanted))))
 
 

@@ -22,7 +22,7 @@ def test_also_in_batches_on_the_other_engine_and_in_derivatives():
 
 
 def test_a_wrong_order_is_found(monkeypatch):
-    monkeypatch.setitem(fuzz.SCHEMES, "plus", (dx.PlusLagrangeDirac(), 2))
+    monkeypatch.setitem(fuzz.SCHEMES, "plus", fuzz.Promise(dx.PlusLagrangeDirac(), 2))
     system, params, start = fuzz.random_case(1)
     assert any("order: q" in what for what in fuzz.examine(system, "plus", params, start))
 

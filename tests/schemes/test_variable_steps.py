@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import dirax as dx
 from dirax.engines.steps_in_numbers import StepsInNumbers
@@ -280,3 +281,33 @@ def test_the_local_frequency_does_not_depend_on_units():
 
 
 SCHEME_OF_LOCAL_FREQUENCY = dx.VariableSteps(dx.Collocation(2))
+
+
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(2, nodes="lobatto")])
+def test_impulses_over_the_lengths_of_their_steps_are_means_of_the_force(scheme):
+    """The tension of a pendulum, of second order as the mean of the step, of first as the value at the row."""
+    pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([(q @ q - 1.0) / 2]))
+    start, errors = {"q": [np.sin(1.2), -np.cos(1.2)], "v": [0.0, 0.0]}, []
+    motion = solve_ivp(
+        lambda t, y: [y[1], -np.sin(y[0])], (0.0, 4.0), [1.2, 0.0], method="DOP853", rtol=1e-12, atol=1e-13, dense_output=True
+    )
+    tension = lambda t: motion.sol(t)[1] ** 2 + np.cos(motion.sol(t)[0])
+    for h in (0.04, 0.02, 0.01):
+        sol = dx.simulate(pendulum, dx.VariableSteps(scheme, lambda q: 1.3 + q[0]), step=h, steps=round(2.0 / h), **start)
+        np.testing.assert_allclose(sol.step_length, np.diff(sol.t), atol=1e-14)
+        mean = (tension(sol.t[:-1]) + 4 * tension(sol.t[:-1] + sol.step_length / 2) + tension(sol.t[1:])) / 6
+        forces = sol.multipliers[:, 0] / sol.step_length
+        errors.append([np.max(np.abs(forces - mean)), np.max(np.abs(forces - tension(sol.t[:-1])))])
+        few = dx.simulate(
+            pendulum, dx.VariableSteps(scheme, lambda q: 1.3 + q[0]), step=h, steps=round(2.0 / h), save_every=5, **start
+        )
+        np.testing.assert_allclose(few.multipliers[:, 0] / few.step_length, forces[::5], atol=1e-9)
+    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), [[2, 1], [2, 1]], atol=0.1)
+
+
+def test_lengths_of_composed_steps_are_summed():
+    pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([q @ q - 1.0]))
+    scheme = dx.Composition(dx.VariableSteps(dx.LagrangeDAlembert(), lambda q: 1.3 + q[0]))
+    sol = dx.simulate(pendulum, scheme, q=[0.6, -0.8], v=[0.4, 0.3], step=0.05, steps=20)
+    np.testing.assert_allclose(sol.step_length, np.diff(sol.t), atol=1e-14)
+    assert "step_length" not in LOW.step_equation(EXAMPLE.system, dx.Shape(2)).fields

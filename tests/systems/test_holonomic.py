@@ -296,7 +296,7 @@ def test_both_kinds_of_constraints():
             [
                 np.max(np.abs(sol.q[:, :2] - np.stack([np.cos(sol.t), sine], 1))),
                 np.max(np.abs(sol.p[:, 2:] - np.stack([sine * rate, rate], 1))),
-                np.max(np.abs(sol.multipliers[1:, 0] / sol.step + force[1:-1])),
+                np.max(np.abs(sol.multipliers[:, 0] / sol.step + force[:-1])),
                 np.max(np.abs(sol.multipliers[:, 1] / sol.step - 0.5)),
             ]
         )

@@ -33,9 +33,10 @@ class LagrangeDAlembertStep(AbstractStep):
     impulses of forces.
 
     The state is (q, p, work); the unknowns are v with q_{k+1} = q_k + h v, the multipliers (μ, λ), and with holonomic
-    constraints those of the projection of the saved momentum: the velocity v̂ that belongs to it, and σ. Where the saved momentum
-    is the mean of those before and after the impulse Wᵀμ, the given one makes both halves of a μ at the first row equal: what
-    the impulse there has beyond this μ is the part `beyond` of the first state.
+    constraints those of the projection of the saved momentum: the velocity v̂ that belongs to it, and σ. Where the mean of the
+    momenta before and after Wᵀμ is saved, the p that a run begins at determines the half of μ after it, and a first p_k at which
+    the half before it is the same. What that half is more, by a step that would arrive at p, is the part `beyond` of the first
+    state, which is added to μ where it is saved.
     Raises `ValueError` for a w_d without one-forms.
     """
 
@@ -221,15 +222,18 @@ class LagrangeDAlembertStep(AbstractStep):
         L or the forces are not defined before, it is a step of −h, whose impulses are nearly the opposite ones.
         """
         rows, share, step = self.rows, self.share, Layout(v=self.shape.n, multipliers=self.rows.count)
-        guess = step.join(v=v)
-        defined = jnp.all(jnp.isfinite(self._arriving(*step.split(guess), q, p, t, h, params)))
-        back, sign = jnp.where(defined, h, -h), jnp.where(defined, 1.0, -1.0)
-        leaves = lambda u: self.equations(*step.split(u), q, p, t, h, params)
-        arrives = lambda u: self._arriving(*step.split(u), q, p, t, back, params)
 
         def solved(equations, guess):
             found = nearest_root(equations, guess)
             return jnp.where(jnp.all(jnp.isfinite(found)), found, guess)
+
+        def missed(equations, h):
+            return lambda u: equations(step.split(u).v, step.split(u).multipliers, q, p, t, h, params)
+
+        guess = step.join(v=v)
+        defined = jnp.all(jnp.isfinite(missed(self._arriving, h)(guess)))
+        sign = jnp.where(defined, 1.0, -1.0)
+        leaves, arrives = missed(self.equations, h), missed(self._arriving, sign * h)
 
         if self.projects:
             both = lambda u: jnp.concatenate([leaves(u[: step.size]), arrives(u[step.size :])])

@@ -42,7 +42,10 @@ class LagrangeDAlembert(AbstractScheme):
 
     `momentum` says what is saved as p at a node where the constraint force jumps: p_k itself ("incoming", the default
     with a one-sided constraint), p_k − W(q_k)ᵀ μ_k = −D1 L_d(q_k, q_{k+1}) ("outgoing"), or the mean of both (default
-    otherwise), which has the order of q. Without constraints the three are the same.
+    otherwise), which has the order of q. Without constraints the three are the same. A run begins at the given p_0. Where that is
+    the mean, up to h², μ_0 is the whole impulse at the first row, that of a step which would arrive there included. Where it is
+    not, no impulse of one-forms has led to it: μ_0 is the impulse from p_0 on, which is a part of that of later rows, half of it
+    for the midpoint pair. From two points, whose step is given, it is zero, and λ_0 is.
     Solvable where [[D2 D1 L_d, Wᵀ], [D2 w_d, 0]] is invertible ([PY] (21)); L itself may be degenerate.
 
     Of a `dx.ManifoldLagrangian` L_d and w_d are on its manifold, functions being of points of R^N, and the equations those of

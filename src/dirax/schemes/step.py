@@ -26,6 +26,9 @@ CLOCK = "clock"
 STEP_DENSITY = "step_density"
 """Those that are the step density z, of which the value in the middle of a step sets its length, step/z."""
 
+STEP_LENGTH = "step_length"
+"""The field of their steps that is the length, where there are impulses, to divide them by."""
+
 PART = "part_of_step"
 """The field of an impact that says where in its step it is, by `step`, of steps that have lengths of their own."""
 

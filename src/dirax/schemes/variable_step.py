@@ -12,7 +12,7 @@ from dirax.program.tracing import along
 from dirax.program.user_functions import evaluated
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.layout import Layout
-from dirax.schemes.step import CLOCK, STEP_DENSITY, Field, StepEquation
+from dirax.schemes.step import CLOCK, STEP_DENSITY, STEP_LENGTH, Field, StepEquation
 
 SAME_RATE = 1e-6
 """Relative distance of two ẋ, the smallest and that of an elimination, that are the same unless there are many."""
@@ -49,7 +49,10 @@ class VariableStep(AbstractStep):
     @property
     def fields(self) -> dict[str, Field]:
         density = Field((), "node", (), "step density z: the step that leaves the row is about step/z long")
-        return {**self.inner.fields, STEP_DENSITY: density, CLOCK: Field((), "node", (), "time")}
+        own = {STEP_DENSITY: density, CLOCK: Field((), "node", (), "time")}
+        if any(field.rule == "sum" for field in self.inner.fields.values()):
+            own[STEP_LENGTH] = Field((), "step", (), "length of the step, over which impulses are forces", "sum")
+        return self.inner.fields | own
 
     @property
     def labels(self):
@@ -92,8 +95,10 @@ class VariableStep(AbstractStep):
     def unpack(self, state, u, t, h, params):
         own, density, time = state[:-2], state[-2], state[-1]
         only_nodes = all(field.place == "node" for field in self.inner.fields.values())
-        length = jnp.nan if only_nodes else self.place(state, h, params).length
-        return {**self.inner.unpack(own, u, time, length, params), STEP_DENSITY: density, CLOCK: time}
+        length = jnp.asarray(jnp.nan) if only_nodes else self.place(state, h, params).length
+        own_fields = {STEP_DENSITY: density, CLOCK: time, STEP_LENGTH: length}
+        row = self.inner.unpack(own, u, time, length, params) | own_fields
+        return {name: row[name] for name in self.fields}
 
     def guess(self, state, previous, h, params):
         at = self.place(state, h, params)

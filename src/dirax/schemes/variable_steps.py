@@ -29,7 +29,9 @@ class VariableSteps(AbstractScheme):
         scheme = dx.VariableSteps(dx.Collocation(4), density=lambda q: (q @ q) ** -0.75)
 
     `sol.t` are the times of the rows, in a batch (B, rows) those of each trajectory, and `sol.step_density` is z; the order is
-    that of the scheme. Takes schemes of one part whose q and p at a row are in their state; may itself be composed.
+    that of the scheme. Impulses, as the multipliers of `dx.LagrangeDAlembert` and `dx.Collocation`, are those of the whole step:
+    over its length, `sol.step_length`, they are the mean of the force in the step, up to h², and not its value at the row.
+    Takes schemes of one part whose q and p at a row are in their state; may itself be composed.
     Raises `TypeError` for other schemes and densities, `ValueError` for densities that are not positive where the run begins;
     one in which z does not stay positive ends there.
     """

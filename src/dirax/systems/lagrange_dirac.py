@@ -58,9 +58,10 @@ class LagrangeDirac(AbstractSystem):
     Equations, with G = ∂g/∂q: ṗ = ∂L/∂q + f − Wᵀμ − Gᵀλ, p = ∂L/∂v, q̇ = v, W v + b = 0, g = 0.
     Units are the user's: the energy has those of L, p those of L·time/q. The saved multipliers are those of the scheme. Of a
     discrete Lagrange–d'Alembert scheme they are impulses at the row that the step leaves, in L·time over the unit of W q or g:
-    over h they are (μ, λ) at that row, up to h² with a scheme of second order. In compositions, and where forces see them, they
-    are the impulses of the whole step, over h its means. Of `dx.DiscreteDirac` they are forces of the opposite sign,
-    ṗ = … + Wᵀλ, at the base point of the step: its middle, for the midpoint map.
+    over h they are (μ, λ) at that row, up to h² with a scheme of second order; at the first row μ is a part of it, unless the
+    saved momentum is the mean (see `momentum` there), and both are 0 after a start from two points. In compositions, and where
+    forces see them, they are the impulses of the whole step, over h its means. Of `dx.DiscreteDirac` they are forces of the
+    opposite sign, ṗ = … + Wᵀλ, at the base point of the step: its middle, for the midpoint map.
 
         system = dx.LagrangeDirac(lambda q, v: v @ v / 2, lambda q: jnp.array([[q[1], -q[0], 1.0]]))
         pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([q @ q - 1.0]))
