@@ -1,5 +1,6 @@
 """The inverses of many matrices side by side, to be applied to vectors: small ones as arrays, large ones by sparse factors."""
 
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -68,10 +69,8 @@ class _Factored:
 
         self.rows, self.columns, self.factors = rows, columns, None
         if np.all(np.isfinite(matrix)):
-            try:
+            with contextlib.suppress(RuntimeError):  # it is singular
                 self.factors: Any = splu(csc_matrix(matrix))
-            except RuntimeError:  # it is singular
-                pass
 
     def __call__(self, v: np.ndarray) -> np.ndarray:
         if self.factors is None or not np.all(np.isfinite(v)):
