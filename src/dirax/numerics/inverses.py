@@ -24,7 +24,7 @@ def no_inverses(count: int, k: int) -> Inverses:
 
 def unknown(inverses: Inverses) -> np.ndarray:
     """Which ones are not known, (matrices,)."""
-    return np.equal(inverses, None) if inverses.ndim == 1 else np.isnan(inverses[:, 0, 0])
+    return np.array([one is None for one in inverses], bool) if inverses.ndim == 1 else np.isnan(inverses[:, 0, 0])
 
 
 def inverted(matrices: np.ndarray) -> Inverses:
