@@ -229,7 +229,7 @@ class Replay:
     def again(
         self, at: Rows, noise: Noise | None = None, guesses: list[np.ndarray] | None = None, near: Near | None = None
     ) -> Again:
-        """The steps that leave these rows, up to the next saved ones, from these `guesses`, and `near` others, if they are given."""
+        """The steps that leave these rows, up to the next saved ones, from these `guesses`, if they are given, `near` others."""
         h, steps = float(self.sol.step), self.steps
         first = steps.nothing_near(len(at.rows)) if near is None else near
         made = steps.step(at.states, guesses or at.guesses, at.t, h, at.params, noise, first)

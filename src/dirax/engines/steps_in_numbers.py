@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
-from dirax.engines.stopping import CONTRACTING, OWN
+from dirax.engines.stopping import CONTRACTING
 from dirax.numerics.equilibration import balanced_inverse, condition_number
 from dirax.numerics.inverses import Inverses, applied, applied_sizes, inverted, no_inverses, unknown
 from dirax.numerics.tolerances import EPSILON
@@ -217,7 +217,8 @@ class StepsInNumbers:
     def _solved(self, stage: int, guess, states, at, noise, near: Near) -> tuple[np.ndarray, np.ndarray]:
         """The unknowns (states, k) of a stage by Newton's method, and where it has a solution.
 
-        A Jacobian serves as long as updates by it contract. Those of one that does not, or of another step, are taken back."""
+        A Jacobian serves as long as updates by it contract. Those of one that does not, or of another step, are taken back. The
+        last update is by that of the solution."""
         index = self.program.stages[stage][0]
         e, (count, k) = self.program.equations[index], guess.shape
         if not k:
@@ -253,17 +254,16 @@ class StepsInNumbers:
             contracts = moved <= CONTRACTING * last[left]
             own[left] |= contracts & np.isfinite(last[left])
             stalled = own[left] & (moved >= last[left] / 2) & (moved < LEFT)
-            found = _largest_ratio(change, np.maximum(np.abs(u[left]), OWN * size[left])) <= FOUND
-            ended = found | stalled | (fresh & np.isnan(moved))
+            ended = (moved <= FOUND) | stalled | (fresh & np.isnan(moved))
             renewed[left] = ~fresh & ~contracts & ~(own[left] & (moved <= KEPT)) & ~ended
             last[left] = np.where(renewed[left], np.inf, moved)
             u[renewed] = safe[renewed]
             left = left[~ended]
             if not len(left):
                 break
-        if noise:
-            known = self._values(index, u, states, at, noise)
-            u = u - applied(inverse, self._read(known, e.residual))
+        # by any other Jacobian the roundoff of constraints would move what they leave free
+        inverse[:] = inverted(self._linearized(index, self._values(index, u, states, at))[0])
+        u = u - applied(inverse, self._read(self._values(index, u, states, at, noise), e.residual))
         return u, last < LEFT
 
     def _values(self, index: int, u, states, at, noise: Noise | None = None) -> Values:

@@ -1,5 +1,6 @@
 """The inverses of many matrices side by side, to be applied to vectors: small ones as arrays, large ones by sparse factors."""
 
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ def no_inverses(count: int, k: int) -> Inverses:
 
 def unknown(inverses: Inverses) -> np.ndarray:
     """Which ones are not known, (matrices,)."""
-    return np.equal(inverses, None) if inverses.ndim == 1 else np.isnan(inverses[:, 0, 0])
+    return np.array([one is None for one in inverses], bool) if inverses.ndim == 1 else np.isnan(inverses[:, 0, 0])
 
 
 def inverted(matrices: np.ndarray) -> Inverses:
@@ -68,10 +69,8 @@ class _Factored:
 
         self.rows, self.columns, self.factors = rows, columns, None
         if np.all(np.isfinite(matrix)):
-            try:
+            with contextlib.suppress(RuntimeError):  # it is singular
                 self.factors: Any = splu(csc_matrix(matrix))
-            except RuntimeError:  # it is singular
-                pass
 
     def __call__(self, v: np.ndarray) -> np.ndarray:
         if self.factors is None or not np.all(np.isfinite(v)):

@@ -1,0 +1,47 @@
+"""Inverses of many matrices: small and large ones, in any units, singular ones, and the sizes that they give."""
+
+import numpy as np
+import pytest
+
+from dirax.numerics.inverses import LARGE, applied, applied_sizes, inverted, no_inverses, unknown
+
+RNG = np.random.default_rng(0)
+
+
+def matrices(count, k):
+    """Banded ones."""
+    near = np.abs(np.subtract.outer(np.arange(k), np.arange(k))) < 3
+    return RNG.standard_normal((count, k, k)) * near + 4.0 * np.eye(k)
+
+
+@pytest.mark.parametrize("k", [3, LARGE + 7])
+def test_they_solve_equations_in_any_units(k):
+    a, x, (rows, columns) = matrices(5, k), RNG.standard_normal((5, k)), 10.0 ** RNG.integers(-6, 6, (2, k))
+    right = rows * (a @ x[..., None])[..., 0]
+    found = applied(inverted(rows[:, None] * a * columns), right) * columns
+    np.testing.assert_allclose(found, x, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("k", [3, LARGE + 7])
+def test_a_singular_one_gives_no_numbers_and_leaves_the_others_alone(k):
+    a = matrices(3, k)
+    a[1, :, 0] = 0.0
+    a[2, 0, 0] = np.nan
+    found = applied(inverted(a), np.ones((3, k)))
+    assert np.all(np.isfinite(found[0]))
+    assert not np.any(np.all(np.isfinite(found[1:]), axis=1))
+
+
+@pytest.mark.parametrize("k", [3, LARGE + 7])
+def test_unknown_ones(k):
+    inverses = no_inverses(4, k)
+    inverses[[0, 2]] = inverted(matrices(2, k))
+    assert unknown(inverses).tolist() == [False, True, False, True]
+
+
+def test_sizes_of_large_ones_are_about_those_of_all_signs():
+    a, sizes = matrices(2, LARGE + 7), RNG.uniform(1.0, 2.0, (2, LARGE + 7))
+    exact = np.einsum("rij,rj->ri", np.abs(np.linalg.inv(a)), sizes)
+    found = applied_sizes(inverted(a), sizes)
+    assert np.all(found <= exact * (1 + 1e-9))
+    assert np.median(found / exact) > 0.5
