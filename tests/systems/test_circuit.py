@@ -220,3 +220,31 @@ def test_the_laws_of_few_and_of_many_nodes(nodes):
     into[-1] += e[-1] / 3.0 - 4.0 * 0.7
     voltages = v[pairs:] - (e[:-1] - e[1:]), x[:pairs] / (2.0 + np.arange(pairs)) - e[:-1], [5.0 - e[1]]
     np.testing.assert_allclose(left, np.concatenate([into, *voltages, [4.0 * e[-1] - e[0]]]), atol=1e-13)
+
+
+@pytest.mark.parametrize("t0", [0.0, 0.4])
+@pytest.mark.parametrize("source", [0.5, lambda t: 0.5 * jnp.cos(t)], ids=["constant", "in time"])
+def test_the_advice_for_a_start_off_the_laws_works_as_written(source, t0):
+    """A source beside a capacitor, which the initial charge contradicts."""
+    system, x = dx.circuit([("V", 1, 0, source), ("C", 1, 0, 2.0), ("R", 1, 2, 1.0), ("C", 2, 0, 3.0)]), np.array([0.0, 0.6])
+    run = {"step": 0.01, "steps": 20, "t0": t0}
+    with pytest.raises(ValueError, match="off the constraint") as refused:
+        dx.simulate(system, MIDPOINT, x=x, **run)
+    advice = str(refused.value).split("where ")[1].split(" finds a point")[0]
+    found = eval(advice, {"dx": dx, "system": system, "x": x})
+    voltage = source if np.isscalar(source) else 0.5 * np.cos(t0)
+    np.testing.assert_allclose(found, [2.0 * voltage, 0.6], atol=1e-14)
+    sol = dx.simulate(system, MIDPOINT, x=found, **run)
+    assert sol.ok and sol.x[-1, 0] == pytest.approx(2.0 * (source if np.isscalar(source) else 0.5 * np.cos(t0 + 0.2)), abs=1e-4)
+
+
+def test_nodes_that_float_are_named_with_the_way_out():
+    """A bridge of diodes that let nothing through backwards: the source between nodes 1 and 2 hangs in the air when all block."""
+    diode = lambda u: 1e-12 * jnp.expm1(u / 0.02585)
+    bridge = [("R", 1, 3, diode), ("R", 2, 3, diode), ("R", 0, 1, diode), ("R", 0, 2, diode)]
+    netlist = [("V", 1, 2, lambda t: 10 * jnp.sin(100 * jnp.pi * t)), *bridge, ("C", 3, 0, 1e-4), ("R", 3, 0, 1000.0)]
+    run = {"x": [0.0], "step": 5e-5, "steps": 400}
+    sol = dx.simulate(dx.circuit(netlist), MIDPOINT, **run)
+    assert not sol.ok and "nothing determines the potential of node 1" in sol.message and "a large resistor" in sol.message
+    helped = dx.simulate(dx.circuit([*netlist, ("R", 1, 0, 1e9)]), MIDPOINT, **run)
+    assert helped.rows > sol.rows or helped.ok, helped.message

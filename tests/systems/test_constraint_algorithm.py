@@ -372,3 +372,34 @@ def test_a_hessian_whose_kernel_turns_has_one_rank():
 def test_schemes_do_not_send_to_a_final_manifold_that_is_none(scheme):
     with pytest.raises(ValueError, match=r"is not found here: the rank of ∂²L/∂v² is 1 at the point and 2 around it"):
         dx.simulate(POLAR, scheme, q=[0.0, 0.2], v=[0.3, 0.5], step=0.1, steps=10)
+
+
+def test_points_of_a_chain_with_a_clock_with_and_without_the_time():
+    """x₀ = 2 cos t: by default the time is that of the point at which the chain was found."""
+    chain = constraint_algorithm(dx.circuit([("V", 1, 0, jnp.cos), ("C", 1, 0, 2.0)]), near={"x": [1.0], "t": 0.3})
+    assert chain.coordinates == ("x0", "t")
+    for t, given in ((0.3, {}), (0.7, {"t": 0.7})):
+        x, whole, charge = np.array([1.0]), np.array([1.0, t]), 2.0 * np.cos(t)
+        np.testing.assert_allclose(chain.project(x, **given), [charge], atol=1e-14)
+        np.testing.assert_allclose(chain.project(whole), [charge, t], atol=1e-14)
+        np.testing.assert_allclose(chain.field(np.array([charge]), **given), [-2.0 * np.sin(t)], atol=1e-13)
+        np.testing.assert_allclose(chain.field(np.array([charge, t])), [-2.0 * np.sin(t), 1.0], atol=1e-13)
+        for function in (chain.constraints, chain.multipliers, chain.off_level):
+            np.testing.assert_array_equal(function(x, **given), function(whole))
+        assert chain.gauge(x, **given).shape == (1, 0) and chain.gauge(whole).shape == (2, 0)
+        np.testing.assert_allclose(
+            jax.jit(lambda x, given=given: chain.project(x, **given))(jnp.asarray(x)), [charge], atol=1e-14
+        )
+        chain.check([charge], **given)
+    with pytest.raises(ValueError, match=r"nearest point of M_f is \[1\.910673\]"):
+        chain.check([1.0])
+    for function in (chain.project, chain.check, chain.field, chain.constraints, chain.off, chain.multipliers, chain.gauge):
+        with pytest.raises(ValueError, match=r"shape \(2,\) = \(x0, t\), or \(1,\) without t, but it has shape \(3,\)"):
+            function(np.zeros(3))
+        with pytest.raises(ValueError, match=r"it has shape \(2,\) beside t=0\.5"):
+            function(np.zeros(2), t=0.5)
+
+
+def test_points_of_the_wrong_length(pendulum):
+    with pytest.raises(ValueError, match=r"x must have shape \(4,\) = \(x0, x1, x2, x3\), but it has shape \(3,\)\.$"):
+        pendulum.project(np.zeros(3))

@@ -219,7 +219,8 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
         for stage in dict.fromkeys(stage.check for stage, _ in equation.stages):
             stage(data, case.h, own)
         needed = partial(needed_at, system, case, initial) if singular else None
-        refuse_bad_start(system, initial, start, equation.stages[0][0].labels, check_initial, settings.project, needed)
+        labels = equation.stages[0][0].labels
+        refuse_bad_start(system, initial, start, labels, check_initial, settings.project, needed, case)
         if check_initial and singular:
             refuse_off_final_manifold(system, case, initial)
         if check_initial:

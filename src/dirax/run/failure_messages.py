@@ -17,11 +17,15 @@ from dirax.program.graph import GraphTooLarge
 from dirax.program.roots import FEWEST_SPARSE, sparse_equations
 from dirax.run.turning_step import follow
 from dirax.schemes.step import CLOCK
+from dirax.systems.circuit import POTENTIAL
 
 SMALLER = "a smaller step may help"
 
 FOLLOWED = 64
 """Unknowns of a step up to which its solutions are followed from short steps on, to see whether there are any."""
+
+COUNTS, NAMED = 0.1, 8
+"""Part that an equation has in a direction for it to be named, and how many are named at most."""
 
 brief: ContextVar[bool] = ContextVar("brief", default=False)
 """Whether the failed step is not computed again to see where it breaks: of a million trajectories many may fail."""
@@ -101,7 +105,8 @@ def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, sizes
             return f"{label} is not finite (outside the domain of the system's functions) in Newton iteration {iteration + 1}", u
         worst = int(np.argmax(np.abs(residual)))
         if not condition < LARGEST_CONDITION:
-            return f"the Jacobian of the step is singular (condition number {condition:.2g})", u
+            dependent = _dependent(stage, numbers.linearized(u, *args)[1]) if stage.unknowns < FEWEST_SPARSE else ""
+            return f"the Jacobian of the step is singular (condition number {condition:.2g}){dependent}", u
         change = solve(residual)
         u = u - change
         update = np.max(np.abs(change) / (np.abs(u) + sizes))
@@ -111,6 +116,24 @@ def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, sizes
         f"Newton did not converge in {max_iterations} iterations (largest residual in {stage.labels[worst]}, "
         f"condition number {condition:.2g}): {_advice(stage, numbers, guess, args, sizes)}"
     ), u
+
+
+def _dependent(stage, jacobian: np.ndarray) -> str:
+    """Which equations of a step depend on each other, and the way out for nodes of a circuit."""
+    rows = np.abs(jacobian).max(axis=1, keepdims=True)
+    left, values, _ = np.linalg.svd(jacobian / np.where(rows > 0.0, rows, 1.0))
+    null = left[:, values <= len(values) * EPSILON * values.max(initial=0.0)]
+    names = [stage.labels[i] for i in np.flatnonzero(np.abs(null).max(axis=1, initial=0.0) > COUNTS)]
+    nodes = [name for name in names if name.startswith(POTENTIAL)]
+    if not names or len(names) > NAMED:
+        return ""
+    if nodes:
+        numbers = ", ".join(name.removeprefix(POTENTIAL) for name in nodes)
+        return (
+            f": nothing determines the potential of {'nodes' if len(nodes) > 1 else 'node'} {numbers}, to which no current flows "
+            "that depends on it; put a large resistor beside an element that blocks, or from there to the ground"
+        )
+    return f": nothing tells these equations apart, {', '.join(names)}"
 
 
 def _where_it_ends(numbers: InNumbers | InJax, guess, args, sizes) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from dirax.numerics.ranks import rank_of_equations
 from dirax.numerics.tolerances import CONSTRAINT_DEFECT, TINY
 from dirax.run.start import Initial, SparseJacobians, Start, direction
+from dirax.run.validate import Case
 from dirax.schemes.adjoint_step import ADJOINT
 from dirax.schemes.collocation_step import AT_NODE
 from dirax.schemes.lagrange_dalembert_step import PROJECTION
@@ -23,6 +24,7 @@ def refuse_bad_start(
     check_constraint: bool,
     projected: bool,
     needed: Callable[[], str] | None,
+    case: Case,
 ) -> None:
     """Raise `ValueError` for functions that are not finite at the data, data off the constraints (with the residual), and a
     first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
@@ -33,7 +35,7 @@ def refuse_bad_start(
     _refuse_constraints_outside_their_domain(system, initial)
     _refuse_outside_the_domain(initial)
     if check_constraint:
-        _refuse_off_constraint(system, initial, start, projected)
+        _refuse_off_constraint(system, initial, start, projected, case)
     if needed and not system.constraints.any and labels[0].startswith(AT_NODE.format(0)):
         raise ValueError(f"collocation takes regular Lagrangians, and ∂²L/∂v² is singular at the initial data: it {needed()}.")
     if start.jacobian is not None:
@@ -67,7 +69,7 @@ def _refuse_constraints_outside_their_domain(system: AbstractSystem, initial: In
             )
 
 
-def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Start, projected: bool) -> None:
+def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Start, projected: bool, case: Case) -> None:
     defect = _lanes(initial.defect, 1)
     if not defect.size:
         return
@@ -76,7 +78,7 @@ def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Star
     bad = ~np.all(np.abs(defect) <= CONSTRAINT_DEFECT * size, axis=-1)
     if np.any(bad):
         lane = int(np.argmax(bad))
-        way = _way_onto_constraint(system, start.row0 is not None, projected)
+        way = _way_onto_constraint(system, start.row0 is not None, projected, case)
         more = system.explain(_lanes(start.state, 1)[lane])
         raise ValueError(
             f"the initial data{_which(bad)} are off the constraint, whose residual is "
@@ -84,14 +86,16 @@ def _refuse_off_constraint(system: AbstractSystem, initial: Initial, start: Star
         )
 
 
-def _way_onto_constraint(system: AbstractSystem, two_points: bool, projected: bool) -> str:
+def _way_onto_constraint(system: AbstractSystem, two_points: bool, projected: bool, case: Case) -> str:
     if two_points:
         return "choose q1 on the discrete constraint, or pass check_initial=False to take the points as they are"
     if not system.projected:
+        near = "x" if case.t0 == 0 else f'{{"x": x, "t": {float(case.t0)!r}}}'
+        near += ", params=params" * (case.params is not None)
         return (
             f"nothing projects the data of this {type(system).__name__}: begin on its constraint manifold, where "
-            "dx.constraint_algorithm(system, near=x).project(x) finds a point, or pass check_initial=False to take them as they "
-            "are"
+            f"dx.constraint_algorithm(system, near={near}).project(x) finds a point, or pass check_initial=False to take them as "
+            "they are"
         )
     if projected:
         return f"project=True, which moves {system.projected}, found no place on it: begin nearer to it"

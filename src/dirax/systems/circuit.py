@@ -31,6 +31,9 @@ from dirax.systems.premise import Premise
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem, refuse_start
 
+POTENTIAL = "potential of node "
+"""How the label of a node's equation begins."""
+
 
 def circuit(netlist: Sequence[Element]) -> "ImplicitSystem | Circuit":
     """The system of a list of elements (kind, node, other node, value); node 0 is the ground.
@@ -251,7 +254,7 @@ class Circuit(AbstractSystem):
 
     def relation_form(self, shape: Shape) -> RelationForm:
         currents = [f"current of {kind} {i}" for kind in "VT" for i in range(self.count(kind))]
-        labels = (*(f"potential of node {node}" for node in self.nodes), *currents)
+        labels = (*(f"{POTENTIAL}{node}" for node in self.nodes), *currents)
         return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port")
 
     def complete(self, data: Data, params: Any, project: bool) -> Data:

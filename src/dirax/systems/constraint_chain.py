@@ -44,7 +44,8 @@ class ConstraintChain:
     - `levels`: the manifolds M_k; `dimension`: that of M_f; `point` (N,): a point of M_f (of the last level reached).
     - `index`: how often constraints are differentiated until (ẋ, u) is determined, or as far as it ever is.
     - `verdict`: "determined", "gauge freedom", "empty" or "irregular", and `explanation` in words.
-    - `coordinates` and `multiplier_names`; with a `clock` the last coordinate is the time, which no projection moves.
+    - `coordinates` and `multiplier_names`; with a `clock` the last coordinate is the time, which no projection moves. A point x
+      may then be given without it too, beside `t=`, by default that of `point`; what comes back is without it as well.
     - `freedom`: the number of undetermined directions of ẋ; `redundant`: that of undetermined multipliers.
     - `units` (N,): the sizes of the coordinates, powers of two, in which distances between points are measured.
 
@@ -83,60 +84,53 @@ class ConstraintChain:
         """Whether no point near the given one has a velocity that stays."""
         return self.verdict == EMPTY
 
-    def constraints(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " c"]:
+    def constraints(self, x: Float[Numbers, " N"], params: Any = None, t: Any = None) -> Float[Numbers, " c"]:
         """All constraint functions of M_f at x, level by level."""
-        return self._at(self._constraints, x, params)
+        return self._at(self._constraints, x, params, t)
 
-    def field(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
+    def field(self, x: Float[Numbers, " N"], params: Any = None, t: Any = None) -> Float[Numbers, " N"]:
         """The tangent field ẋ on M_f; where it is not unique, the one without a part in the undetermined directions, in `units`.
 
         Raises `ValueError` for a chain that ended empty or irregular.
         """
-        return self._at(self._solved(), x, params)[: len(self.coordinates)]
+        return self._at(self._solved(), x, params, t)[: np.shape(x)[0]]
 
-    def multipliers(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " m"]:
+    def multipliers(self, x: Float[Numbers, " N"], params: Any = None, t: Any = None) -> Float[Numbers, " m"]:
         """The multipliers u that keep x on M_f, in the order of `multiplier_names`. Raises as `field`."""
-        return self._at(self._solved(), x, params)[len(self.coordinates) :]
+        return self._at(self._solved(), x, params, t)[len(self.coordinates) :]
 
-    def gauge(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, "N freedom"]:
+    def gauge(self, x: Float[Numbers, " N"], params: Any = None, t: Any = None) -> Float[Numbers, "N freedom"]:
         """A basis, by columns, of the directions of ẋ that the equations leave free. Raises as `field`."""
         if self._kernel is None:
             raise ValueError(f"this constraint chain has no final manifold: {self.explanation}")
-        return self._at(self._free_directions, x, params)
+        return self._at(self._free_directions, x, params, t)[: np.shape(x)[0]]
 
-    def project(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
+    def project(self, x: Float[Numbers, " N"], params: Any = None, t: Any = None) -> Float[Numbers, " N"]:
         """The point y of M_f nearest to x in `units` U: y + U²Dφ(y)ᵀσ = x, φ(y) = 0. Differentiable."""
         self._solved()
-        return self._at(self._nearest, x, params)
+        return self._at(self._nearest, x, params, t)[: np.shape(x)[0]]
 
     def normal(self, covector: Float[Numbers, " N"]) -> Float[Numbers, " N"]:
         """The vector that a combination of the dφ pushes points along: normal to M_f in `units`, without the time's part."""
         vector = covector * self.units**2
         return vector.at[-1].set(0.0) if self.clock else vector
 
-    def check(self, x: Float[Numbers, " N"], params: Any = None) -> None:
+    def check(self, x: Float[Numbers, " N"], params: Any = None, t: Any = None) -> None:
         """Raise `ValueError` for a point off M_f, with the first level it is off, the values, and its projection."""
-        params = self._with(params)
-        if is_traced(x, params):
-            return
-        if np.shape(x) != (len(self.coordinates),):
-            raise ValueError(
-                f"x must have shape ({len(self.coordinates)},) = {self.coordinates}, but it has shape {np.shape(x)}."
-            )
-        if text := self.off(x, params):
+        if not is_traced(x, self._with(params), t) and (text := self.off(x, params, t)):
             raise ValueError(f"{text}: start from chain.project(x).")
 
-    def off(self, x: Float[Numbers, " N"], params: Any = None) -> str:
+    def off(self, x: Float[Numbers, " N"], params: Any = None, t: Any = None) -> str:
         """The first level that x is off, the values of its constraints and the nearest point of M_f, in words; "" on M_f."""
-        if not (off := self.off_level(x, params)):
+        if not (off := self.off_level(x, params, t)):
             return ""
-        where = np.asarray(self.project(x, params))
+        where = np.asarray(self.project(x, params, t))
         distance = np.linalg.norm(where - np.asarray(x))
         return f"{off}. The nearest point of M_f is {np.array2string(where, precision=6)}, at distance {distance:.3g}"
 
-    def off_level(self, x: Float[Numbers, " N"], params: Any = None) -> str:
+    def off_level(self, x: Float[Numbers, " N"], params: Any = None, t: Any = None) -> str:
         """The first level that x is off and the values of its constraints, in words; "" on M_f."""
-        params = self._with(params)
+        params, x = self._with(params), self._whole(x, t)
         for level in self.levels:
             value, slope = map(np.asarray, self._at(once(_with_slope, level.constraints), x, params))
             slope, size = np.abs(slope * self.units).max(initial=0.0), np.abs(np.asarray(x) / self.units).max()
@@ -163,9 +157,23 @@ class ConstraintChain:
     def _with(self, params):
         return self.params if params is None else params
 
-    def _at(self, function: Callable, x, params):
+    def _whole(self, x, t) -> Any:
+        """x with all its coordinates. Raises `ValueError`."""
+        given, size = np.shape(x), len(self.coordinates)
+        if given == (size,) and t is None:
+            return x
+        if self.clock and given == (size - 1,):
+            end = self.point[-1] if t is None else t
+            return jnp.append(x, end) if is_traced(x, end) else np.append(x, end)
+        without = f", or ({size - 1},) without t" if self.clock else ""
+        beside = f" beside t={t!r:.20}" if t is not None else ""
+        raise ValueError(
+            f"x must have shape ({size},) = ({', '.join(self.coordinates)}){without}, but it has shape {given}{beside}."
+        )
+
+    def _at(self, function: Callable, x, params, t=None):
         """A function of (x, params), at concrete values without a compiler."""
-        params = self._with(params)
+        params, x = self._with(params), self._whole(x, t)
         traced = is_traced(x, params)
         return scalar_program(function, x, params) if traced else evaluated(function, np.asarray(x, dtype=float), params)
 

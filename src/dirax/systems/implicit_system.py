@@ -10,7 +10,7 @@ from dirax.numerics.arrays import Data, Numbers
 from dirax.program.linear_solves import scaled_pseudo_inverse
 from dirax.program.user_functions import UserFunction
 from dirax.systems.forms import ImplicitForm, RelationForm
-from dirax.systems.implicit_form import energy_of_x, names, point_of
+from dirax.systems.implicit_form import energy_of_x, names, point_of, without_time
 from dirax.systems.magnitudes import of_solution
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
@@ -59,7 +59,7 @@ class ImplicitSystem(AbstractSystem):
         return RelationForm(self.relation, shape.m, labels, shape.m, axis="closed_port")
 
     def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
-        x = point_of(near, ("x",), self)
+        x = point_of(without_time(near)[0], ("x",), self)
         _, m = self.sizes({"x": jnp.asarray(x)}, params)
         return ImplicitForm(self.equations, x, names("x", x.size), names("u", m), energy_of_x(self), "as stated")
 
