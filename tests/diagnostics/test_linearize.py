@@ -193,6 +193,31 @@ def test_a_weight_that_falls_from_zero_is_at_no_equilibrium_in_any_units():
             dx.linearize(falling, {"q": np.zeros(1), "v": np.zeros(1)}, params=g)
 
 
+@pytest.mark.parametrize("scheme", [None, dx.LagrangeDAlembert(), dx.Composition(dx.LagrangeDAlembert(), "suzuki4")])
+@pytest.mark.parametrize("unit", [1.0, 2.0**-40])
+def test_a_slow_motion_that_grows_is_seen_beside_a_fast_one(scheme, unit):
+    """A pendulum up or down beside a mode of 1 MHz, and two masses on a spring, which move together as if free."""
+    fast = 2 * np.pi * 1e6 / unit
+    params = {"g": 9.81 / unit**2, "k": fast**2}
+    pendulum = lambda up: dx.LagrangeDirac(lambda q, v, p: (v @ v - p["k"] * q[1] ** 2) / 2 - up * p["g"] * jnp.cos(q[0]))
+    pair = dx.LagrangeDirac(lambda q, v, p: (v @ v - p["k"] * (q[1] - q[0]) ** 2) / 2)
+    step = {} if scheme is None else {"scheme": scheme, "step": 0.1 / fast}
+    verdicts = [
+        dx.linearize(system, {"q": np.zeros(2), "v": np.zeros(2)}, **step, params=params).stable
+        for system in (pendulum(1.0), pendulum(-1.0), pair)
+    ]
+    assert verdicts == [False, True, True]
+
+
+@pytest.mark.parametrize("damping", [-1.0, 0.0, 1.0])
+def test_weak_damping_of_a_fast_motion_says_whether_it_grows(damping):
+    """Rates of a millionth of the frequency and less."""
+    system = dx.LagrangeDirac(lambda q, v: (v @ v - 1e12 * q @ q) / 2, forces=lambda t, q, v: -damping * v)
+    place = {"q": [0.0], "v": [0.0]}
+    assert dx.linearize(system, place).stable == (damping >= 0.0)
+    assert dx.linearize(system, place, dx.LagrangeDAlembert(), step=1e-8).stable == (damping >= 0.0)
+
+
 def leaning(q, v):
     """Masses that depend on the place, in a field that pushes a one-form at its equilibrium."""
     kinetic = (1 + 0.3 * q[0] ** 2) * v[0] ** 2 / 2 + v[1] ** 2 / 2 + 0.7 * v[2] ** 2 + 0.3 * q[1] * v[0] - 0.2 * q[0] * v[2]

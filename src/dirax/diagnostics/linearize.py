@@ -26,6 +26,12 @@ OF_STEPS = (
 )
 """Why a relative equilibrium of a system may be none of a step, and the way out."""
 
+ROUNDOFF = 2e-14
+"""Error of an entry of the linear equations, relative to the largest one, where nothing is known of more."""
+
+MULTIPLE = 1e-6
+"""Error of eigenvalues of which several are one, relative to the largest one, at most."""
+
 RANK = 1e-9
 """Singular values, relative to the largest one, that count as zero."""
 
@@ -37,13 +43,15 @@ class Linearization:
     - `matrix` (d, d): A of the system, M of a scheme; `basis` (N, d): the directions y in the coordinates of the state, (q, v)
       or x, and of a scheme its own, orthonormal in natural units of these;
     - `eigenvalues` (d,): of A, or log(μ)/h for the eigenvalues μ of M, by real part, largest first; `multipliers`: μ, None of A;
-    - `residual`: how far the place is from a relative equilibrium, relative to the terms of the equations.
+    - `residual`: how far the place is from a relative equilibrium, relative to the terms of the equations; `error`: how far the
+      entries of the matrix may be off, relative to the largest one.
     """
 
     matrix: np.ndarray
     basis: np.ndarray = field(repr=False)
     residual: float
     step: float | None = None
+    error: float = field(default=ROUNDOFF, repr=False)
 
     @property
     def multipliers(self) -> np.ndarray | None:
@@ -78,9 +86,22 @@ class Linearization:
 
     @property
     def stable(self) -> bool:
-        """Whether no small motion grows, up to roundoff of multiple eigenvalues (1e-6)."""
-        sizes = np.abs(self.eigenvalues) if self.step is not None else np.abs(self.matrix)
-        return bool(self.eigenvalues[0].real <= 1e-6 * sizes.max()) if len(self.matrix) else True
+        """Whether no small motion grows by more than its own eigenvalue may be off: the `error` of the matrix times the condition
+        number of the eigenvalue, but at most 1e-6 of the largest one, as where several are one."""
+        if not len(self.matrix):
+            return True
+        values, vectors = np.linalg.eig(self.matrix)
+        rates, error = np.real(values), self.error * np.abs(self.matrix).max()
+        most = MULTIPLE * (np.abs(self.matrix) if self.step is None else np.abs(self.eigenvalues)).max()
+        with np.errstate(all="ignore"):
+            try:
+                left = np.linalg.inv(vectors)
+            except np.linalg.LinAlgError:  # several eigenvalues are one, with one eigenvector
+                left = np.full_like(vectors, np.inf)
+            errors = error * np.linalg.norm(left, axis=1) * np.linalg.norm(vectors, axis=0)
+            if self.step is not None:
+                rates, errors = np.log(np.abs(values)) / self.step, errors / (np.abs(values) * self.step)
+        return bool(np.all(rates <= np.fmin(errors, most)))
 
 
 def _complex(value: complex) -> str:
@@ -166,7 +187,8 @@ def _reduced(found: FieldAt, step: float | None) -> Linearization:
     across = tangent - _project(found.symmetric, tangent)
     basis = _orthonormal(across)
     matrix = found.rate * (basis.T @ found.matrix @ basis)
-    return Linearization(matrix, found.units[:, None] * basis, float(found.residual), step)
+    error = ROUNDOFF + float(found.residual) + found.error
+    return Linearization(matrix, found.units[:, None] * basis, float(found.residual), step, error)
 
 
 def _project(space: np.ndarray, vectors: np.ndarray) -> np.ndarray:

@@ -23,7 +23,8 @@ class FieldAt(NamedTuple):
     """The matrix (N, N) of the linear equations in the frame that moves with the motion, and the columns that span the tangent
     space of the constraints and the directions of the symmetries; how far the place is from a relative equilibrium.
 
-    All of it is in `units` (N,) of the coordinates, and with times of 1/`rate`."""
+    All of it is in `units` (N,) of the coordinates, and with times of 1/`rate`. `error`: what rounding may have made of the
+    entries of the matrix, relative to the largest one, where that is known."""
 
     matrix: np.ndarray
     tangent: np.ndarray
@@ -31,6 +32,7 @@ class FieldAt(NamedTuple):
     residual: float
     units: np.ndarray
     rate: float
+    error: float = 0.0
 
 
 class Equations:

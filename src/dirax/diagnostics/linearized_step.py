@@ -27,6 +27,9 @@ INVARIANT = 1e-8
 RANK = 1e-12
 """Singular values of linear equations, relative to the largest one, that count as zero."""
 
+OF_MULTIPLIERS = 2e-14
+"""Error of a step's derivative where there are constraints, times the step: roundoff of multipliers grows as 1/h, as measured."""
+
 TRIES = 8
 STEPS = 30
 
@@ -115,7 +118,8 @@ def linearized_step(
     moved = symmetric if symmetric.size else matrix @ lift @ straight[:, None]
     shares = np.linalg.lstsq(moved, change, rcond=RANK)[0]
     residual = np.abs(change - moved @ shares).max() / (1.0 + np.abs(first).max() + np.abs(change).max())
-    return FieldAt(matrix, _kept(matrix, tangent), symmetric, residual, units, 1.0)
+    error = OF_MULTIPLIERS / abs(h * field.rate) if tangent.shape[1] < field.matrix.shape[1] else 0.0
+    return FieldAt(matrix, _kept(matrix, tangent), symmetric, residual, units, 1.0, error)
 
 
 def _kept(matrix: np.ndarray, tangent: np.ndarray) -> np.ndarray:
