@@ -87,6 +87,8 @@ class Replay:
         """Raises `CannotReplay`."""
         if sol.system is None or sol.equation is None:
             raise CannotReplay("the solution was loaded without its system")
+        if lacking := sol.equation.fields.keys() - sol.fields.keys():
+            raise CannotReplay(f"the rows hold no {', '.join(sorted(lacking))}: verify what this was reconstructed from")
         try:
             made = cls(sol, StepsInNumbers.of(sol.equation, sol.given_params, sol.batch_params))
         except (UnsupportedPrimitive, GraphTooLarge) as error:

@@ -127,7 +127,14 @@ class _Comparison:
         return np.concatenate([*pieces, np.asarray(self.replay.sol.axis, float)[self.at.rows][:, None]], axis=1)
 
     def _said(self, again: Again) -> tuple[np.ndarray, np.ndarray]:
-        """What steps say of the rows that they leave, and of the next ones; NaN where nothing."""
+        """What steps say of the rows that they leave, and of the next ones; NaN where nothing, or where it was chosen."""
+        here, there = self._said_of_all(again)
+        for name, size in self.sizes.items():
+            if self.replay.sol.field_info[name].chosen:
+                here[:, self.starts[name] :][:, :size] = there[:, self.starts[name] :][:, :size] = np.nan
+        return here, there
+
+    def _said_of_all(self, again: Again) -> tuple[np.ndarray, np.ndarray]:
         count = len(again.after)
         flat = lambda rows: np.concatenate(
             [*(rows[n].reshape(count, -1) for n in self.sizes), np.full((count, 1), np.nan)], axis=1

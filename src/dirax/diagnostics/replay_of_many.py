@@ -53,7 +53,7 @@ def replayed_of_many(sol: Solution, name: str, tolerance: float | None) -> Line:
                 other = _taken(engine, problem.with_numbers(state=problem.state * (1.0 + DISTURBANCE * signs))) or again
                 moved = {k: np.maximum(a, np.abs(other[k] - again[k]) / DISTURBANCE) for k, a in moved.items()}
             for k, a in again.items():
-                if not a.size:
+                if not a.size or sol.field_info[k].chosen:
                     continue
                 scale = np.maximum(np.maximum(moved[k], np.median(moved[k])), np.finfo(float).tiny)
                 ratio = np.abs(saved[k] - a) / scale

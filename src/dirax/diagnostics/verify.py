@@ -8,6 +8,7 @@ from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
 from dirax.diagnostics.final_manifold_lines import final_manifold
 from dirax.diagnostics.flights import longest_flight
+from dirax.diagnostics.manifold_lines import points
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.premise_line import premise_line
 from dirax.diagnostics.replay_lines import replayed
@@ -37,6 +38,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     - steps replayed: every saved number of every row, of any scheme and of compositions, against the step from the row before,
       taken again in NumPy: 32 ε of what it would be off if every operation were; of long runs as many rows as a few tenths of
       a second are enough for, and the line says so;
+    - points of manifolds and elements of groups, in every row: 32 ε off them, or what the initial data were;
     - discrete Dirac structure of every step ([PY] Proposition 5.17, Theorem 6.8; [BLM] Definition 5.1), saved momenta and
       multipliers against those of the points, constraint: 32 ε, because these hold step by step;
     - steps solved: the largest residual of a run, relative to the terms of its equations, however they cancel, which Newton's
@@ -87,6 +89,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         _completion(sol),
         impacts,
         replayed(flight, tolerance),
+        points(sol, tolerance),
         *membership(whole, structure, tolerance),
         stationary_action(whole, structure, tolerance),
         constraint(whole, structure, tolerance),

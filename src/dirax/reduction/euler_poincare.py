@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.geometry.lie_group import AbstractLieGroup, Algebra
+from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.numerics.arrays import Data
 from dirax.numerics.ranks import rank_of_equations
@@ -70,6 +71,10 @@ class EulerPoincare(AbstractSystem):
 
     stated_by_momenta = False
     """Whether the function of the system is h(μ, a), not l(ξ, a)."""
+
+    @property
+    def manifolds(self) -> dict[str, AbstractManifold]:
+        return {"g": self.space.group, "q": self.space.group}
 
     def lie_algebra_form(self) -> "EulerPoincare":
         return self

@@ -7,6 +7,7 @@ import jax
 from jaxtyping import Array, Float
 
 from dirax.geometry.lie_group import AbstractLieGroup, Algebra
+from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.semidirect import Advected, SemidirectProduct
 from dirax.geometry.structures import DiracStructure
 from dirax.numerics.arrays import Data
@@ -44,6 +45,10 @@ class LiePoisson(AbstractSystem):
 
     stated_by_momenta = True
     """Whether the function of the system is h(μ, a), not l(ξ, a)."""
+
+    @property
+    def manifolds(self) -> dict[str, AbstractManifold]:
+        return {"g": self.space.group, "q": self.space.group}
 
     def lie_algebra_form(self) -> "LiePoisson":
         return self

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from dirax.geometry.manifolds import AbstractManifold
 from dirax.numerics.arrays import Data
 from dirax.program.user_functions import UserFunction, evaluated
 from dirax.reduction.bundle import FactorTranslation, TrivialBundle
@@ -39,6 +40,11 @@ class ReducedManifoldLagrangian(AbstractReducedSystem):
     @property
     def conserves_momentum(self) -> bool:
         return self.connection.abelian and self.system.forces is None and self.system.one_forms is None
+
+    @property
+    def manifolds(self) -> dict[str, AbstractManifold]:
+        bundle = self.connection
+        return {"x": bundle.shapes, "g": bundle.group, "chart": bundle.shapes, "q": bundle.manifold}
 
     def sampled(self, data: Data, params: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """In coordinates of the manifold at the first point."""

@@ -43,6 +43,8 @@ class Field(eqx.Module):
     `composed` says how the row of a composed step is made of those of its parts: "first" (the array of the first part, at
     whose point the row is), "sum" (impulses), "mean" (rates, weighted by the parts' fractions of h) or "each" (all of them,
     along a new axis in front). A field of nodes is "first" unless it says otherwise, one of steps "mean".
+    `chosen` says that steps may begin with any value of it, and that the one in a row is not what the step before led to: the
+    centre of a chart, where a row was not computed in charts. `dx.verify` begins there, and does not expect it.
     Raises `ValueError` for another `composed`.
     """
 
@@ -51,6 +53,7 @@ class Field(eqx.Module):
     dims: tuple[str, ...] = eqx.field(static=True, default=("coordinate",))
     description: str = eqx.field(static=True, default="")
     composed: str = eqx.field(static=True, default="")
+    chosen: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         if self.composed not in ("", *COMPOSED):

@@ -138,8 +138,9 @@ def type_of(variable: str, layout: Sequence[Mapping[str, Any]]) -> str:
 
 
 def vars_of(info: Field) -> dict[str, Any]:
-    """A Field as plain data; how it is composed only where it says so itself, which files of the first version never do."""
-    own = {"composed": info.composed} if info.composed else {}
+    """A Field as plain data; how it is composed, and that it is chosen, only where it says so, which files of the first version
+    never do."""
+    own = ({"composed": info.composed} if info.composed else {}) | ({"chosen": True} if info.chosen else {})
     return {
         "shape": list(info.shape),
         "place": info.place,

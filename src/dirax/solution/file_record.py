@@ -107,7 +107,7 @@ def _check_numbers(record: FileRecord) -> None:
 
 
 def _check_entry(entry: Any) -> None:
-    """A field: its name, the name of its array, shape, place, names of axes, description, how it is composed."""
+    """A field: its name, the name of its array, shape, place, names of axes, description, how it is composed, if it is chosen."""
     text = lambda key: type(entry[key]) is str
     sizes = lambda values: isinstance(values, list) and all(type(size) is int and size >= 0 for size in values)
     named = lambda values: isinstance(values, list) and all(type(name) is str for name in values)
@@ -118,6 +118,7 @@ def _check_entry(entry: Any) -> None:
         and entry["place"] in ("node", "step")
         and named(entry["dims"])
         and entry.get("composed", "") in ("", *COMPOSED)
+        and type(entry.get("chosen", False)) is bool
         and entry.get("dtype", "float64") in TYPES
     ):
         raise Unreadable("it describes a field as dirax does not")

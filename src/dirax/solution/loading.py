@@ -158,7 +158,9 @@ def _solution(said: FileRecord, arrays: dict[str, np.ndarray], params: Any) -> S
         t=arrays["time"],
         fields={e["name"]: arrays[e["variable"]] for e in said.fields},
         field_info={
-            e["name"]: Field(tuple(e["shape"]), e["place"], tuple(e["dims"]), e["description"], e.get("composed", ""))
+            e["name"]: Field(
+                tuple(e["shape"]), e["place"], tuple(e["dims"]), e["description"], e.get("composed", ""), e.get("chosen", False)
+            )
             for e in said.fields
         },
         step=said.step,

@@ -49,7 +49,7 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     if system.system.one_forms is not None:
         lifted["multipliers"] = _multipliers_at(solution, lifted["q"])
     n = lifted["q"].shape[-1]
-    info = {"q": Field((n,)), "p": Field((n,)), "chart": Field((n,))}
+    info = {"q": Field((n,)), "p": Field((n,)), "chart": Field((n,), description="the centre of a chart at the row", chosen=True)}
     about = {name: info.get(name) or solution.field_info[name] for name in lifted}
     whole = _lifted(solution, system.system, lifted, about)
     whole.scheme = jax.tree.map(_on_q, solution.scheme, is_leaf=lambda part: isinstance(part, DiscreteRouth))

@@ -86,6 +86,10 @@ class ManifoldLagrangian(AbstractSystem):
         """Whether a constraint takes the time."""
         return any(f is not None and f.takes_time for f in (self.one_forms, self.affine, self.holonomic))
 
+    @property
+    def manifolds(self) -> dict[str, AbstractManifold]:
+        return {"q": self.manifold, "chart": self.manifold}
+
     def flat_form(self) -> LagrangeDirac | None:
         """The same system in the coordinates of R^N or of a torus, which are those of its points; None on other manifolds."""
         factors = self.manifold.factors if isinstance(self.manifold, Product) else (self.manifold,)

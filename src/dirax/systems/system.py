@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.semidirect import SemidirectProduct
 from dirax.numerics.arrays import Data, Numbers
 from dirax.program.legendre import constrained_velocity
@@ -133,6 +134,11 @@ class AbstractSystem(eqx.Module):
         """The same system as one on a Lie algebra or its dual, reduced by the group, a `dx.EulerPoincare` or `dx.LiePoisson`;
         None where it is none."""
         return None
+
+    @property
+    def manifolds(self) -> dict[str, AbstractManifold]:
+        """Of which manifolds in R^N the arrays of a row, or of initial data, are points, by name."""
+        return {}
 
     def metric_form(self) -> Any:
         """The same system as a metric, a potential and one-forms alone, a `dx.NonholonomicMechanics`, for which Method 2 has
