@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
-from dirax.engines.stopping import CONTRACTING
+from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
 from dirax.numerics.equilibration import balanced_inverse, condition_number
 from dirax.numerics.inverses import Inverses, applied, applied_sizes, inverted, no_inverses, unknown
 from dirax.numerics.tolerances import EPSILON
@@ -17,20 +17,11 @@ from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import Order, with_ends
 from dirax.schemes.step import StepEquation, StepSequence, needs_every_part
 
-UPDATES = 40
-"""Updates of Newton's method after which a step has no solution."""
-
-FOUND = 8 * EPSILON
-"""Relative updates below this are roundoff."""
-
-KEPT = 1e-5
-"""After an update below this no other Jacobian is asked for."""
+UPDATES = 80
+"""Updates of Newton's method after which a step has no solution; every other one may be taken back."""
 
 SMALLEST = float(np.finfo(float).tiny) / EPSILON
 """Numbers below this do not have all their digits, and count as zero."""
-
-LEFT = 1e-6
-"""The last update of a step that has a solution, however badly it is conditioned."""
 
 
 @dataclass
@@ -218,7 +209,7 @@ class StepsInNumbers:
         """The unknowns (states, k) of a stage by Newton's method, and where it has a solution.
 
         A Jacobian serves as long as updates by it contract. Those of one that does not, or of another step, are taken back. The
-        last update is by that of the solution."""
+        last update is by that of the solution. It ends as in the engines (`stopping.py`)."""
         index = self.program.stages[stage][0]
         e, (count, k) = self.program.equations[index], guess.shape
         if not k:
@@ -253,9 +244,10 @@ class StepsInNumbers:
             moved = _largest_ratio(change, np.maximum(np.abs(u[left]), size[left]))
             contracts = moved <= CONTRACTING * last[left]
             own[left] |= contracts & np.isfinite(last[left])
-            stalled = own[left] & (moved >= last[left] / 2) & (moved < LEFT)
-            ended = (moved <= FOUND) | stalled | (fresh & np.isnan(moved))
-            renewed[left] = ~fresh & ~contracts & ~(own[left] & (moved <= KEPT)) & ~ended
+            stalled = own[left] & (moved >= last[left] / 2) & (moved < STALLED)
+            found = _largest_ratio(change, np.maximum(np.abs(u[left]), OWN * size[left])) <= FLOOR
+            ended = found | stalled | (fresh & np.isnan(moved))
+            renewed[left] = ~fresh & ~contracts & ~(own[left] & (moved < STALLED)) & ~ended
             last[left] = np.where(renewed[left], np.inf, moved)
             u[renewed] = safe[renewed]
             left = left[~ended]
@@ -264,7 +256,7 @@ class StepsInNumbers:
         # by any other Jacobian the roundoff of constraints would move what they leave free
         inverse[:] = inverted(self._linearized(index, self._values(index, u, states, at))[0])
         u = u - applied(inverse, self._read(self._values(index, u, states, at, noise), e.residual))
-        return u, last < LEFT
+        return u, last < STALLED
 
     def _values(self, index: int, u, states, at, noise: Noise | None = None) -> Values:
         e, shared = self.program.equations[index], self.program.shared
