@@ -72,3 +72,18 @@ def test_whole_numbers_stand_still(whole):
     power = lambda f: lambda x: jnp.sum(f(x, jnp.full((2,), whole)))
     ours = power(lambda x, n: on_host(lambda x, n: x**2 * n.astype(float), [x, n], "whole"))
     close(jax.grad(ours)(X), 2 * whole * X)
+
+
+def test_cotangents_have_the_dtypes_of_what_they_are_of():
+    """Of operands of single precision beside those of double precision, of several entries, also of the tangents."""
+    wide = lambda x, a: {"both": jnp.sin(x) * a.astype(float)[0], "one": a.astype(float) ** 2}
+    ours = lambda x, a: on_host(wide, [x, a], "of two dtypes")
+    narrow = A.astype(jnp.float32)
+    flow = jax.tree.map(jnp.cos, ours(X, narrow))
+    for back in (lambda x, a: jax.vjp(ours, x, a)[1](flow), jax.jit(lambda x, a: jax.vjp(ours, x, a)[1](flow))):
+        found, expected = back(X, narrow), jax.vjp(jax.vmap(wide), X, narrow)[1](flow)
+        assert [a.dtype for a in found] == [np.float64, np.float32]
+        close(found, expected, 6)
+    cost = lambda a: jnp.sum(ours(X, a)["one"] * ours(X, a)["both"])
+    assert jax.hessian(cost)(narrow).dtype == np.float32
+    close(jax.hessian(cost)(narrow), jax.hessian(cost)(A), 5)

@@ -242,6 +242,61 @@ def test_method_2_of_regular_systems_is_method_1():
     np.testing.assert_array_equal(one.q, two.q)
 
 
+def energy(x):
+    return x @ x / 2 + jnp.cos(x[0])
+
+
+CANONICAL = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.eye(2), np.zeros((2, 2))]])
+METHODS = ("discretize", "resolve")
+FREE = {
+    "HamiltonDirac, n = 1": (dx.HamiltonDirac(lambda q, p: energy(jnp.concatenate([q, p]))), {"q": [0.5], "p": [0.2]}),
+    "HamiltonDirac": (dx.HamiltonDirac(lambda q, p: energy(jnp.concatenate([q, p]))), {"q": [0.5, 0.1], "p": [0.2, 0.3]}),
+    "HamiltonDirac in x": (dx.HamiltonDirac(lambda q, p: energy(jnp.concatenate([q, p]))), {"x": [0.5, 0.1, 0.2, 0.3]}),
+    "DiracSystem": (
+        dx.DiracSystem(dx.DiracStructure.from_bivector(lambda x: jnp.asarray(CANONICAL)), energy),
+        {"x": [0.5, 0.1, 0.2, 0.3]},
+    ),
+    "PortHamiltonian": (dx.PortHamiltonian(energy, CANONICAL, R=0.1 * np.eye(4)), {"x": [0.5, 0.1, 0.2, 0.3]}),
+    "ImplicitSystem": (dx.ImplicitSystem(lambda x: jnp.eye(2), lambda x: jnp.stack([x[1], -x[0]])), {"x": [0.5, 0.1]}),
+    "LiePoisson": (dx.LiePoisson(dx.SO3(), lambda mu: mu @ (mu / jnp.array([1.0, 2.0, 3.0])) / 2), {"x": [0.3, 1.0, 0.2]}),
+    "GeneralizedDiracSystem": (
+        dx.GeneralizedDiracSystem(dx.induced_dirac(None, 2), dx.LagrangianSubmanifold.from_hamiltonian(energy)),
+        {"x": [0.5, 0.1, 0.2, 0.3]},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FREE)
+def test_method_2_of_a_relation_without_constraints_is_method_1(name):
+    system, data = FREE[name]
+    one, two = (dx.simulate(system, dx.DiscreteDirac(constraints=c), **data, step=0.05, steps=15) for c in METHODS)
+    assert two.ok and np.array_equal(one.x, two.x)
+    if name == "HamiltonDirac":
+        np.testing.assert_allclose(two.x[-1], [0.64227645, 0.27763687, 0.1765737, 0.15138615], atol=1e-8)
+
+
+def test_method_2_of_a_hamiltonian_with_one_forms():
+    """By its chain, or by a projector onto the momenta that its one-forms allow, from q= and p= as from x=."""
+    scheme, run = dx.DiscreteDirac(constraints="resolve"), {"step": 0.05, "steps": 15}
+    start = {"q": np.array([0.5, 0.1]), "p": np.zeros(2)}
+    rolling = dx.HamiltonDirac(lambda q, p: p @ p / 2 + q @ q / 2, lambda q: jnp.stack([jnp.sin(q[0]), jnp.ones(())])[None])
+    with pytest.raises(ValueError, match=r"Method 2 of this HamiltonDirac with multipliers.*constraint_algorithm"):
+        dx.simulate(rolling, scheme, **start, **run)
+    chain = dx.constraint_algorithm(rolling, near=start)
+    sol = dx.simulate(chain.resolved(), scheme, x=chain.point, **run)
+    np.testing.assert_allclose(np.sin(sol.x[:, 0]) * sol.x[:, 2] + sol.x[:, 3], 0.0, atol=1e-14)
+
+    def onto(x):
+        row = jnp.stack([jnp.sin(x[0]), jnp.ones(())])
+        return jnp.concatenate([x[:2], x[2:] - row * (row @ x[2:]) / (row @ row)])
+
+    projected = dx.DiscreteDirac(dx.ProjectedMap(dx.Midpoint(), onto), constraints="resolve")
+    whole = {"x": np.concatenate([start["q"], start["p"]])}
+    one, other = (dx.simulate(rolling, projected, **data, **run) for data in (start, whole))
+    assert one.ok and np.array_equal(one.x, other.x)
+    np.testing.assert_allclose(one.x[-1], sol.x[-1], atol=1e-3)
+
+
 # ---------------------------------------------------------------------- where the base point lies in time
 
 CLOCK = dx.PortHamiltonian(lambda x: x @ x / 2, np.zeros((1, 1)), B=np.ones((1, 1)))

@@ -113,7 +113,8 @@ def _transposed(cotangents: Sequence, *operands: Any, jaxpr: ClosedJaxpr, linear
     def along(unit: Any) -> list:
         given = list(operands)
         for i, aval, size, end in zip(unknown, avals, sizes, ends, strict=True):
-            given[i] = jnp.broadcast_to(unit[end - size : end].reshape(aval.shape[1:]), aval.shape)
+            own = unit[end - size : end].reshape(aval.shape[1:]).astype(aval.dtype)
+            given[i] = jnp.broadcast_to(own, aval.shape)
         return host_p.bind(*given, jaxpr=jaxpr, linear=linear)
 
     total = jnp.zeros((sum(sizes), avals[0].shape[0]))
@@ -122,7 +123,7 @@ def _transposed(cotangents: Sequence, *operands: Any, jaxpr: ClosedJaxpr, linear
             total = total + jnp.sum(rows * flow[None], axis=tuple(range(2, rows.ndim)))
     found: list = [None] * len(operands)
     for i, aval, size, end in zip(unknown, avals, sizes, ends, strict=True):
-        found[i] = total[end - size : end].T.reshape(aval.shape)
+        found[i] = total[end - size : end].T.reshape(aval.shape).astype(aval.dtype)
     return found
 
 

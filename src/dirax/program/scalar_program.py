@@ -183,7 +183,8 @@ class ScalarProgram:
         def program(*leaves):
             values: dict[int, Any] = {}
             for nodes, leaf in zip(self.inputs, leaves, strict=True):
-                values.update(zip(nodes.ravel().tolist(), jnp.ravel(leaf), strict=True))
+                number = leaf if leaf.dtype == bool else leaf.astype(float)  # whole numbers are floats in a graph
+                values.update(zip(nodes.ravel().tolist(), jnp.ravel(number), strict=True))
             parts = jnp.split(by_jax(self.graph, outputs, values), ends) if outputs else [jnp.zeros(0)] * len(self.results)
             return [part.reshape(nodes.shape) for part, nodes in zip(parts, self.results, strict=True)]
 

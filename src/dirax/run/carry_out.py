@@ -32,7 +32,7 @@ from dirax.run.result import solution_of
 from dirax.run.settings import Settings, kind_of
 from dirax.run.start import begun, completed
 from dirax.run.streaming import Stream
-from dirax.run.traced_run import Carried, carried_by_jax
+from dirax.run.traced_run import Carried, carried_by_jax, moves
 from dirax.run.validate import Case, refuse_clock_that_stands, refuse_more_than_memory
 from dirax.schemes.step import Shape, make_step_equation
 from dirax.solution.solution import Solution
@@ -234,7 +234,7 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
         steps=steps - int(case.two_points),
         save_every=save_every,
         first_step=int(case.two_points),
-        params=jax.tree.map(jnp.asarray, case.params) if traced else case.params,
+        params=jax.tree.map(lambda leaf: jnp.asarray(leaf) if moves(leaf) else leaf, case.params) if traced else case.params,
         batch=case.batch,
         batch_params=case.batch_params,
         max_iterations=settings.max_iterations,

@@ -38,19 +38,24 @@ class Kind:
 _kinds: Memo[Kind] = Memo(KEPT)
 
 
+def moves(leaf: Any) -> bool:
+    """Whether a leaf is an argument of what JAX compiles: numbers with a point are, and all that JAX traces. Users' functions may
+    count or index by others."""
+    return isinstance(leaf, Tracer) or np.asarray(leaf).dtype.kind == "f"
+
+
 def carried_by_jax(carried: Callable[[Case], Carried], settings: Settings, case: Case, *others: Hashable) -> Carried:
     """`carried(case)` of a case with traced values. It must do the same for equal settings, kinds of values, and others.
 
-    Numbers with a point are arguments of the compiled function; the others, which users' functions may count or index by, are
-    part of it.
+    What `moves` is an argument of the compiled function, the rest is part of it.
     """
     leaves, structure = jax.tree.flatten((case.data, case.params, case.h, case.t0))
-    moves = tuple(isinstance(leaf, Tracer) or np.asarray(leaf).dtype.kind == "f" for leaf in leaves)
+    moving = tuple(map(moves, leaves))
     value = lambda leaf: (np.asarray(leaf).dtype.char, np.asarray(leaf).tobytes())
-    kept = tuple(() if m else value(leaf) for m, leaf in zip(moves, leaves, strict=True))
+    kept = tuple(() if m else value(leaf) for m, leaf in zip(moving, leaves, strict=True))
     shapes = tuple(map(np.shape, leaves)), case.batch, case.batch_params, case.redundant
-    kind = _kinds.get((settings.key, structure, moves, kept, shapes, others), lambda: _kind(carried, case, leaves, moves))
-    arrays, more = kind.arrays([leaf for leaf, m in zip(leaves, moves, strict=True) if m])
+    kind = _kinds.get((settings.key, structure, moving, kept, shapes, others), lambda: _kind(carried, case, leaves, moving))
+    arrays, more = kind.arrays([leaf for leaf, m in zip(leaves, moving, strict=True) if m])
     problem = kind.problem.with_numbers(params=case.params, h=case.h, t0=case.t0)
     return problem, replace(kind.outcome, **arrays, notes=dict(kind.outcome.notes)), more
 

@@ -30,18 +30,18 @@ def where_the_constraints_hold(
 
     equation = make()
 
-    def at(x, t, params):
+    def at(data, params):
+        x, t = system.complete(data, params, False)["x"], data["t"]
         point = manifold.local_parametrization(x)
         constraints = lambda x: system.initial_defect(system.complete({"x": x, "t": t}, params, False), params)
         along = jacobian(lambda r: constraints(point(r)))(jnp.zeros(manifold.dimension))
-        return point(jnp.zeros(manifold.dimension)) - x, along, jacobian(constraints)(x)
+        return point(jnp.zeros(manifold.dimension)) - x, along, jacobian(constraints)(x), x
 
     def check(data, h, params):
         equation.check(data, h, params)
-        x = np.asarray(system.point(data) if "x" not in data else data["x"], float)
-        off, along, slope = (np.asarray(a) for a in evaluated(at, x, np.asarray(data.get("t", 0.0), float), params))
-        off, along, slope = (float(np.max(np.abs(a), initial=0.0)) for a in (off, along, slope))
-        if off > CONSTRAINT_DEFECT * (1.0 + float(np.max(np.abs(x)))):
+        found = evaluated(at, {"t": np.zeros(()), **data}, params)
+        off, along, slope, size = (float(np.max(np.abs(np.asarray(a)), initial=0.0)) for a in found)
+        if off > CONSTRAINT_DEFECT * (1.0 + size):
             raise ValueError(
                 f"the initial point is off the image of the projector by {off:.3g}: start from map.manifold({size}).nearest(x)."
             )

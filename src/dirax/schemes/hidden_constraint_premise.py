@@ -20,13 +20,13 @@ from dirax.systems.system import AbstractSystem
 def nothing_hidden_in_relation(system: AbstractSystem, form: RelationForm, equation: StepEquation) -> StepEquation:
     """The equation, which refuses initial data at which the matrix of ẋ is singular."""
 
-    def matrix(x, t, params):
-        none = jnp.zeros(0)
-        return jacobian(lambda velocity: form.residual(x, velocity, none, t, params))(jnp.zeros_like(x))
+    def matrix(data, params):
+        x, none = system.complete(data, params, False)["x"], jnp.zeros(0)
+        return jacobian(lambda velocity: form.residual(x, velocity, none, data["t"], params))(jnp.zeros_like(x)), x
 
     def at(data, h, params):
-        x = np.asarray(system.point(data))
-        return evaluated(matrix, x, np.asarray(data.get("t", 0.0), float), params), "the matrix of ẋ", x
+        found, x = evaluated(matrix, {"t": np.zeros(()), **data}, params)
+        return found, "the matrix of ẋ", np.asarray(x)
 
     return _refusing(system, at, equation)
 
