@@ -74,7 +74,8 @@ def problem(name: str, **changes) -> Problem:
     m = 0 if one_forms is None else one_forms(q).shape[0]
     equation = make_step_equation(scheme, dx.LagrangeDirac(lagrangian, one_forms), Shape(len(q), m))
     p = jax.grad(lagrangian, argnums=1)(q, v)
-    state, guess = np.concatenate([q, p]), np.concatenate([v, np.zeros(m)])
+    first_alone = np.zeros(equation.state_size - 2 * len(q))  # what the first state has beyond (q, p)
+    state, guess = np.concatenate([q, p, first_alone]), np.concatenate([v, np.zeros(m)])
     return dataclasses.replace(Problem(equation, state, (guess,), h, 0.0, steps, save_every=7), **changes)
 
 

@@ -92,8 +92,9 @@ def test_the_first_step_is_linearized_as_jax_does_it(limit, monkeypatch):
         lambda q: jnp.stack([jnp.sin(q)]),
     )
     equation: Any = make_step_equation(dx.LagrangeDAlembert(), system, Shape(2, 1))
-    u, state = np.random.default_rng(1).normal(size=(2, 5, 4))
-    u, t, h, g = u[:, :3], np.zeros(5), np.full(5, 0.1), np.linspace(1, 2, 5)
+    draw = np.random.default_rng(1)
+    u, state = draw.normal(size=(5, 3)), draw.normal(size=(5, equation.stages[0][0].state_size))
+    t, h, g = np.zeros(5), np.full(5, 0.1), np.linspace(1, 2, 5)
     found = linearized(equation, g, True, u, state, t, h)
     assert found is not None
     expected = jax.vmap(lambda u, x, g: equation.residual(u, x, 0.0, 0.1, g))(u, state, g)

@@ -46,6 +46,8 @@ SAME = {  # primitive name → operation of the graph
     "erfc": "erfc",
     "lt": "lt",
     "le": "le",
+    "lt_to": "lt",  # the order of numbers in which −0 and 0 are told apart, and NaN is the largest: JAX has made them equal before
+    "le_to": "le",
     "eq": "eq",
     "ne": "ne",
     "is_finite": "finite",
@@ -85,10 +87,14 @@ def divide(interpreter: Interpreter, equation: Any, a, b):
     g = interpreter.graph
     if is_integer(equation.outvars[0]):
         x, y = interpreter.static(a), interpreter.static(b)
-        if x is None or y is None or np.any(y == 0):
-            raise Unsupported("divides whole numbers that depend on the state")
-        quotient = np.abs(x) // np.abs(y) * np.sign(x) * np.sign(y)
-        return [interpreter.constants(quotient)]
+        if y is None or np.any(y == 0):
+            raise Unsupported("divides whole numbers by some that depend on the state")
+        if x is not None:
+            return [interpreter.constants(np.abs(x) // np.abs(y) * np.sign(x) * np.sign(y))]
+        # with a half more no quotient is so near to a whole number that roundoff decides
+        over = lambda a, b: g.make("floor", g.div(g.add(g.make("abs", a), g.constant(0.5)), g.make("abs", b)))
+        signed = lambda a, b: g.mul(g.mul(g.make("sign", a), g.make("sign", b)), over(a, b))
+        return [elementwise(signed, a, b)]
     return [elementwise(g.div, a, b)]
 
 
