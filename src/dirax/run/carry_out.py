@@ -26,7 +26,7 @@ from dirax.run.final_manifold import (
 from dirax.run.plan import AnyPlan, planned
 from dirax.run.premises import bytes_of, check_premise
 from dirax.run.progress import reported, reporting
-from dirax.run.redundancy import redundant_constraints, redundant_in_numbers
+from dirax.run.redundancy import redundant_constraints, without_redundant
 from dirax.run.refused_start import refuse_bad_start
 from dirax.run.result import solution_of
 from dirax.run.settings import Settings, kind_of
@@ -125,8 +125,6 @@ def carried_out(
     settings: Settings, case: Case, steps: int, save_every: int, progress: Any, kind: Kind | None = None, entered: float = 0.0
 ) -> Solution:
     """The Solution of a run. Raises `ValueError` for data that a premise excludes."""
-    if case.traced and settings.system.constraints.any:
-        case = replace(case, redundant=redundant_in_numbers(settings.system, case, settings.project))
     if settings.events:
         return run_with_events(carried_out, _begun, settings, case, steps, save_every, progress, kind, entered)
     began, progress = time.perf_counter(), reported(progress)
@@ -134,6 +132,7 @@ def carried_out(
     kind = None if settings.to is not None else kind or kind_for(settings, case)
     refuse_changed(_reads(settings) if kind is None else kind.reads)
     if kind is None and case.traced:
+        case = without_redundant(settings.system, case, settings.project)
         problem, outcome, row0 = carried_by_jax(_by_jax(settings, steps, every), settings, case, steps, every)
         return solution_of(settings.system, settings.scheme, case, problem, outcome, row0, True)
     if kind is not None and kind.starts and (again := kind.again(case, steps, every, save_every)):

@@ -15,6 +15,7 @@ from dirax.run.event_traced import with_traced_events
 from dirax.run.impact import Impact
 from dirax.run.impact_run import check_walls, fly_all
 from dirax.run.impact_traced import flight_of, flown
+from dirax.run.redundancy import without_redundant
 from dirax.run.traced_run import carried_by_jax
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
@@ -195,8 +196,9 @@ def run_with_events(
             return begun, check_walls(plain.system, begun.problem, own, tuple(walls))
 
         if case.traced:
+            known = without_redundant(plain.system, case, plain.project)
             by_jax = lambda case: flown(plain.system, begun_at(case)[0], own, tuple(walls))
-            found = carried_by_jax(by_jax, plain, case, count, *walls, *map(Same, own))
+            found = carried_by_jax(by_jax, plain, known, count, *walls, *map(Same, own))
             return flight_of(plain, case, *found)
         begun, captured = begun_at(case)
         if begun.traced or captured:

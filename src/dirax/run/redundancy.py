@@ -59,6 +59,13 @@ def redundant_constraints(system: AbstractSystem, matrices: Any, data: dict, par
     return tuple(row for row in range(total) if row not in kept)
 
 
+def without_redundant(system: AbstractSystem, case: Case, project: bool) -> Case:
+    """A case with traced values, with the constraints noted in it that are known to follow from others."""
+    if not system.constraints.any:
+        return case
+    return replace(case, redundant=redundant_in_numbers(system, case, project))
+
+
 def redundant_in_numbers(system: AbstractSystem, case: Case, project: bool) -> tuple[int, ...]:
     """The same of a case with traced values, as far as numbers that JAX knows decide it: all of them under `jax.grad`, and of
     constraints that depend on none that are traced under any transformation; none where that is not so."""

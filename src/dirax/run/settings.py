@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from dirax.engines.engine import AbstractEngine
 from dirax.run.event import Event, checked_events
@@ -22,6 +21,9 @@ from dirax.run.validate import (
 )
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
+
+X64 = "jax_enable_x64"
+"""JAX's option for 64-bit floats, which dirax turns on."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ def stated(
 ) -> tuple[Settings, Case, int, int]:  # fmt: skip
     """The settings and the case that the arguments of `simulate` state, steps and save_every; raises as it does."""
     check_kinds(system, scheme)
-    if jnp.result_type(float) != jnp.float64:
+    if not getattr(jax.config, X64):
         raise ValueError(
             "JAX has been set to 32-bit floats since dirax was imported, and structure is kept to the roundoff of 64-bit ones: "
             'say jax.config.update("jax_enable_x64", True).'

@@ -46,7 +46,7 @@ SAME = {  # primitive name → operation of the graph
     "erfc": "erfc",
     "lt": "lt",
     "le": "le",
-    "lt_to": "lt",  # the order of numbers in which −0 and 0 are told apart, and NaN is the largest: JAX has made them equal before
+    "lt_to": "lt",  # of numbers in whose order −0 is below 0 and NaN the largest: JAX has made these equal before
     "le_to": "le",
     "eq": "eq",
     "ne": "ne",
