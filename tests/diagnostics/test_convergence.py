@@ -206,3 +206,13 @@ def test_a_coordinate_that_stays_zero_is_measured_by_the_others():
         found = dx.convergence(plane, dx.LagrangeDAlembert(), **run, reference=noisy, q=[1.0, 0.0], v=[0.0, 0.0])
         assert found.order == pytest.approx(line.order, abs=1e-6)
         np.testing.assert_allclose(found.slopes["q"].errors, line.slopes["q"].errors, rtol=1e-6)
+
+
+def test_impulses_of_composed_steps_have_the_order_of_the_composition():
+    rows = lambda q: jnp.array([[0.4 + 0.3 * q[1], 0.2 * q[0], 1.0]])
+    system = dx.LagrangeDirac(lambda q, v: (1 + 0.3 * q[0] ** 2) * v @ v / 2 + 0.3 * q[1] * v[0] - q @ q / 2, rows)
+    q = np.array([0.3, 0.2, 0.1])
+    along, v = np.asarray(rows(q))[0], np.array([0.2, 0.3, -0.1])
+    run = {"q": q, "v": v - along * (along @ v) / (along @ along), "step_sizes": [0.1, 0.05, 0.025], "time": 1.0}
+    found = dx.convergence(system, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"), **run)
+    assert abs(found.slopes["multipliers"].order - 4.0) < 0.05, str(found)

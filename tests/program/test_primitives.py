@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from jax.extend.core import ClosedJaxpr
 
-import dirax.program.rules  # noqa: F401  (registers the rules)
+import dirax as dx
+import dirax.program.rules
 from dirax.engines.native.ir.compiled_function import compiled
+from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.interpreter import Interpreter, Unavailable
@@ -270,3 +272,34 @@ def test_random_graphs_against_numpy():
 @pytest.mark.soak
 def test_a_hundred_thousand_random_graphs_against_numpy():
     assert sum(fuzz(1000 + seed, 1000) for seed in range(100)) > 100_000
+
+
+def interpolated(q):
+    places = jnp.linspace(-2.0, 2.0, 9)
+    return jnp.interp(q[0], places, jnp.sin(2.0 * places))
+
+
+def switched(q):
+    return jax.lax.switch(jnp.int32(q[0] > 0.0), [lambda q: q @ q, lambda q: 2.0 * q @ q], q)
+
+
+@pytest.mark.parametrize("potential", [interpolated, switched])
+def test_tables_and_switches_are_native(potential):
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - potential(q))
+    end = lambda q, engine: dx.simulate(system, dx.LagrangeDAlembert(), q=q, v=[0.3], step=0.02, steps=200, engine=engine).q[
+        -1, 0
+    ]
+    q = jnp.array([-0.7])
+    assert abs(end(q, "native") - end(q, "xla")) < 1e-13
+    np.testing.assert_allclose(jax.grad(end)(q, "native"), jax.grad(end)(q, "xla"), rtol=1e-10)
+
+
+def test_whole_numbers_that_are_known_late_are_divided_towards_zero():
+    numerators, divisors = jnp.arange(-60, 61), jnp.array([1, -1, 3, 7, -49, 64])
+
+    def quotients(x):
+        n = numerators + x[0].astype(int)
+        return jax.lax.div(jnp.repeat(n, len(divisors)), jnp.tile(divisors, len(n))).astype(float)
+
+    found = in_numpy(quotients, [np.array([[2.0], [-3.0]])], "quotients")
+    np.testing.assert_array_equal(found, np.stack([quotients(jnp.array([x])) for x in (2.0, -3.0)]))

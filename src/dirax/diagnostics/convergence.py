@@ -159,7 +159,7 @@ def convergence(
     order is told the explicit solution and the scheme so refined are compared: one that converges to something else has no
     order, and the notes say so, as `agrees` does. `Convergence.reference` says which was used.
     `quantities`: names of saved fields, by default all of q, p, x that the reference has, and the multipliers of discrete
-    Lagrange–d'Alembert schemes, compared as μ_k/h at their nodes from the second on.
+    Lagrange–d'Alembert schemes, compared as μ_k/h at their nodes from the second on, those of compositions as means over steps.
 
     The slope is a regression over the step sizes above the roundoff plateau. Where fewer than three can be used, because the
     scheme is exact up to roundoff or converges to something else, the order is NaN, and `notes` say what the errors are. Raises
@@ -195,6 +195,7 @@ def convergence(
     elif exact is not None:
         label = "the exact solution"
     expected = refined | (explicit if explicit is not None else _evaluated(exact, common) if exact is not None else {})
+    in_steps = _in_steps(runs, by, h, time, int(stride[-1]), run) if by is scheme else {}
     apart = {} if explicit is None else _apart(measured, refined, explicit, h)
     for name, (distance, needed) in apart.items():
         notes.append(
@@ -210,7 +211,8 @@ def convergence(
         )
     slopes = {}
     for name in names:
-        relative = [_relative(m[name], expected[name], measured[-1][name]) for m in measured]
+        wanted = in_steps.get(name) or [expected[name]] * len(h)
+        relative = [_relative(m[name], one, measured[-1][name]) for m, one in zip(measured, wanted, strict=True)]
         errors = np.array([np.max(one) for one in relative])
         at_end = np.array([np.max(one[..., -1, :]) for one in relative])
         finest = h[-1] / REFINEMENT if name in own else None
@@ -283,6 +285,19 @@ def _quantities(sol: Solution) -> dict[str, np.ndarray]:
     if "multipliers" in sol.fields and "constraint" in sol.fields and sol.rows > 2:
         found["multipliers"] = np.asarray(sol.fields["multipliers"])[..., 1:, :] / sol.step
     return found
+
+
+def _in_steps(runs: list[Solution], by: AbstractScheme, h: np.ndarray, time: float, stride: int, run: Mapping[str, Any]) -> dict:
+    """What the multipliers of composed steps are compared with, for each step size: an impulse is that of the whole step, and so
+    is the sum of those of the refined scheme in it."""
+    if "multipliers" not in _quantities(runs[0]) or len(runs[0].equation.stages) < 2:
+        return {}
+    assert runs[0].system is not None
+    fine = np.asarray(_run(runs[0].system, by, h[-1] / REFINEMENT, time, 1, run).fields["multipliers"])
+    until = np.concatenate([np.zeros_like(fine[..., :1, :]), np.cumsum(fine, axis=-2)], axis=-2)
+    starts = np.arange(1, fine.shape[-2] // (stride * REFINEMENT)) * stride * REFINEMENT
+    ends = [starts + round(size / h[-1] * REFINEMENT) for size in h]
+    return {"multipliers": [(until[..., end, :] - until[..., starts, :]) / size for end, size in zip(ends, h, strict=True)]}
 
 
 def _evaluated(exact: Callable, t: np.ndarray) -> dict[str, np.ndarray]:
