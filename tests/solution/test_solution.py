@@ -1,5 +1,8 @@
 """Solution: derived quantities against closed forms, blocks, how it shows itself, pictures."""
 
+import copy
+import pickle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -185,3 +188,24 @@ def test_pictures_draw_the_solution(name, skate):
     picture = getattr(skate, name)()
     figure = picture if isinstance(picture, Figure) else picture.figure
     assert any(line.get_xdata().size >= 12 for ax in figure.axes for line in ax.lines)
+
+
+def on_a_string(q, v, params):
+    return v @ v / 2 - params["g"] * q[0]
+
+
+def on_a_circle(q):
+    return jnp.array([q @ q - 1.0])
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_solutions_are_pickled_and_copied_in_depth(batch):
+    q = np.array([[0.6, 0.8], [0.0, 1.0]])[: 2 if batch else 1]
+    given = {"q": q if batch else q[0], "v": np.zeros_like(q) if batch else np.zeros(2), "params": {"g": 9.8}}
+    sol = dx.simulate(dx.LagrangeDirac(on_a_string, holonomic=on_a_circle), dx.LagrangeDAlembert(), **given, step=0.01, steps=20)
+    for other in (pickle.loads(pickle.dumps(sol)), copy.deepcopy(sol)):
+        assert all(np.array_equal(other.fields[name], values) for name, values in sol.fields.items())
+        assert np.array_equal(other.energy(), sol.energy()) and str(other) == str(sol)
+        assert str(dx.verify(other)) == str(dx.verify(sol))
+        with pytest.raises(ValueError, match="knows how to go on"):
+            other.extend(3)

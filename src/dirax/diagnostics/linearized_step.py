@@ -18,6 +18,7 @@ from dirax.run.validate import Case, validated_case
 from dirax.schemes.collision_step import SUMS
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import AbstractScheme, make_step_equation
+from dirax.schemes.work_of_forces import BEYOND
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -151,14 +152,14 @@ def _stage(system: AbstractSystem, equation: Any, t: float, h: float) -> _Stage:
 
 
 def _lift(stage: _Stage, layout: Layout, case: Case) -> np.ndarray:
-    """The derivative of the scheme's state by (q, v): q, p = ∂L/∂v, and the rest, sums apart, as where the scheme starts. Raises
-    `TypeError` for a state without q and p."""
+    """The derivative of the scheme's state by (q, v): q, p = ∂L/∂v, and the rest, but for what no step reads, as where it
+    starts. Raises `TypeError` for a state without q and p."""
     q, v = case.data["q"], case.data["v"]
     if not {"q", "p"} <= layout.keys():
         raise TypeError(f"the state of this scheme is {layout!r}, but a linearization needs one of q and p.")
     equations = equations_of(stage.system.lagrangian_form(), case.t0)
     lift = np.zeros((layout.size, 2 * q.size))
-    if any(np.prod(layout[name]) for name in layout.keys() - {"q", "p", *SUMS}):
+    if any(np.prod(layout[name]) for name in layout.keys() - {"q", "p", BEYOND, *SUMS}):
         lift[:] = evaluated(stage.lift, q, v, case.params)
     lift[layout.place("q")] = np.eye(q.size, 2 * q.size)
     lift[layout.place("p")] = np.concatenate(evaluated(equations.momentum, q, v, case.params), axis=1)

@@ -17,7 +17,7 @@ from dirax.schemes.hermite import hermite
 from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field, Shape
-from dirax.schemes.work_of_forces import WorkOfForces
+from dirax.schemes.work_of_forces import BEYOND, WorkOfForces
 from dirax.systems.lagrange_dirac import LagrangeDirac
 
 MOMENTA = {"incoming": 0.0, "mean": 0.5, "outgoing": 1.0}
@@ -65,7 +65,7 @@ class LagrangeDAlembertStep(AbstractStep):
     @cached_property
     def work(self) -> WorkOfForces:
         """The state with the work of the forces."""
-        return WorkOfForces(self.system, self.shape.n, **({"beyond": self.rows.nonholonomic} if 0.0 < self.share < 1.0 else {}))
+        return WorkOfForces(self.system, self.shape.n, **({BEYOND: self.rows.nonholonomic} if 0.0 < self.share < 1.0 else {}))
 
     @cached_property
     def derivatives(self):
@@ -240,12 +240,12 @@ class LagrangeDAlembertStep(AbstractStep):
             leaving, arriving = jnp.split(solved(both, jnp.tile(guess, 2)), 2)
         else:
             leaving = solved(leaves, guess)
-            arriving = solved(arrives, guess) if "beyond" in self.state else guess
+            arriving = solved(arrives, guess) if BEYOND in self.state else guess
         (v1, mu), mu0 = step.split(leaving), sign * step.split(arriving).multipliers
         # with incoming p + s/(1−s) Wᵀμ the multiplier is μ/(1−s), and its share is taken off again; at s = 1 nothing is added
         own, sigma = mu[: rows.nonholonomic], mu0[rows.nonholonomic :]
         jump = share / (1.0 - share) * own if share < 1.0 else 0.0 * own
-        beyond = {"beyond": mu0[: rows.nonholonomic] - jump} if "beyond" in self.state else {}
+        beyond = {BEYOND: mu0[: rows.nonholonomic] - jump} if BEYOND in self.state else {}
         projected = {"saved_v": v, "sigma": sigma} if self.projects else {}
         added = jnp.concatenate([jump, sigma])
         state = self.work.start(q, p + rows.force(t, q, added, params), **beyond)

@@ -7,6 +7,9 @@ from jaxtyping import Array, Float
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
 
+BEYOND = "beyond"
+"""The part of a first state that holds what the impulse at the first row is more than the half that belongs to the first step."""
+
 
 class WorkOfForces:
     """The state (q, p, work) of a Lagrangian system with n coordinates; without forces `work` is empty.

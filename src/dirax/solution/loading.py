@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.schemes.step import Field, Shape, make_step_equation
+from dirax.schemes.step import Field
 from dirax.solution.description import PARAMS_CODE
 from dirax.solution.file_record import FileRecord, file_record
 from dirax.solution.netcdf import open_netcdf
@@ -20,6 +20,7 @@ from dirax.solution.solution import Solution
 from dirax.solution.stored import Stored, Unreadable, checksum, reading
 from dirax.solution.stored_events import events_in
 from dirax.solution.sweep_store import is_sweep, opened
+from dirax.solution.trajectory import equation_of
 from dirax.solution.zarr_store import open_store
 
 MOST_ATTRIBUTE = 2**28
@@ -74,11 +75,7 @@ def with_code(sol: Solution, system: Any, scheme: Any) -> Solution:
     sol.system, sol.scheme = system, sol.scheme if scheme is None else scheme
     if sol.system is None or sol.scheme is None or not sol.initial:
         return sol
-    one = {name: a[0] if a.ndim == 2 else a for name, a in sol.initial.items()}
-    redundant = tuple(sol.stats.get("redundant_constraints", ()))
-    sol.equation = make_step_equation(
-        sol.scheme, sol.system, Shape(*sol.system.sizes(one, sol.params_of_one), redundant=redundant)
-    )
+    sol.equation = equation_of(sol)
     made = {name: tuple(field.shape) for name, field in sol.equation.stages[0][0].fields.items()}
     saved = {name: tuple(field.shape) for name, field in sol.field_info.items()}
     if made != saved:

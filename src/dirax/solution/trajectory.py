@@ -14,7 +14,7 @@ from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
-from dirax.schemes.step import CLOCK, Field
+from dirax.schemes.step import CLOCK, Field, Shape, make_step_equation
 from dirax.text.representation import counted, fields_html
 
 BLOCK = 2**16
@@ -104,6 +104,17 @@ class Trajectory:
         if name in ("q", "p", "x", "multipliers"):
             raise AttributeError(f"this solution has no {name!r}; it holds {', '.join(fields)}.")
         raise AttributeError(f"'Solution' object has no attribute {name!r}")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled and copied in depth: no compiled code, so that nothing is known of how the run goes on."""
+        kept = {"axis", "_params", "events", "impacts", *GIVEN} - {"t", "equation"}
+        return {name: value for name, value in self.__dict__.items() if name in kept}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        none: Any = None
+        whole = self.initial and self.system is not None and self.scheme is not None
+        self.equation = equation_of(self) if whole else none
 
     def replace(self: Some, **changes: Any) -> Some:
         """A copy with other values for some of the constructor's arguments."""
@@ -298,3 +309,11 @@ def last_rows(nodes: list[np.ndarray]) -> np.ndarray:
     """The last row (B,) that each trajectory reached, −1 where there is none, by the arrays (B, rows, …) of the nodes."""
     reached = [np.isfinite(a).reshape(*a.shape[:2], -1).all(axis=2) for a in nodes]
     return np.max(np.where(np.logical_and.reduce(reached), np.arange(nodes[0].shape[1]), -1), axis=1)
+
+
+def equation_of(sol: Trajectory) -> Any:
+    """The equation of the steps of a run, made anew from its system, scheme and initial data."""
+    one = {name: a[0] if a.ndim == 2 else a for name, a in sol.initial.items()}
+    redundant = tuple(sol.stats.get("redundant_constraints", ()))
+    shape = Shape(*sol.system.sizes(one, sol.params_of_one), redundant=redundant)
+    return make_step_equation(sol.scheme, sol.system, shape)
