@@ -145,3 +145,14 @@ def test_discrete_lagrangians_of_schemes_are_looked_at_too():
     own["c"] = 2.0
     with pytest.raises(ValueError, match="reads own"):
         run()
+
+
+def test_runs_with_walls_are_looked_at_too():
+    own = {"g": 1.0}
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - own["g"] * q[0])
+    wall = dx.Impact(lambda t, q: q[0])
+    run = lambda: dx.simulate(system, MIDPOINT, q=[1.0], v=[0.0], step=0.1, steps=5, events=[wall])
+    assert run().ok
+    own["g"] = 2.0
+    with pytest.raises(ValueError, match="reads own"):
+        run()

@@ -16,7 +16,7 @@ def premise_line(sol: Solution) -> Line | None:
     """The first of the rows that are asked at which the premise of the system does not hold; None where it holds at all of them.
     Of large systems it is asked where a run begins alone."""
     fields = {k: np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"}
-    if sol.system is None or sum(a.shape[-1] for a in fields.values()) > LARGE:
+    if sol.system is None or not sol.system.premise_everywhere or sum(a.shape[-1] for a in fields.values()) > LARGE:
         return None
     lanes = 1 if sol.batch is None else sol.batch
     for number in spread(lanes * sol.rows, ROWS).tolist():
@@ -24,13 +24,10 @@ def premise_line(sol: Solution) -> Line | None:
         at = row if sol.batch is None else (lane, row)
         data = {**{name: a[at] for name, a in fields.items()}, "t": np.asarray(sol.time_of(row, lane))}
         params = jax.tree.map(lambda leaf, lane=lane: leaf[lane], sol.given_params) if sol.batch_params else sol.given_params
-        premise = sol.system.premise(data, params)
-        if premise is None or not premise.everywhere:
-            return None
         if not all(np.all(np.isfinite(a)) for a in data.values()):
             continue
         try:
-            premise.check(data, params)
+            sol.system.check(data, params)
         except ValueError as refusal:
             words = str(refusal).replace(" at the initial point", "")
             return Line("premise", None, None, VIOLATED, f"at t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}, {words}")

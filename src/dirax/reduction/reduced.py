@@ -268,8 +268,6 @@ class ReducedLagrangeDirac(AbstractReducedSystem):
 
     def premise(self, data: Data, params: Any) -> Premise:
         """The orbits of the group are free where a run begins: a generator that vanishes there has no inertia there only."""
-        if "x" in data:  # a saved row
-            data = self.complete(data, params, False)
         away = 0.1 * self._units(data, params).q * np.random.default_rng(0).uniform(0.5, 1.0, self.point(data).shape)
         return Premise(_Inertias(self.system, self.connection, tuple(away.tolist())), self._refuse_fixed_points)
 

@@ -126,6 +126,7 @@ def carried_out(
 ) -> Solution:
     """The Solution of a run. Raises `ValueError` for data that a premise excludes."""
     if settings.events:
+        refuse_changed(_reads(settings))  # walls begin runs of their own
         return run_with_events(carried_out, _begun, settings, case, steps, save_every, progress, kind, entered)
     began, progress = time.perf_counter(), reported(progress)
     every = _checked_times(case, steps, save_every)

@@ -259,10 +259,14 @@ class DiracSystem(AbstractSystem):
             )
         return (x.size, 0) if self.holonomic is None else (x.size, *self.constraints.sizes(x, params))
 
+    @property
+    def premise_everywhere(self) -> bool:
+        return True
+
     def premise(self, data: Data, params: Any) -> Premise:
         """The matrices are those of a Dirac structure."""
         of_structure = KERNEL_PAIRS[self.structure.representation]
-        return Premise(self._structure_matrices, lambda matrices: of_structure(*matrices), everywhere=True)
+        return Premise(self._structure_matrices, lambda matrices: of_structure(*matrices))
 
     def _structure_matrices(self, data, params):
         return self.structure.evaluate(self.point(data), params)

@@ -122,9 +122,13 @@ class NonholonomicMechanics(AbstractSystem):
             raise ValueError(f"potential must return a scalar, but it returned shape {potential.shape}.")
         return self.lagrange_dirac().sizes(data, params)
 
+    @property
+    def premise_everywhere(self) -> bool:
+        return True
+
     def premise(self, data: Data, params: Any) -> Premise:
         """The metric is symmetric and positive definite."""
-        return Premise(self._metric_at, _check_metric, everywhere=True)
+        return Premise(self._metric_at, _check_metric)
 
     def _metric_at(self, data, params):
         return self.metric.at(data.get("t", 0.0), self.point(data), params)

@@ -235,9 +235,13 @@ class PortHamiltonian(AbstractSystem):
                 )
         return size, len(closed)
 
+    @property
+    def premise_everywhere(self) -> bool:
+        return True
+
     def premise(self, data: Data, params: Any) -> Premise:
         """J is skew, and R symmetric and positive semidefinite."""
-        return Premise(self._matrices, self._refuse, everywhere=True)
+        return Premise(self._matrices, self._refuse)
 
     def _matrices(self, data, params):
         """Those of J and R that depend on x, or may."""

@@ -12,11 +12,10 @@ from dirax.program.user_functions import evaluated, is_traced
 
 class Premise(NamedTuple):
     """`numbers(data, params)` are the arrays, traceable, of one trajectory; `refuse`, called with their values, raises
-    `ValueError` where what a system presupposes does not hold of them: `everywhere`, or else where a run begins."""
+    `ValueError` where what a system presupposes does not hold of them."""
 
     numbers: Callable[[Data, Any], Any]
     refuse: Callable[[Any], Any]
-    everywhere: bool = False
 
     def check(self, data: Data, params: Any) -> None:
         """Raise `ValueError` where it does not hold at these data and params, which must be concrete."""

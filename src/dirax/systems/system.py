@@ -199,6 +199,11 @@ class AbstractSystem(eqx.Module):
             premise.check(data, params)
 
     @property
+    def premise_everywhere(self) -> bool:
+        """Whether the premise is one of all points that a run comes to, and not of where it begins alone: `verify` asks it."""
+        return False
+
+    @property
     def premise_of_params(self) -> bool:
         """Whether there is a premise of the functions themselves too, which other params may break: `check` asks it."""
         return False
