@@ -162,3 +162,14 @@ def test_a_scheme_whose_state_is_not_saved_says_so():
     line = replayed(sol, None)
     assert line.verdict == "not checked"
     assert "does not start from a saved row" in line.explanation
+
+
+def test_another_solution_of_the_equations_of_a_step_is_one():
+    """sin has many: which of them Newton's method finds is no matter of right and wrong, and one is told from none."""
+    pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 + jnp.cos(q[0]))
+    sol = dx.simulate(pendulum, dx.LagrangeDAlembert(), q=[1.0], v=[0.7], step=1000.0, steps=40)
+    assert sol.ok and dx.verify(sol)["steps replayed"].verdict == "ok"
+    for name, row, off in (("q", 17, 1e-9), ("p", 17, 1e-6), ("q", 30, 1e-9)):
+        changed = np.array(sol.fields[name])
+        changed[row] *= 1.0 + off
+        assert dx.verify(sol.replace(fields=sol.fields | {name: changed}))["steps replayed"].verdict == "VIOLATED", (name, row)

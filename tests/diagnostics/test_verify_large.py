@@ -8,6 +8,7 @@ import pytest
 
 import dirax as dx
 from dirax.diagnostics import rows
+from dirax.diagnostics.replay_of_many import replayed_of_many
 from dirax.diagnostics.report import VIOLATED
 from dirax.diagnostics.symplecticity_of_many import symplecticity_of_many
 from dirax.gallery import hanging_chain
@@ -55,6 +56,22 @@ def test_a_step_that_changes_the_form_is_found(sol):
     equation = sol.equation
     stretched = dataclasses.replace(equation, advance=lambda *given: (1.0 + 1e-9) * equation.advance(*given))
     assert symplecticity_of_many(sol.replace(equation=stretched), SYMPLECTIC, None).verdict == VIOLATED
+
+
+@pytest.mark.parametrize("save_every", [1, 3])
+def test_multipliers_are_those_of_momenta_that_rows_do_not_hold(save_every):
+    """Rows hold mean momenta, and multipliers belong to incoming ones: they are compared one row later."""
+    knife = dx.LagrangeDirac(
+        lambda q, v: v @ v / 2 - q @ q / 3, one_forms=lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.1]])
+    )
+    q, v = np.array([0.2, 0.1, 0.4]), np.array([np.cos(0.4), np.sin(0.4), 0.0])
+    sol = dx.simulate(knife, dx.LagrangeDAlembert(), q=q, v=v, step=0.05, steps=15, save_every=save_every)
+    line = lambda sol: replayed_of_many(sol, "steps replayed", None)
+    assert line(sol).verdict == "ok"
+    for name in ("q", "p", "multipliers"):
+        changed = np.array(sol.fields[name])
+        changed[3 // save_every] *= 1.0 + 1e-9
+        assert line(sol.replace(fields=sol.fields | {name: changed})).verdict == VIOLATED, name
 
 
 @pytest.mark.soak

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.rows import over_rows, times_at
-from dirax.engines.steps_in_numbers import Near, StepsInNumbers
+from dirax.engines.steps_in_numbers import Attempts, Near, StepsInNumbers
 from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -267,6 +267,21 @@ class Replay:
         here = {name: np.where(_column(made.good, a), a, np.nan) for name, a in here.items()}
         return Again(here, np.where(good[:, None], after, np.nan), good, there, made.unknowns, made.states[0], first)
 
+    def leading_to(self, at: Rows, guess: np.ndarray, wanted: dict[int, np.ndarray]) -> Again:
+        """Steps of one part that leave these rows and lead to the wanted entries of states, where there are such."""
+        made = self.steps.leading_to(at.states, guess, wanted, at.t, float(self.sol.step), at.params)
+        return self._taken(made, at.t, at.params)
+
+    def _taken(self, made: Attempts, t: np.ndarray, params: np.ndarray) -> Again:
+        """Steps of one part that nothing needs to solve again."""
+        h, there = float(self.sol.step), None
+        if self.hides:
+            then = self.steps.step(made.after, made.unknowns, t + h, h, params)
+            there = self.steps.rows(then, t + h, h, params)
+        here = {name: np.where(_column(made.good, a), a, np.nan) for name, a in self.steps.rows(made, t, h, params).items()}
+        after = np.where(made.good[:, None], made.after, np.nan)
+        return Again(here, after, made.good, there, made.unknowns, made.states[0], self.steps.nothing_near(len(t)))
+
     def of_given_points(self) -> Again:
         """Row 0 and the state at row 1 of every trajectory of a run from two points, in whose first step nothing was solved."""
         sol, steps, batch = self.sol, self.steps, self.sol.batch or 1
@@ -276,13 +291,8 @@ class Replay:
         items = ({**data, "t": times_at(sol, np.zeros(1, int))},)
         found = over_rows(eqx.Partial(_from_points, sol.system, sol.step, Same(sol.equation)), sol, items)[:, 0]
         state, u = np.split(found, [self.state_size], axis=1)
-        t, h, params = np.full(batch, self.times()[0]), float(sol.step), self.params_of(np.arange(batch))
-        made = steps.taken(state, u, t, h, params)
-        there = None
-        if self.hides:
-            then = steps.step(made.after, [u], t + h, h, params)
-            there = steps.rows(then, t + h, h, params)
-        return Again(steps.rows(made, t, h, params), made.after, made.good, there, [u], state, steps.nothing_near(batch))
+        t, params = np.full(batch, self.times()[0]), self.params_of(np.arange(batch))
+        return self._taken(steps.taken(state, u, t, float(sol.step), params), t, params)
 
     def params_of(self, lanes: np.ndarray) -> np.ndarray:
         """The numbers of the parameters of these trajectories, (entries, numbers)."""

@@ -27,6 +27,9 @@ TYPICAL = 0.9
 the scale of all."""
 
 
+MOST_CUBED = 2e6
+"""Cubes of their unknowns of the steps that are led to the next rows, a few tenths of a second."""
+
 DOUBTED = 2000
 """Rows of which it is asked how far rounding moves them: the worst."""
 
@@ -224,13 +227,25 @@ class _Comparison:
         return moved[0], moved[1]
 
     def _try_from_neighbours(self, entries: np.ndarray) -> None:
-        """Steps again from the unknowns of the steps before them, as the run had it, and after them: an equation may have several
-        solutions."""
+        """Steps again from the unknowns of the steps before them, as the run had it, of those after them, and from some that lead
+        to the next row: an equation may have several solutions."""
         for neighbour in (self.previous, self.next):
             one = np.where(neighbour[entries] >= 0, neighbour[entries], entries)
             two = np.where(neighbour[one] >= 0, neighbour[one], one)
             for guesses in ([u[one] for u in self.again.unknowns], [2 * u[one] - u[two] for u in self.again.unknowns]):
                 self._expect(entries, *self._said(self.replay.again(self.at[entries], guesses=guesses)), if_nearer=True)
+        if len(self.again.unknowns) == 1:
+            self._try_from_next_rows(entries[(self.next[entries] >= 0) & (self.at.steps[entries] == 1)])
+
+    def _try_from_next_rows(self, entries: np.ndarray) -> None:
+        """Steps again from unknowns that lead to the next rows."""
+        entries = entries[: int(MOST_CUBED / max(1, self.again.unknowns[0].shape[1]) ** 3)]
+        if not len(entries):
+            return
+        after, (first, _) = self.saved[self.next[entries]], self.replay.held[min(self.replay.held)]
+        wanted = {i: after[:, self.held[i]] for i, (name, _) in self.replay.held.items() if name == first}
+        again = self.replay.leading_to(self.at[entries], self.again.unknowns[0][entries], wanted)
+        self._expect(entries, *self._said(again), if_nearer=True)
 
 
 def _ratio(missed: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -3,10 +3,12 @@
 import numpy as np
 
 from dirax.diagnostics.replay import CannotReplay, Replay
+from dirax.diagnostics.rows import LARGE, row_numbers
 from dirax.diagnostics.verdicts import spread
 from dirax.engines.contract import ALL_UNKNOWNS, FIXED_POINT
 from dirax.program.graph import GraphTooLarge
 from dirax.solution.solution import Solution
+from dirax.solution.steps_again import begun_at
 
 ROWS = 4
 """Rows of the first trajectory at which they are taken."""
@@ -20,8 +22,13 @@ def residual_size(sol: Solution) -> float | None:
     try:
         replay = Replay.of(sol)
         rows = spread(int(replay.ends[0]) + 1, ROWS)
-        at = replay.resumed(np.zeros_like(rows), rows)
-        of_equations, of_unknowns = replay.steps.sizes(at.states, at.guesses, at.t, float(sol.step), at.params)
+        if row_numbers(sol) > LARGE:
+            states, guesses, t, _ = zip(*(begun_at(sol, 0, row) for row in rows.tolist()), strict=True)
+            at = np.stack(states), list(map(np.stack, zip(*guesses, strict=True))), np.array(t)
+        else:
+            begun = replay.resumed(np.zeros_like(rows), rows)
+            at = begun.states, begun.guesses, begun.t
+        of_equations, of_unknowns = replay.steps.sizes(*at, float(sol.step), replay.params_of(np.zeros_like(rows)))
     except (CannotReplay, GraphTooLarge):
         return None
     iteration = sol.stats.get("iteration", "")

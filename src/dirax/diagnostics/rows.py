@@ -81,10 +81,12 @@ def _compiled(function: Callable, sol: Solution, items: tuple) -> np.ndarray:
     return np.concatenate(found, axis=1)
 
 
-@compiled
-def _piece(function, items, params, axis):
+def _of_pieces(function, items, params, axis):
     lane = jax.vmap(lambda item, params: function(*item, params), in_axes=(0, None))
     return jax.vmap(lane, in_axes=(0, axis))(items, params)
+
+
+_piece = compiled(_of_pieces, seldom=True)
 
 
 def row_numbers(sol: Solution) -> int:

@@ -13,7 +13,7 @@ from dirax.engines.policy import engine_of
 from dirax.program.compiled import compiled
 from dirax.program.memo import Same
 from dirax.solution.solution import Solution
-from dirax.solution.steps_again import begun
+from dirax.solution.steps_again import begun_at
 
 ROWS, PAIRS = 2, 2
 """Steps that are looked at, and pairs of random directions at each."""
@@ -33,12 +33,9 @@ def symplecticity_of_many(sol: Solution, name: str, tolerance: float | None) -> 
     rows, lanes = first + spread(sol.rows - 1 - first, ROWS), spread(sol.batch or 1, ROWS)
     worst, where, rng = np.zeros(sol.batch or 1), "", np.random.default_rng(0)
     for lane in lanes.tolist():
-        lead = () if sol.batch is None else (lane,)
-        params = jax.tree.map(lambda leaf, at=lane: leaf[at], sol.params) if sol.batch_params else sol.params
         for row in rows.tolist():
-            saved = {k: jnp.asarray(sol.fields[k][(*lead, row)]) for k in sol.fields}
-            t = float(sol.axis[row])
-            state, guess = begun(sol.equation, sol.system, saved, t, sol.step, params)
+            state, guess, t, params = begun_at(sol, lane, row)
+            state, guess = jnp.asarray(state), tuple(map(jnp.asarray, guess))
             for _ in range(PAIRS):
                 along = jnp.asarray(rng.normal(size=(2, state.shape[0])))
                 numbers = (jnp.asarray(a, float) for a in (t, sol.step))

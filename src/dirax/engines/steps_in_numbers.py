@@ -1,7 +1,7 @@
 """Steps of many states at once in NumPy, by the scalar program of the step: nothing is compiled, and no engine is asked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
 from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
-from dirax.numerics.equilibration import balanced_inverse, condition_number
+from dirax.numerics.equilibration import balanced_inverse, balancing_scales, condition_number
 from dirax.numerics.inverses import Inverses, applied, applied_sizes, inverted, no_inverses, unknown
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Values
@@ -19,6 +19,12 @@ from dirax.schemes.step import StepEquation, StepSequence, needs_every_part
 
 UPDATES = 80
 """Updates of Newton's method after which a step has no solution; every other one may be taken back."""
+
+ARRIVALS = 3 * [(True, False)] + 3 * [(True, True)] + 5 * [(False, True)]
+"""Updates of unknowns that shall lead to a given state: whether by its entries, and whether by the equations of the step."""
+
+SINGULAR = 1e-10
+"""Relative singular values that count as zero in them."""
 
 SMALLEST = float(np.finfo(float).tiny) / EPSILON
 """Numbers below this do not have all their digits, and count as zero."""
@@ -135,6 +141,31 @@ class StepsInNumbers:
         known = self._values(self.program.stages[0][0], u, state, (t, np.full(len(t), h), params))
         after = self._read(known, self.program.equations[self.program.stages[0][0]].advance)
         return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
+
+    def leading_to(
+        self, states: np.ndarray, guess: np.ndarray, wanted: dict[int, np.ndarray], t: np.ndarray, h: float, params: np.ndarray
+    ) -> Attempts:
+        """Steps of one part whose unknowns, near a guess, lead to the `wanted` entries of the state after it: by the method of
+        Gauss and Newton of these entries alone, of the step's equations too, and then by Newton's of the equations alone."""
+        index, u, after = self.program.stages[0][0], guess.copy(), np.stack(list(wanted.values()), axis=1)
+        e, at = self.program.equations[index], (t, np.full(len(t), h), params)
+        moved = np.full(len(t), np.inf)
+        for of_entries, of_equations in ARRIVALS:
+            known = self._values(index, u, states, at)
+            nodes = [*(e.advance[i] for i in wanted if of_entries), *(e.residual if of_equations else ())]
+            slopes, missed = known.slopes(nodes, e.unknowns), self._read(known, nodes)
+            missed[:, : len(nodes) - len(e.residual) * of_equations] -= after[:, : len(wanted) * of_entries]
+            good = np.all(np.isfinite(slopes), axis=(1, 2)) & np.all(np.isfinite(missed), axis=1)
+            rows, columns = balancing_scales(np.abs(slopes[good]))
+            inverses = np.linalg.pinv(slopes[good] / rows / columns, rcond=SINGULAR) / np.swapaxes(columns, 1, 2)
+            inverses, change = inverses / np.swapaxes(rows, 1, 2), np.full_like(u, np.nan)
+            change[good] = np.einsum("nij,nj->ni", inverses, missed[good])
+            u -= change
+            if not of_entries:
+                size = np.einsum("nij,nj->ni", np.abs(inverses), self._terms(0, u[good], states[good], *(a[good] for a in at)))
+                moved[good] = _largest_ratio(change[good], np.maximum(np.abs(u[good]), size))
+        made = self.taken(states, u, t, h, params)
+        return replace(made, good=made.good & (moved < STALLED))
 
     def sizes(
         self, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, h: float, params: np.ndarray

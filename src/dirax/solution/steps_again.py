@@ -43,6 +43,24 @@ def begun(equation: Any, system: Any, row: dict[str, Any], t: Any, h: Any, param
     return state, (u, *(stage.resume(data, part * h, params)[1] for stage, part in others))
 
 
+def begun_at(sol: Trajectory, lane: int, row: int) -> tuple[np.ndarray, tuple[np.ndarray, ...], float, Any]:
+    """State and first guesses of the step that leaves a saved row of a trajectory, compiled once, the time there, and the params
+    of the trajectory."""
+    lead = () if sol.batch is None else (lane,)
+    params = jax.tree.map(lambda leaf: leaf[lane], sol.params) if sol.batch_params else sol.params
+    fields = {name: jnp.asarray(a[(*lead, min(row, a.shape[len(lead)] - 1))]) for name, a in sol.fields.items()}
+    t, h = float(sol.axis[row]), float(sol.step)
+    state, guess = _begun(Same(sol.equation), Same(sol.system), fields, jnp.asarray(t), jnp.asarray(h), params)
+    return np.asarray(state), tuple(map(np.asarray, guess)), t, params
+
+
+def _begun_by(equation: Same, system: Same, row: dict[str, Any], t: Any, h: Any, params: Any) -> tuple[Any, tuple]:
+    return begun(equation.object, system.object, row, t, h, params)
+
+
+_begun = compiled(_begun_by, seldom=True)
+
+
 def stepped(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> tuple[Any, tuple, tuple]:
     """The state after a step, and of each stage the unknowns and the state that it left, by JAX."""
     written, jacobians = in_scalars(equation, params, False)
