@@ -58,11 +58,12 @@ def close_sizes(at: Entries) -> list[np.ndarray]:
     for i, (stage, u) in enumerate(zip(stages, guesses, strict=True)):
         same = next((j for j in range(i) if stages[j] == stage and np.array_equal(guesses[j], u)), None)
         if same is None:
-            there, both = [(x, part) for part in (1.0, SHORT) for x in (state, end)], ((state, 1.0), (end, 1.0))
-            (residual, slopes, terms), (*_, other), (_, short, _), (_, near, _) = look(i, u, *there, only=OF_SIZES)
+            places, both = [(x, part) for part in (1.0, SHORT) for x in (state, end)], ((state, 1.0), (end, 1.0))
+            (residual, *here), (_, *there), (_, short, _), (_, near, _) = look(i, u, *places, only=OF_SIZES)
             again = lambda s, i=i, u=u, both=both: [a for (a,) in look(i, u, *both, sizes=s, only=(TERMS,))]
             after = lambda u, i=i: next(look(i, u, (state, 1.0), only=(END,)))[0]
-            found.append(_sizes(residual, slopes, short, near, u, (terms, other), again, after, h[i][:, None], np))
+            slopes, rounded = zip(here, there, strict=True)
+            found.append(_sizes(residual, slopes, (short, near), u, rounded, again, after, h[i][:, None], np))
         else:
             found.append(found[same])
     return found
@@ -101,11 +102,11 @@ def sizes_at(equation: Any, state: Any, guess: tuple, params: Any, t: Any, h: An
             end = stage.advance(_updated(residual, slopes, guess[i], jnp), end, t, SHORT * fraction * h, params)
         end = end * _nearby(len(state))
         for i, u in enumerate(guess):
-            residuals, (slopes, short, near) = linear(i, u, [state, state, end], [1.0, SHORT, SHORT])
+            residuals, (*slopes, short, near) = linear(i, u, [state, end, state, end], [1.0, 1.0, SHORT, SHORT])
             again = lambda sizes, i=i, u=u: [*terms(i, u, [state, end], sizes)]
             part, stage = equation.stages[i][1] * h, equation.stages[i][0]
             after = lambda u, stage=stage, part=part: stage.advance(u, state, t, part, params)
-            found.append(_sizes(residuals[0], slopes, short, near, u, again(jnp.abs(u)), again, after, part, jnp))
+            found.append(_sizes(residuals[0], slopes, (short, near), u, again(jnp.abs(u)), again, after, part, jnp))
         return tuple(found)
 
     given = jnp.asarray(state, float), tuple(jnp.asarray(u, float) for u in guess), params, t
@@ -132,6 +133,10 @@ NEAR = 1.0 / 16.0
 """How much, relative, the data are changed to see what derivatives are near them."""
 
 
+MOST = 2.0**16
+"""What is too much for the size of an unknown, beside its value and its size by the derivatives of whole steps: at a first guess
+that is far off, those of a short step and the terms of a whole one may be worlds apart."""
+
 COUPLED = 1e-3
 """Unknowns that change others by less than this of their sizes are not coupled."""
 
@@ -149,9 +154,8 @@ def _nearby(count: int) -> np.ndarray:
 
 def _sizes(
     residual: Any,
-    slopes: Any,
-    short: Any,
-    near: Any,
+    slopes: Sequence,
+    short: Sequence,
     u: Any,
     rounded: Sequence,
     again: Callable,
@@ -159,16 +163,16 @@ def _sizes(
     h: Any,
     xp: ModuleType,
 ) -> Any:
-    """(…, k) from r (…, k) and its derivatives by (u, h) at the state, and those of a short step there and near its end,
-    (…, k, k + 1); `rounded` are the sizes of the terms (…, k) at either place, and `again` those with unknowns of given sizes;
-    `after` is the state after the step with given unknowns."""
+    """(…, k) from r (…, k) at the state, its derivatives by (u, h) there and near the end of a short step, and those of a short
+    step at either place, (…, k, k + 1); `rounded` are the sizes of the terms (…, k) at either, and `again` those with unknowns of
+    given sizes; `after` is the state after the step with given unknowns."""
     if not u.shape[-1]:
         return xp.ones(u.shape)
     k, applied = u.shape[-1], lambda matrix, vector: (matrix @ vector[..., None])[..., 0]
     finite = lambda sizes: xp.where(xp.isfinite(sizes), sizes, 0.0)
     with np.errstate(all="ignore"):
-        both = slopes, near
-        inverse, *others = balanced_inverse(xp.stack([d[..., :k] for d in (slopes, short, near)]), xp)
+        both = slopes[0], short[1]
+        inverse, other, *others = balanced_inverse(xp.stack([d[..., :k] for d in (*slopes, *short)]), xp)
         solution = xp.abs(u - finite(applied(inverse, residual)))
         largest = xp.maximum(xp.abs(u), solution)
         inverses = [xp.abs(other) for other in others]
@@ -176,11 +180,13 @@ def _sizes(
         def of_terms(rounded):
             terms = [of + applied(xp.abs(d[..., :k]), largest) for of, d in zip(rounded, both, strict=True)]
             sizes = [TYPICAL * finite(applied(other, of)) for other, of in zip(inverses, terms, strict=True)]
-            return terms, xp.maximum(*sizes)
+            whole = [applied(xp.abs(one), of) for one, of in zip((inverse, other), rounded, strict=True)]
+            most = xp.maximum(largest, xp.maximum(*map(finite, whole)))
+            return terms, xp.minimum(xp.maximum(*sizes), xp.where(most > 0.0, MOST * most, xp.inf))
 
         terms, sizes = of_terms(rounded)
         blurred = EPSILON * finite(applied(xp.abs(inverse), terms[0]))
-        moved = finite(applied(xp.abs(inverse), xp.abs(h * slopes[..., -1])))
+        moved = finite(applied(xp.abs(inverse), xp.abs(h * slopes[0][..., -1])))
         reached = solution + xp.sqrt(moved * blurred / EPSILON)
         known = blurred <= 4.0 * STALLED * reached
         coupling = (finite(i @ xp.abs(d[..., :k])) for i, d in zip((xp.abs(inverse), inverses[1]), both, strict=True))
@@ -194,7 +200,7 @@ def _sizes(
             sizes = xp.where(too_short, reached, sizes)
         unknowns = xp.maximum(sizes, xp.abs(u))
         rounded = again(unknowns)
-        more, matters = of_terms(rounded)[1], _matters(slopes[..., :k], rounded[0], xp)
+        more, matters = of_terms(rounded)[1], _matters(slopes[0][..., :k], rounded[0], xp)
         more = xp.where((more < ZERO) & (matters < xp.inf), TYPICAL * matters, more)
         return power_of_two(xp.where(unknowns < NOTHING * more, more, unknowns), xp)
 

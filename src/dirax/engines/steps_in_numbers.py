@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dirax.engines.close_sizes import MOST
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
 from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
@@ -277,7 +278,11 @@ class StepsInNumbers:
             own[left] |= contracts & np.isfinite(last[left])
             stalled = own[left] & (moved >= last[left] / 2) & (moved < STALLED)
             found = _largest_ratio(change, np.maximum(np.abs(u[left]), OWN * size[left])) <= FLOOR
-            ended = found | stalled | (fresh & np.isnan(moved))
+            ended = found | stalled
+            far = ended & np.any(size[left] > MOST * np.abs(u[left]), axis=1)
+            if np.any(far):
+                ended[far] = self._are_solved(stage, u[left[far]], states[left[far]], tuple(a[left[far]] for a in at))
+            ended |= fresh & np.isnan(moved)
             renewed[left] = ~fresh & ~contracts & ~(own[left] & (moved < STALLED)) & ~ended
             last[left] = np.where(renewed[left], np.inf, moved)
             u[renewed] = safe[renewed]
@@ -287,7 +292,18 @@ class StepsInNumbers:
         # by any other Jacobian the roundoff of constraints would move what they leave free
         inverse[:] = inverted(self._linearized(index, self._values(index, u, states, at))[0])
         u = u - applied(inverse, self._read(self._values(index, u, states, at, noise), e.residual))
-        return u, last < STALLED
+        good = last < STALLED
+        good[left] &= self._are_solved(stage, u[left], states[left], tuple(a[left] for a in at))
+        return u, good
+
+    def _are_solved(self, stage: int, u, states, at) -> np.ndarray:
+        """Whether the equations of a stage are solved, (states,): to roundoff of their terms, however they cancel. The sizes of
+        unknowns may be those of a place from which an iteration came, and far too large."""
+        if not len(u):
+            return np.ones(0, bool)
+        index = self.program.stages[stage][0]
+        missed = self._read(self._values(index, u, states, at), self.program.equations[index].residual)
+        return _largest_ratio(missed, self._terms(stage, u, states, *at)) < STALLED
 
     def _values(self, index: int, u, states, at, noise: Noise | None = None) -> Values:
         e, shared = self.program.equations[index], self.program.shared
