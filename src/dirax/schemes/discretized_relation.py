@@ -107,6 +107,14 @@ def discretized_relation(
             raise ValueError("this scheme is a one-step method in x: start it from one point, not from two.")
         return data["x"], jnp.concatenate([step.initial(data["x"], data["velocity"]), data.get("guess", jnp.zeros(m))])
 
+    def resume(data, h, params):
+        """With the multipliers of the row, where it has some."""
+        state, u = start(data, h, params)
+        if not form.saved or "multipliers" not in data:
+            return state, u
+        saved = jax.vmap(form.spread)(jnp.eye(m)) @ data["multipliers"]
+        return state, jnp.concatenate([u[:d], jnp.where(jnp.isfinite(saved), saved, u[d:])])
+
     labels = () if on_constraints else form.labels
     fields = {name: Field((size,)) for name in form.names}
     if form.saved:
@@ -114,6 +122,7 @@ def discretized_relation(
     fields |= {seen.name: Field(seen.shape, "step", seen.dims, seen.description) for seen in form.observed}
     return StepEquation(
         start=start,
+        resume=resume,
         residual=residual,
         advance=advance,
         unpack=unpack,
