@@ -631,3 +631,10 @@ def test_what_keeps_no_form_keeps_none_composed():
         report = dx.verify(dx.simulate(pendulum, scheme, x=[0.3, 0.2], step=0.2, steps=20))
         line = report["symplecticity of one step"]
         assert line.verdict == "not checked" and "keep the energy" in line.explanation
+
+
+def test_residuals_of_a_batch_are_relative_to_the_terms_of_all_its_trajectories():
+    pendulum = dx.LagrangeDirac(lambda q, v, params: params["m"] * (v @ v / 2 + jnp.cos(q[0])))
+    masses = {"params": {"m": np.array([1.0, 1e12, 1e-6])}, "batch_params": True}
+    sol = dx.simulate(pendulum, dx.LagrangeDAlembert(), q=np.ones((3, 1)), v=np.zeros((3, 1)), step=0.1, steps=40, **masses)
+    assert sol.stats["max_residual"] > 1e-6 and dx.verify(sol)["steps solved"].verdict == "ok"

@@ -517,3 +517,19 @@ def test_every_kind_of_failure_stays_in_its_lane(engine):
     expected = [[2.0, 1.0], [0.3, 2.0], [0.3, 3.0], [0.3, 4.0], [3.0, 5.0]]
     np.testing.assert_allclose(outcome.last_state, expected, rtol=1e-15)
     np.testing.assert_allclose(np.asarray(outcome.closing["x"]), expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize("step", [0.2, 1.0])
+def test_a_first_guess_behind_an_exponential_wall_is_no_solution(step):
+    """There Newton's method comes down by a constant a step, for more updates than it has: it fails, and says so."""
+    wall = dx.LagrangeDirac(lambda q, v, params: v[0] ** 2 / 2 - jnp.exp(params["a"] * q[0]) / params["a"])
+    draw = np.random.default_rng(0)
+    a, v = np.exp(draw.uniform(0, 4, 256)), draw.uniform(1, 20, (256, 1))
+    start = {"q": -step * v * draw.uniform(1, 3, (256, 1)), "v": v, "params": {"a": a}, "batch_params": True}
+    sol = dx.simulate(wall, dx.LagrangeDAlembert(), **start, step=step, steps=6, engine="native")
+    q, p = np.asarray(sol.q)[..., 0], np.asarray(sol.p)[..., 0]
+    velocity = np.diff(q) / step
+    force = step / 2 * np.exp(a[:, None] * (q[:, :-1] + q[:, 1:]) / 2)
+    missed = np.abs(p[:, :-1] - velocity - force) / (np.abs(p[:, :-1]) + np.abs(velocity) + force)
+    assert np.nanmax(missed) < 1e-9 and 0 < np.sum(sol.ok) < 256
+    assert np.all(np.isfinite(q[sol.ok]))

@@ -1,5 +1,7 @@
 """The size of the terms of a step's equations, to which a residual is relative."""
 
+from functools import partial
+
 import numpy as np
 
 from dirax.diagnostics.replay import CannotReplay, Replay
@@ -10,8 +12,8 @@ from dirax.program.graph import GraphTooLarge
 from dirax.solution.solution import Solution
 from dirax.solution.steps_again import begun_at
 
-ROWS = 4
-"""Rows of the first trajectory at which they are taken."""
+ROWS, ENTRIES = 4, (4096, 16)
+"""Rows of each trajectory at which they are taken, at most, and of all trajectories, of small systems and of large ones."""
 
 
 def residual_size(sol: Solution) -> float | None:
@@ -21,14 +23,17 @@ def residual_size(sol: Solution) -> float | None:
         return None
     try:
         replay = Replay.of(sol)
-        rows = spread(int(replay.ends[0]) + 1, ROWS)
-        if row_numbers(sol) > LARGE:
-            states, guesses, t, _ = zip(*(begun_at(sol, 0, row) for row in rows.tolist()), strict=True)
+        large = row_numbers(sol) > LARGE
+        lanes = spread(sol.batch or 1, ENTRIES[large])
+        rows = np.linspace(0, np.maximum(replay.ends[lanes], 0), max(1, min(ROWS, ENTRIES[large] // len(lanes))))
+        rows, lanes = np.rint(rows).astype(int).ravel(), np.tile(lanes, len(rows))
+        if large:
+            states, guesses, t, _ = zip(*map(partial(begun_at, sol), lanes.tolist(), rows.tolist()), strict=True)
             at = np.stack(states), list(map(np.stack, zip(*guesses, strict=True))), np.array(t)
         else:
-            begun = replay.resumed(np.zeros_like(rows), rows)
+            begun = replay.resumed(lanes, rows)
             at = begun.states, begun.guesses, begun.t
-        of_equations, of_unknowns = replay.steps.sizes(*at, float(sol.step), replay.params_of(np.zeros_like(rows)))
+        of_equations, of_unknowns = replay.steps.sizes(*at, float(sol.step), replay.params_of(lanes))
     except (CannotReplay, GraphTooLarge):
         return None
     iteration = sol.stats.get("iteration", "")

@@ -35,6 +35,7 @@ from dirax.engines.close_sizes import Entries, close_sizes, sizes_at
 from dirax.engines.contract import Problem
 from dirax.engines.first_sizes import first_sizes
 from dirax.engines.step_program import step_program
+from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.numerics.equilibration import power_of_two
 from dirax.numerics.tolerances import TINY
 from dirax.program.compiled import compiled
@@ -77,10 +78,29 @@ def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.
     """The sizes of trajectories at which Newton's method stopped too early or not at all, and which of them grew: the largest of
     those where they began and of those where they stand, after `completed` steps at `state` (lanes, s) with the unknowns `guess`.
 
-    Data may be so special where a run begins that an unknown has no size there. Everything has an axis of the `lanes`."""
+    Data may be so special where a run begins that an unknown has no size there. Sizes are those at the solution of the next step:
+    at a guess that is far from it they may be anything, and what is far from solved would count as roundoff. Everything has an
+    axis of the `lanes`."""
+    guess, good = _next_step(problem, lanes, completed, state, guess)
+    if not np.any(good):
+        return sizes, good
     found = sizes_there(problem, lanes, completed, state, guess)
     more = np.any([np.any(new > old, axis=1) for new, old in zip(found, sizes, strict=True)], axis=0)
-    return tuple(np.maximum(new, old) for new, old in zip(found, sizes, strict=True)), more
+    return tuple(np.maximum(new, old) for new, old in zip(found, sizes, strict=True)), more & good
+
+
+def _next_step(p: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> tuple:
+    """The unknowns of each stage in the step that leaves `state`, and where it has a solution; of steps that cannot be taken in
+    numbers the guess."""
+    if p.size >= FEWEST_SPARSE:
+        return guess, np.ones(len(lanes), bool)
+    try:
+        steps = StepsInNumbers.of(p.equation, p.params, p.batch_params)
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return guess, np.ones(len(lanes), bool)
+    params = steps.parameters(p.params, p.batch if p.batch_params else None, lanes)
+    made = steps.step(state, guess, p.t0 + (p.first_step + completed) * p.h, p.h, params)
+    return tuple(made.unknowns), made.good & steps.solved(made, p.t0 + (p.first_step + completed) * p.h, p.h, params)
 
 
 def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> Sizes:

@@ -187,6 +187,14 @@ class StepsInNumbers:
         known = lambda sizes: np.where(made.good, sizes, np.nan)
         return known(of_equations), known(of_unknowns)
 
+    def solved(self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray) -> np.ndarray:
+        """Whether the equations of all parts are solved, (states,), to roundoff of their terms."""
+        good = np.ones(len(t), bool)
+        for stage, ((_, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
+            good &= self._are_solved(stage, u, state, (t, np.full(len(t), fraction * h), params))
+            t = t + fraction * h
+        return good
+
     def _terms(self, stage: int, u, state, t, h, params) -> np.ndarray:
         """The sizes (states, k) of the terms of a stage's equations, however they cancel."""
         return stage_look(self.program, stage)(u, state, t, h, params, np.abs(u), only=(TERMS,))[0]
