@@ -17,5 +17,6 @@ for kind, name in itertools.product(range(kinds), SCHEMES):  # what is compiled 
             found[wrong.split(":")[0]] += 1
             if not wrong.startswith("refused"):
                 print(f"{seed} {name} {system.kind}: {wrong}", flush=True)
+    print(f"kind {kind}, {name}: {runs} runs, {time.perf_counter() - started:.0f} s", file=sys.stderr)
 print(f"{count} systems, {runs} runs, {time.perf_counter() - started:.0f} s: {dict(found) or 'nothing wrong'}")
 sys.exit(any(kind != "refused" for kind in found))
