@@ -133,7 +133,7 @@ NEAR = 1.0 / 16.0
 """How much, relative, the data are changed to see what derivatives are near them."""
 
 
-MOST = 2.0**16
+MOST = 2.0**8
 """What is too much for the size of an unknown, beside its value and its size by the derivatives of whole steps: at a first guess
 that is far off, those of a short step and the terms of a whole one may be worlds apart."""
 

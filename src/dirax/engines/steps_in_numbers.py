@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from dirax.engines.close_sizes import MOST
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
 from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
@@ -26,6 +25,9 @@ ARRIVALS = 3 * [(True, False)] + 3 * [(True, True)] + 5 * [(False, True)]
 
 SINGULAR = 1e-10
 """Relative singular values that count as zero in them."""
+
+FAR = 2.0**16
+"""Sizes of unknowns beyond this of their values may be those of a place from which an iteration came."""
 
 SMALLEST = float(np.finfo(float).tiny) / EPSILON
 """Numbers below this do not have all their digits, and count as zero."""
@@ -287,7 +289,7 @@ class StepsInNumbers:
             stalled = own[left] & (moved >= last[left] / 2) & (moved < STALLED)
             found = _largest_ratio(change, np.maximum(np.abs(u[left]), OWN * size[left])) <= FLOOR
             ended = found | stalled
-            far = ended & np.any(size[left] > MOST * np.abs(u[left]), axis=1)
+            far = ended & np.any(size[left] > FAR * np.abs(u[left]), axis=1)
             if np.any(far):
                 ended[far] = self._are_solved(stage, u[left[far]], states[left[far]], tuple(a[left[far]] for a in at))
             ended |= fresh & np.isnan(moved)
@@ -305,8 +307,7 @@ class StepsInNumbers:
         return u, good
 
     def _are_solved(self, stage: int, u, states, at) -> np.ndarray:
-        """Whether the equations of a stage are solved, (states,): to roundoff of their terms, however they cancel. The sizes of
-        unknowns may be those of a place from which an iteration came, and far too large."""
+        """Whether the equations of a stage are solved, (states,): to roundoff of their terms, however they cancel."""
         if not len(u):
             return np.ones(0, bool)
         index = self.program.stages[stage][0]
