@@ -49,11 +49,11 @@ class TracedFlight:
         """Of every wall, (walls,)."""
         return gaps_of(self.walls)(self.time(state, t), state[self.equation.state_layout.place("q")], params)
 
-    def terms(self, t, state, end, params):
-        """The sizes of the terms of every gap, as of `gap_terms`; of a step without an end those at its state."""
+    def terms(self, t, state, others, params):
+        """The sizes of the terms of every gap, as of `gap_terms`, at a state and `others` of its step that are finite."""
         q = self.equation.state_layout.place("q")
-        end = jnp.where(jnp.all(jnp.isfinite(end)), end, state)
-        return jax.lax.stop_gradient(gap_terms(gaps_of(self.walls), self.time(state, t), state[q], [end[q]], params))
+        places = [jnp.where(jnp.isfinite(other), other, state)[q] for other in others]
+        return jax.lax.stop_gradient(gap_terms(gaps_of(self.walls), self.time(state, t), state[q], places, params))
 
     def moved(self, state, u, t, h, params):
         """The state after a step of length h and its unknowns; NaN where it has no solution."""
@@ -75,7 +75,7 @@ class TracedFlight:
 
         def part(carry, _):
             state, u, at, _ = carry
-            theta, wall, hit = self._next(state, u, t, at, h, params)
+            theta, wall, hit = self._next(state, u, t, at, h, params, jax.lax.stop_gradient(begun[0]))
             length = jnp.where(hit, theta, 1.0 - at)
             there, of_part = self.moved(state, u, t + at * h, jnp.where(length > 0.0, length, 1.0) * h, params)
             there = jnp.where(length > 0.0, there, state)
@@ -113,8 +113,8 @@ class TracedFlight:
 
         return jax.lax.switch(wall, [off(one) for one in self.walls])
 
-    def _next(self, state, u, t, at, h, params):
-        """(θ, wall, whether there is one) of the next impact in what is left of a step."""
+    def _next(self, state, u, t, at, h, params, origin):
+        """(θ, wall, whether there is one) of the next impact in what is left of a step that began at the state `origin`."""
         fixed, begun = jax.lax.stop_gradient((state, u, t, at, h, params)), jax.lax.stop_gradient(at)
 
         def seen(theta, values):
@@ -125,10 +125,10 @@ class TracedFlight:
 
         places = jnp.arange(PARTS + 1) / PARTS * (1.0 - begun)
         values, states = jax.lax.map(lambda theta: seen(theta, fixed), places)
-        small = ON_WALL * self.terms(t + begun * h, fixed[0], states[-1], fixed[5])
+        small = ON_WALL * self.terms(t + begun * h, fixed[0], (states[-1], origin), fixed[5])
         gaps = lambda theta, values: seen(theta, values)[0]
         values = values.at[0].set(jnp.where(values[0] < small, 0.0, values[0]))
-        below = values < 0.0
+        below = values < -small[None]
         first = jnp.argmax(below, axis=0)
         roots, finds = [], []
         for wall in range(len(self.walls)):
