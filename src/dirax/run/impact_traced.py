@@ -104,15 +104,10 @@ class TracedFlight:
 
     def _bounced(self, state, u, wall, t, h, params):
         """The state after an impact, and a guess of the unknowns after it."""
-
-        def off(one: Impact):
-            def function():
-                after, guess, _, _ = jump(self.system, self.equation, one, state, self.time(state, t), h, params)
-                return after, jax.lax.stop_gradient(guess)
-
-            return function
-
-        return jax.lax.switch(wall, [off(one) for one in self.walls])
+        gap, restitution = gaps_of(self.walls), jnp.array([one.restitution for one in self.walls])[wall]
+        own = lambda t, q, params: gap(t, q, params)[wall]
+        after, guess, _, _ = jump(self.system, self.equation, own, restitution, state, self.time(state, t), h, params)
+        return after, jax.lax.stop_gradient(guess)
 
     def _next(self, state, u, t, at, h, params, origin):
         """The end of the next part of a step that began at the state `origin`, which wall is hit there, and whether one is."""
