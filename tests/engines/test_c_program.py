@@ -41,6 +41,7 @@ def columns(found, name):
         ("chaplygin-sphere", dx.LagrangeDAlembert()),
         ("kepler", dx.Collocation(3)),
         ("kepler", dx.EnergyCollocation(2)),
+        ("kepler", dx.VariableSteps(dx.LagrangeDAlembert(), lambda q: (q @ q) ** -0.75)),
     ],
 )
 def test_the_rows_have_the_bits_of_the_run(tmp_path, name, scheme):

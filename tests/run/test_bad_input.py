@@ -530,6 +530,16 @@ def test_method_2_of_a_singular_lagrangian_needs_its_final_manifold():
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("scheme", [dx.DiscreteDirac(constraints="resolve"), dx.EnergyCollocation(2)])
+def test_a_degenerate_two_form_needs_its_final_manifold(scheme):
+    form = dx.DiracStructure.from_two_form(lambda x: jnp.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    system = dx.DiracSystem(form, lambda x: x @ x / 2 - x[0] * x[2])
+    complaint(
+        ValueError, "rank 2 of 3", "needs its final manifold", "constraint_algorithm",
+        system=system, scheme=scheme, x=[0.7, 0.3, 0.7], q=None, v=None,
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("name", ["project", "check_initial", "compensated", "batch_params"])
 def test_what_is_neither_true_nor_false(name):
     complaint(TypeError, f"{name} must be True or False", "'maybe'", **{name: "maybe"})

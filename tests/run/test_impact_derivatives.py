@@ -52,3 +52,15 @@ def test_reverse_mode_and_second_derivatives():
     exact = lambda y: 0.8 * jnp.sqrt(2 * y) * (end - jnp.sqrt(2 * y)) - (end - jnp.sqrt(2 * y)) ** 2 / 2
     found = jax.jit(lambda y: jax.jvp(jax.grad(height), (y,), (1.0,)))(1.1)
     np.testing.assert_allclose(found, (jax.grad(exact)(1.1), jax.grad(jax.grad(exact))(1.1)), rtol=1e-10)
+
+
+def test_the_step_is_in_one_place_however_many_walls_there_are():
+    """XLA compiles every copy of it, which took half a minute."""
+    ball, scheme = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0]), dx.LagrangeDAlembert()
+
+    def loops(*walls):
+        run = lambda q: dx.simulate(ball, scheme, q=q, v=jnp.zeros(1), step=0.1, steps=2, events=list(walls)).q
+        return jax.jit(run).lower(jnp.ones(1)).as_text().count("stablehlo.while")
+
+    low, high = dx.Impact(lambda q: q[0]), dx.Impact(lambda q: 2.0 - q[0])
+    assert loops(low) == loops(low, high) < 12

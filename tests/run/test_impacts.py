@@ -259,6 +259,25 @@ def test_impacts_that_accumulate_end_the_run():
     assert not dead.ok and "Zeno" in dead.message and dead.t[-1] <= FALL
 
 
+def test_many_walls_at_one_moment_are_no_accumulation():
+    balls = dx.LagrangeDirac(lambda q, v: v @ v / 2 - jnp.sum(q))
+    walls = [dx.Impact(gap) for gap in (
+        lambda q: q[0], lambda q: q[1], lambda q: q[2], lambda q: q[3], lambda q: q[4],
+    )]  # fmt: skip
+    sol = dx.simulate(balls, dx.LagrangeDAlembert(), q=[1.0] * 5, v=[0.0] * 5, step=0.1, steps=20, events=walls)
+    assert sol.ok and len(sol.events) == 5
+
+
+@pytest.mark.parametrize(("v", "step", "steps"), [((3.0, -3.0), 0.1, 100), ((-0.5 / 2.1, 0.5 / 2.1), 0.7, 40)])
+def test_a_corner_is_two_walls(v, step, steps):
+    """It is hit at the end of a step, of which roundoff is left: too little to come off a wall that was passed by roundoff."""
+    free = dx.LagrangeDirac(lambda q, v: v @ v / 2)
+    box = [dx.Impact(lambda q: q[0]), dx.Impact(lambda q: 1 - q[0]), dx.Impact(lambda q: q[1]), dx.Impact(lambda q: 1 - q[1])]
+    sol = dx.simulate(free, dx.LagrangeDAlembert(), q=[0.5, 0.5], v=v, step=step, steps=steps, events=box)
+    exact = 1 - np.abs(np.mod(0.5 + np.outer(sol.t, v), 2) - 1)
+    assert sol.ok and np.max(np.abs(sol.q - exact)) <= 1e-11
+
+
 def test_what_was_run_before_an_interrupt_is_kept(monkeypatch):
     run = lambda **more: dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=400, events=[FLOOR], **DROP | more)
     whole, noted = run(), Flight._noted

@@ -1,7 +1,10 @@
 """dx.prepare and repeated runs: the bits of a first run, and every premise of it, whatever changes from call to call."""
 
+import copy
+import pickle
 import time
 
+import cloudpickle
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -226,3 +229,16 @@ def test_stats_account_for_the_time_of_a_call():
         wall = time.perf_counter() - began
         accounted = sum(value for name, value in sol.stats.items() if name.endswith("_seconds"))
         assert 0.95 * wall <= accounted <= wall
+
+
+def free_motion(q, v):
+    return v @ v / 2
+
+
+def test_a_prepared_run_is_pickled_as_what_it_was_made_from():
+    run = dx.prepare(dx.LagrangeDirac(free_motion), MIDPOINT, q=[0.1], v=[0.2], **STEP)
+    by_lambda = dx.prepare(HENON, MIDPOINT, q=[0.1, 0.2], v=[0.2, 0.1], **STEP)
+    first = run()
+    for other in (pickle.loads(pickle.dumps(run)), copy.deepcopy(run)):
+        assert_same(other(), first)
+    assert_same(pickle.loads(cloudpickle.dumps(by_lambda))(), by_lambda())

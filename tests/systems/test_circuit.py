@@ -248,3 +248,16 @@ def test_nodes_that_float_are_named_with_the_way_out():
     assert not sol.ok and "nothing determines the potential of node 1" in sol.message and "a large resistor" in sol.message
     helped = dx.simulate(dx.circuit([*netlist, ("R", 1, 0, 1e9)]), MIDPOINT, **run)
     assert helped.rows > sol.rows or helped.ok, helped.message
+
+
+@pytest.mark.parametrize(
+    "netlist",
+    [
+        [("L", 0, 1, 1.0), ("R", 1, 2, 0.1), ("V", 2, 0, 1.0)],
+        [("V", 1, 0, -2.516339715003551), ("R", 1, 2, 3.545017486152915), ("C", 2, 0, 1.6115212004542414)],
+        [("R", 1, 0, 0.24189488619574726), ("C", 2, 0, 1.7247021973291805), ("I", 1, 0, -1.959881624692813)],
+    ],
+)
+def test_laws_of_sources_alone_hold_up_to_rounding(netlist):
+    """The potential that a source fixes is a number, found to a rounding: what is left of its law has terms all the same."""
+    assert dx.simulate(dx.circuit(netlist), MIDPOINT, x=[0.3], step=0.05, steps=3).ok

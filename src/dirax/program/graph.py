@@ -316,6 +316,14 @@ class Graph:
                 stack.extend(self.args[node])
         return sorted(seen)
 
+    def replaced(self, outputs: Sequence[int], others: dict[int, int]) -> list[int]:
+        """The outputs with other nodes in place of some."""
+        found = dict(others)
+        for node in self.reachable(outputs, others):
+            args = tuple([found[a] for a in self.args[node]])
+            found[node] = node if args == self.args[node] else self.make(self.op[node], *args)
+        return [found[node] for node in outputs]
+
     def evaluate(
         self,
         outputs: Sequence[int],

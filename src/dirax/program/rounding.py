@@ -128,14 +128,24 @@ def _of(g: Graph, nodes: Nodes, operands: list[Nodes], given: list[Nodes]) -> No
 
 @rule("dirax_rounding")
 def _rule(interpreter: Interpreter, equation: Any, *operands: Nodes):
-    jaxpr = equation.params["jaxpr"]
+    g, jaxpr = interpreter.graph, equation.params["jaxpr"]
     count = len(jaxpr.in_avals)
+    captured, values, given = operands[: 2 * count - len(operands)], operands[2 * count - len(operands) : count], operands[count:]
+    numbers = {node for nodes in values for node in nodes.ravel().tolist() if g.number(node) is not None}
+    held = {node: g.input(f"held {node}") for node in numbers}
     # a product that is no graph would hide its terms
-    within = Interpreter(interpreter.graph, {**interpreter.rules, "dot_general": RULES["dot_general"]})
-    (value,) = within.run(jaxpr, *operands[:count])
-    if isinstance(value, Unavailable):
-        return [value]
-    return [_of(interpreter.graph, value, list(operands[:count]), list(operands[count:]))]
+    ways: list[tuple[dict, dict]] = [({**interpreter.rules, "dot_general": RULES["dot_general"]}, {})]
+    if held:  # numbers that cancel would be a number without terms
+        ways.insert(0, ({}, held))
+    value: Any = None
+    for rules, names in ways:
+        named = [elementwise(lambda node, names=names: names.get(node, node), nodes) for nodes in values]
+        (value,) = Interpreter(g, rules).run(jaxpr, *captured, *named)
+        if not isinstance(value, Unavailable):
+            found = _of(g, value, [*captured, *named], list(given))
+            again = {name: node for node, name in names.items()}
+            return [np.array(g.replaced(found.ravel().tolist(), again), np.int64).reshape(found.shape)]
+    return [value]
 
 
 _written: Memo[Callable] = Memo(128)

@@ -83,11 +83,12 @@ class TracedSearch:
     def of_step(self, step: tuple) -> tuple:
         """(times, index, direction, fields) of what is found in a step (its rows, the fields of steps, t, h, params): (events,
         points, …), NaN where there is nothing."""
-        fixed = jax.lax.stop_gradient(step)
-        found = [self._of_event(number, event, step, fixed) for number, event in enumerate(self.events)]
+        whole = step, self.dense.solved(*step)
+        fixed = jax.lax.stop_gradient(whole)
+        found = [self._of_event(number, event, whole, fixed) for number, event in enumerate(self.events)]
         return jax.tree.map(lambda *parts: jnp.stack(parts), *found)
 
-    def _of_event(self, number: int, event: Event, step: tuple, fixed: tuple) -> tuple:
+    def _of_event(self, number: int, event: Event, whole: tuple, fixed: tuple) -> tuple:
         places = jnp.arange(self.points + 1) / self.points
         values = self._along(number, event, fixed)
         g = jax.lax.map(values, places)
@@ -101,23 +102,24 @@ class TracedSearch:
 
             def located():
                 root = bracketed_fall(lambda x: sign * values(x), low, sign * a, high, sign * b)
-                residual = lambda x, step: self._along(number, event, step)(x[0])[None]
-                theta = implicit(residual, root[None], step, lambda m, r: r / m[0])[0]
-                t, known = self._fields(theta, step)
-                return t, jnp.asarray(float(number)), -sign, {name: known[name] for name in step[0]}
+                residual = lambda x, whole: self._along(number, event, whole)(x[0])[None]
+                theta = implicit(residual, root[None], whole, lambda m, r: r / m[0])[0]
+                t, known = self._fields(theta, *whole)
+                return t, jnp.asarray(float(number)), -sign, {name: known[name] for name in whole[0][0]}
 
             nothing = jax.tree.map(lambda s: jnp.full(s.shape, jnp.nan), jax.eval_shape(located))
             return jax.lax.cond(is_found, located, lambda: nothing)
 
         return jax.lax.map(one, (places[:-1], places[1:], a, b, asked))
 
-    def _fields(self, theta: Any, step: tuple) -> tuple[Any, dict]:
+    def _fields(self, theta: Any, step: tuple, solved: tuple) -> tuple[Any, dict]:
         begins, length = _clock(step)
-        return begins + theta * length, self.dense.inside_one(*step)(theta)
+        return begins + theta * length, self.dense.inside(solved, *step)(theta)
 
-    def _along(self, number: int, event: Event, step: tuple) -> Any:
-        """θ ↦ the function of an event in a step."""
-        inside, params, (begins, length) = self.dense.inside_one(*step), step[-1], _clock(step)
+    def _along(self, number: int, event: Event, whole: tuple) -> Any:
+        """θ ↦ the function of an event in a step, of which everything is known that has to be solved."""
+        step, solved = whole
+        inside, params, (begins, length) = self.dense.inside(solved, *step), step[-1], _clock(step)
 
         def value(theta):
             time, fields = begins + theta * length, inside(theta)

@@ -16,7 +16,7 @@ FIRST_STRETCH, LONGEST_STRETCH = 16, 2**14
 """Steps after which a flight looks up first, and at the latest; others are twice as long as the flight before."""
 
 ACCUMULATED = 1e-9
-"""Part of a step: when impacts follow each other faster, again and again, they are called accumulating."""
+"""Part of a step: when impacts on one wall follow each other faster, again and again, they are called accumulating."""
 
 AGAIN = 3
 """How often."""
@@ -45,7 +45,7 @@ class Flight:
         self.extra = [layout.place(name) for name in (STEP_DENSITY, CLOCK) if name in layout]
         self.rows = self.walk.rows
         self.closing: dict[str, np.ndarray] = {name: np.full(f.shape, np.nan) for name, f in p.fields.items()}
-        self.close, self.last = 0, -np.inf
+        self.close, self.last = [0] * len(self.jumps), [-np.inf] * len(self.jumps)
         self.done, self.state, self.unknowns = 0, np.asarray(p.state), np.asarray(p.guess[0])
 
     @property
@@ -128,9 +128,9 @@ class Flight:
     def _noted(self, state: np.ndarray, wall: int, at: float) -> bool:
         """Note an impact, of which this is the state after it; whether the run goes on."""
         t, number = self.search.time(state, at), self.search.numbers[wall]
-        self.close = self.close + 1 if at - self.last < ACCUMULATED else 0
-        self.last = at
-        if self.close >= AGAIN:
+        self.close[wall] = self.close[wall] + 1 if at - self.last[wall] < ACCUMULATED else 0
+        self.last[wall] = at
+        if self.close[wall] >= AGAIN:
             return self._accumulated(number, t)
         self.hits.append((t, number, state[self.q].copy(), state[self.p].copy(), at, *(state[i][0] for i in self.extra)))
         return True

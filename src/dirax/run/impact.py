@@ -74,15 +74,17 @@ def gaps_of(walls: Sequence[Impact]) -> Callable:
     return lambda t, q, params: jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in walls])
 
 
-def jump(system: Any, stage: StepEquation, impact: Impact, state: Any, t: Any, h: Any, params: Any) -> Any:
-    """`bounced` off one wall, of constraints that may depend on each other."""
+def jump(
+    system: Any, stage: StepEquation, gap: Callable, restitution: Any, state: Any, t: Any, h: Any, params: Any
+) -> tuple[Any, Any, Any, Any]:
+    """`bounced` off the wall of `gap(t, q, params)`, of constraints that may depend on each other."""
     now, constraints = stage.state_layout.split(state), system.constraints
     v = system.complete({"q": now.q, "p": now.p, "t": t}, params, False)["v"]
     if constraints.any:
         rows = constraints.matrix(t, now.q, params)
         forces = solve(system.velocity_hessian(t, now.q, v, params), rows.T)
         v = v - forces @ least_squares(rows @ forces, constraints.velocity_defect(t, now.q, v, params))
-    return bounced(system, stage, lambda t, q: impact(t, q, params), impact.restitution, state, v, t, h, params)
+    return bounced(system, stage, lambda t, q: gap(t, q, params), restitution, state, v, t, h, params)
 
 
 class Numbers:

@@ -113,7 +113,7 @@ def _flights(
     gap = Numbers(gaps, [t, q], p.params, "gaps", *same)
     sizes = lambda t, q, end, params: gap_terms(gaps, t, q, [end], params)
     terms = Numbers(sizes, [t, q, q], p.params, "terms of gaps", *same)
-    jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, state, t, h, params)
+    jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, wall.restitution, state, t, h, params)
     key = "jump", Same(system), Same(p.equation)
     jumps = [Numbers(jumped(wall), [state, t, t], p.params, *key, own) for wall, own in zip(walls, same, strict=True)]
     many, _, hit = problems(p)

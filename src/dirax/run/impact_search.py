@@ -66,8 +66,9 @@ class ImpactSearch:
     def next(self, state: np.ndarray, u: np.ndarray, at: float, rest: float) -> tuple[float, int] | None:
         """How long it is to the next impact within a rest of a step, and which wall is hit; None where none is. Raises
         `ValueError` for a gap that is no number."""
-        end = self.part(state, u, at, rest)[1]
-        small = ON_WALL * self.terms_at(state, end, at)
+        whole = self.part(state, u, at, 1.0)[1]  # in a short rest a coordinate that is zero may be so all along
+        end = whole if rest == 1.0 else self.part(state, u, at, rest)[1]
+        small = ON_WALL * self.terms_at(state, whole, at)
         here = self.gaps_at(state, at)
         values: dict[float, np.ndarray] = {0.0: np.where(here < small, 0.0, here)}
 
@@ -79,7 +80,8 @@ class ImpactSearch:
 
         places = np.linspace(0.0, rest, PARTS + 1)
         g = np.array([gap(float(x)) for x in places])
-        hits = [found for wall in range(len(self.numbers)) if (found := self._hit(wall, gap, places, g[:, wall])) is not None]
+        walls = range(len(self.numbers))
+        hits = [found for wall in walls if (found := self._hit(wall, gap, places, g[:, wall], -small[wall])) is not None]
         return min(hits) if hits else None
 
     def terms_at(self, state: np.ndarray, end: tuple | None, at: float) -> np.ndarray:
@@ -96,13 +98,13 @@ class ImpactSearch:
                 raise ValueError(f"the gap of events[{number}] must be finite along the run, but it is {gap} at t = {t:.6g}.")
         return found
 
-    def _hit(self, wall: int, gap: Any, places: np.ndarray, g: np.ndarray) -> tuple[float, int] | None:
-        """When a wall is hit, and the wall."""
+    def _hit(self, wall: int, gap: Any, places: np.ndarray, g: np.ndarray, behind: float) -> tuple[float, int] | None:
+        """When a wall is hit, and the wall, behind which gaps are less than `behind`: others there are by rounding alone."""
         function = lambda x, _: np.array([gap(float(part))[wall] for part in x])
-        below, near = np.flatnonzero(g < 0.0), np.flatnonzero(dips(g[:-2], g[1:-1], g[2:])) + 1
+        below, near = np.flatnonzero(g < behind), np.flatnonzero(dips(g[:-2], g[1:-1], g[2:])) + 1
         near = near[near < below[0]] if len(below) else near
         found = changes_beside_dips(function, places[near - 1], places[near + 1])
-        falls = np.flatnonzero((found.fa > 0.0) & (found.fb < 0.0))
+        falls = np.flatnonzero((found.fa > 0.0) & (found.fb < behind))
         if len(falls):
             first = falls[np.argmin(found.a[falls])]
             a, b = float(found.a[first]), float(found.b[first])
@@ -113,7 +115,7 @@ class ImpactSearch:
         while gap(a)[wall] <= 0.0:  # it begins on the wall: off it, and back in less than a part of a step?
             middle = (a + b) / 2.0
             a, b = (a, middle) if gap(middle)[wall] <= 0.0 else (middle, b)
-            if b < SHORTEST:
-                return 0.0, wall
+            if b - a < SHORTEST:
+                return a, wall
         one = lambda x: np.array([x])
         return float(bracketed_roots(function, one(a), one(b), one(gap(a)[wall]), one(gap(b)[wall]))[0]), wall

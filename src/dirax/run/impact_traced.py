@@ -1,24 +1,27 @@
 """A run with impacts whose values JAX traces: each step with as many impacts in it as there may be, times and all differentiated.
 
-The time of an impact is the root of the gap along the step, and has its derivative by the implicit function theorem: what
-comes after then has that of the saltation matrix, without a formula for it.
+What a part of a step ends with, its length among it, is the root of the equations of the step and of the gap of the wall, and
+has its derivative by the implicit function theorem: what comes after then has that of the saltation matrix, without a formula
+for it. The search for the wall is not differentiated, and has the step in one place, for XLA compiles every copy of it.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem
-from dirax.program.given_tangents import implicit
+from dirax.engines.in_jax import in_scalars
+from dirax.engines.xla.lane import passing
+from dirax.engines.xla.newton import as_function
 from dirax.run.impact import Impact, gaps_of, jump
 from dirax.run.result import solution_of
 from dirax.schemes.step import CLOCK, StepEquation
 from dirax.schemes.watched_step import ON_WALL, PARTS, gap_terms
 from dirax.solution.events import Events
 from dirax.solution.solution import Solution
-from dirax.solution.steps_again import stepped
+from dirax.solution.steps_again import sized_step
 
 MOST = 4
 """Impacts in one step: with more of them a trajectory ends."""
@@ -49,16 +52,16 @@ class TracedFlight:
         """Of every wall, (walls,)."""
         return gaps_of(self.walls)(self.time(state, t), state[self.equation.state_layout.place("q")], params)
 
-    def terms(self, t, state, end, params):
-        """The sizes of the terms of every gap, as of `gap_terms`; of a step without an end those at its state."""
+    def terms(self, t, state, others, params):
+        """The sizes of the terms of every gap, as of `gap_terms`, at a state and `others` of its step that are finite."""
         q = self.equation.state_layout.place("q")
-        end = jnp.where(jnp.all(jnp.isfinite(end)), end, state)
-        return jax.lax.stop_gradient(gap_terms(gaps_of(self.walls), self.time(state, t), state[q], [end[q]], params))
+        places = [jnp.where(jnp.isfinite(other), other, state)[q] for other in others]
+        return jax.lax.stop_gradient(gap_terms(gaps_of(self.walls), self.time(state, t), state[q], places, params))
 
-    def moved(self, state, u, t, h, params):
-        """The state after a step of length h and its unknowns; NaN where it has no solution."""
-        after, (u,), _ = stepped(self.problem.equation, state, (u,), t, h, params)
-        return after, u
+    @property
+    def written(self) -> StepEquation:
+        """The same in scalars, where it is a scalar program."""
+        return in_scalars(self.problem.equation, self.problem.params, False)[0].stages[0][0]
 
     def fly(self, state, u, params, t0, h):
         """Rows (steps + 1, …), impacts (steps, MOST, …) with NaN where there are none, the last state and its unknowns."""
@@ -75,11 +78,9 @@ class TracedFlight:
 
         def part(carry, _):
             state, u, at, _ = carry
-            theta, wall, hit = self._next(state, u, t, at, h, params)
-            length = jnp.where(hit, theta, 1.0 - at)
-            there, of_part = self.moved(state, u, t + at * h, jnp.where(length > 0.0, length, 1.0) * h, params)
-            there = jnp.where(length > 0.0, there, state)
-            at = jnp.where(hit, at + theta, 1.0)
+            end, wall, hit = self._next(*jax.lax.stop_gradient((state, u, t, at, h, params, begun[0])))
+            there, of_part, length = self._part(end, wall, hit, state, t, at, h, params)
+            at = jnp.where(hit, at + length, 1.0)
             bounced, guess = self._bounced(there, of_part, wall, t + at * h, h, params)
             state, u = jnp.where(hit, bounced, there), jnp.where(hit, guess, of_part)
             place = self.equation.state_layout.place
@@ -103,75 +104,122 @@ class TracedFlight:
 
     def _bounced(self, state, u, wall, t, h, params):
         """The state after an impact, and a guess of the unknowns after it."""
+        gap, restitution = gaps_of(self.walls), jnp.array([one.restitution for one in self.walls])[wall]
+        own = lambda t, q, params: gap(t, q, params)[wall]
+        after, guess, _, _ = jump(self.system, self.equation, own, restitution, state, self.time(state, t), h, params)
+        return after, jax.lax.stop_gradient(guess)
 
-        def off(one: Impact):
-            def function():
-                after, guess, _, _ = jump(self.system, self.equation, one, state, self.time(state, t), h, params)
-                return after, jax.lax.stop_gradient(guess)
+    def _next(self, state, u, t, at, h, params, origin):
+        """The end of the next part of a step that began at the state `origin`, which wall is hit there, and whether one is."""
+        places = jnp.arange(PARTS + 1) / PARTS * (1.0 - at)
 
-            return function
+        def seen(x):
+            flies = x > 0.0
+            step = state, (u,), t + at * h, jnp.where(flies, x, 1.0) * h, params
+            after, (of_x,), _, (sizes,) = sized_step(self.problem.equation, *step, differentiable=False)
+            there, of_x = jnp.where(flies, after, state), jnp.where(jnp.all(jnp.isfinite(after)), of_x, jnp.nan)
+            return End(x, there, of_x, sizes, self.gaps(t + (at + x) * h, there, params))
 
-        return jax.lax.switch(wall, [off(one) for one in self.walls])
+        def bracket(ends):
+            """Between two places, of walls that are in front of the first and behind the second; the last place where none is."""
+            small = ON_WALL * self.terms(t + at * h, state, (ends.state[-1], origin), params)
+            gaps = ends.gaps.at[0].set(jnp.where(ends.gaps[0] < small, 0.0, ends.gaps[0]))
+            below = gaps < -small[None]
+            behind = jnp.any(below, axis=1)
+            last = jnp.where(jnp.any(behind), jnp.argmax(behind), PARTS)
+            first, walls = jnp.maximum(last - 1, 0), below[last]
+            nearest = lambda place: jnp.min(jnp.where(walls, gaps[place], jnp.inf))
+            fall = Fall.between(places[first], nearest(first), places[last], nearest(last))
+            return fall, jax.tree.map(lambda a: a[last], ends), walls
 
-    def _next(self, state, u, t, at, h, params):
-        """(θ, wall, whether there is one) of the next impact in what is left of a step."""
-        fixed, begun = jax.lax.stop_gradient((state, u, t, at, h, params)), jax.lax.stop_gradient(at)
+        def look(carry):
+            k, ends, fall, end, walls = carry
+            found = seen(jnp.where(k <= PARTS, places[jnp.minimum(k, PARTS)], fall.guess))
+            ends = jax.tree.map(lambda a, x: a.at[k].set(x, mode="drop"), ends, found)
+            value = jnp.min(jnp.where(walls, found.gaps, jnp.inf))
+            nearer = jax.tree.map(lambda x, y: jnp.where(value > 0.0, y, x), found, end)
+            ways = lambda: (fall, end, walls), lambda: bracket(ends), lambda: (fall.narrower(found.length, value), nearer, walls)
+            return k + 1, ends, *jax.lax.switch(jnp.sign(k - PARTS) + 1, ways)
 
-        def seen(theta, values):
-            state, u, t, at, h, params = values
-            there, _ = self.moved(state, u, t + at * h, jnp.where(theta > 0.0, theta, 1.0) * h, params)
-            there = jnp.where(theta > 0.0, there, state)
-            return self.gaps(t + (at + theta) * h, there, params), there
+        nothing = jax.tree.map(lambda s: jnp.full(s.shape, jnp.nan), jax.eval_shape(seen, places[0]))
+        ends = jax.tree.map(lambda a: jnp.broadcast_to(a, (PARTS + 1, *a.shape)), nothing)
+        none = jnp.zeros(len(self.walls), bool)
+        begun = 0, ends, Fall.between(*jnp.zeros(4)), nothing, none
+        open_yet = lambda carry: (carry[0] <= PARTS) | (jnp.any(carry[4]) & carry[2].open)
+        _, _, _, end, walls = jax.lax.while_loop(open_yet, look, begun)
+        return end, jnp.argmin(jnp.where(walls, end.gaps, jnp.inf)), jnp.any(walls)
 
-        places = jnp.arange(PARTS + 1) / PARTS * (1.0 - begun)
-        values, states = jax.lax.map(lambda theta: seen(theta, fixed), places)
-        small = ON_WALL * self.terms(t + begun * h, fixed[0], states[-1], fixed[5])
-        gaps = lambda theta, values: seen(theta, values)[0]
-        values = values.at[0].set(jnp.where(values[0] < small, 0.0, values[0]))
-        below = values < 0.0
-        first = jnp.argmax(below, axis=0)
-        roots, finds = [], []
-        for wall in range(len(self.walls)):
-            of_wall = lambda theta, wall=wall: gaps(theta, fixed)[wall]
-            found = jnp.any(below[:, wall])
-            roots.append(jax.lax.cond(
-                found,
-                lambda i=first[wall], f=of_wall, g=values[:, wall]: bracketed_fall(f, places[i - 1], g[i - 1], places[i], g[i]),
-                lambda: jnp.zeros(()),
-            ))  # fmt: skip
-            finds.append(found)
-        roots, finds = jnp.stack(roots), jnp.stack(finds)
-        wall = jnp.argmin(jnp.where(finds, roots, jnp.inf))
-        hit = jnp.any(finds)
+    def _part(self, end, wall, hit, state, t, at, h, params):
+        """State, unknowns and length of a part of a step with this end, as functions of what it begins with."""
+        stage, args = self.written, passing((state, t, at, h, params), jnp.all(jnp.isfinite(end.unknowns)))
 
-        def theta():
-            residual = lambda root, values: gaps(root[0], values)[wall][None]
-            return implicit(residual, roots[wall][None], (state, u, t, at, h, params), lambda a, b: b / a[0])[0]
+        def moved(z, state, t, at, h, params):
+            flies = z[-1] > 0.0
+            step = z[:-1], state, t + at * h, jnp.where(flies, z[-1], 1.0) * h, params
+            return step, jnp.where(flies, stage.advance(*step), state)
 
-        return jax.lax.cond(hit, theta, lambda: jnp.zeros(())), wall, hit
+        def residual(z, state, t, at, h, params):
+            step, there = moved(z, state, t, at, h, params)
+            off = lambda: self.gaps(t + (at + z[-1]) * h, there, params)[wall]
+            return jnp.append(stage.residual(*step), jax.lax.cond(hit, off, lambda: z[-1] - (1.0 - at)))
+
+        z = as_function(residual, jnp.append(end.unknowns, end.length), args, sizes=jnp.append(end.sizes, 1.0))
+        return moved(z, *args)[1], z[:-1], z[-1]
 
 
-def bracketed_fall(function, a, fa, b, fb):
+class End(NamedTuple):
+    """The end of a part of a step: its length, the state, the unknowns and their sizes, and the gaps of all walls."""
+
+    length: Any
+    state: Any
+    unknowns: Any
+    sizes: Any
+    gaps: Any
+
+
+class Fall(NamedTuple):
     """The place between a, where a function is not negative, and b, where it is, through which it falls: by the rule of false
     position that halves the value of an end that stays (Illinois), off a place at which it begins with zero."""
 
-    def narrower(carry):
-        a, fa, b, fb, count, side = carry
+    a: Any
+    fa: Any
+    b: Any
+    fb: Any
+    count: Any
+    side: Any
+
+    @classmethod
+    def between(cls, a, fa, b, fb) -> "Fall":
+        """Nothing is known but the ends."""
+        return cls(a, fa, b, fb, jnp.zeros((), int), jnp.zeros((), int))
+
+    @property
+    def open(self):
+        """Whether it can be narrowed down further."""
+        return (self.b - self.a > 1e-15) & (self.fb < 0.0) & (self.count < HALVINGS + 40)
+
+    @property
+    def guess(self):
+        """Where to look next."""
+        a, fa, b, fb, _, _ = self
         guess = (a * fb - b * fa) / (fb - fa)
-        x = jnp.where((fa > 0.0) & (guess > a) & (guess < b), guess, 0.5 * (a + b))
-        fx = function(x)
+        return jnp.where((fa > 0.0) & (guess > a) & (guess < b), guess, 0.5 * (a + b))
+
+    def narrower(self, x, fx) -> "Fall":
+        """With the value at the guess."""
+        a, fa, b, fb, count, side = self
         above = fx > 0.0
         start = ~above & (fa <= 0.0)  # it begins on the wall, and is behind it here
         fa = jnp.where(above, fx, jnp.where((side == -1) & ~above, 0.5 * fa, fa))
         fb = jnp.where(above, jnp.where(side == 1, 0.5 * fb, fb), fx)
-        return jnp.where(above, x, a), fa, jnp.where(above, b, x), fb, count + 1, jnp.where(start, 0, jnp.where(above, 1, -1))
+        side = jnp.where(start, 0, jnp.where(above, 1, -1))
+        return Fall(jnp.where(above, x, a), fa, jnp.where(above, b, x), fb, count + 1, side)
 
-    def open_yet(carry):
-        a, _, b, fb, count, _ = carry
-        return (b - a > 1e-15) & (fb < 0.0) & (count < HALVINGS + 40)
 
-    a, _, b, _, _, _ = jax.lax.while_loop(open_yet, narrower, (a, fa, b, fb, 0, 0))
-    return b
+def bracketed_fall(function, a, fa, b, fb):
+    """The place of a `Fall` of a function."""
+    look = lambda fall: fall.narrower(fall.guess, function(fall.guess))
+    return jax.lax.while_loop(lambda fall: fall.open, look, Fall.between(a, fa, b, fb)).b
 
 
 def flown(system: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> tuple[Problem, Outcome, Any]:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -24,7 +25,8 @@ class PreparedRun:
     each as it was prepared where it is not given, it returns the Solution that `dx.simulate` returns, bit by bit.
 
     All premises are checked as they are there. Initial data of another kind or shape, and params of another structure, may be
-    given too; the first such call takes as long as a first `dx.simulate`.
+    given too; the first such call takes as long as a first `dx.simulate`. It is pickled where the functions of its system are
+    those of a module; cloudpickle takes lambdas too.
     """
 
     def __init__(self, settings: Settings, case: Case, steps: int, save_every: int, kind: Kind | None):
@@ -103,8 +105,16 @@ class PreparedRun:
         kept = base.data if base.data.keys() >= given.keys() else {}
         return initial_data({**kept, **given})[0], params
 
+    def __reduce__(self) -> tuple:
+        """What is pickled and copied in depth: what the run was made from, without what was found and compiled."""
+        return _prepared_again, (replace(self._settings), self._case, self._steps, self._save_every)
+
     def __repr__(self) -> str:
         return f"PreparedRun({self._settings.scheme!r} on {self._settings.system!r}, {self._steps} steps of {self._case.h})"
+
+
+def _prepared_again(settings: Settings, case: Case, steps: int, save_every: int) -> PreparedRun:
+    return PreparedRun(settings, case, steps, save_every, prepared(settings, case, steps, save_every))
 
 
 def _batch_of(data: Mapping[str, Any]) -> int | None:

@@ -7,6 +7,7 @@ from dirax.program.user_functions import UserFunction
 from dirax.schemes.collocation_tables import MOST_STAGES, gauss, quadrature
 from dirax.schemes.framed_energy_collocation_step import FramedEnergyCollocation
 from dirax.schemes.hamiltonian_energy_collocation_step import HamiltonianEnergyCollocation
+from dirax.schemes.hidden_constraint_premise import nothing_hidden_in_relation
 from dirax.schemes.lagrangian_energy_collocation_step import LagrangianEnergyCollocation
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.systems.forms import RelationForm
@@ -104,7 +105,10 @@ class EnergyCollocation(AbstractScheme):
         relation = system.relation_form(shape) or system.final_relation(shape)
         relation = RelationForm(energy.residual) if relation is None and energy is not None else relation
         if relation is not None and energy is not None and not relation.multipliers:
-            return HamiltonianEnergyCollocation(*tables, relation, energy, shape.n).equation()
+            step = HamiltonianEnergyCollocation(*tables, relation, energy, shape.n)
+            if step.sparse:  # of so many coordinates there is no matrix
+                return step.equation()
+            return nothing_hidden_in_relation(system, relation, step.equation(), "dx.EnergyCollocation")
         lagrangian = system.lagrangian_form()
         if lagrangian is not None:
             return LagrangianEnergyCollocation(*tables, lagrangian, shape).equation()

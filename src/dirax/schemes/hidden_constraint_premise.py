@@ -1,4 +1,5 @@
-"""The premise of Method 2 that a system without stated constraints has none: refused at initial data where it does not hold."""
+"""The premise of schemes that solve for ẋ, Method 2 among them, that a system without stated constraints has none: refused at
+initial data where it does not hold."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,9 +17,13 @@ from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
 from dirax.systems.system import AbstractSystem
 
+METHOD_2 = "Method 2"
 
-def nothing_hidden_in_relation(system: AbstractSystem, form: RelationForm, equation: StepEquation) -> StepEquation:
-    """The equation, which refuses initial data at which the matrix of ẋ is singular."""
+
+def nothing_hidden_in_relation(
+    system: AbstractSystem, form: RelationForm, equation: StepEquation, scheme: str = METHOD_2
+) -> StepEquation:
+    """The equation of a scheme of this name, which refuses initial data at which the matrix of ẋ is singular."""
 
     def matrix(data, params):
         x, none = system.complete(data, params, False)["x"], jnp.zeros(0)
@@ -28,7 +33,7 @@ def nothing_hidden_in_relation(system: AbstractSystem, form: RelationForm, equat
         found, x = evaluated(matrix, {"t": np.zeros(()), **data}, params)
         return found, "the matrix of ẋ", np.asarray(x)
 
-    return _refusing(system, at, equation)
+    return _refusing(system, at, equation, scheme)
 
 
 def nothing_hidden_in_lagrangian(system: LagrangeDirac | ManifoldLagrangian, equation: StepEquation) -> StepEquation:
@@ -50,7 +55,7 @@ def nothing_hidden_in_lagrangian(system: LagrangeDirac | ManifoldLagrangian, equ
     return _refusing(system, at, equation)
 
 
-def _refusing(system: AbstractSystem, at: Callable, equation: StepEquation) -> StepEquation:
+def _refusing(system: AbstractSystem, at: Callable, equation: StepEquation, scheme: str = METHOD_2) -> StepEquation:
     def check(data, h, params):
         equation.check(data, h, params)
         if (found := at(data, h, params)) is None:
@@ -59,7 +64,7 @@ def _refusing(system: AbstractSystem, at: Callable, equation: StepEquation) -> S
         rank = rank_of(matrix)
         if rank < max(matrix.shape):
             raise ValueError(
-                f"{what} has rank {rank} of {max(matrix.shape)} at the initial data, and Method 2 of this "
+                f"{what} has rank {rank} of {max(matrix.shape)} at the initial data, and {scheme} of this "
                 f"{type(system).__name__} {final_manifold_needed(system, near, params)}."
             )
 

@@ -53,21 +53,29 @@ class TracedDense(BetweenRows):
     def _at_one(self, row, after, of_step, time, t, h, params) -> dict[str, Any]:
         begins, ends = row.get(CLOCK, t), after.get(CLOCK, t + h)
         length = ends - begins if CLOCK in row else h
-        return self.inside_one(row, after, of_step, t, h, params)((time - begins) / length)
+        step = row, after, of_step, t, h, params
+        return self.inside(self.solved(*step), *step)((time - begins) / length)
 
-    def inside_one(self, row, after, of_step, t, h, params) -> Callable:
-        """θ ↦ the fields of nodes at a part θ of the step between two rows, with the fields of the step, as JAX traces them."""
-        system, begins, ends = self.sol.system, row.get(CLOCK, t), after.get(CLOCK, t + h)
+    def solved(self, row, after, of_step, t, h, params) -> tuple:
+        """What has to be solved for the inside of the step between two rows, with the fields of the step: once, not at every
+        place in it."""
+        begins, ends = row.get(CLOCK, t), after.get(CLOCK, t + h)
+        if self.interpolate is None and self.between is not None:
+            return tuple(velocity_of(self.sol.system, a, s, params) for a, s in ((row, begins), (after, ends)))
+        state, guess = begun(self.equation, self.sol.system, row | of_step, begins, h, params)
+        return state, guess if self.interpolate is None else stepped(self.equation, state, guess, begins, h, params)[1]
+
+    def inside(self, solved, row, after, of_step, t, h, params) -> Callable:
+        """θ ↦ the fields of nodes at a part θ of that step, as JAX traces them."""
+        begins, ends = row.get(CLOCK, t), after.get(CLOCK, t + h)
         if self.interpolate is None and (between := self.between) is not None:
-            both = ({**a, "t": s, "v": velocity_of(system, a, s, params)} for a, s in ((row, begins), (after, ends)))
-            first, last = both
+            first, last = ({**a, "t": s, "v": v} for a, s, v in zip((row, after), (begins, ends), solved, strict=True))
             return lambda theta: {n: a for n, a in between(theta, first, last, h, params).items() if n in self.nodes}
-        state, guess = begun(self.equation, system, row | of_step, begins, h, params)
+        state, guess = solved
         if (interpolate := self.interpolate) is not None:
-            _, (u,), _ = stepped(self.equation, state, guess, begins, h, params)
 
             def by_polynomial(theta):
-                found = interpolate(theta, u, state, begins, h, params)
+                found = interpolate(theta, guess[0], state, begins, h, params)
                 return {name: found.get(name, row[name]) for name in row}
 
             return by_polynomial

@@ -63,11 +63,19 @@ _begun = compiled(_begun_by, seldom=True)
 
 def stepped(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> tuple[Any, tuple, tuple]:
     """The state after a step, and of each stage the unknowns and the state that it left, by JAX."""
+    return sized_step(equation, state, guess, t, h, params)[:3]
+
+
+def sized_step(
+    equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any, differentiable: bool = True
+) -> tuple[Any, tuple, tuple, tuple]:
+    """`stepped`, and the sizes of the unknowns of each stage."""
     written, jacobians = in_scalars(equation, params, False)
     numerics = Numerics(jacobians=jacobians)
     sizes = sizes_near(written, state, guess, t, h, params)
-    lane, unknowns, states = take_step(written, first_lane(state, guess), t, h, params, sizes, UPDATES, numerics=numerics)
-    return jnp.where(lane.completed > 0, lane.state, jnp.nan), unknowns, states
+    begun = first_lane(state, guess)
+    lane, unknowns, states = take_step(written, begun, t, h, params, sizes, UPDATES, differentiable, numerics)
+    return jnp.where(lane.completed > 0, lane.state, jnp.nan), unknowns, states, sizes
 
 
 def row_of(equation: Any, unknowns: tuple, states: tuple, t: Any, h: Any, params: Any) -> dict[str, Any]:

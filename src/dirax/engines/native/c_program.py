@@ -19,6 +19,7 @@ from dirax.engines.native.loops.step_loop import kernel_module
 from dirax.engines.sizes import sizes_of
 from dirax.program import machine_code as llvm
 from dirax.program.interpreter import UnsupportedPrimitive
+from dirax.schemes.step import CLOCK
 
 PROGRAM = """\
 /* {title}
@@ -60,8 +61,8 @@ static int trajectory(int64_t lane, int64_t steps, int64_t every) {{
     if (completed == steps) run(last, params[lane], ends, 1, t0, h, 0, 0, 1, 1, {cap});
     given = completed == steps ? rows : (completed + every - 1) / every;
     for (int64_t row = 0; row < given; row++) {{
-        int64_t number = row == rows - 1 ? steps : row * every;
-        {lane}printf("%.17g", t0 + (double)number * h);
+        double t = {time};
+        {lane}printf("%.17g", t);
         for (int i = 0; i < FIELDS; i++) {{
             const double *from = row == rows - 1 ? ends[i] : (double *)fields[i] + row * widths[i];
             for (int64_t k = 0; k < widths[i]; k++) {{
@@ -148,6 +149,10 @@ def c_program(p: Problem, name: str, title: str) -> str:
     values = made.step.parameters.flatten(p.params, p.batch if p.batch_params else None)
     values = np.broadcast_to(values, (lanes, values.shape[-1])) if values.size else np.zeros((lanes, 1))
     listed = lambda table: ",\n".join("{" + ", ".join(float(x).hex() for x in row) + "}" for row in table)
+    time = "t0 + (double)(row == rows - 1 ? steps : row * every) * h"
+    if CLOCK in (names := [s.name for s in saved]):  # steps have lengths of their own
+        clock = names.index(CLOCK)
+        time = f"row == rows - 1 ? *(double *)ends[{clock}] : ((double *)fields[{clock}])[row]"
     columns = [*(["trajectory"] if p.batch else []), "t", *(f"{s.name}{k}" for s in saved for k in range(s.size))]
     return PROGRAM.format(
         title=title,
@@ -164,6 +169,7 @@ def c_program(p: Problem, name: str, title: str) -> str:
         size=record.size,
         completed=record.completed,
         status=record.status,
+        time=time,
         fields=len(saved),
         row=sum(s.size for s in saved),
         record=listed(start),
