@@ -293,6 +293,12 @@ class Graph:
     def _not(self, a: int) -> int:
         return self.args[a][0] if self.op[a] == "not" else self._plain("not", a)
 
+    def _held(self, a: int) -> int:
+        return a if self.op[a] == "held" or self.is_boolean(a) else self._plain("held", a)
+
+    def _ruled(self, a: int, along: int) -> int:
+        return self.make("held", a) if self.is_constant(along) else self._plain("ruled", a, along)
+
     def _max(self, a: int, b: int) -> int:
         return a if a == b else self._plain("max", a, b)
 
@@ -302,6 +308,7 @@ class Graph:
     _simplified: ClassVar[dict[str, Callable[..., int]]] = {
         **{"add": _add, "sub": _sub, "neg": _neg, "mul": _mul, "recip": _recip, "pow": _pow},
         **{"select": _select, "and": _and, "or": _or, "not": _not, "max": _max, "min": _min},
+        **{"held": _held, "ruled": _ruled},
     }
 
     # ------------------------------------------------------------------ the whole
