@@ -61,11 +61,30 @@ CASES = {
     "softplus and friends": (lambda x: jax.nn.softplus(x) + jax.nn.sigmoid(x) + jax.nn.relu(x) + jnp.sinc(x), V),
     "error function": (lambda x: jax.scipy.special.erf(x) + jax.scipy.special.erfc(x) + jnp.cbrt(x), V),
     "rounding": (lambda x: jnp.floor(x) + jnp.ceil(2 * x) + jnp.round(3 * x) + jnp.sign(x) + jnp.trunc(5 * x), V),
+    "halves": (
+        lambda x: (
+            jnp.round(jnp.floor(x) + jnp.array([0.5, 1.5, -0.5]))
+            + 100 * jax.lax.round(0 * x + jnp.array([0.5 - 2**-54, -0.5, 2.5]))
+            + jnp.rint(jnp.floor(x) + 0.5)
+        ),
+        V,
+    ),
     "remainders": (lambda x: jnp.mod(x, 0.7) + jnp.fmod(x, 0.3) + jnp.remainder(5 * x, 2.0), V),
     "extremes": (lambda x, y: jnp.maximum(x, y) - jnp.minimum(x, 0.3) + jnp.clip(y, -0.5, 0.5), V, V),
     "where": (lambda x, y: jnp.where((x > y) & ~(x < 0) | (y == x), x, jnp.where(x != 0, 2 * y, 0.0)), V, V),
     "booleans as numbers": (
         lambda x: jnp.sum((x > 0).astype(float)) + jnp.isfinite(x).astype(float) + jnp.any(x > 1).astype(float) * x,
+        V,
+    ),
+    "truth values": (
+        lambda x: (
+            jnp.select([x > 0.2, x < -0.2], [(x - 0.2) ** 3, (x + 0.2) ** 2], 0.5)
+            + jnp.argmax(x > 0.1).astype(float)
+            + jnp.stack([(x > 0.1).max(), (x > 0.1).min(), jnp.any(x > 1)]).astype(float) @ jnp.array([1.0, 2.0, 4.0])
+            + jnp.stack([jnp.maximum(x > 0.2, x < -0.2), jnp.minimum(x > -1, x < 1)], 1).astype(float) @ jnp.array([8.0, 16.0])
+            + jnp.stack([(x > 0.1) < (x < 1), (x > 0.1) >= (x < 1)], 1).astype(float) @ jnp.array([32.0, 64.0])
+            + jnp.stack([(x > 0) ^ (x < 1), (x > 0) == (x < 1)], 1).astype(float) @ jnp.array([128.0, 256.0])
+        ),
         V,
     ),
     "products": (lambda a, x: a @ a.T @ x + jnp.einsum("ij,ik,k->j", a, a, x) + jnp.outer(x, x) @ x, M, V),
