@@ -105,7 +105,7 @@ def loop(interpreter: Interpreter, equation: Any, *operands):
         (going,) = interpreter.run(p["cond_jaxpr"], *for_cond, *carry)
         if isinstance(going, Unavailable):
             return [going] * len(equation.outvars)
-        if not g.is_constant(going.item()):
+        if going.size != 1 or not g.is_constant(going.item()):  # under vmap each entry has a condition of its own
             raise Unsupported("is a loop whose length depends on the state")
         if not g.value[going.item()]:
             return carry
