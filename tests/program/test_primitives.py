@@ -87,6 +87,17 @@ CASES = {
         ),
         V,
     ),
+    "whole numbers": (
+        lambda x: (
+            (jnp.uint8(200) + (x > -9).astype(jnp.uint8) * jnp.uint8(100)).astype(float)
+            + (jnp.int32(2**31 - 1) + (x > 0).astype(jnp.int32)).astype(float)
+            + (jnp.floor(90 * x).astype(int) + 300).astype(jnp.int8).astype(float)
+            + jnp.floor(x).astype(int).astype(jnp.uint32).astype(float)
+            + (5e9 * x).astype(jnp.int32).astype(float)
+            + (jnp.floor(x).astype(int) ** 2).astype(float) * jnp.arange(9.0)[jnp.clip((2 * x).astype(jnp.int32) + 1, 0, 8)]
+        ),
+        V,
+    ),
     "products": (lambda a, x: a @ a.T @ x + jnp.einsum("ij,ik,k->j", a, a, x) + jnp.outer(x, x) @ x, M, V),
     "batched product": (lambda a: jnp.einsum("bij,bjk->bik", jnp.stack([a, a.T]), jnp.stack([a, a + 1])), M),
     "reductions": (lambda a: a.sum(0) + a.max(1) + a.min() + jnp.prod(a, axis=0) + jnp.linalg.norm(a), M),
@@ -147,6 +158,7 @@ UNSUPPORTED = {
     "convert_element_type": lambda x: x.astype(jnp.float32).astype(float),
     "complex": lambda x: jnp.abs(jax.lax.complex(x, x)),
     "sort": lambda x: jnp.sort(x),
+    "mul": lambda x: (jnp.floor(x).astype(int) * 1103515245 % 1000).astype(float),
     "lu": lambda x: jnp.linalg.det(jnp.outer(jnp.tile(x, 5), jnp.tile(x, 5))),
 }
 

@@ -148,7 +148,7 @@ def convert(interpreter: Interpreter, equation: Any, x):
     if new == np.bool_ and old != np.bool_:
         return [elementwise(lambda a: g.make("ne", a, g.zero), x)]
     if np.issubdtype(new, np.integer) and np.issubdtype(old, np.floating):
-        return [elementwise(lambda a: g.make("trunc", a), x)]
+        return [elementwise(lambda a: interpreter.ranges.saturated(g.make("trunc", a), new), x)]
     return [x]
 
 

@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
-from dirax.program.interpreter import RULES, Interpreter, Unsupported, check_dtypes
+from dirax.program.interpreter import RULES, Interpreter, Unsupported, check_dtypes, is_integer
 from dirax.program.rules.reductions import FOLDS, factors_of_product
 from dirax.program.sites.courses import Course, NotBySites, taken_apart
 from dirax.program.sites.pieces import Expressions, Piece, Place, gathered, shared
@@ -90,8 +90,18 @@ class _Walk:
                 raise NotBySites(f"'{equation.primitive.name}' is not known entry by entry")
         for equation in jaxpr.eqns:
             results = self._equation(equation, [read(atom) for atom in equation.invars])
-            values.update(zip(equation.outvars, results, strict=True))
+            values.update((v, self._whole(x, v)) for v, x in zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
+
+    def _whole(self, value: Value, variable: Any) -> Value:
+        """Whole numbers as their type has them."""
+        if isinstance(value, np.ndarray) or not is_integer(variable):
+            return value
+        try:
+            nodes = self.interpreter.whole(np.array([piece.node for piece in value], np.int64), variable)
+        except Unsupported as error:
+            raise NotBySites(str(error)) from None
+        return [piece._replace(node=node) for piece, node in zip(value, nodes.tolist(), strict=True)]
 
     def _equation(self, equation: Any, operands: list[Value]) -> Sequence[Value]:
         name, p = equation.primitive.name, equation.params
