@@ -33,9 +33,9 @@ def by_its_rule(interpreter: Interpreter, equation: Any, *operands: Any) -> list
     make, plain = interpreter.graph.make, Interpreter(interpreter.graph)
     values = plain.run(closed(inner_jaxpr(equation)), *operands)
     of = lambda op, arrays: [elementwise(functools.partial(make, op), x) for x in arrays]
-    moving = [x for x, v in zip(operands, equation.invars, strict=True) if _is_float(v)]
-    along = iter(plain.run(_tangent(equation), *of("held", operands), *of("motion", moving)))
-    return [_ruled(make, x, next(along)) if _is_float(v) else x for x, v in zip(values, equation.outvars, strict=True)]
+    moving = [x for x, v in zip(operands, equation.invars, strict=True) if is_float(v)]
+    along = iter(plain.run(tangent(equation), *of("held", operands), *of("motion", moving)))
+    return [_ruled(make, x, next(along)) if is_float(v) else x for x, v in zip(values, equation.outvars, strict=True)]
 
 
 def _ruled(make: Callable[..., int], value: Any, along: Any) -> Any:
@@ -43,11 +43,11 @@ def _ruled(make: Callable[..., int], value: Any, along: Any) -> Any:
     return lost or elementwise(functools.partial(make, "ruled"), value, along)
 
 
-def _is_float(variable: Any) -> bool:
+def is_float(variable: Any) -> bool:
     return bool(np.issubdtype(variable.aval.dtype, np.floating))
 
 
-def _tangent(equation: Any) -> ClosedJaxpr:
+def tangent(equation: Any) -> ClosedJaxpr:
     """The jaxpr of (operands, motions of those that are floats) ↦ the motions of results that are floats. Raises `Unsupported`
     where they are no linear functions of those of the operands."""
     p, inner = equation.params, getattr(inner_jaxpr(equation), "jaxpr", inner_jaxpr(equation))
@@ -55,7 +55,7 @@ def _tangent(equation: Any) -> ClosedJaxpr:
 
     def traced() -> ClosedJaxpr:
         alone = inner.replace(constvars=(), outvars=equation.outvars, eqns=[equation.replace(invars=inner.invars)])
-        whole, floats = jaxpr_as_fun(ClosedJaxpr(alone, ())), [k for k, v in enumerate(inner.invars) if _is_float(v)]
+        whole, floats = jaxpr_as_fun(ClosedJaxpr(alone, ())), [k for k, v in enumerate(inner.invars) if is_float(v)]
         shapes = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in inner.invars]
 
         def along(*values: Any) -> list:
@@ -64,7 +64,7 @@ def _tangent(equation: Any) -> ClosedJaxpr:
             def of_floats(*chosen):
                 known = dict(zip(floats, chosen, strict=True))
                 results = whole(*(known.get(k, value) for k, value in enumerate(x)))
-                return [y for y, v in zip(results, equation.outvars, strict=True) if _is_float(v)]
+                return [y for y, v in zip(results, equation.outvars, strict=True) if is_float(v)]
 
             point = tuple(x[k] for k in floats)
             if "bwd" in p:  # the transpose of what it does backward
