@@ -167,6 +167,53 @@ def test_derivatives_of_a_long_run_against_the_closed_form(monkeypatch):
     np.testing.assert_allclose(forward, expected, rtol=1e-10)
 
 
+@jax.custom_jvp
+def rounded(x):
+    return jnp.round(x)
+
+
+rounded.defjvp(lambda primals, tangents: (rounded(*primals), (1 + rounded(*primals)) * tangents[0]))
+
+
+@jax.custom_vjp
+def reversed_flow(x):
+    return 1.0 * x
+
+
+reversed_flow.defvjp(lambda x: (1.0 * x, None), lambda _, flow: (-flow,))
+
+
+@jax.custom_vjp
+def clipped_flow(x):
+    return 1.0 * x
+
+
+clipped_flow.defvjp(lambda x: (1.0 * x, None), lambda _, flow: (jnp.clip(flow, -9.0, 9.0),))
+RULES = {
+    "stop_gradient": (lambda k: jax.lax.stop_gradient(k) + 0 * k, "native"),
+    "custom_jvp": (rounded, "native"),
+    "custom_vjp": (reversed_flow, "native"),
+    "a rule that is not linear": (clipped_flow, "xla"),
+    "rules of jax.nn": (lambda k: jax.nn.logsumexp(jnp.stack([k, 1.0])) + jax.nn.softplus(k) * jax.nn.relu(k), "native"),
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_functions_keep_the_rules_of_their_derivatives(name):
+    """A force f(k) for one second: the momentum moves as JAX says that f does; and so inside of a Lagrangian."""
+    f, engine = RULES[name]
+    forced = dx.LagrangeDirac(lambda q, v, k: v @ v / 2, forces=lambda t, q, v, k: jnp.stack([f(k)]))
+    inside = dx.LagrangeDirac(lambda q, v, k: v @ v / 2 + f(k) * q[0])
+
+    def end(k, system):
+        sol = dx.simulate(system, MIDPOINT, q=jnp.zeros(1), v=jnp.zeros(1), params=k, step=0.25, steps=4)
+        assert sol.stats["engine"] == engine
+        return sol.p[-1, 0]
+
+    for system in (forced, inside):
+        np.testing.assert_allclose(jax.grad(end)(1.7, system), jax.grad(f)(1.7), rtol=1e-12)
+
+
 def test_a_trajectory_that_ends_keeps_its_derivative_and_spoils_no_other():
     """L = v²/2 − q + 10⁻⁴√q falls out of its domain; up to there against central differences."""
     falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] + 1e-4 * jnp.sqrt(q[0]))

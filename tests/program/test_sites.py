@@ -30,6 +30,12 @@ def lattice(q, rows=7):
     return jnp.sum(along**4) + jnp.sum(jnp.cos(across)) + jnp.sum(u[1:, 1:] * u[:-1, :-1])
 
 
+@jax.custom_jvp
+def steep(x):
+    return jnp.sin(x)
+
+
+steep.defjvp(lambda primals, tangents: (steep(*primals), (3 + steep(*primals)) * tangents[0]))
 FUNCTIONS = {
     "chain": (jax.grad(energy), Q),
     "masses": (lambda q: MASSES * jnp.roll(q, 1) / (2 + jnp.sin(q)), Q),
@@ -45,6 +51,7 @@ FUNCTIONS = {
     "totals": (lambda p: jnp.einsum("ij,ij->i", p[:70].reshape(1, 70), jnp.sin(p[10:80]).reshape(1, 70)) * p[:5], P),
     "totals of rows": (lambda p: jnp.sum(jnp.outer(jnp.arange(1.0, 4.0), p) ** 2, axis=1), P),
     "few": (lambda q: jnp.sum(jnp.sin(q[:8, None] - q[None, :8]), axis=1), Q),
+    "rules": (lambda q: steep(q) * jax.lax.stop_gradient(q) + jax.nn.softplus(q), np.linspace(-2.0, 2.2, 50)),
 }
 
 
@@ -57,7 +64,7 @@ def test_loops_over_sites_do_what_jax_does(name):
     np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["chain", "masses", "edges", "one in two", "lattice"])
+@pytest.mark.parametrize("name", ["chain", "masses", "edges", "rules", "one in two", "lattice"])
 def test_entries_of_the_jacobian_are_all_of_it(name):
     function, given = FUNCTIONS[name]
     sites = sites_of(function, jax.ShapeDtypeStruct(given.shape, float))

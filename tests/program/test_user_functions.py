@@ -130,6 +130,26 @@ def keyword_params(q, v, *, params=None):
     return v @ v
 
 
+AT = np.array([0, 7])
+MEANT = {
+    "clip": lambda q: q.at[AT].get(mode="clip"),
+    "taken": lambda q: jnp.take(q, AT, mode="clip"),
+    "one": lambda q: q.at[jnp.floor(q[0]).astype(int) + 5].get(mode="clip"),
+    "fill": lambda q: q.at[AT].get(mode="fill", fill_value=0.0),
+    "slice": lambda q: jax.lax.dynamic_slice(q, (jnp.floor(q[0]).astype(int) + 5,), (2,)),
+}
+
+
+@pytest.mark.parametrize("name", MEANT)
+def test_indices_may_be_outside_where_it_is_said_what_is_read_there(name):
+    q = jnp.array([0.5, 1.5, 2.5])
+    assert UserFunction(MEANT[name], "force", ("q",)).shape(q, None).dtype == float
+    both = UserFunction(lambda q: jnp.sum(MEANT[name](q)) + q[jnp.floor(q[0]).astype(int) + 5], "force", ("q",))
+    for function in (both, UserFunction(lambda q: jnp.take(q, AT), "force", ("q",))):
+        with pytest.raises(ValueError, match=r"reads an entry .*out.of.bounds"):
+            function.shape(q, None)
+
+
 def keyword_time(q, v, *, t=0.0):
     return v @ v
 

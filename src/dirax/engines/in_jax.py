@@ -24,7 +24,7 @@ def increments_of(equation: Any, params: Any, batch_params: bool) -> tuple[Calla
 
     Where the step is no scalar program, the reason."""
     try:
-        made = step_program(equation, params, batch_params)
+        made = step_program(equation, params, batch_params).differentiable
     except UnsupportedPrimitive as error:
         return str(error)
     return _increments.get(Same(made), lambda: _increments_of(made))
@@ -44,7 +44,7 @@ def in_scalars(equation: Any, params: Any, batch_params: bool) -> tuple[Any, tup
 
     The equation itself, and None, where it is no scalar program or one of more than policy.MOST_FOR_XLA that is not nested."""
     try:
-        made = step_program(equation, params, batch_params)
+        made = step_program(equation, params, batch_params).differentiable
         return _equations.get(Same(made), lambda: _in_scalars(equation, made))
     except (UnsupportedPrimitive, GraphTooLarge):
         return equation, None

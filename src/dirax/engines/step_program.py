@@ -1,6 +1,6 @@
 """StepProgram: a step as one scalar program, of its functions traced at the flat sizes; what every engine asks of it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import jaxprs_in_params
+from jax.extend.core import ClosedJaxpr, jaxprs_in_params
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.engines import policy
@@ -20,8 +20,9 @@ from dirax.program.evaluation.in_levels import in_levels
 from dirax.program.evaluation.in_numpy import Slopes, Values, in_parts
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge, Order, with_ends
 from dirax.program.graph_derivatives import jacobian
-from dirax.program.interpreter import Nodes, UnsupportedPrimitive
+from dirax.program.interpreter import Nodes, Rule, UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
+from dirax.program.rules.differentiable import DIFFERENTIABLE, has_rules
 from dirax.program.scalar_program import ScalarProgram
 
 DERIVED = 4
@@ -52,6 +53,7 @@ class TracedEquation:
     """How deep derivatives of derivatives go in its functions."""
     array_operations: float
     """How many operations on arrays they are for XLA."""
+    jaxpr: ClosedJaxpr
     weak: tuple[tuple[range, range], ...] = ()
     """(rows, columns) of the Jacobian that Newton's method may leave out."""
 
@@ -72,6 +74,12 @@ def inputs(g: Graph, size: int) -> Inputs:
 
 def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquation:
     """The nodes of one equation. Raises `UnsupportedPrimitive`."""
+    closed, s, k = _jaxpr(equation, p), equation.state_size, equation.unknowns
+    return _nodes(g, shared, closed, tuple(sorted(equation.fields)), s, k, p, equation.weak)
+
+
+def _jaxpr(equation: Any, p: Parameters) -> ClosedJaxpr:
+    """(u, state, previous, t, h, parameters) ↦ guess, residual, advance and the fields of a row in the order of their names."""
     s, k = equation.state_size, equation.unknowns
     scalar, vector = jax.ShapeDtypeStruct((), jnp.float64), lambda n: jax.ShapeDtypeStruct((n,), jnp.float64)
     leaf_shapes = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in p.shapes]
@@ -86,8 +94,13 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
             [jnp.asarray(row[name]) for name in sorted(row)],
         )
 
-    closed = jax.make_jaxpr(everything)(vector(k), vector(s), vector(k), scalar, scalar, leaf_shapes)
-    names = sorted(equation.fields)
+    return jax.make_jaxpr(everything)(vector(k), vector(s), vector(k), scalar, scalar, leaf_shapes)
+
+
+def _nodes(
+    g: Graph, shared: Inputs, closed: ClosedJaxpr, names: tuple[str, ...], s: int, k: int, p: Parameters, weak: tuple,
+    rules: Mapping[str, Rule] | None = None,
+) -> TracedEquation:  # fmt: skip
     state = [g.input(f"state{i}") for i in range(s)]
     unknowns = [g.input(f"u{i}") for i in range(k)]
     previous = [g.input(f"previous{i}") for i in range(k)]
@@ -100,7 +113,7 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
     arguments = [ids(unknowns), ids(state), ids(previous), ids(shared.t, ()), ids(shared.h, ()), *leaves]
     program = ScalarProgram(g, arguments)
     try:
-        program.run(closed)
+        program.run(closed, rules)
     except GraphTooLarge as error:
         raise UnsupportedPrimitive("the step as a whole", f"has {error}", "see docs/native-engine.md") from None
     guess, residual, advance, *rows = program.results
@@ -109,7 +122,7 @@ def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquat
     return TracedEquation(
         state, unknowns, previous, guess.tolist(), residual.tolist(), advance.tolist(),
         dict(zip(names, rows, strict=True)), nesting(closed.jaxpr),
-        array_operations(closed.jaxpr, policy.MORE_FOR_XLA), equation.weak,
+        array_operations(closed.jaxpr, policy.MORE_FOR_XLA), closed, weak,
     )  # fmt: skip
 
 
@@ -174,6 +187,17 @@ class StepProgram:
             distinct += [stage] if index == len(distinct) else []
             stages.append((index, float(fraction)))
         return cls(graph, shared, [trace(graph, shared, stage, p) for stage in distinct], stages, p)
+
+    @cached_property
+    def differentiable(self) -> "StepProgram":
+        """The same in a graph whose derivatives are those of JAX, where functions have rules of their own for them: in its own
+        graph such functions are what they are made of, as Newton's method needs them. Raises `UnsupportedPrimitive`."""
+        if not any(has_rules(e.jaxpr.jaxpr) for e in self.equations):
+            return self
+        graph, p = Graph(DERIVED * self.graph.limit), self.parameters
+        shared = inputs(graph, p.size)
+        of = lambda e: (e.jaxpr, tuple(sorted(e.rows)), len(e.state), len(e.unknowns), p, e.weak, DIFFERENTIABLE)
+        return StepProgram(graph, shared, [_nodes(graph, shared, *of(e)) for e in self.equations], self.stages, p)
 
     @property
     def nested(self) -> bool:

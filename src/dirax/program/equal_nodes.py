@@ -16,7 +16,7 @@ from dirax.program.graph import Graph
 
 PRIME = 2**61 - 1
 
-TOTAL = frozenset(("add", "sub", "mul", "neg", "sin", "cos"))
+TOTAL = frozenset(("add", "sub", "mul", "neg", "sin", "cos", "held", "ruled"))
 """Operations whose values are finite wherever their operands are: they bring no nan into what holds them."""
 
 
@@ -88,6 +88,8 @@ def values_modulo_prime(g: Graph, nodes: Iterable[int]) -> dict[int, int]:
             value = a[0] * a[1]
         elif op == "neg":
             value = -a[0]
+        elif op in ("held", "ruled"):
+            value = a[0]
         elif (number := g.number(node)) is not None and math.isfinite(number):
             numerator, denominator = number.as_integer_ratio()
             value = numerator * _inverse(denominator)

@@ -293,15 +293,37 @@ class Graph:
     def _not(self, a: int) -> int:
         return self.args[a][0] if self.op[a] == "not" else self._plain("not", a)
 
+    def _held(self, a: int) -> int:
+        return a if self.op[a] == "held" or self.is_boolean(a) else self._plain("held", a)
+
+    def _ruled(self, a: int, along: int) -> int:
+        return self.make("held", a) if self.is_constant(along) else self._plain("ruled", a, along)
+
     def _max(self, a: int, b: int) -> int:
-        return a if a == b else self._plain("max", a, b)
+        return a if a == b else self._compared("max", a, b)
 
     def _min(self, a: int, b: int) -> int:
-        return a if a == b else self._plain("min", a, b)
+        return a if a == b else self._compared("min", a, b)
+
+    def _compared(self, op: str, a: int, b: int) -> int:
+        """A comparison, which is logic where it is one of truth values."""
+        if not self.is_boolean(a):
+            return self._plain(op, a, b)
+        make = self.make
+        if op in ("max", "min"):
+            return make("or" if op == "max" else "and", a, b)
+        if op in ("lt", "le"):
+            return make("and" if op == "lt" else "or", make("not", a), b)
+        differ = make("or", make("and", a, make("not", b)), make("and", b, make("not", a)))
+        return make("not", differ) if op == "eq" else differ
+
+    _lt, _le, _eq, _ne = (lambda self, a, b, op=op: self._compared(op, a, b) for op in ("lt", "le", "eq", "ne"))
 
     _simplified: ClassVar[dict[str, Callable[..., int]]] = {
         **{"add": _add, "sub": _sub, "neg": _neg, "mul": _mul, "recip": _recip, "pow": _pow},
         **{"select": _select, "and": _and, "or": _or, "not": _not, "max": _max, "min": _min},
+        **{"lt": _lt, "le": _le, "eq": _eq, "ne": _ne},
+        **{"held": _held, "ruled": _ruled},
     }
 
     # ------------------------------------------------------------------ the whole

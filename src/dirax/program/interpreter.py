@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
 from dirax.program.graph import Graph
+from dirax.program.whole_numbers import Ranges
 
 Nodes = np.ndarray
 """An integer array of node numbers, in the shape of the array that it stands for."""
@@ -63,6 +64,7 @@ class Interpreter:
     def __init__(self, graph: Graph, rules: Mapping[str, Rule] | None = None):
         self.graph, self.rules = graph, {**RULES, **(rules or {})}
         self._equations: list[Any] = []
+        self.ranges = Ranges(graph)
         self.called: dict[tuple, tuple[Any, list[Any]]] = {}
 
     def run(self, closed: ClosedJaxpr, *operands: Any) -> list[Any]:
@@ -92,6 +94,15 @@ class Interpreter:
         flat = [graph.value[n] if graph.is_constant(n) else None for n in nodes.ravel().tolist()]
         return None if None in flat else np.array(flat, dtype=np.int64).reshape(nodes.shape)
 
+    def whole(self, nodes: Any, variable: Any) -> Any:
+        """Whole numbers as their type has them. Raises `Unsupported`."""
+        if isinstance(nodes, Unavailable):
+            return nodes
+        found = [self.ranges.wrapped(node, variable.aval.dtype) for node in nodes.ravel().tolist()]
+        if None in found:
+            raise Unsupported("may make whole numbers that float64 does not have")
+        return np.array(found, dtype=np.int64).reshape(nodes.shape)
+
     def _equation(self, equation: Any, operands: list[Any]) -> Sequence[Any]:
         name = equation.primitive.name
         lost = next((o for o in operands if isinstance(o, Unavailable)), None)
@@ -102,7 +113,8 @@ class Interpreter:
             if name not in self.rules:
                 raise Unsupported("is not supported")
             check_dtypes(equation)
-            return self.rules[name](self, equation, *operands)
+            results = self.rules[name](self, equation, *operands)
+            return [self.whole(x, v) if is_integer(v) else x for x, v in zip(results, equation.outvars, strict=True)]
         except Unsupported as error:
             # equations inside a library's jitted functions have no line of the user's: the calling equation has it
             line = next(filter(None, map(source_line, reversed(self._equations))), "unknown line")

@@ -23,6 +23,7 @@ from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
 from dirax.program.pushed_forward import pushed_forward
+from dirax.program.rules.differentiable import BACKWARD, has_rules
 from dirax.program.scalar_program import ScalarProgram
 
 MOST_NUMBERS = 128
@@ -39,7 +40,8 @@ _pushed: Memo[ClosedJaxpr] = Memo(KEPT)
 def on_host(function: Callable, leaves: Sequence[Any], key: Hashable) -> Any:
     """`function(*arguments)`, a pytree of float arrays, for each entry of `leaves`, arguments (entries, …) that JAX traces.
 
-    None where the function has no scalar program, closes over values that JAX traces, or takes more than `MOST_NUMBERS`.
+    None where the function has no scalar program, closes over values that JAX traces, takes more than `MOST_NUMBERS`, or has a
+    derivative in reverse mode alone.
     `key` is equal for functions that are, and has everything in it on which `function` depends.
     """
     shapes = [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves]
@@ -49,7 +51,7 @@ def on_host(function: Callable, leaves: Sequence[Any], key: Hashable) -> Any:
     jaxpr, result = _traced.get((key, *kinds), lambda: jax.make_jaxpr(function, return_shape=True)(*shapes))
     if any(isinstance(c, Tracer) for c in jaxpr.consts) or any(a.dtype != np.float64 for a in jaxpr.out_avals):
         return None
-    if _program(jaxpr) is None:
+    if _program(jaxpr) is None or has_rules(jaxpr.jaxpr, BACKWARD):
         return None
     return jax.tree.unflatten(jax.tree.structure(result), host_p.bind(*leaves, jaxpr=jaxpr, linear=0))
 

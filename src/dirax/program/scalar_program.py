@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,7 +73,7 @@ class ScalarProgram:
         made.run(jaxpr, {name: functools.partial(rule, made) for name, rule in NUMPY_RULES.items()} if by_numpy else {})
         return made
 
-    def run(self, jaxpr: ClosedJaxpr, rules: dict[str, Callable] | None = None) -> None:
+    def run(self, jaxpr: ClosedJaxpr, rules: Mapping[str, Callable] | None = None) -> None:
         """Find the results, the nodes of `jaxpr` of the inputs. Raises as `of`."""
         self.results = Interpreter(self.graph, rules).run(jaxpr, *self.inputs)
         for result in self.results:

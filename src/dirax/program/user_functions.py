@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.experimental import checkify
-from jax.extend.core import jaxprs_in_params
 
 from dirax.program.captured import Captured, as_stated, refuse_changed
 from dirax.program.compiled import compiled
+from dirax.program.indexed import clamps, indexes
 from dirax.program.memo import Memo
 from dirax.program.signatures import parameters_of, refuse_other_places, takes_params, takes_time
 from dirax.program.tracing import once
@@ -26,10 +26,6 @@ NO_MULTIPLIERS = (
     "forces that see the multipliers are for dx.LagrangeDAlembert, its (+) and (−) cases and their compositions, and for "
     'dx.DiscreteDirac(constraints="resolve")'
 )
-INDEXING = ("dynamic_slice", "gather")
-"""What JAX turns an index into when it is not known to be inside the array."""
-
-
 INDEX = re.compile(r"\bind(ex|ices|exing|exed)\b")
 """What the messages of Python and of JAX have that are about an index."""
 
@@ -127,10 +123,10 @@ class UserFunction(eqx.Module):
             out, jaxpr = _shapes.get((self.function, *self.signed, structure, kinds), lambda: self._shape(values))
         if jaxpr is not None and not is_traced(values, jaxpr.consts):
             note_values_matter()
-            if not _reads_inside(jaxpr, values) and (outside := compiled(_Indexing(self))(*values)[0].get()):
+            if outside := self._outside(jaxpr, values):
                 raise ValueError(
                     f"{self._call} reads an entry that its arguments, of shapes {_shapes_of(values)}, do not have "
-                    f"({_first_line(outside)}): check the length of the initial data and the indices."
+                    f"({outside}): check the length of the initial data and the indices."
                 )
         return out
 
@@ -149,7 +145,15 @@ class UserFunction(eqx.Module):
             what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
             raise TypeError(f"{self._call} must return one array of real numbers (float64), but it returned {what}.")
         traced = is_traced(values, jaxpr.consts)
-        return out, jaxpr if _indexes(jaxpr.jaxpr) and (traced or not _reads_inside(jaxpr, None)) else None
+        return out, jaxpr if indexes(jaxpr.jaxpr) and (traced or not _reads_inside(jaxpr, None)) else None
+
+    def _outside(self, jaxpr: Any, values: tuple) -> str | None:
+        """Which index is outside of its array at these values."""
+        inside = _reads_inside(jaxpr, values)
+        if clamps(jaxpr.jaxpr):  # JAX would report an index, too, that may be outside
+            return "an index is out of bounds" if inside is False else None
+        outside = None if inside else compiled(_Indexing(self))(*values)[0].get()
+        return outside and _first_line(outside)
 
     @property
     def signed(self) -> tuple:
@@ -229,20 +233,14 @@ def _hashable(function: Callable) -> Callable:
     return function
 
 
-def _indexes(jaxpr) -> bool:
-    """Whether an index occurs that JAX could not see to be inside its array."""
-    inner = [sub for equation in jaxpr.eqns for sub in jaxprs_in_params(equation.params)]
-    return any(e.primitive.name in INDEXING for e in jaxpr.eqns) or any(map(_indexes, inner))
-
-
 def reads_outside(jaxpr: Any) -> bool:
     """Whether an index of a closed jaxpr is outside of its array whatever the values are: JAX would read another entry."""
     from dirax.program.evaluation.indices import reads_outside
 
-    return _indexes(jaxpr.jaxpr) and reads_outside(jaxpr)
+    return indexes(jaxpr.jaxpr) and reads_outside(jaxpr)
 
 
-def _reads_inside(jaxpr, values) -> bool:
+def _reads_inside(jaxpr, values) -> bool | None:
     from dirax.program.evaluation.indices import reads_inside
 
     return reads_inside(jaxpr, values)

@@ -108,7 +108,7 @@ class Kernels:
         self.saved: Any = None
         """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
         self.places: Any = None
-        self.digest = _digest(self)
+        self.digest = _digest(self, step)
         self.repeated = len(step.stages) / len(step.equations)
         """How often, in the mean, an equation is solved in a step, which is compiled once."""
         self.runs = Runs(self._run, self.repeated)
@@ -146,7 +146,8 @@ class Kernels:
         if (reverse, width) not in self._linearizations:
             text = lambda: self._linearized(reverse).module(width, llvm.has_fma())
             levels = (QUICK,) if self.operations <= LARGE else (QUICK, SOON)
-            found = self._library("linearized", width, text, "backward" if reverse else "forward", levels=levels)
+            way = "backward" if reverse else "forward"
+            found = self._library("linearized", width, text, way, _digest(self, self.step.differentiable), levels=levels)
             self._linearizations[reverse, width] = llvm.function(found.library, "linearized", LINEARIZED_SIGNATURE)
         return self._linearizations[reverse, width]
 
@@ -167,7 +168,7 @@ class Kernels:
 
     def _linearized(self, reverse: bool) -> LinearizedLoop:
         """Of a step that has been planned, so that there is room for as many nodes as its derivatives need."""
-        step, one = self.step, backward if reverse else forward
+        step, one = self.step.differentiable, backward if reverse else forward
         jacobians, g = step.jacobians, step.graph.copy()
         linear = [one(g, e, step.shared, rows) for e, rows in zip(step.equations, jacobians, strict=True)]
         return LinearizedLoop(g, step.shared, step.equations, linear, step.stages, reverse)
@@ -247,8 +248,8 @@ def kernels(equation: Any, params: Any, batch_params: bool, compensated: bool = 
     return _kernels.get(key, lambda: Kernels(step, compensated, rules, whole))
 
 
-def _digest(made: Kernels) -> str:
-    step, g = made.step, made.step.graph
+def _digest(made: Kernels, step: StepProgram) -> str:
+    g = step.graph
     rows = lambda e: [(name, nodes.shape, nodes.ravel().tolist()) for name, nodes in sorted(e.rows.items())]
     outputs = [(e.state, e.unknowns, e.previous, e.guess, e.residual, e.advance, rows(e), e.weak) for e in step.equations]
     constants = sorted((node, value) for node, value in g.value.items() if node < step.size)

@@ -92,7 +92,7 @@ def _by_levels(equation: Any, stage: Any, shapes: tuple, params: Any, batch_para
     if array_operations(jax.make_jaxpr(stage.residual)(*shapes).jaxpr) <= policy.MOST_ARRAY_OPERATIONS:
         return None
     try:
-        made = step_program(equation, params, batch_params)
+        made = step_program(equation, params, batch_params).differentiable
         index = next(index for (index, _), (other, _) in zip(made.stages, equation.stages, strict=True) if other is stage)
         jacobian = made.jacobians[index]
     except (UnsupportedPrimitive, GraphTooLarge):

@@ -9,14 +9,15 @@ import numpy as np
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
+from dirax.program.indexed import INDEXING, unguarded
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable
 
 
-def reads_inside(jaxpr: Any, values: tuple | None) -> bool:
-    """Whether every index of a closed jaxpr is inside its array at these values, at any by default; False where that is not
-    found."""
+def reads_inside(jaxpr: Any, values: tuple | None) -> bool | None:
+    """Whether every index of a closed jaxpr that has to be inside its array is so at these values, at any by default; None where
+    that is not found."""
     found = _indices(jaxpr, values)
-    return found is not None and all(found)
+    return None if found is None or (None in found and False not in found) else all(found)
 
 
 def reads_outside(jaxpr: Any) -> bool:
@@ -30,13 +31,14 @@ def _indices(jaxpr: Any, values: tuple | None) -> list[bool | None] | None:
 
     def watched(name: str) -> Callable:
         def read(interpreter: Interpreter, equation: Any, x: Nodes, *starts: Nodes):
-            inside.append(_inside(interpreter, equation, x.shape, starts))
+            if unguarded(equation):
+                inside.append(_inside(interpreter, equation, x.shape, starts))
             return RULES[name](interpreter, equation, x, *starts)
 
         return read
 
     graph = Graph(NODE_LIMIT)
-    interpreter = Interpreter(graph, {name: watched(name) for name in ("gather", "dynamic_slice")})
+    interpreter = Interpreter(graph, {name: watched(name) for name in INDEXING})
     try:
         if values is None:
             operands = [_unknown(graph, f"x{number}", v.aval.shape) for number, v in enumerate(jaxpr.jaxpr.invars)]

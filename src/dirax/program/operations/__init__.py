@@ -7,6 +7,7 @@ import numpy as np
 
 from dirax.program.operations import (
     arithmetic,
+    derivatives,
     error_function,
     exponential,
     hyperbolic,
@@ -19,7 +20,7 @@ from dirax.program.operations.operation import Operation
 
 FAMILIES = (
     *(arithmetic, logic, trigonometric, inverse_trigonometric),
-    *(exponential, logarithms_and_powers, hyperbolic, error_function),
+    *(exponential, logarithms_and_powers, hyperbolic, error_function, derivatives),
 )
 OPERATIONS: dict[str, Operation] = {operation.name: operation for family in FAMILIES for operation in family.OPERATIONS}
 

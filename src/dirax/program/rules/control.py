@@ -34,9 +34,12 @@ def call(interpreter: Interpreter, equation: Any, *operands):
 
 @rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", lazy=True)
 def custom_derivative(interpreter: Interpreter, equation: Any, *operands):
-    p = equation.params
-    inner = next(p[key] for key in ("call_jaxpr", "fun_jaxpr", "jaxpr") if key in p)
-    return interpreter.run(closed(inner), *operands)
+    return interpreter.run(closed(inner_jaxpr(equation)), *operands)
+
+
+def inner_jaxpr(equation: Any) -> Any:
+    """What a function with a rule of its own for its derivative is made of."""
+    return next(equation.params[key] for key in ("call_jaxpr", "fun_jaxpr", "jaxpr") if key in equation.params)
 
 
 @rule("cond", lazy=True)
@@ -102,7 +105,7 @@ def loop(interpreter: Interpreter, equation: Any, *operands):
         (going,) = interpreter.run(p["cond_jaxpr"], *for_cond, *carry)
         if isinstance(going, Unavailable):
             return [going] * len(equation.outvars)
-        if not g.is_constant(going.item()):
+        if going.size != 1 or not g.is_constant(going.item()):  # under vmap each entry has a condition of its own
             raise Unsupported("is a loop whose length depends on the state")
         if not g.value[going.item()]:
             return carry

@@ -1,8 +1,9 @@
 """The rules of derivatives, which are taken on a graph of their own."""
 
+import functools
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -10,7 +11,7 @@ from jax.extend.core import ClosedJaxpr
 
 from dirax.program.graph import Graph
 from dirax.program.graph_derivatives import gradient, jacobian
-from dirax.program.interpreter import Interpreter, Nodes, Unavailable, Unsupported, elementwise, rule
+from dirax.program.interpreter import Interpreter, Nodes, Rule, Unavailable, Unsupported, elementwise, rule
 from dirax.program.memo import Memo, Same
 from dirax.program.rules import formulas
 from dirax.program.rules.reductions import fold
@@ -19,33 +20,35 @@ from dirax.program.tracing import of_one_result
 KEPT = 256
 """Derivatives kept in memory."""
 
+Kept: TypeAlias = Mapping[str, Rule] | None
+
 
 _derived: Memo["Derived"] = Memo(KEPT)
 _pushed: Memo[ClosedJaxpr] = Memo(KEPT)
 
 
 @rule("dirax_derivative")
-def derivative(interpreter: Interpreter, equation: Any, *operands: Nodes):
+def derivative(interpreter: Interpreter, equation: Any, *operands: Nodes, kept: Kept = None):
     """Derived on a graph of its own, whose inputs stand for the operands, so that nothing is simplified across them."""
     jaxpr, wanted, limit = equation.params["jaxpr"], equation.params["wanted"], interpreter.graph.limit
-    own = _derived.get((Same(jaxpr), wanted, limit), lambda: Derived.by_operands(jaxpr, wanted, limit))
+    own = _derived.get((Same(jaxpr), wanted, limit, kept is None), lambda: Derived.by_operands(jaxpr, wanted, limit, kept))
     return own.results_in(interpreter.graph, operands)
 
 
 @rule("dirax_directional")
-def directional(interpreter: Interpreter, equation: Any, *operands: Nodes):
+def directional(interpreter: Interpreter, equation: Any, *operands: Nodes, kept: Kept = None):
     """The same by a number s at 0, by which the point is moved along the direction."""
     jaxpr, count, limit = equation.params["jaxpr"], equation.params["count"], interpreter.graph.limit
-    own = _derived.get((Same(jaxpr), count, limit), lambda: Derived.along(jaxpr, count, limit))
+    own = _derived.get((Same(jaxpr), count, limit, kept is None), lambda: Derived.along(jaxpr, count, limit, kept))
     return own.results_in(interpreter.graph, [*operands, np.array(interpreter.graph.zero)])
 
 
 @rule("dirax_pullback")
-def pullback(interpreter: Interpreter, equation: Any, *operands: Nodes):
+def pullback(interpreter: Interpreter, equation: Any, *operands: Nodes, kept: Kept = None):
     """The sum over rows of the derivative, each times an entry of the covector."""
     jaxpr, limit, g = equation.params["jaxpr"], interpreter.graph.limit, interpreter.graph
     wanted = (len(operands) - 2,)
-    own = _derived.get((Same(jaxpr), wanted, limit), lambda: Derived.by_operands(jaxpr, wanted, limit))
+    own = _derived.get((Same(jaxpr), wanted, limit, kept is None), lambda: Derived.by_operands(jaxpr, wanted, limit, kept))
     (matrix,), covector = own.results_in(g, operands[:-1]), operands[-1].tolist()
     return [np.array([fold(interpreter, "add", map(g.mul, column, covector)) for column in matrix.T.tolist()], np.int64)]
 
@@ -67,27 +70,28 @@ def pushed_forward(equation: Any, k: int) -> ClosedJaxpr:
 class Derived:
     """A graph in which powers and functions with rules of their own are single nodes, as long as it is differentiated.
 
-    `written[node]` is the value of such a function in other nodes.
+    `written[node]` is the value of such a function in other nodes. With the rules `kept` of `differentiable.py` the results, too,
+    have derivatives by the rules of the functions.
     """
 
-    def __init__(self, limit: int):
-        self.graph = Graph(limit)
+    def __init__(self, limit: int, kept: Kept = None):
+        self.graph, self.kept = Graph(limit), kept
         self.written: dict[int, int] = {}
         self.inputs: list[int] = []
         self.results: list[Nodes] = []
 
     @classmethod
-    def by_operands(cls, jaxpr: ClosedJaxpr, wanted: tuple[int, ...], limit: int) -> "Derived":
+    def by_operands(cls, jaxpr: ClosedJaxpr, wanted: tuple[int, ...], limit: int, kept: Kept = None) -> "Derived":
         """The derivatives of a jaxpr with one result by its operands of these numbers. Raises `Unsupported`."""
-        made = cls(limit)
+        made = cls(limit, kept)
         inputs = [made._fresh(v.aval.shape) for v in jaxpr.jaxpr.invars]
         made._differentiate(jaxpr, inputs, [inputs[k] for k in wanted])
         return made
 
     @classmethod
-    def along(cls, jaxpr: ClosedJaxpr, count: int, limit: int) -> "Derived":
+    def along(cls, jaxpr: ClosedJaxpr, count: int, limit: int, kept: Kept = None) -> "Derived":
         """The one along a direction of the last `count` operands; the inputs are operands, direction and s."""
-        made, shapes = cls(limit), [v.aval.shape for v in jaxpr.jaxpr.invars]
+        made, shapes = cls(limit, kept), [v.aval.shape for v in jaxpr.jaxpr.invars]
         inputs = [made._fresh(shape) for shape in shapes]
         direction = [made._fresh(shape) for shape in shapes[-count:]]
         s, g = made._fresh(()), made.graph
@@ -136,7 +140,7 @@ class Derived:
             if g.is_constant(operand.item()):
                 slopes.append(None)
                 continue
-            (slope,) = Interpreter(g).run(pushed_forward(equation, k), *operands)
+            (slope,) = Interpreter(g, self.kept).run(pushed_forward(equation, k), *operands)
             if isinstance(slope, Unavailable):
                 return [slope]
             slopes.append(slope.item())
@@ -162,15 +166,31 @@ class Derived:
             node = stack.pop()
             if node not in seen:
                 seen.add(node)
-                stack.extend([self.written[node]] if node in self.written else source.args[node])
+                stack.extend(source.args[node] if node not in self.written else self._needed(node))
         for node in sorted(seen - set(known)):  # operands first
             if node in self.written:
-                there[node] = there[self.written[node]]
+                there[node] = self._made(target, node, there)
             elif source.is_constant(node):
                 there[node] = target.constant(source.value[node])
             else:
                 there[node] = target.make(source.op[node], *(there[a] for a in source.args[node]))
         return [there[node] for node in outputs]
+
+    def _needed(self, node: int) -> list[int]:
+        """What a function as one node is made again of."""
+        along = [x for pair in self._slopes(node) for x in pair] if self.kept else []
+        return [self.written[node], *along]
+
+    def _slopes(self, node: int) -> list[tuple[int, int]]:
+        slopes = zip(self.graph.args[node], self.graph.slopes[node], strict=True)
+        return [(operand, slope) for operand, slope in slopes if slope is not None]
+
+    def _made(self, target: Graph, node: int, there: dict[int, int]) -> int:
+        value = there[self.written[node]]
+        if not self.kept:
+            return value
+        moved = [target.mul(target.make("held", there[s]), target.make("motion", there[x])) for x, s in self._slopes(node)]
+        return target.make("ruled", value, functools.reduce(target.add, moved, target.zero))
 
 
 def _power(interpreter: Interpreter, equation: Any, x: Nodes, *exponent: Nodes):

@@ -4,6 +4,7 @@ import functools
 from typing import Any
 
 import numpy as np
+from jax.lax import RoundingMethod
 
 from dirax.program.graph import Graph
 from dirax.program.interpreter import Interpreter, Unsupported, elementwise, is_integer, rule
@@ -66,8 +67,6 @@ BY_LEMMA = {
 @rule(*SAME)
 def same(interpreter: Interpreter, equation: Any, *operands):
     graph, op = interpreter.graph, SAME[equation.primitive.name]
-    if op in ("eq", "ne") and equation.invars[0].aval.dtype == np.bool_:
-        return [elementwise(lambda a, b: _exclusive_or(graph, a, b, op == "eq"), *operands)]
     return [elementwise(functools.partial(DIRECT[op], graph) if op in DIRECT else functools.partial(graph.make, op), *operands)]
 
 
@@ -75,11 +74,6 @@ def same(interpreter: Interpreter, equation: Any, *operands):
 def by_lemma(interpreter: Interpreter, equation: Any, *operands):
     graph, function = interpreter.graph, BY_LEMMA[equation.primitive.name]
     return [elementwise(lambda *nodes: function(graph, *nodes), *operands)]
-
-
-def _exclusive_or(g: Graph, a: int, b: int, inverted: bool) -> int:
-    differ = g.make("or", g.make("and", a, g.make("not", b)), g.make("and", b, g.make("not", a)))
-    return g.make("not", differ) if inverted else differ
 
 
 @rule("div")
@@ -107,11 +101,15 @@ def integer_power(interpreter: Interpreter, equation: Any, x):
 @rule("round")
 def rounded(interpreter: Interpreter, equation: Any, x):
     g = interpreter.graph
-    to_even = "EVEN" in str(equation.params["rounding_method"])
-    if to_even:
+    if equation.params["rounding_method"] == RoundingMethod.TO_NEAREST_EVEN:
         return [elementwise(lambda a: g.make("round", a), x)]
-    half = lambda a: g.mul(g.make("sign", a), g.make("floor", g.add(g.make("abs", a), g.constant(0.5))))
-    return [elementwise(half, x)]
+
+    def away_from_zero(a: int) -> int:
+        whole = g.make("trunc", a)
+        far = g.make("le", g.constant(0.5), g.make("abs", g.sub(a, whole)))  # the difference is exact
+        return g.select(far, g.add(whole, g.make("sign", a)), whole)
+
+    return [elementwise(away_from_zero, x)]
 
 
 @rule("and", "or", "xor", "not")
@@ -123,9 +121,7 @@ def logical(interpreter: Interpreter, equation: Any, *operands):
             raise Unsupported("acts on bits that depend on the state")
         bitwise = {"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "not": np.invert}
         return [interpreter.constants(bitwise[name](*values))]
-    if name == "xor":
-        return [elementwise(lambda a, b: _exclusive_or(g, a, b, False), *operands)]
-    return [elementwise(lambda *nodes: g.make(name, *nodes), *operands)]
+    return [elementwise(functools.partial(g.make, "ne" if name == "xor" else name), *operands)]
 
 
 @rule("select_n")
@@ -152,7 +148,7 @@ def convert(interpreter: Interpreter, equation: Any, x):
     if new == np.bool_ and old != np.bool_:
         return [elementwise(lambda a: g.make("ne", a, g.zero), x)]
     if np.issubdtype(new, np.integer) and np.issubdtype(old, np.floating):
-        return [elementwise(lambda a: g.make("trunc", a), x)]
+        return [elementwise(lambda a: interpreter.ranges.saturated(g.make("trunc", a), new), x)]
     return [x]
 
 

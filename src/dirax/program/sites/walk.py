@@ -10,7 +10,9 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 from jax.interpreters import partial_eval
 
-from dirax.program.interpreter import RULES, Interpreter, Unsupported, check_dtypes
+from dirax.program.interpreter import RULES, Interpreter, Unsupported, check_dtypes, is_integer
+from dirax.program.rules.control import inner_jaxpr
+from dirax.program.rules.differentiable import RULED, is_float, tangent
 from dirax.program.rules.reductions import FOLDS, factors_of_product
 from dirax.program.sites.courses import Course, NotBySites, taken_apart
 from dirax.program.sites.pieces import Expressions, Piece, Place, gathered, shared
@@ -58,6 +60,7 @@ class _Walk:
         self.expressions = Expressions()
         self.interpreter = Interpreter(self.expressions.graph)
         self.arguments, self.constants, self.totals = arguments, [], []
+        self.plain = False
 
     def results(self, closed: ClosedJaxpr, leaves: list[Any]) -> Sites:
         given: list[Value] = []
@@ -90,11 +93,26 @@ class _Walk:
                 raise NotBySites(f"'{equation.primitive.name}' is not known entry by entry")
         for equation in jaxpr.eqns:
             results = self._equation(equation, [read(atom) for atom in equation.invars])
-            values.update(zip(equation.outvars, results, strict=True))
+            values.update((v, self._whole(x, v)) for v, x in zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
+
+    def _whole(self, value: Value, variable: Any) -> Value:
+        """Whole numbers as their type has them."""
+        if isinstance(value, np.ndarray) or not is_integer(variable):
+            return value
+        try:
+            nodes = self.interpreter.whole(np.array([piece.node for piece in value], np.int64), variable)
+        except Unsupported as error:
+            raise NotBySites(str(error)) from None
+        return [piece._replace(node=node) for piece, node in zip(value, nodes.tolist(), strict=True)]
 
     def _equation(self, equation: Any, operands: list[Value]) -> Sequence[Value]:
         name, p = equation.primitive.name, equation.params
+        if name in RULED and not self.plain and not all(isinstance(o, np.ndarray) for o in operands):
+            try:
+                return self._by_its_rule(equation, operands)
+            except Unsupported as error:
+                raise NotBySites(f"'{name}' {error}") from None
         if name in CALLS:
             inner = p[CALLS[name]]
             return self._run(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), operands)
@@ -122,6 +140,34 @@ class _Walk:
         except Unsupported as error:
             raise NotBySites(f"'{name}' {error}") from None
         raise NotBySites(f"'{name}' is not known entry by entry")
+
+    def _by_its_rule(self, equation: Any, operands: list[Value]) -> Sequence[Value]:
+        """What has a rule of its own for its derivative, as `dirax.program.rules.differentiable` has it."""
+        make, e = self.expressions.graph.make, self.expressions
+
+        def of(op: str, variables: Sequence[Any]) -> list[Value]:
+            chosen = [(x, v) for x, v in zip(operands, equation.invars, strict=True) if v in variables]
+            pieces = [self.pieces(x, v.aval.shape) for x, v in chosen]
+            return [[p._replace(node=make(op, p.node)) for p in own] for own in pieces]
+
+        if equation.primitive.name == "stop_gradient":
+            return of("held", equation.invars)
+        inner = inner_jaxpr(equation)
+        values = self._run(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), operands)
+        moving = [v for v in equation.invars if is_float(v)]
+        self.plain = True  # in a tangent all that could have a rule is held
+        try:
+            along = iter(self._run(tangent(equation), [*of("held", equation.invars), *of("motion", moving)]))
+        finally:
+            self.plain = False
+
+        def ruled(value: Value, variable: Any) -> Value:
+            if not is_float(variable):
+                return value
+            both = shared(e, [self.pieces(x, variable.aval.shape) for x in (value, next(along))])
+            return [piece._replace(node=make("ruled", *nodes)) for piece, nodes in both]
+
+        return [ruled(value, v) for value, v in zip(values, equation.outvars, strict=True)]
 
     def _known(self, equation: Any, operands: list[Any]) -> Sequence[Value]:
         name = equation.primitive.name

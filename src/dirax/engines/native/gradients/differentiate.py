@@ -153,6 +153,7 @@ def run_traced(problem: Problem) -> Outcome:
     c = jnp.concatenate(columns, axis=1) if columns else jnp.zeros((batch, 1))
     made = kernels(task.equation, np.zeros((1, c.shape[1])), True, p.compensated)
     made.check()
+    _ = made.step.differentiable
     guesses = [jnp.asarray(g).reshape(batch, -1) for g in p.guess]
     guess = jnp.stack([jnp.pad(g, ((0, 0), (0, task.unknowns - g.shape[1]))) for g in guesses], axis=1)
     clock = [jnp.broadcast_to(jnp.asarray(x, float), (batch,)) for x in (p.t0, p.h)]
