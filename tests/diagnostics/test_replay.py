@@ -1,6 +1,7 @@
 """verify() takes every step again: a saved number off by a millionth is seen, in any field, and no right run is accused."""
 
 import dataclasses
+import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -88,6 +89,33 @@ def test_every_damage_is_seen(name):
 @pytest.mark.parametrize("name", ["plain", pytest.param("composed", marks=pytest.mark.soak), "discrete gradient", "holonomic"])
 def test_also_where_not_every_step_is_saved(name):
     assert_seen(run(name, save_every=7))
+
+
+FAR = 10_000
+
+
+@pytest.mark.parametrize("name", ["plain", "holonomic", "discrete gradient"])
+def test_also_where_rows_are_far_apart(name):
+    """In a moment: the steps are taken by the engine of the run."""
+    sol = run(name, step=0.005, steps=3 * FAR, save_every=FAR)
+    begun = time.perf_counter()
+    line = replayed(sol, None)
+    assert line.verdict == "ok" and time.perf_counter() - begun < 5.0
+    for field in sol.equation.fields:
+        if field not in ("constraint", "power", "power_terms", "work") and len(sol.fields[field]):
+            changed = np.array(sol.fields[field])
+            changed[1] *= 1.0 + DAMAGE
+            assert replayed(sol.replace(fields=sol.fields | {field: changed}), None).verdict == "VIOLATED", field
+
+
+@pytest.mark.parametrize(("apart", "verdict"), [(100, "ok"), (1000, "ok"), (FAR, "not checked")])
+def test_roundoff_that_many_chaotic_steps_enlarge_is_no_damage(apart, verdict):
+    potential = lambda q: 9.81 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+    system = dx.LagrangeDirac(lambda q, v: v[0] ** 2 + v[1] ** 2 / 2 + v[0] * v[1] * jnp.cos(q[0] - q[1]) + potential(q))
+    sol = dx.simulate(system, MIDPOINT, q=[2.0, 1.0], v=[0.0, 0.0], step=0.02, steps=6 * apart, save_every=apart)
+    line = replayed(sol, None)
+    assert line.verdict == verdict
+    assert verdict == "ok" or "roundoff grows to the size of what is saved" in line.explanation
 
 
 def hanging(links):
