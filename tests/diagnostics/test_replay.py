@@ -201,3 +201,23 @@ def test_another_solution_of_the_equations_of_a_step_is_one():
         changed = np.array(sol.fields[name])
         changed[row] *= 1.0 + off
         assert dx.verify(sol.replace(fields=sol.fields | {name: changed}))["steps replayed"].verdict == "VIOLATED", (name, row)
+
+
+ROLLING = dx.LagrangeDirac(
+    lambda q, v: v @ v / 2 - q @ q / 2 - q[0] ** 4, one_forms=lambda q: jnp.array([[-0.3, jnp.sin(q[0]), 1.0]])
+)
+RUNS_OF_SEVERAL_ROOTS = [(MIDPOINT, 1.5, 54, 160), (MIDPOINT, 1.0, 13, 200)]
+
+
+@pytest.mark.parametrize(("scheme", "h", "seed", "steps"), RUNS_OF_SEVERAL_ROOTS)
+def test_also_where_the_step_after_says_what_a_row_holds(scheme, h, seed, steps):
+    """Mean momenta belong to the steps on both sides, each with several solutions; the second run fails, and no step says which
+    momentum its last row has."""
+    start = np.random.default_rng(seed)
+    q, v = start.normal(size=3) / 2, start.normal(size=3) / 2
+    sol = dx.simulate(ROLLING, scheme, q=q, v=v, step=h, steps=steps, project=True)
+    assert replayed(sol, None).verdict == "ok"
+    for name, row, off in (("q", 9, 1e-9), ("p", 9, 1e-6), ("multipliers", 9, 1e-6), ("q", -1, 1e-9)):
+        changed = np.array(sol.fields[name])
+        changed[row] *= 1.0 + off
+        assert replayed(sol.replace(fields=sol.fields | {name: changed}), None).verdict == "VIOLATED", (name, row)

@@ -285,16 +285,20 @@ class Replay:
         here = {name: np.where(_column(made.good, a), a, np.nan) for name, a in here.items()}
         return Again(here, np.where(good[:, None], after, np.nan), good, there, made.unknowns, made.states[0], first)
 
-    def leading_to(self, at: Rows, guess: np.ndarray, wanted: dict[int, np.ndarray]) -> Again:
-        """Steps of one part that leave these rows and lead to the wanted entries of states, where there are such."""
+    def leading_to(self, at: Rows, guess: np.ndarray, wanted: dict[int, np.ndarray], then: dict[int, np.ndarray]) -> Again:
+        """Steps of one part that leave these rows and lead to the wanted entries of states, where there are such, and steps after
+        them that lead to others."""
         made = self.steps.leading_to(at.states, guess, wanted, at.t, float(self.sol.step), at.params)
-        return self._taken(made, at.t, at.params)
+        return self._taken(made, at.t, at.params, then)
 
-    def _taken(self, made: Attempts, t: np.ndarray, params: np.ndarray) -> Again:
-        """Steps of one part that nothing needs to solve again."""
+    def _taken(self, made: Attempts, t: np.ndarray, params: np.ndarray, wanted: dict[int, np.ndarray] | None = None) -> Again:
+        """Steps of one part that nothing needs to solve again; those after them lead to the wanted entries, where they can."""
         h, there = float(self.sol.step), None
         if self.hides:
             then = self.steps.step(made.after, made.unknowns, t + h, h, params)
+            if wanted is not None:
+                led = self.steps.leading_to(made.after, made.unknowns[0], wanted, t + h, h, params)
+                then.put(led.good, led[led.good])
             there = self.steps.rows(then, t + h, h, params)
         here = {name: np.where(_column(made.good, a), a, np.nan) for name, a in self.steps.rows(made, t, h, params).items()}
         after = np.where(made.good[:, None], made.after, np.nan)

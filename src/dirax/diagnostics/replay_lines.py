@@ -172,10 +172,14 @@ class _Comparison:
             self.expected[rows] = np.where(np.isnan(said), old, said)
 
     def _exist(self, entries: np.ndarray) -> np.ndarray:
-        """Which numbers the rows have: those of steps are not in the last one of a trajectory."""
-        last = self.at.rows[entries] >= self.replay.ends[self.at.lanes[entries]]
-        of_step = [self.replay.sol.field_info[name].place == "step" for name, size in self.sizes.items() for _ in range(size)]
-        return ~(last[:, None] & np.array([*of_step, False])[None])
+        """Which numbers the rows have: those of steps are not in the last one of a trajectory, and in that of a failed one no
+        step was solved that could say more than the state."""
+        sol, lanes = self.replay.sol, self.at.lanes[entries]
+        last, ok = self.at.rows[entries] >= self.replay.ends[lanes], np.atleast_1d(sol.ok)[lanes]
+        of_step = [sol.field_info[name].place == "step" for name, size in self.sizes.items() for _ in range(size)]
+        said = np.isin(np.arange(self.saved.shape[1] - 1), list(self.held.values()), invert=True)
+        lacking = np.where(ok[:, None], np.array(of_step)[None], said)
+        return np.pad(~(last[:, None] & lacking), ((0, 0), (0, 1)), constant_values=True)
 
     def _expect_given_points(self) -> None:
         """Row 0 is what was given, and row 1 follows from it alone."""
@@ -247,13 +251,19 @@ class _Comparison:
             self._try_from_next_rows(entries[(self.next[entries] >= 0) & (self.at.steps[entries] == 1)])
 
     def _try_from_next_rows(self, entries: np.ndarray) -> None:
-        """Steps again from unknowns that lead to the next rows."""
+        """Steps again from unknowns that lead to the next rows, and on to those after them."""
         entries = entries[: int(MOST_CUBED / max(1, self.again.unknowns[0].shape[1]) ** 3)]
         if not len(entries):
             return
-        after, (first, _) = self.saved[self.next[entries]], self.replay.held[min(self.replay.held)]
-        wanted = {i: after[:, self.held[i]] for i, (name, _) in self.replay.held.items() if name == first}
-        again = self.replay.leading_to(self.at[entries], self.again.unknowns[0][entries], wanted)
+        first, _ = self.replay.held[min(self.replay.held)]
+        one = self.next[entries]
+        two = np.where(self.at.steps[one] == 1, self.next[one], -1)
+        held = lambda rows: {
+            i: np.where(rows >= 0, self.saved[rows, self.held[i]], np.nan)
+            for i, (name, _) in self.replay.held.items()
+            if name == first
+        }
+        again = self.replay.leading_to(self.at[entries], self.again.unknowns[0][entries], held(one), held(two))
         self._expect(entries, *self._said(again), if_nearer=True)
 
 

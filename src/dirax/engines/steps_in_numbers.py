@@ -59,6 +59,9 @@ class Attempts:
     after: np.ndarray
     good: np.ndarray
 
+    def __getitem__(self, some: Any) -> "Attempts":
+        return Attempts([u[some] for u in self.unknowns], [a[some] for a in self.states], self.after[some], self.good[some])
+
     def put(self, some: np.ndarray, others: "Attempts") -> None:
         """Take other attempts in place of some."""
         for own, other in ((self.unknowns, others.unknowns), (self.states, others.states)):
