@@ -160,7 +160,7 @@ class Replay:
     @property
     def too_long(self) -> bool:
         """Whether there is no time for a few rows, with all the steps between them."""
-        return self.steps.operations(FEWEST, CALL) * self._steps_a_row > LONGEST
+        return self._steps_a_row > max(1.0, LONGEST / self.steps.operations(FEWEST, CALL))
 
     def chosen(self) -> tuple[np.ndarray, np.ndarray]:
         """(trajectory, row) of the rows whose steps are taken again: all that were reached, or as many as there is time for."""

@@ -28,9 +28,9 @@ ROUGHLY = 1e-12
 ROWS, MOST_NUMBERS = 6, 2**19
 """Rows that are taken again, unless all their steps have more numbers than this: then as many as have, and one at least."""
 
-DISTURBANCES = 2.0**-30, 2.0**-47
-"""By how much, relatively, all numbers of a state are changed, to see how far rounding moves what comes out. The first is far
-above rounding; of the second many steps make all that a motion can differ by only where they do so of rounding, or nearly."""
+DISTURBANCES = 2.0**-30, 2.0**-51, 2.0**-51
+"""By how much, relatively, all numbers of a state are changed, to see how far rounding moves what comes out: far above rounding,
+and as little as rounding does, which shows what differences of rounded numbers, and very many steps, make of that."""
 
 
 def replayed_of_many(sol: Solution, name: str, tolerance: float | None) -> Line:
