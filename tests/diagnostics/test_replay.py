@@ -1,6 +1,7 @@
 """verify() takes every step again: a saved number off by a millionth is seen, in any field, and no right run is accused."""
 
 import dataclasses
+import time
 
 import jax.numpy as jnp
 import numpy as np
@@ -88,6 +89,33 @@ def test_every_damage_is_seen(name):
 @pytest.mark.parametrize("name", ["plain", pytest.param("composed", marks=pytest.mark.soak), "discrete gradient", "holonomic"])
 def test_also_where_not_every_step_is_saved(name):
     assert_seen(run(name, save_every=7))
+
+
+FAR = 10_000
+
+
+@pytest.mark.parametrize("name", ["plain", "holonomic", "discrete gradient"])
+def test_also_where_rows_are_far_apart(name):
+    """In a moment: the steps are taken by the engine of the run."""
+    sol = run(name, step=0.005, steps=3 * FAR, save_every=FAR)
+    begun = time.perf_counter()
+    line = replayed(sol, None)
+    assert line.verdict == "ok" and time.perf_counter() - begun < 5.0
+    for field in sol.equation.fields:
+        if field not in ("constraint", "power", "power_terms", "work") and len(sol.fields[field]):
+            changed = np.array(sol.fields[field])
+            changed[1] *= 1.0 + DAMAGE
+            assert replayed(sol.replace(fields=sol.fields | {field: changed}), None).verdict == "VIOLATED", field
+
+
+@pytest.mark.parametrize(("apart", "verdict"), [(100, "ok"), (1000, "ok"), (FAR, "not checked")])
+def test_roundoff_that_many_chaotic_steps_enlarge_is_no_damage(apart, verdict):
+    potential = lambda q: 9.81 * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+    system = dx.LagrangeDirac(lambda q, v: v[0] ** 2 + v[1] ** 2 / 2 + v[0] * v[1] * jnp.cos(q[0] - q[1]) + potential(q))
+    sol = dx.simulate(system, MIDPOINT, q=[2.0, 1.0], v=[0.0, 0.0], step=0.02, steps=6 * apart, save_every=apart)
+    line = replayed(sol, None)
+    assert line.verdict == verdict
+    assert verdict == "ok" or "roundoff grows to the size of what is saved" in line.explanation
 
 
 def hanging(links):
@@ -182,3 +210,23 @@ def test_a_network_with_a_diode_is_replayed():
     sol = dx.simulate(dx.circuit(parts), dx.DiscreteDirac(), x=[0.0], step=0.05, steps=20)
     line = replayed(sol, None)
     assert line.verdict == "ok" and "could not" not in line.explanation
+
+
+ROLLING = dx.LagrangeDirac(
+    lambda q, v: v @ v / 2 - q @ q / 2 - q[0] ** 4, one_forms=lambda q: jnp.array([[-0.3, jnp.sin(q[0]), 1.0]])
+)
+RUNS_OF_SEVERAL_ROOTS = [(MIDPOINT, 1.5, 54, 160), (MIDPOINT, 1.0, 13, 200)]
+
+
+@pytest.mark.parametrize(("scheme", "h", "seed", "steps"), RUNS_OF_SEVERAL_ROOTS)
+def test_also_where_the_step_after_says_what_a_row_holds(scheme, h, seed, steps):
+    """Mean momenta belong to the steps on both sides, each with several solutions; the second run fails, and no step says which
+    momentum its last row has."""
+    start = np.random.default_rng(seed)
+    q, v = start.normal(size=3) / 2, start.normal(size=3) / 2
+    sol = dx.simulate(ROLLING, scheme, q=q, v=v, step=h, steps=steps, project=True)
+    assert replayed(sol, None).verdict == "ok"
+    for name, row, off in (("q", 9, 1e-9), ("p", 9, 1e-6), ("multipliers", 9, 1e-6), ("q", -1, 1e-9)):
+        changed = np.array(sol.fields[name])
+        changed[row] *= 1.0 + off
+        assert replayed(sol.replace(fields=sol.fields | {name: changed}), None).verdict == "VIOLATED", (name, row)

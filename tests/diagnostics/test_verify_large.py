@@ -74,6 +74,12 @@ def test_multipliers_are_those_of_momenta_that_rows_do_not_hold(save_every):
         assert line(sol.replace(fields=sol.fields | {name: changed})).verdict == VIOLATED, name
 
 
+def test_rows_with_a_projected_momentum_do_not_hold_what_the_multipliers_belong_to():
+    pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.81 * q[1], holonomic=lambda q: jnp.array([(q @ q - 1) / 2]))
+    sol = dx.simulate(pendulum, dx.LagrangeDAlembert(), q=[np.sin(0.5), -np.cos(0.5)], v=[0.0, 0.0], step=0.01, steps=50)
+    assert replayed_of_many(sol, "steps replayed", None).verdict == "ok"
+
+
 @pytest.mark.soak
 def test_a_chain_of_links_passes():
     q = hanging_chain.straight(400)

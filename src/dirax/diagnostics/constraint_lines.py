@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.diagnostics.replay_lines import moved_numbers
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import at_rows, constraint_at, constraint_of, energy_at, over_rows, times_at
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, sampled, sampled_terms, worst_place
@@ -29,8 +30,10 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     scale, redundant = _constraint_scale(sol, structure, residual.shape[-1]), list(sol.stats.get("redundant_constraints", ()))
     scale = np.broadcast_to(scale, residual.shape[-1:]).copy()
     scale[redundant] = np.max(scale)  # what follows from the others has their roundoff
-    values, residual = np.max(residual / scale, axis=-1), np.max(residual, axis=-1)
     steps = "constraint" in sol.fields
+    if steps and np.any(residual > roundoff_limit(tolerance, 1) * scale):  # points of manifolds are rounded, and then subtracted
+        scale = np.maximum(scale, np.max(moved_numbers(sol, "constraint").reshape(-1, len(scale)), axis=0))
+    values, residual = np.max(residual / scale, axis=-1), np.max(residual, axis=-1)
     given = int(steps and "q0" in sol.initial)  # the first pair was given, not computed
     if residual.shape[1] <= given:
         return Line(name, None, None, NOT_CHECKED, "no step was computed")

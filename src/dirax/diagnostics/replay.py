@@ -20,9 +20,30 @@ from dirax.solution.trajectory import SavedRow, last_rows
 MOST_OPERATIONS = 4e7
 """Scalar operations of the steps that are taken again, a few tenths of a second: of longer runs as many rows, evenly spread."""
 
+FEWEST, CALL = 16, 2048
+"""Rows that are taken again at least, and states of which a function in NumPy takes as long as of one."""
+
+LONGEST = 5 * MOST_OPERATIONS
+"""Operations from which on these are too long."""
 
 APART = 16
 """Rows from one to the next that is asked where its step begins."""
+
+
+def steps_before(sol: Solution) -> np.ndarray:
+    """The number of the step that each row is at."""
+    counts, last = np.arange(sol.rows, dtype=float) * sol.save_every, sol.rows - 1
+    if "q0" in sol.initial:
+        counts[1:] = 1.0 + np.arange(last, dtype=float) * sol.save_every
+    left = np.rint((float(sol.axis[last]) - float(sol.axis[last - 1])) / float(sol.step)) if last else 0.0
+    if last and 1 <= left <= counts[last] - counts[last - 1]:
+        counts[last] = counts[last - 1] + left
+    return counts
+
+
+def times_of(sol: Solution) -> np.ndarray:
+    """The times that the rows should have."""
+    return float(sol.axis[0]) + steps_before(sol) * float(sol.step)
 
 
 class CannotReplay(Exception):
@@ -118,14 +139,7 @@ class Replay:
     @cached_property
     def counts(self) -> np.ndarray:
         """The number of the step that each row is at."""
-        counts = np.arange(self.sol.rows, dtype=float) * self.sol.save_every
-        if self.from_points:
-            counts[1:] = 1.0 + np.arange(self.sol.rows - 1, dtype=float) * self.sol.save_every
-        last = self.sol.rows - 1
-        left = np.rint((float(self.sol.axis[last]) - float(self.sol.axis[last - 1])) / float(self.sol.step)) if last else 0.0
-        if last and 1 <= left <= counts[last] - counts[last - 1]:
-            counts[last] = counts[last - 1] + left
-        return counts
+        return steps_before(self.sol)
 
     @property
     def from_points(self) -> bool:
@@ -137,17 +151,21 @@ class Replay:
         """Whether a state has entries that no row holds."""
         return len(self.held) < len(self.steps.program.equations[self.steps.program.stages[0][0]].state)
 
-    def times(self) -> np.ndarray:
-        """The times that the rows should have."""
-        return float(self.sol.axis[0]) + self.counts * float(self.sol.step)
-
     # ------------------------------------------------------------------------------------------ where steps begin
+
+    @property
+    def _steps_a_row(self) -> float:
+        return max(1.0, float(np.mean(np.diff(self.counts))))
+
+    @property
+    def too_long(self) -> bool:
+        """Whether there is no time for a few rows, with all the steps between them."""
+        return self._steps_a_row > max(1.0, LONGEST / self.steps.operations(FEWEST, CALL))
 
     def chosen(self) -> tuple[np.ndarray, np.ndarray]:
         """(trajectory, row) of the rows whose steps are taken again: all that were reached, or as many as there is time for."""
         lanes, rows = np.nonzero(np.arange(self.sol.rows)[None] <= self.ends[:, None])
-        steps = max(1.0, float(np.mean(np.diff(self.counts))))
-        most = max(16, int(MOST_OPERATIONS / self.steps.operations / steps))
+        most = max(FEWEST, int(MOST_OPERATIONS / self.steps.operations() / self._steps_a_row))
         if len(rows) > most:
             some = np.unique(np.linspace(0, len(rows) - 2, most // 2).astype(int))
             some = np.union1d(some, some + 1)  # with their successors
@@ -173,7 +191,7 @@ class Replay:
         guesses = [between(u) if u.shape[1] else np.zeros((len(rows), 0)) for u in made.unknowns]
         states = np.zeros((len(rows), self.state_size))
         self._hold(states, lanes, rows)
-        return Rows(lanes, rows, states, guesses, self.times()[rows], self._gaps(lanes, rows), self.params_of(lanes))
+        return Rows(lanes, rows, states, guesses, times_of(self.sol)[rows], self._gaps(lanes, rows), self.params_of(lanes))
 
     def resumed(self, lanes: np.ndarray, rows: np.ndarray) -> Rows:
         """The same, of every row as the scheme says."""
@@ -187,7 +205,7 @@ class Replay:
             states[rows == 0] = first[rows == 0]
         self._hold(states, lanes, rows)
         guesses = [np.nan_to_num(guess) for guess in guesses]
-        return Rows(lanes, rows, states, guesses, self.times()[rows], self._gaps(lanes, rows), self.params_of(lanes))
+        return Rows(lanes, rows, states, guesses, times_of(self.sol)[rows], self._gaps(lanes, rows), self.params_of(lanes))
 
     def _hold(self, states: np.ndarray, lanes: np.ndarray, rows: np.ndarray) -> None:
         """Write what the rows hold into the states."""
@@ -267,16 +285,20 @@ class Replay:
         here = {name: np.where(_column(made.good, a), a, np.nan) for name, a in here.items()}
         return Again(here, np.where(good[:, None], after, np.nan), good, there, made.unknowns, made.states[0], first)
 
-    def leading_to(self, at: Rows, guess: np.ndarray, wanted: dict[int, np.ndarray]) -> Again:
-        """Steps of one part that leave these rows and lead to the wanted entries of states, where there are such."""
+    def leading_to(self, at: Rows, guess: np.ndarray, wanted: dict[int, np.ndarray], then: dict[int, np.ndarray]) -> Again:
+        """Steps of one part that leave these rows and lead to the wanted entries of states, where there are such, and steps after
+        them that lead to others."""
         made = self.steps.leading_to(at.states, guess, wanted, at.t, float(self.sol.step), at.params)
-        return self._taken(made, at.t, at.params)
+        return self._taken(made, at.t, at.params, then)
 
-    def _taken(self, made: Attempts, t: np.ndarray, params: np.ndarray) -> Again:
-        """Steps of one part that nothing needs to solve again."""
+    def _taken(self, made: Attempts, t: np.ndarray, params: np.ndarray, wanted: dict[int, np.ndarray] | None = None) -> Again:
+        """Steps of one part that nothing needs to solve again; those after them lead to the wanted entries, where they can."""
         h, there = float(self.sol.step), None
         if self.hides:
             then = self.steps.step(made.after, made.unknowns, t + h, h, params)
+            if wanted is not None:
+                led = self.steps.leading_to(made.after, made.unknowns[0], wanted, t + h, h, params)
+                then.put(led.good, led[led.good])
             there = self.steps.rows(then, t + h, h, params)
         here = {name: np.where(_column(made.good, a), a, np.nan) for name, a in self.steps.rows(made, t, h, params).items()}
         after = np.where(made.good[:, None], made.after, np.nan)
@@ -291,7 +313,7 @@ class Replay:
         items = ({**data, "t": times_at(sol, np.zeros(1, int))},)
         found = over_rows(eqx.Partial(_from_points, sol.system, sol.step, Same(sol.equation)), sol, items)[:, 0]
         state, u = np.split(found, [self.state_size], axis=1)
-        t, params = np.full(batch, self.times()[0]), self.params_of(np.arange(batch))
+        t, params = np.full(batch, times_of(self.sol)[0]), self.params_of(np.arange(batch))
         return self._taken(steps.taken(state, u, t, float(sol.step), params), t, params)
 
     def params_of(self, lanes: np.ndarray) -> np.ndarray:

@@ -1,8 +1,10 @@
 """The line of `dx.verify` on every saved number: each row is what the step from the row before it makes of that."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from dirax.diagnostics.replay import Again, CannotReplay, Replay, Rows
+from dirax.diagnostics.replay import Again, CannotReplay, Replay, Rows, times_of
 from dirax.diagnostics.replay_of_many import replayed_of_many
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import LARGE, row_numbers
@@ -15,6 +17,9 @@ NAME = "steps replayed"
 
 DISTURBANCE = 2.0**-36
 """Relative changes that show what rounding does: far above it, and small enough to do the same, only more."""
+
+SMALL = 2.0**-47
+"""Others, hardly above it: many steps make of the larger ones all that a motion can differ by before they do so of rounding."""
 
 SAMPLED = 48
 """Steps of a run at which that is seen, besides those in doubt."""
@@ -40,6 +45,8 @@ def replayed(sol: Solution, tolerance: float | None) -> Line:
         return replayed_of_many(sol, NAME, tolerance)
     try:
         replay = Replay.of(sol)
+        if replay.too_long:
+            return replayed_of_many(sol, NAME, tolerance)
         at = replay.begun(*replay.chosen())
     except CannotReplay as reason:
         return Line(NAME, None, None, NOT_CHECKED, str(reason))
@@ -60,7 +67,8 @@ def moved_numbers(sol: Solution, name: str) -> np.ndarray:
     shape = sol.field_info[name].shape
     try:
         replay = Replay.of(sol)
-        found = _Comparison(replay, replay.begun(*replay.chosen()))
+        at = replay.begun(*replay.chosen())
+        found = _Comparison(replay, replace(at, steps=np.ones_like(at.steps)))
     except CannotReplay:
         return np.zeros(shape)
     first = found.starts[name]
@@ -86,7 +94,7 @@ class _Comparison:
         self._expect(everywhere, *self._said(self.again))
         if replay.from_points:
             self._expect_given_points()
-        self.expected[:, -1] = replay.times()[at.rows]
+        self.expected[:, -1] = times_of(replay.sol)[at.rows]
 
     def name(self, number: int) -> str:
         """What a number is called."""
@@ -164,10 +172,14 @@ class _Comparison:
             self.expected[rows] = np.where(np.isnan(said), old, said)
 
     def _exist(self, entries: np.ndarray) -> np.ndarray:
-        """Which numbers the rows have: those of steps are not in the last one of a trajectory."""
-        last = self.at.rows[entries] >= self.replay.ends[self.at.lanes[entries]]
-        of_step = [self.replay.sol.field_info[name].place == "step" for name, size in self.sizes.items() for _ in range(size)]
-        return ~(last[:, None] & np.array([*of_step, False])[None])
+        """Which numbers the rows have: those of steps are not in the last one of a trajectory, and in that of a failed one no
+        step was solved that could say more than the state."""
+        sol, lanes = self.replay.sol, self.at.lanes[entries]
+        last, ok = self.at.rows[entries] >= self.replay.ends[lanes], np.atleast_1d(sol.ok)[lanes]
+        of_step = [sol.field_info[name].place == "step" for name, size in self.sizes.items() for _ in range(size)]
+        said = np.isin(np.arange(self.saved.shape[1] - 1), list(self.held.values()), invert=True)
+        lacking = np.where(ok[:, None], np.array(of_step)[None], said)
+        return np.pad(~(last[:, None] & lacking), ((0, 0), (0, 1)), constant_values=True)
 
     def _expect_given_points(self) -> None:
         """Row 0 is what was given, and row 1 follows from it alone."""
@@ -202,9 +214,10 @@ class _Comparison:
         doubted = self._worst(ratio, limit)
         if len(doubted):
             before = self.previous[doubted]
-            said_before = np.where((before >= 0)[:, None], self._scales_at(np.maximum(before, 0))[1], 0.0)
-            own = np.maximum(self._scales_at(doubted)[0], said_before)
-            ratio[doubted] = _ratio(self.missed[doubted], np.maximum(own, usual))
+            for size in (DISTURBANCE, SMALL):
+                said_before = np.where((before >= 0)[:, None], self._scales_at(np.maximum(before, 0), size)[1], 0.0)
+                usual = np.maximum(usual, np.maximum(self._scales_at(doubted, size)[0], said_before))
+            ratio[doubted] = _ratio(self.missed[doubted], usual)
         return ratio
 
     def _worst(self, ratio: np.ndarray, limit: float) -> np.ndarray:
@@ -213,17 +226,17 @@ class _Comparison:
         doubted = np.flatnonzero(most > limit)
         return doubted if len(doubted) <= DOUBTED else np.sort(doubted[np.argsort(-most[doubted])[:DOUBTED]])
 
-    def _scales_at(self, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far the numbers that the steps of these entries say of their rows, and of the next ones, move, relative to what
-        every operation is off."""
+    def _scales_at(self, entries: np.ndarray, size: float = DISTURBANCE) -> tuple[np.ndarray, np.ndarray]:
+        """How far the numbers that the steps of these entries say of their rows, and of the next ones, move, relative to the
+        `size` of what every operation is off."""
         at, guesses, near = self.at[entries], [u[entries] for u in self.again.unknowns], self.again.near[entries]
         said = self._said(self.replay.again(at, guesses=guesses, near=near))
         often = np.tile(np.arange(len(entries)), OFTEN)  # all disturbances at once: few entries take as long as one
-        many = self.replay.again(at[often], Noise(DISTURBANCE, 0), [u[often] for u in guesses], near[often])
+        many = self.replay.again(at[often], Noise(size, 0), [u[often] for u in guesses], near[often])
         moved = []
         for one, off in zip(said, self._said(many), strict=True):
             off = np.abs(off.reshape(OFTEN, *one.shape) - one)
-            moved.append(np.max(np.nan_to_num(off, posinf=0.0), axis=0) / DISTURBANCE)
+            moved.append(np.max(np.nan_to_num(off, posinf=0.0), axis=0) / size)
         return moved[0], moved[1]
 
     def _try_from_neighbours(self, entries: np.ndarray) -> None:
@@ -238,13 +251,19 @@ class _Comparison:
             self._try_from_next_rows(entries[(self.next[entries] >= 0) & (self.at.steps[entries] == 1)])
 
     def _try_from_next_rows(self, entries: np.ndarray) -> None:
-        """Steps again from unknowns that lead to the next rows."""
+        """Steps again from unknowns that lead to the next rows, and on to those after them."""
         entries = entries[: int(MOST_CUBED / max(1, self.again.unknowns[0].shape[1]) ** 3)]
         if not len(entries):
             return
-        after, (first, _) = self.saved[self.next[entries]], self.replay.held[min(self.replay.held)]
-        wanted = {i: after[:, self.held[i]] for i, (name, _) in self.replay.held.items() if name == first}
-        again = self.replay.leading_to(self.at[entries], self.again.unknowns[0][entries], wanted)
+        first, _ = self.replay.held[min(self.replay.held)]
+        one = self.next[entries]
+        two = np.where(self.at.steps[one] == 1, self.next[one], -1)
+        held = lambda rows: {
+            i: np.where(rows >= 0, self.saved[rows, self.held[i]], np.nan)
+            for i, (name, _) in self.replay.held.items()
+            if name == first
+        }
+        again = self.replay.leading_to(self.at[entries], self.again.unknowns[0][entries], held(one), held(two))
         self._expect(entries, *self._said(again), if_nearer=True)
 
 

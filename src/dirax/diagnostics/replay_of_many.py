@@ -1,4 +1,5 @@
-"""Rows of a large system once more, each by the engine of the run from the row before it: a sample, of which all is compared.
+"""Rows of a large system, or far apart, once more, each by the engine of the run from the row before it: a sample, of which all
+is compared.
 
 A row need not hold the whole state of a run: where it holds the mean momentum at a node, the force of the constraints there is a
 share short. So what a step says of itself is compared in the step after it, which begins at what was computed.
@@ -8,10 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from dirax.diagnostics.replay import steps_before, times_of
 from dirax.diagnostics.report import NOT_CHECKED, Line
+from dirax.diagnostics.rows import row_numbers
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread
-from dirax.engines.contract import Problem
+from dirax.engines.contract import Outcome, Problem
 from dirax.engines.policy import engine_of
+from dirax.numerics.tolerances import TINY
 from dirax.solution.solution import Solution
 from dirax.solution.steps_again import begun_at
 
@@ -21,24 +25,28 @@ CONSTRAINT = "constraint"
 ROUGHLY = 1e-12
 """Relative differences below this are roundoff."""
 
-ROWS = 6
-"""Rows that are taken again."""
+ROWS, MOST_NUMBERS = 6, 2**19
+"""Rows that are taken again, unless all their steps have more numbers than this: then as many as have, and one at least."""
 
-DISTURBANCE, OFTEN = 2.0**-30, 2
-"""By how much, relatively, and how often all numbers of a state are changed, to see how far rounding moves what comes out."""
+DISTURBANCES = 2.0**-30, 2.0**-51, 2.0**-51
+"""By how much, relatively, all numbers of a state are changed, to see how far rounding moves what comes out: far above rounding,
+and as little as rounding does, which shows what differences of rounded numbers, and very many steps, make of that."""
 
 
 def replayed_of_many(sol: Solution, name: str, tolerance: float | None) -> Line:
     """The line: the difference of a saved number from what it should be, relative to how far it moves where the row before moves,
-    and no less than the median of its field."""
+    no less than the median of its field, and no less than itself. Roundings of many steps add up."""
     first = int("q0" in sol.initial)
     count = sol.rows - 1 - first
-    if sol.has_own_times or sol.impacts is not None or "engine" not in sol.stats:
-        return Line(name, None, None, NOT_CHECKED, "of a large system, only runs of equal steps are taken again")
-    rows, lanes = first + spread(count, ROWS), spread(sol.batch or 1, 2)
+    if sol.impacts is not None or "engine" not in sol.stats:
+        why = "of large systems and of rows far apart, steps that walls divide are not taken again"
+        return Line(name, None, None, NOT_CHECKED, why)
+    numbers, times = steps_before(sol), np.abs(np.asarray(sol.axis) - times_of(sol)) / (np.max(np.abs(sol.axis)) + sol.step)
+    most = max(1, min(ROWS, int(MOST_NUMBERS / row_numbers(sol) / sol.save_every)))
+    rows, lanes, limit = first + spread(count, most), spread(sol.batch or 1, 2), roundoff_limit(tolerance, sol.save_every)
     nodes = [name for name, info in sol.field_info.items() if info.place == "node"]
-    engine, worst, where, off = engine_of(sol.stats["engine"]), np.zeros(sol.batch or 1), "", 0.0
-    rng = np.random.default_rng(0)
+    engine, worst, off, told = engine_of(sol.stats["engine"]), np.full(sol.batch or 1, np.max(times)), 0.0, False
+    where, rng = f"t in row {int(np.argmax(times))}", np.random.default_rng(0)
     for lane in lanes.tolist():
         lead = () if sol.batch is None else (lane,)
         for row in rows.tolist():
@@ -46,7 +54,7 @@ def replayed_of_many(sol: Solution, name: str, tolerance: float | None) -> Line:
             if not all(np.all(np.isfinite(read(name, row + 1))) for name in nodes):
                 continue
             (state, guess, t, params), last = begun_at(sol, lane, row), min(row + 2, sol.rows - 1)
-            to_next, to_last = (round((float(sol.axis[at]) - t) / float(sol.step)) for at in (row + 1, last))
+            to_next, to_last = (int(numbers[at] - numbers[row]) for at in (row + 1, last))
             problem = Problem(
                 sol.equation,
                 np.asarray(state),
@@ -57,26 +65,32 @@ def replayed_of_many(sol: Solution, name: str, tolerance: float | None) -> Line:
                 to_next,
                 params=params,
             )
-            again = _taken(engine, problem)
-            if again is None:
+            found = _taken(engine, problem)
+            if found is None:
                 return Line(name, None, None, NOT_CHECKED, f"the step from t = {t:.6g} has no solution from its saved row")
-            whole = all(_equal(again.pop((k, 0)), read(k, row)) for k in nodes)
+            out, again = found
+            end = begun_at(sol, lane, last, {k: out.closing[k][0] for k in nodes}, t + to_last * float(sol.step))[0]
+            whole = _equal(end, out.last_state[0])
             moved = {k: np.zeros_like(a) for k, a in again.items()}
-            for _ in range(OFTEN):
+            for size in DISTURBANCES:
                 signs = rng.choice([-1.0, 1.0], problem.state.shape)
-                other = _taken(engine, problem.with_numbers(state=problem.state * (1.0 + DISTURBANCE * signs))) or again
-                moved = {k: np.maximum(a, np.abs(other[k] - again[k]) / DISTURBANCE) for k, a in moved.items()}
+                other = (_taken(engine, problem.with_numbers(state=problem.state * (1.0 + size * signs))) or found)[1]
+                moved = {k: np.maximum(a, np.abs(other[k] - again[k]) / size) for k, a in moved.items()}
             for (k, after), a in again.items():
                 if not a.size or k == CONSTRAINT or sol.field_info[k].chosen or not (after or whole):
                     continue
-                scale = np.maximum(np.maximum(moved[k, after], np.median(moved[k, after])), np.finfo(float).tiny)
-                missed = np.abs(read(k, row + after) - a)
+                scale = np.maximum(np.maximum(moved[k, after], np.median(moved[k, after])), np.maximum(np.abs(a), TINY))
+                missed, told = np.abs(read(k, row + after) - a), told or np.min(limit * scale) < np.max(np.abs(a))
                 at = np.unravel_index(int(np.argmax(missed / scale)), missed.shape)
                 if missed[at] / scale[at] >= worst[lane]:
                     worst[lane], off = missed[at] / scale[at], missed[at]
                     where = f"{k}{list(map(int, at))} at t = {float(sol.axis[row + after]):.6g}{of_lane(sol, lane)}"
+    if not told:
+        why = f"in the {sol.save_every} steps from one row to the next, roundoff grows to the size of what is saved"
+        return Line(name, None, None, NOT_CHECKED, why)
     text = f"{len(rows) * len(lanes)} of {count * (sol.batch or 1)} rows, each by the engine from the one before"
-    return judged(sol, name, worst, roundoff_limit(tolerance, 1), f"{text}; worst {where}, off by {off:.2g}")
+    text += f" by {sol.save_every} steps" if sol.save_every > 1 else ""
+    return judged(sol, name, worst, limit, f"{text}; worst {where}, off by {off:.2g}")
 
 
 def _equal(one: np.ndarray, other: np.ndarray) -> bool:
@@ -84,14 +98,14 @@ def _equal(one: np.ndarray, other: np.ndarray) -> bool:
     return np.allclose(one, other, rtol=ROUGHLY, atol=ROUGHLY * np.max(np.abs(other), initial=0.0))
 
 
-def _taken(engine: Any, problem: Problem) -> dict[tuple[str, int], np.ndarray] | None:
-    """What the row that a run leaves should hold, and the next one, by the name of a field and 0 or 1; None where there is none.
-    Of the fields of steps, the second is said where another row as far away was reached."""
+def _taken(engine: Any, problem: Problem) -> tuple[Outcome, dict[tuple[str, int], np.ndarray]] | None:
+    """A run, and what the row that it leaves should hold of the step there, and the next one, by the name of a field and 0 or 1;
+    None where there is none. Of the fields of steps, the second is said where another row as far away was reached."""
     out = engine.run(problem)
     done, every = int(out.completed[0]), problem.save_every
     if done < every:
         return None
-    said = {
-        (k, i): np.asarray(a[0, i]) for k, a in out.fields.items() for i in range(1 + (problem.is_node(k) or done == 2 * every))
-    }
-    return said | ({(k, 1): np.asarray(out.closing[k][0]) for k in out.fields if problem.is_node(k)} if done == every else {})
+    of_steps = [k for k in out.fields if not problem.is_node(k)]
+    said = {(k, i): np.asarray(out.fields[k][0, i]) for k in of_steps for i in range(1 + (done == 2 * every))}
+    at_next = {k: out.closing[k][0] if done == every else out.fields[k][0, 1] for k in out.fields if problem.is_node(k)}
+    return out, said | {(k, 1): np.asarray(a) for k, a in at_next.items()}

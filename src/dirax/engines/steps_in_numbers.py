@@ -62,6 +62,9 @@ class Attempts:
     after: np.ndarray
     good: np.ndarray
 
+    def __getitem__(self, some: Any) -> "Attempts":
+        return Attempts([u[some] for u in self.unknowns], [a[some] for a in self.states], self.after[some], self.good[some])
+
     def put(self, some: np.ndarray, others: "Attempts") -> None:
         """Take other attempts in place of some."""
         for own, other in ((self.unknowns, others.unknowns), (self.states, others.states)):
@@ -88,11 +91,11 @@ class StepsInNumbers:
         """Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for too large a Jacobian."""
         return cls(equation, step_program(equation, params, batch_params))
 
-    @property
-    def operations(self) -> int:
-        """About how many scalar operations a step takes: its functions a few times, and a matrix or two inverted."""
+    def operations(self, states: int = 1, call: int = 1) -> int:
+        """About how many scalar operations a step of so many states takes: its functions a few times, and a matrix or two
+        inverted. A function takes as long as of `call` states, at least."""
         unknowns = [len(self.program.equations[index].unknowns) for index, _ in self.program.stages]
-        return 4 * sum(len(self.program.graph) + k**3 for k in unknowns)
+        return 4 * sum(max(states, call) * len(self.program.graph) + states * k**3 for k in unknowns)
 
     def parameters(self, params: Any, batch: int | None, lanes: np.ndarray) -> np.ndarray:
         """The numbers of `params` of these trajectories, (states, numbers); `batch` is None for params that all of them share."""

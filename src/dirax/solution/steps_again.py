@@ -43,13 +43,16 @@ def begun(equation: Any, system: Any, row: dict[str, Any], t: Any, h: Any, param
     return state, (u, *(stage.resume(data, part * h, params)[1] for stage, part in others))
 
 
-def begun_at(sol: Trajectory, lane: int, row: int) -> tuple[np.ndarray, tuple[np.ndarray, ...], float, Any]:
+def begun_at(
+    sol: Trajectory, lane: int, row: int, of_row: dict[str, Any] | None = None, t: float | None = None
+) -> tuple[np.ndarray, tuple[np.ndarray, ...], float, Any]:
     """State and first guesses of the step that leaves a saved row of a trajectory, compiled once, the time there, and the params
-    of the trajectory."""
+    of the trajectory. What is known `of_row` and its time `t` may be other than what was saved."""
     lead = () if sol.batch is None else (lane,)
     params = jax.tree.map(lambda leaf: leaf[lane], sol.params) if sol.batch_params else sol.params
     fields = {name: jnp.asarray(a[(*lead, min(row, a.shape[len(lead)] - 1))]) for name, a in sol.fields.items()}
-    t, h = float(sol.axis[row]), float(sol.step)
+    fields |= {name: jnp.asarray(a) for name, a in (of_row or {}).items()}
+    t, h = float(sol.axis[row]) if t is None else t, float(sol.step)
     state, guess = _begun(Same(sol.equation), Same(sol.system), fields, jnp.asarray(t), jnp.asarray(h), params)
     return np.asarray(state), tuple(map(np.asarray, guess)), t, params
 
