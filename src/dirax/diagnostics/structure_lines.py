@@ -18,8 +18,9 @@ from dirax.schemes.discrete_structure import AbstractDiscreteStructure, Abstract
 from dirax.schemes.step import StepSequence
 from dirax.solution.solution import Solution
 
-SAMPLED_STEPS = 8
-"""Steps of a trajectory at which the derivative of the step is taken."""
+SAMPLED_STEPS, SAMPLED_CUBED = 8, 2e7
+"""Steps of a trajectory at which the derivative of the step is taken, unless the cubes of all their unknowns are more than this:
+then as many as have, and two at least."""
 
 LARGEST_STATE = 1000
 """Numbers of a state, or of a row, up to which the derivative of a step and the distribution at a row, matrices, are taken."""
@@ -200,5 +201,6 @@ def _sampled(sol: Solution) -> np.ndarray:
     """Numbers of a few rows that have a successor, spread over the shortest and over the longest trajectory."""
     values = np.asarray(sol.fields["q" if "q" in sol.fields else "x"])
     reached = np.sum(np.all(np.isfinite(values), axis=-1), axis=-1)
-    half = SAMPLED_STEPS // 2 if np.min(reached) < np.max(reached) else SAMPLED_STEPS
+    most = max(2, min(SAMPLED_STEPS, int(SAMPLED_CUBED / max(1, _unknowns(sol)) ** 3)))
+    half = most // 2 if np.min(reached) < np.max(reached) else most
     return np.union1d(spread(int(np.min(reached)) - 1, half), spread(int(np.max(reached)) - 1, half)).astype(int)

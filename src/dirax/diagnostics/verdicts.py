@@ -25,8 +25,8 @@ SAMPLED_ENTRIES = 2**13
 DISTURBANCE = 2.0**-26
 """By how much, relatively, a number is changed for a scale."""
 
-PROBES = 32
-"""Times that all numbers of a row are changed."""
+PROBES, MANY = 32, 100
+"""Times that all numbers of a row are changed, in rows of more than so many."""
 
 
 def where_reached(values: np.ndarray, items: dict[str, np.ndarray]) -> np.ndarray:
@@ -95,11 +95,11 @@ def sampled_terms(sol: Solution, function: eqx.Partial) -> np.ndarray:
     what roundings of the rows do to f, in units of ε.
 
     By differences, which a scale is content with: f needs no derivative, and what is known of f at all rows is enough. In rows of
-    a large system all numbers are changed at once, each up or down at random, PROBES times: the largest change of an entry that
+    many numbers all are changed at once, each up or down at random, PROBES times: the largest change of an entry that
     few numbers have to do with is that sum; of one that all have to do with, it is from derivatives.
     """
     nodes = _nodes(sol)
-    if row_numbers(sol) > LARGE:
+    if row_numbers(sol) > MANY:
         return _terms_of_many(sol, nodes, function)
     axis, count = int(sol.batch is not None), 1 + sum(math.prod(sol.field_info[k].shape) for k in nodes)
     rows = spread(sol.rows, min(SAMPLED_ROWS, max(4, SAMPLED_ENTRIES // (count * (sol.batch or 1)))))
@@ -117,20 +117,24 @@ def sampled_terms(sol: Solution, function: eqx.Partial) -> np.ndarray:
 
 
 def _terms_of_many(sol: Solution, nodes: dict[str, Any], function: eqx.Partial) -> np.ndarray:
-    rows, axis, rng = sampled_rows(sol, sol.rows)[:SAMPLED_ROWS], int(sol.batch is not None), np.random.default_rng(0)
+    few = min(SAMPLED_ROWS, max(4, SAMPLED_ENTRIES // (PROBES * row_numbers(sol))))
+    rows, axis, rng = spread(sol.rows, few), int(sol.batch is not None), np.random.default_rng(0)
     plain = {k: np.asarray(a[(*(slice(None),) * axis, rows)], float) for k, a in nodes.items()} | {"t": times_at(sol, rows)}
-    whole = over_rows(eqx.Partial(_with_slope, function), sol, (plain,))
+    with_slope = eqx.Partial(_with_slope, function.func, *function.args)  # what is traced once, being made of the same
+    whole = over_rows(with_slope, sol, (plain,))
     if whole.shape[2:] == (2,):
         return whole[..., 1:]
     found = np.zeros_like(whole)
     for _ in range(PROBES):
         moved = {k: a * (1.0 + DISTURBANCE * rng.choice([-1.0, 1.0], np.shape(a))) if k != "t" else a for k, a in plain.items()}
-        found = np.maximum(found, np.abs(over_rows(eqx.Partial(_with_slope, function), sol, (moved,)) - whole) / DISTURBANCE)
+        found = np.maximum(found, np.abs(over_rows(with_slope, sol, (moved,)) - whole) / DISTURBANCE)
     return found
 
 
-def _with_slope(function: eqx.Partial, row: dict, params: Any):
-    """The value; of a single number also Σ |∂f/∂x_i| |x_i|."""
+def _with_slope(*of: Any):
+    """The value of a function of other arguments, a row and params; of a single number also Σ |∂f/∂x_i| |x_i|."""
+    *function, row, params = of
+    function = eqx.Partial(*function)
     if math.prod(jax.eval_shape(function, row, params).shape) != 1:
         return jnp.ravel(function(row, params))
     t = {"t": row["t"]}

@@ -167,7 +167,7 @@ class StepsInNumbers:
             inverses, change = inverses / np.swapaxes(rows, 1, 2), np.full_like(u, np.nan)
             change[good] = np.einsum("nij,nj->ni", inverses, missed[good])
             u -= change
-            if not of_entries:
+            if not of_entries and np.any(good):
                 size = np.einsum("nij,nj->ni", np.abs(inverses), self._terms(0, u[good], states[good], *(a[good] for a in at)))
                 moved[good] = _largest_ratio(change[good], np.maximum(np.abs(u[good]), size))
         made = self.taken(states, u, t, h, params)
