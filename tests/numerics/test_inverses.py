@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import threadpoolctl
 
 from dirax.numerics.inverses import LARGE, applied, applied_sizes, inverted, no_inverses, unknown
+from dirax.numerics.one_thread import one_thread
 
 RNG = np.random.default_rng(0)
 
@@ -45,3 +47,16 @@ def test_sizes_of_large_ones_are_about_those_of_all_signs():
     found = applied_sizes(inverted(a), sizes)
     assert np.all(found <= exact * (1 + 1e-9))
     assert np.median(found / exact) > 0.5
+
+
+def test_blas_has_one_thread_inside_and_its_own_again_outside():
+    """Whoever comes in while others are inside, and whoever goes first."""
+    count = lambda: [lib.num_threads for lib in threadpoolctl.ThreadpoolController().select(user_api="blas").lib_controllers]
+    before, first, second = count(), one_thread(), one_thread()
+    first.__enter__()
+    second.__enter__()
+    assert set(count()) <= {1}
+    first.__exit__(None, None, None)
+    assert set(count()) <= {1}
+    second.__exit__(None, None, None)
+    assert count() == before

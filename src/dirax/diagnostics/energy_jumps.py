@@ -74,9 +74,15 @@ class _Ways:
             items[name] = values if self.sol.batch is not None else values[0]
         return over_rows(at_rows(self.sol, energy_at), self.sol, (items,)).reshape(s.shape)
 
+    def only(self, some: np.ndarray) -> None:
+        """Go on with some of the K ways of each trajectory."""
+        for ends in (self.starts, self.ends):
+            ends.update({name: a[:, some] for name, a in ends.items()})
+        self.shape = len(self.starts["t"]), len(some)
+
     def jump(self, least: float) -> np.ndarray:
-        """Where (B, K) the energy has a jump of more than `least`, at one time."""
-        low, width = np.zeros(self.shape), 1.0
+        """Where (B, K) the energy has a jump of more than `least`, at one time. Ways without one are left."""
+        found, which, low, width = np.zeros(self.shape, bool), np.arange(self.shape[1]), np.zeros(self.shape), 1.0
         left = half = np.zeros(self.shape)
         for i in range(TIMES):
             s = low[..., None] + width * np.linspace(0.0, 1.0, PIECES + 1)
@@ -84,12 +90,17 @@ class _Ways:
             low = np.take_along_axis(s, np.argmax(pieces, axis=-1)[..., None], axis=-1)[..., 0]
             left, width = np.max(pieces, axis=-1), width / PIECES
             half = left if i == TIMES // 2 else half
-            if not np.any(left > least):
-                return np.zeros(self.shape, bool)
+            some = np.flatnonzero(np.any(left > least, axis=0))
+            if not len(some):
+                return found
+            if len(some) < len(which):
+                self.only(some)
+                which, low, left, half = which[some], low[:, some], left[:, some], half[:, some]
         keeps = (left > least) & (left > half / 2) & (left < 2 * half)
         middle = (low + width / 2)[..., None]
         beside = np.clip(middle + np.array([-BESIDE, BESIDE]), 0.0, 1.0)
-        return keeps & (_changes(self.energy(beside, middle))[..., 0] > left / 2)
+        found[:, which] = keeps & (_changes(self.energy(beside, middle))[..., 0] > left / 2)
+        return found
 
 
 def _changes(energy: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from dirax.diagnostics.reversal_line import taken_back
 from dirax.diagnostics.structure_lines import membership, structure_of, symplecticity
 from dirax.diagnostics.verdicts import steps_of
 from dirax.engines.stopping import STALLED
+from dirax.numerics.one_thread import one_thread
 from dirax.program.memo import patience
 from dirax.solution.events import WALLS_WORK
 from dirax.solution.reconstruction import reconstruct
@@ -25,6 +26,7 @@ from dirax.solution.solution import Solution
 
 
 @patience()
+@one_thread()
 def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None = None) -> Report:
     """Measure the structure of a solution: a `Report` with one line a quantity, each with a tolerance and a verdict.
 

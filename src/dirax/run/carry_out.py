@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Outcome, Problem
+from dirax.numerics.one_thread import one_thread
 from dirax.program.captured import Captured, functions_in, refuse_changed
 from dirax.program.memo import Memo, patience
 from dirax.program.user_functions import is_traced, values_matter
@@ -191,6 +192,7 @@ def _no_plan() -> None:
 
 
 @patience()
+@one_thread()
 def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: int) -> Begun:
     """The general way from a case to its problem; `asked`: the `save_every` that was asked for."""
     system, scheme, by_jax = settings.system, settings.scheme, settings.engine.compiles_start(case.traced)

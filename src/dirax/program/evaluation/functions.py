@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr
 
 import dirax.program.rules  # noqa: F401  (registers the rules)
+from dirax.numerics.one_thread import one_thread
 from dirax.program.evaluation.noise import Noise
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -39,7 +40,10 @@ def in_numpy(
     has them.
     """
     found = program_of(function, [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves], key, for_few)
-    return None if found is None else jax.tree.unflatten(found[1], found[0].in_numpy(leaves, noise))
+    if found is None:
+        return None
+    with one_thread():
+        return jax.tree.unflatten(found[1], found[0].in_numpy(leaves, noise))
 
 
 def program_of(
