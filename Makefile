@@ -19,6 +19,9 @@ export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
 # Byte code is kept, whatever the shell says: without it every process compiles the packages anew, which takes most of its time.
 unexport PYTHONDONTWRITEBYTECODE
 
+# Tests run in as many processes as there are cores: threads of BLAS would wait for each other.
+test soak fuzz: export OPENBLAS_NUM_THREADS ?= 1
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help install demo test lint types format docs soak fuzz bench vendor lock clean

@@ -52,11 +52,12 @@ def test_sizes_of_large_ones_are_about_those_of_all_signs():
 def test_blas_has_one_thread_inside_and_its_own_again_outside():
     """Whoever comes in while others are inside, and whoever goes first."""
     count = lambda: [lib.num_threads for lib in threadpoolctl.ThreadpoolController().select(user_api="blas").lib_controllers]
-    before, first, second = count(), one_thread(), one_thread()
-    first.__enter__()
-    second.__enter__()
-    assert set(count()) <= {1}
-    first.__exit__(None, None, None)
-    assert set(count()) <= {1}
-    second.__exit__(None, None, None)
-    assert count() == before
+    first, second = one_thread(), one_thread()
+    with threadpoolctl.threadpool_limits(2, "blas"):
+        first.__enter__()
+        second.__enter__()
+        assert set(count()) == {1}
+        first.__exit__(None, None, None)
+        assert set(count()) == {1}
+        second.__exit__(None, None, None)
+        assert set(count()) == {2}
