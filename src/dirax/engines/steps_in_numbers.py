@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dirax.engines.first_sizes import TYPICAL
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
 from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
@@ -192,13 +193,19 @@ class StepsInNumbers:
         known = lambda sizes: np.where(made.good, sizes, np.nan)
         return known(of_equations), known(of_unknowns)
 
-    def solved(self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray) -> np.ndarray:
-        """Whether the equations of all parts are solved, (states,), to roundoff of their terms."""
-        good = np.ones(len(t), bool)
-        for stage, ((_, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
-            good &= self._are_solved(stage, u, state, (t, np.full(len(t), fraction * h), params))
+    def solved(
+        self, made: Attempts, near: Near, t: np.ndarray, h: float, params: np.ndarray
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """The sizes (states, k) of the unknowns of each part where steps found them, their values and what a typical rounding of
+        each term of the equations comes to; and whether the equations are solved, (states,), to roundoff of their terms."""
+        sizes, good = [], made.good.copy()
+        for stage, ((_index, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
+            at = t, np.full(len(t), fraction * h), params
+            terms = self._terms(stage, u, state, *at)
+            good &= self._are_solved(stage, u, state, at, terms)
+            sizes.append(np.maximum(np.abs(u), TYPICAL * applied_sizes(near.inverses[stage], terms)) if u.shape[1] else u)
             t = t + fraction * h
-        return good
+        return sizes, good & np.all([np.all(np.isfinite(a), axis=1) for a in sizes], axis=0)
 
     def _terms(self, stage: int, u, state, t, h, params) -> np.ndarray:
         """The sizes (states, k) of the terms of a stage's equations, however they cancel."""
@@ -309,13 +316,13 @@ class StepsInNumbers:
         good[left] &= self._are_solved(stage, u[left], states[left], tuple(a[left] for a in at))
         return u, good
 
-    def _are_solved(self, stage: int, u, states, at) -> np.ndarray:
+    def _are_solved(self, stage: int, u, states, at, terms: np.ndarray | None = None) -> np.ndarray:
         """Whether the equations of a stage are solved, (states,): to roundoff of their terms, however they cancel."""
-        if not len(u):
-            return np.ones(0, bool)
-        index = self.program.stages[stage][0]
+        if not u.size:
+            return np.ones(len(u), bool)
+        index, terms = self.program.stages[stage][0], self._terms(stage, u, states, *at) if terms is None else terms
         missed = self._read(self._values(index, u, states, at), self.program.equations[index].residual)
-        return _largest_ratio(missed, self._terms(stage, u, states, *at)) < STALLED
+        return np.all(np.isfinite(terms), axis=1) & (_largest_ratio(missed, terms) < STALLED)
 
     def _values(self, index: int, u, states, at, noise: Noise | None = None) -> Values:
         e, shared = self.program.equations[index], self.program.shared
@@ -363,7 +370,8 @@ class StepsInNumbers:
 
 def _largest_ratio(values: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """The largest |value|/size of each row, NaN where one is not finite."""
-    ratios = np.divide(np.abs(values), sizes, out=np.zeros_like(values), where=sizes > SMALLEST)
+    with np.errstate(invalid="ignore", over="ignore"):
+        ratios = np.divide(np.abs(values), sizes, out=np.zeros_like(values), where=sizes > SMALLEST)
     return np.where(np.all(np.isfinite(values), axis=1), np.max(ratios, axis=1), np.nan)
 
 
