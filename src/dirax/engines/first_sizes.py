@@ -32,6 +32,10 @@ NOTHING = 2.0**-40
 LOOSE = 2.0**8
 """What is too much for the size of an unknown, beside the least value at which it would matter: a bound that is far too large."""
 
+OFF, FAR = 2.0**-4, 2.0**16
+"""Residuals of a first guess that is off, beside their terms; and sizes of unknowns there, beside their values, that may be those
+of the guess alone."""
+
 SOLVED = 1e-10
 """What a solution with good pivots leaves of a right-hand side, relative to its terms."""
 
@@ -91,6 +95,14 @@ class FirstSizes:
             matters = self._matters([(e, row[j]) for e, row in zip(rounded, rows, strict=True) if j in row])
             sure = below(g.mul(g.constant(NOTHING), matters), size_of)
             sure = below(size_of, g.mul(g.constant(LOOSE), matters))
+        off = reduce(
+            lambda a, b: g.make("or", a, b),
+            [g.make("lt", g.mul(g.constant(OFF), e), size(r)) for e, r in zip(rounded, residual, strict=True)],
+            g.false,
+        )
+        for a, u, v in zip(own, unknowns, solution, strict=True):
+            large = g.make("lt", g.mul(g.constant(FAR), g.make("max", size(u), v)), a)
+            sure = g.make("and", sure, g.make("not", g.make("and", off, large)))
         for r, row in zip(residual, matrix, strict=True):
             of_row = [g.mul(a, d) for a, d in zip(row, change, strict=True)]
             sure = below(size(g.sub(total(of_row), r)), g.mul(g.constant(SOLVED), total([size(r), *map(size, of_row)])))

@@ -31,9 +31,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.close_sizes import Entries, close_sizes, sizes_at
+from dirax.engines.close_sizes import MOST, Entries, close_sizes, sizes_at
 from dirax.engines.contract import Problem
-from dirax.engines.first_sizes import first_sizes
+from dirax.engines.first_sizes import FAR, first_sizes
 from dirax.engines.step_program import step_program
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.numerics.equilibration import power_of_two
@@ -110,7 +110,7 @@ def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, stat
     moved = lambda a: np.asarray(a)[lanes] if p.batch is not None else np.asarray(a)[None][lanes]
     params = jax.tree.map(moved, p.params) if p.batch_params else p.params
     here = dataclasses.replace(p, state=state, guess=guess, params=params, batch=len(lanes))
-    return _in_numbers(here, p.t0 + (p.first_step + completed) * p.h, close_sizes)
+    return _in_numbers(here, p.t0 + (p.first_step + completed) * p.h, _closely)
 
 
 def _start(p: Problem) -> Any:
@@ -139,7 +139,7 @@ def _entries(p: Problem, t: Any, xp: Any) -> Entries:
 def _looked_at(at: Entries) -> list[np.ndarray]:
     """By one linearization where that leaves no doubt, else closely. Raises `GraphTooLarge`."""
     if not at.program.sizes_are_written:
-        return close_sizes(at)
+        return _closely(at)
     found, sure = [], np.ones(len(at.state), bool)
     for stage, ((_, fraction), u) in enumerate(zip(at.stages, at.guesses, strict=True)):
         if u.shape[1]:
@@ -150,7 +150,23 @@ def _looked_at(at: Entries) -> list[np.ndarray]:
             found.append(np.ones(u.shape))
     if np.all(sure):
         return found
-    return [np.where(sure[:, None], a, b) for a, b in zip(found, close_sizes(at), strict=True)]
+    return [np.where(sure[:, None], a, b) for a, b in zip(found, _closely(at), strict=True)]
+
+
+def _closely(at: Entries) -> list[np.ndarray]:
+    """The sizes looked at closely, and where they are far above the unknowns, no larger than the solution of the step allows, or
+    the guess where no solution is found: it may be far from one. Raises `GraphTooLarge`."""
+    found = close_sizes(at)
+    far = [np.any(a > FAR * np.abs(u), axis=1) for a, u in zip(found, at.guesses, strict=True)]
+    if not np.any(far):
+        return found
+    steps = StepsInNumbers(None, at.program)
+    near = steps.nothing_near(len(at.state))
+    with np.errstate(all="ignore"):
+        made = steps.step(at.state, at.guesses, at.t, at.h, at.leaves, near=near)
+        sizes, good = steps.solved(made, near, at.t, at.h, at.leaves)
+    most = [np.where(good[:, None], MOST * a, FAR * np.abs(u)) for a, u in zip(sizes, at.guesses, strict=True)]
+    return [np.where(b > 0.0, np.minimum(a, power_of_two(b)), a) for a, b in zip(found, most, strict=True)]
 
 
 def _on_host(p: Problem) -> Sizes | None:

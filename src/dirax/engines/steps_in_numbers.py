@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.engines.first_sizes import TYPICAL
+from dirax.engines.first_sizes import FAR, TYPICAL
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
 from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
@@ -26,9 +26,6 @@ ARRIVALS = 3 * [(True, False)] + 3 * [(True, True)] + 5 * [(False, True)]
 
 SINGULAR = 1e-10
 """Relative singular values that count as zero in them."""
-
-FAR = 2.0**16
-"""Sizes of unknowns beyond this of their values may be those of a place from which an iteration came."""
 
 SMALLEST = float(np.finfo(float).tiny) / EPSILON
 """Numbers below this do not have all their digits, and count as zero."""
@@ -78,7 +75,8 @@ class Attempts:
 class StepsInNumbers:
     """The steps of an equation as functions of arrays with an axis of states in front; `params` (states, numbers) in all."""
 
-    equation: StepEquation | StepSequence
+    equation: StepEquation | StepSequence | None
+    """None where no rows are asked for."""
     program: StepProgram
     _depends: list[set[int]] = field(init=False)
     _orders: dict[tuple[bytes, int | None], Order] = field(init=False, default_factory=dict)
