@@ -81,25 +81,27 @@ def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.
     Data may be so special where a run begins that an unknown has no size there. Sizes are those at the solution of the next step:
     at a guess that is far from it they may be anything, and what is far from solved would count as roundoff. Everything has an
     axis of the `lanes`."""
-    found, good = _of_next_step(problem, lanes, completed, state, guess)
+    guess, good = _next_step(problem, lanes, completed, state, guess)
+    if not np.any(good):
+        return sizes, good
+    found = sizes_there(problem, lanes, completed, state, guess)
     more = np.any([np.any(new > old, axis=1) for new, old in zip(found, sizes, strict=True)], axis=0)
     return tuple(np.maximum(new, old) for new, old in zip(found, sizes, strict=True)), more & good
 
 
-def _of_next_step(p: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> tuple[Sizes, Any]:
-    """The sizes of the unknowns of the step that leaves `state`, and where it has a solution; of steps that cannot be taken in
-    numbers those at the guess."""
+def _next_step(p: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> tuple[tuple, Any]:
+    """The unknowns of each stage in the step that leaves `state`, and where it has a solution; of steps that cannot be taken in
+    numbers the guess."""
     try:
         steps = StepsInNumbers.of(p.equation, p.params, p.batch_params) if p.size < FEWEST_SPARSE else None
     except (UnsupportedPrimitive, GraphTooLarge):
         steps = None
     if steps is None:
-        return sizes_there(p, lanes, completed, state, guess), np.ones(len(lanes), bool)
+        return guess, np.ones(len(lanes), bool)
     params = steps.parameters(p.params, p.batch if p.batch_params else None, lanes)
     t, near = p.t0 + (p.first_step + completed) * p.h, steps.nothing_near(len(lanes))
-    with np.errstate(all="ignore"):
-        sizes, good = steps.solved(steps.step(state, guess, t, p.h, params, near=near), near, t, p.h, params)
-    return tuple(power_of_two(a) if a.size else np.ones(a.shape) for a in sizes), good
+    made = steps.step(state, guess, t, p.h, params, near=near)
+    return tuple(made.unknowns), steps.solved(made, near, t, p.h, params)[1]
 
 
 def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> Sizes:
@@ -162,9 +164,8 @@ def _closely(at: Entries) -> list[np.ndarray]:
         return found
     steps = StepsInNumbers(None, at.program)
     near = steps.nothing_near(len(at.state))
-    with np.errstate(all="ignore"):
-        made = steps.step(at.state, at.guesses, at.t, at.h, at.leaves, near=near)
-        sizes, good = steps.solved(made, near, at.t, at.h, at.leaves)
+    made = steps.step(at.state, at.guesses, at.t, at.h, at.leaves, near=near)
+    sizes, good = steps.solved(made, near, at.t, at.h, at.leaves)
     most = [np.where(good[:, None], MOST * a, FAR * np.abs(u)) for a, u in zip(sizes, at.guesses, strict=True)]
     return [np.where(b > 0.0, np.minimum(a, power_of_two(b)), a) for a, b in zip(found, most, strict=True)]
 

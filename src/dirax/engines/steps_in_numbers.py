@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.engines.first_sizes import FAR, TYPICAL
+from dirax.engines.first_sizes import FAR, NOTHING, TYPICAL
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import StepProgram, step_program
 from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
@@ -75,8 +75,8 @@ class Attempts:
 class StepsInNumbers:
     """The steps of an equation as functions of arrays with an axis of states in front; `params` (states, numbers) in all."""
 
-    equation: StepEquation | StepSequence | None
-    """None where no rows are asked for."""
+    equation: Any
+    """A StepEquation or a StepSequence; None where no rows are asked for."""
     program: StepProgram
     _depends: list[set[int]] = field(init=False)
     _orders: dict[tuple[bytes, int | None], Order] = field(init=False, default_factory=dict)
@@ -130,6 +130,7 @@ class StepsInNumbers:
             join([p.good for p in parts]),
         )
 
+    @np.errstate(all="ignore")
     def _step(self, states, guesses, t, h, params, noise, near: Near) -> Attempts:
         unknowns, begun, good = [], [], np.ones(len(states), bool)
         for stage, ((index, fraction), guess) in enumerate(zip(self.program.stages, guesses, strict=True)):
@@ -147,6 +148,7 @@ class StepsInNumbers:
         after = self._read(known, self.program.equations[self.program.stages[0][0]].advance)
         return Attempts([u], [state], after, np.all(np.isfinite(after), axis=1))
 
+    @np.errstate(all="ignore")
     def leading_to(
         self, states: np.ndarray, guess: np.ndarray, wanted: dict[int, np.ndarray], t: np.ndarray, h: float, params: np.ndarray
     ) -> Attempts:
@@ -191,6 +193,7 @@ class StepsInNumbers:
         known = lambda sizes: np.where(made.good, sizes, np.nan)
         return known(of_equations), known(of_unknowns)
 
+    @np.errstate(all="ignore")
     def solved(
         self, made: Attempts, near: Near, t: np.ndarray, h: float, params: np.ndarray
     ) -> tuple[list[np.ndarray], np.ndarray]:
@@ -199,15 +202,14 @@ class StepsInNumbers:
         sizes, good = [], made.good.copy()
         for stage, ((_index, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
             at = t, np.full(len(t), fraction * h), params
-            terms = self._terms(stage, u, state, *at)
-            good &= self._are_solved(stage, u, state, at, terms)
-            sizes.append(np.maximum(np.abs(u), TYPICAL * applied_sizes(near.inverses[stage], terms)) if u.shape[1] else u)
+            sizes.append(self._sizes(stage, u, state, at, near.inverses[stage]))
+            good &= self._are_solved(stage, u, state, at, sizes[-1])
             t = t + fraction * h
         return sizes, good & np.all([np.all(np.isfinite(a), axis=1) for a in sizes], axis=0)
 
-    def _terms(self, stage: int, u, state, t, h, params) -> np.ndarray:
-        """The sizes (states, k) of the terms of a stage's equations, however they cancel."""
-        return stage_look(self.program, stage)(u, state, t, h, params, np.abs(u), only=(TERMS,))[0]
+    def _terms(self, stage: int, u, state, t, h, params, sizes: np.ndarray | None = None) -> np.ndarray:
+        """The sizes (states, k) of the terms of a stage's equations, however they cancel, with unknowns of their own sizes."""
+        return stage_look(self.program, stage)(u, state, t, h, params, np.abs(u) if sizes is None else sizes, only=(TERMS,))[0]
 
     def differentiated(
         self, made: Attempts, t: np.ndarray, h: float, params: np.ndarray, noise: Noise | None = None
@@ -299,7 +301,7 @@ class StepsInNumbers:
             ended = found | stalled
             far = ended & np.any(size[left] > FAR * np.abs(u[left]), axis=1)
             if np.any(far):
-                ended[far] = self._are_solved(stage, u[left[far]], states[left[far]], tuple(a[left[far]] for a in at))
+                ended[far] = self._are_solved(*self._part(stage, u, states, at, inverse, left[far]))
             ended |= fresh & np.isnan(moved)
             renewed[left] = ~fresh & ~contracts & ~(own[left] & (moved < STALLED)) & ~ended
             last[left] = np.where(renewed[left], np.inf, moved)
@@ -311,14 +313,28 @@ class StepsInNumbers:
         inverse[:] = inverted(self._linearized(index, self._values(index, u, states, at))[0])
         u = u - applied(inverse, self._read(self._values(index, u, states, at, noise), e.residual))
         good = last < STALLED
-        good[left] &= self._are_solved(stage, u[left], states[left], tuple(a[left] for a in at))
+        if len(left):
+            good[left] &= self._are_solved(*self._part(stage, u, states, at, inverse, left))
         return u, good
 
-    def _are_solved(self, stage: int, u, states, at, terms: np.ndarray | None = None) -> np.ndarray:
-        """Whether the equations of a stage are solved, (states,): to roundoff of their terms, however they cancel."""
+    def _part(self, stage: int, u, states, at, inverse: Inverses, some: np.ndarray) -> tuple:
+        """What `_are_solved` takes, of some steps."""
+        here = u[some], states[some], tuple(a[some] for a in at)
+        return stage, *here, self._sizes(stage, *here, inverse[some])
+
+    def _sizes(self, stage: int, u, states, at, inverses: Inverses) -> np.ndarray:
+        """The values of unknowns, and what a typical rounding of each term of the equations comes to where that is more."""
+        terms = self._terms(stage, u, states, *at)
+        return np.maximum(np.abs(u), TYPICAL * applied_sizes(inverses, terms)) if u.shape[1] else u
+
+    def _are_solved(self, stage: int, u, states, at, sizes: np.ndarray) -> np.ndarray:
+        """Whether the equations of a stage are solved, (states,): to roundoff of their terms, however they cancel. One that has
+        none but the roundoff of zero has those of unknowns of these sizes."""
         if not u.size:
             return np.ones(len(u), bool)
-        index, terms = self.program.stages[stage][0], self._terms(stage, u, states, *at) if terms is None else terms
+        index = self.program.stages[stage][0]
+        terms, others = self._terms(stage, u, states, *at), self._terms(stage, u, states, *at, sizes)
+        terms = np.where(terms < NOTHING * others, others, terms)
         missed = self._read(self._values(index, u, states, at), self.program.equations[index].residual)
         return np.all(np.isfinite(terms), axis=1) & (_largest_ratio(missed, terms) < STALLED)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import NOT_FINITE, OK, TOO_LARGE, Outcome, Problem
-from dirax.engines.sizes import sizes_of
+from dirax.engines.sizes import Sizes, sizes_of
 from dirax.engines.stage_in_numbers import InJax, InNumbers, in_numbers
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import balanced_condition, balanced_inverse
@@ -27,14 +27,20 @@ FOLLOWED = 64
 COUNTS, NAMED = 0.1, 8
 """Part that an equation has in a direction for it to be named, and how many are named at most."""
 
+NEARLY = 1e-9
+"""Singular values that say no more of an unknown than that it floats."""
+
 brief: ContextVar[bool] = ContextVar("brief", default=False)
 """Whether the failed step is not computed again to see where it breaks: of a million trajectories many may fail."""
 
 
-def explain(problem: Problem, outcome: Outcome, lane: int, kept: int | None = None) -> str:
+def explain(
+    problem: Problem, outcome: Outcome, lane: int, kept: int | None = None, sizes: Callable[[], Sizes] | None = None
+) -> str:
     """One or two sentences on the step at which trajectory `lane` failed, or on the interruption.
 
-    `kept` counts the steps up to the last row that was kept: all good ones by default.
+    `kept` counts the steps up to the last row that was kept: all good ones by default. `sizes` gives those of the unknowns where
+    the trajectories begin.
     """
     p, completed = problem, int(outcome.completed[lane])
     time_of = lambda steps: p.t0 + (p.first_step + steps) * p.h
@@ -46,7 +52,7 @@ def explain(problem: Problem, outcome: Outcome, lane: int, kept: int | None = No
     if int(outcome.status[lane]) == OK:
         return f"interrupted by the user; {rows}."
     at = time_of(completed)
-    reason = _by_status(outcome, lane) if brief.get() else _reason(p, outcome, lane, at) + _remark(p, outcome, lane, at)
+    reason = _by_status(outcome, lane) if brief.get() else _reason(p, outcome, lane, at, sizes) + _remark(p, outcome, lane, at)
     return f"step {p.first_step + completed + 1} (from t = {at:.6g}) failed: {reason}; {rows}."
 
 
@@ -63,7 +69,7 @@ def _remark(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     return f"; {said}" if said else ""
 
 
-def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
+def _reason(p: Problem, outcome: Outcome, lane: int, t: float, sizes: Callable[[], Sizes] | None) -> str:
     """The stages of the failing step are replayed one by one, to see where it breaks."""
     params = jax.tree.map(lambda a: np.asarray(a[lane] if p.batch_params else a), p.params)
     state, last = np.asarray(outcome.last_state[lane]), np.asarray(outcome.last_unknowns[lane])
@@ -73,8 +79,8 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
             f"{TOO_LARGE}: take a smaller step, another scheme, or engine='xla', which may compile it for minutes"
         )
     alone = p.batch is None and len(p.equation.stages) == 1
-    solved, known, sizes = [], {}, [a[lane if p.batch is not None else ...] for a in sizes_of(p)]
-    for (stage, fraction), size in zip(p.equation.stages, sizes, strict=True):
+    solved, known, found = [], {}, [a[lane if p.batch is not None else ...] for a in (sizes() if sizes else sizes_of(p))]
+    for (stage, fraction), size in zip(p.equation.stages, found, strict=True):
         if id(stage) not in known:
             known[id(stage)] = in_numbers(stage, params)
         numbers, h = known[id(stage)], fraction * p.h
@@ -82,6 +88,8 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
         reason, u = _replay_newton(stage, numbers, guess, (state, t, h), params, size, p.max_iterations)
         if reason:
             return reason + (_where_it_ends(numbers, guess, (state, t, h), size) if reason.endswith(SMALLER) and alone else "")
+        if floating := _dependent(stage, numbers.linearized(u, state, t, h)[1], NEARLY, of_nodes=True):
+            return f"Newton did not converge from the values extrapolated from the steps before{floating}"
         solved.append((stage, numbers, guess, (state, t, h), size))
         state, t = numbers.advance(u, state, t, h), t + h
         if not np.all(np.isfinite(state)):
@@ -118,14 +126,18 @@ def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, sizes
     ), u
 
 
-def _dependent(stage, jacobian: np.ndarray) -> str:
-    """Which equations of a step depend on each other, and the way out for nodes of a circuit."""
+def _dependent(stage, jacobian: np.ndarray, tolerance: float = EPSILON, of_nodes: bool = False) -> str:
+    """Which equations of a step depend on each other, and the way out for nodes of a circuit; `of_nodes` alone where they do so
+    but for what is small."""
+    labels = stage.labels
+    if of_nodes and not any(label.startswith(POTENTIAL) for label in labels):
+        return ""
     rows = np.abs(jacobian).max(axis=1, keepdims=True)
     left, values, _ = np.linalg.svd(jacobian / np.where(rows > 0.0, rows, 1.0))
-    null = left[:, values <= len(values) * EPSILON * values.max(initial=0.0)]
+    null = left[:, values <= len(values) * tolerance * values.max(initial=0.0)]
     names = [stage.labels[i] for i in np.flatnonzero(np.abs(null).max(axis=1, initial=0.0) > COUNTS)]
     nodes = [name for name in names if name.startswith(POTENTIAL)]
-    if not names or len(names) > NAMED:
+    if not names or len(names) > NAMED or (of_nodes and not nodes):
         return ""
     if nodes:
         numbers = ", ".join(name.removeprefix(POTENTIAL) for name in nodes)
@@ -209,8 +221,9 @@ def _roundoff(numbers: InNumbers | InJax, u, args, sizes) -> np.ndarray:
     """The change of each unknown, relative to their size, that follows from a last place of every number that the residual
     is a function of."""
     by_u, by_state = numbers.slopes(u, *args)
-    left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
+    with np.errstate(all="ignore"):
+        left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
     if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and balanced_condition(by_u) < LARGEST_CONDITION):
         return np.full(len(u), np.inf)
-    change = EPSILON * np.abs(balanced_inverse(by_u)) @ left
-    return change / (np.abs(u) + sizes)
+    with np.errstate(all="ignore"):
+        return EPSILON * np.abs(balanced_inverse(by_u)) @ left / (np.abs(u) + sizes)

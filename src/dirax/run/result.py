@@ -1,11 +1,13 @@
 """From what an engine gives back to a Solution: rows, times, messages, and what is reported of the run."""
 
+import functools
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Outcome, Problem, cut, saved_steps
+from dirax.engines.sizes import sizes_of
 from dirax.run.failure_messages import explain
 from dirax.run.validate import Case
 from dirax.schemes.step import AbstractScheme
@@ -66,9 +68,9 @@ def messages(p: Problem, outcome: Outcome, numbers: np.ndarray, said: list[str] 
     """Why each trajectory ended, "" where it did not."""
     good = np.asarray(outcome.completed)
     kept = good if p.batch is None else numbers[np.searchsorted(numbers, good, side="right") - 1]
-    found = [""] * len(good)
+    found, sizes = [""] * len(good), functools.cache(lambda: sizes_of(p))
     for lane in np.flatnonzero(good < p.steps).tolist():
-        found[lane] = (said[lane] if said else "") or explain(p, outcome, lane, kept=int(kept[lane]))
+        found[lane] = (said[lane] if said else "") or explain(p, outcome, lane, int(kept[lane]), sizes)
     return found
 
 
