@@ -195,7 +195,7 @@ class StepsInNumbers:
 
     @np.errstate(all="ignore")
     def solved(
-        self, made: Attempts, near: Near, t: np.ndarray, h: float, params: np.ndarray
+        self, made: Attempts, near: Near, t: np.ndarray, h: float | np.ndarray, params: np.ndarray
     ) -> tuple[list[np.ndarray], np.ndarray]:
         """The sizes (states, k) of the unknowns of each part where steps found them, their values and what a typical rounding of
         each term of the equations comes to; and whether the equations are solved, (states,), to roundoff of their terms."""
@@ -333,7 +333,7 @@ class StepsInNumbers:
         if not u.size:
             return np.ones(len(u), bool)
         index = self.program.stages[stage][0]
-        terms, others = self._terms(stage, u, states, *at), self._terms(stage, u, states, *at, sizes)
+        terms, others = self._terms(stage, u, states, *at), self._terms(stage, u, states, *at, sizes=sizes)
         terms = np.where(terms < NOTHING * others, others, terms)
         missed = self._read(self._values(index, u, states, at), self.program.equations[index].residual)
         return np.all(np.isfinite(terms), axis=1) & (_largest_ratio(missed, terms) < STALLED)
