@@ -55,16 +55,7 @@ def replayed_of_many(sol: Solution, name: str, tolerance: float | None) -> Line:
                 continue
             (state, guess, t, params), last = begun_at(sol, lane, row), min(row + 2, sol.rows - 1)
             to_next, to_last = (int(numbers[at] - numbers[row]) for at in (row + 1, last))
-            problem = Problem(
-                sol.equation,
-                np.asarray(state),
-                tuple(map(np.asarray, guess)),
-                float(sol.step),
-                t,
-                to_last,
-                to_next,
-                params=params,
-            )
+            problem = Problem(sol.equation, state, guess, float(sol.step), t, to_last, to_next, params=params)
             found = _taken(engine, problem)
             if found is None:
                 return Line(name, None, None, NOT_CHECKED, f"the step from t = {t:.6g} has no solution from its saved row")

@@ -99,9 +99,8 @@ def _next_step(p: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.n
     if steps is None:
         return guess, np.ones(len(lanes), bool)
     params = steps.parameters(p.params, p.batch if p.batch_params else None, lanes)
-    t, near = p.t0 + (p.first_step + completed) * p.h, steps.nothing_near(len(lanes))
-    made = steps.step(state, guess, t, p.h, params, near=near)
-    return tuple(made.unknowns), steps.solved(made, near, t, p.h, params)[1]
+    unknowns, _, good = steps.solved(state, guess, p.t0 + (p.first_step + completed) * p.h, p.h, params)
+    return tuple(unknowns), good
 
 
 def sizes_there(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> Sizes:
@@ -162,10 +161,7 @@ def _closely(at: Entries) -> list[np.ndarray]:
     far = [np.any(a > FAR * np.abs(u), axis=1) for a, u in zip(found, at.guesses, strict=True)]
     if not np.any(far):
         return found
-    steps = StepsInNumbers(None, at.program)
-    near = steps.nothing_near(len(at.state))
-    made = steps.step(at.state, at.guesses, at.t, at.h, at.leaves, near=near)
-    sizes, good = steps.solved(made, near, at.t, at.h, at.leaves)
+    _, sizes, good = StepsInNumbers(None, at.program).solved(at.state, at.guesses, at.t, at.h, at.leaves)
     most = [np.where(good[:, None], MOST * a, FAR * np.abs(u)) for a, u in zip(sizes, at.guesses, strict=True)]
     return [np.where(b > 0.0, np.minimum(a, power_of_two(b)), a) for a, b in zip(found, most, strict=True)]
 

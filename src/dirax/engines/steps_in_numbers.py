@@ -195,17 +195,19 @@ class StepsInNumbers:
 
     @np.errstate(all="ignore")
     def solved(
-        self, made: Attempts, near: Near, t: np.ndarray, h: float | np.ndarray, params: np.ndarray
-    ) -> tuple[list[np.ndarray], np.ndarray]:
-        """The sizes (states, k) of the unknowns of each part where steps found them, their values and what a typical rounding of
-        each term of the equations comes to; and whether the equations are solved, (states,), to roundoff of their terms."""
-        sizes, good = [], made.good.copy()
-        for stage, ((_index, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
-            at = t, np.full(len(t), fraction * h), params
-            sizes.append(self._sizes(stage, u, state, at, near.inverses[stage]))
-            good &= self._are_solved(stage, u, state, at, sizes[-1])
+        self, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, h: float | np.ndarray, params: np.ndarray
+    ) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
+        """A step of each state: the unknowns of each part, their sizes (states, k), which are their values and what a typical
+        rounding of each term of the equations comes to, and whether the equations are solved to roundoff of these, (states,)."""
+        near = self.nothing_near(len(t))
+        made = self.step(states, guesses, t, h, params, near=near)
+        sizes, good = [], made.good
+        for stage, ((_, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
+            of_part, solved = self._judged(stage, u, state, (t, np.full(len(t), fraction * h), params), near.inverses[stage])
+            sizes.append(of_part)
+            good = good & solved & np.all(np.isfinite(of_part), axis=1)
             t = t + fraction * h
-        return sizes, good & np.all([np.all(np.isfinite(a), axis=1) for a in sizes], axis=0)
+        return made.unknowns, sizes, good
 
     def _terms(self, stage: int, u, state, t, h, params, sizes: np.ndarray | None = None) -> np.ndarray:
         """The sizes (states, k) of the terms of a stage's equations, however they cancel, with unknowns of their own sizes."""
@@ -274,6 +276,8 @@ class StepsInNumbers:
         fixed, u = None, safe.copy()
         inverse, size = near.inverses[stage], near.sizes[stage]
         last, left, renewed = np.full(count, np.inf), np.arange(count), unknown(inverse)
+        of_some = lambda some: (u[some], states[some], tuple(a[some] for a in at), inverse[some])
+        is_solved = lambda some: self._judged(stage, *of_some(some))[1]
         own = renewed.copy()  # the Jacobian is of these equations, or was seen to contract
         for _ in range(UPDATES):
             some = known if fixed is None else fixed.at(left) if len(left) < count else fixed.without(set())
@@ -301,7 +305,7 @@ class StepsInNumbers:
             ended = found | stalled
             far = ended & np.any(size[left] > FAR * np.abs(u[left]), axis=1)
             if np.any(far):
-                ended[far] = self._are_solved(*self._part(stage, u, states, at, inverse, left[far]))
+                ended[far] = is_solved(left[far])
             ended |= fresh & np.isnan(moved)
             renewed[left] = ~fresh & ~contracts & ~(own[left] & (moved < STALLED)) & ~ended
             last[left] = np.where(renewed[left], np.inf, moved)
@@ -314,29 +318,20 @@ class StepsInNumbers:
         u = u - applied(inverse, self._read(self._values(index, u, states, at, noise), e.residual))
         good = last < STALLED
         if len(left):
-            good[left] &= self._are_solved(*self._part(stage, u, states, at, inverse, left))
+            good[left] &= is_solved(left)
         return u, good
 
-    def _part(self, stage: int, u, states, at, inverse: Inverses, some: np.ndarray) -> tuple:
-        """What `_are_solved` takes, of some steps."""
-        here = u[some], states[some], tuple(a[some] for a in at)
-        return stage, *here, self._sizes(stage, *here, inverse[some])
-
-    def _sizes(self, stage: int, u, states, at, inverses: Inverses) -> np.ndarray:
-        """The values of unknowns, and what a typical rounding of each term of the equations comes to where that is more."""
-        terms = self._terms(stage, u, states, *at)
-        return np.maximum(np.abs(u), TYPICAL * applied_sizes(inverses, terms)) if u.shape[1] else u
-
-    def _are_solved(self, stage: int, u, states, at, sizes: np.ndarray) -> np.ndarray:
-        """Whether the equations of a stage are solved, (states,): to roundoff of their terms, however they cancel. One that has
-        none but the roundoff of zero has those of unknowns of these sizes."""
+    def _judged(self, stage: int, u, states, at, inverses: Inverses) -> tuple[np.ndarray, np.ndarray]:
+        """The sizes of unknowns, as of `solved`, and whether the equations are solved, (states,): to roundoff of their terms,
+        however they cancel. One that has none but the roundoff of zero has those of unknowns of these sizes."""
         if not u.size:
-            return np.ones(len(u), bool)
-        index = self.program.stages[stage][0]
-        terms, others = self._terms(stage, u, states, *at), self._terms(stage, u, states, *at, sizes=sizes)
+            return u, np.ones(len(u), bool)
+        terms = self._terms(stage, u, states, *at)
+        sizes = np.maximum(np.abs(u), TYPICAL * applied_sizes(inverses, terms))
+        others, index = self._terms(stage, u, states, *at, sizes=sizes), self.program.stages[stage][0]
         terms = np.where(terms < NOTHING * others, others, terms)
         missed = self._read(self._values(index, u, states, at), self.program.equations[index].residual)
-        return np.all(np.isfinite(terms), axis=1) & (_largest_ratio(missed, terms) < STALLED)
+        return sizes, np.all(np.isfinite(terms), axis=1) & (_largest_ratio(missed, terms) < STALLED)
 
     def _values(self, index: int, u, states, at, noise: Noise | None = None) -> Values:
         e, shared = self.program.equations[index], self.program.shared
@@ -384,8 +379,7 @@ class StepsInNumbers:
 
 def _largest_ratio(values: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """The largest |value|/size of each row, NaN where one is not finite."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        ratios = np.divide(np.abs(values), sizes, out=np.zeros_like(values), where=sizes > SMALLEST)
+    ratios = np.divide(np.abs(values), sizes, out=np.zeros_like(values), where=sizes > SMALLEST)
     return np.where(np.all(np.isfinite(values), axis=1), np.max(ratios, axis=1), np.nan)
 
 

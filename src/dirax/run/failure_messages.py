@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import NOT_FINITE, OK, TOO_LARGE, Outcome, Problem
-from dirax.engines.sizes import Sizes, sizes_of
+from dirax.engines.sizes import Sizes
 from dirax.engines.stage_in_numbers import InJax, InNumbers, in_numbers
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import balanced_condition, balanced_inverse
@@ -34,17 +34,13 @@ brief: ContextVar[bool] = ContextVar("brief", default=False)
 """Whether the failed step is not computed again to see where it breaks: of a million trajectories many may fail."""
 
 
-def explain(
-    problem: Problem, outcome: Outcome, lane: int, kept: int | None = None, sizes: Callable[[], Sizes] | None = None
-) -> str:
+def explain(problem: Problem, outcome: Outcome, lane: int, kept: int, sizes: Callable[[], Sizes]) -> str:
     """One or two sentences on the step at which trajectory `lane` failed, or on the interruption.
 
-    `kept` counts the steps up to the last row that was kept: all good ones by default. `sizes` gives those of the unknowns where
-    the trajectories begin.
+    `kept` counts the steps up to the last row that was kept; `sizes` gives those of the unknowns where the trajectories begin.
     """
     p, completed = problem, int(outcome.completed[lane])
     time_of = lambda steps: p.t0 + (p.first_step + steps) * p.h
-    kept = completed if kept is None else kept
     if CLOCK in (layout := p.equation.stages[0][0].state_layout):  # steps have lengths of their own
         reached = float(np.asarray(outcome.last_state[lane])[layout.place(CLOCK)][0])
         time_of = lambda steps: reached if steps == completed else np.nan
@@ -69,7 +65,7 @@ def _remark(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
     return f"; {said}" if said else ""
 
 
-def _reason(p: Problem, outcome: Outcome, lane: int, t: float, sizes: Callable[[], Sizes] | None) -> str:
+def _reason(p: Problem, outcome: Outcome, lane: int, t: float, sizes: Callable[[], Sizes]) -> str:
     """The stages of the failing step are replayed one by one, to see where it breaks."""
     params = jax.tree.map(lambda a: np.asarray(a[lane] if p.batch_params else a), p.params)
     state, last = np.asarray(outcome.last_state[lane]), np.asarray(outcome.last_unknowns[lane])
@@ -79,8 +75,8 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float, sizes: Callable[[
             f"{TOO_LARGE}: take a smaller step, another scheme, or engine='xla', which may compile it for minutes"
         )
     alone = p.batch is None and len(p.equation.stages) == 1
-    solved, known, found = [], {}, [a[lane if p.batch is not None else ...] for a in (sizes() if sizes else sizes_of(p))]
-    for (stage, fraction), size in zip(p.equation.stages, found, strict=True):
+    solved, known, of_lane = [], {}, [a[lane if p.batch is not None else ...] for a in sizes()]
+    for (stage, fraction), size in zip(p.equation.stages, of_lane, strict=True):
         if id(stage) not in known:
             known[id(stage)] = in_numbers(stage, params)
         numbers, h = known[id(stage)], fraction * p.h
@@ -88,7 +84,7 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float, sizes: Callable[[
         reason, u = _replay_newton(stage, numbers, guess, (state, t, h), params, size, p.max_iterations)
         if reason:
             return reason + (_where_it_ends(numbers, guess, (state, t, h), size) if reason.endswith(SMALLER) and alone else "")
-        if floating := _dependent(stage, numbers.linearized(u, state, t, h)[1], NEARLY, of_nodes=True):
+        if floating := _floating(stage, numbers, u, (state, t, h)):
             return f"Newton did not converge from the values extrapolated from the steps before{floating}"
         solved.append((stage, numbers, guess, (state, t, h), size))
         state, t = numbers.advance(u, state, t, h), t + h
@@ -126,26 +122,36 @@ def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, sizes
     ), u
 
 
-def _dependent(stage, jacobian: np.ndarray, tolerance: float = EPSILON, of_nodes: bool = False) -> str:
-    """Which equations of a step depend on each other, and the way out for nodes of a circuit; `of_nodes` alone where they do so
-    but for what is small."""
-    labels = stage.labels
-    if of_nodes and not any(label.startswith(POTENTIAL) for label in labels):
+def _dependent(stage, jacobian: np.ndarray) -> str:
+    """Which equations of a step depend on each other, and the way out for nodes of a circuit."""
+    names = _in_null_space(stage, jacobian, EPSILON)
+    return _of_nodes(names) or (f": nothing tells these equations apart, {', '.join(names)}" if names else "")
+
+
+def _floating(stage, numbers: InNumbers | InJax, u, args) -> str:
+    """Which nodes of a circuit have a potential that next to nothing determines, and the way out."""
+    if stage.unknowns >= FEWEST_SPARSE or not any(label.startswith(POTENTIAL) for label in stage.labels):
         return ""
+    return _of_nodes(_in_null_space(stage, numbers.linearized(u, *args)[1], NEARLY))
+
+
+def _in_null_space(stage, jacobian: np.ndarray, tolerance: float) -> list[str]:
+    """The labels of equations that depend on each other; none of too many to be named."""
     rows = np.abs(jacobian).max(axis=1, keepdims=True)
     left, values, _ = np.linalg.svd(jacobian / np.where(rows > 0.0, rows, 1.0))
     null = left[:, values <= len(values) * tolerance * values.max(initial=0.0)]
     names = [stage.labels[i] for i in np.flatnonzero(np.abs(null).max(axis=1, initial=0.0) > COUNTS)]
-    nodes = [name for name in names if name.startswith(POTENTIAL)]
-    if not names or len(names) > NAMED or (of_nodes and not nodes):
+    return names if len(names) <= NAMED else []
+
+
+def _of_nodes(names: list[str]) -> str:
+    nodes = [name.removeprefix(POTENTIAL) for name in names if name.startswith(POTENTIAL)]
+    if not nodes:
         return ""
-    if nodes:
-        numbers = ", ".join(name.removeprefix(POTENTIAL) for name in nodes)
-        return (
-            f": nothing determines the potential of {'nodes' if len(nodes) > 1 else 'node'} {numbers}, to which no current flows "
-            "that depends on it; put a large resistor beside an element that blocks, or from there to the ground"
-        )
-    return f": nothing tells these equations apart, {', '.join(names)}"
+    return (
+        f": nothing determines the potential of {'nodes' if len(nodes) > 1 else 'node'} {', '.join(nodes)}, to which no current "
+        "flows that depends on it; put a large resistor beside an element that blocks, or from there to the ground"
+    )
 
 
 def _where_it_ends(numbers: InNumbers | InJax, guess, args, sizes) -> str:
