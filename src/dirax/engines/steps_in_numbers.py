@@ -323,15 +323,18 @@ class StepsInNumbers:
 
     def _judged(self, stage: int, u, states, at, inverses: Inverses) -> tuple[np.ndarray, np.ndarray]:
         """The sizes of unknowns, as of `solved`, and whether the equations are solved, (states,): to roundoff of their terms,
-        however they cancel. One that has none but the roundoff of zero has those of unknowns of these sizes."""
+        however they cancel. One that has none but the roundoff of zero has those of unknowns of the sizes that equations give
+        them which are solved for sure: at a place that solves nothing, near a singular Jacobian, unknowns have any size."""
         if not u.size:
             return u, np.ones(len(u), bool)
-        terms = self._terms(stage, u, states, *at)
-        sizes = np.maximum(np.abs(u), TYPICAL * applied_sizes(inverses, terms))
-        others, index = self._terms(stage, u, states, *at, sizes=sizes), self.program.stages[stage][0]
-        terms = np.where(terms < NOTHING * others, others, terms)
+        terms, index = self._terms(stage, u, states, *at), self.program.stages[stage][0]
         missed = self._read(self._values(index, u, states, at), self.program.equations[index].residual)
-        return sizes, np.all(np.isfinite(terms), axis=1) & (_largest_ratio(missed, terms) < STALLED)
+        within = lambda terms: np.abs(missed) <= STALLED * terms
+        of_terms = lambda terms: np.maximum(np.abs(u), TYPICAL * applied_sizes(inverses, terms))
+        others = self._terms(stage, u, states, *at, sizes=of_terms(np.where(within(terms), terms, 0.0)))
+        larger = np.where(terms < NOTHING * others, others, terms)
+        good = np.isfinite(larger) & (within(larger) | (np.abs(missed) <= SMALLEST))
+        return of_terms(terms), np.all(good, axis=1)
 
     def _values(self, index: int, u, states, at, noise: Noise | None = None) -> Values:
         e, shared = self.program.equations[index], self.program.shared

@@ -28,7 +28,7 @@ from dirax.run.plan import AnyPlan, planned
 from dirax.run.premises import bytes_of, check_premise
 from dirax.run.progress import reported, reporting
 from dirax.run.redundancy import redundant_constraints, without_redundant
-from dirax.run.refused_start import refuse_bad_start
+from dirax.run.refused_start import SHORTER, refuse_bad_start
 from dirax.run.result import solution_of
 from dirax.run.settings import Settings, kind_of
 from dirax.run.start import begun, completed
@@ -222,7 +222,8 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
             stage(data, case.h, own)
         needed = partial(needed_at, system, case, initial) if singular else None
         labels = equation.stages[0][0].labels
-        refuse_bad_start(system, initial, start, labels, check_initial, settings.project, needed, case)
+        shorter = lambda: begun(equation, replace(case, h=SHORTER * case.h), initial, by_jax)
+        refuse_bad_start(system, initial, start, labels, check_initial, settings.project, needed, case, shorter)
         if check_initial and singular:
             refuse_off_final_manifold(system, case, initial)
         if check_initial:

@@ -25,10 +25,13 @@ def refuse_bad_start(
     projected: bool,
     needed: Callable[[], str] | None,
     case: Case,
+    shorter: Callable[[], Start],
 ) -> None:
     """Raise `ValueError` for functions that are not finite at the data, data off the constraints (with the residual), and a
     first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
-    the equations of the first step; `projected` says that the data have been moved, `needed` what a singular Lagrangian needs."""
+    the equations of the first step; `projected` says that the data have been moved, `needed` what a singular Lagrangian needs.
+    `shorter` is the start of a run with steps SHORTER times as long: a matrix that is singular at the first guess of a long step
+    alone may just be far from the solution."""
     if start.row0 is not None and "constraint" in start.row0:
         both = _lanes(initial.defect, 1), _lanes(start.row0["constraint"], 1)
         initial = initial._replace(defect=np.concatenate(both, axis=-1))
@@ -39,7 +42,8 @@ def refuse_bad_start(
     if needed and not system.constraints.any and labels[0].startswith(AT_NODE.format(0)):
         raise ValueError(f"collocation takes regular Lagrangians, and ∂²L/∂v² is singular at the initial data: it {needed()}.")
     if start.jacobian is not None:
-        _refuse_singular_step(start, labels, needed, initial.lagrangian is not None)
+        short = None if start.row0 is not None else lambda: shorter().jacobian
+        _refuse_singular_step(start, labels, needed, initial.lagrangian is not None, short)
 
 
 def _refuse_outside_the_domain(initial: Initial) -> None:
@@ -102,7 +106,13 @@ def _way_onto_constraint(system: AbstractSystem, two_points: bool, projected: bo
     return "pass project=True to project them, or check_initial=False to take them as they are"
 
 
-def _refuse_singular_step(start: Start, labels: Sequence[str], needed: Callable[[], str] | None, lagrangian: bool) -> None:
+def _refuse_singular_step(
+    start: Start,
+    labels: Sequence[str],
+    needed: Callable[[], str] | None,
+    lagrangian: bool,
+    shorter: Callable[[], Any] | None,
+) -> None:
     residual, sparse = _lanes(start.residual, 1), isinstance(start.jacobian, SparseJacobians)
     jacobian = start.jacobian.product[:, 0, :, None] if sparse else _lanes(start.jacobian, 2)
     rows = np.isfinite(residual) & np.all(np.isfinite(jacobian), axis=2)
@@ -119,9 +129,11 @@ def _refuse_singular_step(start: Start, labels: Sequence[str], needed: Callable[
             "domain of the system's functions, or on its edge."
         )
     if sparse:
-        return _refuse_singular_sparse_step(start.jacobian, labels)
+        return _refuse_singular_sparse_step(start.jacobian, labels, shorter)
     ranks, directions = rank_of_equations(jacobian)
     unknowns = jacobian.shape[1]
+    if shorter and np.any(ranks < unknowns):
+        ranks = np.maximum(ranks, _ranks_where_finite(_lanes(shorter(), 2)))
     if np.any(ranks < unknowns):
         lane = int(np.argmax(ranks < unknowns))
         way = (
@@ -161,6 +173,12 @@ def _refuse_singular_step(start: Start, labels: Sequence[str], needed: Callable[
         )
 
 
+def _ranks_where_finite(jacobians: np.ndarray) -> np.ndarray:
+    """The ranks (B,) of matrices (B, k, k), 0 of one that is not finite."""
+    finite = np.all(np.isfinite(jacobians), axis=(1, 2))
+    return rank_of_equations(np.where(finite[:, None, None], jacobians, 0.0))[0]
+
+
 def _projection_alone(jacobian: np.ndarray, labels: Sequence[str]) -> bool:
     """Whether the equations of a step have a unique solution without those of the projection of its momentum, which are the last
     and have unknowns of their own."""
@@ -168,7 +186,9 @@ def _projection_alone(jacobian: np.ndarray, labels: Sequence[str]) -> bool:
     return steps < len(labels) and int(rank_of_equations(jacobian[None, :steps, :steps])[0][0]) == steps
 
 
-def _refuse_singular_sparse_step(jacobians: SparseJacobians, labels: Sequence[str]) -> None:
+def _refuse_singular_sparse_step(
+    jacobians: SparseJacobians, labels: Sequence[str], shorter: Callable[[], SparseJacobians] | None
+) -> None:
     """The same of many unknowns, of which only some are named: those that move most in the direction that is left free.
 
     That the pattern has all entries is checked by a product with a vector that was not found with it."""
@@ -187,6 +207,10 @@ def _refuse_singular_sparse_step(jacobians: SparseJacobians, labels: Sequence[st
             if np.any(worst > PRODUCT):
                 raise AssertionError(f"the {what} of the step is wrong in {labels[int(np.argmax(worst))]}: report this.")
         free = free_direction(jacobians.equations, matrix)
+        if free is not None and shorter:
+            short = shorter()
+            if free_direction(short.equations, short.equations.matrix(short.values[lane][0])) is None:
+                continue
         if free is not None:
             most = np.argsort(-np.abs(free))[:4]
             most = most[np.abs(free[most]) > 1e-3 * np.abs(free[most[0]])]
@@ -199,6 +223,9 @@ def _refuse_singular_sparse_step(jacobians: SparseJacobians, labels: Sequence[st
                 "discrete Lagrangian."
             )
 
+
+SHORTER = 2.0**-10
+"""Part of a step that is short."""
 
 PRODUCT = 1e-10
 """Difference of two ways to a residual, or to a product of the Jacobian with a vector, relative to terms, that roundoff makes."""
