@@ -21,6 +21,7 @@ from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.kernels import QUICK, SOON, kernels
 from dirax.engines.native.loops.sizes import sizes_module
 from dirax.engines.native.loops.step_loop import kernel_module
+from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.xla import Xla
 from dirax.program import machine_code as llvm
 from dirax.program.graph import Graph
@@ -535,18 +536,25 @@ def test_a_first_guess_behind_an_exponential_wall_is_no_solution(step):
     assert np.all(np.isfinite(q[sol.ok]))
 
 
-def test_a_first_guess_between_two_bodies_gives_no_sizes():
-    """Where two of three bodies nearly meet at a first guess, the terms there are no measure of roundoff at the solution."""
+BODIES = np.array([0, 0, 1.2, 0, 0.6, 1.1])
+
+
+def bodies(trap):
+    """Three bodies in the plane with the potential r⁻¹² − r⁻⁶, in a trap; and that potential."""
 
     def potential(q):
         i, j = np.triu_indices(3, 1)
         apart = jnp.sum((q.reshape(3, 2)[i] - q.reshape(3, 2)[j]) ** 2, axis=1)
-        return jnp.sum(apart**-6 - apart**-3) + q @ q / 2
+        return jnp.sum(apart**-6 - apart**-3) + trap * q @ q / 2
 
-    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - potential(q))
-    draw, h = np.random.default_rng(11), 0.4
-    first = np.array([0, 0, 1.2, 0, 0.6, 1.1])
-    starts = [(first + 0.1 * draw.normal(size=6), 1.5 * draw.normal(size=6)) for _ in range(54)]
+    return dx.LagrangeDirac(lambda q, v: v @ v / 2 - potential(q)), potential
+
+
+def test_a_first_guess_between_two_bodies_gives_no_sizes():
+    """Where two of three bodies nearly meet at a first guess, the terms there are no measure of roundoff at the solution."""
+    (system, potential), h = bodies(1.0), 0.4
+    draw = np.random.default_rng(11)
+    starts = [(BODIES + 0.1 * draw.normal(size=6), 1.5 * draw.normal(size=6)) for _ in range(54)]
     force, solved = jax.jit(jax.vmap(jax.grad(potential))), 0
     for q, v in [starts[i] for i in (0, 22, 53)]:
         sol = dx.simulate(system, dx.DiscreteDirac(), q=q, v=v, step=h, steps=3, engine="native")
@@ -555,3 +563,51 @@ def test_a_first_guess_between_two_bodies_gives_no_sizes():
         assert np.all(np.max(missed, axis=1) <= 1e-9 * np.max(terms, axis=1))
         solved += sol.rows > 1
     assert solved
+
+
+def test_a_step_that_is_singular_at_its_first_guess_alone_is_taken():
+    """The matrix of a long step may be singular where two bodies nearly meet: that says nothing of the Lagrangian."""
+    system, potential = bodies(0.0)
+    q = np.array([0.06276237, 0.01395781, 1.17679126, -0.10015474, 0.61158643, 1.06730199])
+    v = np.array([2.21501677, 0.74635929, -0.86769064, -0.32712642, -0.22428694, -4.26135685])
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[q, BODIES], v=[v, 0 * v], step=0.4, steps=3)
+    middle, velocity = (sol.q[0, 1:] + sol.q[0, :-1]) / 2, np.diff(sol.q[0], axis=0) / 0.4
+    pull = 0.2 * np.asarray(jax.vmap(jax.grad(potential))(jnp.asarray(middle)))
+    assert np.all(sol.ok)
+    np.testing.assert_allclose(sol.p[0, :-1], velocity + pull, atol=1e-9 * np.max(np.abs(pull)))
+
+
+def test_a_place_near_a_singular_jacobian_is_no_solution():
+    """There unknowns have any size: residuals are measured by sizes that are sure."""
+    (system, _), h = bodies(0.0), 0.4
+    q, v = (
+        np.array(
+            [
+                -0.16126217540869092,
+                0.04128695313297544,
+                1.1214502717004151,
+                0.17566032046188712,
+                0.49333028925891326,
+                0.9483054570283299,
+            ]
+        ),
+        np.array(
+            [
+                -0.11786860928129683,
+                -0.6053262067781735,
+                -1.5928010176783007,
+                -0.08642939653937219,
+                0.13639926152320564,
+                0.004152625990252928,
+            ]
+        ),
+    )
+    sol = dx.simulate(system, dx.DiscreteDirac(), q=q, v=v, step=h, steps=1, engine="native")
+    stage = sol.equation.stages[0][0]
+    state, guess = stage.start({"q": jnp.asarray(q), "v": jnp.asarray(v), "p": jnp.asarray(v), "t": 0.0}, h, None)
+    steps = StepsInNumbers.of(sol.equation, None, False)
+    begun, none = (np.asarray(state)[None], [np.asarray(guess)[None]], np.zeros(1)), np.zeros((1, 0))
+    (unknowns,), _, good = steps.solved(*begun, h, none)
+    missed = np.asarray(stage.residual(jnp.asarray(unknowns[0]), state, 0.0, h, None))
+    assert not sol.ok
+    assert not good[0] or np.max(np.abs(missed)) < 1e-6
