@@ -586,3 +586,13 @@ def test_32_bit_floats_are_refused_by_name():
             dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.0], step=0.1, steps=2)
     finally:
         jax.config.update("jax_enable_x64", True)
+
+
+def test_params_that_no_function_takes_are_said():
+    free = dx.LagrangeDirac(lambda q, v: v @ v / 2)
+    run = {"q": [0.0], "v": [1.0], "step": 0.1, "steps": 2, "params": {"k": 1.0}}
+    for start in (dx.simulate, dx.prepare):
+        with pytest.warns(UserWarning, match=r"none of the functions \(lagrangian\) takes them"):
+            start(free, dx.DiscreteDirac(), **run)
+    dx.simulate(dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v, params: -params["k"] * q), dx.DiscreteDirac(), **run)
+    dx.simulate(free, dx.DiscreteDirac(), **run, events=[dx.Event(lambda q, params: q[0] - params["k"])])

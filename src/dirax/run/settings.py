@@ -1,5 +1,7 @@
 """What is said of a run: Settings besides its numbers, and the Case that are its numbers."""
 
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -8,6 +10,8 @@ from typing import Any
 import jax
 
 from dirax.engines.engine import AbstractEngine
+from dirax.program.memo import Memo, Same
+from dirax.program.user_functions import UserFunction
 from dirax.run.event import Event, checked_events
 from dirax.run.impact import Impact
 from dirax.run.scalars import count, flag
@@ -70,7 +74,34 @@ def stated(
     given = {"project": project, "check_initial": check_initial, "compensated": compensated}
     flags = {name: flag(value, name) for name, value in given.items()}
     settings = Settings(system, scheme, on, max_iterations=max_iterations, events=events, to=path, **flags)
+    if case.params is not None and not events:  # which may take them too
+        _warn_of_unused_params(system, scheme)
     return settings, case, steps, save_every
+
+
+_unused: Memo[str] = Memo(256)
+"""The names of the functions where none takes params."""
+
+
+def _warn_of_unused_params(*stated: Any) -> None:
+    """Warn where no function of what is stated takes params, unless something in it is not of dirax and may read them."""
+    if names := _unused.get(tuple(map(Same, stated)), lambda: _without_params(stated)):
+        warnings.warn(
+            f"params were given, but none of the functions ({names}) takes them, so that they change nothing: a function takes "
+            "params as its last argument.",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def _without_params(stated: Sequence[Any]) -> str:
+    """The names of the functions; none where one takes params or is not known."""
+    if not all(type(value).__module__.startswith("dirax.") for value in stated):
+        return ""
+    is_known = lambda value: isinstance(value, UserFunction)
+    functions = [value for value in jax.tree.leaves(stated, is_leaf=is_known) if callable(value)]
+    known = all(is_known(f) and not f.takes_params for f in functions)
+    return ", ".join(dict.fromkeys(f.name for f in functions)) if known else ""
 
 
 def kind_of(case: Case) -> tuple:
