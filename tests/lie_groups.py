@@ -77,9 +77,8 @@ def unreduced(group, l, h, start, a0, steps, forms=None):
             action = lambda eta: discrete_lagrangian(before, curve(eta)) + discrete_lagrangian(curve(eta), after)
             return jnp.concatenate([jax.grad(action)(jnp.zeros(d)) + A.T @ u[d:], A @ u[:d]])
 
-        u = jnp.concatenate([xi, jnp.zeros(len(A))])
-        for _ in range(5):
-            u = u - jnp.linalg.solve(jax.jacfwd(equations)(u), equations(u))
+        better = lambda _, u: u - jnp.linalg.solve(jax.jacfwd(equations)(u), equations(u))
+        u = jax.lax.fori_loop(0, 5, better, jnp.concatenate([xi, jnp.zeros(len(A))]))
         return (g, following(g, u[:d]), u[:d]), (following(g, u[:d]), u)
 
     first = following(one, start)

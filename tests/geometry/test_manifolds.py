@@ -50,11 +50,18 @@ def manifold_laws(name):
         x = manifold.nearest(a)
         v = inside(manifold, x, scale * manifold.projection(x, b), 0.95)
         w = manifold.projection(x, c)
-        y = manifold.exp(x, v)
-        log = manifold.log(x, y)
         near = inside(manifold, x, v, 0.45)
         zero, time = jnp.zeros_like(v), jnp.asarray(0.3)
-        curve = lambda t: manifold.exp(x, t * v)
+        # one trace of each function serves all that is asked of it: it is compiled once
+        pushed = lambda f, v, w: jax.jvp(lambda v: f(x, v), (v,), (w,))
+        moved = lambda f, *pairs: jax.vmap(lambda v, w: pushed(f, v, w))(*map(jnp.stack, zip(*pairs, strict=True)))
+        (y, later, _), (_, speed, by_exp) = moved(manifold.exp, (v, w), (time * v, v), (zero, w))
+        (there, close, _), (_, _, by_retraction) = moved(manifold.retraction, (v, w), (near, w), (zero, w))
+        ends = jnp.stack([x, y]), jnp.stack([y, x])
+        log, back = jax.vmap(manifold.log)(*ends)
+        there_and_back = jax.vmap(manifold.distance)(*ends)
+        along, carried = jax.vmap(lambda w: manifold.transport(x, w, y))(jnp.stack([log, w]))
+        place, velocity = manifold.geodesic(x, v, time)
         point = manifold.local_parametrization(x)
         origin = jnp.zeros(manifold.dimension)
         frame = manifold.frame(x)
@@ -63,18 +70,18 @@ def manifold_laws(name):
             "projection idempotent": manifold.projection(x, w) - w,
             "projection symmetric": jnp.dot(w, b) - jnp.dot(w, manifold.projection(x, b)),
             "exp on the manifold": manifold.defect(y),
-            "point of a geodesic": manifold.geodesic(x, v, time)[0] - manifold.exp(x, time * v),
-            "velocity of a geodesic": manifold.geodesic(x, v, time)[1] - jax.jvp(curve, (time,), (1.0,))[1],
+            "point of a geodesic": place - later,
+            "velocity of a geodesic": velocity - speed,
             "log tangent": manifold.tangent_defect(x, log),
             "log of exp": log - v,
             "exp of log": manifold.representative(manifold.exp(x, log), y) - y,
-            "inverse of retraction": manifold.inverse_retraction(x, manifold.retraction(x, near)) - near,
-            "retraction on the manifold": manifold.defect(manifold.retraction(x, v)),
-            "derivative of exp": jax.jvp(lambda v: manifold.exp(x, v), (zero,), (w,))[1] - w,
-            "derivative of retraction": jax.jvp(lambda v: manifold.retraction(x, v), (zero,), (w,))[1] - w,
-            "distance symmetric": manifold.distance(x, y) - manifold.distance(y, x),
-            "transport along": manifold.transport(x, log, y) + manifold.log(y, x),
-            "transport isometric": norm(manifold.transport(x, w, y)) - norm(w),
+            "inverse of retraction": manifold.inverse_retraction(x, close) - near,
+            "retraction on the manifold": manifold.defect(there),
+            "derivative of exp": by_exp - w,
+            "derivative of retraction": by_retraction - w,
+            "distance symmetric": there_and_back[0] - there_and_back[1],
+            "transport along": along + back,
+            "transport isometric": norm(carried) - norm(w),
             "parametrization at 0": point(origin) - x,
             "parametrization on the manifold": manifold.defect(point(3.0 * r)),
             "frame": jax.jacfwd(point)(origin) - frame,

@@ -1,5 +1,7 @@
 """Tulczyjew triples: inverses, commuting diagrams, what the arrows do to the symplectic forms, and the discrete flows."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,9 +43,14 @@ def canonical(n):
 
 def pulled_back(arrow, point, n=2):
     """The canonical two-form of a cotangent bundle of dimension 4n, pulled back by an arrow at a point."""
-    flat = lambda x: jnp.concatenate(arrow(*jnp.split(x, 4)))
-    jacobian = np.asarray(jax.jit(jax.jacfwd(flat))(jnp.concatenate(point)))
+    jacobian = np.asarray(jacobian_of(arrow)(np.concatenate(point)))
     return jacobian.T @ canonical(2 * n) @ jacobian
+
+
+@functools.cache
+def jacobian_of(arrow):
+    """The derivative of an arrow, of the four parts of its argument in one array."""
+    return jax.jit(jax.jacfwd(lambda x: jnp.concatenate(arrow(*jnp.split(x, 4)))))
 
 
 def lagrangian(q, v):

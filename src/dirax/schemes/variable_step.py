@@ -131,7 +131,7 @@ class VariableStep(AbstractStep):
 
     def check(self, data, h, params):
         complete, rate = evaluated(self._completed, {**data, "t": data.get("t", 0.0)}, params)
-        density = self._first_density(complete, params)
+        density = evaluated(self._first_density, complete, params)
         if not (np.isfinite(density) and density > 0.0):
             raise ValueError(
                 f"density must be positive and finite along the motion, but it is {float(density):.6g} where the run begins: "
@@ -144,7 +144,7 @@ class VariableStep(AbstractStep):
                 "dx.VariableSteps takes two-forms that determine ẋ, but that of the system is degenerate where the run begins: "
                 "state it by dx.DiracStructure.from_kernel(F, E) with F = ωᵀ and E = −1, of which the smallest ẋ is taken."
             )
-        own, u = self.inner.start(complete, h / density, params)
+        own, u = evaluated(self.inner.start, complete, h / density, params)
         if moves(lambda step: tuple(self.row(own, 0.0, params, step).values()), jnp.append(u, h)):
             raise TypeError(
                 "dx.VariableSteps takes schemes whose q and p at a row do not depend on the step that leaves it, such as "

@@ -11,6 +11,7 @@ from dirax.geometry.group_retractions import coadjoint
 from dirax.geometry.lie_group import AbstractLieGroup
 from dirax.numerics.tolerances import GROUP_DEFECT
 from dirax.program.evaluation.functions import in_numpy
+from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.routh import DiscreteRouth
@@ -78,11 +79,22 @@ def _multipliers_at(solution: Solution, q: Any) -> Any:
         force = moved @ (fixed.T @ given[kept])
         return given.at[kept].set(jnp.linalg.solve(moved @ moved.T, force))
 
+    leaves, structure = jax.tree.flatten(solution.given_params)
+    t, rows = solution.t[:-1], q[..., :-1, :]
+    if not is_traced(t, rows, multipliers, leaves):
+        lead = np.shape(rows)[:-1]
+        of_params = [np.asarray(leaf) for leaf in leaves]
+        of_params = [np.expand_dims(a, 1) if solution.batch_params else a[(None,) * len(lead)] for a in of_params]
+        spread = lambda a: np.broadcast_to(a, (*lead, *a.shape[len(lead) :])).reshape(-1, *a.shape[len(lead) :])
+        entries = [spread(a) for a in (np.broadcast_to(t, lead), rows, np.asarray(multipliers), *of_params)]
+        flat = lambda t, q, given, *leaves: at(t, q, given, jax.tree.unflatten(structure, leaves))
+        found = in_numpy(flat, entries, (_multipliers_at, Same(system), tuple(kept.tolist()), structure))
+        if found is not None:
+            return found.reshape(*lead, -1)
     along = jax.vmap(at, in_axes=(0, 0, 0, None))
     if solution.batch is not None:
         along = jax.vmap(along, in_axes=(None, 0, 0, 0 if solution.batch_params else None))
-    rows = jnp.asarray(q)[..., :-1, :]
-    found = jax.jit(along)(jnp.asarray(solution.t)[:-1], rows, jnp.asarray(multipliers), solution.params)
+    found = jax.jit(along)(jnp.asarray(t), jnp.asarray(rows), jnp.asarray(multipliers), solution.params)
     return found if is_traced(found) else np.asarray(found)
 
 
