@@ -15,8 +15,9 @@ with_shapes = jaxtyping.jaxtyped
 
 def names_a_shape(annotation: Any) -> bool:
     """Also in parts of the type, and in what is not known yet."""
-    own = isinstance(annotation, str) or isinstance(annotation, type) and issubclass(annotation, jaxtyping.AbstractArray)
-    return own or any(map(names_a_shape, get_args(annotation)))
+    if isinstance(annotation, type) and issubclass(annotation, jaxtyping.AbstractArray):
+        return True
+    return isinstance(annotation, str) or any(map(names_a_shape, get_args(annotation)))
 
 
 def checked(*, typechecker):

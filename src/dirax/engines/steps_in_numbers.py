@@ -90,8 +90,8 @@ class StepsInNumbers:
 
     @classmethod
     def of(cls, equation: StepEquation | StepSequence, params: Any, batch_params: bool) -> "StepsInNumbers":
-        """Those of an equation, made once. Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for
-        too large a Jacobian."""
+        """Made once for an equation. Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for too
+        large a Jacobian."""
         program = step_program(equation, params, batch_params)
         return _made.get((Same(equation), Same(program)), lambda: cls(equation, program))
 

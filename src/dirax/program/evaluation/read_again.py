@@ -26,9 +26,8 @@ class ReadAgain:
         """The values (entries, …) of nodes (…) that depend on what is bound alone; of those that were needed all that are not
         `moving` may stay known, where these are given, always the same for an `index`."""
         key = nodes.tobytes()
-        if known.table is None:
-            if (tape := self._tape(key, nodes)) is not None:
-                return tape(known.given(tape)).reshape(known.entries, *nodes.shape)
+        if known.table is None and (tape := self._tape(key, nodes)) is not None:
+            return tape(known.given(tape)).reshape(known.entries, *nodes.shape)
         if (key, index) not in self._orders:
             read = nodes.ravel().tolist()
             order = self.graph.reachable(read)
