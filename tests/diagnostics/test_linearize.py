@@ -224,16 +224,21 @@ def leaning(q, v):
     return kinetic - q[0] ** 2 - q[1] ** 2 / 2 - 1.5 * q[2] ** 2 - 0.2 * q[0] * q[1] - 0.5 * q[0]
 
 
-def at_rest(system, one_form):
+ONE_FORM = lambda q: jnp.array([[0.4 + 0.3 * q[1], 0.2 * q[0], 1.0]])
+LEANING = dx.LagrangeDirac(leaning, ONE_FORM, forces=lambda t, q, v: -0.1 * v)
+
+
+@pytest.fixture(scope="module")
+def at_rest():
     """q = (a, b, .3) with ∂L/∂q = Wᵀλ, by Newton's method for (a, b, λ)."""
 
     def defect(z):
         q = jnp.stack([z[0], z[1], 0.3])
-        return jax.grad(leaning)(q, jnp.zeros(3)) - one_form(q)[0] * z[2]
+        return jax.grad(leaning)(q, jnp.zeros(3)) - ONE_FORM(q)[0] * z[2]
 
-    z = jnp.array([0.0, 0.0, -0.5])
+    linearized, z = jax.jit(lambda z: (jax.jacobian(defect)(z), defect(z))), np.array([0.0, 0.0, -0.5])
     for _ in range(20):
-        z = z - jnp.linalg.solve(jax.jacobian(defect)(z), defect(z))
+        z = z - np.linalg.solve(*linearized(z))
     return {"q": np.array([z[0], z[1], 0.3]), "v": np.zeros(3)}
 
 
@@ -245,13 +250,10 @@ def at_rest(system, one_form):
         (dx.EnergyCollocation(2), 1e-6),
     ],
 )
-def test_steps_with_multipliers_or_the_energy_in_their_state(scheme, error):
+def test_steps_with_multipliers_or_the_energy_in_their_state(scheme, error, at_rest):
     """A constraint that pushes where the system is at rest, and depends on the place. The multiplier in the state of collocation
     has an eigenvalue of its own, near 1 or −1, that is none of the system."""
-    one_form = lambda q: jnp.array([[0.4 + 0.3 * q[1], 0.2 * q[0], 1.0]])
-    system = dx.LagrangeDirac(leaning, one_form, forces=lambda t, q, v: -0.1 * v)
-    place = at_rest(system, one_form)
-    exact = dx.linearize(system, place).eigenvalues
-    found = dx.linearize(system, place, scheme, step=0.02)
+    exact = dx.linearize(LEANING, at_rest).eigenvalues
+    found = dx.linearize(LEANING, at_rest, scheme, step=0.02)
     assert found.stable and exact.shape == found.eigenvalues.shape == (5,)
     np.testing.assert_allclose(found.eigenvalues, exact, atol=error)

@@ -67,12 +67,27 @@ def moved_numbers(sol: Solution, name: str) -> np.ndarray:
     shape = sol.field_info[name].shape
     try:
         replay = Replay.of(sol)
-        at = replay.begun(*replay.chosen())
+        lanes, rows = replay.chosen()
+        some = _sampled(_neighbours(lanes, rows, sol.rows)[0])
+        at = replay.begun(lanes[some], rows[some])
         found = _Comparison(replay, replace(at, steps=np.ones_like(at.steps)))
     except CannotReplay:
         return np.zeros(shape)
     first = found.starts[name]
-    return found.usual()[first : first + found.sizes[name]].reshape(shape)
+    return found.usual(np.arange(len(some)))[first : first + found.sizes[name]].reshape(shape)
+
+
+def _neighbours(lanes: np.ndarray, rows: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """The entries of the row after each of some rows of trajectories and before each, −1 where there is none."""
+    order = lanes.astype(np.int64) * (most + 1) + rows
+    following, numbers = np.append(np.diff(order) == 1, False), np.arange(len(order))
+    return np.where(following, numbers + 1, -1), np.where(np.roll(following, 1), numbers - 1, -1)
+
+
+def _sampled(after: np.ndarray) -> np.ndarray:
+    """The entries, of which a row follows, that tell how far numbers move in a typical one."""
+    several = np.flatnonzero(after >= 0)
+    return several[spread(len(several), SAMPLED)]
 
 
 class _Comparison:
@@ -86,7 +101,7 @@ class _Comparison:
         self.sizes = {name: int(np.prod(a.shape[2:])) for name, a in replay.saved.items()}
         self.starts = dict(zip(self.sizes, np.cumsum([0, *self.sizes.values()]).tolist(), strict=False))
         self.held = {i: self.starts[name] + place for i, (name, place) in replay.held.items()}
-        self.next, self.previous = self._neighbours()
+        self.next, self.previous = _neighbours(at.lanes, at.rows, replay.sol.rows)
         self.saved = self._saved()
         self.again = replay.again(at)
         self.expected = np.full_like(self.saved, np.nan)
@@ -121,13 +136,6 @@ class _Comparison:
         """|saved − expected|, 0 where nothing is expected, infinite where a number should be and none is."""
         missed = np.abs(self.saved - self.expected)
         return np.where(np.isfinite(self.expected), np.where(np.isfinite(missed), missed, np.inf), 0.0)
-
-    def _neighbours(self) -> tuple[np.ndarray, np.ndarray]:
-        """The entries of the row after each and before each, −1 where there is none."""
-        order = self.at.lanes.astype(np.int64) * (self.replay.sol.rows + 1) + self.at.rows
-        following = np.append((np.diff(order) == 1), False)
-        numbers = np.arange(len(order))
-        return np.where(following, numbers + 1, -1), np.where(np.roll(following, 1), numbers - 1, -1)
 
     def _saved(self) -> np.ndarray:
         pieces = []
@@ -194,17 +202,16 @@ class _Comparison:
 
     # ------------------------------------------------------------------------------------------ how far rounding moves it
 
-    def usual(self) -> np.ndarray:
-        """How far each number moves in a typical row."""
-        several = np.flatnonzero(self.next >= 0)
-        scale = np.maximum(*self._scales_at(several[spread(len(several), SAMPLED)]))
+    def usual(self, sampled: np.ndarray) -> np.ndarray:
+        """How far each number moves in a typical row, of these entries."""
+        scale = np.maximum(*self._scales_at(sampled))
         usual = np.quantile(scale, TYPICAL, axis=0)
         usual[-1] = np.max(np.abs(self.saved[:, -1])) + float(self.replay.sol.step)
         return usual
 
     def ratios(self, limit: float) -> np.ndarray:
         """`missed`, relative to the terms of each number: those of a typical row, and in a row in doubt its own."""
-        usual = self.usual()
+        usual = self.usual(_sampled(self.next))
         ratio = _ratio(self.missed, usual)
         doubted = self._worst(ratio, limit)
         if not len(doubted):

@@ -8,6 +8,7 @@ import numpy as np
 from dirax.engines.step_program import KEPT, StepProgram, nodes_array
 from dirax.program.evaluation.in_floats import Floats, in_floats
 from dirax.program.evaluation.in_numpy import Slopes, Values
+from dirax.program.evaluation.read_again import ReadAgain
 from dirax.program.graph_derivatives import jacobian
 from dirax.program.memo import Memo, Same
 from dirax.program.rounding import rounding_nodes
@@ -36,6 +37,7 @@ class StageLook:
         self.sizes = [graph.input(f"size{i}") for i in range(k)]
         errors = dict(zip(e.unknowns, self.sizes, strict=True))
         self.terms, self.graph = rounding_nodes(graph, e.residual, errors), graph
+        self._reads = ReadAgain(graph)
         self.runs = 0
         """In how many runs it was looked at: it is compiled for the second one."""
         self._floats: Floats | None = None
@@ -61,7 +63,7 @@ class StageLook:
 
     def _read(self, known: Values, only: tuple[int, ...]) -> list[np.ndarray]:
         k = len(self.equation.unknowns)
-        found = [known.read(nodes_array(self._nodes(what))) for what in only]
+        found = [self._reads(known, nodes_array(self._nodes(what))) for what in only]
         return [a.reshape(-1, k, k + 1) if what == SLOPES else a for what, a in zip(only, found, strict=True)]
 
     def _swept(self, known: Values, only: tuple[int, ...]) -> list[np.ndarray]:

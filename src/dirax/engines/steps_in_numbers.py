@@ -8,14 +8,15 @@ import numpy as np
 
 from dirax.engines.first_sizes import FAR, NOTHING, TYPICAL
 from dirax.engines.stage_look import TERMS, stage_look
-from dirax.engines.step_program import StepProgram, step_program
+from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
 from dirax.numerics.equilibration import balanced_inverse, balancing_scales, condition_number
 from dirax.numerics.inverses import Inverses, applied, applied_sizes, inverted, no_inverses, unknown
 from dirax.numerics.tolerances import EPSILON
-from dirax.program.evaluation.in_numpy import LANES, Values
+from dirax.program.evaluation.in_numpy import LANES, Slopes, Values
 from dirax.program.evaluation.noise import Noise
-from dirax.program.graph import Order, with_ends
+from dirax.program.evaluation.read_again import ReadAgain
+from dirax.program.memo import Memo, Same
 from dirax.schemes.step import StepEquation, StepSequence, needs_every_part
 
 UPDATES = 80
@@ -79,16 +80,20 @@ class StepsInNumbers:
     """A StepEquation or a StepSequence; None where no rows are asked for."""
     program: StepProgram
     _depends: list[set[int]] = field(init=False)
-    _orders: dict[tuple[bytes, int | None], Order] = field(init=False, default_factory=dict)
+    _reads: ReadAgain = field(init=False)
+    _slopes: dict[tuple[int, ...], Slopes] = field(init=False, default_factory=dict)
 
     def __post_init__(self):
         _ = self.program.jacobians  # with which the graph has all its nodes
+        self._reads = ReadAgain(self.program.graph)
         self._depends = [self._moving(e.unknowns) for e in self.program.equations]
 
     @classmethod
     def of(cls, equation: StepEquation | StepSequence, params: Any, batch_params: bool) -> "StepsInNumbers":
-        """Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for too large a Jacobian."""
-        return cls(equation, step_program(equation, params, batch_params))
+        """Made once for an equation. Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for too
+        large a Jacobian."""
+        program = step_program(equation, params, batch_params)
+        return _made.get((Same(equation), Same(program)), lambda: cls(equation, program))
 
     def operations(self, states: int = 1, call: int = 1) -> int:
         """About how many scalar operations a step of so many states takes: its functions a few times, and a matrix or two
@@ -160,7 +165,7 @@ class StepsInNumbers:
         for of_entries, of_equations in ARRIVALS:
             known = self._values(index, u, states, at)
             nodes = [*(e.advance[i] for i in wanted if of_entries), *(e.residual if of_equations else ())]
-            slopes, missed = known.slopes(nodes, e.unknowns), self._read(known, nodes)
+            slopes, missed = self._slopes_of(known, nodes, e.unknowns), self._read(known, nodes)
             missed[:, : len(nodes) - len(e.residual) * of_equations] -= after[:, : len(wanted) * of_entries]
             good = np.all(np.isfinite(slopes), axis=(1, 2)) & np.all(np.isfinite(missed), axis=1)
             rows, columns = balancing_scales(np.abs(slopes[good]))
@@ -223,7 +228,7 @@ class StepsInNumbers:
         for (index, fraction), u, states in zip(self.program.stages, made.unknowns, made.states, strict=True):
             e, k = self.program.equations[index], u.shape[1]
             known = self._values(index, u, states, (t, np.full(count, fraction * h), params), noise)
-            slopes = known.slopes([*e.residual, *e.advance], [*e.unknowns, *e.state])
+            slopes = self._slopes_of(known, [*e.residual, *e.advance], [*e.unknowns, *e.state])
             slopes = noise.off(slopes) if noise else slopes  # for what is made of them by matrices
             by_u, by_state = slopes[:, :, :k], slopes[:, :, k:]
             step = by_state[:, k:]
@@ -354,16 +359,14 @@ class StepsInNumbers:
         return out, found[:, len(places) :]
 
     def _read(self, known: Values, nodes: Any, index: int | None = None) -> np.ndarray:
-        """The values of nodes, in an order that is found once; what does not depend on the unknowns of an equation stays known,
-        if its `index` is given."""
-        nodes = _nodes(nodes)
-        key = nodes.tobytes(), index
-        if key not in self._orders:
-            graph, read = self.program.graph, nodes.ravel().tolist()
-            order = graph.reachable(read)
-            kept = () if index is None else set(order) - self._depends[index]
-            (self._orders[key],) = with_ends(graph, [(order, read)], kept)
-        return known.read(nodes, self._orders[key])
+        """The values of nodes; what does not depend on the unknowns of an equation may stay known, if its `index` is given."""
+        return self._reads(known, _nodes(nodes), None if index is None else self._depends[index], index)
+
+    def _slopes_of(self, known: Values, nodes: list[int], inputs: list[int]) -> np.ndarray:
+        """The derivatives of nodes by inputs, (states, nodes, inputs)."""
+        if (key := (*nodes, -1, *inputs)) not in self._slopes:
+            self._slopes[key] = Slopes(self.program.graph, nodes, inputs)
+        return known.slopes(nodes, inputs, self._slopes[key])
 
     def _read_each(self, known: Values, named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The values of arrays of nodes by their names, all at once."""
@@ -378,6 +381,9 @@ class StepsInNumbers:
             if node not in moving and any(a in moving for a in args[node]):
                 moving.add(node)
         return moving
+
+
+_made: Memo[StepsInNumbers] = Memo(KEPT)
 
 
 def _largest_ratio(values: np.ndarray, sizes: np.ndarray) -> np.ndarray:

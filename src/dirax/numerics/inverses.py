@@ -57,11 +57,12 @@ def applied_sizes(inverses: Inverses, sizes: np.ndarray) -> np.ndarray:
     if inverses.ndim > 1:
         return np.einsum("rij,rj->ri", np.abs(inverses), sizes)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, sizes.shape[1]))
-    return np.max([np.abs(applied(inverses, one * sizes)) for one in signs], axis=0)
+    moved = lambda inverse, s: np.max(np.abs(inverse((signs * s).T)), axis=1)
+    return np.stack([moved(inverse, s) for inverse, s in zip(inverses, sizes, strict=True)]) if len(sizes) else sizes
 
 
 class _Factored:
-    """v ↦ A⁻¹v of a matrix that is given divided by the scales of its rows and columns; NaN for a singular one."""
+    """v ↦ A⁻¹v, (k, …), of a matrix that is given divided by the scales of its rows and columns; NaN for a singular one."""
 
     def __init__(self, matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray):
         from scipy.sparse import csc_matrix  # imported when they are used
@@ -69,13 +70,15 @@ class _Factored:
 
         self.rows, self.columns, self.factors = rows, columns, None
         if np.all(np.isfinite(matrix)):
+            column, row = np.nonzero(matrix.T)
+            starts = np.searchsorted(column, np.arange(len(matrix) + 1))
             with contextlib.suppress(RuntimeError):  # it is singular
-                self.factors: Any = splu(csc_matrix(matrix))
+                self.factors: Any = splu(csc_matrix((matrix[row, column], row, starts), matrix.shape))
 
     def __call__(self, v: np.ndarray) -> np.ndarray:
         if self.factors is None or not np.all(np.isfinite(v)):
             return np.full_like(v, np.nan)
-        return self.factors.solve(v / self.rows) / self.columns
+        return (self.factors.solve((v.T / self.rows).T).T / self.columns).T
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:

@@ -49,10 +49,8 @@ class Values:
 
     def given(self, tape: Tape) -> np.ndarray:
         """The values (entries, inputs) of the inputs of a tape."""
-        table = np.empty((len(tape.inputs), self.entries))
-        for row, node in zip(table, tape.inputs, strict=True):
-            row[:] = self._known[node]
-        return table.T
+        values = np.concatenate([self._known[node] for node in tape.inputs]) if tape.inputs else np.empty(0)
+        return values.reshape(len(tape.inputs), self.entries).T
 
     def slopes(self, nodes: list[int], inputs: list[int], plan: "Slopes | None" = None) -> np.ndarray:
         """The derivatives of nodes by inputs, (entries, nodes, inputs): over the graph, which only gains the derivatives of
