@@ -181,7 +181,10 @@ def test_traced_runs_hold_the_same(engine):
 
 @EVERY
 def test_derivatives_are_those_of_the_good_steps(engine):
-    """Of all rows that there are, every third step, which hold the same too; with x = 1 − w² a step is w ↦ w', so that x' depends on x by w/(w' + h/2)·w'/w."""
+    """Of all rows that there are, of every third step, which hold the same as without JAX's transformations.
+
+    With x = 1 − w² a step is w ↦ w', so that x' depends on x by w/(w' + h/2)·w'/w.
+    """
 
     def total(x):
         fields, *ends = traced(engine, x, save_every=3)

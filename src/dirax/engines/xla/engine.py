@@ -116,7 +116,7 @@ class Xla(AbstractEngine):
             return jax.tree.map(lambda a, b: jnp.where(k < p.steps, a, b), after, lanes), row
 
         def to_next_row(lanes, start):
-            """The lanes at the next row and the row that they leave here: of one step in the program, whatever `save_every` is."""
+            """The lanes at the next row and the row that they leave here, by one step in the program, run many times."""
             if p.save_every == 1:
                 return step(lanes, start)
 
