@@ -70,12 +70,16 @@ def test_derivatives_beside_an_index(engine):
 STILL = {"count": 2, "stiff": True, "on": np.array([True]), "which": np.int32(1)}
 
 
+@oscillator
+def MIXED(p):
+    stiffness = jnp.where(p["stiff"] & p["on"][0], jnp.asarray(TABLE)[p["which"]] * jnp.asarray(p["k"], float), 0.0)
+    return stiffness * jnp.asarray(p["count"], float)
+
+
 def mixed(engine, **params):
     """The end of a run whose stiffness is 2·TABLE[1]·k, of leaves that are no floats and one that is."""
-    stiffness = lambda p: jnp.where(p["stiff"] & p["on"][0], jnp.asarray(TABLE)[p["which"]] * jnp.asarray(p["k"], float), 0.0)
-    system = oscillator(lambda p: stiffness(p) * jnp.asarray(p["count"], float))
     run = {"q": np.ones(1), "v": np.zeros(1), "step": 0.1, "steps": 30, "engine": engine}
-    return dx.simulate(system, MIDPOINT, params=STILL | params, **run).q[-1, 0]
+    return dx.simulate(MIXED, MIDPOINT, params=STILL | params, **run).q[-1, 0]
 
 
 def mixed_slope(k):
@@ -85,19 +89,23 @@ def mixed_slope(k):
 @pytest.mark.parametrize("engine", ["xla", "auto", "native"])
 def test_leaves_that_stand_still_beside_one_that_jax_traces(engine):
     end = lambda k: mixed(engine, k=k)
-    np.testing.assert_allclose(jax.jit(end)(1.5), cayley(6.0, 0.1, 30), atol=1e-12)
-    np.testing.assert_allclose(jax.vmap(end)(jnp.array([1.5, 0.5])), cayley(np.array([6.0, 2.0]), 0.1, 30), atol=1e-12)
-    slopes = jax.grad(end)(1.5), jax.jvp(end, (1.5,), (1.0,))[1], jax.grad(end)(jnp.float32(1.5))
-    np.testing.assert_allclose(slopes, mixed_slope(1.5), rtol=1e-6)
-    assert slopes[-1].dtype == np.float32
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(end)))(jnp.array([1.5, 0.5]))
+    np.testing.assert_allclose(values, cayley(np.array([6.0, 2.0]), 0.1, 30), atol=1e-12)
+    np.testing.assert_allclose(slopes, [mixed_slope(1.5), mixed_slope(0.5)], rtol=1e-6)
+    value, slope = jax.jvp(end, (1.5,), (1.0,))
+    np.testing.assert_allclose([value, slope], [values[0], slopes[0]], rtol=1e-12)
+    single = jax.grad(end)(jnp.float32(1.5))
+    np.testing.assert_allclose(single, mixed_slope(1.5), rtol=1e-6)
+    assert single.dtype == np.float32
 
 
 @pytest.mark.parametrize("engine", [pytest.param("xla", marks=pytest.mark.soak), "auto"])
 def test_leaves_that_are_no_floats_and_that_jax_traces(engine):
     params = STILL | {"k": 1.5}
     end = lambda params: mixed(engine, **params)
-    np.testing.assert_allclose(jax.jit(end)(params), cayley(6.0, 0.1, 30), atol=1e-12)
-    np.testing.assert_allclose(jax.grad(end, allow_int=True)(params)["k"], mixed_slope(1.5), rtol=1e-6)
+    value, slope = jax.jit(jax.value_and_grad(end, allow_int=True))(params)
+    np.testing.assert_allclose(value, cayley(6.0, 0.1, 30), atol=1e-12)
+    np.testing.assert_allclose(slope["k"], mixed_slope(1.5), rtol=1e-6)
     several = jax.tree.map(lambda a: np.stack([a, a]), params) | {"count": np.array([2, 1])}
     np.testing.assert_allclose(jax.vmap(end)(several), cayley(np.array([6.0, 3.0]), 0.1, 30), atol=1e-12)
 

@@ -76,7 +76,7 @@ def test_derivatives_of_a_nonlinear_trajectory_against_finite_differences():
         return jnp.concatenate([sol.q[-1], sol.p[-1]])
 
     z = np.array([1.0, 0.5, 0.0, 0.5, 9.81])
-    backward, forward = jax.jit(jax.jacrev(end))(z), jax.jit(jax.jacfwd(end))(z)
+    backward, forward = jax.jit(lambda z: (jax.jacrev(end)(z), jax.jacfwd(end)(z)))(z)
     np.testing.assert_allclose(forward, backward, rtol=1e-11, atol=1e-13)
     columns = [(end(z + d) - end(z - d)) / 2e-5 for d in 1e-5 * np.eye(5)]  # runs of the engine's other loop
     np.testing.assert_allclose(forward, np.stack(columns, axis=1), rtol=1e-7, atol=1e-8)
@@ -226,7 +226,8 @@ def test_a_failure_leaves_the_derivatives_of_the_others(state):
         rows = jnp.concatenate([sol.q, sol.p], axis=1)[..., 0]
         return weights @ jnp.sum(jnp.where(jnp.isnan(rows), 0.0, jnp.sin(rows)), axis=1)
 
-    slopes, others, sound = jax.jit(jax.grad(weighted, argnums=(0, 1, 2))), np.array([0, 2]), np.array([0, 0, 2])
+    both, others, sound = jax.jit(jax.value_and_grad(weighted, argnums=(0, 1, 2))), np.array([0, 2]), np.array([0, 0, 2])
+    slopes = lambda *given: both(*given)[1]
     mixed = slopes(q, v, 1.0, np.ones(3))
     assert all(np.all(np.isfinite(slope)) for slope in mixed)
     alone = slopes(q[sound], v[sound], 1.0, np.array([1.0, 0.0, 1.0]))
@@ -235,7 +236,7 @@ def test_a_failure_leaves_the_derivatives_of_the_others(state):
     np.testing.assert_allclose(slopes(q, v, 1.0, np.array([1.0, 0.0, 1.0]))[2], alone[2], rtol=1e-12)
     d = 1e-6
     moved = [q + nudge * np.array([[0.0], [1.0], [0.0]]) for nudge in (d, -d)]
-    values = [jax.jit(weighted)(q, v, 1.0, np.array([0.0, 1.0, 0.0])) for q in moved]
+    values = [both(q, v, 1.0, np.array([0.0, 1.0, 0.0]))[0] for q in moved]
     np.testing.assert_allclose(mixed[0][1, 0], (values[0] - values[1]) / (2 * d), rtol=1e-5)
 
 

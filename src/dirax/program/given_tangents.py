@@ -81,7 +81,7 @@ def _by_jax(*operands, value: Callable, tangent: Callable, axes: Axes) -> Array:
 
 def _tangents(primals: Sequence, tangents: Sequence, *, value: Callable, tangent: Callable, axes: Axes):
     result = given_p.bind(*primals, value=value, tangent=tangent, axes=axes)
-    moves = [not isinstance(t, ad.Zero) and t.dtype != float0 for t in tangents]
+    moves = [not isinstance(t, ad.Zero) and getattr(t, "dtype", None) != float0 for t in tangents]
     count = len(primals)
 
     def one(result, *given):

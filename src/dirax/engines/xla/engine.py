@@ -116,11 +116,17 @@ class Xla(AbstractEngine):
             return jax.tree.map(lambda a, b: jnp.where(k < p.steps, a, b), after, lanes), row
 
         def to_next_row(lanes, start):
-            after, row = step(lanes, start)
+            """The lanes at the next row and the row that they leave here, by one step in the program, run many times."""
             if p.save_every == 1:
-                return after, row
-            later = start + 1 + jnp.arange(p.save_every - 1)
-            return jax.lax.scan(lambda lanes, k: (step(lanes, k)[0], None), after, later)[0], row
+                return step(lanes, start)
+
+            def onwards(carry, k):
+                lanes, row = carry
+                after, left = step(lanes, k)
+                return (after, jnp.where(k == start, left, row)), None
+
+            shape = jax.eval_shape(step, lanes, start)[1]
+            return jax.lax.scan(onwards, (lanes, jnp.zeros(shape.shape, shape.dtype)), start + jnp.arange(p.save_every))[0]
 
         @jax.checkpoint
         def segment(lanes, starts):
