@@ -594,5 +594,6 @@ def test_params_that_no_function_takes_are_said():
     for start in (dx.simulate, dx.prepare):
         with pytest.warns(UserWarning, match=r"none of the functions \(lagrangian\) takes them"):
             start(free, dx.DiscreteDirac(), **run)
-    dx.simulate(dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v, params: -params["k"] * q), dx.DiscreteDirac(), **run)
+    pulled = dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v, params: -params["k"] * q)
+    dx.simulate(pulled, dx.DiscreteDirac(), **run)
     dx.simulate(free, dx.DiscreteDirac(), **run, events=[dx.Event(lambda q, params: q[0] - params["k"])])
