@@ -54,7 +54,8 @@ def explain(problem: Problem, outcome: Outcome, lane: int, kept: int, sizes: Cal
 
 def _by_status(outcome: Outcome, lane: int) -> str:
     not_finite = int(outcome.status[lane]) == NOT_FINITE
-    return "the new state is not finite" if not_finite else "Newton's method did not converge"
+    diverged = "the new state is not finite: Newton's method diverged, or left the domain of the system's functions"
+    return diverged if not_finite else "Newton's method did not converge"
 
 
 def _remark(p: Problem, outcome: Outcome, lane: int, t: float) -> str:
