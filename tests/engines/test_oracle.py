@@ -34,13 +34,14 @@ failing = dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], **(run | {"v": [5
 assert one.ok and np.all(many.ok) and not failing.ok and "not finite" in failing.message
 slope = jax.grad(lambda k: dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], **(run | {"params": k})).q[-1, 0])(1.0)
 assert np.isfinite(slope)
+assert all(dx.verify(run).ok for run in [one, many, many, many])
 print(one.stats["engine"], one.stats.get("not_native", ""))
 """
 
 
 @pytest.mark.parametrize("engine", ["xla", pytest.param("auto", marks=pytest.mark.soak)])
 def test_xla_runs_without_the_compiler(engine):
-    """A single trajectory, a batch that is written in scalars, a failure with its message, a gradient."""
+    """A single trajectory, a batch that is written in scalars, a failure with its message, a gradient, a verdict."""
     program = ALONE.replace("ENGINE", repr(engine))
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr[-3000:]

@@ -7,6 +7,7 @@ import numpy as np
 
 from dirax.program.evaluation.row_tape import RowTape
 from dirax.program.evaluation.tape import FEWEST_NODES, Tape
+from dirax.program.evaluation.tape_code import compiles
 from dirax.program.graph import Graph, Order
 from dirax.program.graph_derivatives import slopes
 from dirax.program.interpreter import Nodes
@@ -127,8 +128,8 @@ class Slopes:
 
     @functools.cached_property
     def tape(self) -> RowTape | None:
-        """The derivatives by a compiled loop; None for few nodes."""
-        if len(self.order.nodes) < FEWEST_NODES:
+        """The derivatives by a compiled loop; None for few nodes, and where nothing compiles it."""
+        if len(self.order.nodes) < FEWEST_NODES or not compiles():
             return None
         return RowTape(self.graph, self.nodes, self.inputs, self.more, self.terms, self.needed, self.backward)
 

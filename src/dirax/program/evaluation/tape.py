@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.program.evaluation.tape_code import CODE, LANES, NUMBER, loops
+from dirax.program.evaluation.tape_code import CODE, LANES, NUMBER, compiles, loops
 from dirax.program.graph import Graph
 from dirax.program.operations import NUMPY
 
@@ -98,7 +98,7 @@ class Tape:
     def _need(self, outputs: Sequence[int]) -> None:
         """Have nodes computed: between calls of NumPy, all that can be."""
         graph, ops, args = self.graph, self.graph.op, self.graph.args
-        depth, waves = [0] * len(ops), defaultdict(list)
+        depth, waves, compiled = [0] * len(ops), defaultdict(list), CODE if compiles() else {}
         for node in graph.reachable(outputs, self._known):
             operands = args[node]
             if not operands:
@@ -107,7 +107,7 @@ class Tape:
             below = depth[operands[0]]
             for a in operands[1:]:
                 below = max(below, depth[a])
-            by_numpy = ops[node] not in CODE
+            by_numpy = ops[node] not in compiled
             waves[2 * below + by_numpy].append(node)
             depth[node] = below + by_numpy
         for place in sorted(waves):

@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import importlib.util
 import re
 from typing import Any
 
@@ -44,6 +45,15 @@ ROW_CODE = {
 """The same of an operation on rows x and y with a factor f, where the row o was."""
 
 NUMBER = {name: k for k, name in enumerate((*CODE, *ROW_CODE))}
+
+
+@functools.cache
+def compiles() -> bool:
+    """Whether LLVM is installed, which compiles the loops; where it is not, NumPy computes what they would."""
+    try:
+        return importlib.util.find_spec("llvmlite") is not None
+    except ImportError:
+        return False
 
 
 @functools.cache
