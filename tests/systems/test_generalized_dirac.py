@@ -140,3 +140,18 @@ def test_mistakes():
         run(dx.GeneralizedDiracSystem(dx.induced_dirac(None, 1), vector), x=[0.0, 1.0])
     with pytest.raises(ValueError, match="structure has dimension 6, but x has 4"):
         run(dx.GeneralizedDiracSystem(CANONICAL, dx.LagrangianSubmanifold.from_hamiltonian(lambda x: x @ x)), x=np.ones(4))
+
+
+def test_matrices_of_no_dirac_structure():
+    """They are refused where a run begins, and `verify` finds the place where they cease to be those of one."""
+    of_energy = dx.LagrangianSubmanifold.from_hamiltonian(lambda x: x @ x / 2)
+    one = lambda x: jnp.eye(2)
+    for wrong, words in [
+        (dx.DiracStructure.from_bivector(one), "bivector is not skew"),
+        (dx.DiracStructure.from_kernel(one, one), "not isotropic"),
+    ]:
+        with pytest.raises(ValueError, match=words):
+            run(dx.GeneralizedDiracSystem(wrong, of_energy), x=[1.0, 0.0])
+    skew_above = lambda x: jnp.array([[0.0, 1.0], [-1.0, jnp.minimum(x[0] - 0.9, 0.0)]])
+    sol = run(dx.GeneralizedDiracSystem(dx.DiracStructure.from_bivector(skew_above), of_energy), x=[1.0, 0.0])
+    assert sol.ok and not dx.verify(sol).ok and "bivector is not skew" in str(dx.verify(sol))

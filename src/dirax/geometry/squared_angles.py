@@ -18,9 +18,11 @@ from dirax.program.tracing import once
 Scalar: TypeAlias = Float[Array, ""]
 
 TINY = 1e-30  # a squared distance below which two points of the unit sphere are the same in float64
-NO_ANGLE = 1e-200  # a squared angle below which its cosine is 1, and 1/√s still far from overflow
-RADIAL_SERIES_BELOW = 4.0  # 13 terms of the series reach 1e-19 here
-ARC_SERIES_BELOW = 0.05  # 18 terms of the series reach 1e-20 here, those of its third derivative 1e-16
+RADIAL_SERIES = 4.0, 13  # below it so many terms of the series reach 1e-19
+ARC_SERIES = 0.05, 18  # so many terms reach 1e-20, those of the third derivative 1e-16
+# Of f_0, f_1 and F themselves, which are accurate elsewhere: through √s rounding would seem to move them by all that s is off.
+RADIAL_SERIES_AT_REST = 1e-3, 4
+ARC_SERIES_AT_REST = 1e-4, 5
 
 
 def radial(order: int, s: Scalar) -> Scalar:
@@ -40,14 +42,12 @@ class Radial(Formula):
     def value(self, xp, x):
         """f_n(s): its series near 0, the recurrence elsewhere."""
         (s,), order = x, self.order
-        if order <= 1:
-            # finite also for a derivative that is taken through the root, as that of a scalar graph is
-            none = s < NO_ANGLE
-            root = xp.sqrt(xp.where(none, 1.0, s))
-            return xp.where(none, 1.0, xp.cos(root) if order == 0 else xp.sin(root) / root)
+        below, terms = RADIAL_SERIES if order > 1 else RADIAL_SERIES_AT_REST
 
         def by_recurrence(s):
             root = xp.sqrt(s)
+            if order == 0:
+                return xp.cos(root)
             before, value = xp.cos(root), xp.sin(root) / root
             for n in range(1, order):
                 before, value = value, ((2.0 * n - 1.0) * value - before) / s
@@ -55,9 +55,9 @@ class Radial(Formula):
 
         odd_factorial = math.prod(range(1, 2 * order, 2))
         coefficients = [1.0 / odd_factorial]
-        for k in range(1, 13):
+        for k in range(1, terms):
             coefficients.append(coefficients[-1] * -0.5 / (k * (2 * order - 1 + 2 * k)))
-        return _piecewise(xp, s, RADIAL_SERIES_BELOW, coefficients, by_recurrence)
+        return _piecewise(xp, s, below, coefficients, by_recurrence)
 
     def slopes(self):
         """−½ f_{n+1}."""
@@ -82,23 +82,23 @@ class ArcOverSine(Formula):
     def value(self, xp, x):
         """F^(n): its series near 0, the recurrence of the hypergeometric function elsewhere."""
         (near, far), order = x, self.order
+        below, terms = ARC_SERIES if order else ARC_SERIES_AT_REST
         far = xp.where(far < TINY, 1.0, far)
 
         def by_recurrence(near):
             root = xp.sqrt(near * far)
             before = xp.arctan2(xp.sqrt(near), xp.sqrt(far)) / root
+            if order == 0:
+                return before
             value = (1.0 - (far - near) * before) / (2.0 * near * far)
             for n in range(order - 1):
                 slope = (1.5 + n) - (3.0 + 2.0 * n) * near
                 before, value = value, ((1.0 + n) ** 2 * before - slope * value) / (near * far)
-            return before if order == 0 else value
+            return value
 
-        if order == 0:
-            zero = xp.equal(near, 0.0)
-            return xp.where(zero, 1.0, by_recurrence(xp.where(zero, 1.0, near)))
-        taylor = [4.0**k * math.factorial(k) ** 2 / math.factorial(2 * k + 1) for k in range(18 + order)]
+        taylor = [4.0**k * math.factorial(k) ** 2 / math.factorial(2 * k + 1) for k in range(terms + order)]
         coefficients = [taylor[k] * math.perm(k, order) for k in range(order, len(taylor))]
-        return _piecewise(xp, near, ARC_SERIES_BELOW, coefficients, by_recurrence)
+        return _piecewise(xp, near, below, coefficients, by_recurrence)
 
     def slopes(self):
         """F^(n+1), by the first argument alone."""

@@ -31,6 +31,9 @@ BY_NODES = 2**12
 """Numbers of a function's arguments, times those of its value, up to which the sizes of its terms are found operation by
 operation."""
 
+IN_JAX = 2**13
+"""Nodes up to which XLA is given the operations one by one: it takes a millisecond for each, and minutes for thrice as many."""
+
 DIRECTIONS = 16
 """Directions in which a larger one is moved."""
 
@@ -85,20 +88,20 @@ def _error(g: Graph, node: int, error: dict[int, int]) -> int:
 
 
 def _by_jax(*operands, jaxpr: ClosedJaxpr):
-    """By the operations of the scalar program; where there is none, from the value and its derivatives."""
+    """By the operations of the scalar program; where there is none, or a large one, from the value and its derivatives."""
     count = len(operands) - len(jaxpr.in_avals)
 
     def written() -> Callable:
         try:
             made = ScalarProgram.of(jaxpr)
-            if not made.results:
-                return lambda *x: _by_derivatives(jaxpr, *x)
             errors = [made.fresh(nodes.shape) for nodes in made.inputs[len(made.inputs) - count :]]
             made.results = [_of(made.graph, nodes, made.inputs, errors) for nodes in made.results]
             made.inputs += errors
-            return made.in_jax
+            if made.results and len(made.graph) <= IN_JAX:
+                return made.in_jax
         except (UnsupportedPrimitive, GraphTooLarge):
-            return lambda *x: _by_derivatives(jaxpr, *x)
+            pass
+        return lambda *x: _by_derivatives(jaxpr, *x)
 
     return _written.get((Same(jaxpr), count), written)(*operands)
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dirax.geometry.lagrangian_submanifolds import LagrangianSubmanifold
+from dirax.geometry.representations import KERNEL_PAIRS
 from dirax.geometry.structures import DiracStructure
 from dirax.numerics.arrays import Data, Numbers
 from dirax.program.roots import nearest_root
@@ -32,8 +33,8 @@ class GeneralizedDiracSystem(AbstractSystem):
         system = dx.GeneralizedDiracSystem(D, dx.LagrangianSubmanifold.from_lagrangian(L, 2))
 
     Data are x=, or q=, p= with x = (q, p); of a Lagrangian q=, v= too, which give p and s = v. `dx.constraint_algorithm` works on
-    (x, s). Raises `TypeError` for other kinds of objects, and `ValueError` for functions and data of wrong shapes, and where F
-    is no Morse family at the initial point.
+    (x, s). Raises `TypeError` for other kinds of objects, and `ValueError` for functions and data of wrong shapes, and where the
+    matrices are those of no Dirac structure or F is no Morse family at the initial point; `verify` asks it along the way.
     """
 
     structure: DiracStructure
@@ -116,16 +117,23 @@ class GeneralizedDiracSystem(AbstractSystem):
             raise ValueError(f"the Dirac structure has dimension {N}, but x has {x.shape[0]} entries.")
         return x.shape[0], k
 
-    def premise(self, data: Data, params: Any) -> Premise:
-        """F(x, s) is a Morse family: [∂²F/∂s∂x, ∂²F/∂s∂s] has full rank."""
-        return Premise(self._slopes, self._refuse)
+    @property
+    def premise_everywhere(self) -> bool:
+        return True
 
-    def _slopes(self, data, params):
-        found = self.complete(data, params, False)
-        return found["x"], found["guess"], self.submanifold.slopes(found["x"], found["guess"], params)
+    def premise(self, data: Data, params: Any) -> Premise:
+        """The matrices are those of a Dirac structure, and F(x, s) is a Morse family: [∂²F/∂s∂x, ∂²F/∂s∂s] has full rank."""
+        return Premise(self._matrices_and_slopes, self._refuse)
+
+    def _matrices_and_slopes(self, data, params):
+        start = {name: data[name] for name in ("x", "q", "p", "v") if name in data}
+        found = self.complete(start, params, False)
+        x, s = found["x"], found["guess"]
+        return self.structure.evaluate(x, params), x, s, self.submanifold.slopes(x, s, params)
 
     def _refuse(self, found):
-        x, s, slopes = found
+        matrices, x, s, slopes = found
+        KERNEL_PAIRS[self.structure.representation](*matrices)
         if len(s) and (rank := np.linalg.matrix_rank(slopes)) < len(s):
             raise ValueError(
                 f"F(x, s) is no Morse family at the initial point x = {x}, s = {s}: [∂²F/∂s∂x, ∂²F/∂s∂s] has rank {rank} of "
