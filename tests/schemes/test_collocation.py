@@ -249,6 +249,11 @@ def test_bad_arguments(arguments, words):
         dx.Collocation(**arguments)
 
 
+def test_whole_numbers_of_numpy_are_stages():
+    assert dx.Collocation(np.int64(3)) == dx.Collocation(3)
+    assert dx.EnergyCollocation(np.int64(2), np.int32(8)) == dx.EnergyCollocation(2, 8)
+
+
 TURN = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
 
 
