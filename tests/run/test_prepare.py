@@ -219,6 +219,7 @@ def test_extending_what_does_not_know_how_it_was_run():
         sol[0:2].extend(3)
     with pytest.raises(ValueError, match="steps must be a whole number"):
         sol.extend(0)
+    assert len(sol.extend(np.int64(2)).q) == len(sol.q) + 2
 
 
 def test_stats_account_for_the_time_of_a_call():

@@ -195,6 +195,15 @@ def test_a_trajectory_of_a_batch_has_the_bits_of_its_own_run_and_failures_stay_i
         np.testing.assert_array_equal(batch.p[lane], alone.p)
 
 
+@pytest.mark.parametrize("lanes", [(), (3,)], ids=["one", "batch"])
+def test_forces_that_depend_on_no_velocity_have_their_work(lanes):
+    springs = dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v: -q)
+    start = {"q": np.full((*lanes, 2), 0.5), "v": np.full((*lanes, 2), 0.3)}
+    sol = dx.simulate(springs, dx.Collocation(3), step=0.1, steps=20, engine="native", **start)
+    np.testing.assert_allclose(sol.q[..., -1, :], 0.5 * np.cos(2.0) + 0.3 * np.sin(2.0), atol=1e-9)
+    np.testing.assert_allclose(sol.work, (0.5 - np.sum(sol.q**2, -1)) / 2, atol=1e-9)
+
+
 def test_rows_saved_now_and_then_are_those_of_every_step():
     system, data, step = SYSTEMS["rates of a mass matrix"]
     every = dx.simulate(system, dx.Collocation(4), step=step, steps=20, **data)
@@ -238,6 +247,11 @@ def test_gradients_are_those_of_differences(engine):
 def test_bad_arguments(arguments, words):
     with pytest.raises(ValueError, match=words):
         dx.Collocation(**arguments)
+
+
+def test_whole_numbers_of_numpy_are_stages():
+    assert dx.Collocation(np.int64(3)) == dx.Collocation(3)
+    assert dx.EnergyCollocation(np.int64(2), np.int32(8)) == dx.EnergyCollocation(2, 8)
 
 
 TURN = jnp.array([[0.0, 1.0], [-1.0, 0.0]])

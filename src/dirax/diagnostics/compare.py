@@ -12,6 +12,7 @@ from dirax.diagnostics.convergence import convergence
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.energy_lines import energy_less_work, energy_scale
 from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
+from dirax.numerics.arrays import is_whole
 from dirax.numerics.tolerances import EPSILON
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
@@ -129,7 +130,7 @@ def compare(
     named = dict(schemes) if isinstance(schemes, Mapping) else _named(schemes)
     if not named:
         raise ValueError("schemes must name at least one scheme, but it is empty.")
-    if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
+    if not is_whole(repeats) or repeats < 1:
         raise ValueError(f"repeats must be a whole number ≥ 1, but {repeats!r:.80} was given.")
     sols = {name: simulate(system, scheme, step=step, steps=steps, **run) for name, scheme in named.items()}
     seconds = {name: [] for name in named}

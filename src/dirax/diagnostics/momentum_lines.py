@@ -12,6 +12,7 @@ from dirax.diagnostics.replay_lines import moved_numbers
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import initial_of_one, over_rows
 from dirax.diagnostics.verdicts import judged, of_lane, relative_changes, roundoff_limit, steps_of
+from dirax.numerics.arrays import is_whole
 from dirax.solution.solution import Solution
 
 Symmetries = Mapping[str, Callable] | Sequence[int] | None
@@ -40,7 +41,7 @@ def generators_of(sol: Solution, symmetries: Symmetries) -> dict[str, Callable]:
         raise ValueError(f"symmetries need a solution with q and p, but this one holds {', '.join(sol.fields)}.")
     n, found = np.shape(sol.q)[-1], {}
     for index in symmetries:
-        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < n:
+        if not is_whole(index) or not 0 <= index < n:
             raise ValueError(f"symmetries must name coordinates by whole numbers from 0 to {n - 1}, but {index!r} was given.")
         found[f"p[{int(index)}]"] = eqx.Partial(_translation, int(index))
     return found

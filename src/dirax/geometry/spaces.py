@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.geometry.squared_angles import TINY, arc_over_sine, norm, radial
+from dirax.numerics.arrays import is_whole
 from dirax.program.tracing import once
 
 
@@ -227,7 +228,7 @@ class Sphere(AbstractGeodesicManifold):
 
 
 def _whole(what: str, n: Any, least: int) -> int:
-    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < least:
+    if not is_whole(n) or n < least:
         raise ValueError(f"{what}, needs a whole number n ≥ {least}, but n = {n!r} came.")
     return int(n)
 

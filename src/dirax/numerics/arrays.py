@@ -1,6 +1,7 @@
-"""The arrays that signatures name: of NumPy where the numbers are known, of JAX where they are traced; and whether two agree."""
+"""The arrays that signatures name: of NumPy where the numbers are known, of JAX where they are traced; whether two agree, and
+whether a value is a whole number."""
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Array
@@ -23,3 +24,8 @@ def agree(a: np.ndarray, b: np.ndarray, tolerance: float, axis: int | None = Non
     `axis`, whatever units that is in. Entries that are not finite must be the same."""
     largest = np.max(np.abs(b), axis=axis, keepdims=True, initial=0.0, where=np.isfinite(b))
     return a.shape == b.shape and np.allclose(a, b, rtol=0.0, atol=tolerance * largest, equal_nan=True)
+
+
+def is_whole(value: Any) -> bool:
+    """Whether it is a whole number of Python or NumPy."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)

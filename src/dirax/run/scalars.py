@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.numerics.arrays import is_whole
 from dirax.program.user_functions import is_traced
 
 MOST_COUNTED = 2**63 - 1
@@ -49,7 +50,7 @@ def count(value, name: str, most: int = MOST_COUNTED) -> int:
     """The whole number; raises `ValueError` for anything else, below 1 and above `most`."""
     if type(value) is int and 1 <= value <= most:
         return value
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+    if not is_whole(value) or value < 1:
         raise ValueError(f"{name} must be a whole number ≥ 1, but {_shown(value)} was given.")
     if value > most:
         bound = "2⁶³ − 1, which is what 64 bits count" if most == MOST_COUNTED else f"{most}"

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from dirax.numerics.arrays import is_whole
 from dirax.schemes.collocation_step import LagrangianCollocation, RelationCollocation
 from dirax.schemes.collocation_tables import MOST_STAGES, Tableau, gauss, lobatto
 from dirax.schemes.constrained_collocation_step import ConstrainedCollocation
@@ -49,11 +50,11 @@ class Collocation(AbstractScheme):
         if nodes not in NODES:
             raise ValueError(f"nodes must be {' or '.join(map(repr, NODES))}, but {nodes!r} was given.")
         fewest = 1 if nodes == "gauss" else 2
-        if isinstance(stages, bool) or not isinstance(stages, int) or not fewest <= stages <= MOST_STAGES:
+        if not is_whole(stages) or not fewest <= stages <= MOST_STAGES:
             raise ValueError(
                 f"stages must be a whole number from {fewest} to {MOST_STAGES} for {nodes} nodes, but {stages!r} was given."
             )
-        self.stages, self.nodes = stages, nodes
+        self.stages, self.nodes = int(stages), nodes
 
     @property
     def order(self) -> int:

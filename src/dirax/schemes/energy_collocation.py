@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from dirax.numerics.arrays import is_whole
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.collocation_tables import MOST_STAGES, gauss, quadrature
 from dirax.schemes.framed_energy_collocation_step import FramedEnergyCollocation
@@ -56,10 +57,10 @@ class EnergyCollocation(AbstractScheme):
     frame: UserFunction | None
 
     def __init__(self, stages: int = 2, points: int | None = None, *, frame: Callable | None = None):
-        if isinstance(stages, bool) or not isinstance(stages, int) or not 1 <= stages <= MOST_STAGES:
+        if not is_whole(stages) or not 1 <= stages <= MOST_STAGES:
             raise ValueError(f"stages must be a whole number from 1 to {MOST_STAGES}, but {stages!r} was given.")
         points = POINTS[stages > 4] if points is None else points
-        if isinstance(points, bool) or not isinstance(points, int) or not stages <= points <= MOST_STAGES:
+        if not is_whole(points) or not stages <= points <= MOST_STAGES:
             raise ValueError(
                 f"points must be a whole number from the number of stages, {stages}, to {MOST_STAGES}, but {points!r} was given."
             )
@@ -67,7 +68,7 @@ class EnergyCollocation(AbstractScheme):
             raise TypeError(
                 f"frame must be a function (q) -> (n, n − m) of a basis of the distribution, but {frame!r} was given."
             )
-        self.stages, self.points = stages, points
+        self.stages, self.points = int(stages), int(points)
         self.frame = None if frame is None else UserFunction(frame, "frame", ("q",))
 
     @property

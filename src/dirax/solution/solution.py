@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from dirax.numerics.arrays import is_whole
 from dirax.solution import export, moments, plotting, saving, selection
 from dirax.solution.trajectory import Trajectory
 
@@ -43,14 +44,14 @@ class Solution(Trajectory):
         Raises `ValueError` for a part of a solution, one from a file and one that JAX traces, which do not know how they were
         run.
         """
-        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+        if not is_whole(steps) or steps < 1:
             raise ValueError(f"steps must be a whole number ≥ 1, but {steps!r} was given.")
         if self.continuation is None:
             raise ValueError(
                 "only what dx.simulate or a prepared run has returned, outside of jax.grad, jit and vmap, knows how to go on: "
                 "extend that, before a part of it is taken or it is saved."
             )
-        return self.continuation(self, steps, progress)
+        return self.continuation(self, int(steps), progress)
 
     __getitem__ = selection.select
     __len__ = selection.count

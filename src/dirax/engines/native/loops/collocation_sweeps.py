@@ -223,7 +223,8 @@ class SecondOrder(AtEveryNode):
             over.filled(forces, k.weighted(self._gained(region), node), node)
         speeds = self._speeds(forces)
         with over.at() as node:
-            region = self.region(k.along(speeds, node, self.first), [], node)
+            rates = k.along(forces, node, self.rates)  # which the work of forces depends on, as accelerations do not
+            region = self.region(k.along(speeds, node, self.first), rates, node)
             found(node, self._gained(region), over.emitter.true)
             self._weighted_rates(region, ends, node)
         return k.totals([*speeds, *ends])
