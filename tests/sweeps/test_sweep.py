@@ -5,6 +5,7 @@ import json
 import os
 import socket
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import jax
@@ -341,6 +342,18 @@ def test_ways_to_write_case_have_one_result(function, mode):
     )
 
 
+def test_a_case_gives_params_of_a_dataclass_that_jax_has_not_seen():
+    @dataclass
+    class Pendulum:
+        g: float
+        whole: bool
+
+    values = {"g": np.linspace(0.5, 2.0, 5)}
+    function = lambda g: {"q": [g], "v": [0.0], "params": Pendulum(2 * g, True)}
+    _, params = Case.of(function, ("g",), 0).chosen(values).at(values)
+    assert np.array_equal(params.g, 2 * values["g"]) and params.whole.tolist() == [True] * 5
+
+
 def test_a_wrong_case_names_the_point(tmp_path):
     at = r"g = 1\.[0-9]+, angle = 2\.[0-9]+"
     wrong = lambda g, angle: (g > 1.0) & (g < 2.0) & (angle > 2.0) & (angle < 3.0)
@@ -360,6 +373,10 @@ def test_a_wrong_case_names_the_point(tmp_path):
         (lambda g, angle: [angle], "must return a dict"),
         (lambda g, angle: {"angle": [angle]}, "may return q, v"),
         (lambda g, angle: {"q": [[angle]], "v": [0.0]}, "a row of real numbers"),
+        (
+            lambda g, angle: case(g, angle) | {"params": {"g": "Mars"}},
+            r"numbers and arrays, but params\['g'\] is 'Mars'",
+        ),
     ):
         with pytest.raises(ValueError, match=text):
             study(tmp_path / "wrong.zarr", case=function)

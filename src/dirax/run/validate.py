@@ -93,6 +93,18 @@ def validated_case(given: dict[str, Any], params: Any, batch_params: bool, step:
 def params_of_case(params: Any) -> Any:
     """The params with arrays for leaves; dataclasses in them become pytrees. Raises `TypeError` and `ValueError` for leaves that
     are no finite numbers, and for dictionaries whose keys have no order."""
+    register_dataclasses(params)
+    leaves, structure = jax.tree.flatten(params)
+    plain = [plain_floats(leaf) for leaf in leaves]
+    if not any([leaf is None for leaf in plain]):
+        return jax.tree.unflatten(structure, plain)
+    params = arrays_of_params(params)
+    check_finite("params", params)
+    return params
+
+
+def register_dataclasses(params: Any) -> None:
+    """Have JAX look into the dataclasses in params. Raises `TypeError` for dictionaries whose keys have no order."""
     try:
         _register_dataclasses(params)
     except (TypeError, ValueError):
@@ -100,13 +112,6 @@ def params_of_case(params: Any) -> Any:
             raise
         text = f"params has a dictionary with the keys {keys:.60}, which have no order: name all of them by texts."
         raise TypeError(text) from None
-    leaves, structure = jax.tree.flatten(params)
-    plain = [plain_floats(leaf) for leaf in leaves]
-    if not any([leaf is None for leaf in plain]):
-        return jax.tree.unflatten(structure, plain)
-    params = _arrays(params)
-    check_finite("params", params)
-    return params
 
 
 def _without_order(params: Any) -> str | None:
@@ -289,8 +294,9 @@ def _is_boolean(leaf) -> bool:
     return isinstance(leaf, bool) or jnp.issubdtype(getattr(leaf, "dtype", object), jnp.bool_)
 
 
-def _arrays(params):
-    """The pytree with arrays for its leaves: NumPy's where they can be, for JAX's start JAX and compile what takes a part."""
+def arrays_of_params(params):
+    """The pytree with arrays for its leaves: NumPy's where they can be, for JAX's start JAX and compile what takes a part.
+    Raises `TypeError` and `ValueError` for leaves that are no numbers."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if not is_number(leaf) and not _is_boolean(leaf):
             raise TypeError(

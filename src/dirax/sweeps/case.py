@@ -16,6 +16,7 @@ import numpy as np
 
 from dirax.numerics.arrays import agree
 from dirax.program.memo import Memo, Same
+from dirax.run.validate import arrays_of_params, register_dataclasses
 from dirax.sweeps.axes import PointError, described, identities
 from dirax.sweeps.columns import Column, spread
 
@@ -89,6 +90,7 @@ class Case:
     def at(self, values: Values) -> tuple[dict[str, np.ndarray], Any]:
         """Initial data (B, n) by name and the params, None or a pytree whose leaves have the axis of the points, too, at points
         with these values (B,). Raises `PointError`."""
+        register_dataclasses(self.like)  # in a process that has not called the function yet
         found = self._one_by_one(values) if self.mode == "points" else self._tried(values)
         if found is None:
             found = self._one_by_one(values)
@@ -197,10 +199,11 @@ def _check_keys(found: Any) -> None:
 def _normal(found: Any, xp: Any) -> dict[str, Any]:
     """What `case` returned, its lists as arrays."""
     _check_keys(found)
+    register_dataclasses(found.get("params"))
     normal = {}
     for name in sorted(found):
         value = found[name]
-        normal[name] = xp.asarray(value) if name != "params" else jax.tree.map(xp.asarray, value)
+        normal[name] = xp.asarray(value) if name != "params" else arrays_of_params(value)
         if name != "params":
             if normal[name].dtype.kind not in "fiub" or normal[name].ndim != 1:
                 raise PointError(
