@@ -100,8 +100,8 @@ def _without_params(stated: Sequence[Any]) -> str:
         return ""
     is_known = lambda value: isinstance(value, UserFunction)
     functions = [value for value in jax.tree.leaves(stated, is_leaf=is_known) if callable(value)]
-    known = all(is_known(f) and not f.takes_params for f in functions)
-    return ", ".join(dict.fromkeys(f.name for f in functions)) if known else ""
+    known = [f for f in functions if isinstance(f, UserFunction) and not f.takes_params]
+    return ", ".join(dict.fromkeys(f.name for f in known)) if len(known) == len(functions) else ""
 
 
 def kind_of(case: Case) -> tuple:
