@@ -12,6 +12,8 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # are compiled faster in one piece than cut up for several threads
 QUICK = ("backend_optimization_level=0", "cpu_use_fusion_emitters=false", "cpu_parallel_codegen_split_count=1")
 os.environ.setdefault("XLA_FLAGS", " ".join(f"--xla_{flag}" for flag in QUICK))
+# what is compiled does not say from which lines it comes, which takes a twentieth of the time
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 
 gc.set_threshold(50_000, 20, 100)  # tracing makes many objects that live
 
