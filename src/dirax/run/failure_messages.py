@@ -224,13 +224,12 @@ def _advice(stage, numbers: InNumbers | InJax, u, args, sizes) -> str:
     )
 
 
+@np.errstate(all="ignore")
 def _roundoff(numbers: InNumbers | InJax, u, args, sizes) -> np.ndarray:
     """The change of each unknown, relative to their size, that follows from a last place of every number that the residual
     is a function of."""
     by_u, by_state = numbers.slopes(u, *args)
-    with np.errstate(all="ignore"):
-        left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
+    left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
     if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and balanced_condition(by_u) < LARGEST_CONDITION):
         return np.full(len(u), np.inf)
-    with np.errstate(all="ignore"):
-        return EPSILON * np.abs(balanced_inverse(by_u)) @ left / (np.abs(u) + sizes)
+    return EPSILON * np.abs(balanced_inverse(by_u)) @ left / (np.abs(u) + sizes)

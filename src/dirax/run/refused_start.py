@@ -1,5 +1,6 @@
 """Initial data that a premise of the system or of the scheme excludes: refused before the first step, with the premise."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -25,13 +26,13 @@ def refuse_bad_start(
     projected: bool,
     needed: Callable[[], str] | None,
     case: Case,
-    shorter: Callable[[], Start],
+    shorter: Callable[[], Any],
 ) -> None:
     """Raise `ValueError` for functions that are not finite at the data, data off the constraints (with the residual), and a
     first step without a unique solution (with the rank of the matrix (21) of [PY]). `labels` are those of
     the equations of the first step; `projected` says that the data have been moved, `needed` what a singular Lagrangian needs.
-    `shorter` is the start of a run with steps SHORTER times as long: a matrix that is singular at the first guess of a long step
-    alone may just be far from the solution."""
+    `shorter` gives the Jacobian of a first step SHORTER times as long: a matrix that is singular at the first guess of a long
+    step alone may just be far from the solution."""
     if start.row0 is not None and "constraint" in start.row0:
         both = _lanes(initial.defect, 1), _lanes(start.row0["constraint"], 1)
         initial = initial._replace(defect=np.concatenate(both, axis=-1))
@@ -42,8 +43,8 @@ def refuse_bad_start(
     if needed and not system.constraints.any and labels[0].startswith(AT_NODE.format(0)):
         raise ValueError(f"collocation takes regular Lagrangians, and ∂²L/∂v² is singular at the initial data: it {needed()}.")
     if start.jacobian is not None:
-        short = None if start.row0 is not None else lambda: shorter().jacobian
-        _refuse_singular_step(start, labels, needed, initial.lagrangian is not None, short)
+        once = functools.cache(shorter) if start.row0 is None else None
+        _refuse_singular_step(start, labels, needed, initial.lagrangian is not None, once)
 
 
 def _refuse_outside_the_domain(initial: Initial) -> None:
@@ -192,8 +193,6 @@ def _refuse_singular_sparse_step(
     """The same of many unknowns, of which only some are named: those that move most in the direction that is left free.
 
     That the pattern has all entries is checked by a product with a vector that was not found with it."""
-    from dirax.numerics.sparse.ranks import free_direction  # imported when it is used
-
     for lane, (values, products, missed) in enumerate(zip(*jacobians[1:], strict=True)):
         which = f" of trajectory {lane}" if len(jacobians.values) > 1 else ""
         matrix, near = map(jacobians.equations.matrix, values)
@@ -206,22 +205,25 @@ def _refuse_singular_sparse_step(
             worst = np.max(np.nan_to_num(of), axis=0)  # out of the domain nothing is known
             if np.any(worst > PRODUCT):
                 raise AssertionError(f"the {what} of the step is wrong in {labels[int(np.argmax(worst))]}: report this.")
-        free = free_direction(jacobians.equations, matrix)
-        if free is not None and shorter:
-            short = shorter()
-            if free_direction(short.equations, short.equations.matrix(short.values[lane][0])) is None:
-                continue
-        if free is not None:
-            most = np.argsort(-np.abs(free))[:4]
-            most = most[np.abs(free[most]) > 1e-3 * np.abs(free[most[0]])]
-            rows = np.unique(matrix.tocsc()[:, most].indices)
-            raise ValueError(
-                f"the first step has no unique solution: its matrix ([PY] (21)) is singular at the initial data{which}, and "
-                f"leaves a direction free in which the unknowns {', '.join(map(str, np.sort(most)))} move most, which stand in "
-                f"{', '.join(labels[int(row)] for row in rows[:4])}. The Lagrangian is singular together with its constraints: "
-                "remove the coordinates that it does not determine, constraints that follow from others, or choose another "
-                "discrete Lagrangian."
-            )
+        free = _free_direction(jacobians, lane)
+        if free is None or (shorter and _free_direction(shorter(), lane) is None):
+            continue
+        most = np.argsort(-np.abs(free))[:4]
+        most = most[np.abs(free[most]) > 1e-3 * np.abs(free[most[0]])]
+        rows = np.unique(matrix.tocsc()[:, most].indices)
+        raise ValueError(
+            f"the first step has no unique solution: its matrix ([PY] (21)) is singular at the initial data{which}, and "
+            f"leaves a direction free in which the unknowns {', '.join(map(str, np.sort(most)))} move most, which stand in "
+            f"{', '.join(labels[int(row)] for row in rows[:4])}. The Lagrangian is singular together with its constraints: "
+            "remove the coordinates that it does not determine, constraints that follow from others, or choose another "
+            "discrete Lagrangian."
+        )
+
+
+def _free_direction(jacobians: SparseJacobians, lane: int) -> np.ndarray | None:
+    from dirax.numerics.sparse.ranks import free_direction  # imported when it is used
+
+    return free_direction(jacobians.equations, jacobians.equations.matrix(jacobians.values[lane][0]))
 
 
 SHORTER = 2.0**-10

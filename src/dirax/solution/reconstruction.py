@@ -18,6 +18,7 @@ from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import Field
 from dirax.solution.loading import with_code
 from dirax.solution.solution import Solution
+from dirax.solution.steps_again import Entries
 
 
 def reconstruct(solution: Solution, g0: Any = None) -> Solution:
@@ -79,23 +80,17 @@ def _multipliers_at(solution: Solution, q: Any) -> Any:
         force = moved @ (fixed.T @ given[kept])
         return given.at[kept].set(jnp.linalg.solve(moved @ moved.T, force))
 
-    leaves, structure = jax.tree.flatten(solution.given_params)
     t, rows = solution.t[:-1], q[..., :-1, :]
-    if not is_traced(t, rows, multipliers, leaves):
-        lead = np.shape(rows)[:-1]
-        of_params = [np.asarray(leaf) for leaf in leaves]
-        of_params = [np.expand_dims(a, 1) if solution.batch_params else a[(None,) * len(lead)] for a in of_params]
-        spread = lambda a: np.broadcast_to(a, (*lead, *a.shape[len(lead) :])).reshape(-1, *a.shape[len(lead) :])
-        entries = [spread(a) for a in (np.broadcast_to(t, lead), rows, np.asarray(multipliers), *of_params)]
-        flat = lambda t, q, given, *leaves: at(t, q, given, jax.tree.unflatten(structure, leaves))
-        found = in_numpy(flat, entries, (_multipliers_at, Same(system), tuple(kept.tolist()), structure))
-        if found is not None:
-            return found.reshape(*lead, -1)
+    if not is_traced(t, rows, multipliers, solution.given_params):
+        batch, flat = solution.batch or 1, lambda a: np.reshape(a, (-1, np.shape(a)[-1]))
+        values, lanes = (np.tile(t, batch), flat(rows), flat(multipliers)), np.repeat(np.arange(batch), len(t))
+        key = _multipliers_at, Same(system), tuple(kept.tolist())
+        each = lambda values, params: at(values[0], values[1], values[2], params)
+        return Entries(solution)(each, lanes, values, *key).reshape(np.shape(multipliers))
     along = jax.vmap(at, in_axes=(0, 0, 0, None))
     if solution.batch is not None:
         along = jax.vmap(along, in_axes=(None, 0, 0, 0 if solution.batch_params else None))
-    found = jax.jit(along)(jnp.asarray(t), jnp.asarray(rows), jnp.asarray(multipliers), solution.params)
-    return found if is_traced(found) else np.asarray(found)
+    return jax.jit(along)(jnp.asarray(t), rows, multipliers, solution.params)
 
 
 def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> Solution:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from dirax.numerics.arrays import is_whole
 from dirax.program.signatures import parameters_of
 from dirax.program.user_functions import UserFunction
 
@@ -63,7 +64,7 @@ def check_element(element: Any) -> None:
     sides = (start, end) if kind == "T" else ((start, end),)
     if not all(isinstance(ends, tuple | list) and len(ends) == 2 for ends in sides):
         raise ValueError(f"a transformer is (T, (a, b), (c, d), ratio), but {given}.")
-    if not all(isinstance(node, int | np.integer) and not isinstance(node, bool) for ends in sides for node in ends):
+    if not all(is_whole(node) for ends in sides for node in ends):
         raise TypeError(f"nodes are whole numbers, {GROUND} that of the ground, but {given}.")
     if any(a == b for a, b in sides):
         raise ValueError(f"an element is {ELEMENT} between two nodes, but {given}.")
