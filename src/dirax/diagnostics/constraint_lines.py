@@ -8,7 +8,7 @@ import numpy as np
 
 from dirax.diagnostics.replay_lines import moved_numbers
 from dirax.diagnostics.report import NOT_CHECKED, Line
-from dirax.diagnostics.rows import at_rows, constraint_at, constraint_of, energy_at, over_rows, times_at
+from dirax.diagnostics.rows import at_rows, constraint_at, constraint_of, energy_at, over_rows
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, sampled, sampled_terms, worst_place
 from dirax.numerics.tolerances import TINY
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure
@@ -60,8 +60,8 @@ def hidden_constraint(sol: Solution, tolerance: float | None) -> Line | None:
     system = None if sol.system is None else sol.system.lagrangian_form()
     if system is None or system.holonomic is None or "constraint" not in sol.fields:
         return None
-    hidden, items = at_rows(sol, _hidden, system), {"q": np.asarray(sol.q), "p": np.asarray(sol.p)}
-    values = np.abs(over_rows(hidden, sol, ({**items, "t": times_at(sol, np.arange(sol.rows))},)))
+    hidden, items = at_rows(sol, _hidden, system), {name: np.asarray(a) for name, a in sol.row_fields.items()}
+    values = np.abs(over_rows(hidden, sol, (items,)))
     terms = sampled(sol, at_rows(sol, _constraint_terms, system))[..., -values.shape[-1] :]
     values = np.max(values / _largest(sampled_terms(sol, hidden), terms), axis=-1)
     lane, row = worst_place(values)
@@ -71,12 +71,12 @@ def hidden_constraint(sol: Solution, tolerance: float | None) -> Line | None:
 
 def _hidden(system: LagrangeDirac, row: dict, params: Any):
     """G v + ∂g/∂t."""
-    velocity = system.inverse_legendre(row["q"], row["p"], params, t=row["t"])
+    velocity = system.inverse_legendre(row["q"], row["p"], params, row.get("about"), row["t"])
     return system.constraints.hidden_defect(row["t"], row["q"], velocity, params)
 
 
 def _constraint_terms(system: LagrangeDirac, row: dict, params: Any):
-    velocity = system.inverse_legendre(row["q"], row["p"], params, t=row["t"])
+    velocity = system.inverse_legendre(row["q"], row["p"], params, row.get("about"), row["t"])
     return system.constraint_terms(row["t"], row["q"], velocity, params)
 
 

@@ -4,7 +4,7 @@ jump keeps its size, and a kink, a stiff spring or a steep wall does not."""
 import numpy as np
 
 from dirax.diagnostics.report import VIOLATED, Line
-from dirax.diagnostics.rows import at_rows, energy_at, over_rows, row_numbers, times_at
+from dirax.diagnostics.rows import at_rows, energy_at, over_rows, row_numbers
 from dirax.diagnostics.verdicts import of_lane
 from dirax.schemes.step import CLOCK
 from dirax.solution.solution import Solution
@@ -57,9 +57,7 @@ class _Ways:
     def __init__(self, sol: Solution, rows: np.ndarray):
         self.sol, self.shape = sol, rows.shape
         lanes = np.arange(len(rows))[:, None]
-        nodes = [name for name, info in sol.field_info.items() if info.place == "node"]
-        whole = {"t": times_at(sol, np.arange(sol.rows))} | {name: sol.fields[name] for name in nodes}
-        whole = {name: a if sol.batch is not None else np.asarray(a)[None] for name, a in whole.items()}
+        whole = {name: a if sol.batch is not None else np.asarray(a)[None] for name, a in sol.row_fields.items()}
         self.starts, self.ends = ({name: np.asarray(a)[lanes, rows + i] for name, a in whole.items()} for i in (0, 1))
 
     def energy(self, s: np.ndarray, time: np.ndarray | None = None) -> np.ndarray:

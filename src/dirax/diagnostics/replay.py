@@ -235,7 +235,7 @@ class Replay:
         # of the last row no step is saved: what is said of it is that of the step before, which nothing asks for
         taken = lambda a: np.take(a, np.minimum(every, a.shape[int(sol.batch is not None)] - 1), axis=int(sol.batch is not None))
         items: dict[str, Any] = {name: taken(np.asarray(a)) for name, a in sol.fields.items()}
-        items["t"] = times_at(sol, every)
+        items |= {name: taken(np.asarray(a)) for name, a in sol.row_fields.items() if name not in sol.fields}
         try:
             found = over_rows(eqx.Partial(_begun, sol.system, sol.step, Same(equation), anew), sol, (items,))
             return found[lanes, back]

@@ -119,8 +119,7 @@ def constraint_of(sol: Solution) -> np.ndarray:
 def _of_nodes(sol: Solution, name: str, function: Callable) -> np.ndarray:
     if name in sol.derived:
         return np.asarray(sol.derived[name])
-    nodes = {key: np.asarray(a) for key, a in sol.fields.items() if sol.field_info[key].place == "node"}
-    nodes["t"] = times_at(sol, np.arange(sol.rows))
+    nodes = {key: np.asarray(a) for key, a in sol.row_fields.items()}
     found = over_rows(at_rows(sol, function), sol, (nodes,))
     return found if sol.batch is not None else found[0]
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.diagnostics.report import OK, VIOLATED, Line
-from dirax.diagnostics.rows import LARGE, over_rows, row_numbers, sampled_rows, times_at
+from dirax.diagnostics.rows import LARGE, over_rows, row_numbers, sampled_rows
 from dirax.numerics.tolerances import EPSILON, TINY
 from dirax.solution.solution import Solution
 
@@ -24,6 +24,9 @@ SAMPLED_ENTRIES = 2**13
 
 DISTURBANCE = 2.0**-26
 """By how much, relatively, a number is changed for a scale."""
+
+KNOWN = ("t", "about")
+"""What a row says besides its numbers."""
 
 PROBES, MANY = 32, 100
 """Times that all numbers of a row are changed, in rows of more than so many."""
@@ -86,8 +89,7 @@ def sampled(sol: Solution, function: eqx.Partial) -> np.ndarray:
     rows = spread(sol.rows, SAMPLED_ROWS)
     rows = np.intersect1d(rows, sampled_rows(sol, sol.rows))
     lead = (slice(None),) * int(sol.batch is not None)
-    items = {k: np.asarray(a[(*lead, rows)]) for k, a in _nodes(sol).items()}
-    return over_rows(function, sol, ({**items, "t": times_at(sol, rows)},))
+    return over_rows(function, sol, ({k: np.asarray(a[(*lead, rows)]) for k, a in _nodes(sol).items()},))
 
 
 def sampled_terms(sol: Solution, function: eqx.Partial) -> np.ndarray:
@@ -101,11 +103,13 @@ def sampled_terms(sol: Solution, function: eqx.Partial) -> np.ndarray:
     nodes = _nodes(sol)
     if row_numbers(sol) > MANY:
         return _terms_of_many(sol, nodes, function)
-    axis, count = int(sol.batch is not None), 1 + sum(math.prod(sol.field_info[k].shape) for k in nodes)
+    axis, count = int(sol.batch is not None), 1 + row_numbers(sol)
     rows = spread(sol.rows, min(SAMPLED_ROWS, max(4, SAMPLED_ENTRIES // (count * (sol.batch or 1)))))
-    items, first = {"t": np.repeat(times_at(sol, rows), count, axis=axis)}, 1
+    items, first = {}, 1
     for name, values in nodes.items():
-        many = np.repeat(np.take(values, rows, axis=axis), count, axis=axis).astype(float)
+        items[name] = many = np.repeat(np.take(values, rows, axis=axis), count, axis=axis).astype(float)
+        if name in KNOWN:
+            continue
         many = many.reshape(*many.shape[:axis], len(rows), count, -1)
         for i in range(many.shape[-1]):
             many[..., first + i, i] *= 1.0 + DISTURBANCE
@@ -119,14 +123,15 @@ def sampled_terms(sol: Solution, function: eqx.Partial) -> np.ndarray:
 def _terms_of_many(sol: Solution, nodes: dict[str, Any], function: eqx.Partial) -> np.ndarray:
     few = min(SAMPLED_ROWS, max(4, SAMPLED_ENTRIES // (PROBES * row_numbers(sol))))
     rows, axis, rng = spread(sol.rows, few), int(sol.batch is not None), np.random.default_rng(0)
-    plain = {k: np.asarray(a[(*(slice(None),) * axis, rows)], float) for k, a in nodes.items()} | {"t": times_at(sol, rows)}
+    plain = {k: np.asarray(a[(*(slice(None),) * axis, rows)], float) for k, a in nodes.items()}
     with_slope = eqx.Partial(_with_slope, function.func, *function.args)  # what is traced once, being made of the same
     whole = over_rows(with_slope, sol, (plain,))
     if whole.shape[2:] == (2,):
         return whole[..., 1:]
     found = np.zeros_like(whole)
     for _ in range(PROBES):
-        moved = {k: a * (1.0 + DISTURBANCE * rng.choice([-1.0, 1.0], np.shape(a))) if k != "t" else a for k, a in plain.items()}
+        changed = lambda a: a * (1.0 + DISTURBANCE * rng.choice([-1.0, 1.0], np.shape(a)))
+        moved = {name: a if name in KNOWN else changed(a) for name, a in plain.items()}
         found = np.maximum(found, np.abs(over_rows(with_slope, sol, (moved,)) - whole) / DISTURBANCE)
     return found
 
@@ -137,13 +142,11 @@ def _with_slope(*of: Any):
     function = eqx.Partial(*function)
     if math.prod(jax.eval_shape(function, row, params).shape) != 1:
         return jnp.ravel(function(row, params))
-    t = {"t": row["t"]}
-    x = {name: a for name, a in row.items() if name != "t"}
-    value, slope = jax.value_and_grad(lambda x: jnp.sum(function({**x, **t}, params)))(x)
+    known = {name: a for name, a in row.items() if name in KNOWN}
+    x = {name: a for name, a in row.items() if name not in KNOWN}
+    value, slope = jax.value_and_grad(lambda x: jnp.sum(function({**x, **known}, params)))(x)
     return jnp.stack([value, sum(jnp.sum(jnp.abs(slope[name] * x[name])) for name in x)])
 
 
 def _nodes(sol: Solution) -> dict[str, Any]:
-    return {
-        k: a if row_numbers(sol) > LARGE else np.asarray(a) for k, a in sol.fields.items() if sol.field_info[k].place == "node"
-    }
+    return {k: a if row_numbers(sol) > LARGE else np.asarray(a) for k, a in sol.row_fields.items()}

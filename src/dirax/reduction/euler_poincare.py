@@ -92,11 +92,13 @@ class EulerPoincare(AbstractSystem):
         """The body momentum μ = ∂l/∂ξ."""
         return self.slopes(xi, a, params)[0]
 
-    def inverse_legendre(self, momentum: Algebra, a: Advected, params: Any = None) -> Algebra:
-        """The ξ with ∂l/∂ξ = μ; of an l that is quadratic in ξ by linear equations."""
+    def inverse_legendre(self, momentum: Algebra, a: Advected, params: Any = None, guess: Algebra | None = None) -> Algebra:
+        """The ξ with ∂l/∂ξ = μ, of several one near `guess` (zero by default); of an l that is quadratic in ξ by linear
+        equations."""
         of_xi = lambda xi: self.value(xi, a, params)
         if moves(jax.hessian(of_xi), momentum):
-            return nearest_root(lambda xi: self.legendre(xi, a, params) - momentum, jnp.zeros_like(momentum))
+            begin = jnp.zeros_like(momentum) if guess is None else guess
+            return nearest_root(lambda xi: self.legendre(xi, a, params) - momentum, begin)
         return constrained_velocity(of_xi, momentum, jnp.zeros((0, len(momentum))), jnp.zeros(0), momentum)[0]
 
     def constraint_forms(self, a: Advected, params: Any = None) -> Float[Array, "m d"]:
@@ -130,8 +132,8 @@ class EulerPoincare(AbstractSystem):
     def _given(self, xi, a):
         return (xi, a) if self.space.advected else (xi,)
 
-    def _energy(self, momentum, a, params):
-        xi = self.inverse_legendre(momentum, a, params)
+    def _energy(self, momentum, a, params, guess=None):
+        xi = self.inverse_legendre(momentum, a, params, guess)
         return momentum @ xi - self.value(xi, a, params)
 
     # ------------------------------------------------------------------ AbstractSystem
@@ -236,16 +238,20 @@ class EulerPoincare(AbstractSystem):
         largest = jnp.abs(xi) + as_large_as_kinetic(lambda xi: self.legendre(xi, a, params), xi)
         return {name: jnp.abs(value) for name, value in data.items()} | {"v": largest}
 
+    @property
+    def searches_near(self) -> str:
+        return "xi"
+
     def energy_at(self, row: Data, params: Any) -> Float[Array, ""]:
         """⟨μ, ξ⟩ − l(ξ, a)."""
-        return self._energy(*self.space.split(row["x"]), params)
+        return self._energy(*self.space.split(row["x"]), params, row.get("about"))
 
     def constraint_at(self, row: Data, params: Any) -> Float[Array, " m"]:
         """A ξ."""
         if self.one_forms is None:
             return no_constraint()
         momentum, a = self.space.split(row["x"])
-        return self.constraint_forms(a, params) @ self.inverse_legendre(momentum, a, params)
+        return self.constraint_forms(a, params) @ self.inverse_legendre(momentum, a, params, row.get("about"))
 
     @property
     def projected(self) -> str:

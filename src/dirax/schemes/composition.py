@@ -26,7 +26,7 @@ class Composition(AbstractScheme):
     and is refused at the start. So are Method 1 and discrete gradients of systems in x that leave their constraints: what is off
     them changes its sign in every step, and stays of second order. Method 2 composes to the order that is named.
 
-    Raises `ValueError` for unknown names and for numbers that do not sum to 1.
+    Raises `ValueError` for unknown names and for numbers that do not sum to 1, `TypeError` for what is neither.
     """
 
     scheme: AbstractScheme
@@ -36,12 +36,12 @@ class Composition(AbstractScheme):
         _check_scheme(scheme)
         if isinstance(coefficients, str):
             if coefficients not in COEFFICIENTS:
-                raise ValueError(
-                    f"coefficients must be one of {', '.join(map(repr, COEFFICIENTS))} or numbers, "
-                    f"but {coefficients!r} was given."
-                )
+                raise ValueError(_no_coefficients(coefficients))
             coefficients = COEFFICIENTS[coefficients]
-        numbers = tuple(float(c) for c in coefficients)
+        try:
+            numbers = tuple(map(float, coefficients))
+        except (TypeError, ValueError):
+            raise TypeError(_no_coefficients(coefficients)) from None
         if not numbers or not abs(sum(numbers) - 1.0) <= 1e-12:
             raise ValueError(f"the coefficients must sum to 1, but {numbers} sum to {sum(numbers):.15g}.")
         self.scheme, self.coefficients = scheme, numbers
@@ -60,6 +60,10 @@ class Composition(AbstractScheme):
     @property
     def constraints_at_rows(self) -> bool:
         return self.scheme.constraints_at_rows
+
+
+def _no_coefficients(given: Any) -> str:
+    return f"coefficients must be one of {', '.join(map(repr, COEFFICIENTS))} or numbers, but {given!r} was given."
 
 
 class Adjoint(AbstractScheme):

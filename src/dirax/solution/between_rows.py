@@ -38,5 +38,6 @@ class BetweenRows:
 
 
 def velocity_of(system: Any, row: dict, t: Any, params: Any) -> Any:
-    """The velocity that belongs to q and p."""
-    return system.complete({"q": row["q"], "p": row["p"], "t": t}, params, False)["v"]
+    """The velocity that belongs to q and p, near what is known `about` it."""
+    near = {name: row[name] for name in ("q", "p", "about") if name in row}
+    return system.complete({**near, "t": t}, params, False)["v"]

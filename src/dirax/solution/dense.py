@@ -45,6 +45,12 @@ class Dense(BetweenRows):
         return {name: np.asarray(a)[None] if one else np.asarray(a) for name, a in self.sol.fields.items()}
 
     @cached_property
+    def about(self) -> np.ndarray | None:
+        """Near what the velocities of rows are, (B, rows, n)."""
+        near = self.sol.row_fields.get("about")
+        return near if near is None else np.asarray(near).reshape(*self.sol.times.shape, -1)
+
+    @cached_property
     def ends(self) -> np.ndarray:
         """The number of the last step + 1 that each trajectory reached, (B,)."""
         return self.counts[np.maximum(last_rows([self.saved[name] for name in self.nodes]), 0)]
@@ -63,6 +69,8 @@ class Dense(BetweenRows):
         """The velocities that belong to q and p."""
         system = self.sol.system
         given = {name: fields[name] for name in ("q", "p")}
+        if self.about is not None:
+            given["about"] = self.about[lanes, self._row(self.place(lanes, t)[0])]
         function = lambda values, params: velocity_of(system, values[0], values[1], params)
         return self.entries(function, lanes, (given, t), "velocity", Same(system))
 
@@ -160,7 +168,11 @@ class Dense(BetweenRows):
 
     def of_rows(self, name: str, lanes: np.ndarray, numbers: np.ndarray) -> Any:
         """A field of which a polynomial says nothing: that of the row before."""
-        return self.saved[name][lanes, np.searchsorted(self.counts, numbers, side="right") - 1]
+        return self.saved[name][lanes, self._row(numbers)]
+
+    def _row(self, numbers: np.ndarray) -> np.ndarray:
+        """The last rows that are not after the beginnings of these steps."""
+        return np.searchsorted(self.counts, numbers, side="right") - 1
 
     def time_at(self, lanes: np.ndarray, numbers: np.ndarray, theta: Any) -> np.ndarray:
         """The times of places inside steps."""

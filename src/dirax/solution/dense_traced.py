@@ -60,8 +60,10 @@ class TracedDense(BetweenRows):
         """What has to be solved for the inside of the step between two rows, with the fields of the step: once, not at every
         place in it."""
         begins, ends = row.get(CLOCK, t), after.get(CLOCK, t + h)
+        length = ends - begins
         if self.interpolate is None and self.between is not None:
-            return tuple(velocity_of(self.sol.system, a, s, params) for a, s in ((row, begins), (after, ends)))
+            about = {"about": (after["q"] - row["q"]) / length}
+            return tuple(velocity_of(self.sol.system, a | about, s, params) for a, s in ((row, begins), (after, ends)))
         state, guess = begun(self.equation, self.sol.system, row | of_step, begins, h, params)
         return state, guess if self.interpolate is None else stepped(self.equation, state, guess, begins, h, params)[1]
 

@@ -51,6 +51,8 @@ def begun_at(
     lead = () if sol.batch is None else (lane,)
     params = jax.tree.map(lambda leaf: leaf[lane], sol.params) if sol.batch_params else sol.params
     fields = {name: jnp.asarray(a[(*lead, min(row, a.shape[len(lead)] - 1))]) for name, a in sol.fields.items()}
+    if "about" in (near := sol.row_fields):
+        fields["about"] = jnp.asarray(near["about"][(*lead, row)])
     fields |= {name: jnp.asarray(a) for name, a in (of_row or {}).items()}
     t, h = float(sol.axis[row]) if t is None else t, float(sol.step)
     state, guess = _begun(Same(sol.equation), Same(sol.system), fields, jnp.asarray(t), jnp.asarray(h), params)
@@ -219,6 +221,8 @@ class StepsAgain:
         if sol.rows > 1:
             of_steps = {name: a for name, a in sol.fields.items() if sol.field_info[name].place == "step"}
             row |= {name: take(a, np.minimum(rows, sol.rows - 2)) for name, a in of_steps.items()}
+        if "about" in (near := sol.row_fields):
+            row["about"] = take(near["about"], rows)
         return self.begin(lanes, row, t)
 
     def begin(self, lanes: np.ndarray, row: dict[str, np.ndarray], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -195,13 +195,27 @@ class Trajectory:
         values = self._without_compiling(momentum, momentum)
         return self.map_rows(momentum) if values is None else values
 
+    @property
+    def row_fields(self) -> dict[str, Any]:
+        """What a function of a row is given, (…, rows, …): the fields of nodes, the time "t", and `about`, near which the system
+        searches for the velocity or the parameters of the row."""
+        nodes = {k: a for k, a in self.fields.items() if self.field_info[k].place == "node"}
+        xp = jnp if is_traced(self.t) else np
+        nodes["t"] = xp.broadcast_to(self.t, (self.rows,) if self.batch is None else (self.batch, self.rows))
+        name = "" if self.system is None else self.system.searches_near
+        if name not in self.fields or self.rows < 2:
+            return nodes
+        of_steps, axis = self.fields[name], int(self.batch is not None)
+        if name in nodes:
+            lengths = xp.diff(nodes["t"], axis=axis)
+            changes = (jnp if is_traced(of_steps) else np).diff(of_steps, axis=axis)
+            of_steps = changes / lengths.reshape(*lengths.shape, *(1,) * (changes.ndim - lengths.ndim))
+        return nodes | {"about": _at_nodes(of_steps, axis)}
+
     def map_rows(self, function: Callable):
         """`function(row, params)` for every saved row, stacked; `row` is the dict of node fields of one trajectory and of
         the time `t`."""
-        nodes = {k: a for k, a in self.fields.items() if self.field_info[k].place == "node"}
-        batched = self.batch is not None
-        xp = jnp if is_traced(self.t) else np
-        nodes["t"] = xp.broadcast_to(self.t, (self.rows,) if self.batch is None else (self.batch, self.rows))
+        nodes, batched = self.row_fields, self.batch is not None
         axes = (0, 0 if self.batch_params and self.params is not None else None) if batched else None
         size = self.rows if is_traced(nodes, self.params) else self.rows_at_a_time
         if size >= self.rows:
@@ -240,15 +254,14 @@ class Trajectory:
     def _without_compiling(self, function: Callable, key: Hashable) -> np.ndarray | None:
         """The array that `function(row, params)` is at every row by its scalar program, which is ready sooner than XLA's; None
         for long trajectories, where XLA is faster, and where there is no such program. Functions with equal keys are equal."""
-        nodes = {k: a for k, a in self.fields.items() if self.field_info[k].place == "node"}
+        nodes = self.row_fields
         leaves, structure = jax.tree.flatten(self._params)
         count = self.batch or 1
         many = self.rows * count > BY_NUMPY or self.rows * count * self._width > NUMBERS_BY_NUMPY
-        if many or is_traced(self.t, nodes, leaves) or not all(map(_is_numeric, leaves)):
+        if many or is_traced(nodes, leaves) or not all(map(_is_numeric, leaves)):
             return None
         lead = (self.rows,) if self.batch is None else (self.batch, self.rows)
         rows = {k: np.asarray(a).reshape(self.rows * count, *np.shape(a)[len(lead) :]) for k, a in nodes.items()}
-        rows["t"] = np.broadcast_to(np.asarray(self.t), lead).ravel()
         repeated = lambda leaf: np.repeat(leaf, self.rows, axis=0)
         constant = lambda leaf: np.broadcast_to(leaf, (self.rows * count, *np.shape(leaf)))
         along = [(repeated if self.batch_params else constant)(np.asarray(leaf)) for leaf in leaves]
@@ -299,6 +312,15 @@ def _is_numeric(leaf: Any) -> bool:
 
 
 @compiled
+def _at_nodes(of_steps: Any, axis: int) -> Any:
+    """The means of what two steps have at the node between them; what one has where the other has none, and else zero."""
+    xp = jnp if is_traced(of_steps) else np
+    first, last = (xp.take(of_steps, xp.asarray([i]), axis=axis) for i in (0, -1))
+    before, after = xp.concatenate([first, of_steps], axis=axis), xp.concatenate([of_steps, last], axis=axis)
+    one = xp.where(xp.isfinite(before), before, xp.where(xp.isfinite(after), after, 0.0))
+    return xp.where(xp.isfinite(before) & xp.isfinite(after), 0.5 * (before + after), one)
+
+
 def _along(function, nodes, params, axes):
     """`function` of every row, compiled once per function and shape: a system's bound method is compared by its system."""
     along = jax.vmap(lambda row, params: function(SavedRow(row), params), in_axes=(0, None))

@@ -88,8 +88,9 @@ class GeneralizedDiracSystem(AbstractSystem):
         return self.started(data, None)[0]
 
     def started(self, data: Data, params: Any) -> tuple[Float[Numbers, " N"], Float[Numbers, " k"]]:
-        """x of initial data and a first guess of s; raises `ValueError` for others than x, q and p, or a Lagrangian's q and v."""
-        given, k, lagrangian = set(data) - {"t"}, self.submanifold.parameters, self.submanifold.lagrangian
+        """x of initial data and a first guess of s, zero where nothing is known `about` it. Raises `ValueError` for other data
+        than x, q and p, or a Lagrangian's q and v."""
+        given, k, lagrangian = set(data) - {"t", "about"}, self.submanifold.parameters, self.submanifold.lagrangian
         if given == {"q", "v"} and lagrangian is not None:
             q, v = data["q"], data["v"]
             if q.shape != (k,) or v.shape != (k,):
@@ -103,7 +104,7 @@ class GeneralizedDiracSystem(AbstractSystem):
         x = data["x"] if "x" in data else jnp.concatenate([data["q"], data["p"]])
         if lagrangian is not None and x.shape != (2 * k,):
             raise ValueError(f"x = (q, p) must have shape ({2 * k},), 2n of from_lagrangian, but its shape is {x.shape}.")
-        return x, jnp.zeros(k)
+        return x, data.get("about", jnp.zeros(k))
 
     def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         """(N, k)."""
@@ -161,14 +162,22 @@ class GeneralizedDiracSystem(AbstractSystem):
         sizes = {name: jnp.abs(a) for name, a in data.items()}
         return sizes | {"x": sizes["x"] + energetic[:N], "velocity": solved[:N], "guess": solved[N:] + energetic[N:]}
 
+    @property
+    def searches_near(self) -> str:
+        return "multipliers"
+
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """F(x, s) for the s over x."""
-        found = self.complete({"x": row["x"]}, params, False)
+        found = self._found(row, params)
         return self.submanifold.family(found["x"], found["guess"], params)
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " N+k"]:
         """The defect of x, as in `initial_defect`."""
-        return self.initial_defect(self.complete({"x": row["x"]}, params, False), params)
+        return self.initial_defect(self._found(row, params), params)
+
+    def _found(self, row, params):
+        """What is complete over the x of a row, with the s near those that its step had."""
+        return self.complete({name: row[name] for name in ("x", "about") if name in row}, params, False)
 
     @property
     def projected(self) -> str:

@@ -187,7 +187,7 @@ class LagrangeDirac(AbstractSystem):
         if "v" in data:
             v = data["v"]
         else:
-            v = self.inverse_legendre(q, data["p"], params, t=t)
+            v = self.inverse_legendre(q, data["p"], params, data.get("about"), t)
             if constraints.any:
                 v = v - jax.lax.stop_gradient(self._undetermined_part(q, v, params, t))
         if project:
@@ -254,9 +254,13 @@ class LagrangeDirac(AbstractSystem):
         where it is zero as large as the others make it."""
         return self.constraints.terms(t, q, v, self.speeds(t, q, v, params), params, self._as_large(t, q, v, q, params))
 
+    @property
+    def searches_near(self) -> str:
+        return "q"
+
     def _velocity(self, row: Data, params: Any) -> Float[Numbers, " n"]:
         """The velocity that belongs to the saved momentum."""
-        return self.inverse_legendre(row["q"], row["p"], params, t=row.get("t", 0.0))
+        return self.inverse_legendre(row["q"], row["p"], params, row.get("about"), row.get("t", 0.0))
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """E at the node, with the velocity that belongs to the saved momentum."""

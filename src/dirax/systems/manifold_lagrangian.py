@@ -112,14 +112,16 @@ class ManifoldLagrangian(AbstractSystem):
         """The covector ∂L/∂v restricted to the tangent space at q."""
         return self.manifold.projection(q, gradient(lambda v: self.lagrangian(q, v, params))(v))
 
-    def inverse_legendre(self, q: Float[Numbers, " N"], p: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
-        """The tangent vector v at q with legendre(q, v) = p."""
+    def inverse_legendre(
+        self, q: Float[Numbers, " N"], p: Float[Numbers, " N"], params: Any = None, guess: Float[Numbers, " N"] | None = None
+    ) -> Float[Numbers, " N"]:
+        """The tangent vector v at q with legendre(q, v) = p; where there are several, one near `guess` (zero by default)."""
         frame = self.manifold.frame(q)
 
         def defect(s):
             return frame.T @ (gradient(lambda v: self.lagrangian(q, v, params))(frame @ s) - p)
 
-        return frame @ nearest_root(defect, jnp.zeros(self.manifold.dimension))
+        return frame @ nearest_root(defect, jnp.zeros(self.manifold.dimension) if guess is None else frame.T @ guess)
 
     def energy(self, q: Float[Numbers, " N"], v: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, ""]:
         """⟨∂L/∂v, v⟩ − L."""
@@ -190,7 +192,7 @@ class ManifoldLagrangian(AbstractSystem):
         if "q0" in data:
             return dict(data)
         q, t = data["q"], data.get("t", 0.0)
-        v = data["v"] if "v" in data else self.inverse_legendre(q, data["p"], params)
+        v = data["v"] if "v" in data else self.inverse_legendre(q, data["p"], params, data.get("about"))
         if project and self.constraints.any:
             q = self.project_position(q, v, params, t)
             v = self.project_velocity(q, v, params, t)
@@ -213,16 +215,20 @@ class ManifoldLagrangian(AbstractSystem):
         speed, size = (as_large(metric, a) for a in (v, q))
         return self.constraints.terms(t, q, v, speed, params, size)
 
+    @property
+    def searches_near(self) -> str:
+        return "q"
+
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy at the saved point and momentum."""
-        return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params), params)
+        return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params, row.get("about")), params)
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
         """How far the point is from the manifold, and (W v + b, g, G v + ∂g/∂t) with the velocity of the saved momentum."""
         q, off = row["q"], self.manifold.defect(row["q"])[None]
         if not self.constraints.any:
             return off
-        v = self.inverse_legendre(q, row["p"], params)
+        v = self.inverse_legendre(q, row["p"], params, row.get("about"))
         return jnp.concatenate([off, self.constraints.defect(row.get("t", 0.0), q, v, params)])
 
     @property

@@ -80,6 +80,12 @@ class AbstractSystem(eqx.Module):
         of what it could be."""
         return {name: jnp.abs(a) for name, a in data.items()}
 
+    @property
+    def searches_near(self) -> str:
+        """The saved field that says where, of several, the velocity or the parameters of a row are, its entry `about`: "q" by its
+        changes from row to row, one of steps by those before and after it; "" where none are searched."""
+        return ""
+
     @abstractmethod
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy at one saved row (its node fields, and the time `t`)."""
