@@ -30,6 +30,9 @@ from dirax.schemes.step import Field
 OK, NOT_CONVERGED, NOT_FINITE = 0, 1, 2
 """Outcome of a trajectory's last attempted step."""
 
+UNSOLVED = NOT_CONVERGED, NOT_FINITE
+"""Those of a step without a solution."""
+
 TOO_LARGE = "Newton's method is too large for this engine"
 """In the note on an iteration that did not converge, and is the only one that the engine has for the step."""
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from dirax.engines.first_sizes import FAR, NOTHING, TYPICAL
+from dirax.engines.following import FOLLOWED, followed
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
@@ -278,7 +279,7 @@ class StepsInNumbers:
         safe = self._read(known, e.guess)
         known = known.without(self._depends[index])
         known.bind(_nodes(e.unknowns), safe)
-        fixed, u = None, safe.copy()
+        fixed, u, begun = None, safe.copy(), safe.copy()
         inverse, size = near.inverses[stage], near.sizes[stage]
         last, left, renewed = np.full(count, np.inf), np.arange(count), unknown(inverse)
         of_some = lambda some: (u[some], states[some], tuple(a[some] for a in at), inverse[some])
@@ -318,13 +319,38 @@ class StepsInNumbers:
             left = left[~ended]
             if not len(left):
                 break
-        # by any other Jacobian the roundoff of constraints would move what they leave free
-        inverse[:] = inverted(self._linearized(index, self._values(index, u, states, at))[0])
-        u = u - applied(inverse, self._read(self._values(index, u, states, at, noise), e.residual))
         good = last < STALLED
+        self._to_floor(index, u, inverse, states, at, noise)
         if len(left):
             good[left] &= is_solved(left)
+        if len(lost := np.flatnonzero(~good)) and k <= FOLLOWED:
+            there, _ = self.followed(stage, begun[lost], size[lost], states[lost], tuple(a[lost] for a in at))
+            if len(some := lost[np.isfinite(there[:, 0])]):
+                u[some] = there[np.isfinite(there[:, 0])]
+                of_them = u[some], inverse[some], states[some], tuple(a[some] for a in at), noise
+                u[some], inverse[some] = self._to_floor(index, *of_them)
+                good[some] = is_solved(some)
         return u, good
+
+    def _to_floor(self, index: int, u, inverse: Inverses, states, at, noise) -> tuple[np.ndarray, Inverses]:
+        """A last update in place, by the Jacobians of the solutions: by any other the roundoff of constraints would move what
+        they leave free."""
+        inverse[:] = inverted(self._linearized(index, self._values(index, u, states, at))[0])
+        u -= applied(inverse, self._read(self._values(index, u, states, at, noise), self.program.equations[index].residual))
+        return u, inverse
+
+    def followed(self, stage: int, guess, sizes, states, at) -> tuple[np.ndarray, np.ndarray]:
+        """`following.followed` of the equations of a stage, from a guess (states, k) on."""
+        index, (t, h, params) = self.program.stages[stage][0], at
+        e, of_step = self.program.equations[index], self.program.shared.h
+
+        def slopes(some, u, part):
+            known = self._values(index, u, states[some], (t[some], part * h[some], params[some]))
+            found = self._slopes_of(known, e.residual, [*e.unknowns, of_step])
+            found[:, :, -1] *= h[some][:, None]
+            return self._read(known, e.residual), found
+
+        return followed(slopes, guess, sizes)
 
     def _judged(self, stage: int, u, states, at, inverses: Inverses) -> tuple[np.ndarray, np.ndarray]:
         """The sizes of unknowns, as of `solved`, and whether the equations are solved, (states,): to roundoff of their terms,

@@ -187,7 +187,8 @@ class UserFunction(eqx.Module):
             return ""
         last = parameters_of(self.function)[len(self.arguments) :][:1]
         takes = f"its argument {last[0]} stands for" if last and last[0] != "params" else "it takes"
-        return f" and params=None ({takes} params, which were not given: pass params=…)"
+        seen = "; those of constraints are called multipliers" if self.arguments == ("t", "q", "v") else ""
+        return f" and params=None ({takes} params, which were not given: pass params=…{seen})"
 
 
 def evaluated(function: Callable, *values: Any) -> Any:

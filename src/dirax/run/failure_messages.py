@@ -8,21 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import NOT_FINITE, OK, TOO_LARGE, Outcome, Problem
+from dirax.engines.following import FOLLOWED
 from dirax.engines.sizes import Sizes
 from dirax.engines.stage_in_numbers import InJax, InNumbers, in_numbers
+from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.stopping import STALLED
 from dirax.numerics.equilibration import balanced_condition, balanced_inverse
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
 from dirax.program.graph import GraphTooLarge
 from dirax.program.roots import FEWEST_SPARSE, sparse_equations
-from dirax.run.turning_step import follow
 from dirax.schemes.step import CLOCK
 from dirax.systems.circuit import POTENTIAL
 
 SMALLER = "a smaller step may help"
-
-FOLLOWED = 64
-"""Unknowns of a step up to which its solutions are followed from short steps on, to see whether there are any."""
 
 COUNTS, NAMED = 0.1, 8
 """Part that an equation has in a direction for it to be named, and how many are named at most."""
@@ -158,14 +156,16 @@ def _of_nodes(names: list[str]) -> str:
 def _where_it_ends(numbers: InNumbers | InJax, guess, args, sizes) -> str:
     """Whether there is a solution, found from shorter steps on."""
     state, t, h = args
-    if not 0 < len(guess) <= FOLLOWED or h <= 0.0:
+    if not 0 < len(guess) <= FOLLOWED or not isinstance(numbers, InNumbers):
         return ""
-    found = follow(lambda u, step: numbers.linearized(u, state, t, step), guess, np.asarray(sizes), float(h))
-    if found is None:
+    one = lambda a: np.asarray(a, float)[None]
+    of_step = one(t), one(h), one(numbers.params)
+    part = float(StepsInNumbers(None, numbers.step).followed(0, one(guess), one(sizes), one(state), of_step)[1][0])
+    if part == 0.0:
         return ""
-    if found.whole:
+    if part == 1.0:
         return " (there is a solution, to which those of shorter steps lead, but not Newton's method from these values)"
-    return f" (the solutions of shorter steps lead to h = {found.step:.3g} and turn back there: longer ones have none near)"
+    return f" (the solutions of shorter steps lead to h = {part * h:.3g} and turn back there: longer ones have none near)"
 
 
 def _dense(numbers: InNumbers | InJax, args) -> Callable:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, OK, Problem
+from dirax.engines.contract import OK, UNSOLVED, Problem
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.loops.record import DOUBTFUL
@@ -106,8 +106,8 @@ class Lanes:
 
     @property
     def stuck(self) -> bool:
-        """Whether there is a trajectory for which Newton's method has not converged."""
-        return bool((self.records[:, self.record.status] == NOT_CONVERGED).any())
+        """Whether there is a trajectory whose step has not been solved."""
+        return bool(np.isin(self.records[:, self.record.status], UNSOLVED).any())
 
     def close(self, kernel) -> dict[str, np.ndarray]:
         """The rows of the last states."""

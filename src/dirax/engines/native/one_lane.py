@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, OK, Problem
+from dirax.engines.contract import OK, UNSOLVED, Problem
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.lanes import TOGETHER, arrays_saved
@@ -85,8 +85,8 @@ class OneLane:
 
     @property
     def stuck(self) -> bool:
-        """Whether Newton's method has not converged."""
-        return bool(self.memory[self.record.status] == NOT_CONVERGED)
+        """Whether its step has not been solved."""
+        return self.memory[self.record.status] in UNSOLVED
 
     def attempt(self, numbers: np.ndarray, made: Kernels | CollocationKernels, table: np.ndarray) -> np.ndarray:
         """The record after going on from one, which is not kept."""

@@ -11,7 +11,8 @@ from dirax.engines.native.collocation_kernels import CollocationKernels, colloca
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
 from dirax.engines.native.one_lane import OneLane, places_of
-from dirax.engines.native.sizes_of_lanes import find_sizes, with_present_sizes
+from dirax.engines.native.sizes_of_lanes import find_sizes
+from dirax.engines.native.stuck_lanes import otherwise
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.text.representation import counted
 
@@ -70,7 +71,7 @@ class Ready:
         if p.record is None and isinstance(self.made, Kernels):  # a fixed point finds its own
             waited += find_sizes(lanes, self.made)
         started, before, done, interrupted, threads = time.perf_counter(), waited, p.after, False, 1
-        count = max(1, FIRST_CHUNK // max(1, p.batch or 1))
+        count, others = max(1, FIRST_CHUNK // max(1, p.batch or 1)), []
         try:
             while done < p.steps and (done == p.after or lanes.going):
                 count = min(count, p.steps - done)
@@ -90,15 +91,12 @@ class Ready:
                 threads = lanes.threads if threads > 1 or p.steps - done > rate * WORTH_THREADS else 1
                 if progress:
                     progress(done, p.steps)
+            if lanes.stuck:
+                others = (
+                    _by_newton(lanes, self.made) if isinstance(self.made, CollocationKernels) else otherwise(lanes, self.made)
+                )
         except KeyboardInterrupt:
             interrupted = True
-        others: list[str] = []
-        if not interrupted and lanes.stuck:
-            if isinstance(self.made, CollocationKernels):
-                others = _by_newton(lanes, self.made)
-            else:
-                with_present_sizes(lanes, self.made)
-                others = _with_weak_entries(lanes, self.made)
         run_seconds = time.perf_counter() - started - (waited - before)
         closing = lanes.close(kernel)
         compile_seconds, cached = self.compile_seconds + waited, self.notes["kernel_cached"] and ready
@@ -130,25 +128,6 @@ def _told(notes: dict[str, Any], others: list[str]) -> dict[str, str]:
     return {"iteration": "; then ".join([notes.get("iteration", "Newton's method"), *others])} if others else {}
 
 
-def _with_weak_entries(lanes: Lanes | OneLane, made: Kernels) -> list[str]:
-    """Go on with trajectories whose steps are so long that entries of the Jacobian which are weak in others have to be in it.
-    Returns what was tried."""
-    p, record, table = lanes.problem, lanes.record, lanes.table()
-    stuck = np.flatnonzero(table[:, record.status] == NOT_CONVERGED)
-    if not len(stuck) or not any(stage.weak for stage, _ in p.equation.stages):
-        return []
-    try:
-        whole = kernels(p.equation, p.params, p.batch_params, p.compensated, whole=True)
-        whole.runs.kernel(1, p.steps)
-    except UnsupportedPrimitive:  # too large to be written out: they end where they are
-        return []
-    own = table[stuck]
-    own[:, record.status] = OK
-    lanes.put(stuck, lanes.attempt(stuck, whole, own))
-    with_present_sizes(lanes, whole)
-    return [f"with the whole Jacobian, {counted(len(stuck), 'trajectory', 'trajectories')}"]
-
-
 def _by_newton(lanes: Lanes | OneLane, made: CollocationKernels) -> list[str]:
     """Go on with trajectories whose fixed-point iteration has not converged: by Newton's method with one Jacobian for all nodes,
     which needs systems of the size of one node alone, and where that does not converge by Newton's method with all unknowns
@@ -178,6 +157,5 @@ def _by_newton(lanes: Lanes | OneLane, made: CollocationKernels) -> list[str]:
     for i, (stage, _) in enumerate(p.equation.stages):
         own[:, record.sizes(i, stage.unknowns)] = 0.0
     lanes.put(stuck, own)
-    with_present_sizes(lanes, whole)
     others.append(f"{ALL_UNKNOWNS}, {counted(len(stuck), 'trajectory', 'trajectories')}")
-    return others
+    return others + otherwise(lanes, whole)

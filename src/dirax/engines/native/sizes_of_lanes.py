@@ -1,21 +1,17 @@
-"""The sizes of unknowns in the records of trajectories: where a run begins, and where it stops too early."""
+"""The sizes of unknowns in the records of trajectories, where a run begins."""
 
 import time
 
 import jax
 import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, OK
-from dirax.engines.native.collocation_kernels import CollocationKernels
+from dirax.engines.contract import OK
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.lanes import Lanes
 from dirax.engines.native.loops.record import DOUBTFUL
 from dirax.engines.native.one_lane import OneLane
-from dirax.engines.sizes import grown, sizes_of, sizes_there
+from dirax.engines.sizes import sizes_of, sizes_there
 from dirax.program.memo import Memo, Same
-
-RESUMED = 16
-"""How often trajectories go on with other sizes."""
 
 _looked: Memo[tuple] = Memo(64)
 """What a closer look at single trajectories found, for runs that begin as others did."""
@@ -54,28 +50,3 @@ def look_closer(lanes: Lanes | OneLane) -> None:
     record.put_sizes(own, found)
     own[:, record.status] = OK
     lanes.put(doubtful, own)
-
-
-def with_present_sizes(lanes: Lanes | OneLane, made: Kernels | CollocationKernels) -> None:
-    """Go on with trajectories whose unknowns have become larger than where they began. An attempt that does not come to another
-    step leaves no trace."""
-    p, record = lanes.problem, lanes.record
-    if not lanes.stuck:
-        return
-    table = lanes.table()
-    failed, tried = np.flatnonzero(table[:, record.status] == NOT_CONVERGED), 0
-    while len(failed) and tried < RESUMED:
-        tried, own, stages = tried + 1, table[failed], [stage.unknowns for stage, _ in p.equation.stages]
-        places = [record.sizes(i, k) for i, k in enumerate(stages)]
-        before = tuple(own[:, place] for place in places)
-        guess = tuple(own[:, record.unknowns(i, k)] for i, k in enumerate(stages))
-        sizes, more = grown(p, failed, own[:, record.completed], own[:, record.state], guess, before)
-        if not np.any(more):
-            return
-        record.put_sizes(own, sizes)
-        own[:, record.status] = OK
-        before, chosen = table[failed[more]], failed[more]
-        after = lanes.attempt(chosen, made, own[more])
-        further = after[:, record.completed] > own[more, record.completed]
-        lanes.put(chosen, np.where(further[:, None], after, before))
-        table, failed = lanes.table(), chosen[further & (after[:, record.status] == NOT_CONVERGED)]

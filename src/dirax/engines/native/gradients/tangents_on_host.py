@@ -9,6 +9,7 @@ from dirax.engines.native.gradients.recording import Recorded
 from dirax.engines.native.kernels import kernels
 from dirax.engines.native.lanes import Lanes, width_for
 from dirax.engines.native.sizes_of_lanes import find_sizes
+from dirax.engines.native.stuck_lanes import otherwise
 
 SEGMENT_BYTES = 2**26
 """Memory for the steps that are gone over at a time."""
@@ -21,7 +22,7 @@ class Segments:
         self.task, self.problem = task, task.problem(*inputs, every_stage=True)
         p = self.problem
         self.stages = len(p.equation.stages)
-        made = kernels(p.equation, p.params, True, p.compensated)
+        self.made = made = kernels(p.equation, p.params, True, p.compensated)
         self.lanes = Lanes(p, made, width_for(p.batch or 1))
         self.kernel, _ = made.runs.kernel(self.lanes.width, p.steps * self.lanes.blocks)
         find_sizes(self.lanes, made)
@@ -32,24 +33,32 @@ class Segments:
         self.length = max(1, SEGMENT_BYTES // row_bytes)
 
     def segments(self) -> list[tuple[int, int, np.ndarray]]:
-        """(first step, number of steps, lanes there); the last segment ends with the step leaving the last row."""
-        found, records = [], self.lanes.records
+        """(first step, number of steps, records there); the last segment ends with the step leaving the last row."""
+        found, table = [], self.lanes.table()
         for first in range(0, self.problem.steps + 1, self.length):
             count = min(self.length, self.problem.steps + 1 - first)
-            found.append((first, count, records.copy()))
+            found.append((first, count, table))
             if first + count <= self.problem.steps:
-                self._run(records, count)
+                table = self._run(first, count, table).table()
         return found
 
-    def _run(self, records: np.ndarray, count: int) -> dict[str, np.ndarray]:
-        arrays, outs = self.lanes.arrays(count)
-        self.lanes.call(self.kernel, records, outs, 0, count, 1, self.lanes.threads)
-        return {name: a.reshape(len(a), count * self.stages, a.shape[-1]) for name, a in arrays.items()}
+    def _run(self, first: int, count: int, table: np.ndarray) -> Lanes:
+        """The trajectories after a segment, as they went through it before."""
+        p = self.problem.with_numbers(steps=first + count, save_every=1, first_row=first, record=(table,))
+        lanes = Lanes(p, self.made, self.lanes.width)
+        lanes.advance(self.kernel, first, first + count, lanes.threads)
+        if lanes.stuck:
+            otherwise(lanes, self.made)
+        return lanes
 
-    def rows(self, count: int, records: np.ndarray) -> np.ndarray:
-        """State and unknowns of every stage of a segment, (blocks, rows, quantities, width)."""
-        arrays = self._run(records, count)
-        return self.blocked(np.concatenate([arrays["state"], arrays["unknowns"]], axis=2))
+    def rows(self, first: int, count: int, table: np.ndarray, completed: np.ndarray) -> np.ndarray:
+        """State and unknowns of every stage of a segment, (blocks, rows, quantities, width); NaN for trajectories that do not get
+        as far as their run, which has `completed` (B,) steps."""
+        lanes = self._run(first, count, table)
+        parts = (lanes.fields[name][:, :count] for name in ("state", "unknowns"))
+        rows = np.concatenate([a.reshape(len(table), count * self.stages, -1) for a in parts], axis=2)
+        rows[lanes.table()[:, lanes.record.completed] < np.minimum(completed, first + count)] = np.nan
+        return self.blocked(rows)
 
     def blocked(self, rows: np.ndarray) -> np.ndarray:
         """(blocks, …, width) from (B, …)."""
@@ -99,8 +108,8 @@ def jvp(task: Recorded, *arrays: np.ndarray) -> list[np.ndarray]:
     carry = parts.blocked(np.concatenate([state, c, t0[:, None], h[:, None], limits], axis=1))
     states = np.zeros((batch, task.rows, task.parts, s))
     unknowns = np.zeros((batch, task.rows, task.parts, task.unknowns))
-    for first, count, records in parts.segments():
-        rows = parts.rows(count, records)
+    for first, count, table in parts.segments():
+        rows = parts.rows(first, count, table, completed)
         flow = np.zeros_like(rows)
         parts.call(carry, rows, flow, first, count)
         chosen, at = parts.saved(first, count)
@@ -118,8 +127,8 @@ def vjp(task: Recorded, *arrays: np.ndarray) -> list[np.ndarray]:
     limits = parts.limits(completed, np.any(closing != 0, axis=1))
     carry = parts.blocked(np.concatenate([np.zeros((batch, s + m + 2)), limits], axis=1))
     given = np.concatenate([a.reshape(batch, task.rows, task.parts, -1) for a in (states, unknowns)], axis=3)
-    for first, count, records in reversed(parts.segments()):
-        rows = parts.rows(count, records)
+    for first, count, table in reversed(parts.segments()):
+        rows = parts.rows(first, count, table, completed)
         flow = np.zeros((batch, count * parts.stages, given.shape[3]))
         chosen, at = parts.saved(first, count)
         flow[:, at] = given[:, chosen]

@@ -1,0 +1,77 @@
+"""Solutions of a step followed from short ones on: where they turn back, by closed forms, and what is said of a failed run."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import dirax as dx
+from dirax import gallery
+from dirax.engines.following import followed
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_a_parabola_turns_at_its_vertex_in_any_units(size):
+    """u = size + h u²/size has the roots size (1 ± √(1 − 4h))/(2h)."""
+
+    def slopes(some, u, part):
+        h = part[:, None] * step[some]
+        residual = u - size - h * u**2 / size
+        return residual, np.stack([1.0 - 2.0 * h * u / size, -step[some] * u**2 / size], axis=2)
+
+    step = np.array([[1.0], [0.2]])
+    unknowns, parts = followed(slopes, np.full((2, 1), size), np.zeros((2, 1)))
+    assert parts[0] == pytest.approx(0.25, rel=2e-2)
+    assert parts[1] == 1.0
+    assert np.isnan(unknowns[0, 0])
+    assert unknowns[1, 0] == pytest.approx(size * (1.0 - np.sqrt(0.2)) / 0.4, rel=1e-12)
+
+
+def test_a_failed_step_says_where_solutions_turn_back():
+    """The turning point of two stages at t = .7 is .0835 by a continuation with other steps and scales; of three there is none."""
+    example = gallery.get("cartesian-double-pendulum")
+    run = lambda stages: dx.simulate(
+        example.system, dx.Collocation(stages, "lobatto"), step=0.1, steps=40, params=example.params, **example.initial
+    )
+    assert "turn back there: longer ones have none near" in run(2).message and "lead to h = 0.083" in run(2).message
+    assert run(3).ok
+    assert "followed" in run(3).stats["iteration"]
+    assert dx.verify(run(3)).ok
+
+
+MU, SLIP, H = 0.3 * 9.81, 1e-3, 0.01
+
+
+def block(steps, q=(3.0,), mu=MU, **options):
+    """A block on a spring that friction stops: Newton's method fails where it comes to rest within a step."""
+    friction = lambda t, q, v, p: -p * jnp.tanh(v / SLIP)
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 2.0 * q @ q, forces=friction)
+    v = np.zeros_like(np.asarray(q))
+    return dx.simulate(system, dx.LagrangeDAlembert(), q=q, v=v, step=H, steps=steps, params=mu, **options)
+
+
+def test_where_friction_stops_a_block():
+    """Against the roots of the same equations in one number, which brackets find."""
+    sol, q, p = block(400), 3.0, 0.0
+    for k in range(400):
+        half = lambda v: H / 2 * (-4.0 * (q + H / 2 * v) - MU * np.tanh(v / SLIP))  # noqa: B023
+        v = brentq(lambda v: v - half(v) - p, -20.0, 20.0, xtol=1e-16)  # noqa: B023
+        q, p = q + H * v, v + half(v)
+        np.testing.assert_allclose((sol.q[k + 1, 0], sol.p[k + 1, 0]), (q, p), atol=1e-12)
+    assert "followed" in sol.stats["iteration"]
+    assert dx.verify(sol).ok
+    assert np.array_equal(block(313).extend(87).q, sol.q)
+    assert np.array_equal(block(400, q=[[2.5], [3.0]]).q[1], sol.q)
+    assert np.array_equal(block(400, save_every=10).q, sol.q[::10])
+
+
+def test_its_derivative():
+    end = lambda mu: block(400, mu=mu).q[-1, 0]
+    assert jax.grad(end)(MU) == pytest.approx((end(MU + 1e-6) - end(MU - 1e-6)) / 2e-6, rel=1e-6)
+
+
+def test_few_updates_are_a_bound():
+    sol = block(400, max_iterations=7)
+    assert not sol.ok
+    assert "there is a solution, to which those of shorter steps lead" in sol.message
