@@ -29,7 +29,7 @@ def test_a_parabola_turns_at_its_vertex_in_any_units(size):
 
 
 def test_a_failed_step_says_where_solutions_turn_back():
-    """The turning point of two stages at t = .7 is .0835 by a continuation with other steps and scales; of three there is none."""
+    """The turning point of two stages at t = .7 is .0835 by a continuation with other steps and scales; three have none."""
     example = gallery.get("cartesian-double-pendulum")
     run = lambda stages: dx.simulate(
         example.system, dx.Collocation(stages, "lobatto"), step=0.1, steps=40, params=example.params, **example.initial
