@@ -241,6 +241,15 @@ def test_the_search_and_the_step_onto_the_wall_agree(monkeypatch):
     assert np.max(np.abs(fast.events.t[:4] - slow.events.t[:4])) <= 1e-11
 
 
+def test_walls_that_are_far_away_are_not_searched_for(monkeypatch):
+    searched, search = [], Flight._searched
+    monkeypatch.setattr(Flight, "_searched", lambda *at: searched.append(at) or search(*at))
+    pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([q @ q - 1.0]))
+    start = {"q": [1e-3, -np.sqrt(1 - 1e-6)], "v": [0.0, 0.0], "step": 0.01, "steps": 100}  # 0.001 is known to 1e-16 of a length
+    sol = dx.simulate(pendulum, dx.LagrangeDAlembert(), events=[dx.Impact(lambda q: q[0] + 0.1)], **start)
+    assert sol.ok and not len(sol.events) and len(searched) <= 12
+
+
 def test_a_wall_that_moves_gives_its_velocity():
     free = dx.LagrangeDirac(lambda q, v: v @ v / 2)
     piston = dx.Impact(lambda t, q, params: q[0] - params["u"] * t)
