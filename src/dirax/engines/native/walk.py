@@ -58,9 +58,9 @@ class KernelWalk(AbstractWalk):
         self._stuck += 1
         if self._stuck <= FEW:
             return False
-        memory, one = self._memory, np.zeros(1, int)
-        completed, *rest = (memory[place][None] for place in (self.record.completed, self.record.state, self._unknowns, self._sizes))
-        state, unknowns, before = rest
+        memory, record, one = self._memory, self.record, np.zeros(1, int)
+        places = record.completed, record.state, self._unknowns, self._sizes
+        completed, state, unknowns, before = (memory[place][None] for place in places)
         (sizes,), more = grown(self.problem.with_numbers(t0=t, h=h), one, completed, state, (unknowns,), (before,))
         memory[self._sizes] = sizes[0]
         return bool(more[0])
