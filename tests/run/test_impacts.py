@@ -324,6 +324,9 @@ def test_what_is_refused():
         run(dx.Impact(lambda q: q))
     with pytest.raises(TypeError, match="with a composition"):
         run(FLOOR, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"))
+    with pytest.raises(TypeError, match=r"this is PortHamiltonian with a state of x\."):
+        system = dx.PortHamiltonian(lambda x: x @ x / 2, J=np.array([[0.0, 1.0], [-1.0, 0.0]]))
+        dx.simulate(system, dx.DiscreteDirac(), x=[1.0, 0.0], step=0.05, steps=20, events=[FLOOR])
     with pytest.raises(ValueError, match="from 0 to 1"):
         dx.Impact(lambda q: q[0], restitution=1.5)
     with pytest.raises(TypeError, match="it takes v"):
