@@ -359,6 +359,18 @@ def test_what_impacts_do_to_energy_and_multipliers_is_no_violation(forces, gap, 
     assert not dx.verify(sol.replace(fields=sol.fields | {"q": q})).ok
 
 
+@pytest.mark.parametrize("save_every", [1, 5])
+def test_all_flights_are_replayed_but_for_the_steps_that_walls_divide(save_every):
+    wall = dx.Impact(lambda q: q[1], restitution=0.8)
+    start = {"q": [[0.0, 1.0], [0.0, 2.0]], "v": [[0.3, 0.0], [0.3, 0.0]], "step": 0.05, "steps": 100}
+    sol = dx.simulate(BALL, dx.LagrangeDAlembert(), save_every=save_every, events=[wall], **start)
+    replayed = lambda sol: dx.verify(sol)["steps replayed"]
+    assert len(sol.events) == 3 and replayed(sol).verdict == "ok"
+    last = np.array(sol.p)
+    last[0, -2] += 1e-9  # the longest flight is another one
+    assert replayed(sol.replace(fields=sol.fields | {"p": last})).verdict == "VIOLATED"
+
+
 def test_verify_sees_an_energy_that_a_wall_at_rest_has_changed():
     sol = dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=80, events=[FLOOR], **DROP)
     after = sol.t > sol.events.t[0]
