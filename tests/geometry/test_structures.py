@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.structures import DiracStructure, canonical_two_form, induced_dirac
+from dirax.program.user_functions import constant_entries
 
 POINT = np.array([0.3, -0.7, 1.1, 0.4])
 
@@ -303,6 +304,32 @@ def test_mass_and_spring_through_their_ports_are_the_oscillator():
     assert joined.integrability_defect(x) < 1e-14
     with pytest.raises(ValueError, match="ports"):
         mass.integrability_defect(x[:1])
+
+
+def test_a_composition_of_constant_structures_is_constant_where_it_is_traced():
+    part = DiracStructure.from_bivector(lambda x: jnp.array([[0.0, 1.0, 1.0], [-1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), n=2, ports=1)
+    joined, x = part.compose(part), np.array([0.3, 0.2, 0.1, 0.4])
+    traced = jax.jit(joined.kernel)
+    assert np.array_equal(constant_entries(lambda x: jnp.stack(joined.kernel(x)), x), joined.kernel(x))
+    assert np.array_equal(traced(x), joined.kernel(x))
+    of_params = DiracStructure.from_bivector(lambda x, params: params * jnp.array([[0.0, 1.0], [-1.0, 0.0]]), n=1, ports=1)
+    mixed = of_params.compose(of_params)
+    assert np.allclose(jax.jit(mixed.kernel)(x[:2], 2.0), mixed.kernel(x[:2], 2.0), atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "change, error, message",
+    [
+        ({"other": 3}, TypeError, "composed with another one, but a int"),
+        ({"ports": 0}, TypeError, "ports must be a list of whole numbers"),
+        ({"other_ports": [0.5]}, TypeError, "other_ports must be a list of whole numbers"),
+        ({"common": "efforts"}, ValueError, "'covectors' or 'vectors' was expected"),
+    ],
+)
+def test_what_is_no_composition(change, error, message):
+    part = DiracStructure.from_bivector(lambda x: jnp.array([[0.0, 1.0], [-1.0, 0.0]]), n=1, ports=1)
+    with pytest.raises(error, match=message):
+        part.compose(**{"other": part, "ports": [0], "other_ports": [0], **change})
 
 
 def test_open_ports_keep_their_places():

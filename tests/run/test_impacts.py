@@ -241,6 +241,15 @@ def test_the_search_and_the_step_onto_the_wall_agree(monkeypatch):
     assert np.max(np.abs(fast.events.t[:4] - slow.events.t[:4])) <= 1e-11
 
 
+def test_walls_that_are_far_away_are_not_searched_for(monkeypatch):
+    searched, search = [], Flight._searched
+    monkeypatch.setattr(Flight, "_searched", lambda *at: searched.append(at) or search(*at))
+    pendulum = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1], holonomic=lambda q: jnp.array([q @ q - 1.0]))
+    start = {"q": [1e-3, -np.sqrt(1 - 1e-6)], "v": [0.0, 0.0], "step": 0.01, "steps": 100}  # 0.001 is known to 1e-16 of a length
+    sol = dx.simulate(pendulum, dx.LagrangeDAlembert(), events=[dx.Impact(lambda q: q[0] + 0.1)], **start)
+    assert sol.ok and not len(sol.events) and len(searched) <= 12
+
+
 def test_a_wall_that_moves_gives_its_velocity():
     free = dx.LagrangeDirac(lambda q, v: v @ v / 2)
     piston = dx.Impact(lambda t, q, params: q[0] - params["u"] * t)
@@ -315,6 +324,9 @@ def test_what_is_refused():
         run(dx.Impact(lambda q: q))
     with pytest.raises(TypeError, match="with a composition"):
         run(FLOOR, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"))
+    with pytest.raises(TypeError, match=r"this is PortHamiltonian with a state of x\."):
+        system = dx.PortHamiltonian(lambda x: x @ x / 2, J=np.array([[0.0, 1.0], [-1.0, 0.0]]))
+        dx.simulate(system, dx.DiscreteDirac(), x=[1.0, 0.0], step=0.05, steps=20, events=[FLOOR])
     with pytest.raises(ValueError, match="from 0 to 1"):
         dx.Impact(lambda q: q[0], restitution=1.5)
     with pytest.raises(TypeError, match="it takes v"):
@@ -345,6 +357,18 @@ def test_what_impacts_do_to_energy_and_multipliers_is_no_violation(forces, gap, 
     q = np.asarray(sol.q).copy()
     q[:, 0] += 1e-9
     assert not dx.verify(sol.replace(fields=sol.fields | {"q": q})).ok
+
+
+@pytest.mark.parametrize("save_every", [1, 5])
+def test_all_flights_are_replayed_but_for_the_steps_that_walls_divide(save_every):
+    wall = dx.Impact(lambda q: q[1], restitution=0.8)
+    start = {"q": [[0.0, 1.0], [0.0, 2.0]], "v": [[0.3, 0.0], [0.3, 0.0]], "step": 0.05, "steps": 100}
+    sol = dx.simulate(BALL, dx.LagrangeDAlembert(), save_every=save_every, events=[wall], **start)
+    replayed = lambda sol: dx.verify(sol)["steps replayed"]
+    assert len(sol.events) == 3 and replayed(sol).verdict == "ok"
+    last = np.array(sol.p)
+    last[0, -2] += 1e-9  # the longest flight is another one
+    assert replayed(sol.replace(fields=sol.fields | {"p": last})).verdict == "VIOLATED"
 
 
 def test_verify_sees_an_energy_that_a_wall_at_rest_has_changed():

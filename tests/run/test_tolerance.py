@@ -57,6 +57,9 @@ def test_bad_input():
             run(tolerance=tolerance)
     with pytest.raises(ValueError, match="at rest"):
         run(tolerance=1e-6, q=[0.0])
+    falling = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0])
+    with pytest.raises(ValueError, match=r"steps tried were .* or the scheme has no error on it"):
+        dx.simulate(falling, dx.LagrangeDAlembert(), q=[1.0], v=[0.0], tolerance=1e-6, steps=4)
     with pytest.raises(ValueError, match="belong to one step"):
         run(tolerance=1e-6, q=None, v=None, q0=[0.0], q1=[0.1])
     with pytest.raises(ValueError, match="JAX traces"):

@@ -43,8 +43,14 @@ def test_several_trajectories_stay_a_batch(batch):
         np.testing.assert_array_equal(part.q, batch.q[1:])
         np.testing.assert_array_equal(part.params["k"], [2.0, 3.0])
     np.testing.assert_array_equal(batch[batch.ok].p, batch.p)
-    with pytest.raises(IndexError):
+    with pytest.raises(IndexError, match="the numbers 0 to 2, but 3 was asked for"):
         batch[3]
+
+
+@pytest.mark.parametrize("which", ["q", (0, 1), True, [0.5], [True, False], None])
+def test_what_names_no_trajectories_is_refused(batch, which):
+    with pytest.raises(TypeError, match="one truth value for each of the 3 trajectories"):
+        batch[which]
 
 
 def test_a_failed_trajectory_ends_at_its_last_good_row():

@@ -192,8 +192,10 @@ def test_a_sweep_over_params(tmp_path):
 def test_params_that_are_no_values(changed, error, message):
     with pytest.raises(error, match=message):
         dx.simulate(dx.circuit(OF_PARAMS), MIDPOINT, x=[0.0], step=0.1, steps=2, params=changed and VALUES | changed)
-    with pytest.raises(TypeError, match="has the keys 'load'"):
+    with pytest.raises(TypeError, match=r"resistance\(\) could not be traced by JAX: KeyError.* has the keys 'load'"):
         dx.simulate(dx.circuit(OF_PARAMS[1:]), MIDPOINT, x=[0.0], step=0.1, steps=2, params={"load": 1.0})
+    with pytest.raises(TypeError, match=r"resistance\(\) could not be traced by JAX with params=None \(it takes params"):
+        dx.simulate(dx.circuit(OF_PARAMS[1:]), MIDPOINT, x=[0.0], step=0.1, steps=2)
 
 
 def test_functions_are_user_functions():

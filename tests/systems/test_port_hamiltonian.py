@@ -86,6 +86,37 @@ def test_ports_that_do_not_fit(change, message):
         dx.interconnect(**{"one": mass(), "other": mass(), "ports": [0], "other_ports": [0], "sizes": (2, 2), **change})
 
 
+@pytest.mark.parametrize(
+    "change, error, message",
+    [
+        ({"sizes": 4}, TypeError, "sizes must be a list of whole numbers"),
+        ({"sizes": (2,)}, ValueError, "lengths of the two x"),
+        ({"sizes": (3, 1)}, ValueError, r"as sizes has it: J must have shape \(3, 3\)"),
+        ({"ports": 0}, TypeError, "ports must be a list of whole numbers"),
+        ({"other_ports": [0.5]}, TypeError, "other_ports must be a list of whole numbers"),
+        ({"one": dx.PortHamiltonian(lambda x: x @ x, J=J, B=lambda x, params: params["b"] * B)}, TypeError, "pass params="),
+    ],
+)
+def test_what_does_not_say_which_ports_meet(change, error, message):
+    with pytest.raises(error, match=message):
+        dx.interconnect(**{"one": mass(), "other": mass(), "ports": [0], "other_ports": [0], "sizes": (2, 2), **change})
+
+
+@pytest.mark.parametrize("kind", ["feedback", "joint"])
+def test_sparse_systems_are_joined_to_a_sparse_one_and_to_others(kind):
+    ends = np.array([[0.0, 1.0], [1.0, 0.0]])
+    system = lambda own: dx.PortHamiltonian(lambda x: x @ x / 2, J=own(J), B=own(ends), R=own(np.diag([0.0, 0.3])))
+    join = lambda one, other: dx.interconnect(one, other, [1], [0], sizes=(2, 2), kind=kind)
+    dense, sparse = system(np.asarray), system(csr_matrix)
+    expected = join(dense, dense)
+    for whole, all_sparse in ((join(sparse, sparse), True), (join(sparse, dense), False)):
+        for name in ("J", "B", "R"):
+            found = getattr(whole, name)(jnp.zeros(4), None)
+            assert np.array_equal(found, getattr(expected, name)(jnp.zeros(4), None))
+            assert hasattr(found, "matrix") == all_sparse
+        assert whole.closed == expected.closed and whole.sizes({"x": jnp.zeros(4)}, None)[0] == 4
+
+
 def test_some_ports_closed_and_some_driven():
     """A free particle in the plane, closed in y and pushed in x."""
     system = dx.PortHamiltonian(

@@ -26,6 +26,9 @@ FEWEST, CALL = 16, 2048
 LONGEST = 5 * MOST_OPERATIONS
 """Operations from which on these are too long."""
 
+AT_ROW = 1e-6
+"""Part of a step by which a wall may be hit off a row and still at it."""
+
 APART = 16
 """Rows from one to the next that is asked where its step begins."""
 
@@ -163,14 +166,29 @@ class Replay:
         return self._steps_a_row > max(1.0, LONGEST / self.steps.operations(FEWEST, CALL))
 
     def chosen(self) -> tuple[np.ndarray, np.ndarray]:
-        """(trajectory, row) of the rows whose steps are taken again: all that were reached, or as many as there is time for."""
-        lanes, rows = np.nonzero(np.arange(self.sol.rows)[None] <= self.ends[:, None])
+        """(trajectory, row) of the rows whose steps are taken again: all that were reached and that are beside no step which a
+        wall divides, or as many as there is time for. Raises `CannotReplay` where there are none."""
+        lanes, rows = np.nonzero((np.arange(self.sol.rows)[None] <= self.ends[:, None]) & ~self.beside_walls)
+        if not len(rows):
+            raise CannotReplay("walls divide every step")
         most = max(FEWEST, int(MOST_OPERATIONS / self.steps.operations() / self._steps_a_row))
         if len(rows) > most:
             some = np.unique(np.linspace(0, len(rows) - 2, most // 2).astype(int))
             some = np.union1d(some, some + 1)  # with their successors
             lanes, rows = lanes[some], rows[some]
         return lanes, rows
+
+    @property
+    def beside_walls(self) -> np.ndarray:
+        """The rows (B, rows) before and after a step that a wall divides: their momenta and multipliers are of parts of it."""
+        sol, beside = self.sol, np.zeros((self.sol.batch or 1, self.sol.rows), bool)
+        if sol.impacts is not None:
+            lanes, times = sol.impacts.lane, sol.impacts.t
+            for lane in np.unique(lanes):
+                for t in (times[lanes == lane] - AT_ROW * sol.step, times[lanes == lane] + AT_ROW * sol.step):
+                    before = np.clip(np.searchsorted(sol.times[lane], t, side="right") - 1, 0, sol.rows - 2)
+                    beside[lane, before] = beside[lane, before + 1] = True
+        return beside
 
     def begun(self, lanes: np.ndarray, rows: np.ndarray) -> Rows:
         """Where the steps that leave these rows, in order, begin. Raises `CannotReplay` where the rows do not say it.

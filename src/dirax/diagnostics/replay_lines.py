@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from dirax.diagnostics.flights import longest_flight
 from dirax.diagnostics.replay import Again, CannotReplay, Replay, Rows, times_of
 from dirax.diagnostics.replay_of_many import replayed_of_many
 from dirax.diagnostics.report import NOT_CHECKED, Line
@@ -42,11 +43,11 @@ DOUBTED = 2000
 def replayed(sol: Solution, tolerance: float | None) -> Line:
     """The line: the difference of a saved number from what it should be, relative to its terms, the largest of all."""
     if row_numbers(sol) > LARGE and sol.system is not None and sol.equation is not None and sol.rows > 2:
-        return replayed_of_many(sol, NAME, tolerance)
+        return replayed_of_many(longest_flight(sol)[0], NAME, tolerance)
     try:
         replay = Replay.of(sol)
         if replay.too_long:
-            return replayed_of_many(sol, NAME, tolerance)
+            return replayed_of_many(longest_flight(sol)[0], NAME, tolerance)
         at = replay.begun(*replay.chosen())
     except CannotReplay as reason:
         return Line(NAME, None, None, NOT_CHECKED, str(reason))

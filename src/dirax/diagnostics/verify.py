@@ -55,8 +55,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
       where there are constraints ([PY] §3.2): 32 ε · 2n · the condition number of the step's equations, at a few steps, of
       each entry of the form;
     - variable steps: a step and the step back, 32 ε of what it would be off if every operation were;
-    - runs with impacts: momentum maps over the run, and the energy where no wall changes it, all else in the longest flight
-      between two of them;
+    - runs with impacts: steps replayed but those that a wall divides, momentum maps over the run, and the energy where no wall
+      changes it; all else in the longest flight between two of them;
     - systems with ports ([BLM] §7.1): the power balance of every step and, with a discrete gradient, the books over the run,
       H − H(0) less what was supplied plus what was dissipated: 32 ε, however many steps;
     - premise: there, and violated, where J, R, a metric or a Dirac structure is none at one of 64 rows, as is asked where a run
@@ -90,9 +90,9 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     structure = structure_of(whole)
     lines = [
         _completion(sol),
-        impacts,
-        replayed(flight, tolerance),
+        replayed(sol, tolerance),
         points(sol, tolerance),
+        impacts,
         *membership(whole, structure, tolerance),
         stationary_action(whole, structure, tolerance),
         constraint(whole, structure, tolerance),

@@ -37,6 +37,9 @@ from dirax.geometry.subspaces import (
 )
 from dirax.numerics.tolerances import STRUCTURE_DEFECT, STRUCTURE_RANK, TRANSVERSALITY
 
+COMMON = ("covectors", "vectors")
+"""What may agree at ports that are joined."""
+
 
 class LinearDirac(eqx.Module):
     """A linear Dirac structure D = D^⊥ ⊂ V ⊕ V* on V = R^n ([BLM] Definition 2.1), or a batch of them.
@@ -274,7 +277,7 @@ class LinearDirac(eqx.Module):
         other_ports = _port_list("other_ports", ports if other_ports is None else other_ports, other.n)
         if len(ports) != len(other_ports):
             raise ValueError(f"{len(ports)} ports cannot be joined to {len(other_ports)} other_ports.")
-        if common not in ("covectors", "vectors"):
+        if common not in COMMON:
             raise ValueError(f"common is {common!r}; 'covectors' or 'vectors' was expected.")
         F, E = _kernel(self.direct_sum(other))
         first = np.array(ports, dtype=int)

@@ -4,6 +4,7 @@ Integrability is never required, only measured: nonholonomic constraints give st
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal
 
 import equinox as eqx
@@ -12,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.geometry.linear import LinearDirac
+from dirax.geometry.linear import COMMON, LinearDirac
 from dirax.geometry.representations import KERNEL_PAIRS, KernelPair
 from dirax.geometry.scattering import block_diagonal, scattering_matrix
 from dirax.geometry.subspaces import AnyArray, known
+from dirax.numerics.arrays import is_whole
 from dirax.program.compiled import compiled
-from dirax.program.user_functions import UserFunction
+from dirax.program.user_functions import UserFunction, constant_entries, is_traced
 
 Matrices = tuple[Float[AnyArray, "rows columns"], ...]
 
@@ -105,7 +107,12 @@ class DiracStructure(eqx.Module):
         Raises as the `LinearDirac` constructor does where the matrices at x are bad; for a batch of points use vmap.
         """
         F, E = self.kernel(x, params)
-        return LinearDirac(scattering_matrix((known(F), known(E))))
+        if is_traced(F, E):  # numbers all the same, where they depend on nothing
+            entries = constant_entries(lambda x, params: jnp.stack(self.kernel(x, params)), x, params)
+            F, E = (F, E) if entries is None or np.any(np.isnan(entries)) else entries
+        F, E = known(F), known(E)
+        with _in_numbers(F, E):
+            return LinearDirac(scattering_matrix((F, E)))
 
     def kernel(self, x: Float[Array, " n"], params: Any = None) -> KernelPair:
         """(F, E), smooth in x, with D(x) = {(v, α) : F v + E α = 0}: (ωᵀ, −I) for a two-form, (I, −Λ) for a bivector.
@@ -170,18 +177,29 @@ class DiracStructure(eqx.Module):
 
         `ports` and `other_ports` count the ports of each from 0 and are all of them by default. Needs `n` of both.
         """
+        if not isinstance(other, DiracStructure):
+            raise TypeError(f"a dx.DiracStructure is composed with another one, but a {type(other).__name__} was given.")
+        if common not in COMMON:
+            raise ValueError(f"common is {common!r}; 'covectors' or 'vectors' was expected.")
         if self.n is None or other.n is None:
             raise ValueError("A product needs the dimensions of both structures: give n=… to their constructors.")
-        ports = list(range(self.ports)) if ports is None else [int(port) for port in ports]
-        other_ports = list(range(other.ports)) if other_ports is None else [int(port) for port in other_ports]
+        ports = range(self.ports) if ports is None else ports
+        other_ports = range(other.ports) if other_ports is None else other_ports
         for name, chosen, count in (("ports", ports, self.ports), ("other_ports", other_ports, other.ports)):
+            if not (isinstance(chosen, Sequence | np.ndarray) and all(map(is_whole, chosen))):
+                raise TypeError(f"{name} must be a list of whole numbers, like [0, 1], but {chosen!r:.100} was given.")
             if len(set(chosen)) != len(chosen) or any(not 0 <= port < count for port in chosen):
                 raise ValueError(f"{name} is {chosen}; distinct numbers of the {count} ports, from 0, were expected.")
         if len(ports) != len(other_ports):
             raise ValueError(f"{len(ports)} ports cannot be joined to {len(other_ports)} other_ports.")
-        joined = _Composition(self, other, tuple(ports), tuple(other_ports), common)
+        joined = _Composition(self, other, tuple(map(int, ports)), tuple(map(int, other_ports)), common)
         left = self.ports - len(ports) + other.ports - len(other_ports)
         return DiracStructure(joined, "kernel", self.n + other.n, left)
+
+
+def _in_numbers(*known_or_traced: Any) -> AbstractContextManager:
+    """Where what is known is computed at once, also while JAX traces other things."""
+    return nullcontext() if is_traced(known_or_traced) else jax.ensure_compile_time_eval()
 
 
 def induced_dirac(one_forms: Callable | None, n: int) -> DiracStructure:
@@ -273,13 +291,10 @@ class _Composition(eqx.Module):
     def __call__(self, x, params):
         n, m = self.first.n or 0, self.second.n or 0
         if self.ports:
-            joined = self.first.at(x[:n], params).compose(
-                self.second.at(x[n:], params),
-                [n + port for port in self.ports],
-                [m + port for port in self.other_ports],
-                self.common,
-            )
-            F, E = joined.kernel()
+            first, second = self.first.at(x[:n], params), self.second.at(x[n:], params)
+            ports = [n + port for port in self.ports], [m + port for port in self.other_ports]
+            with _in_numbers(first, second):
+                F, E = map(known, first.compose(second, *ports, self.common).kernel())
         else:
             pairs = zip(self.first.kernel(x[:n], params), self.second.kernel(x[n:], params), strict=True)
             F, E = (block_diagonal(own, other) for own, other in pairs)

@@ -138,8 +138,7 @@ class UserFunction(eqx.Module):
         except Exception as error:
             way = _way_out(error, values[-1] if self.takes_params else None)
             raise TypeError(
-                f"{self._call} could not be traced by JAX on float64 arrays of shapes {_shapes_of(values)}"
-                f"{self._without_params(values)}: {type(error).__name__}: {_first_line(error)}{way}"
+                f"{self._call} could not be traced by JAX{self._on(values)}: {type(error).__name__}: {_first_line(error)}{way}"
             ) from error
         if not isinstance(out, jax.ShapeDtypeStruct) or out.dtype != jnp.float64:
             what = f"dtype {out.dtype}: convert it with .astype(float)" if hasattr(out, "dtype") else type(out).__name__
@@ -182,13 +181,16 @@ class UserFunction(eqx.Module):
     def __repr__(self) -> str:
         return self.signature
 
-    def _without_params(self, values) -> str:
+    def _on(self, values) -> str:
+        """What it was traced on, in words."""
+        arrays = f" on float64 arrays of shapes {_shapes_of(values)}" if self.arguments else ""
         if not self.takes_params or values[-1] is not None:
-            return ""
+            return arrays
         last = parameters_of(self.function)[len(self.arguments) :][:1]
         takes = f"its argument {last[0]} stands for" if last and last[0] != "params" else "it takes"
         seen = "; those of constraints are called multipliers" if self.arguments == ("t", "q", "v") else ""
-        return f" and params=None ({takes} params, which were not given: pass params=…{seen})"
+        way = f"{takes} params, which were not given: pass params=…{seen}"
+        return f"{arrays} {'and' if arrays else 'with'} params=None ({way})"
 
 
 def evaluated(function: Callable, *values: Any) -> Any:

@@ -133,10 +133,11 @@ def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tup
     stages = p.equation.stages
     layout = stages[0][0].state_layout
     if system.lagrangian_form() is None or len(stages) > 1 or not {"q", "p"} <= set(layout):
+        held = "composition" if len(stages) > 1 else f"state of {', '.join('x' if name == 'state' else name for name in layout)}"
         raise TypeError(
             "dx.Impact bounces Lagrangian systems in coordinates by schemes of one part whose state holds (q, p), such as "
             "dx.LagrangeDAlembert(), dx.DiscreteDirac() and dx.Collocation(); this is "
-            f"{type(system).__name__} with a {'composition' if len(stages) > 1 else 'state of ' + ', '.join(layout)}."
+            f"{type(system).__name__} with a {held}."
         )
     if p.first_step:
         raise ValueError("a run with dx.Impact starts from q= with v= or p=, not from two points.")

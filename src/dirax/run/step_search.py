@@ -41,7 +41,7 @@ def step_for(run: Callable[..., Solution], settings: Settings, case: Case, toler
     """The step of a case, and what is said of it in `stats`; `run(settings, case, steps, save_every, progress)` runs it.
 
     Raises `ValueError` for runs that JAX traces, that start from two points or have steps of lengths of their own, and where no
-    step has this error: at rest, below rounding.
+    step has this error: at rest, for a scheme that has none on the motion, below rounding.
     """
     if case.traced or case.two_points:
         what = "JAX traces its values" if case.traced else "q0= and q1= belong to one step"
@@ -88,6 +88,7 @@ def step_for(run: Callable[..., Solution], settings: Settings, case: Case, toler
             break
     where = f"{good:.3g} and {bad:.3g}" if good and bad < math.inf else f"{good or bad:.3g}"
     raise ValueError(
-        f"no step was found whose error over the first {STRETCH} steps is {tolerance:g} of the motion's size (the last were "
-        f"{where}): the motion is at rest there, or the tolerance is below rounding; give step=."
+        f"no step was found whose error over the first {STRETCH} steps is {tolerance:g} of the motion's size (the last "
+        f"steps tried were {where}): the motion is at rest there, or the scheme has no error on it, or the tolerance is below "
+        "rounding; give step=."
     )

@@ -191,6 +191,6 @@ class Dense(BetweenRows):
         outside = ~((times >= first - slack) & (times <= last + slack))
         if np.any(outside):
             raise ValueError(
-                f"sol.at takes times inside the run, from {first:.6g} to {last:.6g}, but {times[outside].flat[0]!r} is not among "
-                "them: run more steps, or go on with sol.extend(steps)."
+                f"sol.at takes times inside the run, from {first:.6g} to {last:.6g}, but {float(times[outside][0])!r} is not "
+                "among them: run more steps, or go on with sol.extend(steps)."
             )

@@ -44,8 +44,22 @@ def select(sol: Some, which: Any) -> Some:
             f"this solution is one trajectory, but sol[{shortened(which)}] was asked for: sol[t0:t1] with floats is a stretch of "
             f"time, sol[i:j] are rows, and sol.{next(iter(sol.fields))}[i] is a row."
         )
-    index = np.arange(sol.batch)[which if isinstance(which, slice) else np.asarray(which)]
+    index = np.arange(sol.batch)[which if isinstance(which, slice) else _numbers(which, sol.batch)]
     return _trajectory(sol, int(index)) if np.ndim(index) == 0 else _trajectories(sol, index)
+
+
+def _numbers(which: Any, batch: int) -> np.ndarray:
+    """Numbers of trajectories, or which of them. Raises `TypeError` and `IndexError`."""
+    chosen = np.asarray(which) if not isinstance(which, tuple) else np.empty((0, 0))
+    if chosen.dtype.kind in "iu" and chosen.ndim <= 1:
+        if np.any(outside := (chosen < -batch) | (chosen >= batch)):
+            raise IndexError(f"the trajectories have the numbers 0 to {batch - 1}, but {chosen[outside].flat[0]} was asked for.")
+    elif not (chosen.dtype == bool and chosen.shape == (batch,)):
+        raise TypeError(
+            f"sol[i], sol[i:j], sol[[i, j]] and sol[mask] with one truth value for each of the {batch} trajectories take some of "
+            f"them, and sol[t0:t1] with floats a stretch of time, but sol[{shortened(which)}] was asked for."
+        )
+    return chosen
 
 
 def count(sol: Trajectory) -> int:

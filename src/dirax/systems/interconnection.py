@@ -5,10 +5,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+import numpy as np
 
-from dirax.numerics.arrays import Numbers
+from dirax.numerics.arrays import is_whole
+from dirax.program.sparse_matrix import SparseMatrix
 from dirax.systems.port_hamiltonian import PortHamiltonian
+from dirax.systems.port_matrices import ConstantFunction
 
 KINDS = ("feedback", "joint")
 
@@ -31,7 +33,9 @@ def interconnect(
     ones stay closed. `params` are only needed where B takes them, to count its columns. Raises `ValueError` for ports that
     do not exist, meet twice, are closed, or have no partner.
     """
-    ports, other_ports = tuple(map(int, ports)), tuple(map(int, other_ports))
+    ports, other_ports, lengths = _whole(ports, "ports"), _whole(other_ports, "other_ports"), _whole(sizes, "sizes")
+    if len(lengths) != 2 or min(lengths) < 1:
+        raise ValueError(f"sizes must be the lengths of the two x, like (2, 2), but {lengths} were given.")
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(map(repr, KINDS))}, but {kind!r} was given.")
     if not ports or len(ports) != len(other_ports):
@@ -50,67 +54,84 @@ def interconnect(
             raise ValueError(f"{name} {chosen} are closed, and a closed port meets nothing.")
         if len(set(chosen)) < len(chosen) or min(chosen) < 0:
             raise ValueError(f"{name} must be different columns of B, but {chosen} were given.")
-    n = sizes[0]
-    at_one = lambda function, x, params: function(x[:n], params)
-    at_other = lambda function, x, params: function(x[n:], params)
+    width, other_width = (_count(system, size, params) for system, size in zip((one, other), lengths, strict=True))
+    for count, chosen, name in ((width, ports, "ports"), (other_width, other_ports, "other_ports")):
+        if max(chosen) >= count:
+            raise ValueError(f"{name} {chosen} do not all exist: its B has {count} columns.")
+    n, count, meeting = lengths[0], width + other_width, (list(ports), [width + port for port in other_ports])
+    closed_one, closed_other = (system.closed if isinstance(system.closed, tuple) else () for system in (one, other))
+    shut = [*closed_one, *(width + port for port in closed_other)]
+    left = [port for port in range(count) if port not in (*meeting[0], *meeting[1], *shut)]
+    unit = np.eye(count)
+    joints = unit[:, meeting[0]] - unit[:, meeting[1]] if kind == "joint" else unit[:, :0]
+    kept = np.concatenate([unit[:, left + shut], joints], axis=1)  # open ports left over, then closed ones, then the joints
+    coupling = unit[:, meeting[1]] @ unit[meeting[0]] - unit[:, meeting[0]] @ unit[meeting[1]]
+
+    def both(function, of_other, x, params):
+        """Those of the two systems along the diagonal; None stands for no dissipation."""
+        pairs = zip((function, of_other), (x[:n], x[n:]), lengths, strict=True)
+        return _diagonal(*(SparseMatrix(((), ((), ())), (m, m)) if f is None else f(part, params) for f, part, m in pairs))
 
     def hamiltonian(x, params):
-        return at_one(one.hamiltonian, x, params) + at_other(other.hamiltonian, x, params)
-
-    def columns(x, params):
-        b, c = at_one(one.input_matrix, x, params), at_other(other.input_matrix, x, params)
-        for matrix, chosen, name in ((b, ports, "ports"), (c, other_ports, "other_ports")):
-            if max(chosen) >= matrix.shape[1]:
-                raise ValueError(f"{name} {chosen} do not all exist: its B has {matrix.shape[1]} columns.")
-        return b, c
+        return one.hamiltonian(x[:n], params) + other.hamiltonian(x[n:], params)
 
     def J(x, params):
-        structure = jax.scipy.linalg.block_diag(at_one(one.J, x, params), at_other(other.J, x, params))
+        structure = both(one.J, other.J, x, params)
         if kind == "joint":
             return structure
-        b, c = columns(x, params)
-        coupling = b[:, list(ports)] @ c[:, list(other_ports)].T
-        return structure + jnp.zeros_like(structure).at[:n, n:].set(-coupling).at[n:, :n].set(coupling.T)
+        b = both(one.B, other.B, x, params)
+        return structure + _product(_product(b, coupling), b.T)
 
     def R(x, params):
-        sides = ((one.R, x[:n]), (other.R, x[n:]))
-        losses = [jnp.zeros((part.size, part.size)) if r is None else r(part, params) for r, part in sides]
-        return jax.scipy.linalg.block_diag(*losses)
+        return both(one.R, other.R, x, params)
 
     def B(x, params):
-        """Open ports left over, then closed ones, then the joints."""
-        b, c = columns(x, params)
-        return _port_columns(one, other, b, c, ports, other_ports, joint=kind == "joint")
+        return _product(both(one.B, other.B, x, params), kept)
 
-    def count(system: PortHamiltonian, size: int, taken: tuple[int, ...]) -> tuple[int, int]:
-        closed = len(system.closed) if isinstance(system.closed, tuple) else 0
-        width = jax.eval_shape(lambda x: system.input_matrix(x, params), jnp.zeros(size)).shape[1]
-        return width - len(taken) - closed, closed
-
-    for system, size, chosen, name in ((one, sizes[0], ports, "ports"), (other, sizes[1], other_ports, "other_ports")):
-        if max(chosen) >= sum(count(system, size, ())):
-            raise ValueError(f"{name} {chosen} do not all exist: its B has {sum(count(system, size, ()))} columns.")
-    (open_one, closed_one), (open_other, closed_other) = count(one, sizes[0], ports), count(other, sizes[1], other_ports)
-    left, shut = open_one + open_other, closed_one + closed_other + (len(ports) if kind == "joint" else 0)
-    dissipates = one.R is not None or other.R is not None
+    closed = kept.shape[1] - len(left)
+    parts = [f for system in (one, other) for f in (system.J, system.B, system.R) if f is not None]
+    sparse = all(isinstance(function, ConstantFunction) for function in parts)
+    stated = lambda matrix: matrix(np.zeros(sum(lengths)), None) if sparse else matrix
     return PortHamiltonian(
         hamiltonian,
-        J,
-        B=B if left + shut else None,
-        R=R if dissipates else None,
-        closed=tuple(range(left, left + shut)) or False,
+        stated(J),
+        B=stated(B) if kept.shape[1] else None,
+        R=stated(R) if one.R is not None or other.R is not None else None,
+        closed=tuple(range(len(left), len(left) + closed)) or False,
     )
 
 
-def _port_columns(one, other, b, c, ports, other_ports, joint: bool) -> Float[Numbers, "N m"]:
-    above = jnp.concatenate([b, jnp.zeros((c.shape[0], b.shape[1]))])
-    below = jnp.concatenate([jnp.zeros((b.shape[0], c.shape[1])), c])
-    shut = [system.closed if isinstance(system.closed, tuple) else () for system in (one, other)]
-    kept = [
-        [i for i in range(matrix.shape[1]) if i not in taken and i not in closed]
-        for matrix, taken, closed in ((b, ports, shut[0]), (c, other_ports, shut[1]))
-    ]
-    parts = [above[:, kept[0]], below[:, kept[1]], above[:, list(shut[0])], below[:, list(shut[1])]]
-    if joint:
-        parts.append(above[:, list(ports)] - below[:, list(other_ports)])
-    return jnp.concatenate(parts, axis=1)
+def _whole(given: Any, name: str) -> tuple[int, ...]:
+    numbers: list[Any] = list(given) if isinstance(given, Sequence | np.ndarray) else [None]
+    if not all(map(is_whole, numbers)):
+        raise TypeError(f"{name} must be a list of whole numbers, like (0, 1), but {given!r:.100} was given.")
+    return tuple(map(int, numbers))
+
+
+def _count(system: PortHamiltonian, size: int, params: Any) -> int:
+    """How many ports a system with x of this size has."""
+    x, B = jnp.zeros(size), system.B
+    assert B is not None
+    functions = [f for f in (system.hamiltonian, system.J, B, system.R) if f is not None]
+    try:
+        if params is not None or not any(f.takes_params for f in functions):
+            system.sizes({"x": x}, params)
+        return B.shape(x, params).shape[1]
+    except (ValueError, IndexError) as error:
+        raise ValueError(f"with x of shape ({size},), as sizes has it: {error}") from error
+
+
+def _diagonal(first: Any, second: Any) -> Any:
+    """The two matrices along the diagonal of one that is zero beside them; sparse where both are."""
+    if isinstance(first, SparseMatrix) and isinstance(second, SparseMatrix):
+        from scipy.sparse import block_diag  # imported when it is used
+
+        return SparseMatrix(block_diag([first.matrix, second.matrix]))
+    return jax.scipy.linalg.block_diag(jnp.asarray(first), jnp.asarray(second))
+
+
+def _product(first: Any, second: Any) -> Any:
+    """Sparse where the first is."""
+    if isinstance(first, SparseMatrix):
+        return SparseMatrix(first.matrix @ getattr(second, "matrix", second))
+    return first @ second
