@@ -1,10 +1,12 @@
 """The command line, as a user types it."""
 
+import gc
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -370,6 +372,38 @@ sys.modules.pop("ast", None)
     )
     status, out, err = ended(process)
     assert (status, out, err.strip()) == (130, "", "dirax: interrupted.")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_an_interruption_that_an_import_would_lose():
+    before = """
+import os, signal
+class Interrupts:
+    def find_spec(self, name, path=None, target=None):
+        if name == "dirax.gallery":
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt:
+                pass
+sys.meta_path.insert(0, Interrupts())
+"""
+    status, out, err = ended(program("list", "--json", before=before))
+    assert (status, out, err.strip()) == (130, "", "dirax: interrupted.")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_an_interruption_while_garbage_is_collected(capsys):
+    interrupt = lambda *_: signal.raise_signal(signal.SIGINT)
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit, match="130"), terminal.interruptible():
+            gc.callbacks.append(interrupt)
+            gc.collect(0)
+            gc.callbacks.remove(interrupt)
+            time.sleep(5)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert capsys.readouterr().err == "dirax: interrupted.\n"
 
 
 def test_another_program_keeps_its_own_interruptions():
