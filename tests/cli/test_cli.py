@@ -1,5 +1,6 @@
 """The command line, as a user types it."""
 
+import errno
 import gc
 import json
 import os
@@ -21,6 +22,7 @@ from dirax.cli.schemes import scheme_from_text
 from dirax.cli.subject import changed
 from dirax.gallery import peng_yoshimura, reproduction
 from dirax.gallery.listing import listing
+from dirax.solution import saving
 from dirax.solution.style import new_figure
 
 SPRING = """
@@ -69,6 +71,27 @@ def test_run_prints_the_report_and_saves_once(tmp_path):
     assert again.exit_code == 1 and "exists" in again.stderr and "--overwrite" in again.stderr
     assert call(*arguments[:3], "steps=10", *arguments[4:], "--overwrite").exit_code == 0
     assert dx.load(path).q.shape == (11, 2)
+
+
+def test_a_run_that_cannot_be_saved_is_shown(spring, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setitem(saving.FORMATS, ".nc", (full, Path.is_file))
+    path = tmp_path / "run.nc"
+    result = call("run", spring, "--out", path)
+    assert result.exit_code == 1 and "steps solved" in result.stdout and "saved in" not in result.stdout
+    assert f"dirax: {path} cannot be written (there is no space left for it)" in result.stderr
+    assert json.loads(call("run", spring, "--out", path, "--json").stdout)["saved"] is None
+    monkeypatch.setattr(os, "access", lambda *_: False)  # before anything is run
+    for command in (("run", spring), ("report", spring), ("export", "c", spring), ("bench", "--json", path)):
+        place = (
+            ()
+            if command[0] == "bench"
+            else ("--out", path.with_suffix({"report": ".html", "export": ".c"}.get(command[0], ".nc")))
+        )
+        result = call(*command, *place)
+        assert result.exit_code == 1 and "is read-only here" in result.stderr and not result.stdout
 
 
 def test_run_a_file_as_json(spring, tmp_path):
@@ -282,7 +305,7 @@ def test_a_reader_that_stops_ends_the_program():
 def test_a_full_disk(command):
     with open("/dev/full", "w") as full:
         status, _, err = ended(program(command, stdout=full))
-    assert status == 1 and "No space left" in err and len(err.splitlines()) == 1
+    assert status == 1 and "could not be written: No space left" in err and len(err.splitlines()) == 1
 
 
 @pytest.mark.skipif(os.name != "posix", reason="file descriptors of POSIX")

@@ -33,7 +33,11 @@ def with_messages(command: Callable) -> Callable:
         try:
             return command(*args, **kwargs)
         except REPORTED as error:
-            typer.echo(f"dirax: {error}", err=True)
+            from dirax.solution.atomic_files import FULL, Unwritten  # imported when it is used
+
+            unwritten = isinstance(error, OSError) and error.errno in FULL and not isinstance(error, Unwritten)
+            text = f"the results could not be written: {error.strerror}." if unwritten else error
+            typer.echo(f"dirax: {text}", err=True)
             raise typer.Exit(1) from error
         except KeyboardInterrupt as end:
             typer.echo(f"dirax: {str(end) or 'interrupted.'}", err=True)
