@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import socket
+import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -474,6 +475,12 @@ def test_another_value_of_what_a_case_closes_over_is_noticed_in_any_units():
         data, _ = Case.of(case, ("charge",), 0).chosen(values).at(values)
         assert np.allclose(data["q"][:, 1], scale * values["charge"], rtol=1e-12, atol=0.0)
         scale *= 5.0
+
+
+def test_functions_that_cannot_be_sent_to_other_processes_are_one_error(tmp_path):
+    kept = threading.Lock()
+    with pytest.raises(TypeError, match=r"cannot be sent to other processes \(cannot pickle.*leave executor out"):
+        study(tmp_path / "locked.zarr", {"g": [1.0], "angle": [0.5]}, executor=1, keep=lambda sol: {"x": 1.0 * kept.locked()})
 
 
 @pytest.mark.parametrize("kept", [np.int16(3), np.uint64(3), np.float16(0.5)])

@@ -1,12 +1,14 @@
 """Stores that are written while something runs: files that are on the disk when they appear, and one writer at a time."""
 
 import contextlib
+import errno
 import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 from dirax.solution.atomic_files import FULL, Unwritten, reason_of
+from dirax.solution.zarr_store import NODE
 
 try:
     import fcntl
@@ -32,6 +34,9 @@ def writing(folder: Path) -> Iterator[None]:
     except StoreError:
         raise
     except OSError as error:
+        if error.errno == errno.ENOENT and not (folder / NODE).exists():
+            what = f"the store {folder} was removed or moved while it was written: the same call again begins anew"
+            raise StoreError(error.errno, what) from error
         way = "free some space, then" if error.errno in FULL else "mend this, then"
         what = f"the store {folder} cannot be written ({reason_of(error)}). What was finished is kept"
         raise StoreError(error.errno or 0, f"{what}: {way} the same call again goes on") from error
