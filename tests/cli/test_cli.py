@@ -154,6 +154,7 @@ def test_compare_has_the_exact_energy_of_discrete_gradients_where_there_is_a_ham
     [
         (("run", "keplr"), "did you mean 'kepler'"),
         (("run", "nowhere.py"), "there is no file nowhere.py"),
+        (("run", os.curdir), ". is no Python file: give one that ends in .py"),
         (("run", "kepler", "--set", "steps"), "key=value"),
         (("run", "kepler", "--set", "stpes=3"), "did you mean steps"),
         (("run", "kepler", "--set", "steps=0"), "steps must be a whole number"),
@@ -183,6 +184,7 @@ def test_mistakes_end_with_a_sentence_and_a_status(arguments, message):
     "text, message",
     [
         ("x = (", "line 1"),
+        ("x = 1\0", "bad.py: source code"),
         ("\nimport dirax\n1 / 0\n", "line 3: ZeroDivisionError"),
         ("initial = {}", "does not define `system`"),
         ("system = 3\ninitial = dict(q=[0.0])", "`system`"),
