@@ -1,10 +1,13 @@
 """The command line, as a user types it."""
 
+import errno
+import gc
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +22,7 @@ from dirax.cli.schemes import scheme_from_text
 from dirax.cli.subject import changed
 from dirax.gallery import peng_yoshimura, reproduction
 from dirax.gallery.listing import listing
+from dirax.solution import saving
 from dirax.solution.style import new_figure
 
 SPRING = """
@@ -67,6 +71,27 @@ def test_run_prints_the_report_and_saves_once(tmp_path):
     assert again.exit_code == 1 and "exists" in again.stderr and "--overwrite" in again.stderr
     assert call(*arguments[:3], "steps=10", *arguments[4:], "--overwrite").exit_code == 0
     assert dx.load(path).q.shape == (11, 2)
+
+
+def test_a_run_that_cannot_be_saved_is_shown(spring, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setitem(saving.FORMATS, ".nc", (full, Path.is_file))
+    path = tmp_path / "run.nc"
+    result = call("run", spring, "--out", path)
+    assert result.exit_code == 1 and "steps solved" in result.stdout and "saved in" not in result.stdout
+    assert f"dirax: {path} cannot be written (there is no space left for it)" in result.stderr
+    assert json.loads(call("run", spring, "--out", path, "--json").stdout)["saved"] is None
+    monkeypatch.setattr(os, "access", lambda *_: False)  # before anything is run
+    for command in (("run", spring), ("report", spring), ("export", "c", spring), ("bench", "--json", path)):
+        place = (
+            ()
+            if command[0] == "bench"
+            else ("--out", path.with_suffix({"report": ".html", "export": ".c"}.get(command[0], ".nc")))
+        )
+        result = call(*command, *place)
+        assert result.exit_code == 1 and "is read-only here" in result.stderr and not result.stdout
 
 
 def test_run_a_file_as_json(spring, tmp_path):
@@ -129,6 +154,7 @@ def test_compare_has_the_exact_energy_of_discrete_gradients_where_there_is_a_ham
     [
         (("run", "keplr"), "did you mean 'kepler'"),
         (("run", "nowhere.py"), "there is no file nowhere.py"),
+        (("run", os.curdir), ". is no Python file: give one that ends in .py"),
         (("run", "kepler", "--set", "steps"), "key=value"),
         (("run", "kepler", "--set", "stpes=3"), "did you mean steps"),
         (("run", "kepler", "--set", "steps=0"), "steps must be a whole number"),
@@ -158,6 +184,7 @@ def test_mistakes_end_with_a_sentence_and_a_status(arguments, message):
     "text, message",
     [
         ("x = (", "line 1"),
+        ("x = 1\0", "bad.py: source code"),
         ("\nimport dirax\n1 / 0\n", "line 3: ZeroDivisionError"),
         ("initial = {}", "does not define `system`"),
         ("system = 3\ninitial = dict(q=[0.0])", "`system`"),
@@ -280,7 +307,7 @@ def test_a_reader_that_stops_ends_the_program():
 def test_a_full_disk(command):
     with open("/dev/full", "w") as full:
         status, _, err = ended(program(command, stdout=full))
-    assert status == 1 and "No space left" in err and len(err.splitlines()) == 1
+    assert status == 1 and "could not be written: No space left" in err and len(err.splitlines()) == 1
 
 
 @pytest.mark.skipif(os.name != "posix", reason="file descriptors of POSIX")
@@ -370,6 +397,38 @@ sys.modules.pop("ast", None)
     )
     status, out, err = ended(process)
     assert (status, out, err.strip()) == (130, "", "dirax: interrupted.")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_an_interruption_that_an_import_would_lose():
+    before = """
+import os, signal
+class Interrupts:
+    def find_spec(self, name, path=None, target=None):
+        if name == "dirax.gallery":
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt:
+                pass
+sys.meta_path.insert(0, Interrupts())
+"""
+    status, out, err = ended(program("list", "--json", before=before))
+    assert (status, out, err.strip()) == (130, "", "dirax: interrupted.")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_an_interruption_while_garbage_is_collected(capsys):
+    interrupt = lambda phase, _: phase == "start" and signal.raise_signal(signal.SIGINT)
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        with pytest.raises(SystemExit, match="130"), terminal.interruptible():
+            gc.callbacks.append(interrupt)
+            gc.collect(0)
+            gc.callbacks.remove(interrupt)
+            time.sleep(5)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert capsys.readouterr().err == "dirax: interrupted.\n"
 
 
 def test_another_program_keeps_its_own_interruptions():

@@ -94,6 +94,21 @@ def test_derivatives_of_the_root_to_second_order():
     assert second == pytest.approx(-2 / (9 * u**5), rel=1e-13)
 
 
+@jax.custom_vjp
+def cubed(u):
+    return u**3
+
+
+cubed.defvjp(lambda u: (cubed(u), u), lambda u, flow: (3 * u**2 * flow,))
+
+
+def test_a_derivative_of_the_users_own_in_reverse_mode_alone():
+    equation = lambda u, a: cubed(u) - cubed(a)
+    found = lambda a: newton_root(equation, jnp.array([1.3]), (jax.lax.stop_gradient(a),), 50)[0]
+    root, slope = jax.jit(jax.value_and_grad(lambda a: as_function(equation, found(a), (a,))[0]))(2.0)
+    assert [root, slope] == pytest.approx([2.0, 1.0], rel=1e-14)
+
+
 SOLVED = jax.jit(lambda a, b: Dense().solve(Dense().factorise(a), b))
 
 

@@ -94,6 +94,15 @@ def test_returning_checks_the_shape_where_it_is_called():
         checked(jnp.ones(3), None)
 
 
+def test_what_jax_does_not_differentiate_is_named():
+    scaled = UserFunction(lambda q: jnp.ones(2).at[np.array([0, 1])].multiply(q), "field", ("q",))
+    np.testing.assert_array_equal(scaled(Q, None), Q)
+    with pytest.raises(
+        TypeError, match=r"^field\(q\) cannot be differentiated or batched by JAX, .* \(scatter_mul gradients .*jax\.custom_jvp"
+    ):
+        jax.jacfwd(scaled)(Q, None)
+
+
 def test_finite_values_pass_and_traced_ones_are_not_looked_at():
     check_finite("params", {"a": [1, 2.0, np.ones(3)], "b": None, "c": "text", "d": jnp.arange(2)})
     jax.jit(lambda x: check_finite("x", x))(jnp.nan)

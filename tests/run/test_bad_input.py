@@ -165,6 +165,7 @@ def test_params():
     massive = dx.LagrangeDirac(lambda q, v, params: params["m"] * v @ v / 2)
     complaint(TypeError, "params=None", "pass params=", system=massive)
     complaint(TypeError, "params must be a pytree of numbers", "params['m'] is 'heavy'", system=massive, params={"m": "heavy"})
+    complaint(TypeError, "params['m'] is a key of JAX: pass jax.random.key_data", params={"m": jax.random.key(0)}, system=massive)
     batch = "with batch_params=True every leaf of params needs the same leading batch axis"
     complaint(ValueError, batch, "(2,), (3,)", params=[np.ones(2), np.ones(3)], batch_params=True)
     complaint(ValueError, batch, "()", params=1.0, batch_params=True)

@@ -1,6 +1,8 @@
 """Runs into a store: the rows, bits and messages of a run in memory, whatever stops them; what is read of them later."""
 
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -98,6 +100,14 @@ def test_what_stops_a_run_keeps_what_was_written(where, stops, tmp_path, monkeyp
     assert not part.ok and "the same call" in part.message and 15 < part.rows < 40
     assert np.array_equal(part.q, theirs.q[: part.rows]) and len(part.multipliers) == part.rows - 1
     same(run("multipliers", 40, to=path), theirs)
+
+
+@pytest.mark.parametrize("at", [14, 40])
+def test_a_store_that_is_taken_away_meanwhile_is_one_error(at, tmp_path):
+    path = tmp_path / "run.zarr"
+    vanishing = lambda done, _: done >= at and shutil.rmtree(path, ignore_errors=True)
+    with pytest.raises(OSError, match=rf"^the store {re.escape(str(path))} was removed or moved while it was written"):
+        run("native", 40, to=path, progress=vanishing)
 
 
 def test_reads_what_is_indexed(tmp_path, monkeypatch):

@@ -1,8 +1,10 @@
 """Files: exact round trips, named dimensions and units, no code from a file, nothing lost, one clear sentence of error."""
 
+import errno
 import json
 import os
 import pickle
+import re
 import shutil
 import signal
 import subprocess
@@ -342,6 +344,26 @@ def test_an_interrupted_save_leaves_the_old_file(moment, ending, tmp_path, batch
     monkeypatch.undo()
     assert_same(dx.load(path), two_points)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_what_the_system_says_against_writing_is_said_of_the_path(ending, tmp_path, batch, two_points, monkeypatch):
+    path = two_points.save(tmp_path / f"run{ending}")
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "inner words")
+
+    monkeypatch.setitem(saving.FORMATS, ending, (full, saving.FORMATS[ending][1]))
+    with pytest.raises(
+        OSError, match=rf"^{re.escape(str(path))} cannot be written \(there is no space left.* free some"
+    ) as raised:
+        batch.save(path, overwrite=True)
+    assert raised.value.errno == errno.ENOSPC
+    assert_same(dx.load(path), two_points)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    monkeypatch.setattr(atomic_files.os, "access", lambda *_: False)
+    with pytest.raises(OSError, match=rf"^the folder {re.escape(str(tmp_path))} is read-only here: make it writable"):
+        batch.save(tmp_path / f"other{ending}")
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems have no such call")

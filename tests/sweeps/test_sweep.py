@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import socket
+import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -17,6 +18,7 @@ import xarray as xr
 import dirax as dx
 import swept_pendulums
 from dirax.solution.flushed_files import Hold
+from dirax.solution.stored import TYPES
 from dirax.sweeps import arrange, commit, executors, store, sweep, task, trial
 from dirax.sweeps.case import Case
 from dirax.sweeps.grid import cut
@@ -475,7 +477,21 @@ def test_another_value_of_what_a_case_closes_over_is_noticed_in_any_units():
         scale *= 5.0
 
 
+def test_functions_that_cannot_be_sent_to_other_processes_are_one_error(tmp_path):
+    kept = threading.Lock()
+    with pytest.raises(TypeError, match=r"cannot be sent to other processes \(cannot pickle.*leave executor out"):
+        study(tmp_path / "locked.zarr", {"g": [1.0], "angle": [0.5]}, executor=1, keep=lambda sol: {"x": 1.0 * kept.locked()})
+
+
+@pytest.mark.parametrize("kept", [np.int16(3), np.uint64(3), np.float16(0.5)])
+def test_numbers_of_types_that_stores_do_not_hold_are_kept_in_wider_ones(kept, tmp_path):
+    data = study(tmp_path / "small.zarr", {"g": [1.0], "angle": [0.5, 1.0]}, keep=lambda sol: {"x": kept})
+    assert np.all(data.x == kept) and data.x.dtype.name in TYPES
+
+
 def test_a_wrong_keep_is_one_error(tmp_path):
+    with pytest.raises(ValueError, match="keep must return real numbers, but x has the dtype complex128"):
+        study(tmp_path / "wrong.zarr", keep=lambda sol: {"x": 1j})
     with pytest.raises(ValueError, match=r"keep fails for the trajectory at g = 0\.5, angle = 0\.0: KeyError"):
         study(tmp_path / "wrong.zarr", keep=lambda sol: {"x": sol.fields["x"]})
     with pytest.raises(ValueError, match="keep must return a dict"):
@@ -537,8 +553,10 @@ def test_wrong_axes_name_the_axis(tmp_path):
             study(tmp_path / "wrong.zarr", over)
     with pytest.raises(ValueError, match="g has 2, angle has 1"):
         study(tmp_path / "wrong.zarr", {"g": [1.0, 2.0], "angle": [1.0]}, zip=True)
-    with pytest.raises(TypeError, match="executor must be"):
-        study(tmp_path / "wrong.zarr", executor="cluster")
+    for name, value in (("executor", "cluster"), ("seed", 1.5), ("project", "no"), ("overwrite", 1), ("to", None)):
+        with pytest.raises(TypeError, match=f"{name} must be"):
+            study(**{"to": tmp_path / "wrong.zarr", name: value})
+    assert type(executors.checked(np.int64(2))) is int
 
 
 @pytest.mark.parametrize(("shape", "points"), [((7,), 3), ((5, 6, 7), 20), ((5, 6, 7), 1), ((3, 4), 100), ((1, 9), 4)])

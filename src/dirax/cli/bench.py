@@ -10,6 +10,7 @@ from dirax.diagnostics.bench.machines import Machines, bench_machines
 from dirax.diagnostics.bench.measure import Bench, bench
 from dirax.diagnostics.bench.subject import Subject
 from dirax.gallery.example import Example
+from dirax.solution.atomic_files import checked_place, write_text
 from dirax.solution.style import save_figure
 
 LONGEST = 2000
@@ -49,9 +50,8 @@ def run_machines(
     quick: bool,
     tell: Callable[[float | None, str], None] | None = None,
     steps: int | None = None,
-    table: Path | None = None,
 ) -> Machines:
-    """`bench_machines` of these machines, of all of them without names, stored as JSON where a path is given.
+    """`bench_machines` of these machines, of all of them without names.
 
     Raises `ValueError` for a system of the gallery that is no machine.
     """
@@ -63,10 +63,7 @@ def run_machines(
         from dirax.gallery.bicycle import MANOEUVRES
 
         chosen += MANOEUVRES
-    found = bench_machines(chosen, repeats or (QUICK_REPEATS if quick else 5), steps or (QUICK_STEPS if quick else 1000), tell)
-    if table is not None:
-        table.write_text(json.dumps(found.to_dict(), indent=1, ensure_ascii=False) + "\n", "utf-8")
-    return found
+    return bench_machines(chosen, repeats or (QUICK_REPEATS if quick else 5), steps or (QUICK_STEPS if quick else 1000), tell)
 
 
 def subject(example: Example, longest: int) -> Subject:
@@ -88,13 +85,18 @@ def check_targets(table: Path | None, picture: Path | None) -> None:
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"--plot must end in {', '.join(PICTURES)}, but {str(picture)!r} was given.")
     for path in (table, picture):
-        if path is not None and not path.parent.is_dir():
-            raise FileNotFoundError(f"the folder {path.parent} does not exist: create it, or choose another place.")
+        if path is not None:
+            checked_place(path, True, lambda path: not path.is_dir())
+
+
+def write_json(found: Bench | Machines, table: Path) -> None:
+    """Everything measured, as JSON. Raises `OSError`."""
+    write_text(table, json.dumps(found.to_dict(), indent=1, ensure_ascii=False) + "\n")
 
 
 def store(found: Bench, table: Path | None, picture: Path | None) -> None:
     """Write the JSON file and the picture, each where a path is given."""
     if table is not None:
-        table.write_text(json.dumps(found.to_dict(), indent=1, ensure_ascii=False) + "\n", "utf-8")
+        write_json(found, table)
     if picture is not None:
         save_figure(found.plot(), picture)

@@ -69,7 +69,7 @@ def run(
     it likes, `scheme`, `step`, `steps` and `params`. The exit status is 1 when the trajectory failed or a structure is violated;
     a drifting energy is a finding, not a failure.
     """
-    from dirax.cli.running import description, message, run_and_verify, summary
+    from dirax.cli.running import description, message, run_and_verify, saved, summary
     from dirax.cli.schemes import scheme_from_text
     from dirax.cli.subject import changed, subject
     from dirax.diagnostics.report import HEADER, VIOLATED
@@ -78,16 +78,17 @@ def run(
     chosen = scheme_from_text(scheme) if scheme else example.scheme
     with progress_bar(f"{example.title}: compiling") as tell:
         sol, report = run_and_verify(example, chosen, options, out, overwrite, tell)
+        unsaved = saved(sol, out, overwrite)
     if as_json:
-        show_json(description(example, sol, report, out))
+        show_json(description(example, sol, report, None if unsaved else out))
     else:
         typer.echo(f"{summary(example, sol)}\n")
         show_table(report.title, HEADER, [line.cells() for line in report.lines], str(report))
-        if out is not None:
+        if out is not None and not unsaved:
             typer.echo(f"saved in {out}")
-    if message(sol):
-        typer.echo(f"dirax: {message(sol)}", err=True)
-    if any(line.verdict == VIOLATED for line in report.lines):
+    for text in filter(None, (message(sol), unsaved)):
+        typer.echo(f"dirax: {text}", err=True)
+    if unsaved or any(line.verdict == VIOLATED for line in report.lines):
         raise typer.Exit(1)
 
 
@@ -237,15 +238,17 @@ def bench(
     gallery takes about a quarter of an hour. The exit status is 1 when a system could not be timed.
     With --machines MuJoCo, Exudyn and pinocchio are columns where they are installed, which say what they cannot state.
     """
-    from dirax.cli.bench import check_targets, run_bench, run_machines, store
+    from dirax.cli.bench import check_targets, run_bench, run_machines, store, write_json
 
     check_targets(table, picture)
     if machines:
         if picture is not None:
             raise ValueError("--machines is a table, which --plot does not draw: leave --plot out.")
         with progress_bar("starting") as tell:
-            measured = run_machines(names or (), repeats, quick, tell, steps, table)
+            measured = run_machines(names or (), repeats, quick, tell, steps)
         show_table(measured.title, measured.header, measured.cells(), str(measured), measured.notes())
+        if table is not None:
+            write_json(measured, table)
         return
     with progress_bar("starting") as tell:
         found = run_bench(names or (), repeats, quick, tell, steps)

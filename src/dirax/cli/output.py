@@ -33,13 +33,22 @@ def with_messages(command: Callable) -> Callable:
         try:
             return command(*args, **kwargs)
         except REPORTED as error:
-            typer.echo(f"dirax: {error}", err=True)
+            typer.echo(f"dirax: {_in_words(error)}", err=True)
             raise typer.Exit(1) from error
         except KeyboardInterrupt as end:
             typer.echo(f"dirax: {str(end) or 'interrupted.'}", err=True)
             raise typer.Exit(130) from None
 
     return run
+
+
+def _in_words(error: Exception) -> str:
+    """The message of an error; where it comes from the printing itself, as on a full disk, what it is about, too."""
+    from dirax.solution.atomic_files import FULL, Unwritten  # imported when it is used
+
+    if isinstance(error, OSError) and error.errno in FULL and not isinstance(error, Unwritten):
+        return f"the results could not be written: {error.strerror}."
+    return str(error)
 
 
 @contextmanager

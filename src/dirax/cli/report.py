@@ -7,7 +7,7 @@ from typing import Any
 from dirax import gallery
 from dirax.cli.schemes import scheme_from_text
 from dirax.cli.subject import changed, subject
-from dirax.show.report import report
+from dirax.show.report import PAGES, checked_path, report
 from dirax.solution.loading import load
 from dirax.solution.saving import FORMATS
 from dirax.solution.solution import Solution
@@ -21,6 +21,7 @@ def write_report(
     path = Path(f"{stem}.html") if out is None else out
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: pass --overwrite to replace it, or choose another path for --out.")
+    checked_path(path, PAGES, True)
     if Path(name).suffix in FORMATS:
         if settings or schemes:
             raise ValueError(f"{name} holds a trajectory that was run already: --set and --scheme are for systems.")

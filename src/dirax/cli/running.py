@@ -9,6 +9,7 @@ from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
 from dirax.gallery.example import Example
 from dirax.schemes.step import AbstractScheme
+from dirax.solution.atomic_files import checked_folder
 from dirax.solution.saving import FORMATS
 from dirax.solution.solution import Solution
 from dirax.text.tables import plain
@@ -17,7 +18,7 @@ from dirax.text.tables import plain
 def run_and_verify(
     example: Example, scheme: AbstractScheme, options: dict[str, Any], out: Path | None, overwrite: bool, tell: Any
 ) -> tuple[Solution, Report]:
-    """Run the example, verify it and save it; `tell(fraction, text)` hears of the progress."""
+    """Run the example and verify it, if it could be saved in `out`; `tell(fraction, text)` hears of the progress."""
     if out is not None:
         refuse_target(out, overwrite)
 
@@ -26,10 +27,17 @@ def run_and_verify(
 
     sol = example.simulate(scheme, progress=steps_done, **options)
     tell(None, "verifying")
-    report = verify(sol, symmetries=example.symmetries or None)
-    if out is not None:
-        sol.save(out, overwrite=overwrite)
-    return sol, report
+    return sol, verify(sol, symmetries=example.symmetries or None)
+
+
+def saved(sol: Solution, out: Path | None, overwrite: bool) -> str:
+    """Save a run where a path is given: why that is not done, empty if it is."""
+    try:
+        if out is not None:
+            sol.save(out, overwrite=overwrite)
+    except OSError as error:
+        return str(error)
+    return ""
 
 
 def refuse_target(path: Path, overwrite: bool) -> None:
@@ -40,6 +48,7 @@ def refuse_target(path: Path, overwrite: bool) -> None:
         raise FileNotFoundError(f"the folder {path.parent} does not exist: create it, or choose another for --out.")
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: pass --overwrite to replace it, or choose another path for --out.")
+    checked_folder(path.parent)
 
 
 def message(sol: Solution) -> str:

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import difflib
+import os
 import re
 import runpy
 import traceback
@@ -26,7 +27,10 @@ EXCLUDES = {"v": {"p"}, "p": {"v"}, "q0": {"q", "v", "p"}, "q1": {"q", "v", "p"}
 
 
 def subject(name: str) -> Example:
-    """The example to run: the gallery's by name, or the one that a Python file defines if `name` ends in .py."""
+    """The example to run: the gallery's by name, or the one that a Python file defines if `name` ends in .py. Raises `ValueError`
+    for another name, and for the path of anything else."""
+    if not name.endswith(".py") and name not in gallery.names() and os.path.exists(name):
+        raise ValueError(f"{name} is no Python file: give one that ends in .py, or a name that `dirax list` shows.")
     return from_file(Path(name)) if name.endswith(".py") else gallery.get(name)
 
 
@@ -65,11 +69,12 @@ def from_file(path: Path) -> Example:
 def namespace(path: Path) -> dict[str, Any]:
     """What a Python file defines. Raises `ValueError` where it fails, with the line, `FileNotFoundError` without a file."""
     if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}: check the path, or give a name that `dirax list` shows.")
+        raise FileNotFoundError(f"there is no file {path}: check the path.")
     try:
         return runpy.run_path(str(path), run_name="dirax_file")
     except SyntaxError as error:
-        raise ValueError(f"{path}, line {error.lineno}: {error.msg}.") from error
+        where = f", line {error.lineno}" if error.lineno else ""  # none for a file that is no text
+        raise ValueError(f"{path}{where}: {error.msg}.") from error
     except Exception as error:
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename) == path]
         where = f", line {lines[-1]}" if lines else ""

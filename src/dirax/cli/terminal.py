@@ -6,9 +6,11 @@ import io
 import os
 import signal
 import sys
+import threading
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 from dirax.interruption import INTERRUPTED
@@ -17,22 +19,35 @@ from dirax.interruption import end as end_now
 SIMPLER = {"─": "-", "–": "-", "—": "-", "−": "-", "…": "...", "’": "'", "≤": "<=", "≥": ">=", "·": "."}
 """What takes the place of signs that an encoding lacks; Greek letters are written out, others lose their accents."""
 
+AGAIN = 0.01
+"""Seconds after which an interruption is tried again that no caller could hear of."""
+
 
 @contextmanager
 def interruptible() -> Iterator[None]:
     """After Ctrl-C inside the block the exit status is INTERRUPTED, whatever became of the interruption, and there is no
-    traceback; after the block Ctrl-C ends the process at once."""
+    traceback; after the block, and while a module is imported, Ctrl-C ends the process at once."""
     # another handler, such as in the background: nothing is heard
     if signal.getsignal(signal.SIGINT) not in (signal.default_int_handler, end_now):
         yield
         return
     heard = False
 
-    def interrupt(*_: Any) -> None:
+    def interrupt(_: int, frame: FrameType | None) -> None:
         nonlocal heard
         heard = True
+        if _imports(frame):  # a compiled module that is interrupted while it is loaded crashes
+            end_now()
         raise KeyboardInterrupt
 
+    def unheard(lost: Any) -> None:
+        """Python drops what is raised while it collects garbage: an interruption is sent again, when that has ended."""
+        if heard and issubclass(lost.exc_type, KeyboardInterrupt):
+            threading.Timer(AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
+        else:
+            said(lost)
+
+    said, sys.unraisablehook = sys.unraisablehook, unheard
     signal.signal(signal.SIGINT, interrupt)
     try:
         yield
@@ -44,6 +59,14 @@ def interruptible() -> Iterator[None]:
         raise SystemExit(INTERRUPTED) from None
     finally:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+        sys.unraisablehook = said
+
+
+def _imports(frame: FrameType | None) -> bool:
+    """Whether a module is being imported where the program is."""
+    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+        frame = frame.f_back
+    return frame is not None
 
 
 def prepared() -> None:

@@ -11,6 +11,7 @@ from dirax.gallery.picture import SCHEMES
 from dirax.gallery.reproduction import DIFFERS, HEADER, WRONG, Reproduction
 from dirax.show.page import asset
 from dirax.show.report import report
+from dirax.solution.atomic_files import made_folder, write_text
 from dirax.text.tables import html_table
 
 SHOWPIECE = "rolling-disk.html"
@@ -26,7 +27,7 @@ def write_index(results: Sequence[Reproduction], folder: Path, tell: Callable[[f
     runs = [disk.simulate(scheme, step=0.01, steps=2000) for scheme, *_ in SCHEMES.values()]
     report(runs, folder / SHOWPIECE, names=list(SCHEMES), verdicts=False)
     pictures = folder / "gallery"
-    pictures.mkdir(parents=True, exist_ok=True)
+    made_folder(pictures)
     names, cards = gallery.names(), []
     for k, name in enumerate(names):
         tell((k + 1) / (len(names) + 1), f"{name} in motion")
@@ -39,7 +40,7 @@ def write_index(results: Sequence[Reproduction], folder: Path, tell: Callable[[f
         systems="".join(cards),
     )
     path = folder / "index.html"
-    path.write_text(text, "utf-8")
+    write_text(path, text)
     return path
 
 

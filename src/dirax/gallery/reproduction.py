@@ -10,6 +10,7 @@ from typing import Any
 
 from dirax.gallery.theorems import HEADER as THEOREMS
 from dirax.gallery.theorems import HOLDS, Theorem
+from dirax.solution.atomic_files import made_folder, write_text
 from dirax.text.tables import plain, text_table
 
 AGREES, DIFFERS, WRONG, NEW, NOT_OURS = "agrees", "DIFFERS", "paper is wrong", "not in paper", "not reproduced"
@@ -89,7 +90,7 @@ class Reproduction:
         """Write every figure as PNG into `folder`, which is made if it is missing; returns the files."""
         from dirax.solution.style import save_figure
 
-        folder.mkdir(parents=True, exist_ok=True)
+        made_folder(folder)
         paths = [folder / f"{name}.png" for name in self.figures]
         for path, figure in zip(paths, self.figures.values(), strict=True):
             save_figure(figure, path)
@@ -105,13 +106,16 @@ def reproduce(paper: str = "all", out: Any = None, progress: Progress | None = N
     """Reproduce a paper, or all of them: its runs, its table, its figures.
 
     With `out`, a folder, the figures go to `out/<paper>/*.png` and the tables to `out/table.json` and `out/table.txt`.
-    `progress` is called with (fraction, text). Raises `ValueError` for an unknown paper.
+    `progress` is called with (fraction, text). Raises `ValueError` for an unknown paper, and `OSError` for a folder that cannot
+    be written to, before anything is run.
     """
     known = {name.lower(): name for name in _PAPERS}
     wanted = str(paper).lower()
     if wanted != "all" and wanted not in known:
         raise ValueError(f"no reproduction of {paper!r}: choose one of {', '.join(_PAPERS)} or all.")
     chosen = list(_PAPERS) if wanted == "all" else [known[wanted]]
+    if out is not None:
+        made_folder(Path(out))
     tell = progress or (lambda fraction, text: None)
     results = []
     for number, name in enumerate(chosen):
@@ -129,9 +133,9 @@ def reproduce(paper: str = "all", out: Any = None, progress: Progress | None = N
 
 def write_tables(results: Sequence[Reproduction], folder: Path) -> None:
     """`table.json` and `table.txt` in `folder`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "table.json").write_text(tables_as_json(results) + "\n", "utf-8")
-    (folder / "table.txt").write_text("\n\n\n".join(map(str, results)) + "\n", "utf-8")
+    made_folder(folder)
+    write_text(folder / "table.json", tables_as_json(results) + "\n")
+    write_text(folder / "table.txt", "\n\n\n".join(map(str, results)) + "\n")
 
 
 def tables_as_json(results: Sequence[Reproduction]) -> str:

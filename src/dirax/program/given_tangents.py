@@ -16,6 +16,7 @@ from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
+from dirax.program.derivatives_by_jax import along_by_jax, jacobian_by_jax
 from dirax.program.primitives import is_tracing
 from dirax.program.tracing import closed_over
 
@@ -65,8 +66,8 @@ def implicit_tangent(residual: Callable, root: Array, operands: Sequence, along:
         return residual(root, *given)
 
     points, directions = (tuple(values[k] for k in moving) for values in (operands, along))
-    right = jax.jvp(of_moving, points, directions)[1]
-    return -solve(jax.jacfwd(lambda u: residual(u, *operands))(root), right)
+    right = along_by_jax(of_moving, points, directions)
+    return -solve(jacobian_by_jax(lambda u: residual(u, *operands))(root), right)
 
 
 def _over(function: Callable, axes: Axes) -> Callable:

@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, jaxprs_in_params
 
+from dirax.program.derivatives_by_jax import gradient_by_jax, jacobian_by_jax
 from dirax.program.memo import Memo, Same
 from dirax.program.primitives import binds, is_tracing, plain_primitive
 from dirax.program.same_jaxpr import shared
@@ -72,12 +73,12 @@ def _has_hash(value: Any) -> bool:
 
 def gradient(function: Callable, argnums: int | tuple[int, ...] = 0) -> Callable:
     """`jax.grad(function, argnums)`."""
-    return _derivative(function, argnums, _gradient_by_jax)
+    return _derivative(function, argnums, gradient_by_jax)
 
 
 def jacobian(function: Callable, argnums: int | tuple[int, ...] = 0, reverse: bool = False) -> Callable:
     """`jax.jacfwd(function, argnums)`, or `jax.jacrev`, of a function with one array."""
-    return _derivative(function, argnums, jax.jacrev if reverse else jax.jacfwd)
+    return _derivative(function, argnums, jax.jacrev if reverse else jacobian_by_jax)
 
 
 def along(function: Callable, point: tuple, direction: tuple) -> Any:
@@ -109,30 +110,16 @@ def _derivative(function: Callable, argnums: int | tuple[int, ...], by_jax: Call
         if not is_tracing():
             return by_jax(function, argnums)(*values)
         traced = _Traced(function, values)
-        if not traced.is_plain or (by_jax is _gradient_by_jax and traced.result.shape):
+        if not traced.is_plain or (by_jax is gradient_by_jax and traced.result.shape):
             return by_jax(function, argnums)(*values)
         chosen = (argnums,) if isinstance(argnums, int) else tuple(argnums)
         starts = np.cumsum([0, *(len(jax.tree.leaves(value)) for value in values)])
         wanted = tuple(len(traced.captured) + int(starts[k]) for k in chosen)
-        reverse = by_jax is not jax.jacfwd
+        reverse = by_jax is not jacobian_by_jax
         found = derivative_p.bind(*traced.captured, *traced.leaves, jaxpr=traced.jaxpr, wanted=wanted, reverse=reverse)
         return found[0] if isinstance(argnums, int) else tuple(found)
 
     return derivative
-
-
-def _gradient_by_jax(function: Callable, argnums: int | tuple[int, ...]) -> Callable:
-    """`jax.grad`, and in forward mode of what has a loop of unknown length, which JAX does not take backwards."""
-
-    def found(*values):
-        try:
-            return jax.grad(function, argnums)(*values)
-        except ValueError as error:
-            if "while_loop" not in str(error):
-                raise
-            return jax.jacfwd(function, argnums)(*values)
-
-    return found
 
 
 def operand(value: Any) -> Any:
@@ -201,7 +188,7 @@ def of_one_result(jaxpr: ClosedJaxpr) -> Callable:
 
 def _derivatives_by_jax(*operands, jaxpr: ClosedJaxpr, wanted: tuple[int, ...], reverse: bool):
     (result,) = jaxpr.out_avals
-    by_jax = jax.grad if not result.shape else jax.jacrev if reverse else jax.jacfwd
+    by_jax = jax.grad if not result.shape else jax.jacrev if reverse else jacobian_by_jax
     return by_jax(of_one_result(jaxpr), wanted)(*operands)
 
 

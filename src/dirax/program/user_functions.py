@@ -16,6 +16,7 @@ from jax.experimental import checkify
 
 from dirax.program.captured import Captured, as_stated, refuse_changed
 from dirax.program.compiled import compiled
+from dirax.program.derivatives_by_jax import differentiated
 from dirax.program.indexed import clamps, indexes
 from dirax.program.memo import Memo
 from dirax.program.signatures import parameters_of, refuse_other_places, takes_params, takes_time
@@ -93,7 +94,8 @@ class UserFunction(eqx.Module):
                 + (f": {NO_MULTIPLIERS}." if "multipliers" in self.arguments else "; params, which may be None, come last.")
             )
         refuse_changed([(self.name, self.captured)])
-        return once(self.function)(*args, *((params,) if self.takes_params else ()))
+        with differentiated(self._call, values):
+            return once(self.function)(*args, *((params,) if self.takes_params else ()))
 
     def at(self, t: Any, *values: Any):
         """The function of `(*arguments, params)` at time t, which is passed on where the function takes it."""

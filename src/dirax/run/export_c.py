@@ -6,6 +6,7 @@ from typing import Any
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
+from dirax.solution.atomic_files import checked_place, written
 from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
 
@@ -17,7 +18,8 @@ def export_c(path: Any, system: AbstractSystem, scheme: AbstractScheme, title: s
     `main` prints the rows of the run, t and every saved array, with the bits of the Solution. Initial state and parameters are
     arrays in it, and `run` can be called by a program of one's own. Of a batch, the rows of one trajectory stand after those of
     another, each behind its number. A start from two points is not written, nor a run by collocation in which the fixed-point
-    iteration of the stages does not converge. Raises what `dx.simulate` raises, and `ValueError` for these.
+    iteration of the stages does not converge. Raises what `dx.simulate` raises, `ValueError` for these, and `OSError` where the
+    file cannot be written.
 
         dx.export_c("disk.c", system, dx.LagrangeDAlembert(), q=q, v=v, step=0.01, steps=1000)
     """
@@ -26,7 +28,9 @@ def export_c(path: Any, system: AbstractSystem, scheme: AbstractScheme, title: s
     file = Path(path)
     if file.suffix != ".c":
         raise ValueError(f"path must end in .c, but it is {str(path)!r}.")
+    checked_place(file, True)
     try:
-        return simulate(system, scheme, **settings, engine=WritesC(str(file), title or type(system).__name__))
+        with written(file):
+            return simulate(system, scheme, **settings, engine=WritesC(str(file), title or type(system).__name__))
     except UnsupportedPrimitive as error:
         raise ValueError(f"this run cannot be written as C: {error.primitive} {error.reason}.") from error

@@ -58,6 +58,13 @@ def count(value, name: str, most: int = MOST_COUNTED) -> int:
     return int(value)
 
 
+def whole_number(value, name: str) -> int:
+    """The whole number; raises `TypeError` for anything else."""
+    if not is_whole(value):
+        raise TypeError(f"{name} must be a whole number, but {value!r:.80} was given.")
+    return int(value)
+
+
 def flag(value, name: str) -> bool:
     """True or False; raises `TypeError` for anything else."""
     if not isinstance(value, bool | np.bool_):

@@ -299,10 +299,10 @@ def arrays_of_params(params):
     Raises `TypeError` and `ValueError` for leaves that are no numbers."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if not is_number(leaf) and not _is_boolean(leaf):
-            raise TypeError(
-                f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {leaf!r:.60}: "
-                "use such a value in the system's functions directly."
-            )
+            found = f"{leaf!r:.60}: use such a value in the system's functions directly"
+            if jnp.issubdtype(getattr(leaf, "dtype", object), jax.dtypes.prng_key):
+                found = "a key of JAX: pass jax.random.key_data(key), and have jax.random.wrap_key_data in the system's functions"
+            raise TypeError(f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {found}.")
         _refuse_masked(leaf, f"params{jax.tree_util.keystr(path)}")
         if isinstance(leaf, int) and not -(2**63) <= leaf < 2**63:
             raise ValueError(

@@ -11,7 +11,7 @@ import numpy as np
 
 from dirax.show import frames, series
 from dirax.show.drawing import Drawing
-from dirax.show.report import checked_path, checked_solutions, report
+from dirax.show.report import PAGES, checked_path, checked_solutions, report
 from dirax.solution.atomic_files import placed
 from dirax.solution.solution import Solution
 from dirax.solution.style import INK, style
@@ -27,7 +27,7 @@ RAPID = 4000
 LARGEST_MOVE, LARGEST_TURN = 0.05, 0.25
 """Of a body between two frames: in sizes of the picture, and in radians."""
 
-ENDINGS = (".gif", ".webp", ".mp4", ".html", ".htm")
+ENDINGS = (".gif", ".webp", ".mp4", *PAGES)
 
 
 def animate(
@@ -51,7 +51,7 @@ def animate(
     """
     path = Path(path)
     checked_path(path, ENDINGS, overwrite)
-    if path.suffix in (".html", ".htm"):
+    if path.suffix in PAGES:
         return report(solutions, path, scene=scene, verdicts=False)
     encoder = _ffmpeg() if path.suffix == ".mp4" else ""
     if not seconds > 0 or not frames_per_second > 0:

@@ -19,6 +19,9 @@ from dirax.show.series import Run
 from dirax.solution.atomic_files import checked_place, placed
 from dirax.solution.solution import Solution
 
+PAGES = (".html", ".htm")
+"""Endings of a page."""
+
 SMALL = 1500
 """Rows and frames of a view in a notebook."""
 
@@ -55,7 +58,7 @@ def report(
         dx.report([plus, minus], "both.html", names=["(+)", "(−)"])
     """
     path = Path(path)
-    checked_path(path, (".html", ".htm"), overwrite)
+    checked_path(path, PAGES, overwrite)
     several = checked_solutions(solutions)
     text = html(several, scene=scene, names=names, title=title, symmetries=symmetries, exact=exact, verdicts=verdicts)
     with placed(path, overwrite) as beside:

@@ -7,6 +7,9 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from dirax.solution.atomic_files import FULL, Unwritten, reason_of
+from dirax.solution.zarr_store import NODE
+
 try:
     import fcntl
 except ImportError:  # Windows: nothing is locked
@@ -19,11 +22,8 @@ LOCK = "lock"
 """The file, among the unfinished ones, that the caller holds who fills a store."""
 
 
-class StoreError(OSError):
+class StoreError(Unwritten):
     """A store that cannot be written, in words."""
-
-    def __str__(self) -> str:
-        return str(self.args[-1])
 
 
 @contextlib.contextmanager
@@ -34,14 +34,12 @@ def writing(folder: Path) -> Iterator[None]:
     except StoreError:
         raise
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            reason, way = "there is no space left for it", "free some space, then"
-        else:
-            reason, way = error.strerror or str(error), "mend this, then"
-        raise StoreError(
-            error.errno or 0,
-            f"the store {folder} cannot be written ({reason}). What was finished is kept: {way} the same call again goes on",
-        ) from error
+        if error.errno == errno.ENOENT and not (folder / NODE).exists():
+            what = f"the store {folder} was removed or moved while it was written: the same call again begins anew"
+            raise StoreError(error.errno, what) from error
+        way = "free some space, then" if error.errno in FULL else "mend this, then"
+        what = f"the store {folder} cannot be written ({reason_of(error)}). What was finished is kept"
+        raise StoreError(error.errno or 0, f"{what}: {way} the same call again goes on") from error
 
 
 def flushed(path: Path, data: bytes) -> None:

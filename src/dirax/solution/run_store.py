@@ -110,10 +110,11 @@ class RunStore:
 
     def grow(self, rows: int) -> None:
         """Have room for so many rows."""
-        for name, array in self.reached.arrays.items():
-            node = json.loads((self.path / name / NODE).read_bytes())
-            if node["shape"] != (shape := list(array.shape(rows - array.ends_before))):
-                self._place(self.path / name / NODE, json.dumps({**node, "shape": shape}, indent=1).encode())
+        with writing(self.path):
+            for name, array in self.reached.arrays.items():
+                node = json.loads((self.path / name / NODE).read_bytes())
+                if node["shape"] != (shape := list(array.shape(rows - array.ends_before))):
+                    self._place(self.path / name / NODE, json.dumps({**node, "shape": shape}, indent=1).encode())
 
     def keep(self, rows: int) -> None:
         """Forget what was written of rows from this one on."""
@@ -156,7 +157,8 @@ class RunStore:
         said = dict(self.reached.said)
         if lanes := said.pop("lanes_ok"):
             self._place(chunk_file(self.path / "ok", (0,)), bytes(lanes))
-        self.describe(json.loads((self.path / NODE).read_bytes())["attributes"] | said)
+        with writing(self.path):
+            self.describe(json.loads((self.path / NODE).read_bytes())["attributes"] | said)
 
     def _place(self, file: Path, data: Any) -> None:
         with writing(self.path):

@@ -53,12 +53,12 @@ def save(
     return path
 
 
-def path_of(path: Any) -> Path:
-    """The path; `TypeError` for what is none."""
+def path_of(path: Any, name: str = "path", such: str = "run.zarr") -> Path:
+    """The path, an argument of this name, such as that one; `TypeError` for what is none."""
     try:
         return Path(path)
     except TypeError:
-        raise TypeError(f'path must be a text or a pathlib.Path such as "run.zarr", but {path!r:.60} was given.') from None
+        raise TypeError(f'{name} must be a text or a pathlib.Path such as "{such}", but {path!r:.60} was given.') from None
 
 
 def checked_ending(path: Path) -> str:

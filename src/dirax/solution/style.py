@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from dirax.solution.atomic_files import written
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -71,7 +73,8 @@ def new_figure(rows: int = 1, columns: int = 1, size: tuple[float, float] = (5.6
 @style()
 def save_figure(figure: "Figure", path: Any) -> None:
     """Write a figure in the format that the ending of `path` names, 160 dots per inch."""
-    figure.savefig(path)
+    with written(path):
+        figure.savefig(path)
 
 
 def given_or_new(ax: "Axes | None", size: tuple[float, float] = (5.6, 3.6), **kind: Any) -> "Axes":

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 
 from dirax.engines.threads import thread_count
+from dirax.numerics.arrays import is_whole
 from dirax.sweeps.processes import Outcome, Processes, packed, run_packed
 from dirax.sweeps.task import Done, Plan, Task, run_task
 
@@ -47,8 +48,8 @@ def checked(executor: Any) -> Any:
     """The executor that a user gave. Raises `TypeError` for anything else, `ImportError` for dask where it is not installed."""
     if executor is None or isinstance(executor, Executor) or _is_client(executor):
         return executor
-    if isinstance(executor, int) and not isinstance(executor, bool) and executor > 0:
-        return executor
+    if is_whole(executor) and executor > 0:
+        return int(executor)
     if executor == "dask":
         try:
             import distributed  # noqa: F401

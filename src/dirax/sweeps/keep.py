@@ -133,11 +133,7 @@ class Keep:
             raise PointError(f"keep fails for the trajectory at {described(values, lane)}: {in_words(error)}") from error
         if not isinstance(found, Mapping) or not found or not all(isinstance(name, str) for name in found):
             raise PointError(f"keep must return a dict of numbers and arrays, but it returned {found!r:.60}.")
-        arrays = {name: np.asarray(value) for name, value in found.items()}
-        for name, array in arrays.items():
-            if array.dtype.name not in TYPES:
-                raise PointError(f"keep must return numbers, but {name} has the dtype {array.dtype}.")
-        return arrays
+        return {name: _storable(name, np.asarray(value)) for name, value in found.items()}
 
     def _stacked(self, sol: Solution, ones: list[dict[str, np.ndarray]], values: Values) -> dict[str, np.ndarray]:
         form = lambda one: {name: array.shape for name, array in one.items()}
@@ -212,6 +208,16 @@ def single(sol: Solution, lane: int) -> Solution:
         batch_params=False,
         initial={name: array[0] if np.ndim(array) == 2 else array for name, array in part.initial.items()},
     )
+
+
+def _storable(name: str, array: np.ndarray) -> np.ndarray:
+    """The array, in the next type that stores hold where they do not hold its own. Raises `PointError`."""
+    if array.dtype.name in TYPES:
+        return array
+    wider = [kind for kind in ("int64", "float32", "float64") if np.can_cast(array.dtype, kind)]
+    if not wider or array.dtype.kind == "c":
+        raise PointError(f"keep must return real numbers, but {name} has the dtype {array.dtype}.")
+    return array.astype(wider[0])
 
 
 def _nothing(like: np.ndarray) -> np.ndarray:

@@ -107,10 +107,17 @@ def _ending(code: int) -> str:
 
 
 def packed(plan: Plan) -> bytes:
-    """The plan for other processes; functions travel by value where these could not import them."""
+    """The plan for other processes; functions travel by value where these could not import them. Raises `TypeError` for what
+    cannot."""
     import cloudpickle
 
-    return cloudpickle.dumps(plan)
+    try:
+        return cloudpickle.dumps(plan)
+    except Exception as error:
+        raise TypeError(
+            f"the functions of this sweep, or what they read, cannot be sent to other processes ({error}): let them read nothing "
+            "such, or leave executor out, for threads of this process."
+        ) from error
 
 
 _plans: dict[int, Any] = {}

@@ -11,10 +11,11 @@ import jax
 import numpy as np
 
 from dirax.engines.engine import AbstractEngine
-from dirax.run.scalars import count, finite, positive
+from dirax.run.scalars import count, finite, flag, positive, whole_number
 from dirax.run.validate import check_kinds, engine_from
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.flushed_files import Hold, StoreError
+from dirax.solution.saving import path_of
 from dirax.solution.sweep_store import opened
 from dirax.sweeps import executors
 from dirax.sweeps.arrange import arranged, sized
@@ -99,7 +100,7 @@ def sweep(
     Raises `TypeError` and `ValueError` for wrong arguments; where `case` or `keep` is wrong, naming the point; and `OSError`
     where the store cannot be written or another call is filling it. What was done is kept.
     """
-    path = Path(to).absolute()
+    path = path_of(to, "to", "study.zarr").absolute()
     refuse_place(path)
     check_kinds(system, scheme)
     executor = executors.checked(executor)
@@ -110,22 +111,23 @@ def sweep(
         "save_every": count(save_every, "save_every"),
         "t0": finite(t0, "t0"),
         "max_iterations": count(max_iterations, "max_iterations"),
-        "compensated": bool(compensated),
-        "project": bool(project),
-        "check_initial": bool(check_initial),
+        "compensated": flag(compensated, "compensated"),
+        "project": flag(project, "project"),
+        "check_initial": flag(check_initial, "check_initial"),
         "engine": engine,
     }
     engine_from(engine)
+    seed, overwrite = whole_number(seed, "seed"), flag(overwrite, "overwrite")
     task_seconds = positive(task_seconds, "task_seconds")
     whole = system if inputs is None else system.with_inputs(inputs)
     params = None if params is None else jax.tree.map(np.asarray, params)
-    trial = tried(whole, scheme, axes, Case.of(case, tuple(axes.values), int(seed)), Keep.of(keep), options, params)
+    trial = tried(whole, scheme, axes, Case.of(case, tuple(axes.values), seed), Keep.of(keep), options, params)
     if params is not None and "params" in trial.case.like:
         raise ValueError("params is given and case returns params, too: let case return all of them, or none.")
     if isinstance(engine, str):
         options["engine"] = trial.engine  # the same on every machine
     layout, named = arranged(axes, trial, units, coordinates)
-    marks = fingerprint_of(whole, scheme, axes, trial, options, params, int(seed))
+    marks = fingerprint_of(whole, scheme, axes, trial, options, params, seed)
     slots = executors.parallel(executor, trial.engine == "xla") if executor != "dask" else executors.parallel(None, False)
     group = ranks()
     grid = sized(axes, layout, trial, task_seconds, slots * group.count)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.engines.stopping import CONTRACTING, FLOOR, NEAR, NEGLIGIBLE, OWN, STALLED
 from dirax.engines.xla.dense import Dense
+from dirax.program.derivatives_by_jax import jacobian_by_jax
 from dirax.program.given_tangents import implicit
 
 
@@ -61,7 +62,7 @@ def newton_root(
     if guess.shape[0] == 0:
         return guess, jnp.zeros((), jnp.int64), jnp.array(True)
     equation = lambda u: residual(u, *args)
-    slopes = (lambda u: jacobian(u, *args)) if jacobian else jax.jacfwd(equation)
+    slopes = (lambda u: jacobian(u, *args)) if jacobian else jacobian_by_jax(equation)
     found = newton(equation, slopes, linear_solver or Dense(), guess, max_iterations, sizes, running)
     return found.u, found.updates.astype(int), at_floor(found)
 
