@@ -75,3 +75,13 @@ def test_few_updates_are_a_bound():
     sol = block(400, max_iterations=7)
     assert not sol.ok
     assert "there is a solution, to which those of shorter steps lead" in sol.message
+
+
+def test_of_many_that_fail_the_first_are_explained():
+    kepler = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 1.0 / jnp.sqrt(q @ q))
+    q, v = np.tile([1.0, 0.0], (60, 1)), np.tile([0.0, 0.3], (60, 1))
+    sol = dx.simulate(kepler, dx.LagrangeDAlembert(), q=q, v=v, step=0.7, steps=50)
+    assert not np.any(sol.ok)
+    assert "largest residual in" in sol.message[0]
+    assert len(sol.message[-1]) < len(sol.message[0])
+    assert "Newton's method" in sol.message[-1]

@@ -14,8 +14,8 @@ MOST = 200
 FIRST, LONGEST, SHORTEST = 0.05, 0.3, 1e-5
 """Distances between them, in unknowns relative to their sizes and in parts of the step."""
 
-FOUND, UPDATES = 1e-9, 8
-"""The relative update of Newton's method at which a point is found, and how many there may be."""
+NEAR, FOUND, UPDATES = 1e-4, 1e-9, 8
+"""The relative update of Newton's method at which a point on the way is found, and the last one, and how many there may be."""
 
 TURNED = 0.98
 """Part of the longest step found below which the solutions have turned back."""
@@ -48,38 +48,39 @@ def followed(slopes: Slopes, unknowns: np.ndarray, sizes: np.ndarray) -> tuple[n
         rows = np.where(rows != 0.0, rows, 1.0)
         return residual / rows, np.concatenate([matrix / rows[..., None], normal[:, None]], axis=1)
 
-    def corrected(some, start, normal):
-        """The points of the branches on the planes through these, and which are found."""
-        y, found = start.copy(), np.zeros(len(some), bool)
+    def corrected(some, start, normal, near):
+        """The points of the branches on the planes through these, the last matrices there, and which points are found."""
+        y, found, matrices = start.copy(), np.zeros(len(some), bool), np.empty((len(some), k + 1, k + 1))
         for _ in range(UPDATES):
             if not len(left := np.flatnonzero(~found)):
                 break
-            residual, matrix = bordered(some[left], y[left], normal[left])
+            residual, matrices[left] = bordered(some[left], y[left], normal[left])
             off = np.einsum("nk,nk->n", normal[left], y[left] - start[left])
-            change = _solved(matrix, np.append(residual, off[:, None], axis=1))
+            change = _solved(matrices[left], np.append(residual, off[:, None], axis=1))
             y[left] -= change
-            found[left] = np.max(np.abs(change), axis=1) < FOUND
-        return y, found
+            found[left] = np.max(np.abs(change), axis=1) < near[left]
+        return y, matrices, found
 
     y = np.append(unknowns / scale[:, :k], np.full((n, 1), BEGIN), axis=1)
-    normal = np.broadcast_to(last, y.shape)
-    y, going = corrected(np.arange(n), y, normal)
-    direction, distance, longest, reached = normal.copy(), np.full(n, FIRST), np.zeros(n), np.zeros(n)
+    direction, distance, longest, reached = np.tile(last, (n, 1)), np.full(n, FIRST), np.zeros(n), np.zeros(n)
+    y, matrices, going = corrected(np.arange(n), y, direction, np.full(n, NEAR))
     for _ in range(MOST):
         if not len(some := np.flatnonzero(going)):
             break
-        along = _solved(bordered(some, y[some], direction[some])[1], np.broadcast_to(last, (len(some), k + 1)))
+        matrices[some, k] = direction[some]
+        along = _solved(matrices[some], np.broadcast_to(last, (len(some), k + 1)))
         direction[some] = along = along / np.linalg.norm(along, axis=1, keepdims=True)
         to_end = (1.0 - y[some, k]) / along[:, k]
         ends = (along[:, k] > 0.0) & (to_end <= distance[some])  # the last point is at the whole step
         far = np.where(ends, to_end, distance[some])
         ahead = y[some] + far[:, None] * along
         ahead[ends, k] = 1.0
-        new, found = corrected(some, ahead, np.where(ends[:, None], last, along))
+        near = np.where(ends, FOUND, NEAR)
+        new, there, found = corrected(some, ahead, np.where(ends[:, None], last, along), near)
         found &= np.linalg.norm(new - y[some], axis=1) < 2.0 * far
         distance[some] = np.where(found, np.minimum(1.5 * distance[some], LONGEST), far / 2.0)
         here = some[found]
-        y[here] = new[found]
+        y[here], matrices[here] = new[found], there[found]
         turned = y[here, k] < TURNED * longest[here]
         reached[here] = np.where(turned, longest[here], np.where(ends[found], 1.0, 0.0))
         longest[here] = np.maximum(longest[here], y[here, k])

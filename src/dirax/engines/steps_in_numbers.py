@@ -121,13 +121,16 @@ class StepsInNumbers:
         params: np.ndarray,
         noise: Noise | None = None,
         near: Near | None = None,
+        follow: bool = True,
     ) -> Attempts:
-        """A step of each state (states, s), with one guess (states, k) a stage; h is one number, or one a state."""
+        """A step of each state (states, s), with one guess (states, k) a stage; h is one number, or one a state. `follow`: a
+        solution that Newton's method does not find is followed from a short step on."""
         parts, h = [], np.broadcast_to(h, t.shape)
         for low in range(0, max(len(states), 1), LANES):
             some = slice(low, low + LANES)
             here = self.nothing_near(len(states[some])) if near is None else near[some]
-            parts.append(self._step(states[some], [g[some] for g in guesses], t[some], h[some], params[some], noise, here))
+            at = states[some], [g[some] for g in guesses], t[some], h[some], params[some]
+            parts.append(self._step(*at, noise, here, follow))
         join = np.concatenate
         return Attempts(
             [join(a) for a in zip(*(p.unknowns for p in parts), strict=True)],
@@ -137,11 +140,11 @@ class StepsInNumbers:
         )
 
     @np.errstate(all="ignore")
-    def _step(self, states, guesses, t, h, params, noise, near: Near) -> Attempts:
+    def _step(self, states, guesses, t, h, params, noise, near: Near, follow: bool) -> Attempts:
         unknowns, begun, good = [], [], np.ones(len(states), bool)
         for stage, ((index, fraction), guess) in enumerate(zip(self.program.stages, guesses, strict=True)):
             e, at = self.program.equations[index], (t, fraction * h, params)
-            u, solved = self._solved(stage, guess, states, at, noise, near)
+            u, solved = self._solved(stage, guess, states, at, noise, near, follow)
             known = self._values(index, u, states, at, noise)
             begun.append(states)
             unknowns.append(u)
@@ -206,7 +209,7 @@ class StepsInNumbers:
         """A step of each state: the unknowns of each part, their sizes (states, k), which are their values and what a typical
         rounding of each term of the equations comes to, and whether the equations are solved to roundoff of these, (states,)."""
         near = self.nothing_near(len(t))
-        made = self.step(states, guesses, t, h, params, near=near)
+        made = self.step(states, guesses, t, h, params, near=near, follow=False)
         sizes, good = [], made.good
         for stage, ((_, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
             of_part, solved = self._judged(stage, u, state, (t, np.full(len(t), fraction * h), params), near.inverses[stage])
@@ -265,7 +268,7 @@ class StepsInNumbers:
             whole[name] = parts[0][name] if about.rule == "first" else np.stack(arrays, axis=1) if each else sum(arrays)
         return whole
 
-    def _solved(self, stage: int, guess, states, at, noise, near: Near) -> tuple[np.ndarray, np.ndarray]:
+    def _solved(self, stage: int, guess, states, at, noise, near: Near, follow: bool) -> tuple[np.ndarray, np.ndarray]:
         """The unknowns (states, k) of a stage by Newton's method, and where it has a solution.
 
         A Jacobian serves as long as updates by it contract. Those of one that does not, or of another step, are taken back. The
@@ -323,7 +326,7 @@ class StepsInNumbers:
         self._to_floor(index, u, inverse, states, at, noise)
         if len(left):
             good[left] &= is_solved(left)
-        if len(lost := np.flatnonzero(~good)) and k <= FOLLOWED:
+        if follow and len(lost := np.flatnonzero(~good)) and k <= FOLLOWED:
             there, _ = self.followed(stage, begun[lost], size[lost], states[lost], tuple(a[lost] for a in at))
             if len(some := lost[np.isfinite(there[:, 0])]):
                 u[some] = there[np.isfinite(there[:, 0])]

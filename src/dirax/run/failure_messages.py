@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextvars import ContextVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +49,15 @@ def explain(problem: Problem, outcome: Outcome, lane: int, kept: int, sizes: Cal
     at = time_of(completed)
     reason = _by_status(outcome, lane) if brief.get() else _reason(p, outcome, lane, at, sizes) + _remark(p, outcome, lane, at)
     return f"step {p.first_step + completed + 1} (from t = {at:.6g}) failed: {reason}; {rows}."
+
+
+def in_few_words(*of_explain: Any) -> str:
+    """`explain`, without computing the step again."""
+    with_few = brief.set(True)
+    try:
+        return explain(*of_explain)
+    finally:
+        brief.reset(with_few)
 
 
 def _by_status(outcome: Outcome, lane: int) -> str:

@@ -8,11 +8,14 @@ import numpy as np
 
 from dirax.engines.contract import Outcome, Problem, cut, saved_steps
 from dirax.engines.sizes import sizes_of
-from dirax.run.failure_messages import explain
+from dirax.run.failure_messages import explain, in_few_words
 from dirax.run.validate import Case
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
+
+EXPLAINED = 32
+"""Trajectories of a batch whose failed step is computed again, to say where it breaks."""
 
 
 def solution_of(
@@ -69,8 +72,9 @@ def messages(p: Problem, outcome: Outcome, numbers: np.ndarray, said: list[str] 
     good = np.asarray(outcome.completed)
     kept = good if p.batch is None else numbers[np.searchsorted(numbers, good, side="right") - 1]
     found, sizes = [""] * len(good), functools.cache(lambda: sizes_of(p))
-    for lane in np.flatnonzero(good < p.steps).tolist():
-        found[lane] = (said[lane] if said else "") or explain(p, outcome, lane, int(kept[lane]), sizes)
+    for which, lane in enumerate(np.flatnonzero(good < p.steps).tolist()):
+        explained = explain if which < EXPLAINED else in_few_words
+        found[lane] = (said[lane] if said else "") or explained(p, outcome, lane, int(kept[lane]), sizes)
     return found
 
 

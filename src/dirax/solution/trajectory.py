@@ -36,10 +36,10 @@ Some = TypeVar("Some", bound="Trajectory")
 
 
 class SavedRow(dict):
-    """The node fields of one row and its time "t", which say so where something is asked of them that was not saved."""
+    """The node fields of one row, its time "t" and `about`, which say so where something is asked of them that was not saved."""
 
     def __missing__(self, name: str):
-        held = ", ".join(key for key in self if key != "t")
+        held = ", ".join(key for key in self if key not in ("t", "about"))
         raise ValueError(f"needs {name}, but the rows hold {held} alone (a scheme saves what its `fields` name)")
 
 
