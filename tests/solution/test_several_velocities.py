@@ -66,3 +66,12 @@ def test_on_a_lie_algebra():
     xi = np.array([0.9, 0.8, 1.1])
     sol = dx.simulate(body, dx.DiscreteEulerPoincare(), x=body.state(xi), step=0.01, steps=50)
     np.testing.assert_allclose(sol.energy(), 0.75 * (xi @ xi) ** 2 - xi @ ([1.0, 2.0, 3.0] * xi) / 6, atol=1e-6)
+
+
+def test_on_a_quotient():
+    of_speed = lambda q, v: (v @ v) ** 2 / 4 - v @ v / 2 - q[0] ** 2 / 2
+    system, data = dx.LagrangeDirac(of_speed), {"q": [0.0, 0.3], "v": [1.2, 0.9], "step": 0.01, "steps": 60}
+    bent = dx.LinearConnection(fibre=[1], horizontal=[[0.3]])
+    sol = dx.simulate(dx.reduce(system, bent), dx.LagrangeDAlembert(), **data)
+    np.testing.assert_allclose(sol.energy(), ENERGY, atol=1e-6)
+    np.testing.assert_allclose(dx.reconstruct(sol).energy(), sol.energy(), atol=1e-13)

@@ -239,8 +239,8 @@ class EulerPoincare(AbstractSystem):
         return {name: jnp.abs(value) for name, value in data.items()} | {"v": largest}
 
     @property
-    def searches_near(self) -> str:
-        return "xi"
+    def searches_near(self) -> tuple[str, ...]:
+        return ("xi",)
 
     def energy_at(self, row: Data, params: Any) -> Float[Array, ""]:
         """⟨μ, ξ⟩ − l(ξ, a)."""

@@ -195,10 +195,24 @@ class AbstractReducedSystem(AbstractSystem):
 
     def energy_at(self, row: Data, params: Any) -> Float[Array, ""]:
         """The energy of the unreduced system, which the group coordinate does not change."""
-        return self.system.energy_at(self.unreduced_row(row), params)
+        return self.system.energy_at(self._whole(row), params)
 
     def constraint_at(self, row: Data, params: Any) -> Float[Array, " m"]:
-        return self.system.constraint_at(self.unreduced_row(row), params)
+        return self.system.constraint_at(self._whole(row), params)
+
+    @property
+    def searches_near(self) -> tuple[str, ...]:
+        return ("x", "g") if self.system.searches_near == ("q",) else ()
+
+    def _whole(self, row: Data) -> Data:
+        """The row over a reduced row, with the velocity q̇ that it is about of ẋ and ġ."""
+        whole = self.unreduced_row(row)
+        if "about" not in row:
+            return whole
+        places = row["x"], row["g"]
+        along = jnp.split(row["about"], [row["x"].size])
+        moving = tuple(a.reshape(place.shape) for a, place in zip(along, places, strict=True))
+        return whole | {"about": jax.jvp(self.connection.join, places, moving)[1]}
 
     @property
     def projected(self) -> str:

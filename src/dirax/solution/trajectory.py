@@ -202,15 +202,17 @@ class Trajectory:
         nodes = {k: a for k, a in self.fields.items() if self.field_info[k].place == "node"}
         xp = jnp if is_traced(self.t) else np
         nodes["t"] = xp.broadcast_to(self.t, (self.rows,) if self.batch is None else (self.batch, self.rows))
-        name = "" if self.system is None else self.system.searches_near
-        if name not in self.fields or self.rows < 2:
+        names = () if self.system is None else self.system.searches_near
+        if not names or self.rows < 2 or not self.fields.keys() >= set(names):
             return nodes
-        of_steps, axis = self.fields[name], int(self.batch is not None)
-        if name in nodes:
-            lengths = xp.diff(nodes["t"], axis=axis)
-            changes = (jnp if is_traced(of_steps) else np).diff(of_steps, axis=axis)
-            of_steps = changes / lengths.reshape(*lengths.shape, *(1,) * (changes.ndim - lengths.ndim))
-        return nodes | {"about": _at_nodes(of_steps, axis)}
+        axis, lengths = int(self.batch is not None), xp.diff(nodes["t"], axis=-1)[..., None]
+        near = []
+        for name in names:
+            of_steps = self.fields[name].reshape(*np.shape(self.fields[name])[: axis + 1], -1)
+            if name in nodes:
+                of_steps = (jnp if is_traced(of_steps) else np).diff(of_steps, axis=axis) / lengths
+            near.append(_at_nodes(of_steps, axis))
+        return nodes | {"about": (jnp if is_traced(near) else np).concatenate(near, axis=-1)}
 
     def map_rows(self, function: Callable):
         """`function(row, params)` for every saved row, stacked; `row` is the dict of node fields of one trajectory and of

@@ -163,8 +163,8 @@ class GeneralizedDiracSystem(AbstractSystem):
         return sizes | {"x": sizes["x"] + energetic[:N], "velocity": solved[:N], "guess": solved[N:] + energetic[N:]}
 
     @property
-    def searches_near(self) -> str:
-        return "multipliers"
+    def searches_near(self) -> tuple[str, ...]:
+        return ("multipliers",)
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """F(x, s) for the s over x."""

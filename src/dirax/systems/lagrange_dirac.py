@@ -255,8 +255,8 @@ class LagrangeDirac(AbstractSystem):
         return self.constraints.terms(t, q, v, self.speeds(t, q, v, params), params, self._as_large(t, q, v, q, params))
 
     @property
-    def searches_near(self) -> str:
-        return "q"
+    def searches_near(self) -> tuple[str, ...]:
+        return ("q",)
 
     def _velocity(self, row: Data, params: Any) -> Float[Numbers, " n"]:
         """The velocity that belongs to the saved momentum."""

@@ -216,8 +216,8 @@ class ManifoldLagrangian(AbstractSystem):
         return self.constraints.terms(t, q, v, speed, params, size)
 
     @property
-    def searches_near(self) -> str:
-        return "q"
+    def searches_near(self) -> tuple[str, ...]:
+        return ("q",)
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy at the saved point and momentum."""

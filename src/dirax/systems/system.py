@@ -81,10 +81,10 @@ class AbstractSystem(eqx.Module):
         return {name: jnp.abs(a) for name, a in data.items()}
 
     @property
-    def searches_near(self) -> str:
-        """The saved field that says where, of several, the velocity or the parameters of a row are, its entry `about`: "q" by its
-        changes from row to row, one of steps by those before and after it; "" where none are searched."""
-        return ""
+    def searches_near(self) -> tuple[str, ...]:
+        """The saved fields that say where, of several, the velocity or the parameters of a row are, its entry `about`: those of
+        nodes by their changes from row to row, those of steps by those before and after it; () where none are searched."""
+        return ()
 
     @abstractmethod
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
