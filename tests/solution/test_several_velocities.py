@@ -75,3 +75,12 @@ def test_on_a_quotient():
     sol = dx.simulate(dx.reduce(system, bent), dx.LagrangeDAlembert(), **data)
     np.testing.assert_allclose(sol.energy(), ENERGY, atol=1e-6)
     np.testing.assert_allclose(dx.reconstruct(sol).energy(), sol.energy(), atol=1e-13)
+
+
+@pytest.mark.parametrize("every", [1, 7])
+def test_beside_a_wall_that_turns_the_velocity(every):
+    wall = dx.Impact(lambda q: 0.5 - q[0])
+    data = {**START, "step": 0.01, "steps": 70, "save_every": every, "events": wall}
+    sol = dx.simulate(dx.LagrangeDirac(lagrangian), dx.LagrangeDAlembert(), **data)
+    assert len(sol.impacts) == 1
+    np.testing.assert_allclose(sol.energy(), ENERGY, atol=1e-6)

@@ -26,9 +26,6 @@ FEWEST, CALL = 16, 2048
 LONGEST = 5 * MOST_OPERATIONS
 """Operations from which on these are too long."""
 
-AT_ROW = 1e-6
-"""Part of a step by which a wall may be hit off a row and still at it."""
-
 APART = 16
 """Rows from one to the next that is asked where its step begins."""
 
@@ -181,13 +178,9 @@ class Replay:
     @property
     def beside_walls(self) -> np.ndarray:
         """The rows (B, rows) before and after a step that a wall divides: their momenta and multipliers are of parts of it."""
-        sol, beside = self.sol, np.zeros((self.sol.batch or 1, self.sol.rows), bool)
-        if sol.impacts is not None:
-            lanes, times = sol.impacts.lane, sol.impacts.t
-            for lane in np.unique(lanes):
-                for t in (times[lanes == lane] - AT_ROW * sol.step, times[lanes == lane] + AT_ROW * sol.step):
-                    before = np.clip(np.searchsorted(sol.times[lane], t, side="right") - 1, 0, sol.rows - 2)
-                    beside[lane, before] = beside[lane, before + 1] = True
+        beside, divided = np.zeros((self.sol.batch or 1, self.sol.rows), bool), self.sol.divided
+        beside[:, :-1] |= divided
+        beside[:, 1:] |= divided
         return beside
 
     def begun(self, lanes: np.ndarray, rows: np.ndarray) -> Rows:

@@ -17,6 +17,9 @@ from dirax.program.user_functions import is_traced
 from dirax.schemes.step import CLOCK, Field, Shape, make_step_equation
 from dirax.text.representation import counted, fields_html
 
+AT_ROW = 1e-6
+"""Part of a step by which a wall may be hit off a row and still at it."""
+
 BLOCK = 2**16
 """Rows that a quantity is computed for at a time, which bounds the memory that it takes."""
 
@@ -196,6 +199,18 @@ class Trajectory:
         return self.map_rows(momentum) if values is None else values
 
     @property
+    def divided(self) -> np.ndarray:
+        """Between which rows and the next ones walls are hit, (B, rows − 1); at a row, on both sides of it."""
+        found = np.zeros((self.batch or 1, max(self.rows - 1, 0)), bool)
+        if self.impacts is None or is_traced(self.impacts.t):
+            return found
+        lanes, times, near = self.impacts.lane, self.impacts.t, AT_ROW * self.step
+        for lane in np.unique(lanes):
+            for t in (times[lanes == lane] - near, times[lanes == lane] + near):
+                found[lane, np.clip(np.searchsorted(self.times[lane], t, side="right") - 1, 0, self.rows - 2)] = True
+        return found
+
+    @property
     def row_fields(self) -> dict[str, Any]:
         """What a function of a row is given, (…, rows, …): the fields of nodes, the time "t", and `about`, near which the system
         searches for the velocity or the parameters of the row."""
@@ -211,6 +226,9 @@ class Trajectory:
             of_steps = self.fields[name].reshape(*np.shape(self.fields[name])[: axis + 1], -1)
             if name in nodes:
                 of_steps = (jnp if is_traced(of_steps) else np).diff(of_steps, axis=axis) / lengths
+                if self.impacts is not None:  # between such rows no velocity is a mean one
+                    divided = self.divided.reshape(*of_steps.shape[:-1], 1)
+                    of_steps = xp.where(divided, xp.nan, of_steps)
             near.append(_at_nodes(of_steps, axis))
         return nodes | {"about": (jnp if is_traced(near) else np).concatenate(near, axis=-1)}
 
