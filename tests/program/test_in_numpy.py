@@ -40,6 +40,10 @@ CASES = {
     "a loop of unknown length": lambda a, x: jax.lax.while_loop(
         lambda c: jnp.max(jnp.abs(c[0])) > 1e-3, lambda c: (c[0] / 3, c[1] + 1), (a @ x, 0)
     ),
+    "entries in the order of Fortran": lambda a, x: (
+        a.ravel(order="F") * jnp.arange(9.0),
+        jax.grad(lambda a: jnp.sum((a @ a).reshape((9,), order="F") ** 3 * jnp.arange(9.0)))(a),
+    ),
     "a derivative through a root": lambda a, x: jax.jacfwd(
         lambda x: nearest_root(lambda u: u**3 + u + 0.1 * (a @ u) - x, jnp.zeros(3))
     )(x),

@@ -47,6 +47,7 @@ FUNCTIONS = {
     "total": (lambda q: q / jnp.sum(q**2), Q),
     "drawn": (lambda q: q[DRAWN] * q[DRAWN[::-1]] + jnp.roll(q, 2)[DRAWN], Q),
     "lattice": (jax.grad(lattice), P[: 7 * 9]),
+    "lattice by columns": (lambda p: p[:63].reshape(7, 9).ravel(order="F") * jnp.sin(p[:63]), P),
     "beside nothing": (lambda q: jnp.concatenate([jnp.sin(q)[:42].reshape(6, 7), jnp.zeros((6, 0))], axis=1), Q),
     "totals": (lambda p: jnp.einsum("ij,ij->i", p[:70].reshape(1, 70), jnp.sin(p[10:80]).reshape(1, 70)) * p[:5], P),
     "totals of rows": (lambda p: jnp.sum(jnp.outer(jnp.arange(1.0, 4.0), p) ** 2, axis=1), P),

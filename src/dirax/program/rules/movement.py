@@ -13,6 +13,9 @@ CHOICES = 64
 
 @rule("reshape", "squeeze", "expand_dims")
 def reshape(interpreter: Interpreter, equation: Any, x, *_):
+    order = equation.params.get("dimensions")  # of the axes before, where a function has one: of jnp.ravel(x, order="F")
+    if equation.primitive.name == "reshape" and order is not None:
+        x = np.transpose(x, order)
     return [x.reshape(equation.outvars[0].aval.shape)]
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from dirax.program.convolved import factors
 from dirax.program.interpreter import Interpreter, rule
 
 FOLDS = {
@@ -84,6 +85,15 @@ def dot_general(interpreter: Interpreter, equation: Any, a, b):
         for row in one
         for column in other
     ]
+    return [np.array(out, dtype=np.int64).reshape(equation.outvars[0].aval.shape)]
+
+
+@rule("conv_general_dilated")
+def convolution(interpreter: Interpreter, equation: Any, a, b):
+    g, (left, right) = interpreter.graph, factors(equation)
+    nodes = np.append(g.zero, a), np.append(g.zero, b)
+    terms = (x[numbers].reshape(-1, numbers.shape[-1]).tolist() for x, numbers in zip(nodes, (left, right), strict=True))
+    out = [fold(interpreter, "add", [g.mul(x, y) for x, y in zip(*pairs, strict=True)]) for pairs in zip(*terms, strict=True)]
     return [np.array(out, dtype=np.int64).reshape(equation.outvars[0].aval.shape)]
 
 

@@ -238,7 +238,7 @@ class _Walk:
 
     def _moved(self, equation: Any, operands: list[Value]) -> list[Value]:
         name = equation.primitive.name
-        if name in ("reshape", "squeeze", "expand_dims"):
+        if name in ("squeeze", "expand_dims") or (name == "reshape" and equation.params["dimensions"] is None):
             return [operands[0]]
         pieces, numbers = self._one(operands, equation)
         size, shapes = sum(n.size for n in numbers), [n.shape for n in numbers]

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from dirax.program.convolved import factors
 from dirax.program.sparsity.values import Value, folded, of_all, rows, spread, too_many, union
 
 ODD = frozenset(("neg", "convert_element_type", "copy", "copy_p", "reduce_precision", "real", "abs", "square", "sin", "tan"))
@@ -93,6 +94,16 @@ def product(equation: Any, *operands: Value) -> list[Value]:
             part = taken @ sets
         found = union(found, part)
     return [Value(found, None, zero)]
+
+
+def convolved(equation: Any, *operands: Value) -> list[Value]:
+    """Sums of products of the entries in a window."""
+    found: Any = None
+    for operand, numbers in zip(operands, factors(equation), strict=True):
+        if operand.sets is not None:
+            for k in range(numbers.shape[-1]):
+                found = union(found, rows(operand.sets, numbers[..., k]))
+    return [Value(found)]
 
 
 def zero_products(there: list[Any], sizes: list[list[int]]) -> np.ndarray:

@@ -38,6 +38,7 @@ BY_NAME: dict[str, Callable[..., list[Value]]] = {
     **dict.fromkeys(("gather", "dynamic_slice"), movement.gathered),
     "dynamic_update_slice": movement.updated,
     "dot_general": arithmetic.product,
+    "conv_general_dilated": arithmetic.convolved,
     "select_n": arithmetic.selected,
 }
 """What primitives do to sets, whatever their operands."""
