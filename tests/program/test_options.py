@@ -46,6 +46,8 @@ FUNCTIONS = {
     "branches": lambda x: lax.switch(7, [lambda x: x, lambda x: 2 * x, lambda x: x**2], x),
     "activations": lambda x: jax.nn.gelu(x, approximate=False) + jax.nn.gelu(x) + jax.nn.softmax(x, axis=0) + jax.nn.selu(x),
     "special": lambda x: special.logsumexp(x, axis=0, b=2.0, keepdims=True) + special.entr(jnp.abs(x)) + special.log_ndtr(x),
+    "constants": lambda x: (jnp.arange(4) ** 2 + ((jnp.arange(4) << 1) & 3)).astype(float)[None] * x,
+    "order of constants": lambda x: x[:, jnp.argsort(jnp.array([3, 1, 2, 0]))],
     "axes": lambda x: jax.vmap(lambda a: a * jnp.arange(3.0), 1, 1)(x),
 }  # fmt: skip
 

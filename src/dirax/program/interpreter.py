@@ -3,13 +3,14 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from jax._src import source_info_util
 from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
 from dirax.program.graph import Graph
-from dirax.program.whole_numbers import Ranges
+from dirax.program.whole_numbers import EXACT, Ranges
 
 Nodes = np.ndarray
 """An integer array of node numbers, in the shape of the array that it stands for."""
@@ -103,6 +104,23 @@ class Interpreter:
             raise Unsupported("may make whole numbers that float64 does not have")
         return np.array(found, dtype=np.int64).reshape(nodes.shape)
 
+    def _known(self, equation: Any, operands: list[Any]) -> list[Any] | None:
+        """The results of constants that have no rule, by JAX; None where an operand is no constant."""
+        if not folds(equation) or any(isinstance(o, Unavailable) for o in operands):
+            return None
+        values = []
+        for nodes, atom in zip(operands, equation.invars, strict=True):
+            numbers = [self.graph.value[n] for n in nodes.ravel().tolist() if self.graph.is_constant(n)]
+            if len(numbers) < nodes.size:
+                return None
+            values.append(np.array(numbers, dtype=float).reshape(nodes.shape).astype(atom.aval.dtype))
+        with jax.ensure_compile_time_eval():
+            found = equation.primitive.bind(*values, **equation.params)
+        results = list(map(np.asarray, found if equation.primitive.multiple_results else [found]))
+        if any(a.dtype.kind in "iu" and np.any(np.abs(a.astype(float)) > EXACT) for a in (*values, *results)):
+            return None
+        return list(map(self.constants, results))
+
     def _equation(self, equation: Any, operands: list[Any]) -> Sequence[Any]:
         name = equation.primitive.name
         lost = next((o for o in operands if isinstance(o, Unavailable)), None)
@@ -116,6 +134,8 @@ class Interpreter:
             results = self.rules[name](self, equation, *operands)
             return [self.whole(x, v) if is_integer(v) else x for x, v in zip(results, equation.outvars, strict=True)]
         except Unsupported as error:
+            if (known := self._known(equation, operands)) is not None:
+                return known
             # equations inside a library's jitted functions have no line of the user's: the calling equation has it
             line = next(filter(None, map(source_line, reversed(self._equations))), "unknown line")
             failure = UnsupportedPrimitive(name, str(error), line)
@@ -124,13 +144,22 @@ class Interpreter:
             self._equations.pop()
 
 
+def folds(equation: Any) -> bool:
+    """Whether an equation is one primitive of JAX alone, with results that nodes can hold."""
+    inner = any(hasattr(p, "eqns") or hasattr(p, "jaxpr") for p in jax.tree.leaves(list(equation.params.values())))
+    return not inner and not equation.effects and not equation.primitive.name.startswith("dirax_") and not has_others(equation)
+
+
 def check_dtypes(equation: Any) -> None:
     """Raise `Unsupported` for results that are neither float64, nor whole numbers, nor booleans."""
-    for variable in equation.outvars:
-        dtype = getattr(variable.aval, "dtype", None)
-        known = dtype is not None and (dtype == np.float64 or dtype == np.bool_ or np.issubdtype(dtype, np.integer))
-        if not known:
-            raise Unsupported(f"has a result of dtype {dtype}")
+    if others := has_others(equation):
+        raise Unsupported(f"has a result of dtype {others[0]}")
+
+
+def has_others(equation: Any) -> list[Any]:
+    """The dtypes of results that are none of these."""
+    dtypes = [getattr(variable.aval, "dtype", None) for variable in equation.outvars]
+    return [d for d in dtypes if d is None or not (d == np.float64 or d == np.bool_ or np.issubdtype(d, np.integer))]
 
 
 def source_line(equation: Any) -> str:
