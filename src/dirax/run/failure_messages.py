@@ -174,7 +174,10 @@ def _where_it_ends(numbers: InNumbers | InJax, guess, args, sizes) -> str:
     if part == 0.0:
         return ""
     if part == 1.0:
-        return " (there is a solution, to which those of shorter steps lead, but not Newton's method from these values)"
+        return (
+            " (there is a solution, to which those of shorter steps lead, but not Newton's method from these values; the native "
+            "engine follows them where max_iterations is not below 8)"
+        )
     return f" (the solutions of shorter steps lead to h = {part * h:.3g} and turn back there: longer ones have none near)"
 
 
