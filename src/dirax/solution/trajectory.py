@@ -331,7 +331,6 @@ def _is_numeric(leaf: Any) -> bool:
     return isinstance(leaf, bool | int | float | np.ndarray | np.generic | jax.Array) and np.asarray(leaf).dtype.kind in "fiub"
 
 
-@compiled
 def _at_nodes(of_steps: Any, axis: int) -> Any:
     """The means of what two steps have at the node between them; what one has where the other has none, and else zero."""
     xp = jnp if is_traced(of_steps) else np
@@ -341,6 +340,7 @@ def _at_nodes(of_steps: Any, axis: int) -> Any:
     return xp.where(xp.isfinite(before) & xp.isfinite(after), 0.5 * (before + after), one)
 
 
+@compiled
 def _along(function, nodes, params, axes):
     """`function` of every row, compiled once per function and shape: a system's bound method is compared by its system."""
     along = jax.vmap(lambda row, params: function(SavedRow(row), params), in_axes=(0, None))
