@@ -327,7 +327,7 @@ class StepsInNumbers:
         if len(left):
             good[left] &= is_solved(left)
         if follow and len(lost := np.flatnonzero(~good)) and k <= FOLLOWED:
-            there, _ = self.followed(stage, begun[lost], size[lost], states[lost], tuple(a[lost] for a in at))
+            there, _ = self.followed(stage, begun[lost], states[lost], tuple(a[lost] for a in at))
             if len(some := lost[np.isfinite(there[:, 0])]):
                 u[some] = there[np.isfinite(there[:, 0])]
                 of_them = u[some], inverse[some], states[some], tuple(a[some] for a in at), noise
@@ -342,10 +342,14 @@ class StepsInNumbers:
         u -= applied(inverse, self._read(self._values(index, u, states, at, noise), self.program.equations[index].residual))
         return u, inverse
 
-    def followed(self, stage: int, guess, sizes, states, at) -> tuple[np.ndarray, np.ndarray]:
-        """`following.followed` of the equations of a stage, from a guess (states, k) on."""
+    @np.errstate(all="ignore")
+    def followed(self, stage: int, guess, states, at) -> tuple[np.ndarray, np.ndarray]:
+        """`following.followed` of the equations of a stage, from a guess (states, k) on, in the sizes that unknowns have there:
+        where Newton's method went from it, they may have any."""
         index, (t, h, params) = self.program.stages[stage][0], at
         e, of_step = self.program.equations[index], self.program.shared.h
+        inverses = inverted(self._linearized(index, self._values(index, guess, states, at))[0])
+        sizes = np.nan_to_num(applied_sizes(inverses, self._terms(stage, guess, states, *at)), nan=0.0, posinf=0.0)
 
         def slopes(some, u, part):
             known = self._values(index, u, states[some], (t[some], part * h[some], params[some]))
