@@ -80,6 +80,18 @@ def test_where_friction_stops_a_block():
     assert np.array_equal(block(400, save_every=10).q, sol.q[::10])
 
 
+def test_many_that_stop_have_the_bits_of_each_alone():
+    """A bead on a hoop under friction of its normal force, of several unknowns: those of the others set no scale."""
+    friction = lambda t, q, v, multipliers: -0.4 * jnp.abs(multipliers[0]) * v / jnp.sqrt(v @ v + 1e-8)
+    round_hoop = lambda q: jnp.array([(q @ q - 1) / 2])
+    hoop = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.81 * q[1], holonomic=round_hoop, forces=friction)
+    angle = np.array([-0.24, 0.24])
+    q, v = np.stack([np.sin(angle), -np.cos(angle)], axis=1), 2.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    run = lambda some: dx.simulate(hoop, dx.LagrangeDAlembert(), q=q[some], v=v[some], step=0.02, steps=60)
+    assert "22 steps followed" in run([0, 1]).stats["iteration"]
+    assert np.array_equal(run([0, 0]).q[0], run([0, 1]).q[0])
+
+
 def test_its_derivative():
     end = lambda mu: block(400, mu=mu).q[-1, 0]
     assert jax.grad(end)(MU) == pytest.approx((end(MU + 1e-6) - end(MU - 1e-6)) / 2e-6, rel=1e-6)
