@@ -282,6 +282,17 @@ def test_the_symplecticity_defect_of_the_explicit_euler_method_is_its_closed_for
     assert report["symplecticity of one step"].value == pytest.approx(0.01 / 1.01, rel=1e-12)
 
 
+def test_a_pendulum_at_rest_has_the_momenta_of_its_roundings():
+    down = np.array([3.3, -9.1])
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + q @ down, holonomic=lambda q: jnp.array([(q @ q - 1) / 2]))
+    rest = down / np.linalg.norm(down)
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), q=rest, v=[0.0, 0.0], step=0.01, steps=100)
+    assert 0.0 < np.abs(sol.p).max() < 1e-15
+    assert verify(sol).ok, verify(sol)
+    off = sol.p + (np.arange(101) == 7)[:, None] * 1e-13 * rest
+    assert verify(sol.replace(fields=sol.fields | {"p": off}))["hidden constraint"].verdict == "VIOLATED"
+
+
 def test_a_composition_is_symplectic_in_unbalanced_units():
     heavy = dx.LagrangeDirac(lambda q, v: 1e6 * (v @ v) / 2 - 1e6 * jnp.sum(q**4))
     scheme = dx.Composition(OneStep("verlet", mass=1e6), "yoshida4")

@@ -28,6 +28,20 @@ def test_a_parabola_turns_at_its_vertex_in_any_units(size):
     assert unknowns[1, 0] == pytest.approx(size * (1.0 - np.sqrt(0.2)) / 0.4, rel=1e-12)
 
 
+def test_unknowns_that_become_far_larger_on_the_way():
+    """A block at rest under friction μ tanh(v/ε), which slides 200 times as fast in a short step: v − p = s f(v)."""
+    p, drive, mu, slip = -0.0125, 2e-4, 0.039, 1e-4
+    force = lambda v: drive - mu * np.tanh(v / slip)
+
+    def slopes(some, u, part):
+        by_u = 1.0 + part[:, None] * mu / slip / np.cosh(u / slip) ** 2
+        return u - p - part[:, None] * force(u), np.stack([by_u, -force(u)], axis=2)
+
+    unknowns, parts = followed(slopes, np.full((1, 1), 3e-5), np.zeros((1, 1)))
+    assert parts[0] == 1.0
+    assert unknowns[0, 0] == pytest.approx(brentq(lambda v: v - p - force(v), -1.0, 1.0, xtol=1e-18), rel=1e-9)
+
+
 def test_a_failed_step_says_where_solutions_turn_back():
     """The turning point of two stages at t = .7 is .0835 by a continuation with other steps and scales; three have none."""
     example = gallery.get("cartesian-double-pendulum")
@@ -66,9 +80,31 @@ def test_where_friction_stops_a_block():
     assert np.array_equal(block(400, save_every=10).q, sol.q[::10])
 
 
+def test_many_that_stop_have_the_bits_of_each_alone():
+    """A bead on a hoop under friction of its normal force, of several unknowns: those of the others set no scale."""
+    friction = lambda t, q, v, multipliers: -0.4 * jnp.abs(multipliers[0]) * v / jnp.sqrt(v @ v + 1e-8)
+    round_hoop = lambda q: jnp.array([(q @ q - 1) / 2])
+    hoop = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.81 * q[1], holonomic=round_hoop, forces=friction)
+    angle = np.array([-0.24, 0.24])
+    q, v = np.stack([np.sin(angle), -np.cos(angle)], axis=1), 2.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    run = lambda some: dx.simulate(hoop, dx.LagrangeDAlembert(), q=q[some], v=v[some], step=0.02, steps=60)
+    assert "22 steps followed" in run([0, 1]).stats["iteration"]
+    assert np.array_equal(run([0, 0]).q[0], run([0, 1]).q[0])
+
+
 def test_its_derivative():
     end = lambda mu: block(400, mu=mu).q[-1, 0]
     assert jax.grad(end)(MU) == pytest.approx((end(MU + 1e-6) - end(MU - 1e-6)) / 2e-6, rel=1e-6)
+
+
+def test_from_where_newton_left_to_far_places():
+    """An exponential that is cut off at e³⁰, where Newton's method comes to velocities of 1e14."""
+    force = lambda v, xp: -1e3 * (xp.exp(xp.clip(v / 0.05, -60.0, 30.0)) - 1.0)
+    diode = dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v: force(v, jnp))
+    sol = dx.simulate(diode, dx.LagrangeDAlembert(), q=[0.0], v=[-1.0], step=0.05, steps=1)
+    assert sol.ok, sol.message
+    v = brentq(lambda v: v - 0.025 * force(v, np) + 1.0, -1.0, 1.0, xtol=1e-18)
+    assert sol.q[1, 0] / 0.05 == pytest.approx(v, rel=1e-12)
 
 
 def test_few_updates_are_a_bound():

@@ -61,3 +61,12 @@ def test_blas_has_one_thread_inside_and_its_own_again_outside():
         assert set(count()) == {1}
         second.__exit__(None, None, None)
         assert set(count()) == {2}
+
+
+def test_the_roundoff_of_zeros_sets_no_scales():
+    """Diagonal matrices with roundoff of zero, of any size, above the diagonal."""
+    rng, k = np.random.default_rng(0), 40
+    roundoff = np.triu(10.0 ** rng.uniform(-40.0, -17.0, (k, k)) * rng.choice([-1.0, 0.0, 1.0], (k, k)), 1)
+    diagonal = rng.uniform(0.5, 2.0, k)
+    for alone in (False, True):
+        np.testing.assert_allclose(inverted((np.diag(diagonal) + roundoff)[None], alone)[0], np.diag(1.0 / diagonal), atol=1e-14)

@@ -14,8 +14,11 @@ MOST = 200
 FIRST, LONGEST, SHORTEST = 0.05, 0.3, 1e-5
 """Distances between them, in unknowns relative to their sizes and in parts of the step."""
 
-NEAR, FOUND, UPDATES = 1e-4, 1e-9, 8
+NEAR, FOUND, UPDATES = 1e-6, 1e-9, 8
 """The relative update of Newton's method at which a point on the way is found, and the last one, and how many there may be."""
+
+BESIDE = 2.0**-13
+"""Part of sizes, which are bounds, that counts beside values: an unknown that becomes larger on the way counts as that."""
 
 TURNED = 0.98
 """Part of the longest step found below which the solutions have turned back."""
@@ -35,7 +38,7 @@ def followed(slopes: Slopes, unknowns: np.ndarray, sizes: np.ndarray) -> tuple[n
     `slopes(some, u, s)` gives of the steps numbered `some` the residuals (m, k) at u (m, k) and parts s (m,), and their
     derivatives (m, k, k + 1) by the unknowns and by s.
     """
-    (n, k), scale = unknowns.shape, np.abs(unknowns) + sizes
+    (n, k), scale = unknowns.shape, np.abs(unknowns) + BESIDE * sizes
     scale = np.where((scale != 0.0) & np.isfinite(scale), scale, 1.0)
     scale = np.append(scale, np.ones((n, 1)), axis=1)
     last = np.append(np.zeros(k), 1.0)
@@ -81,6 +84,9 @@ def followed(slopes: Slopes, unknowns: np.ndarray, sizes: np.ndarray) -> tuple[n
         distance[some] = np.where(found, np.minimum(1.5 * distance[some], LONGEST), far / 2.0)
         here = some[found]
         y[here], matrices[here] = new[found], there[found]
+        grown = np.maximum(np.abs(y), 1.0)
+        grown[:, k] = 1.0
+        y, direction, scale, matrices = y / grown, direction / grown, scale * grown, matrices * grown[:, None]
         turned = y[here, k] < TURNED * longest[here]
         reached[here] = np.where(turned, longest[here], np.where(ends[found], 1.0, 0.0))
         longest[here] = np.maximum(longest[here], y[here, k])

@@ -122,15 +122,16 @@ class StepsInNumbers:
         noise: Noise | None = None,
         near: Near | None = None,
         follow: bool = True,
+        alone: bool = False,
     ) -> Attempts:
         """A step of each state (states, s), with one guess (states, k) a stage; h is one number, or one a state. `follow`: a
-        solution that Newton's method does not find is followed from a short step on."""
+        solution that Newton's method does not find is followed from a short step on. `alone`: no bit depends on other states."""
         parts, h = [], np.broadcast_to(h, t.shape)
         for low in range(0, max(len(states), 1), LANES):
             some = slice(low, low + LANES)
             here = self.nothing_near(len(states[some])) if near is None else near[some]
             at = states[some], [g[some] for g in guesses], t[some], h[some], params[some]
-            parts.append(self._step(*at, noise, here, follow))
+            parts.append(self._step(*at, noise, here, follow, alone))
         join = np.concatenate
         return Attempts(
             [join(a) for a in zip(*(p.unknowns for p in parts), strict=True)],
@@ -140,11 +141,11 @@ class StepsInNumbers:
         )
 
     @np.errstate(all="ignore")
-    def _step(self, states, guesses, t, h, params, noise, near: Near, follow: bool) -> Attempts:
+    def _step(self, states, guesses, t, h, params, noise, near: Near, follow: bool, alone: bool) -> Attempts:
         unknowns, begun, good = [], [], np.ones(len(states), bool)
         for stage, ((index, fraction), guess) in enumerate(zip(self.program.stages, guesses, strict=True)):
             e, at = self.program.equations[index], (t, fraction * h, params)
-            u, solved = self._solved(stage, guess, states, at, noise, near, follow)
+            u, solved = self._solved(stage, guess, states, at, noise, near, follow, alone)
             known = self._values(index, u, states, at, noise)
             begun.append(states)
             unknowns.append(u)
@@ -268,7 +269,9 @@ class StepsInNumbers:
             whole[name] = parts[0][name] if about.rule == "first" else np.stack(arrays, axis=1) if each else sum(arrays)
         return whole
 
-    def _solved(self, stage: int, guess, states, at, noise, near: Near, follow: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _solved(
+        self, stage: int, guess, states, at, noise, near: Near, follow: bool, alone: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The unknowns (states, k) of a stage by Newton's method, and where it has a solution.
 
         A Jacobian serves as long as updates by it contract. Those of one that does not, or of another step, are taken back. The
@@ -294,9 +297,9 @@ class StepsInNumbers:
             residual, fresh = None, renewed[left]
             if np.all(fresh):
                 slopes, residual = self._linearized(index, some)
-                inverse[left] = inverted(slopes)
+                inverse[left] = inverted(slopes, alone)
             elif np.any(fresh):
-                inverse[left[fresh]] = inverted(self._linearized(index, some.at(np.flatnonzero(fresh)))[0])
+                inverse[left[fresh]] = inverted(self._linearized(index, some.at(np.flatnonzero(fresh)))[0], alone)
             residual = self._read(some, e.residual, index) if residual is None else residual
             change = applied(inverse[left], residual)
             fixed = known.without(self._depends[index]) if fixed is None else fixed
@@ -323,29 +326,33 @@ class StepsInNumbers:
             if not len(left):
                 break
         good = last < STALLED
-        self._to_floor(index, u, inverse, states, at, noise)
+        self._to_floor(index, u, inverse, states, at, noise, alone)
         if len(left):
             good[left] &= is_solved(left)
         if follow and len(lost := np.flatnonzero(~good)) and k <= FOLLOWED:
-            there, _ = self.followed(stage, begun[lost], size[lost], states[lost], tuple(a[lost] for a in at))
+            there, _ = self.followed(stage, begun[lost], states[lost], tuple(a[lost] for a in at))
             if len(some := lost[np.isfinite(there[:, 0])]):
                 u[some] = there[np.isfinite(there[:, 0])]
-                of_them = u[some], inverse[some], states[some], tuple(a[some] for a in at), noise
+                of_them = u[some], inverse[some], states[some], tuple(a[some] for a in at), noise, alone
                 u[some], inverse[some] = self._to_floor(index, *of_them)
                 good[some] = is_solved(some)
         return u, good
 
-    def _to_floor(self, index: int, u, inverse: Inverses, states, at, noise) -> tuple[np.ndarray, Inverses]:
+    def _to_floor(self, index: int, u, inverse: Inverses, states, at, noise, alone: bool) -> tuple[np.ndarray, Inverses]:
         """A last update in place, by the Jacobians of the solutions: by any other the roundoff of constraints would move what
         they leave free."""
-        inverse[:] = inverted(self._linearized(index, self._values(index, u, states, at))[0])
+        inverse[:] = inverted(self._linearized(index, self._values(index, u, states, at))[0], alone)
         u -= applied(inverse, self._read(self._values(index, u, states, at, noise), self.program.equations[index].residual))
         return u, inverse
 
-    def followed(self, stage: int, guess, sizes, states, at) -> tuple[np.ndarray, np.ndarray]:
-        """`following.followed` of the equations of a stage, from a guess (states, k) on."""
+    @np.errstate(all="ignore")
+    def followed(self, stage: int, guess, states, at) -> tuple[np.ndarray, np.ndarray]:
+        """`following.followed` of the equations of a stage, from a guess (states, k) on, in the sizes that unknowns have there:
+        where Newton's method went from it, they may have any."""
         index, (t, h, params) = self.program.stages[stage][0], at
         e, of_step = self.program.equations[index], self.program.shared.h
+        inverses = inverted(self._linearized(index, self._values(index, guess, states, at))[0], alone=True)
+        sizes = np.nan_to_num(applied_sizes(inverses, self._terms(stage, guess, states, *at)), nan=0.0, posinf=0.0)
 
         def slopes(some, u, part):
             known = self._values(index, u, states[some], (t[some], part * h[some], params[some]))

@@ -10,6 +10,10 @@ from dirax.numerics.equilibration import balancing_scales, geometric_scales
 LARGE = 64
 """Rows from which on a matrix is factored and not inverted."""
 
+DOUBTFUL = 1e12
+"""Condition numbers from which on other scales are tried: geometric means follow the roundoff of zeros, of which the Jacobian of
+a machine at rest has many, as large ones do."""
+
 PROBES = 8
 """Vectors of random signs by which the sizes are found that a large inverse gives."""
 
@@ -27,22 +31,35 @@ def unknown(inverses: Inverses) -> np.ndarray:
     return np.array([one is None for one in inverses], bool) if inverses.ndim == 1 else np.isnan(inverses[:, 0, 0])
 
 
-def inverted(matrices: np.ndarray) -> Inverses:
-    """Those of matrices (matrices, k, k) whose rows and columns have units in common."""
+def inverted(matrices: np.ndarray, alone: bool = False) -> Inverses:
+    """Those of matrices (matrices, k, k) whose rows and columns have units in common; or each `alone`, in units of its own, so
+    that its bits do not depend on the others."""
     with np.errstate(all="ignore"):
-        sizes = np.max(np.abs(matrices), axis=0, where=np.isfinite(matrices), initial=0.0)
-        # geometric means follow the roundoff of zeros, of which large matrices have many
-        rows, columns = geometric_scales(sizes) if matrices.shape[-1] < LARGE else balancing_scales(sizes)
-        scaled = matrices / rows / columns
+        finite, own = np.isfinite(matrices), np.abs(matrices)
+        sizes = np.where(finite, own, 0.0) if alone else np.max(own, axis=0, where=finite, initial=0.0)[None]
         if matrices.shape[-1] >= LARGE:
-            found = no_inverses(*matrices.shape[:2])
-            found[:] = [_Factored(matrix, rows[:, 0], columns[0]) for matrix in scaled]
+            rows, columns = balancing_scales(sizes)
+            scaled, found = matrices / rows / columns, no_inverses(*matrices.shape[:2])
+            rows, columns = (np.broadcast_to(a, (len(matrices), *a.shape[1:])) for a in (rows, columns))
+            found[:] = [_Factored(matrix, r[:, 0], c[0]) for matrix, r, c in zip(scaled, rows, columns, strict=True)]
             return found
-        try:
-            found = np.linalg.inv(scaled)
-        except np.linalg.LinAlgError:
-            found = np.stack([_inverse(matrix) for matrix in scaled])
-    return found / columns.T / rows.T
+        found, grown = _scaled_inverses(matrices, *geometric_scales(sizes))
+        if len(some := np.flatnonzero(grown > DOUBTFUL)):
+            others, less = _scaled_inverses(matrices[some], *balancing_scales(own[some]))
+            better = less < grown[some]
+            found[some[better]] = others[better]
+    return found
+
+
+def _scaled_inverses(matrices: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of matrices to be divided by these scales, and about the condition number of each."""
+    scaled = matrices / rows / columns
+    try:
+        found = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        found = np.stack([_inverse(matrix) for matrix in scaled])
+    grown = np.max(np.abs(scaled), axis=(1, 2), initial=0.0) * np.max(np.abs(found), axis=(1, 2), initial=0.0)
+    return found / np.swapaxes(columns, 1, 2) / np.swapaxes(rows, 1, 2), grown
 
 
 def applied(inverses: Inverses, vectors: np.ndarray) -> np.ndarray:

@@ -92,7 +92,7 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float, sizes: Callable[[
         guess = numbers.guess(state, last if len(last) == stage.unknowns else np.zeros(stage.unknowns), h)
         reason, u = _replay_newton(stage, numbers, guess, (state, t, h), params, size, p.max_iterations)
         if reason:
-            return reason + (_where_it_ends(numbers, guess, (state, t, h), size) if reason.endswith(SMALLER) and alone else "")
+            return reason + (_where_it_ends(numbers, guess, (state, t, h)) if reason.endswith(SMALLER) and alone else "")
         if floating := _floating(stage, numbers, u, (state, t, h)):
             return f"Newton did not converge from the values extrapolated from the steps before{floating}"
         solved.append((stage, numbers, guess, (state, t, h), size))
@@ -100,7 +100,7 @@ def _reason(p: Problem, outcome: Outcome, lane: int, t: float, sizes: Callable[[
         if not np.all(np.isfinite(state)):
             return "the new state is not finite: it has left the domain of the system's functions, or overflowed"
     advice = next((found for place in solved if (found := _advice(*place)) != SMALLER), SMALLER)
-    ends = _where_it_ends(*solved[0][1:]) if alone and advice == SMALLER and solved else ""
+    ends = _where_it_ends(*solved[0][1:4]) if alone and advice == SMALLER and solved else ""
     return f"Newton did not converge from the values extrapolated from the steps before: {advice}{ends}"
 
 
@@ -163,14 +163,14 @@ def _of_nodes(names: list[str]) -> str:
     )
 
 
-def _where_it_ends(numbers: InNumbers | InJax, guess, args, sizes) -> str:
+def _where_it_ends(numbers: InNumbers | InJax, guess, args) -> str:
     """Whether there is a solution, found from shorter steps on."""
     state, t, h = args
     if not 0 < len(guess) <= FOLLOWED or not isinstance(numbers, InNumbers):
         return ""
     one = lambda a: np.asarray(a, float)[None]
     of_step = one(t), one(h), one(numbers.params)
-    part = float(StepsInNumbers(None, numbers.step).followed(0, one(guess), one(sizes), one(state), of_step)[1][0])
+    part = float(StepsInNumbers(None, numbers.step).followed(0, one(guess), one(state), of_step)[1][0])
     if part == 0.0:
         return ""
     if part == 1.0:

@@ -76,7 +76,7 @@ def by_following(lanes: Lanes | OneLane, made: Kernels) -> int:
             break
         guesses = [own[:, record.unknowns(i, k)] for i, k in enumerate(stages)]
         params = steps.parameters(p.params, p.batch if p.batch_params else None, failed)
-        found = steps.step(own[:, record.state], guesses, p.t0 + (p.first_step + done) * p.h, p.h, params)
+        found = steps.step(own[:, record.state], guesses, p.t0 + (p.first_step + done) * p.h, p.h, params, alone=True)
         if not np.any(found.good):
             break
         failed, before, own, done = failed[found.good], own[found.good].copy(), own[found.good], done[found.good]
