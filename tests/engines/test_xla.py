@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 import dirax as dx
+from dirax.engines import sizes
 from dirax.engines.contract import NOT_FINITE, OK, Problem
 from dirax.engines.sizes import sizes_of, sizes_of_traced
 from dirax.engines.xla import Xla, engine, loop
+from dirax.program.graph import GraphTooLarge
 from dirax.schemes.step import Field, Shape, StepEquation, explicit_step, make_step_equation
 
 XLA = Xla()
@@ -285,19 +287,32 @@ def test_one_compiled_function_serves_every_run_of_an_equation():
         jax.monitoring.unregister_event_duration_listener(listener)
 
 
+def test_sizes_of_a_step_that_is_too_large_to_be_solved_in_numbers(monkeypatch):
+    """The guess says how large they may be: under a transformation JAX could not be asked any more."""
+    far = problem(OSCILLATOR, [1.0, 1e6], [1e-9], 0.1, 1, params=1.0)
+
+    def too_large(*_):
+        raise GraphTooLarge("more than 60000 scalar operations")
+
+    at = sizes._entries(far, 0.0, np)
+    assert sizes._closely(at)[0][0, 0] > 2 * sizes.FAR * 1e-9
+    monkeypatch.setattr(sizes, "StepsInNumbers", too_large)
+    assert 0.0 < sizes._closely(at)[0][0, 0] <= 2 * sizes.FAR * 1e-9
+
+
 @pytest.mark.parametrize("batch", [None, 2])
 def test_sizes_of_a_run_that_jax_traces_are_those_of_the_run(batch):
     """One by one and over axes of vmap, of the data, of the step and of a parameter."""
     state, guess = np.array([1.0, 0.5, 0.0, 1e-9]), np.array([1.0, 0.5])
     many = (lambda a: np.stack([a, 2.0 * a])) if batch else (lambda a: a)
 
-    def sizes(find, h, g, scale):
+    def sought(find, h, g, scale):
         given = problem(PENDULUMS, many(state), many(guess), h, 1, params=g, batch=batch)
         return find(given.with_numbers(state=many(state) * scale, guess=(many(guess) * scale,)))[0]
 
     h, g, scale = np.array([0.1, 0.01]), np.array([9.81, 1e3]), np.array([1.0, 1e-4])
-    apart = [[sizes(sizes_of, *one, s) for s in scale] for one in zip(h, g, strict=True)]
-    traced = lambda h, g, s: sizes(sizes_of_traced, h, g, s)
+    apart = [[sought(sizes_of, *one, s) for s in scale] for one in zip(h, g, strict=True)]
+    traced = lambda h, g, s: sought(sizes_of_traced, h, g, s)
     found = jax.jit(jax.vmap(jax.vmap(traced, in_axes=(None, None, 0)), in_axes=(0, 0, None)))(h, g, scale)
     np.testing.assert_array_equal(found, apart)
     assert len(np.unique(apart)) > 2

@@ -90,3 +90,9 @@ def test_constants_and_inputs_alone(program):
     first = int(program.inputs[0][0])
     found = Tape(graph, [first], [graph.one, first, graph.zero, graph.true])(np.array([[2.5], [3.5]]))
     np.testing.assert_array_equal(found, [[1.0, 2.5, 0.0, 1.0], [1.0, 3.5, 0.0, 1.0]])
+
+
+def test_nothing_in_and_nothing_out(program):
+    graph, first = program.graph, int(program.inputs[0][0])
+    assert Tape(graph, [first], [])(np.ones((9, 1))).shape == (9, 0)
+    np.testing.assert_array_equal(Tape(graph, [], [graph.one])(np.ones((9, 0))), np.ones((9, 1)))

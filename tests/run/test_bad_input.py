@@ -598,3 +598,27 @@ def test_params_that_no_function_takes_are_said():
     pulled = dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=lambda t, q, v, params: -params["k"] * q)
     dx.simulate(pulled, dx.DiscreteDirac(), **run)
     dx.simulate(free, dx.DiscreteDirac(), **run, events=[dx.Event(lambda q, params: q[0] - params["k"])])
+
+
+def test_what_looks_at_numbers_refuses_traced_ones():
+    spring = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params * q @ q / 2)
+    start = {"q": [1.0], "v": [0.0]}
+    calls = {
+        "dx.verify": lambda k: dx.verify(dx.simulate(spring, PLUS, params=k, step=0.1, steps=2, **start)),
+        "dx.compare": lambda k: dx.compare(spring, [PLUS], params=k, step=0.1, steps=2, **start),
+        "dx.convergence": lambda k: dx.convergence(spring, PLUS, params=k, step_sizes=[0.4, 0.2, 0.1], time=1.0, **start),
+        "dx.linearize": lambda k: dx.linearize(spring, {"q": [0.0], "v": [0.0]}, params=k),
+        "dx.sweep": lambda k: dx.sweep(
+            spring, PLUS, over={"x": [1.0]}, case=lambda x: {"q": [x]}, params=k, step=1, steps=1, to="a"
+        ),
+    }
+    for name, call in calls.items():
+        with pytest.raises(ValueError, match=rf"^{name} looks at numbers.*outside of jax\.grad, jit and vmap\."):
+            jax.jit(call)(2.0)
+
+
+def test_functions_in_params_are_refused_with_the_way_to_learn_a_network():
+    with pytest.raises(
+        TypeError, match=r"params\['act'\] is .*eqx\.filter\(module, eqx\.is_array\), and join it there by eqx\.combine"
+    ):
+        dx.simulate(dx.LagrangeDirac(lambda q, v, params: v @ v), PLUS, params={"act": jnp.tanh}, **GOOD)

@@ -35,6 +35,14 @@ def test_events_stand_beside_walls():
     assert np.max(np.abs(sol.events.of(1).t - [1.0, 1.0 + 2 * FALL])) <= 1e-13
 
 
+def test_events_beside_walls_of_a_system_that_takes_whole_numbers():
+    """JAX computes the states there, for there is no scalar program."""
+    heavy = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params.astype(float) * q[1])
+    events = [FLOOR, dx.Event(lambda q: q[1] - 0.5, direction=-1)]
+    sol = dx.simulate(heavy, dx.LagrangeDAlembert(), params=1, step=0.3, steps=6, events=events, **DROP)
+    assert np.array_equal(sol.events.index, [1, 0]) and abs(sol.events.of(0).t[0] - FALL) <= 1e-13
+
+
 @pytest.mark.parametrize("scheme", [dx.Collocation(2), dx.VariableSteps(dx.Collocation(2), lambda q: 1.0 + 0.0 * q[0])])
 def test_events_beside_walls_stay_in_a_run_that_is_extended(scheme):
     given = {"events": [FLOOR, dx.Event(lambda v: v[1], direction=-1)], "step": 0.05, **DROP}

@@ -14,6 +14,7 @@ from dirax.diagnostics.energy_lines import energy_less_work, energy_scale
 from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
 from dirax.numerics.arrays import is_whole
 from dirax.numerics.tolerances import EPSILON
+from dirax.program.user_functions import refuse_traced
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
@@ -127,6 +128,7 @@ def compare(
 
     Raises what `dx.simulate` raises for bad data; a scheme that fails midway has that in its row.
     """
+    refuse_traced("dx.compare", step, run)
     named = dict(schemes) if isinstance(schemes, Mapping) else _named(schemes)
     if not named:
         raise ValueError("schemes must name at least one scheme, but it is empty.")

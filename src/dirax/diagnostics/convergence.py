@@ -8,6 +8,7 @@ import numpy as np
 
 from dirax.diagnostics.bench.subject import Skipped
 from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
+from dirax.program.user_functions import refuse_traced
 from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
@@ -165,6 +166,7 @@ def convergence(
     scheme is exact up to roundoff or converges to something else, the order is NaN, and `notes` say what the errors are. Raises
     `ValueError` for step sizes that do not fit and for a run that fails.
     """
+    refuse_traced("dx.convergence", step_sizes, time, run)
     h = _checked(step_sizes, time)
     if "q0" in run or "q1" in run:
         raise ValueError("the points q0= and q1= belong to one step size, and here there are several: give q= with v= or p=.")

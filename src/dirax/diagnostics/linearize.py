@@ -10,6 +10,7 @@ from dirax.diagnostics.linearized_field import FieldAt, linearized_chain, linear
 from dirax.diagnostics.linearized_step import linearized_step
 from dirax.numerics.tolerances import TINY
 from dirax.program.captured import functions_in, refuse_changed
+from dirax.program.user_functions import refuse_traced
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
 from dirax.text.tables import text_table
@@ -146,6 +147,7 @@ def linearize(
     generators = list(symmetries.values()) if isinstance(symmetries, Mapping) else list(symmetries)
     if (scheme is None) != (step is None):
         raise ValueError("a scheme is linearized with its step: give scheme= and step= together, or neither.")
+    refuse_traced("dx.linearize", at, params, step)
     refuse_changed(functions_in([system, scheme]))
     wanted = ("x",) if system.lagrangian_form() is None else ("q", "v")
     if not isinstance(at, Mapping) or not set(wanted) <= set(at):

@@ -20,6 +20,7 @@ from dirax.diagnostics.verdicts import steps_of
 from dirax.engines.stopping import STALLED
 from dirax.numerics.one_thread import one_thread
 from dirax.program.memo import patience
+from dirax.program.user_functions import refuse_traced
 from dirax.solution.events import WALLS_WORK
 from dirax.solution.reconstruction import reconstruct
 from dirax.solution.solution import Solution
@@ -69,13 +70,14 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     A batch is judged by its worst trajectory, a failed run by the part that was computed, and what cannot be checked says
     so, and why: membership needs every step saved, a loaded solution its system (`dx.load(path, system=…)`).
 
-    Raises `TypeError` or `ValueError` for something that is not a Solution, for symmetries that are neither functions
-    of q nor coordinate numbers, and for a `tolerance` that is negative or no number.
+    Raises `TypeError` or `ValueError` for something that is not a Solution, for one inside `jax.grad`, `jit` or `vmap`, for
+    symmetries that are neither functions of q nor coordinate numbers, and for a `tolerance` that is negative or no number.
 
         print(dx.verify(sol, symmetries={"rotation": lambda q: jnp.array([-q[1], q[0]])}))
     """
     if not isinstance(sol, Solution):
         raise TypeError(f"sol must be a dirax Solution (from dx.simulate or dx.load), but a {type(sol).__name__} was given.")
+    refuse_traced("dx.verify", sol.t, sol.fields, sol.params)
     if tolerance is not None and not 0.0 <= float(tolerance) < np.inf:
         raise ValueError(f"tolerance must be a number that is not negative, but {tolerance!r:.80} was given.")
     generators = generators_of(sol, symmetries)

@@ -156,12 +156,16 @@ def _looked_at(at: Entries) -> list[np.ndarray]:
 
 def _closely(at: Entries) -> list[np.ndarray]:
     """The sizes looked at closely, and where they are far above the unknowns, no larger than the solution of the step allows, or
-    the guess where no solution is found: it may be far from one. Raises `GraphTooLarge`."""
+    the guess, which may be far from one, where no solution is found or the step is too large to be solved in numbers. Raises
+    `GraphTooLarge` where the sizes themselves are too large."""
     found = close_sizes(at)
     far = [np.any(a > FAR * np.abs(u), axis=1) for a, u in zip(found, at.guesses, strict=True)]
     if not np.any(far):
         return found
-    _, sizes, good = StepsInNumbers(None, at.program).solved(at.state, at.guesses, at.t, at.h, at.leaves)
+    try:
+        _, sizes, good = StepsInNumbers(None, at.program).solved(at.state, at.guesses, at.t, at.h, at.leaves)
+    except GraphTooLarge:
+        sizes, good = at.guesses, np.zeros(len(at.state), bool)
     most = [np.where(good[:, None], MOST * a, FAR * np.abs(u)) for a, u in zip(sizes, at.guesses, strict=True)]
     return [np.where(b > 0.0, np.minimum(a, power_of_two(b)), a) for a, b in zip(found, most, strict=True)]
 

@@ -294,6 +294,14 @@ def is_traced(*trees: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def refuse_traced(what: str, *trees: Any) -> None:
+    """Raise `ValueError` where a leaf is a JAX tracer, for `what` looks at numbers."""
+    if is_traced(*trees):
+        raise ValueError(
+            f"{what} looks at numbers, but was given values that JAX traces: call it outside of jax.grad, jit and vmap."
+        )
+
+
 def check_finite(name: str, value: Any) -> None:
     """Raise `ValueError`, naming the entry, when a concrete numerical leaf of `value` holds NaN or infinity."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(value):

@@ -300,6 +300,8 @@ def arrays_of_params(params):
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         if not is_number(leaf) and not _is_boolean(leaf):
             found = f"{leaf!r:.60}: use such a value in the system's functions directly"
+            if callable(leaf):
+                found += " (of an equinox module give eqx.filter(module, eqx.is_array), and join it there by eqx.combine)"
             if jnp.issubdtype(getattr(leaf, "dtype", object), jax.dtypes.prng_key):
                 found = "a key of JAX: pass jax.random.key_data(key), and have jax.random.wrap_key_data in the system's functions"
             raise TypeError(f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {found}.")

@@ -108,7 +108,8 @@ class Entries:
         return [np.broadcast_to(leaf, (len(lanes), *leaf.shape)) for leaf in self.leaves]
 
     def __call__(self, function: Callable, lanes: np.ndarray, values: Any, *key: Any) -> Any:
-        """`function(values, params)` of every entry, a pytree of arrays; `key` is equal for functions that are."""
+        """`function(values, params)` of every entry, a pytree of arrays that may be written to; `key` is equal for functions that
+        are."""
         leaves, structure = jax.tree.flatten(values)
         if not len(lanes):  # one entry, for the shapes of what there is none of
             one = [np.zeros((1, *np.shape(leaf)[1:])) for leaf in leaves]
@@ -126,7 +127,7 @@ class Entries:
             more = np.minimum(np.arange(1 << max(size - 1, 0).bit_length()), max(size - 1, 0))
             given = [jnp.asarray(a[more]) for a in arrays]
             found = jax.tree.map(
-                lambda a: np.asarray(a)[:size], compiled_call(Keyed(_each(flat), key, structure, self.structure), *given)
+                lambda a: np.array(a)[:size], compiled_call(Keyed(_each(flat), key, structure, self.structure), *given)
             )
         return found
 

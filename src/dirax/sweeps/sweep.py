@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from dirax.engines.engine import AbstractEngine
+from dirax.program.user_functions import refuse_traced
 from dirax.run.scalars import count, finite, flag, positive, whole_number
 from dirax.run.validate import check_kinds, engine_from
 from dirax.schemes.step import AbstractScheme
@@ -100,6 +101,7 @@ def sweep(
     Raises `TypeError` and `ValueError` for wrong arguments; where `case` or `keep` is wrong, naming the point; and `OSError`
     where the store cannot be written or another call is filling it. What was done is kept.
     """
+    refuse_traced("dx.sweep", over, params, step)
     path = path_of(to, "to", "study.zarr").absolute()
     refuse_place(path)
     check_kinds(system, scheme)

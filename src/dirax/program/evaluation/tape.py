@@ -180,11 +180,11 @@ def write(table: np.ndarray, places: np.ndarray, given: np.ndarray) -> None:
         return
     if more := blocks * LANES - entries:
         given = np.concatenate([given, np.broadcast_to(given[-1:], (more, given.shape[1]))])
-    table[:, places] = given.reshape(blocks, LANES, -1).transpose(0, 2, 1)
+    table[:, places] = given.reshape(blocks, LANES, len(places)).transpose(0, 2, 1)
 
 
 def read(table: np.ndarray, places: np.ndarray, entries: int) -> np.ndarray:
     """What stands there, (entries, count)."""
     if entries == 1:
         return table[0, places, 0][None]
-    return table[:, places].transpose(0, 2, 1).reshape(-1, len(places))[:entries]
+    return table[:, places].transpose(0, 2, 1).reshape(len(table) * LANES, len(places))[:entries]
