@@ -360,7 +360,11 @@ class StepsInNumbers:
             found[:, :, -1] *= h[some][:, None]
             return self._read(known, e.residual), found
 
-        return followed(slopes, guess, sizes)
+        unknowns, reached = followed(slopes, guess, sizes)
+        orientation = lambda u: np.linalg.slogdet(self._linearized(index, self._values(index, u, states, at))[0])[0]
+        beyond = np.isfinite(unknowns[:, 0]) & (orientation(guess) != orientation(unknowns))
+        unknowns[beyond], reached[beyond] = np.nan, 0.0  # across a place where the equations are singular
+        return unknowns, reached
 
     def _judged(self, stage: int, u, states, at, inverses: Inverses) -> tuple[np.ndarray, np.ndarray]:
         """The sizes of unknowns, as of `solved`, and whether the equations are solved, (states,): to roundoff of their terms,
