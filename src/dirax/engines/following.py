@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-BEGIN = 1 / 32
+BEGIN = 2.0**-10
 """The part of the step at which following begins."""
 
 MOST = 200
