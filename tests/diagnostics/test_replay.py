@@ -215,7 +215,7 @@ def test_a_network_with_a_diode_is_replayed():
 ROLLING = dx.LagrangeDirac(
     lambda q, v: v @ v / 2 - q @ q / 2 - q[0] ** 4, one_forms=lambda q: jnp.array([[-0.3, jnp.sin(q[0]), 1.0]])
 )
-RUNS_OF_SEVERAL_ROOTS = [(MIDPOINT, 1.5, 54, 160), (MIDPOINT, 1.0, 26, 200)]
+RUNS_OF_SEVERAL_ROOTS = [(MIDPOINT, 1.5, 54, 160), (MIDPOINT, 1.0, 13, 200), (MIDPOINT, 1.0, 26, 200)]
 
 
 @pytest.mark.parametrize(("scheme", "h", "seed", "steps"), RUNS_OF_SEVERAL_ROOTS)

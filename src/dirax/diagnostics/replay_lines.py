@@ -161,7 +161,10 @@ class _Comparison:
         )
         here = flat(again.here)
         if again.there is not None:
-            return here, flat(again.there)
+            there = flat(again.there)
+            for i, number in self.held.items():  # known also where the step after has no solution
+                there[:, number] = np.where(np.isnan(there[:, number]), again.after[:, i], there[:, number])
+            return here, there
         there = np.full_like(here, np.nan)
         for i, number in self.held.items():
             there[:, number], here[:, number] = again.after[:, i], np.nan
