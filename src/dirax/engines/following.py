@@ -5,6 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from dirax.numerics.inverses import solved
+
 BEGIN = 2.0**-10
 """The part of the step at which following begins."""
 
@@ -59,7 +61,7 @@ def followed(slopes: Slopes, unknowns: np.ndarray, sizes: np.ndarray) -> tuple[n
                 break
             residual, matrices[left] = bordered(some[left], y[left], normal[left])
             off = np.einsum("nk,nk->n", normal[left], y[left] - start[left])
-            change = _solved(matrices[left], np.append(residual, off[:, None], axis=1))
+            change = solved(matrices[left], np.append(residual, off[:, None], axis=1))
             y[left] -= change
             found[left] = np.max(np.abs(change), axis=1) < near[left]
         return y, matrices, found
@@ -71,7 +73,7 @@ def followed(slopes: Slopes, unknowns: np.ndarray, sizes: np.ndarray) -> tuple[n
         if not len(some := np.flatnonzero(going)):
             break
         matrices[some, k] = direction[some]
-        along = _solved(matrices[some], np.broadcast_to(last, (len(some), k + 1)))
+        along = solved(matrices[some], np.broadcast_to(last, (len(some), k + 1)))
         direction[some] = along = along / np.linalg.norm(along, axis=1, keepdims=True)
         to_end = (1.0 - y[some, k]) / along[:, k]
         ends = (along[:, k] > 0.0) & (to_end <= distance[some])  # the last point is at the whole step
@@ -93,14 +95,3 @@ def followed(slopes: Slopes, unknowns: np.ndarray, sizes: np.ndarray) -> tuple[n
         going[here] = ~turned & ~ends[found]
         going[some[~found]] &= distance[some[~found]] >= SHORTEST
     return np.where(reached[:, None] == 1.0, y[:, :k] * scale[:, :k], np.nan), reached
-
-
-def _solved(matrices: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Solutions (n, k) side by side, NaN of singular matrices."""
-    try:
-        return np.linalg.solve(matrices, sides[..., None])[..., 0]
-    except np.linalg.LinAlgError:
-        regular = np.linalg.slogdet(matrices)[0] != 0.0
-        found = np.full(sides.shape, np.nan)
-        found[regular] = np.linalg.solve(matrices[regular], sides[regular][..., None])[..., 0]
-        return found

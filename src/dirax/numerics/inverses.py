@@ -62,6 +62,19 @@ def _scaled_inverses(matrices: np.ndarray, rows: np.ndarray, columns: np.ndarray
     return found / np.swapaxes(columns, 1, 2) / np.swapaxes(rows, 1, 2), grown
 
 
+@np.errstate(all="ignore")
+def solved(matrices: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """Solutions of linear systems (matrices, k, k) with one right-hand side (matrices, k) or several (matrices, k, r); NaN where
+    a matrix is singular."""
+    columns = sides if sides.ndim == matrices.ndim else sides[..., None]
+    try:
+        found = np.linalg.solve(matrices, columns)
+    except np.linalg.LinAlgError:
+        regular, found = np.linalg.slogdet(matrices)[0] != 0.0, np.full(columns.shape, np.nan)
+        found[regular] = np.linalg.solve(matrices[regular], columns[regular])
+    return found.reshape(sides.shape)
+
+
 def applied(inverses: Inverses, vectors: np.ndarray) -> np.ndarray:
     """A⁻¹v of vectors (matrices, k)."""
     if inverses.ndim > 1:

@@ -31,40 +31,33 @@ def differentiated(call: str, values: Any) -> Iterator[None]:
         ) from error
 
 
+def _or(first: Callable, other: Callable, kind: type[Exception], word: str) -> Any:
+    """What the first gives, or what the other does where the first raises an error of this kind with this word."""
+    try:
+        return first()
+    except kind as error:
+        if word not in str(error):
+            raise
+    return other()
+
+
 def gradient_by_jax(function: Callable, argnums: int | tuple[int, ...]) -> Callable:
     """`jax.grad`, and in forward mode of what has a loop of unknown length, which JAX does not take backwards."""
-
-    def found(*values):
-        try:
-            return jax.grad(function, argnums)(*values)
-        except ValueError as error:
-            if "while_loop" not in str(error):
-                raise
-            return jax.jacfwd(function, argnums)(*values)
-
-    return found
+    backwards, forwards = jax.grad(function, argnums), jax.jacfwd(function, argnums)
+    return lambda *values: _or(lambda: backwards(*values), lambda: forwards(*values), ValueError, "while_loop")
 
 
 def jacobian_by_jax(function: Callable, argnums: int | tuple[int, ...] = 0) -> Callable:
     """`jax.jacfwd`, and in reverse mode of what has a derivative of the user's own in reverse mode alone (`jax.custom_vjp`)."""
-
-    def found(*values):
-        try:
-            return jax.jacfwd(function, argnums)(*values)
-        except TypeError as error:
-            if "custom_vjp" not in str(error):
-                raise
-            return jax.jacrev(function, argnums)(*values)
-
-    return found
+    forwards, backwards = jax.jacfwd(function, argnums), jax.jacrev(function, argnums)
+    return lambda *values: _or(lambda: forwards(*values), lambda: backwards(*values), TypeError, "custom_vjp")
 
 
 def along_by_jax(function: Callable, point: tuple, direction: tuple) -> Any:
     """`jax.jvp(function, point, direction)[1]` of a function of arrays with one array, where `jacobian_by_jax` takes it."""
-    try:
-        return jax.jvp(function, point, direction)[1]
-    except TypeError as error:
-        if "custom_vjp" not in str(error):
-            raise
+
+    def by_slopes():
         slopes = jax.jacrev(function, tuple(range(len(point))))(*point)
         return sum(jnp.tensordot(slope, x, jnp.ndim(x)) for slope, x in zip(slopes, direction, strict=True))
+
+    return _or(lambda: jax.jvp(function, point, direction)[1], by_slopes, TypeError, "custom_vjp")

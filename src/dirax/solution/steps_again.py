@@ -184,6 +184,11 @@ class StepsAgain:
         except (UnsupportedPrimitive, GraphTooLarge):
             return None
 
+    @cached_property
+    def about(self) -> Any:
+        """Near what the velocities of rows are; None where they are not searched."""
+        return self.sol.row_fields.get("about")
+
     @property
     def key(self) -> tuple:
         """Equal for runs of one equation."""
@@ -222,8 +227,8 @@ class StepsAgain:
         if sol.rows > 1:
             of_steps = {name: a for name, a in sol.fields.items() if sol.field_info[name].place == "step"}
             row |= {name: take(a, np.minimum(rows, sol.rows - 2)) for name, a in of_steps.items()}
-        if "about" in (near := sol.row_fields):
-            row["about"] = take(near["about"], rows)
+        if self.about is not None:
+            row["about"] = take(self.about, rows)
         return self.begin(lanes, row, t)
 
     def begin(self, lanes: np.ndarray, row: dict[str, np.ndarray], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

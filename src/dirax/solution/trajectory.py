@@ -17,7 +17,7 @@ from dirax.program.user_functions import is_traced
 from dirax.schemes.step import CLOCK, Field, Shape, make_step_equation
 from dirax.text.representation import counted, fields_html
 
-AT_ROW = 1e-6
+BESIDE_ROW = 1e-6
 """Part of a step by which a wall may be hit off a row and still at it."""
 
 BLOCK = 2**16
@@ -204,7 +204,7 @@ class Trajectory:
         found = np.zeros((self.batch or 1, max(self.rows - 1, 0)), bool)
         if self.impacts is None or is_traced(self.impacts.t):
             return found
-        lanes, times, near = self.impacts.lane, self.impacts.t, AT_ROW * self.step
+        lanes, times, near = self.impacts.lane, self.impacts.t, BESIDE_ROW * self.step
         for lane in np.unique(lanes):
             for t in (times[lanes == lane] - near, times[lanes == lane] + near):
                 found[lane, np.clip(np.searchsorted(self.times[lane], t, side="right") - 1, 0, self.rows - 2)] = True

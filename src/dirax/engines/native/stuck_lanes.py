@@ -48,11 +48,8 @@ def with_present_sizes(lanes: Lanes | OneLane, made: Kernels) -> None:
             return
         record.put_sizes(own, sizes)
         own[:, record.status] = OK
-        before, chosen = table[failed[more]], failed[more]
-        after = lanes.attempt(chosen, made, own[more])
-        further = after[:, record.completed] > own[more, record.completed]
-        lanes.put(chosen, np.where(further[:, None], after, before))
-        table, failed = lanes.table(), chosen[further & (after[:, record.status] == NOT_CONVERGED)]
+        chosen, status = _further(lanes, made, failed[more], own[more])
+        table, failed = lanes.table(), chosen[status == NOT_CONVERGED]
 
 
 def by_following(lanes: Lanes | OneLane, made: Kernels) -> int:
@@ -79,16 +76,23 @@ def by_following(lanes: Lanes | OneLane, made: Kernels) -> int:
         found = steps.step(own[:, record.state], guesses, p.t0 + (p.first_step + done) * p.h, p.h, params, alone=True)
         if not np.any(found.good):
             break
-        failed, before, own, done = failed[found.good], own[found.good].copy(), own[found.good], done[found.good]
+        own = own[found.good]
         for i, unknowns in enumerate(found.unknowns):
             own[:, record.unknowns(i, stages[i])] = unknowns[found.good]
         own[:, record.differences], own[:, record.status] = 0.0, OK
-        after = lanes.attempt(failed, made, own)
-        further = after[:, record.completed] > done
-        lanes.put(failed, np.where(further[:, None], after, before))
-        count += int(np.sum(further))
-        failed = failed[further & np.isin(after[:, record.status], UNSOLVED)]
+        chosen, status = _further(lanes, made, failed[found.good], own)
+        count, failed = count + len(chosen), chosen[np.isin(status, UNSOLVED)]
     return count
+
+
+def _further(lanes: Lanes | OneLane, made: Kernels, some: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Have trajectories go on from these records: which came to another step, and what became of them then; the others stay as
+    they were."""
+    after, record = lanes.attempt(some, made, own), lanes.record
+    further = after[:, record.completed] > own[:, record.completed]
+    if np.any(further):
+        lanes.put(some[further], after[further])
+    return some[further], after[further, record.status]
 
 
 def _with_weak_entries(lanes: Lanes | OneLane, made: Kernels) -> tuple[list[str], Kernels]:

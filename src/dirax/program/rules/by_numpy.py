@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
+from dirax.numerics.inverses import solved
 from dirax.numerics.newton import damped_step, sizes_of_unknowns
 from dirax.numerics.tolerances import EQUATION_RANK
 from dirax.program.evaluation.in_numpy import Slopes, Values
@@ -136,19 +137,7 @@ def while_(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operan
 
 @numpy_rule("dirax_solve")
 def solved_by_numpy(made: ScalarProgram, interpreter: Interpreter, equation: Any, matrix: Nodes, right: Nodes) -> list[Nodes]:
-    return made.between([matrix, right], [right.shape], lambda operands: [_solved(*operands)], "solve")
-
-
-def _solved(matrices: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    columns = sides if sides.ndim == matrices.ndim else sides[..., None]
-    try:
-        found = np.linalg.solve(matrices, columns)
-    except np.linalg.LinAlgError:  # one of them is singular
-        found = np.full(columns.shape, np.nan)
-        for k, (matrix, column) in enumerate(zip(matrices, columns, strict=True)):
-            if np.all(np.isfinite(matrix)) and np.linalg.det(matrix) != 0.0:
-                found[k] = np.linalg.solve(matrix, column)
-    return found.reshape(sides.shape)
+    return made.between([matrix, right], [right.shape], lambda operands: [solved(*operands)], "solve")
 
 
 @numpy_rule("dirax_pseudo_inverse")
