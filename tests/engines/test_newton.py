@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+import scipy.optimize
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -56,6 +57,29 @@ def test_linear_equations_are_solved_by_the_first_update():
 def test_equations_without_a_root_are_said_not_to_converge(equation, guess):
     _, updates, converged = root(equation, guess)
     assert not converged and updates <= 50
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_an_iteration_that_comes_from_far_away_is_not_done_yet(engine):
+    """A wall of exponentials that is cut off, met at full speed: the first update leads to 1e20, the next back to about zero,
+    and the third is small beside it. Whoever takes that for contraction is wrong by 2 %."""
+    force = lambda v: -1e3 * (np.exp(np.clip(v / 0.02, -100.0, 45.0)) - 1.0)
+    traced = lambda t, q, v: -1e3 * (jnp.exp(jnp.clip(v / 0.02, -100.0, 45.0)) - 1.0)
+    system, h, q, p = dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=traced), 0.05, 0.0, 1.0
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), q=[0.0], v=[1.0], step=h, steps=4, engine=engine)
+    assert sol.ok
+    for found in sol.q[1:, 0]:
+        velocity = scipy.optimize.brentq(lambda v, p=p: v - p - h / 2 * force(v), -1.0, 2.0, xtol=1e-18, rtol=1e-15)
+        q, p = q + h * velocity, velocity + h / 2 * force(velocity)
+        assert found == pytest.approx(q, rel=1e-10, abs=1e-15)
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_a_linearization_that_leads_nowhere_says_nothing_about_sizes(engine):
+    """From rest, by a force that is constant at the guess and 1e22 times weaker where that leads: Newton goes to and fro."""
+    force = lambda t, q, v: -1e3 * (jnp.exp(jnp.clip((v + 1.0) / 0.02, -100.0, 50.0)) - 1.0)
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2, forces=force)
+    assert not dx.simulate(system, dx.LagrangeDAlembert(), q=[0.0], v=[0.0], step=0.05, steps=3, engine=engine).ok
 
 
 def test_an_equation_full_of_roundoff_stops_at_its_floor():

@@ -2,8 +2,9 @@
 has to be found.
 
 The inverse of the Jacobian is bounded by the sizes of its triangular factors, whose pivots are those of a kernel. There is doubt
-where these are too small, and where an unknown is not known to 4·STALLED of what it comes to: `sizes.py` looks closer then, as it
-does for trajectories at which Newton's method stops too early.
+where these are too small, where an unknown is not known to 4·STALLED of what it comes to, and where the step is so far from
+linear that what solves its linearization says nothing: `sizes.py` looks closer then, as it does for trajectories at which
+Newton's method stops too early.
 """
 
 from dataclasses import dataclass
@@ -36,6 +37,9 @@ OFF, FAR = 2.0**-4, 2.0**16
 """Residuals of a first guess that is off, beside their terms; and sizes of unknowns there, beside their values, that may be those
 of the guess alone."""
 
+LEFT = 0.5
+"""What is left of a residual, or OFF of its terms, at the solution of a linearization that says how large unknowns are."""
+
 SOLVED = 1e-10
 """What a solution with good pivots leaves of a right-hand side, relative to its terms."""
 
@@ -67,7 +71,8 @@ class Linearized:
 
 class FirstSizes:
     """The sizes of one equation as nodes of a graph, which gains them: of the `unknowns`, and `sure`, 1 where there is no
-    doubt and 0 where there is; `order` is that of the pivots."""
+    doubt and 0 where there is; `order` is that of the pivots. Where `asked` is 1, `sure` holds if the residual at the `solution`
+    of the linearized step is nowhere above `most`."""
 
     def __init__(self, g: Graph, given: Linearized, order: list[list[tuple[int, int]]]):
         unknowns, residual, matrix, rounded, h = given.unknowns, given.residual, given.matrix, given.terms, given.h
@@ -77,7 +82,8 @@ class FirstSizes:
         rows = [{j: n for j, n in enumerate(row) if n != g.zero} for row in matrix]
         factors = Factors(g, matrix, order)
         change = factors.solve(g, residual)
-        solution = [size(g.sub(u, d)) for u, d in zip(unknowns, change, strict=True)]
+        self.solution = [g.sub(u, d) for u, d in zip(unknowns, change, strict=True)]
+        solution = [size(u) for u in self.solution]
         products = lambda row, values: [g.mul(size(row[j]), value) for j, value in enumerate(values) if j in row]
         terms = [total([e, *products(row, solution)]) for e, row in zip(rounded, rows, strict=True)]
         known = factors.bounds(g, terms)
@@ -100,13 +106,19 @@ class FirstSizes:
             [g.make("lt", g.mul(g.constant(OFF), e), size(r)) for e, r in zip(rounded, residual, strict=True)],
             g.false,
         )
+        asked = g.false
         for a, u, v in zip(own, unknowns, solution, strict=True):
-            large = g.make("lt", g.mul(g.constant(FAR), g.make("max", size(u), v)), a)
-            sure = g.make("and", sure, g.make("not", g.make("and", off, large)))
+            large = lambda known, a=a: g.make("and", off, g.make("lt", g.mul(g.constant(FAR), known), a))
+            sure = g.make("and", sure, g.make("not", large(g.make("max", size(u), v))))
+            asked = g.make("or", asked, large(size(u)))
         for r, row in zip(residual, matrix, strict=True):
             of_row = [g.mul(a, d) for a, d in zip(row, change, strict=True)]
             sure = below(size(g.sub(total(of_row), r)), g.mul(g.constant(SOLVED), total([size(r), *map(size, of_row)])))
-        self.unknowns, self.sure = own, g.select(sure, g.one, g.zero)
+        self.unknowns, self.sure, self.asked = own, g.select(sure, g.one, g.zero), g.select(asked, g.one, g.zero)
+        self.most = [
+            g.make("max", g.mul(g.constant(OFF), e), g.mul(g.constant(LEFT), size(r)))
+            for e, r in zip(rounded, residual, strict=True)
+        ]
 
     def _matters(self, where: list[tuple[int, int]]) -> int:
         """The least size at which an unknown matters in an equation with these terms and this derivative by it, or ∞."""
@@ -119,14 +131,17 @@ class FirstSizes:
     @property
     def outputs(self) -> list[int]:
         """All of them."""
-        return [*self.unknowns, self.sure]
+        return [*self.unknowns, self.sure, self.asked, *self.solution, *self.most]
 
 
 _known: Memo[tuple[FirstSizes, Linearized]] = Memo(KEPT)
 
 
-def first_sizes(program: StepProgram, stage: int, u: np.ndarray, state, t, h: np.ndarray, leaves) -> np.ndarray:
-    """The outputs of a stage of a step, (entries, k + 1); the arguments have an axis of entries."""
+def first_sizes(
+    program: StepProgram, stage: int, u: np.ndarray, state, t, h: np.ndarray, leaves
+) -> tuple[np.ndarray, np.ndarray]:
+    """The sizes of the unknowns of a stage of a step, (entries, k), and whether they are sure, (entries,); the arguments have an
+    axis of entries."""
     matrix, order = elimination(program, program.stages[stage][0])
 
     def made() -> tuple[FirstSizes, Linearized]:
@@ -144,4 +159,12 @@ def first_sizes(program: StepProgram, stage: int, u: np.ndarray, state, t, h: np
             known.bind(nodes_array(own), array)
         return [known.read(nodes_array(first.outputs))]
 
-    return in_parts(part, [u, h, residual, slopes[..., :-1], slopes[..., -1], terms])[0]
+    (found,) = in_parts(part, [u, h, residual, slopes[..., :-1], slopes[..., -1], terms])
+    k = u.shape[1]
+    sizes, sure, (solution, most) = found[:, :k], found[:, k] == 1.0, np.split(found[:, k + 2 :], 2, axis=1)
+    asked = np.flatnonzero(sure & (found[:, k + 1] == 1.0))
+    if len(asked):
+        at = (a[asked] for a in (state, t, h, leaves, np.abs(solution)))
+        (after,) = stage_look(program, stage)(solution[asked], *at, (RESIDUAL,))
+        sure[asked] = np.all(np.abs(after) <= most[asked], axis=1)
+    return sizes, sure

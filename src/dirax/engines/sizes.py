@@ -144,9 +144,9 @@ def _looked_at(at: Entries) -> list[np.ndarray]:
     found, sure = [], np.ones(len(at.state), bool)
     for stage, ((_, fraction), u) in enumerate(zip(at.stages, at.guesses, strict=True)):
         if u.shape[1]:
-            values = first_sizes(at.program, stage, u, at.state, at.t, fraction * at.h, at.leaves)
-            found.append(power_of_two(values[:, :-1]))
-            sure &= values[:, -1] > 0.0
+            sizes, known = first_sizes(at.program, stage, u, at.state, at.t, fraction * at.h, at.leaves)
+            found.append(power_of_two(sizes))
+            sure &= known
         else:
             found.append(np.ones(u.shape))
     if np.all(sure):
@@ -156,18 +156,19 @@ def _looked_at(at: Entries) -> list[np.ndarray]:
 
 def _closely(at: Entries) -> list[np.ndarray]:
     """The sizes looked at closely, and where they are far above the unknowns, no larger than the solution of the step allows, or
-    the guess, which may be far from one, where no solution is found or the step is too large to be solved in numbers. Raises
-    `GraphTooLarge` where the sizes themselves are too large."""
+    where none is found the guess, which may be far from one; or, where the step is too large to be solved in numbers, what is not
+    zero of it. Raises `GraphTooLarge` where the sizes themselves are too large."""
     found = close_sizes(at)
     far = [np.any(a > FAR * np.abs(u), axis=1) for a, u in zip(found, at.guesses, strict=True)]
     if not np.any(far):
         return found
     try:
-        _, sizes, good = StepsInNumbers(None, at.program).solved(at.state, at.guesses, at.t, at.h, at.leaves)
+        _, sizes, good = StepsInNumbers(None, at.program).solved(at.state, at.guesses, at.t, at.h, at.leaves, follow=True)
+        most = [np.where(good[:, None], MOST * a, FAR * np.abs(u)) for a, u in zip(sizes, at.guesses, strict=True)]
+        bounded = ~good[:, None]
     except GraphTooLarge:
-        sizes, good = at.guesses, np.zeros(len(at.state), bool)
-    most = [np.where(good[:, None], MOST * a, FAR * np.abs(u)) for a, u in zip(sizes, at.guesses, strict=True)]
-    return [np.where(b > 0.0, np.minimum(a, power_of_two(b)), a) for a, b in zip(found, most, strict=True)]
+        most, bounded = [FAR * np.abs(u) for u in at.guesses], np.zeros((len(at.state), 1), bool)
+    return [np.where(bounded | (b > 0.0), np.minimum(a, power_of_two(b)), a) for a, b in zip(found, most, strict=True)]
 
 
 def _on_host(p: Problem) -> Sizes | None:

@@ -205,12 +205,19 @@ class StepsInNumbers:
 
     @np.errstate(all="ignore")
     def solved(
-        self, states: np.ndarray, guesses: Sequence[np.ndarray], t: np.ndarray, h: float | np.ndarray, params: np.ndarray
+        self,
+        states: np.ndarray,
+        guesses: Sequence[np.ndarray],
+        t: np.ndarray,
+        h: float | np.ndarray,
+        params: np.ndarray,
+        follow: bool = False,
     ) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
-        """A step of each state: the unknowns of each part, their sizes (states, k), which are their values and what a typical
-        rounding of each term of the equations comes to, and whether the equations are solved to roundoff of these, (states,)."""
+        """A step of each state, followed as of `step`: the unknowns of each part, their sizes (states, k), which are their values
+        and what a typical rounding of each term of the equations comes to, and whether the equations are solved to roundoff of
+        these, (states,)."""
         near = self.nothing_near(len(t))
-        made = self.step(states, guesses, t, h, params, near=near, follow=False)
+        made = self.step(states, guesses, t, h, params, near=near, follow=follow)
         sizes, good = [], made.good
         for stage, ((_, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
             of_part, solved = self._judged(stage, u, state, (t, np.full(len(t), fraction * h), params), near.inverses[stage])

@@ -1,7 +1,8 @@
 """When Newton's method stops, in every engine: at the roundoff floor, and not at a tolerance.
 
 An update is measured by its largest |change_i| / (|u_i| + size_i), with the sizes of `sizes.py`, whose ε-th part is the
-roundoff of the unknowns, so that units do not matter; and its ratio to the one before says how the iteration contracts.
+roundoff of the unknowns, so that units do not matter; and its ratio to the one before says how the iteration contracts, to 1
+where that was larger, since coming from far away says nothing.
 With a Jacobian from a distance e of the root the error shrinks by 2Ce in an update, C the curvature, and Ce is the ratio of the
 first two updates: what an update leaves is at most 2·ratio·update. The iteration has reached its floor where
 

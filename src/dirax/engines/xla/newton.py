@@ -121,7 +121,7 @@ def newton(
         u = s.u - change
         of_size, of_own = (jnp.abs(change) / (jnp.abs(u) + share * size) for share in (1.0, OWN))
         update, own = folded((of_size, jnp.maximum, 0.0), (of_own, jnp.maximum, 0.0))
-        ratio = jnp.where(s.updates > 0, update / s.update, jnp.nan)
+        ratio = jnp.where(s.updates > 0, update / jnp.minimum(s.update, 1.0), jnp.nan)
         return Search(u, jnp.stack([update, ratio, s.updates + 1, own]))
 
     def unfinished(s: Search):

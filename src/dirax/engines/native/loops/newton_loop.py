@@ -175,7 +175,7 @@ class NewtonLoop:
         update = e.select(e.compare("uno", total, total), e.const(float("nan")), update)
         count = b.load(e.real, self._number)
         first = e.compare("oeq", count, e.const(0.0))
-        ratio = e.select(first, e.const(float("nan")), e.div(update, b.load(e.real, self._update)))
+        ratio = e.select(first, e.const(float("nan")), e.max(e.div(update, b.load(e.real, self._update)), update))
         self._take(old, new, now)
         b.store(e.real, e.select(now, update, b.load(e.real, self._update)), self._update)
         count = e.select(now, e.add(count, e.const(1.0)), count)

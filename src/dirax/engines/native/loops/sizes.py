@@ -55,17 +55,31 @@ def _define_sizes(plan: Plan, module: Module, width: int, index: int) -> None:
     e = Emitter(b, width)
     places = lambda base, count: [b.at(e.real, base, i) for i in range(count)]
     load = lambda pointer: b.load(e.real, pointer)
-    region = Region(e, plan.graph)
-    region.bind(plan.shared.t, "%t")
-    region.bind(plan.shared.h, "%h")
-    given = [*plan.shared.params, *equation.state, *equation.unknowns]
-    at = [*places("%params", len(plan.shared.params)), *places("%lanes", record.state_size), *places("%unknowns", k)]
-    for node, pointer in zip(given, at, strict=True):
-        region.bind(node, load(pointer))
+    given = [*plan.shared.params, *equation.state]
+    at = [*places("%params", len(plan.shared.params)), *places("%lanes", record.state_size)]
+    known = {plan.shared.t: "%t", plan.shared.h: "%h"} | {node: load(p) for node, p in zip(given, at, strict=True)}
+
+    def where(unknowns: list[str]) -> Region:
+        region = Region(e, plan.graph)
+        for node, value in (known | dict(zip(equation.unknowns, unknowns, strict=True))).items():
+            region.bind(node, value)
+        return region
+
+    region = where([load(pointer) for pointer in places("%unknowns", k)])
     found = FirstSizes(plan.graph, Linearized.of(plan.graph, equation, plan.shared.h, correction.jacobian), correction.order)
     region.require(found.outputs)
     status = b.at(e.real, "%lanes", record.status)
-    sure = e.compare("oeq", region.value(found.sure), e.const(1.0))
+    one = lambda node: e.compare("oeq", region.value(node), e.const(1.0))
+    verdict, asked = b.alloca(e.bool), e.both(one(found.sure), one(found.asked))
+    b.store(e.bool, one(found.sure), verdict, 1)
+    with b.when(e.any(asked)):
+        there = where([region.value(node) for node in found.solution])
+        there.require(equation.residual)
+        holds = e.true
+        for r, most in zip(equation.residual, found.most, strict=True):
+            holds = e.both(holds, e.compare("ole", e.abs(there.value(r)), region.value(most)))
+        b.store(e.bool, e.both(one(found.sure), e.either(e.invert(asked), holds)), verdict, 1)
+    sure = b.load(e.bool, verdict, 1)
     new = [_power_of_two(e, region.value(node)) for node in found.unknowns]
     new.append(e.select(sure, load(status), e.const(float(DOUBTFUL))))
     for value, pointer in zip(new, [*places("%sizes", k), status], strict=True):

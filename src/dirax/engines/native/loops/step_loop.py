@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+from dirax.engines.contract import OK
 from dirax.engines.native.functions.far_reduction import add_far_reduction
 from dirax.engines.native.ir.emitter import Body, Emitter, Module
 from dirax.engines.native.ir.lower import Region
@@ -111,20 +112,58 @@ def _emit_steps(block: Block, give_back: Callable[[], None]) -> None:
 
 
 def _emit_step(block: Block, number: str, saves: str) -> None:
-    """Every stage of step `number`, whose row is saved where `saves` holds."""
-    plan, frame, e = block.plan, block.frame, block.emitter
+    """Every stage of step `number`, whose row is saved where `saves` holds: in lanes in which that fails once more, from the
+    unknowns of the step before as they are, which are nearer where these jump to and fro."""
+    frame, e = block.frame, block.emitter
     b, running = e.body, block.running()
     frame.stores(frame.loads(frame.carried), frame.kept)
     count = e.add(e.splat(b.put("sitofp i64 %offset to double")), b.load(e.real, frame.completed))
     time = e.add(e.splat("%t0"), e.mul(count, e.splat("%h")))
+    counted = frame.iterations, frame.max_residual
+    before = frame.loads(counted)
+    begin, again, done = b.fresh(), b.fresh(), b.fresh()
+    b.branch(begin)
+    b.label(begin)
+    _emit_stages(block, time, running, number, saves)
+    failed = e.both(running, e.invert(block.running()))
+    with b.when(e.any(failed)):
+        failed = e.both(failed, _zero_differences(block, failed))
+        b.branch_if(e.any(failed), again, done)
+        b.label(again)
+        frame.stores(frame.loads(frame.kept), frame.carried)
+        frame.stores(before, counted)
+        b.store(e.real, e.select(running, e.const(float(OK)), b.load(e.real, frame.status)), frame.status)
+        b.branch(begin)
+        b.label(done)
+    _commit(block, running)
+
+
+def _zero_differences(block: Block, lanes: str) -> str:
+    """Have no differences in these lanes any more; in which there were some."""
+    frame, e = block.frame, block.emitter
+    b = e.body
+    there = b.alloca(e.bool)
+    b.store(e.bool, e.false, there, 1)
+    with b.loop(0, block.plan.record.kept) as i:
+        for base in (frame.slopes, frame.bends):
+            place = b.at(e.real, base, i)
+            value = b.load(e.real, place)
+            own = e.both(lanes, e.compare("une", value, e.const(0.0)))
+            b.store(e.bool, e.either(b.load(e.bool, there, 1), own), there, 1)
+            b.store(e.real, e.select(own, e.const(0.0), value), place)
+    return b.load(e.bool, there, 1)
+
+
+def _emit_stages(block: Block, time: str, running: str, number: str, saves: str) -> None:
+    """The stages of a step one after the other."""
+    plan, e, b = block.plan, block.emitter, block.emitter.body
     if len(plan.stages) == 1:
         emit_stage(block, 0, 0, block.known, time, running, number, saves)
-    else:
-        clock = b.alloca(e.real)
-        b.store(e.real, time, clock)
-        with b.loop(0, len(plan.stages)) as stage:
-            _emit_one_of_stages(block, stage, clock, running, number, saves)
-    _commit(block, running)
+        return
+    clock = b.alloca(e.real)
+    b.store(e.real, time, clock)
+    with b.loop(0, len(plan.stages)) as stage:
+        _emit_one_of_stages(block, stage, clock, running, number, saves)
 
 
 def _emit_one_of_stages(block: Block, stage: str, clock: str, running: str, number: str, saves: str) -> None:
