@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -195,14 +196,26 @@ def test_settings_that_are_no_numbers_are_refused(monkeypatch, setting):
         kernel_cache.write(name(), KERNEL)
 
 
-def test_what_killed_processes_left_is_swept(folder):
+def test_what_killed_processes_left_is_swept(folder, monkeypatch):
     kernel_cache.write(name(), KERNEL)
     old, new = (folder / f"{word}{private_folder.UNFINISHED}" for word in ("old", "new"))
     for path in (old, new):
         path.write_bytes(b"part")
     os.utime(old, (1, 1))
+    monkeypatch.setattr(kernel_cache, "_looked", {})  # as in the next process
     kernel_cache.write(name(1), KERNEL)
     assert not old.exists() and new.exists()
+
+
+def test_what_other_processes_write_counts(folder, monkeypatch):
+    """Now and then a process looks how much there is."""
+    monkeypatch.setenv("DIRAX_CACHE_FILES", "100")
+    kernel_cache.write(name(), KERNEL)
+    for k in range(1, 101):
+        shutil.copy(folder / name(), folder / name(k))
+    for k in range(101, 102 + kernel_cache.SELDOM):
+        kernel_cache.write(name(k), KERNEL)
+    assert kernel_cache.contents().files == 100
 
 
 def test_clearing_removes_what_is_the_caches_own(folder):

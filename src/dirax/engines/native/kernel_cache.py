@@ -117,7 +117,8 @@ def write(name: str, kernel: Kernel) -> None:
             key = _key(folder)
             if key is not None:
                 write_private(folder, name, _signature(key, name, content) + content)
-                _let_go(folder, most)
+                if _may_be_full(path, DIGEST + len(content), most):
+                    _looked[path] = _let_go(folder, most), 0
     except NotPrivate as reason:
         _note(path, reason)
     except OSError:
@@ -192,7 +193,25 @@ def _entries(folder: int) -> Iterator[tuple[int, int, str]]:
                     remove(folder, entry.name)
 
 
-def _let_go(folder: int, most: Contents) -> None:
+SELDOM = 64
+"""Kernels that a process writes before it looks how many others have written: that takes 8 ms where there are 4096."""
+
+_looked: dict[Path, tuple[Contents, int]] = {}
+"""What a folder held at the last look, with what this process has written since, and how many kernels that was."""
+
+
+def _may_be_full(path: Path, size: int, most: Contents) -> bool:
+    """Whether to look what the folder holds, now that there is a kernel of this size more."""
+    if path not in _looked:
+        return True
+    held, written = _looked[path]
+    held = Contents(held.files + 1, held.size + size)
+    _looked[path] = held, written + 1
+    return held.files > most.files or held.size > most.size or written >= SELDOM
+
+
+def _let_go(folder: int, most: Contents) -> Contents:
+    """Remove those that were used longest ago until there are no more than `most`. Returns what is left."""
     entries = sorted(_entries(folder))
     files, size = len(entries), sum(bytes_ for _, bytes_, _ in entries)
     for _, bytes_, name in entries:
@@ -200,6 +219,7 @@ def _let_go(folder: int, most: Contents) -> None:
             break
         if remove(folder, name):
             files, size = files - 1, size - bytes_
+    return Contents(files, size)
 
 
 def _note(path: Path, reason: NotPrivate) -> None:
