@@ -293,6 +293,16 @@ def test_a_pendulum_at_rest_has_the_momenta_of_its_roundings():
     assert verify(sol.replace(fields=sol.fields | {"p": off}))["hidden constraint"].verdict == "VIOLATED"
 
 
+def test_two_links_that_hang_straight_have_the_velocities_of_their_roundings():
+    """Both constraints by Lobatto's nodes, whose velocities are roundings; one that is not is seen."""
+    links = lambda q: jnp.stack([q[0] ** 2 + q[1] ** 2 - 1.0, (q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2 - 0.49])
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - 9.81 * (q[1] + q[3]), holonomic=links)
+    sol = dx.simulate(system, dx.Collocation(2, "lobatto"), q=[0.0, -1.0, 0.0, -1.7], v=np.zeros(4), step=0.01, steps=100)
+    assert verify(sol).ok, verify(sol)
+    off = sol.p + (np.arange(101) == 50)[:, None] * np.array([0.0, 0.0, 0.0, 1e-13])
+    assert verify(sol.replace(fields=sol.fields | {"p": off}))["constraint"].verdict == "VIOLATED"
+
+
 def test_a_composition_is_symplectic_in_unbalanced_units():
     heavy = dx.LagrangeDirac(lambda q, v: 1e6 * (v @ v) / 2 - 1e6 * jnp.sum(q**4))
     scheme = dx.Composition(OneStep("verlet", mass=1e6), "yoshida4")

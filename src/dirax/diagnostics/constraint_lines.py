@@ -34,6 +34,8 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     steps = "constraint" in sol.fields
     if steps and np.any(residual > roundoff_limit(tolerance, 1) * scale):  # points of manifolds are rounded, and then subtracted
         scale = np.maximum(scale, np.max(moved_numbers(sol, "constraint").reshape(-1, len(scale)), axis=0))
+    if not steps and sol.system is not None and "p" in sol.fields and np.any(residual > roundoff_limit(tolerance, 1) * scale):
+        scale = scale + _moved_by_momenta(sol, at_rows(sol, constraint_at))
     values, residual = np.max(residual / scale, axis=-1), np.max(residual, axis=-1)
     given = int(steps and "q0" in sol.initial)  # the first pair was given, not computed
     if residual.shape[1] <= given:
@@ -65,8 +67,8 @@ def hidden_constraint(sol: Solution, tolerance: float | None) -> Line | None:
     values = np.abs(over_rows(hidden, sol, (items,)))
     terms = sampled(sol, at_rows(sol, _constraint_terms, system))[..., -values.shape[-1] :]
     sizes, limit = _largest(sampled_terms(sol, hidden), terms), roundoff_limit(tolerance, 1)
-    if np.any(values > limit * sizes):  # a machine at rest has the momenta that roundings of its impulses leave
-        sizes = sizes + _largest(sampled(sol, eqx.Partial(_moved, system, moved_numbers(sol, "p"))))
+    if np.any(values > limit * sizes):
+        sizes = sizes + _moved_by_momenta(sol, hidden)
     values = np.max(values / sizes, axis=-1)
     lane, row = worst_place(values)
     text = f"∂g/∂q v + ∂g/∂t at each row, relative to its terms, worst at t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
@@ -79,9 +81,14 @@ def _hidden(system: LagrangeDirac, row: dict, params: Any):
     return system.constraints.hidden_defect(row["t"], row["q"], velocity, params)
 
 
-def _moved(system: LagrangeDirac, moved: np.ndarray, row: dict, params: Any):
-    """By how much momenta move G v + ∂g/∂t that move so far."""
-    return jnp.abs(jacobian(lambda p: _hidden(system, row | {"p": p}, params))(row["p"])) @ moved
+def _moved_by_momenta(sol: Solution, function: eqx.Partial) -> np.ndarray:
+    """How far momenta that move as in a typical step move `function`(row, params): a machine at rest has those that roundings of
+    its impulses leave."""
+    return _largest(sampled(sol, eqx.Partial(_moved, function, moved_numbers(sol, "p"))))
+
+
+def _moved(function: eqx.Partial, moved: np.ndarray, row: dict, params: Any):
+    return jnp.abs(jacobian(lambda p: function(row | {"p": p}, params))(row["p"])) @ moved
 
 
 def _constraint_terms(system: LagrangeDirac, row: dict, params: Any):
