@@ -16,6 +16,7 @@ from dirax.engines.policy import engine_of
 from dirax.engines.sizes import sizes_near
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.xla.lane import Numerics, first_lane, take_step
+from dirax.engines.xla.newton import as_function
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import GraphTooLarge
@@ -67,8 +68,43 @@ _begun = compiled(_begun_by, seldom=True)
 
 
 def stepped(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> tuple[Any, tuple, tuple]:
-    """The state after a step, and of each stage the unknowns and the state that it left, by JAX."""
-    return sized_step(equation, state, guess, t, h, params)[:3]
+    """The state after a step, and of each stage the unknowns and the state that it left, as JAX traces them."""
+    roots = _roots_on_host(equation, state, guess, t, h, params)
+    if roots is None:
+        return sized_step(equation, state, guess, t, h, params)[:3]
+    unknowns, states = [], []
+    for (stage, fraction), root in zip(equation.stages, roots, strict=True):
+        args = state, t, fraction * h, params
+        unknowns.append(as_function(stage.residual, root, args))
+        states.append(state)
+        state, t = stage.advance(unknowns[-1], *args), t + fraction * h
+    return state, tuple(unknowns), tuple(states)
+
+
+def _roots_on_host(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> tuple | None:
+    """The unknowns of each stage, without derivatives and NaN where there are none, by a call of the host from where XLA runs:
+    it takes seconds to compile an iteration. None where the step has no scalar program, or JAX a device of its own."""
+    if jax.default_backend() != "cpu":
+        return None
+    try:
+        steps = StepsInNumbers.of(equation, params, False)
+    except (UnsupportedPrimitive, GraphTooLarge):
+        return None
+    sizes = [stage.unknowns for stage, _ in equation.stages]
+
+    def find(*given: Any) -> tuple[np.ndarray, ...]:
+        """Of arrays (…, n), with the axes of vmap in front."""
+        lead = np.broadcast_shapes(*(np.shape(a)[:-1] for a in given))
+        rows = lambda a: np.broadcast_to(a, (*lead, np.shape(a)[-1])).reshape(-1, np.shape(a)[-1])
+        state, t, h, numbers, *guesses = map(rows, given)
+        made = steps.step(state, guesses, t[:, 0], h[:, 0], numbers)
+        found = (np.where(made.good[:, None], u, np.nan) for u in made.unknowns)
+        return tuple(u.reshape(*lead, k) for u, k in zip(found, sizes, strict=True))
+
+    numbers = steps.program.parameters.flatten(params, None, jnp)
+    one = lambda a: jnp.reshape(jnp.asarray(a, float), (1,))
+    given = jax.lax.stop_gradient((jnp.asarray(state), one(t), one(h), jnp.reshape(numbers, (-1,)), *map(jnp.asarray, guess)))
+    return jax.pure_callback(find, tuple(jax.ShapeDtypeStruct((k,), float) for k in sizes), *given, vmap_method="expand_dims")
 
 
 def sized_step(
@@ -145,10 +181,12 @@ class Keyed:
         return hash(self.key)
 
 
-@compiled
-def compiled_call(function: Keyed, *values: Any) -> Any:
+def _call(function: Keyed, *values: Any) -> Any:
     """The function of these values, compiled once for its key."""
     return function.function(*values)
+
+
+compiled_call = compiled(_call, seldom=True)
 
 
 def _each(function: Callable) -> Callable:
