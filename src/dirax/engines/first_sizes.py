@@ -165,6 +165,6 @@ def first_sizes(
     asked = np.flatnonzero(sure & (found[:, k + 1] == 1.0))
     if len(asked):
         at = (a[asked] for a in (state, t, h, leaves, np.abs(solution)))
-        (after,) = stage_look(program, stage)(solution[asked], *at, (RESIDUAL,))
+        (after,) = stage_look(program, stage)(solution[asked], *at, only=(RESIDUAL,))
         sure[asked] = np.all(np.abs(after) <= most[asked], axis=1)
     return sizes, sure
