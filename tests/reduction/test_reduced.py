@@ -105,3 +105,21 @@ def test_mistakes():
             dx.reduce(free, symmetry)
     with pytest.raises(TypeError, match=r"dx\.reconstruct takes"):
         dx.reconstruct(dx.simulate(pulled, dx.PlusLagrangeDirac(), **run))
+
+
+def test_events_are_lifted_with_the_motion():
+    """A zero of a shape on the quotient is that of the unreduced motion; on a group, spatial momenta at events are the first."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] ** 2 / 2 - q[1] ** 2 + 0.3 * v[2] * q[0])
+    run = {"q": [1.0, 0.2, 0.3], "v": [0.0, 0.1, 0.5], "step": 0.01, "steps": 500}
+    scheme, reduced = dx.PlusLagrangeDirac("midpoint"), dx.reduce(system, dx.LinearConnection([2]))
+    lifted = dx.reconstruct(dx.simulate(reduced, scheme, **run, events=[dx.Event(lambda x: x[0])])).events
+    whole = dx.simulate(system, scheme, **run, events=[dx.Event(lambda q: q[0])]).events
+    assert len(lifted) == len(whole) == 2
+    np.testing.assert_allclose(lifted.t, whole.t, atol=1e-6)
+    np.testing.assert_allclose(np.concatenate([lifted.q, lifted.p]), np.concatenate([whole.q, whole.p]), atol=2e-5)
+    inertia, start = np.array([1.0, 2.0, 3.0]), np.array([[0.3, 1.0, 0.2], [0.1, -2.0, 0.1]])
+    top = dx.EulerPoincare(dx.SO3(), lambda xi: (inertia * xi) @ xi / 2)
+    spun = dx.simulate(top, dx.DiscreteEulerPoincare("cayley"), x=start, step=0.05, steps=500, events=[dx.Event(lambda x: x[1])])
+    events = dx.reconstruct(spun).events
+    assert set(events.lane) == {0, 1}
+    np.testing.assert_allclose(events.spatial_momentum, start[events.lane], atol=1e-12)

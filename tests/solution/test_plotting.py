@@ -1,5 +1,6 @@
 """Plots show the solution's own numbers, labelled, and leave matplotlib as they found it."""
 
+import jax
 import matplotlib
 import numpy as np
 import pytest
@@ -148,3 +149,13 @@ def test_a_section_has_the_states_at_the_value():
         plotting.plot_section(BATCH)
     with pytest.raises(ValueError, match="4 numbers"):
         plotting.plot_section(BATCH, points=np.zeros((3, 2)))
+
+
+def test_nothing_is_drawn_inside_of_transformations():
+    def end(x):
+        sol = gallery.get("henon-heiles").simulate(q=[x, 0.1], v=[0.2, 0.2], steps=3)
+        with pytest.raises(ValueError, match=r"draw it outside of jax\.grad"):
+            sol.plot()
+        return sol.q[-1, 0]
+
+    assert np.isfinite(jax.grad(end)(0.1))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.geometry.structures import canonical_two_form
+from dirax.numerics.arrays import is_whole
 from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction, evaluated
 
@@ -31,9 +32,10 @@ class LagrangianSubmanifold(eqx.Module):
     lagrangian: UserFunction | None
 
     def __init__(self, family: Callable, parameters: int, lagrangian: UserFunction | None = None):
-        if not isinstance(parameters, int) or isinstance(parameters, bool) or parameters < 0:
+        if not is_whole(parameters) or parameters < 0:
             raise ValueError(f"parameters must be the number k of the entries of s, 0 or more, but {parameters!r} was given.")
-        self.family, self.parameters, self.lagrangian = UserFunction(family, "morse_family", ("x", "s")), parameters, lagrangian
+        self.family, self.parameters = UserFunction(family, "morse_family", ("x", "s")), int(parameters)
+        self.lagrangian = lagrangian
 
     @classmethod
     def from_hamiltonian(cls, hamiltonian: Callable) -> "LagrangianSubmanifold":

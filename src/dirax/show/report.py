@@ -12,7 +12,6 @@ import numpy as np
 
 from dirax.diagnostics.report import Report
 from dirax.diagnostics.verify import verify
-from dirax.program.user_functions import is_traced
 from dirax.show import frames, page, series
 from dirax.show.arrays import Arrays
 from dirax.show.series import Run
@@ -132,8 +131,7 @@ def checked_solutions(solutions: Any) -> list[Solution]:
         what = type(others[0] if others else solutions).__name__
         raise TypeError(f"solutions must be a dirax Solution (from dx.simulate or dx.load) or a list of them, but got a {what}.")
     for sol in several:
-        if is_traced(sol.t, sol.fields):
-            raise ValueError("a solution inside jax.grad, jit or vmap holds no numbers to show: make the report outside.")
+        sol.refuse_traced("make the report")
     sizes = {tuple((k, sol.fields[k].shape[-1]) for k in ("q", "x") if k in sol.fields) for sol in several}
     if len(sizes) > 1:
         raise ValueError(f"solutions side by side must be of one system, but they have {' and '.join(map(str, sizes))}.")

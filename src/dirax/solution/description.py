@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from dirax.program.user_functions import is_traced
 from dirax.schemes.step import Field
 from dirax.solution.plain_forms import NotPlain, code_of_params, encode_params, encode_scheme
 from dirax.solution.stored_events import KINDS, WHOLE_ARRAYS, arrays_of, record_of
@@ -64,11 +63,7 @@ def describe(
 
     Raises `ValueError` for unknown, repeated or too few names, and for a solution inside `jax.grad`, `jit` or `vmap`.
     """
-    if is_traced(sol.t, sol.fields, sol.step, sol.params, sol.stats):
-        raise ValueError(
-            "this solution holds traced values, not numbers: convert or save it outside of jax.grad, jit and vmap, or return "
-            "its arrays from the transformed function."
-        )
+    sol.refuse_traced("convert or save it")
     layout = layout_of(sol.field_info)
     units = _checked_units(sol, units)
     lead = () if sol.batch is None else ("trajectory",)

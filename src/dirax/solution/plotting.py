@@ -4,6 +4,7 @@ Names and units of axes come from `solution.metadata` ("coordinates" and "units"
 solution without them shows q0, q1, … The style is that of style.py.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +39,19 @@ ENVELOPE = 1000
 ENERGY_ERROR = "$|E - E_0| \\,/\\, |E_0|$"
 
 
-@style()
+def picture(draw: Callable) -> Callable:
+    """A function that draws a solution in the style of dirax. It raises `ValueError` inside of `jax.grad`, `jit` or `vmap`."""
+
+    @functools.wraps(draw)
+    def drawn(sol: Any, *how: Any, **named: Any) -> Any:
+        sol.refuse_traced("draw it")
+        with style():
+            return draw(sol, *how, **named)
+
+    return drawn
+
+
+@picture
 def plot_trajectory(
     sol: Any, x: int | str = 0, y: int | str = 1, z: int | str | None = None, *, ax: "Axes | None" = None, **line: Any
 ) -> "Axes":
@@ -65,7 +78,7 @@ def plot_trajectory(
     return ax
 
 
-@style()
+@picture
 def plot_coordinate(sol: Any, i: int | str = 0, *, field: str = "q", ax: "Axes | None" = None, **line: Any) -> "Axes":
     """One entry of a saved field against time: `field` is "q", "p", "x" or another name of an array at nodes.
 
@@ -83,7 +96,7 @@ def plot_coordinate(sol: Any, i: int | str = 0, *, field: str = "q", ax: "Axes |
     return ax
 
 
-@style()
+@picture
 def plot_energy(sol: Any, *, figure: "Figure | None" = None, ax: Any = None, **line: Any) -> "Figure":
     """The energy against time, and beside it its error |E − E(0)| / |E(0)| on a logarithmic scale (absolute if E(0) = 0).
 
@@ -117,7 +130,7 @@ def plot_error(ax: "Axes", t: Any, values: Any, **line: Any) -> None:
     _plot_log(ax, np.asarray(t), np.abs(values - values[0]) / (abs(values[0]) or 1.0), **line)
 
 
-@style()
+@picture
 def plot_phase(sol: Any, i: int | str = 0, *, ax: "Axes | None" = None, **line: Any) -> "Axes":
     """The path in the phase plane (q_i, p_i). Raises `ValueError` for an unknown coordinate or a solution without p."""
     index = index_of(sol, i)
@@ -135,7 +148,7 @@ def plot_phase(sol: Any, i: int | str = 0, *, ax: "Axes | None" = None, **line: 
     return ax
 
 
-@style()
+@picture
 def plot_constraint(sol: Any, *, ax: "Axes | None" = None, **line: Any) -> "Axes":
     """The largest absolute constraint residual against time on a logarithmic scale; exact zeros are left out.
 
@@ -152,7 +165,7 @@ def plot_constraint(sol: Any, *, ax: "Axes | None" = None, **line: Any) -> "Axes
     return ax
 
 
-@style()
+@picture
 def plot_momenta(sol: Any, symmetries: Mapping[str, Callable] | None = None, *, ax: "Axes | None" = None, **line: Any) -> "Axes":
     """How far the momenta of symmetries have moved since the start, J(t) − J(0) with J = ⟨p, ξ(q)⟩, against time.
 
@@ -180,7 +193,7 @@ def plot_momenta(sol: Any, symmetries: Mapping[str, Callable] | None = None, *, 
     return ax
 
 
-@style()
+@picture
 def plot_section(
     sol: Any,
     x: int | str = 0,

@@ -1,5 +1,6 @@
 """From a trajectory on the quotient back to the configuration space."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,7 @@ from dirax.program.user_functions import is_traced
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.routh import DiscreteRouth
 from dirax.schemes.step import Field
+from dirax.solution.events import Events
 from dirax.solution.loading import with_code
 from dirax.solution.solution import Solution
 from dirax.solution.steps_again import Entries
@@ -46,14 +48,15 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     if g0 is not None:
         raise ValueError("g0 is for systems on a Lie group: here the initial data name the group coordinate already.")
     reduced = (*system.own_fields, "vertical")
-    lifted = _each_row(solution, system.unreduced_row, system.own_fields)
+    of_rows = lambda fields, _: _each_row({name: fields[name] for name in system.own_fields}, system.unreduced_row)
+    lifted = of_rows(solution.fields, None)
     lifted |= {name: a for name, a in solution.fields.items() if name not in reduced}
     if system.system.one_forms is not None:
         lifted["multipliers"] = _multipliers_at(solution, lifted["q"])
     n = lifted["q"].shape[-1]
     info = {"q": Field((n,)), "p": Field((n,)), "chart": Field((n,), description="the centre of a chart at the row", chosen=True)}
     about = {name: info.get(name) or solution.field_info[name] for name in lifted}
-    whole = _lifted(solution, system.system, lifted, about)
+    whole = _lifted(solution, system.system, lifted, about, of_rows)
     whole.scheme = jax.tree.map(_on_q, solution.scheme, is_leaf=lambda part: isinstance(part, DiscreteRouth))
     return whole if is_traced(lifted) or solution.equation is None else with_code(whole, whole.system, whole.scheme)
 
@@ -105,6 +108,11 @@ def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> S
     if solution.batch is not None:
         along = jax.vmap(along, in_axes=(0 if batched else None, 0, 0))
     lifted = _plain(jax.jit(along)(start, jnp.asarray(solution.fields["g"]), jnp.asarray(solution.fields["x"])))
+
+    def of_events(fields, lanes):
+        each = jax.vmap(rows, in_axes=(0 if batched else None, 0, 0))
+        return _plain(each(start[lanes] if batched else start, jnp.asarray(fields["g"]), jnp.asarray(fields["x"])))
+
     kept = {name: a for name, a in solution.fields.items() if name != "g"}
     about = {
         "q": Field((group.ambient_dimension,), dims=("group",), description="group element"),
@@ -112,7 +120,7 @@ def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> S
         "spatial_momentum": Field((d,), dims=("algebra",), description="Ad*_{g⁻¹} μ"),
     }
     about |= {name: solution.field_info[name] for name in kept}
-    return _lifted(solution, solution.system, lifted | kept, about, solution.equation)
+    return _lifted(solution, solution.system, lifted | kept, about, of_events, solution.equation)
 
 
 def _element(group: AbstractLieGroup, g0: Any, batch: int | None) -> jax.Array:
@@ -136,11 +144,10 @@ def _element(group: AbstractLieGroup, g0: Any, batch: int | None) -> jax.Array:
     return element
 
 
-def _each_row(solution: Solution, function: Callable, names: tuple[str, ...]) -> dict[str, Any]:
+def _each_row(rows: dict[str, Any], function: Callable) -> dict[str, Any]:
     """`function(row)` of every row, in NumPy where it has a scalar program."""
-    rows = {name: solution.fields[name] for name in names}
-    lead = np.shape(solution.fields["x"])[:-1]
-    if not is_traced(rows):
+    names, lead = tuple(rows), np.shape(rows["x"])[:-1]
+    if not is_traced(rows) and math.prod(lead):
         entries = [np.asarray(a).reshape(-1, *np.shape(a)[len(lead) :]) for a in rows.values()]
         found = in_numpy(lambda *values: function(dict(zip(names, values, strict=True))), entries, (function, names))
         if found is not None:
@@ -154,8 +161,11 @@ def _plain(fields: dict[str, Any]) -> dict[str, Any]:
     return {name: np.asarray(a) if not is_traced(a) else a for name, a in fields.items()}
 
 
-def _lifted(solution: Solution, system: Any, fields: dict[str, Any], info: dict[str, Field], equation: Any = None) -> Solution:
-    return Solution(
+def _lifted(
+    solution: Solution, system: Any, fields: dict[str, Any], info: dict[str, Field], of_events: Callable, equation: Any = None
+) -> Solution:
+    """The solution with these fields, and its events with those that `of_events` makes of theirs and their trajectories."""
+    whole = Solution(
         t=solution.axis,
         fields=fields,
         field_info=info,
@@ -171,3 +181,8 @@ def _lifted(solution: Solution, system: Any, fields: dict[str, Any], info: dict[
         batch_params=solution.batch_params,
         initial=solution.initial,
     )
+    if (events := solution.events) is not None:
+        kept = {name: a for name, a in events.fields.items() if name in fields}
+        found = of_events(events.fields, events.lane) | kept
+        whole.events = Events(events.t, events.index, events.direction, events.lane, found)
+    return whole

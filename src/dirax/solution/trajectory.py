@@ -258,6 +258,14 @@ class Trajectory:
         """Numbers of a row of one trajectory."""
         return 1 + sum(math.prod(info.shape) for info in self.field_info.values() if info.place == "node")
 
+    def refuse_traced(self, what: str) -> None:
+        """Raise `ValueError` inside of `jax.grad`, `jit` or `vmap`, where there are no numbers to do `what` with."""
+        if is_traced(self.t, self.fields, self.step, self.params, self.stats):
+            raise ValueError(
+                f"this solution holds traced values, not numbers: {what} outside of jax.grad, jit and vmap, or return its arrays "
+                "from the transformed function."
+            )
+
     def _per_row(self, name: str, method: str):
         if name not in self.derived:
             if self.system is None:
