@@ -5,18 +5,32 @@ import sys
 import time
 from collections import Counter
 
-from fuzz.examine import SCHEMES, examine, random_case
+from fuzz.examine import SCHEMES, examine, examine_together, random_case
+
+TOGETHER = 32
+"""Systems of a kind that are examined as one batch."""
+
+DEEP = 50
+"""One system of so many is examined alone and in depth."""
 
 count, first, kinds = (int(a) for a in (*sys.argv[1:], *("100", "0", "24")[len(sys.argv) - 1 :]))
 started, found, runs = time.perf_counter(), Counter(), 0
 for kind, name in itertools.product(range(kinds), SCHEMES):  # what is compiled serves a kind and a scheme
+    wrong, others = {}, {}
     for seed in range(first + (kind - first) % kinds, first + count, kinds):
         system, params, start = random_case(seed, kinds)
-        runs += 1
-        for wrong in examine(system, name, params, start, deep=seed % 50 == 0):
-            found[wrong.split(":")[0]] += 1
-            if not wrong.startswith("refused"):
-                print(f"{seed} {name} {system.kind}: {wrong}", flush=True)
+        if seed % DEEP == 0:
+            wrong[seed] = examine(system, name, params, start, deep=True)
+        else:
+            others[seed] = params, start
+    for low in range(0, len(others), TOGETHER):
+        wrong |= examine_together(system, name, dict(itertools.islice(others.items(), low, low + TOGETHER)))
+    for seed, each in sorted(wrong.items()):
+        found.update(what.split(":")[0] for what in each)
+        for what in each:
+            if not what.startswith("refused"):
+                print(f"{seed} {name} {system.kind}: {what}", flush=True)
+    runs += len(wrong)
     print(f"kind {kind}, {name}: {runs} runs, {time.perf_counter() - started:.0f} s", file=sys.stderr)
 print(f"{count} systems, {runs} runs, {time.perf_counter() - started:.0f} s: {dict(found) or 'nothing wrong'}")
 sys.exit(any(kind != "refused" for kind in found))

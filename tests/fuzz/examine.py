@@ -79,6 +79,35 @@ def examine(system: RandomSystem, name: str, params: dict, start: dict, deep: bo
     return wrong
 
 
+def examine_together(system: RandomSystem, name: str, cases: dict[int, tuple[dict, dict]]) -> dict[int, list[str]]:
+    """The same of several systems of a kind, by number, as trajectories of one batch, in which one number is damaged. Where
+    something is wrong, or a run does not begin, each is examined alone."""
+    alone = lambda numbers: {number: examine(system, name, *cases[number]) for number in numbers}
+    promise, (params, start) = SCHEMES[name], jax.tree.map(lambda *leaves: np.stack(leaves), *cases.values())
+    run = lambda h, steps, **more: dx.simulate(
+        system.system, promise.scheme, **({"params": params, "batch_params": True, "step": h, "steps": steps} | start | more)
+    )
+    try:
+        sols = [run(STEP / 2**i, STEPS * 2**i) for i in range(3)]
+    except (TypeError, ValueError):
+        return alone(cases)
+    if not all(np.all(sol.ok) for sol in sols):
+        return alone(cases)
+    orders = [any(_orders(system, [sol[i] for sol in sols], promise, *case)) for i, case in enumerate(cases.values())]
+    found = {number: [] for number in cases} | alone(number for number, wrong in zip(cases, orders, strict=True) if wrong)
+    report, several = dx.verify(sols[1]), list(damaged(sols[1]))
+    what, other = several[zlib.crc32(np.asarray(sols[1].q).tobytes()) % len(several)]
+    wrong = _restart(sols[1], run)
+    wrong += [f"false alarm: {line.quantity}: {line.explanation}" for line in report.lines if line.verdict == "VIOLATED"]
+    if report["steps replayed"].verdict != "ok" or replayed(other, None).verdict != "VIOLATED":
+        wrong.append(f"missed: {what}; {report['steps replayed'].explanation}")
+    if wrong:
+        found = alone(cases)
+        first = min(cases)
+        found[first] = [*found[first], *(f"{text} (in a batch of {len(cases)})" for text in wrong)]
+    return found
+
+
 def damaged(sol: dx.Solution) -> Iterator[tuple[str, dx.Solution]]:
     """The solution with one number off by a millionth of the largest of its field, for each field."""
     draw = np.random.default_rng(0)
@@ -138,9 +167,14 @@ def _error_of_forces(system: RandomSystem, sol, exact: dict, t: np.ndarray, ever
 def _restart(sol, run) -> list[str]:
     """A run that goes on from a saved row is the run."""
     middle = sol.rows // 2
-    given = {"q": np.asarray(sol.q)[middle], "v": None, "p": np.asarray(sol.p)[middle], "t0": float(sol.t[middle])}
+    given = {
+        "q": np.asarray(sol.q)[..., middle, :],
+        "v": None,
+        "p": np.asarray(sol.p)[..., middle, :],
+        "t0": float(sol.t[middle]),
+    }
     other = run(sol.step, sol.rows - 1 - middle, **given, check_initial=False)
-    apart = np.max(np.abs(np.asarray(other.q)[-1] - np.asarray(sol.q)[-1]))
+    apart = np.max(np.abs(np.asarray(other.q)[..., -1, :] - np.asarray(sol.q)[..., -1, :]))
     return [] if apart < 1e-10 else [f"restart: q is off by {apart:.2g} at the end"]
 
 
