@@ -16,13 +16,10 @@ DEEP = 50
 count, first, kinds = (int(a) for a in (*sys.argv[1:], *("100", "0", "24")[len(sys.argv) - 1 :]))
 started, found, runs = time.perf_counter(), Counter(), 0
 for kind, name in itertools.product(range(kinds), SCHEMES):  # what is compiled serves a kind and a scheme
-    wrong, others = {}, {}
-    for seed in range(first + (kind - first) % kinds, first + count, kinds):
-        system, params, start = random_case(seed, kinds)
-        if seed % DEEP == 0:
-            wrong[seed] = examine(system, name, params, start, deep=True)
-        else:
-            others[seed] = params, start
+    system = random_case(kind, kinds)[0]
+    cases = {seed: random_case(seed, kinds)[1:] for seed in range(first + (kind - first) % kinds, first + count, kinds)}
+    wrong = {seed: examine(system, name, *case, deep=True) for seed, case in cases.items() if seed % DEEP == 0}
+    others = {seed: case for seed, case in cases.items() if seed % DEEP}
     for low in range(0, len(others), TOGETHER):
         wrong |= examine_together(system, name, dict(itertools.islice(others.items(), low, low + TOGETHER)))
     for seed, each in sorted(wrong.items()):
