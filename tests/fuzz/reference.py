@@ -9,6 +9,9 @@ from scipy.integrate import solve_ivp
 
 from fuzz.systems import RandomSystem
 
+KEPT = 4096
+"""Motions that are remembered."""
+
 
 @functools.lru_cache(maxsize=64)
 def field_of(system: RandomSystem):
@@ -49,8 +52,21 @@ def rows_of(system: RandomSystem):
     return jax.jit(jax.vmap(both, in_axes=(0, 0, None)))
 
 
+_known: dict[tuple, dict[str, np.ndarray]] = {}
+"""The motions of a kind, at the times that schemes of one sort ask for."""
+
+
 def motion(system: RandomSystem, params: dict, start: dict, t: np.ndarray) -> dict[str, np.ndarray]:
     """q, p, work and the multipliers λ at the times."""
+    key = id(system), t.tobytes(), *(np.asarray(a).tobytes() for a in jax.tree.leaves((params, start)))
+    if key not in _known:
+        if len(_known) > KEPT:
+            _known.clear()
+        _known[key] = _motion(system, params, start, t)
+    return _known[key]
+
+
+def _motion(system: RandomSystem, params: dict, start: dict, t: np.ndarray) -> dict[str, np.ndarray]:
     n, k = system.kind.n, int(system.kind.m > 0) + int(system.kind.c > 0)
     field, momentum = field_of(system)
     y0 = np.concatenate([start["q"], start["v"], np.zeros(1 + k)])
