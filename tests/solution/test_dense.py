@@ -161,3 +161,19 @@ def test_an_engine_without_scalar_programs_is_not_asked_for_them():
     sol = dx.simulate(dx.LagrangeDirac(lagrangian), dx.Collocation(2), q=[0.4], v=[0.2], step=0.1, steps=3, engine="xla")
     assert np.max(np.abs(sol.at(sol.t).q - sol.q)) <= 1e-13
     assert sol.at(0.123).q.shape == (1,)
+
+
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Composition(dx.LagrangeDAlembert(), "suzuki4")], ids=repr)
+def test_rows_that_were_not_saved(scheme):
+    """They are those of the run, far from saved ones too, and momenta between them have the order of the scheme: half of the
+    impulse of the constraints is that of a step of one length before and after."""
+    disk = gallery.get("rolling-disk")
+    run = lambda h, steps, **more: disk.simulate(scheme, step=h, steps=steps, **more)
+    whole, thin = run(0.02, 200), run(0.02, 200, save_every=200)
+    some = np.array([3, 70, 141, 199])
+    for name in ("q", "p"):
+        np.testing.assert_allclose(getattr(thin.at(whole.t[some]), name), getattr(whole, name)[some], rtol=0, atol=1e-13)
+    exact = disk.simulate(dx.Collocation(4, "lobatto"), step=0.02, steps=200).at([0.713, 1.234, 2.777])
+    errors = [np.max(np.abs(run(0.04 / k, 80 * k, save_every=80 * k).at([0.713, 1.234, 2.777]).p - exact.p)) for k in (1, 2, 4)]
+    order = 4 if isinstance(scheme, dx.Composition) else 2
+    assert np.log2(errors[0] / errors[2]) / 2 > order - 0.25, errors

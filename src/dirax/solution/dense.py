@@ -121,14 +121,17 @@ class Dense(BetweenRows):
         found = {name: self.saved[name][lanes, row].astype(float) for name in self.nodes}
         if not np.all(at_row):
             off = ~at_row
-            lanes_all, lanes, t, part = lanes, lanes[off], t[off], np.maximum(theta[off], AT_ROW) * h[off]
+            lanes_all, lanes, t, part = lanes, lanes[off], t[off], theta[off] * h[off]
             if self.sol.has_own_times:
                 at = numbers[off]
                 length = self.time_at(lanes, at + 1, 0.0) - t
                 part = step_for(part / h[off], self.saved[STEP_DENSITY][lanes, at], length, h[off])
             states, u = self.again.at(lanes, numbers[off])
-            states, u = self.again.step(lanes, states, u, t, part)
-            made = self.again.row(lanes, states, u, t + part)
+            inside = theta[off] > AT_ROW
+            if np.any(inside):
+                at = lanes[inside], states[inside], u[inside], t[inside], part[inside]
+                states[inside], u[inside] = self.again.step(*at)
+            made = self.again.row(lanes, states, u, t + part, np.where(inside, part, h[off]))
             for name, values in found.items():
                 values[off] = made[name]
             fails = np.flatnonzero(off)[~np.isfinite(states).all(axis=1) & (theta[off] < SHORT)]

@@ -87,8 +87,8 @@ class TracedDense(BetweenRows):
             if CLOCK in row:
                 part = step_for(part / h, row[STEP_DENSITY], ends - begins, h)
             there, u, _ = stepped(self.equation, state, guess, begins, part, params)
-            _, unknowns, states = stepped(self.equation, there, u, begins + part, h, params)
-            made = row_of(self.equation, unknowns, states, begins + part, h, params)
+            _, unknowns, states = stepped(self.equation, there, u, begins + part, part, params)
+            made = row_of(self.equation, unknowns, states, begins + part, part, params)
             return {name: jnp.where(theta > AT_ROW, made[name], row[name]) for name in row}
 
         return by_step

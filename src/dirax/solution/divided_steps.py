@@ -34,7 +34,7 @@ class DividedSteps:
 
     def inside(self, lanes: np.ndarray, numbers: np.ndarray, theta: np.ndarray, hit: np.ndarray) -> dict[str, np.ndarray]:
         """The fields inside steps, some of which walls divide: by the scheme's own step from the last impact before."""
-        dense, sol, layout = self.dense, self.sol, self.dense.equation.stages[0][0].state_layout
+        dense, sol = self.dense, self.sol
         found = {name: a[lanes, numbers].astype(float) for name, a in dense.saved.items() if name in dense.nodes}
         if not np.all(hit):
             for name, values in dense.inside(lanes[~hit], numbers[~hit], theta[~hit]).items():
@@ -50,10 +50,13 @@ class DividedSteps:
         states, u = dense.again.begin(lanes[some], row, t)
         moved = part > AT_ROW
         if np.any(moved):
-            h = part[moved] * float(sol.step)
-            states[moved] = dense.again.step(lanes[some][moved], states[moved], u[moved], t[moved], h)[0]
-        for name in filter(layout.__contains__, found):
-            found[name][some] = states[:, layout.place(name)].reshape(found[name][some].shape)
+            h, own = part[moved] * float(sol.step), lanes[some][moved]
+            after = dense.again.step(own, states[moved], u[moved], t[moved], h)
+            made = dense.again.row(own, *after, t[moved] + h, h)
+        for name in found:
+            found[name][some] = row[name]
+            if np.any(moved):
+                found[name][some[moved]] = made[name]
         return found
 
     def _since_impact(self, lane: int, number: int, theta: float) -> tuple[int | None, float, float]:

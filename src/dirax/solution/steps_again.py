@@ -28,6 +28,9 @@ from dirax.solution.trajectory import Trajectory
 MANY = 2000
 """Steps from which on it pays to compile them."""
 
+FEW = 4
+"""Steps of one trajectory that take as long in NumPy as a run of an engine does to begin."""
+
 UPDATES = 50
 """Newton's updates a step, where it is solved by JAX."""
 
@@ -245,17 +248,47 @@ class StepsAgain:
 
     def _find(self, lanes: np.ndarray, numbers: np.ndarray) -> None:
         rows = np.searchsorted(self.counts, numbers, side="right") - 1
+        far = numbers - self.counts[rows] > FEW * len(numbers)
+        if np.any(far):
+            self._find_by_runs(lanes[far], rows[far], numbers[far])
         left = np.zeros((self.sol.batch or 1, len(self.counts)), np.int64) - 1
+        still = ~self.known[lanes, numbers]
+        lanes, rows, numbers = lanes[still], rows[still], numbers[still]
         np.maximum.at(left, (lanes, rows), numbers - self.counts[rows])
         lanes, rows = np.nonzero(left >= 0)  # steps from every row that is begun with
         left, number = left[lanes, rows], self.counts[rows]
         state, u = self.begun_at(lanes, rows, self.time(number))
         while len(lanes):
             after, u = self._whole(lanes, state, u, self.time(number))
-            self.states[lanes, number], self.unknowns[lanes, number] = state, u
-            self.known[lanes, number] = True
+            self._keep(lanes, number, state, u)
             on = left > 0
             lanes, left, number, state, u = lanes[on], left[on] - 1, number[on] + 1, after[on], u[on]
+
+    def _find_by_runs(self, lanes: np.ndarray, rows: np.ndarray, numbers: np.ndarray) -> None:
+        """The same of steps far from rows, by runs of an engine to where they begin, as far as these come there."""
+        sol, engine = self.sol, engine_of("auto")
+        state, u = self.begun_at(lanes, rows, self.time(self.counts[rows]))
+        arrived = np.zeros(len(lanes), bool)
+        for i, (lane, first, last) in enumerate(zip(lanes, self.counts[rows], numbers, strict=True)):
+            params = jax.tree.map(lambda a, i=lane: np.asarray(a)[i] if sol.batch_params else np.asarray(a), sol.given_params)
+            steps = int(last - first)
+            problem = Problem(
+                equation=self.equation, state=state[i], guess=self._split(u[i]), h=float(sol.step), t0=float(sol.axis[0]),
+                steps=steps, save_every=steps - 1, first_step=int(first), params=params,
+            )  # fmt: skip
+            out = engine.run(problem)
+            arrived[i] = out.completed[0] == steps
+            if arrived[i]:
+                row = {
+                    name: np.asarray(a)[:, -1] for name, a in out.fields.items()
+                } | out.closing  # the last step's, and after it
+                state[i], u[i] = out.last_state[0], self.begin(lanes[i : i + 1], row, self.time(numbers[i : i + 1]))[1][0]
+        lanes, numbers, state = lanes[arrived], numbers[arrived], state[arrived]
+        self._keep(lanes, numbers, state, self._whole(lanes, state, u[arrived], self.time(numbers))[1])
+
+    def _keep(self, lanes: np.ndarray, numbers: np.ndarray, states: np.ndarray, unknowns: np.ndarray) -> None:
+        self.states[lanes, numbers], self.unknowns[lanes, numbers] = states, unknowns
+        self.known[lanes, numbers] = True
 
     def begun_at(self, lanes: np.ndarray, rows: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`begin` at saved rows of these numbers."""
@@ -319,9 +352,9 @@ class StepsAgain:
             return None
         return _solved_equations.get(Same(self.equation), lambda: _solved(self.equation))
 
-    def row(self, lanes, state, u, t) -> dict[str, np.ndarray]:
-        """The rows that are at these states, by the steps of the run's length that leave them."""
-        h = np.full(len(t), float(self.sol.step))
+    def row(self, lanes, state, u, t, h) -> dict[str, np.ndarray]:
+        """The rows that are at these states, by steps of these lengths that leave them: what is half of the impulses of a step
+        before and of one after it is right where both are of one length."""
         if self.in_numbers is None:
             return self.entries(self._one_row, lanes, (state, u, t, h), "row", *self.key)
         made = self.in_numbers.step(state, self._split(u), t, h, self._numbers(lanes))
