@@ -53,10 +53,10 @@ class DividedSteps:
             h, own = part[moved] * float(sol.step), lanes[some][moved]
             after = dense.again.step(own, states[moved], u[moved], t[moved], h)
             made = dense.again.row(own, *after, t[moved] + h, h)
+            for name in found:
+                row[name][moved] = made[name]
         for name in found:
             found[name][some] = row[name]
-            if np.any(moved):
-                found[name][some[moved]] = made[name]
         return found
 
     def _since_impact(self, lane: int, number: int, theta: float) -> tuple[int | None, float, float]:
