@@ -29,6 +29,9 @@ from dirax.engines.native.private_folder import (
 MEGABYTES, FILES = 200, 4096
 """Largest size of the cache, unless DIRAX_CACHE_MEGABYTES and DIRAX_CACHE_FILES say otherwise."""
 
+OFTEN = 64
+"""The part of the entries that are new when the folder is looked through again."""
+
 ABANDONED = 3600
 """Seconds after which a file that is still being written belongs to a process that was killed."""
 
@@ -51,6 +54,10 @@ class Contents:
 
     files: int
     size: int
+
+
+_held: dict[Path, tuple[Contents, int]] = {}
+"""What folders hold, as far as this process knows, and how many entries it has written since it looked through them."""
 
 
 def cache_folder() -> Path | None:
@@ -117,7 +124,7 @@ def write(name: str, kernel: Kernel) -> None:
             key = _key(folder)
             if key is not None:
                 write_private(folder, name, _signature(key, name, content) + content)
-                _let_go(folder, most)
+                _bound(path, folder, DIGEST + len(content), most)
     except NotPrivate as reason:
         _note(path, reason)
     except OSError:
@@ -192,14 +199,29 @@ def _entries(folder: int) -> Iterator[tuple[int, int, str]]:
                     remove(folder, entry.name)
 
 
-def _let_go(folder: int, most: Contents) -> None:
+def _bound(path: Path, folder: int, written: int, most: Contents) -> None:
+    """After an entry of so many bytes, let those go that were used longest ago if there are too many.
+
+    To look through thousands of files takes as long as to compile a small kernel: of N entries it is done when N/OFTEN are new,
+    and where there would be too many. Some more than need be go then, so that there is room for as many."""
+    held, new = _held.get(path, (Contents(0, 0), 0))
+    held, new = Contents(held.files + 1, held.size + written), new + 1
+    if OFTEN * new >= held.files or held.files > most.files or held.size > most.size:
+        held, new = _let_go(folder, most), 0
+    _held[path] = held, new
+
+
+def _let_go(folder: int, most: Contents) -> Contents:
+    """Let the entries that were used longest ago go, if there are too many; what is left."""
     entries = sorted(_entries(folder))
     files, size = len(entries), sum(bytes_ for _, bytes_, _ in entries)
-    for _, bytes_, name in entries:
-        if files <= most.files and size <= most.size:
-            break
-        if remove(folder, name):
-            files, size = files - 1, size - bytes_
+    if files > most.files or size > most.size:
+        for _, bytes_, name in entries:
+            if files <= most.files - most.files // OFTEN and size <= most.size - most.size // OFTEN:
+                break
+            if remove(folder, name):
+                files, size = files - 1, size - bytes_
+    return Contents(files, size)
 
 
 def _note(path: Path, reason: NotPrivate) -> None:
