@@ -80,7 +80,7 @@ def methods(space, x, v, y):
 
 
 def manifolds_and_maps() -> None:
-    """Every method of every manifold and map at one point, and under jit."""
+    """Every method of every manifold and map at one point under jit, and some in numbers."""
     turned = jnp.array([1.0, 2.0, 2.0, 4.0]) / 5.0
     places = {
         dx.Euclidean(2): (jnp.array([1.0, 2.0]), jnp.array([0.1, 0.2])),
@@ -93,10 +93,9 @@ def manifolds_and_maps() -> None:
     }
     for space, (x, v) in places.items():
         if v is None:
-            v = space.left_translate(x, 0.1 * jnp.ones(space.dimension))
-            coadjoint(space, x, jnp.ones(space.dimension))
-        y = jax.jit(space.exp)(x, v)
-        back = jax.jit(space.log)(x, y)
+            moved = lambda x, xi, space=space: (space.left_translate(x, 0.1 * xi), coadjoint(space, x, xi))
+            v, _ = jax.jit(moved)(x, np.ones(space.dimension))
+        y, back = jax.jit(lambda x, v, space=space: (y := space.exp(x, v), space.log(x, y)))(x, v)
         assert np.allclose(back, v) and float(space.defect(y)) < 1e-12 and space.contains(y)
         space.check_point(y), space.check_tangent(x, v)
         jax.eval_shape(partial(methods, space), x, v, y)  # shapes alone are looked at: nothing is compiled
@@ -109,11 +108,12 @@ def manifolds_and_maps() -> None:
         dx.ProductMap((dx.Theta(0.5), 2), (dx.Theta(0.5), 1)): (jnp.arange(3.0), jnp.ones(3)),
     }
     for step, (x, v) in along.items():
-        assert np.allclose(jnp.stack(step.inverse(*step(x, v))), jnp.stack([x, v]))
-        step.forward(x, v), step.reach(x, v), step.manifold(x.size), step.base_fraction
+        there = jax.jit(lambda x, v, step=step: (step.inverse(*step(x, v)), step.forward(x, v), step.reach(x, v)))(x, v)
+        assert np.allclose(np.stack(there[0]), np.stack([x, v]))
+        step.manifold(x.size), step.base_fraction
     lift = dx.cotangent_lift(dx.SphereProjection())
     x, v = jnp.concatenate(sphere), jnp.concatenate([jnp.array([0.0, 0.08, -0.06]), jnp.zeros(3)])
-    lift.forward(x, v), lift.manifold(6).frame(x), lift.manifold(6).nearest(x)
+    jax.jit(lambda x, v: (lift.forward(x, v), lift.manifold(6).frame(x), lift.manifold(6).nearest(x)))(x, v)
 
 
 def structures_and_systems() -> None:

@@ -36,6 +36,17 @@ def one_stage(stage, state, guess, t, h, params, most, follow):
     return u, new, jnp.max(jnp.abs(left), initial=0.0), updates, outcome
 
 
+made = {}
+
+
+def compiled(stage, most, follow):
+    """`one_stage` of a stage, and its rows, compiled once for all trajectories and runs."""
+    key = id(stage), most, follow
+    if key not in made:  # with the stage itself, so that no other one has its number
+        made[key] = stage, jax.jit(lambda *a: one_stage(stage, *a, most, follow)), jax.jit(stage.unpack)
+    return made[key][1:]
+
+
 class Reference(dx.AbstractEngine):
     """For problems without compensated summation."""
 
@@ -71,8 +82,8 @@ class Reference(dx.AbstractEngine):
     def _one(self, p: Problem, state, guesses, params, follow: bool, progress):
         """The fields, the closing row, (completed, status, updates, worst), the last state and unknowns of one trajectory."""
         first, fraction = p.equation.stages[0]
-        stages = [jax.jit(lambda *a, s=s: one_stage(s, *a, p.max_iterations, follow)) for s, _ in p.equation.stages]
-        unpack, rows, good = jax.jit(first.unpack), {}, jnp.array(True)
+        stages = [compiled(s, p.max_iterations, follow)[0] for s, _ in p.equation.stages]
+        unpack, rows, good = compiled(first, p.max_iterations, follow)[1], {}, jnp.array(True)
         state, guesses, numbers = jnp.asarray(state), [jnp.asarray(g) for g in guesses], jnp.zeros(4)
         for k in range(p.steps + 1):  # the last one for the unknowns of the closing row
             at, t, results = state, p.t0 + (p.first_step + numbers[0]) * p.h, []

@@ -189,6 +189,19 @@ def test_the_size_is_bounded(folder, monkeypatch):
     assert kernel_cache.contents().files == 3 and kernel_cache.read(name(9)) is None
 
 
+def test_a_folder_of_many_entries_is_looked_through_now_and_then(folder, monkeypatch):
+    monkeypatch.setenv("DIRAX_CACHE_FILES", "300")
+    looks, entries = [], kernel_cache._entries
+    monkeypatch.setattr(kernel_cache, "_entries", lambda folder: looks.append(folder) or entries(folder))
+    for k in range(400):
+        kernel_cache.write(name(k), Kernel(1, b""))
+        assert k < 200 or len(looks) < 170
+    assert 296 <= len(list(folder.iterdir())) - 1 <= 300  # beside the key
+    monkeypatch.setattr(kernel_cache, "_held", {})  # another process has written the others
+    kernel_cache.write(name(400), Kernel(1, b""))
+    assert 296 <= len(list(folder.iterdir())) - 1 <= 300 and kernel_cache.read(name(400)) is not None
+
+
 @pytest.mark.parametrize("setting", ["DIRAX_CACHE_FILES", "DIRAX_CACHE_MEGABYTES"])
 def test_settings_that_are_no_numbers_are_refused(monkeypatch, setting):
     monkeypatch.setenv(setting, "many")
