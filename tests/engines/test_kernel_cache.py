@@ -188,6 +188,19 @@ def test_the_size_is_bounded(folder, monkeypatch):
     assert kernel_cache.contents().files == 3 and kernel_cache.read(name(9)) is None
 
 
+def test_a_full_cache_is_looked_through_now_and_then(folder, monkeypatch):
+    monkeypatch.setenv("DIRAX_CACHE_FILES", "512")
+    looks, entries = [], kernel_cache._entries
+    for k in range(512):
+        kernel_cache.write(name(k), KERNEL)
+    monkeypatch.setattr(kernel_cache, "_entries", lambda folder: looks.append(folder) or entries(folder))
+    for k in range(512, 612):
+        kernel_cache.write(name(k), KERNEL)
+    assert 3 <= len(looks) <= 50 and kernel_cache.contents().files <= 512
+    kept = [kernel_cache.read(name(k)) is not None for k in range(612)]
+    assert sum(kept) >= 480 and all(kept[180:]) and not any(kept[:60])  # of those written at one moment any may be the first
+
+
 @pytest.mark.parametrize("setting", ["DIRAX_CACHE_FILES", "DIRAX_CACHE_MEGABYTES"])
 def test_settings_that_are_no_numbers_are_refused(monkeypatch, setting):
     monkeypatch.setenv(setting, "many")
@@ -201,6 +214,7 @@ def test_what_killed_processes_left_is_swept(folder):
     for path in (old, new):
         path.write_bytes(b"part")
     os.utime(old, (1, 1))
+    kernel_cache._room.clear()  # as in another process, whose first kernel it is
     kernel_cache.write(name(1), KERNEL)
     assert not old.exists() and new.exists()
 

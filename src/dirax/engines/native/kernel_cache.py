@@ -117,7 +117,9 @@ def write(name: str, kernel: Kernel) -> None:
             key = _key(folder)
             if key is not None:
                 write_private(folder, name, _signature(key, name, content) + content)
-                _let_go(folder, most)
+                left = _room.get((path, most), Contents(0, 0))
+                left = Contents(left.files - 1, left.size - DIGEST - len(content))
+                _room[path, most] = left if min(left.files, left.size) >= 0 else _let_go(folder, most)
     except NotPrivate as reason:
         _note(path, reason)
     except OSError:
@@ -192,14 +194,23 @@ def _entries(folder: int) -> Iterator[tuple[int, int, str]]:
                     remove(folder, entry.name)
 
 
-def _let_go(folder: int, most: Contents) -> None:
+_room: dict[tuple[Path, Contents], Contents] = {}
+"""What this process may write into a folder with its limits before it looks again at all that is there, which takes longer than
+to compile a small kernel."""
+
+
+def _let_go(folder: int, most: Contents) -> Contents:
+    """Where there is more than the most, let those go that were used longest ago, and a sixteenth of it besides. What may be
+    written before that is looked at again: a quarter of the room that is left, for there may be other processes."""
     entries = sorted(_entries(folder))
     files, size = len(entries), sum(bytes_ for _, bytes_, _ in entries)
-    for _, bytes_, name in entries:
-        if files <= most.files and size <= most.size:
-            break
-        if remove(folder, name):
-            files, size = files - 1, size - bytes_
+    if files > most.files or size > most.size:
+        for _, bytes_, name in entries:
+            if files <= most.files - most.files // 16 and size <= most.size - most.size // 16:
+                break
+            if remove(folder, name):
+                files, size = files - 1, size - bytes_
+    return Contents((most.files - files) // 4, (most.size - size) // 4)
 
 
 def _note(path: Path, reason: NotPrivate) -> None:
