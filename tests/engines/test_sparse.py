@@ -308,7 +308,7 @@ def test_machines_of_many_bodies_are_run_by_the_levels_of_their_program():
     from dirax.engines.step_program import step_program
     from dirax.gallery import n_four_bar
 
-    system, windows = n_four_bar.model(3).system, 3
+    system, windows = n_four_bar.model(2).system, 2
     n, c = 2 * windows + 1, 2 * windows
     equation = make_step_equation(dx.LagrangeDAlembert(), system, Shape(n, c=c))
     plan = sparse_plan(equation, {}, False)
