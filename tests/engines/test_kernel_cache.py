@@ -189,17 +189,28 @@ def test_the_size_is_bounded(folder, monkeypatch):
     assert kernel_cache.contents().files == 3 and kernel_cache.read(name(9)) is None
 
 
-def test_a_folder_of_many_entries_is_looked_through_now_and_then(folder, monkeypatch):
-    monkeypatch.setenv("DIRAX_CACHE_FILES", "300")
+def test_a_full_cache_is_looked_through_now_and_then(folder, monkeypatch):
+    monkeypatch.setenv("DIRAX_CACHE_FILES", "512")
     looks, entries = [], kernel_cache._entries
+    for k in range(512):
+        kernel_cache.write(name(k), KERNEL)
     monkeypatch.setattr(kernel_cache, "_entries", lambda folder: looks.append(folder) or entries(folder))
-    for k in range(400):
-        kernel_cache.write(name(k), Kernel(1, b""))
-        assert k < 200 or len(looks) < 170
-    assert 296 <= len(list(folder.iterdir())) - 1 <= 300  # beside the key
-    monkeypatch.setattr(kernel_cache, "_held", {})  # another process has written the others
-    kernel_cache.write(name(400), Kernel(1, b""))
-    assert 296 <= len(list(folder.iterdir())) - 1 <= 300 and kernel_cache.read(name(400)) is not None
+    for k in range(512, 612):
+        kernel_cache.write(name(k), KERNEL)
+    assert 3 <= len(looks) <= 50 and kernel_cache.contents().files <= 512
+    kept = [kernel_cache.read(name(k)) is not None for k in range(612)]
+    assert sum(kept) >= 480 and all(kept[180:]) and not any(kept[:60])  # of those written at one moment any may be the first
+
+
+def test_what_other_processes_write_counts(folder, monkeypatch):
+    """Before a quarter of the room is used up that there was at the last look, a process looks again."""
+    monkeypatch.setenv("DIRAX_CACHE_FILES", "100")
+    kernel_cache.write(name(), KERNEL)
+    for k in range(1, 101):
+        shutil.copy(folder / name(), folder / name(k))
+    for k in range(101, 126):
+        kernel_cache.write(name(k), KERNEL)
+    assert kernel_cache.contents().files <= 100
 
 
 @pytest.mark.parametrize("setting", ["DIRAX_CACHE_FILES", "DIRAX_CACHE_MEGABYTES"])
@@ -209,26 +220,15 @@ def test_settings_that_are_no_numbers_are_refused(monkeypatch, setting):
         kernel_cache.write(name(), KERNEL)
 
 
-def test_what_killed_processes_left_is_swept(folder, monkeypatch):
+def test_what_killed_processes_left_is_swept(folder):
     kernel_cache.write(name(), KERNEL)
     old, new = (folder / f"{word}{private_folder.UNFINISHED}" for word in ("old", "new"))
     for path in (old, new):
         path.write_bytes(b"part")
     os.utime(old, (1, 1))
-    monkeypatch.setattr(kernel_cache, "_looked", {})  # as in the next process
+    kernel_cache._room.clear()  # as in another process, whose first kernel it is
     kernel_cache.write(name(1), KERNEL)
     assert not old.exists() and new.exists()
-
-
-def test_what_other_processes_write_counts(folder, monkeypatch):
-    """Now and then a process looks how much there is."""
-    monkeypatch.setenv("DIRAX_CACHE_FILES", "100")
-    kernel_cache.write(name(), KERNEL)
-    for k in range(1, 101):
-        shutil.copy(folder / name(), folder / name(k))
-    for k in range(101, 102 + kernel_cache.SELDOM):
-        kernel_cache.write(name(k), KERNEL)
-    assert kernel_cache.contents().files == 100
 
 
 def test_clearing_removes_what_is_the_caches_own(folder):

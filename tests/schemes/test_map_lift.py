@@ -1,5 +1,7 @@
 """Lagrangian systems by any discretization map and its cotangent lift: the θ maps' own form, SciPy on other equations, laws."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -56,6 +58,7 @@ def metric(q):
     return jnp.diag(jnp.array([1.0, 1.0, 0.5])) + 0.2 * jnp.outer(jnp.sin(q), jnp.sin(q))
 
 
+@cache
 def moving_edge():
     """One-forms, forces and explicit time."""
     return dx.LagrangeDirac(
@@ -65,6 +68,7 @@ def moving_edge():
     ), {"q": [0.3, 0.1, 0.4], "v": [0.9, 0.4, 1.0]}
 
 
+@cache
 def tied_pendulum():
     """A holonomic constraint."""
     system = dx.LagrangeDirac(lambda q, v: v @ metric(q) @ v / 2 - q[2], holonomic=lambda q: jnp.array([q @ q - 1.0]))
@@ -148,29 +152,36 @@ def suslov_ode(t, y):
     return np.concatenate([turn, free + multiplier * lifted]), multiplier
 
 
+body_momentum = jax.jit(SO3.body_momentum)
+
+
 def suslov_start():
     g = np.array([0.5, 0.5, -0.5, 0.5])
     omega = np.cross(BODY_AXIS, [1.0, -1.0, 0.4])
     return g, omega
 
 
+@cache
+def suslov_motion():
+    """t ↦ (g, ω), by DOP853."""
+    start = np.concatenate(suslov_start())
+    found = solve_ivp(lambda t, y: suslov_ode(t, y)[0], (0, 1), start, "DOP853", dense_output=True, rtol=1e-12, atol=1e-13)
+    return found.sol
+
+
 @pytest.mark.parametrize("constraints", METHODS)
 @pytest.mark.parametrize("map", [dx.LieGroupExp(SO3), dx.RiemannianExp(SO3)])
 def test_suslovs_problem_on_the_group_against_eulers_equations(map, constraints):
     g, omega = suslov_start()
-    exact = solve_ivp(
-        lambda t, y: suslov_ode(t, y)[0], (0, 1), np.concatenate([g, omega]), method="DOP853", rtol=1e-12, atol=1e-13,
-        dense_output=True,
-    ).sol  # fmt: skip
-    errors = []
+    exact, errors = suslov_motion(), []
+    v = np.asarray(SO3.left_translate(jnp.asarray(g), jnp.asarray(omega)))
     for steps in (20, 40, 80):
-        v = np.asarray(SO3.left_translate(jnp.asarray(g), jnp.asarray(omega)))
         sol = dx.simulate(suslov, dx.DiscreteDirac(map, constraints), q=g, v=v, step=1 / steps, steps=steps)
         assert sol.ok and np.abs(np.linalg.norm(sol.q, axis=1) - 1).max() < 1e-15 * steps
         assert np.abs((sol.q * sol.p).sum(axis=1)).max() < 1e-14
         if constraints == "resolve":
             assert np.abs(sol.constraint_residual()).max() < 1e-13
-        momentum = np.asarray(jax.vmap(SO3.body_momentum)(sol.q, sol.p))[-1]
+        momentum = np.asarray(body_momentum(sol.q[-1], sol.p[-1]))
         turned = INERTIA @ exact(1.0)[4:]
         means = (sol.multipliers[1:, 0] + sol.multipliers[:-1, 0]) / 2  # of neighbours, at the node between them
         forces = np.array([suslov_ode(t, exact(t))[1] for t in np.asarray(sol.t)[1:-1]])

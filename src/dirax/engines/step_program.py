@@ -72,9 +72,13 @@ def inputs(g: Graph, size: int) -> Inputs:
     return Inputs(g.input("t"), g.input("h"), [g.input(f"param{i}") for i in range(size)])
 
 
+_jaxprs: Memo[ClosedJaxpr] = Memo(KEPT)
+
+
 def trace(g: Graph, shared: Inputs, equation: Any, p: Parameters) -> TracedEquation:
-    """The nodes of one equation. Raises `UnsupportedPrimitive`."""
-    closed, s, k = _jaxpr(equation, p), equation.state_size, equation.unknowns
+    """The nodes of one equation, which is traced once, whether alone or as a part of compositions. Raises
+    `UnsupportedPrimitive`."""
+    closed, s, k = _jaxprs.get((Same(equation), p.key), lambda: _jaxpr(equation, p)), equation.state_size, equation.unknowns
     return _nodes(g, shared, closed, tuple(sorted(equation.fields)), s, k, p, equation.weak)
 
 

@@ -35,21 +35,12 @@ class SampleUnits(NamedTuple):
 
 def sample_units(value: Callable, constraints: Any, q: np.ndarray, v: np.ndarray, params: Any) -> SampleUnits:
     """Those of a function value(q, v, params), a Lagrangian in coordinates or a discrete one, and of constraints, from their
-    numbers at (q, v)."""
+    numbers at (q, v). Equal functions and constraints are traced once."""
     n = q.size
     if n > MOST:
         return SampleUnits.plain(n)
 
-    @once
-    def numbers(q, v, params):
-        of_both = lambda both: value(both[:n], both[n:], params)
-        by_both, both = gradient(of_both), jnp.concatenate([q, v])
-        rows = [jnp.zeros((0, n))]
-        if constraints is not None and constraints.any:
-            rows.append(constraints.matrix(0.0, q, params))
-        return of_both(both), by_both(both), jacobian(by_both)(both), jnp.concatenate(rows)
-
-    size, slope, bend, rows = (np.asarray(a) for a in evaluated(numbers, q, v, params))
+    size, slope, bend, rows = (np.asarray(a) for a in evaluated(once(_numbers, value, constraints), q, v, params))
     if not all(np.all(np.isfinite(a)) for a in (size, slope, bend, rows)):
         return SampleUnits.plain(n)
     time, energy, first = n, n + 1, n + 2
@@ -69,3 +60,14 @@ def sample_units(value: Callable, constraints: Any, q: np.ndarray, v: np.ndarray
         terms.add(values[there], None, (there, 1.0), (time + 0 * there, power))
     units = terms.units((slice(0, n), tuple(f"q{i}" for i in range(n))))
     return SampleUnits(units[:n], float(units[time]))
+
+
+def _numbers(value: Callable, constraints: Any, q: Any, v: Any, params: Any) -> tuple:
+    """value(q, v, params), its first and second derivatives by (q, v), and the rows of the constraints."""
+    n = q.size
+    of_both = lambda both: value(both[:n], both[n:], params)
+    by_both, both = gradient(of_both), jnp.concatenate([q, v])
+    rows = [jnp.zeros((0, n))]
+    if constraints is not None and constraints.any:
+        rows.append(constraints.matrix(0.0, q, params))
+    return of_both(both), by_both(both), jacobian(by_both)(both), jnp.concatenate(rows)

@@ -13,6 +13,7 @@ from dirax.numerics.ranks import numerical_rank
 from dirax.numerics.tolerances import SYMMETRY_DEFECT, TINY
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.memo import Same
+from dirax.program.tracing import once
 from dirax.program.user_functions import UserFunction
 from dirax.reduction.actions import AbstractAction
 from dirax.reduction.sample_units import SampleUnits, sample_units
@@ -95,7 +96,11 @@ def units_of(system: Any, q: np.ndarray, v: np.ndarray, params: Any) -> SampleUn
     form: Any = with_lagrangian(system)
     if getattr(form, "lagrangian_form", lambda: None)() is not form:
         return SampleUnits.plain(q.size)
-    return sample_units(lambda q, v, params: form.lagrangian.at(0.0, q, v, params), form.constraints, q, v, params)
+    return sample_units(once(_at_time_zero, form.lagrangian), form.constraints, q, v, params)
+
+
+def _at_time_zero(lagrangian: UserFunction, q: Any, v: Any, params: Any) -> Any:
+    return lagrangian.at(0.0, q, v, params)
 
 
 Samples: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]

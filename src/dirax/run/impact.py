@@ -10,6 +10,7 @@ import numpy as np
 
 from dirax.program.evaluation.functions import program_of
 from dirax.program.linear_solves import solve
+from dirax.program.tracing import once
 from dirax.run.event import names_of
 from dirax.schemes.collision_step import bounced, least_squares
 from dirax.schemes.step import StepEquation
@@ -71,7 +72,11 @@ class Impact:
 
 def gaps_of(walls: Sequence[Impact]) -> Callable:
     """(t, q, params) ↦ the gaps of all walls (walls,)."""
-    return lambda t, q, params: jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in walls])
+    return once(_gaps, tuple(walls))
+
+
+def _gaps(walls: Sequence[Impact], t: Any, q: Any, params: Any) -> Any:
+    return jnp.stack([jnp.asarray(wall(t, q, params), float) for wall in walls])
 
 
 def jump(

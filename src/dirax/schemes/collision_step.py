@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from dirax.program.legendre import moves
 from dirax.program.linear_solves import scaled_pseudo_inverse, solve
-from dirax.program.tracing import gradient
+from dirax.program.tracing import gradient, once
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
@@ -66,6 +66,7 @@ class CollisionStep(AbstractStep):
     def guess(self, state, previous, h, params):
         return jnp.append(self.inner.guess(state[:-3], previous[:-1], h * previous[-1], params), previous[-1])
 
+    @once
     def at_wall(self, u, state, t, h, params) -> tuple[Any, Any, Any]:
         """(state of `inner`, time, gaps) at the wall."""
         after, layout = self.inner.advance(u[:-1], state[:-3], t, u[-1] * h, params), self.inner.state_layout
@@ -91,6 +92,7 @@ class CollisionStep(AbstractStep):
         there, time, _ = self.at_wall(u, state, t, h, params)
         return {**row, LEAVING: self._jumped(u, state, there, time, h, params)[1]}
 
+    @once
     def _jumped(self, u, state, there, time, h, params):
         now, restitution = self.inner.state_layout.split(there), self._own(state[-2], self.restitutions)
         begun = self.inner.state_layout.split(state[:-3])

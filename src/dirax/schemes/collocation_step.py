@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dirax.program.tracing import gradient
+from dirax.program.tracing import gradient, once
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.collocation_tables import Tableau
 from dirax.schemes.labels import Labels
@@ -44,6 +44,7 @@ class CollocationStep(AbstractStep):
     def labels(self) -> Labels:
         return sum((Labels.numbered(f"{AT_NODE} {j + 1}", self.n) for j in range(self.tableau.stages)), Labels())
 
+    @once
     def nodes(self, u, state, t, h, params) -> tuple[list, list, list, list]:
         """(time, y, a, ḃ) at every node."""
         times = [t + c * h for c in self.tableau.nodes.tolist()]

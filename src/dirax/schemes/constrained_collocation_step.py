@@ -120,6 +120,7 @@ class ConstrainedCollocation(AbstractStep):
         force = self.system.forces(t, q, v, params)
         return slope + force, force @ v
 
+    @once
     def nodes(self, u, state, t, h, params) -> Nodes:
         """The nodes of a step."""
         times = [t + c * h for c in self.tableau.nodes.tolist()]

@@ -103,6 +103,7 @@ class EnergyCollocationStep(AbstractStep):
         a = state[None, : self.moving] + h * (np.concatenate([table.matrix, self.tableau.weights[None]]) @ y)
         return y, a, inner.reshape(len(points), -1) if self.inner else values @ y, t + h * points
 
+    @once
     def _nodes(self, u, state, t, h, params) -> tuple[Array, Array]:
         """What is zero (stages, moving) at the right rates of the nodes, and (ȧ, ḃ) (stages, s) there."""
         y, a, at, times = self._at_points(u, state, t, h)

@@ -84,6 +84,7 @@ class ManifoldCollocation(AbstractStep):
         p = by_r @ solve(by_shift.T @ by_r, momentum, apart=True)
         return nearest(q + along), p, by_r.T @ p
 
+    @once
     def nodes(self, u, state, h, params) -> tuple[Any, Any, tuple]:
         """∂L/∂z (s, N) at the nodes, ∂L/∂ż + h Σ_j (b_j − a_ij) ∂L/∂z (s, N), and (q_1, p_1, π_1)."""
         (q, p), rates = self.state.split(state), u.reshape(self.tableau.stages, -1)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.program.legendre import moves
-from dirax.program.tracing import along
+from dirax.program.tracing import along, once
 from dirax.program.user_functions import evaluated
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.layout import Layout
@@ -60,6 +60,7 @@ class VariableStep(AbstractStep):
 
     # ------------------------------------------------------------------------------------------ the length of a step
 
+    @once
     def place(self, state, h, params) -> Place:
         """What there is to know of a state."""
         own, density, time = state[:-2], state[-2], state[-1]
@@ -72,6 +73,7 @@ class VariableStep(AbstractStep):
         row = self.inner.unpack(own, step[:-1], time, step[-1], params)
         return {name: row[name] for name in ("q", "p", "x") if name in row}
 
+    @once
     def growth(self, own, time, params):
         """G = d ln ρ/dt along the motion."""
         row = self.row(own, time, params)
@@ -162,7 +164,7 @@ class VariableStep(AbstractStep):
         at, interpolate = self.place(state, h, params), self.inner.interpolate
         assert interpolate is not None
         found = interpolate(theta, u, at.state, at.time, at.length, params)
-        after = self.advance(u, state, t, h, params)
+        after = once(self.advance)(u, state, t, h, params)
         density = at.density + theta * (after[-2] - at.density)
         return {**found, STEP_DENSITY: density, CLOCK: at.time + theta * at.length}
 

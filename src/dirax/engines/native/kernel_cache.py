@@ -117,8 +117,9 @@ def write(name: str, kernel: Kernel) -> None:
             key = _key(folder)
             if key is not None:
                 write_private(folder, name, _signature(key, name, content) + content)
-                if _may_be_full(path, DIGEST + len(content), most):
-                    _looked[path] = _let_go(folder, most), 0
+                left = _room.get((path, most), Contents(0, 0))
+                left = Contents(left.files - 1, left.size - DIGEST - len(content))
+                _room[path, most] = left if min(left.files, left.size) >= 0 else _let_go(folder, most)
     except NotPrivate as reason:
         _note(path, reason)
     except OSError:
@@ -193,33 +194,23 @@ def _entries(folder: int) -> Iterator[tuple[int, int, str]]:
                     remove(folder, entry.name)
 
 
-SELDOM = 64
-"""Kernels that a process writes before it looks how many others have written: that takes 8 ms where there are 4096."""
-
-_looked: dict[Path, tuple[Contents, int]] = {}
-"""What a folder held at the last look, with what this process has written since, and how many kernels that was."""
-
-
-def _may_be_full(path: Path, size: int, most: Contents) -> bool:
-    """Whether to look what the folder holds, now that there is a kernel of this size more."""
-    if path not in _looked:
-        return True
-    held, written = _looked[path]
-    held = Contents(held.files + 1, held.size + size)
-    _looked[path] = held, written + 1
-    return held.files > most.files or held.size > most.size or written >= SELDOM
+_room: dict[tuple[Path, Contents], Contents] = {}
+"""What this process may write into a folder with its limits before it looks again at all that is there, which takes longer than
+to compile a small kernel."""
 
 
 def _let_go(folder: int, most: Contents) -> Contents:
-    """Remove those that were used longest ago until there are no more than `most`. Returns what is left."""
+    """Where there is more than the most, let those go that were used longest ago, and a sixteenth of it besides. What may be
+    written before that is looked at again: a quarter of the room that is left, for there may be other processes."""
     entries = sorted(_entries(folder))
     files, size = len(entries), sum(bytes_ for _, bytes_, _ in entries)
-    for _, bytes_, name in entries:
-        if files <= most.files and size <= most.size:
-            break
-        if remove(folder, name):
-            files, size = files - 1, size - bytes_
-    return Contents(files, size)
+    if files > most.files or size > most.size:
+        for _, bytes_, name in entries:
+            if files <= most.files - most.files // 16 and size <= most.size - most.size // 16:
+                break
+            if remove(folder, name):
+                files, size = files - 1, size - bytes_
+    return Contents((most.files - files) // 4, (most.size - size) // 4)
 
 
 def _note(path: Path, reason: NotPrivate) -> None:
