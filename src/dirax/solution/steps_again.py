@@ -1,6 +1,7 @@
 """The steps of a run once more, where they are asked for: the state that each leaves and its unknowns, kept once found."""
 
 import contextlib
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -98,7 +99,8 @@ def _roots_on_host(equation: Any, state: Any, guess: tuple, t: Any, h: Any, para
     def find(*given: Any) -> tuple[np.ndarray, ...]:
         """Of arrays (…, n), with the axes of vmap in front."""
         lead = np.broadcast_shapes(*(np.shape(a)[:-1] for a in given))
-        rows = lambda a: np.broadcast_to(a, (*lead, np.shape(a)[-1])).reshape(-1, np.shape(a)[-1])
+        many = math.prod(lead)  # said, for a run may have no parameters
+        rows = lambda a: np.broadcast_to(a, (*lead, np.shape(a)[-1])).reshape(many, np.shape(a)[-1])
         state, t, h, numbers, *guesses = map(rows, given)
         made = steps.step(state, guesses, t[:, 0], h[:, 0], numbers)
         found = (np.where(made.good[:, None], u, np.nan) for u in made.unknowns)
