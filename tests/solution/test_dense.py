@@ -176,3 +176,10 @@ def test_rows_that_were_not_saved(scheme):
     errors = [np.max(np.abs(run(0.04 / k, 80 * k, save_every=80 * k).at(times).p - p)) for k in (1, 2, 4)]
     order = 4 if isinstance(scheme, dx.Composition) else 2
     assert np.log2(errors[0] / errors[2]) / 2 > order - 0.25, errors
+
+
+def test_rows_on_manifolds_are_the_runs_own():
+    """The polynomial of the momenta meets those of the rows up to its order alone."""
+    sol = gallery.get("spherical-pendulums").simulate(dx.Collocation(2), steps=12, save_every=3)
+    rows = sol.at(sol.t)
+    assert all(np.array_equal(rows.fields[name], sol.fields[name]) for name in ("q", "p"))

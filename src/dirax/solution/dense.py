@@ -115,9 +115,7 @@ class Dense(BetweenRows):
         return DividedSteps(self)
 
     def _by_steps(self, lanes, numbers, theta, t, h) -> dict[str, np.ndarray]:
-        nearest = numbers + (theta > 0.5)
-        row = np.minimum(np.searchsorted(self.counts, nearest), self.sol.rows - 1)
-        at_row = (np.abs(numbers + theta - nearest) <= AT_ROW) & (self.counts[row] == nearest)
+        row, at_row = self._saved_row(numbers, theta)
         found = {name: self.saved[name][lanes, row].astype(float) for name in self.nodes}
         if not np.all(at_row):
             off = ~at_row
@@ -140,6 +138,12 @@ class Dense(BetweenRows):
                     found[name][fails] = values
         return found
 
+    def _saved_row(self, numbers: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The saved rows that are nearest to places in steps, and which of these are at them."""
+        nearest = numbers + (theta > 0.5)
+        row = np.minimum(np.searchsorted(self.counts, nearest), self.sol.rows - 1)
+        return row, (np.abs(numbers + theta - nearest) <= AT_ROW) & (self.counts[row] == nearest)
+
     def _near_row(self, lanes: np.ndarray, numbers: np.ndarray, theta: np.ndarray) -> dict[str, np.ndarray]:
         """The same so near to a row that the equations of a step of this length are not solved in floats: by the cubic through
         the row and longer steps."""
@@ -160,6 +164,10 @@ class Dense(BetweenRows):
         numbers, theta = self.place(lanes, flat)
         found = self.inside(lanes, numbers, theta)
         fields: dict[str, Any] = {name: found.get(name, self.of_rows(name, lanes, numbers)) for name in self.nodes}
+        row, there = self._saved_row(numbers, theta)
+        if sol.impacts is None:  # which may be at rows
+            for name, values in fields.items():
+                values[there] = self.saved[name][lanes, row][there]
         if sol.save_every == 1:
             steps = {name: a for name, a in self.saved.items() if name not in fields}
             fields |= {name: a[lanes, np.minimum(numbers, a.shape[1] - 1)] for name, a in steps.items()}
