@@ -7,8 +7,8 @@ from collections import Counter
 
 from fuzz.examine import SCHEMES, examine, examine_together, random_case
 
-TOGETHER = 32
-"""Systems of a kind that are examined as one batch: of more, not every row would be computed again."""
+TOGETHER = 16
+"""Systems of a kind that are examined as one batch: of many, not every row is computed again."""
 
 DEEP = 200
 """One system of so many is examined alone and in depth."""
