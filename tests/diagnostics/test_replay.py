@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import dirax as dx
+from dirax import gallery
 from dirax.diagnostics.replay_lines import replayed
 from dirax.numerics.inverses import LARGE
 
@@ -247,3 +248,22 @@ def test_also_where_the_step_after_says_what_a_row_holds(scheme, h, seed, steps)
         changed = np.array(sol.fields[name])
         changed[row] *= 1.0 + off
         assert replayed(sol.replace(fields=sol.fields | {name: changed}), None).verdict == "VIOLATED", (name, row)
+
+
+@pytest.mark.parametrize(
+    ("name", "scheme"),
+    [
+        ("knife-edge", dx.Collocation(2, "lobatto")),
+        ("spherical-pendulums", dx.LagrangeDAlembert()),
+        ("mass-spring-damper", dx.DiscreteGradient()),
+        ("suslov", None),
+    ],
+)
+def test_a_part_of_a_run_is_right_where_the_run_is(name, scheme):
+    """Its first row is none that a run began at: what no row holds goes on from there. A damage is seen as in the whole."""
+    part = gallery.get(name).simulate(*([scheme] if scheme else []), steps=14)[4:11]
+    assert dx.verify(part).ok, dx.verify(part)
+    field = "x" if "x" in part.fields else "p"
+    values = np.array(part.fields[field])
+    values[3, 0] += 1e-6 * np.abs(values).max()
+    assert replayed(part.replace(fields=part.fields | {field: values}), None).verdict == "VIOLATED"

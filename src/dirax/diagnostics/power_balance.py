@@ -70,9 +70,9 @@ def _flow_size(system: Any, x, params: Any):
 
 
 def _whole_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
-    """H − H(0) − supplied + dissipated at every saved row."""
+    """H − H(0) − supplied + dissipated at every saved row, since the first one."""
     energy, work = energy_of(sol), np.asarray(sol.fields["work"])
-    supplied, dissipated = work[..., 0], work[..., 1]
+    supplied, dissipated = np.moveaxis(work - work[..., :1, :], -1, 0)
     missing = np.abs(energy - energy[..., :1] - supplied + dissipated)
     sizes = energy_scale + np.abs(supplied) + np.abs(dissipated)
     worst = float(np.nanmax(relative_to(missing, sizes)))

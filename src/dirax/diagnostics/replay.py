@@ -15,7 +15,7 @@ from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
 from dirax.solution.solution import Solution
-from dirax.solution.trajectory import SavedRow, last_rows
+from dirax.solution.trajectory import ROWS_BEFORE, SavedRow, last_rows
 
 MOST_OPERATIONS = 4e7
 """Scalar operations of the steps that are taken again, a few tenths of a second: of longer runs as many rows, evenly spread."""
@@ -147,6 +147,11 @@ class Replay:
         return "q0" in self.sol.initial
 
     @property
+    def begins(self) -> bool:
+        """Whether the run began at its first row, and does not go on from one that was left out."""
+        return ROWS_BEFORE not in self.sol.stats
+
+    @property
     def hides(self) -> bool:
         """Whether a state has entries that no row holds."""
         return len(self.held) < len(self.steps.program.equations[self.steps.program.stages[0][0]].state)
@@ -209,7 +214,7 @@ class Replay:
         program, sol = self.steps.program, self.sol
         sizes = [len(program.equations[index].unknowns) for index, _ in program.stages]
         states, *guesses = np.split(self._started(lanes, rows, False), np.cumsum([self.state_size, *sizes])[:-1], axis=1)
-        if self.hides:
+        if self.hides and self.begins:
             lane = np.arange(sol.batch or 1)
             first = self._started(lane, np.zeros_like(lane), True)[lanes, : self.state_size]
             states[:, self.constants] = first[:, self.constants]

@@ -172,7 +172,7 @@ class _Comparison:
 
     def _expect(self, entries: np.ndarray, here: np.ndarray, there: np.ndarray, if_nearer: bool = False) -> None:
         """Take what the steps of some entries say of their rows and of the next ones."""
-        first = np.full(len(entries), True) if not self.replay.hides else self.at.rows[entries] == 0
+        first = np.full(len(entries), True) if not self.replay.hides else self.replay.begins & (self.at.rows[entries] == 0)
         after = self.next[entries]
         for which, rows, said in ((first, entries, here), (after >= 0, after, there)):
             rows, said = rows[which], said[which]

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from dirax.program.user_functions import is_traced
-from dirax.solution.trajectory import Some, Trajectory
+from dirax.solution.trajectory import ROWS_BEFORE, Some, Trajectory
 from dirax.text.representation import shortened
 
 SLACK = 1e-6
@@ -104,6 +104,7 @@ def rows_of(sol: Some, rows: range) -> Some:
     if rows.start > 0:
         names = ("q", "p") if "q" in sol.fields else ("x",)
         changes["initial"] = {k: sol.fields[k][(*lead, rows.start)] for k in names if k in sol.fields}
+        changes["stats"] = sol.stats | {ROWS_BEFORE: sol.stats.get(ROWS_BEFORE, 0) + rows.start}
     part = sol.replace(t=sol.axis[rows.start : rows.stop], fields=fields, **changes)
     part.events, part.impacts = (_between_rows(sol, found, rows) for found in (sol.events, sol.impacts))
     return part

@@ -20,6 +20,9 @@ from dirax.text.representation import counted, fields_html
 BESIDE_ROW = 1e-6
 """Part of a step by which a wall may be hit off a row and still at it."""
 
+ROWS_BEFORE = "rows_before"
+"""The entry of `stats` that says how many rows of the run a part of it leaves out in front."""
+
 BLOCK = 2**16
 """Rows that a quantity is computed for at a time, which bounds the memory that it takes."""
 
