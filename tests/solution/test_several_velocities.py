@@ -39,6 +39,16 @@ def test_energies_and_places_between_rows(motion, scheme, of_energy, of_q):
     assert dx.verify(sol).ok
 
 
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Composition(dx.LagrangeDAlembert(), "kahan-li6")])
+@pytest.mark.parametrize("v", [1.5, -0.9, 0.2])
+def test_rows_far_from_saved_ones(scheme, v):
+    run = lambda every: dx.simulate(dx.LagrangeDirac(lagrangian), scheme, q=[0.0], v=[v], step=0.01, steps=20, save_every=every)
+    whole, thin = run(1), run(20)
+    found = thin.at(whole.t[[3, 11, 17]])
+    for name in ("q", "p"):
+        np.testing.assert_allclose(found.fields[name], whole.fields[name][[3, 11, 17]], rtol=0, atol=1e-13)
+
+
 def test_rows_of_a_batch_are_those_of_one():
     run = lambda q, v: dx.simulate(dx.LagrangeDirac(lagrangian), dx.LagrangeDAlembert(), q=q, v=v, step=0.01, steps=9)
     two, one = run(np.zeros((2, 1)), [[1.5], [1.2]]), run([0.0], [1.2])

@@ -23,7 +23,6 @@ them itself in no time. Those of very many unknowns are found by `sizes_of_many.
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -42,6 +41,7 @@ from dirax.program.compiled import compiled
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.linear_solves import solve
+from dirax.program.on_host import called_on_host
 from dirax.program.roots import FEWEST_SPARSE
 
 Sizes = tuple[Any, ...]
@@ -190,21 +190,13 @@ def _on_host(p: Problem) -> Sizes | None:
         )
     except (UnsupportedPrimitive, GraphTooLarge):
         return None
-    entries, widths = len(at.state), [u.shape[1] for u in at.guesses]
 
-    def find(*given: Any) -> tuple[np.ndarray, ...]:
-        """Of arrays (…, entries, n), with the axes of vmap in front."""
-        lead = np.broadcast_shapes(*(a.shape[:-2] for a in given))
-        many = math.prod(lead) * entries  # said, for a run may have no parameters
-        flat = [np.broadcast_to(a, (*lead, *a.shape[-2:])).reshape(many, a.shape[-1]) for a in map(np.asarray, given)]
-        (state, t, h, leaves), guesses = flat[:4], flat[4:]
-        here = dataclasses.replace(at, state=state, guesses=guesses, t=t[:, 0], h=h[:, 0], leaves=leaves)
-        return tuple(a.reshape(*lead, entries, a.shape[-1]) for a in _looked_at(here))
+    def find(state: np.ndarray, t: np.ndarray, h: np.ndarray, leaves: np.ndarray, *guesses: np.ndarray) -> list[np.ndarray]:
+        return _looked_at(dataclasses.replace(at, state=state, guesses=guesses, t=t[:, 0], h=h[:, 0], leaves=leaves))
 
-    shapes = tuple(jax.ShapeDtypeStruct((entries, width), float) for width in widths)
-    given = jax.lax.stop_gradient((at.state, at.t[:, None], at.h[:, None], at.leaves, *at.guesses))
-    found = jax.pure_callback(find, shapes, *given, vmap_method="expand_dims")
-    return found if p.batch is not None else tuple(a[0] for a in found)
+    widths = [u.shape[1] for u in at.guesses]
+    found = called_on_host(find, widths, at.state, at.t[:, None], at.h[:, None], at.leaves, *at.guesses)
+    return tuple(found) if p.batch is not None else tuple(a[0] for a in found)
 
 
 def _arguments(p: Problem, t: Any) -> tuple:

@@ -56,6 +56,21 @@ def on_host(function: Callable, leaves: Sequence[Any], key: Hashable) -> Any:
     return jax.tree.unflatten(jax.tree.structure(result), host_p.bind(*leaves, jaxpr=jaxpr, linear=0))
 
 
+def called_on_host(function: Callable, widths: Sequence[int], *arrays: Any) -> list[jax.Array]:
+    """`function(*arrays)` of arrays (…, n), with all axes but the last as one: arrays (…, width) of these widths, without
+    derivatives, by a call of the host from where XLA runs. `vmap` adds axes in front."""
+
+    def called(*given: Any) -> tuple[np.ndarray, ...]:
+        lead = np.broadcast_shapes(*(np.shape(a)[:-1] for a in given))
+        many = math.prod(lead)  # said, for an array may have no numbers
+        flat = (np.broadcast_to(a, (*lead, np.shape(a)[-1])).reshape(many, np.shape(a)[-1]) for a in given)
+        return tuple(a.reshape(*lead, a.shape[-1]) for a in function(*flat))
+
+    lead = np.shape(arrays[0])[:-1]
+    shapes = [jax.ShapeDtypeStruct((*lead, width), float) for width in widths]
+    return list(jax.pure_callback(called, tuple(shapes), *jax.lax.stop_gradient(arrays), vmap_method="expand_dims"))
+
+
 def _program(jaxpr: ClosedJaxpr) -> ScalarProgram | None:
     def made() -> ScalarProgram | None:
         try:

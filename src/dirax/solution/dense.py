@@ -167,7 +167,7 @@ class Dense(BetweenRows):
         row, there = self._saved_row(numbers, theta)
         if sol.impacts is None:  # which may be at rows
             for name, values in fields.items():
-                values[there] = self.saved[name][lanes, row][there]
+                values[there] = self.saved[name][lanes[there], row[there]]
         if sol.save_every == 1:
             steps = {name: a for name, a in self.saved.items() if name not in fields}
             fields |= {name: a[lanes, np.minimum(numbers, a.shape[1] - 1)] for name, a in steps.items()}

@@ -1,7 +1,6 @@
 """The steps of a run once more, where they are asked for: the state that each leaves and its unknowns, kept once found."""
 
 import contextlib
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -11,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.contract import Problem
+from dirax.engines.contract import Outcome, Problem
 from dirax.engines.in_jax import in_scalars
 from dirax.engines.policy import engine_of
 from dirax.engines.sizes import sizes_near
@@ -23,6 +22,7 @@ from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
+from dirax.program.on_host import called_on_host
 from dirax.schemes.step import CLOCK, Field, StepEquation, composed_row, needs_every_part
 from dirax.solution.trajectory import Trajectory
 
@@ -85,7 +85,7 @@ def stepped(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any
     return state, tuple(unknowns), tuple(states)
 
 
-def _roots_on_host(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> tuple | None:
+def _roots_on_host(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> list | None:
     """The unknowns of each stage, without derivatives and NaN where there are none, by a call of the host from where XLA runs:
     it takes seconds to compile an iteration. None where the step has no scalar program, or JAX a device of its own."""
     if jax.default_backend() != "cpu":
@@ -94,22 +94,15 @@ def _roots_on_host(equation: Any, state: Any, guess: tuple, t: Any, h: Any, para
         steps = StepsInNumbers.of(equation, params, False)
     except (UnsupportedPrimitive, GraphTooLarge):
         return None
-    sizes = [stage.unknowns for stage, _ in equation.stages]
 
-    def find(*given: Any) -> tuple[np.ndarray, ...]:
-        """Of arrays (…, n), with the axes of vmap in front."""
-        lead = np.broadcast_shapes(*(np.shape(a)[:-1] for a in given))
-        many = math.prod(lead)  # said, for a run may have no parameters
-        rows = lambda a: np.broadcast_to(a, (*lead, np.shape(a)[-1])).reshape(many, np.shape(a)[-1])
-        state, t, h, numbers, *guesses = map(rows, given)
+    def find(state: np.ndarray, t: np.ndarray, h: np.ndarray, numbers: np.ndarray, *guesses: np.ndarray) -> list[np.ndarray]:
         made = steps.step(state, guesses, t[:, 0], h[:, 0], numbers)
-        found = (np.where(made.good[:, None], u, np.nan) for u in made.unknowns)
-        return tuple(u.reshape(*lead, k) for u, k in zip(found, sizes, strict=True))
+        return [np.where(made.good[:, None], u, np.nan) for u in made.unknowns]
 
-    numbers = steps.program.parameters.flatten(params, None, jnp)
+    numbers = jnp.reshape(steps.program.parameters.flatten(params, None, jnp), (-1,))
     one = lambda a: jnp.reshape(jnp.asarray(a, float), (1,))
-    given = jax.lax.stop_gradient((jnp.asarray(state), one(t), one(h), jnp.reshape(numbers, (-1,)), *map(jnp.asarray, guess)))
-    return jax.pure_callback(find, tuple(jax.ShapeDtypeStruct((k,), float) for k in sizes), *given, vmap_method="expand_dims")
+    widths = [stage.unknowns for stage, _ in equation.stages]
+    return called_on_host(find, widths, jnp.asarray(state), one(t), one(h), numbers, *map(jnp.asarray, guess))
 
 
 def sized_step(
@@ -272,21 +265,28 @@ class StepsAgain:
         state, u = self.begun_at(lanes, rows, self.time(self.counts[rows]))
         arrived = np.zeros(len(lanes), bool)
         for i, (lane, first, last) in enumerate(zip(lanes, self.counts[rows], numbers, strict=True)):
-            params = jax.tree.map(lambda a, i=lane: np.asarray(a)[i] if sol.batch_params else np.asarray(a), sol.given_params)
             steps = int(last - first)
             problem = Problem(
                 equation=self.equation, state=state[i], guess=self._split(u[i]), h=float(sol.step), t0=float(sol.axis[0]),
-                steps=steps, save_every=steps - 1, first_step=int(first), params=params,
+                steps=steps, save_every=steps - 1, first_step=int(first), params=self._params(lane),
             )  # fmt: skip
             out = engine.run(problem)
             arrived[i] = out.completed[0] == steps
             if arrived[i]:
-                row = {
-                    name: np.asarray(a)[:, -1] for name, a in out.fields.items()
-                } | out.closing  # the last step's, and after it
+                row = self._last_row(problem, out)
                 state[i], u[i] = out.last_state[0], self.begin(lanes[i : i + 1], row, self.time(numbers[i : i + 1]))[1][0]
         lanes, numbers, state = lanes[arrived], numbers[arrived], state[arrived]
         self._keep(lanes, numbers, state, self._whole(lanes, state, u[arrived], self.time(numbers))[1])
+
+    def _last_row(self, problem: Problem, out: Outcome) -> dict[str, np.ndarray]:
+        """The last row of a run whose last step was saved, with the fields of that step, and near what its velocity is."""
+        fields = {name: np.asarray(a) for name, a in out.fields.items()}
+        row = {name: a[:, -1] for name, a in fields.items()}
+        if self.about is not None:
+            flat = {name: fields[name].reshape(1, fields[name].shape[1], -1) for name in self.sol.system.searches_near}
+            rate = lambda name, a: (a[:, -1] - a[:, -2]) / problem.h if problem.is_node(name) else a[:, -1]
+            row["about"] = np.concatenate([rate(name, a) for name, a in flat.items()], axis=1)
+        return row
 
     def _keep(self, lanes: np.ndarray, numbers: np.ndarray, states: np.ndarray, unknowns: np.ndarray) -> None:
         self.states[lanes, numbers], self.unknowns[lanes, numbers] = states, unknowns
@@ -331,10 +331,9 @@ class StepsAgain:
         """`step` with the length of the run's: by machine code where there are many, and they do not depend on the time."""
         if len(lanes) >= MANY and self.solved is not None:
             sol = self.sol
-            params = jax.tree.map(lambda a: np.asarray(a)[lanes] if sol.batch_params else np.asarray(a), sol.given_params)
             problem = Problem(
-                equation=self.solved, state=state, guess=(u,), h=float(sol.step), t0=float(sol.axis[0]), steps=1, params=params,
-                batch=len(lanes), batch_params=sol.batch_params,
+                equation=self.solved, state=state, guess=(u,), h=float(sol.step), t0=float(sol.axis[0]), steps=1,
+                params=self._params(lanes), batch=len(lanes), batch_params=sol.batch_params,
             )  # fmt: skip
             with contextlib.suppress(UnsupportedPrimitive, ImportError):
                 out = engine_of("native").run(problem)
@@ -377,6 +376,11 @@ class StepsAgain:
     def _split(self, u: Any) -> tuple:
         """The unknowns of each stage."""
         return tuple(u[..., end - stage.unknowns : end] for end, (stage, _) in zip(self.ends, self.equation.stages, strict=True))
+
+    def _params(self, lanes: Any) -> Any:
+        """The params of a trajectory or of several, or those that all share."""
+        own = (lambda a: np.asarray(a)[lanes]) if self.sol.batch_params else np.asarray
+        return jax.tree.map(own, self.sol.given_params)
 
     def _numbers(self, lanes: np.ndarray) -> np.ndarray:
         steps, sol = self.in_numbers, self.sol

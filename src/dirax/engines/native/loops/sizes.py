@@ -69,16 +69,16 @@ def _define_sizes(plan: Plan, module: Module, width: int, index: int) -> None:
     found = FirstSizes(plan.graph, Linearized.of(plan.graph, equation, plan.shared.h, correction.jacobian), correction.order)
     region.require(found.outputs)
     status = b.at(e.real, "%lanes", record.status)
-    one = lambda node: e.compare("oeq", region.value(node), e.const(1.0))
-    verdict, asked = b.alloca(e.bool), e.both(one(found.sure), one(found.asked))
-    b.store(e.bool, one(found.sure), verdict, 1)
+    sure, asked = (e.compare("oeq", region.value(node), e.const(1.0)) for node in (found.sure, found.asked))
+    verdict, asked = b.alloca(e.bool), e.both(sure, asked)
+    b.store(e.bool, sure, verdict, 1)
     with b.when(e.any(asked)):
         there = where([region.value(node) for node in found.solution])
         there.require(equation.residual)
         holds = e.true
         for r, most in zip(equation.residual, found.most, strict=True):
             holds = e.both(holds, e.compare("ole", e.abs(there.value(r)), region.value(most)))
-        b.store(e.bool, e.both(one(found.sure), e.either(e.invert(asked), holds)), verdict, 1)
+        b.store(e.bool, e.both(sure, e.either(e.invert(asked), holds)), verdict, 1)
     sure = b.load(e.bool, verdict, 1)
     new = [_power_of_two(e, region.value(node)) for node in found.unknowns]
     new.append(e.select(sure, load(status), e.const(float(DOUBTFUL))))
