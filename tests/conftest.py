@@ -1,5 +1,7 @@
 """Shared test configuration: a compilation cache, reproducible examples, strict promotion, figures without a screen."""
 
+import atexit
+import functools
 import gc
 import os
 import tempfile
@@ -30,11 +32,22 @@ kernels.FEW = 0  # code of few operations is compiled with little optimization t
 hypothesis.settings.register_profile("dirax", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("dirax")
 
+# each of many small modules is made in a context of its own, which takes as long as a tenth of the module and is kept
+mlir = jax._src.interpreters.mlir
+mlir.make_ir_context = functools.cache(mlir.make_ir_context)
+
+atexit.unregister(jax._src.api.clean_up)  # seconds, in which all that was compiled is let go, one by one
+
 
 def pytest_collection_modifyitems(items):
     """The pages of the documentation and walks through the whole package are long: they go first, so that no worker is left with
     one at the end."""
     items.sort(key=lambda item: len(item.path.relative_to(item.config.rootpath).parts))
+
+
+def pytest_collection_finish():
+    """Before its first test hypothesis looks through all objects there are, which are few now."""
+    hypothesis.given(hypothesis.strategies.none())(lambda nothing: None)()
 
 
 def pytest_sessionfinish():

@@ -221,6 +221,18 @@ def test_another_solution_of_the_equations_of_a_step_is_one():
         assert dx.verify(sol.replace(fields=sol.fields | {name: changed}))["steps replayed"].verdict == "VIOLATED", (name, row)
 
 
+@pytest.mark.parametrize(("scheme", "width"), [("yoshida4", 2e-3), ("suzuki4", 5e-4)])
+def test_also_of_several_solutions_of_parts_of_steps(scheme, width):
+    """A block that comes to rest by friction: back in time it may have come from either side, or have rested."""
+    block = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2, forces=lambda t, q, v: -0.3 * jnp.tanh(v / width))
+    sol = dx.simulate(block, dx.Composition(MIDPOINT, scheme), q=[-0.12], v=[0.03], step=0.01, steps=60)
+    assert replayed(sol, None).verdict == "ok"
+    for name, row, off in (("q", 3, 1e-9), ("p", 40, 1e-6), ("p", -1, 1e-6)):
+        changed = np.array(sol.fields[name])
+        changed[row] += off
+        assert replayed(sol.replace(fields=sol.fields | {name: changed}), None).verdict == "VIOLATED", (name, row)
+
+
 def test_a_network_with_a_diode_is_replayed():
     """Multipliers far from those of the step lead Newton's method to an exponential that only comes down by a constant."""
     diode = lambda u: 0.2 * (jnp.exp(2 * u) - 1)

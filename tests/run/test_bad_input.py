@@ -415,6 +415,13 @@ def test_newton_that_does_not_converge():
     assert "condition number 1" in sol.message and "smaller step may help" in sol.message
 
 
+def test_a_step_without_a_solution_from_rest_is_not_too_small():
+    """Back in time by friction: Newton's method stays about the least of a residual that has no root there."""
+    block = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2, forces=lambda t, q, v: -0.3 * jnp.tanh(v / 1e-3))
+    sol = dx.simulate(block, dx.Composition(dx.LagrangeDAlembert(), "yoshida4"), q=[1.0], v=[0.0], step=0.01, steps=9)
+    assert not sol.ok and "a smaller step may help" in sol.message and "too small" not in sol.message
+
+
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.PlusLagrangeDirac()])
 def test_a_step_that_is_too_small_for_double_precision(scheme):
     """g(q)/h carries ε/h ≈ 2·10⁻⁸ of noise: more of it in a smaller step, which is not what is advised. Method 2 has none."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from dirax.diagnostics.flights import longest_flight
-from dirax.diagnostics.replay import Again, CannotReplay, Replay, Rows, times_of
+from dirax.diagnostics.replay import MOST_OPERATIONS, Again, CannotReplay, Replay, Rows, times_of
 from dirax.diagnostics.replay_of_many import replayed_of_many
 from dirax.diagnostics.report import NOT_CHECKED, Line
 from dirax.diagnostics.rows import LARGE, row_numbers
@@ -35,6 +35,12 @@ the scale of all."""
 
 MOST_CUBED = 2e6
 """Cubes of their unknowns of the steps that are led to the next rows, a few tenths of a second."""
+
+PASSES = 32
+"""Times that steps in doubt are taken again from the unknowns of others that were found."""
+
+SCATTERED, SCATTERED_TIMES = 64, 16
+"""Steps that are taken again from scattered unknowns at most, and how often each."""
 
 DOUBTED = 2000
 """Rows of which it is asked how far rounding moves them: the worst."""
@@ -220,7 +226,10 @@ class _Comparison:
         doubted = self._worst(ratio, limit)
         if not len(doubted):
             return ratio
-        self._try_from_neighbours(np.union1d(doubted, self.previous[doubted][self.previous[doubted] >= 0]))
+        self._try_from_neighbours(self._steps_into(doubted), usual)
+        left = self._worst(_ratio(self.missed, usual), limit)
+        if len(left) and len(self.again.unknowns) > 1:
+            self._try_from_found(left, usual, limit)
         ratio = _ratio(self.missed, usual)
         doubted = self._worst(ratio, limit)
         if len(doubted):
@@ -250,16 +259,68 @@ class _Comparison:
             moved.append(np.max(np.nan_to_num(off, posinf=0.0), axis=0) / size)
         return moved[0], moved[1]
 
-    def _try_from_neighbours(self, entries: np.ndarray) -> None:
+    def _steps_into(self, entries: np.ndarray) -> np.ndarray:
+        """The steps that leave these rows, and those that lead to them."""
+        return np.union1d(entries, self.previous[entries][self.previous[entries] >= 0])
+
+    def _try_from_neighbours(self, entries: np.ndarray, usual: np.ndarray) -> None:
         """Steps again from the unknowns of the steps before them, as the run had it, of those after them, and from some that lead
         to the next row: an equation may have several solutions."""
         for neighbour in (self.previous, self.next):
             one = np.where(neighbour[entries] >= 0, neighbour[entries], entries)
             two = np.where(neighbour[one] >= 0, neighbour[one], one)
-            for guesses in ([u[one] for u in self.again.unknowns], [2 * u[one] - u[two] for u in self.again.unknowns]):
-                self._expect(entries, *self._said(self.replay.again(self.at[entries], guesses=guesses)), if_nearer=True)
+            self._try_near(entries, one, two, usual)
         if len(self.again.unknowns) == 1:
             self._try_from_next_rows(entries[(self.next[entries] >= 0) & (self.at.steps[entries] == 1)])
+
+    def _try_from_found(self, doubted: np.ndarray, usual: np.ndarray, limit: float) -> None:
+        """Steps of several parts into rows in doubt again, from the unknowns of the nearest steps that lead to what was saved,
+        and from scattered ones, as long as this finds others: of several solutions of a part a run keeps near one."""
+        for _ in range(min(self._affordable(len(doubted)), PASSES)):
+            entries, count = self._steps_into(doubted), len(doubted)
+            found = self._missed_after(np.arange(len(self.at.rows)), usual) <= limit
+            for nearest in _nearest(found, self.at.lanes):
+                one = np.where(nearest[entries] >= 0, nearest[entries], entries)
+                self._try_near(entries, one, np.where(self.previous[one] >= 0, self.previous[one], one), usual)
+            doubted = self._worst(_ratio(self.missed, usual), limit)
+            if len(doubted) == count:
+                self._try_scattered(self._steps_into(doubted)[:SCATTERED], usual)
+                doubted = self._worst(_ratio(self.missed, usual), limit)
+            if not 0 < len(doubted) < count:
+                return
+
+    def _affordable(self, steps: int) -> int:
+        """How often there is time for so many steps; once at least."""
+        return max(1, int(MOST_OPERATIONS / self.replay.steps.operations(steps)))
+
+    def _try_scattered(self, entries: np.ndarray, usual: np.ndarray) -> None:
+        """Steps of these entries from unknowns that are anywhere among those of all of them and of their parts."""
+        random, unknowns = np.random.default_rng(0), self.again.unknowns
+        most = [np.max(np.abs(u[entries]), axis=0) for u in unknowns]
+        if len({len(a) for a in most}) == 1:
+            most = len(most) * [np.max(most, axis=0)]
+        for _ in range(min(self._affordable(len(entries)), SCATTERED_TIMES)):
+            self._try(entries, [2 * a * random.uniform(-1, 1, (len(entries), len(a))) for a in most], usual)
+
+    def _try_near(self, entries: np.ndarray, one: np.ndarray, two: np.ndarray, usual: np.ndarray) -> None:
+        """Steps of these entries from the unknowns of others, and from the line through those of two."""
+        unknowns = self.again.unknowns
+        for guesses in ([u[one] for u in unknowns], [2 * u[one] - u[two] for u in unknowns]):
+            self._try(entries, guesses, usual)
+
+    def _try(self, entries: np.ndarray, guesses: list[np.ndarray], usual: np.ndarray) -> None:
+        """Steps of these entries from other guesses: what is nearer to what was saved is expected."""
+        again, before = self.replay.again(self.at[entries], guesses=guesses), self._missed_after(entries, usual)
+        self._expect(entries, *self._said(again), if_nearer=True)
+        nearer = self._missed_after(entries, usual) < before
+        for own, other in zip(self.again.unknowns, again.unknowns, strict=True):
+            own[entries[nearer]] = other[nearer]
+        self.again.near.put(entries[nearer], again.near[nearer])
+
+    def _missed_after(self, entries: np.ndarray, usual: np.ndarray) -> np.ndarray:
+        """By how much (entries,) the rows are missed to which these steps lead; infinite where there is none."""
+        missed = np.max(_ratio(np.abs(self.saved - self.expected), usual), axis=1)
+        return np.where(self.next[entries] >= 0, missed[self.next[entries]], np.inf)
 
     def _try_from_next_rows(self, entries: np.ndarray) -> None:
         """Steps again from unknowns that lead to the next rows, and on to those after them."""
@@ -276,6 +337,15 @@ class _Comparison:
         }
         again = self.replay.leading_to(self.at[entries], self.again.unknowns[0][entries], held(one), held(two))
         self._expect(entries, *self._said(again), if_nearer=True)
+
+
+def _nearest(found: np.ndarray, lanes: np.ndarray) -> list[np.ndarray]:
+    """Of each entry the nearest one of its trajectory before it that was found, and after it; −1 where there is none."""
+    numbers = np.arange(len(found))
+    before = np.maximum.accumulate(np.where(found, numbers, -1))
+    after = np.minimum.accumulate(np.where(found, numbers, len(found))[::-1])[::-1]
+    after = np.where(after < len(found), after, -1)
+    return [np.where((near >= 0) & (lanes[near] == lanes), near, -1) for near in (before, after)]
 
 
 def _ratio(missed: np.ndarray, scale: np.ndarray) -> np.ndarray:

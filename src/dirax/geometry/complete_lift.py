@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from dirax.geometry.maps import AbstractDiscretizationMap
+from dirax.program.tracing import once
 from dirax.program.user_functions import UserFunction, evaluated
 
 Form = Float[Array, "k k"]
@@ -20,7 +20,7 @@ def complete_lift(two_form: Callable, x: ArrayLike, v: ArrayLike) -> Form:
     d_T ω = [[ẋ·∂ω, ω], [ω, 0]] ([BLM] (19) for ω = dα). Raises `ValueError` for shapes that do not belong together.
     """
     x, v = _checked(two_form, x, v)
-    return jnp.asarray(evaluated(eqx.Partial(_lift, two_form), x, v))
+    return jnp.asarray(evaluated(once(_lift, two_form), x, v))
 
 
 def _lift(two_form: Callable, x: Array, v: Array) -> Form:
@@ -38,7 +38,7 @@ def symplectic_equations(map: AbstractDiscretizationMap, two_form: Callable, x: 
         dx.symplectic_equations(dx.Midpoint(), vortices.two_form, q, v)     # zeros where dα is constant
     """
     x, v = _checked(two_form, x, v)
-    return tuple(jnp.asarray(block) for block in evaluated(eqx.Partial(_equations, map, two_form), x, v))
+    return tuple(jnp.asarray(block) for block in evaluated(once(_equations, map, two_form), x, v))
 
 
 def _equations(map: AbstractDiscretizationMap, two_form: Callable, x: Array, v: Array) -> tuple[Array, ...]:

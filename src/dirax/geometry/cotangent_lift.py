@@ -9,6 +9,7 @@ from dirax.geometry.manifolds import AbstractManifold, Vector
 from dirax.geometry.map_report import tangent_coordinates
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.spaces import Euclidean
+from dirax.program.tracing import once
 from dirax.program.user_functions import evaluated
 
 
@@ -156,7 +157,7 @@ def symplecticity_defect(lift: AbstractDiscretizationMap, x: ArrayLike, v: Array
     zero for a cotangent lift. x = (q, p) and v = (q̇, ṗ) have shape (2N,).
     """
     x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
-    return jnp.asarray(evaluated(eqx.Partial(_symplecticity_defect, lift), x, v))
+    return jnp.asarray(evaluated(once(_symplecticity_defect, lift), x, v))
 
 
 def _symplecticity_defect(lift: AbstractDiscretizationMap, x: Array, v: Array) -> Array:

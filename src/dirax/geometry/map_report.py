@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from dirax.geometry.manifolds import AbstractManifold, Vector
 from dirax.geometry.maps import AbstractDiscretizationMap
+from dirax.program.tracing import once
 from dirax.program.user_functions import evaluated
 
 
@@ -28,7 +29,7 @@ class DiscretizationMapReport(eqx.Module):
 def check_discretization_map(map: AbstractDiscretizationMap, x: ArrayLike, v: ArrayLike) -> DiscretizationMapReport:
     """How far (D1), (D2) and invertibility ([BLM] Definition 4.5, Proposition 4.6) fail at the tangent vector v at x."""
     x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
-    return jax.tree.map(jnp.asarray, evaluated(eqx.Partial(_report, map), x, v))
+    return jax.tree.map(jnp.asarray, evaluated(once(_report, map), x, v))
 
 
 def _report(map: AbstractDiscretizationMap, x: Vector, v: Vector) -> DiscretizationMapReport:

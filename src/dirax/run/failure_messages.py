@@ -127,7 +127,7 @@ def _replay_newton(stage, numbers: InNumbers | InJax, guess, args, params, sizes
         return "", u
     return (
         f"Newton did not converge in {max_iterations} iterations (largest residual in {stage.labels[worst]}, "
-        f"condition number {condition:.2g}): {_advice(stage, numbers, guess, args, sizes)}"
+        f"condition number {condition:.2g}): {_advice(stage, numbers, guess, args, sizes + np.abs(u))}"
     ), u
 
 
