@@ -3,7 +3,7 @@
 import numpy as np
 
 from dirax.diagnostics.replay import CannotReplay, Replay
-from dirax.diagnostics.replay_lines import DISTURBANCE, OFTEN
+from dirax.diagnostics.replay_comparison import DISTURBANCE, OFTEN
 from dirax.diagnostics.report import NOT_CHECKED, OK, Line
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread
 from dirax.engines.steps_in_numbers import SMALLEST
