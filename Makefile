@@ -41,8 +41,8 @@ lint: $(READY)  ## Check style with ruff
 	$(RUN) ruff check
 	$(RUN) ruff format --check
 
-types: $(READY)  ## Check types with basedpyright
-	$(BIN)/basedpyright --pythonpath $(BIN)/python
+types: $(READY)  ## Check types with pyrefly
+	$(BIN)/pyrefly check --python-interpreter-path $(BIN)/python
 
 format: $(READY)  ## Repair style with ruff
 	$(RUN) ruff check --fix

@@ -63,7 +63,7 @@ def in_casadi(sites: int, solver: str, folder: str) -> Callable[[int], float] | 
     """(steps) ↦ µs of processor time a step of the same by CasADi: derivatives and two updates of Newton's method with one of its
     sparse linear solvers in the C that it writes, SPAN steps a call; None without CasADi or a C compiler."""
     try:
-        import casadi as ca  # pyright: ignore[reportMissingImports]
+        import casadi as ca
     except ImportError:
         return None
     if shutil.which("cc") is None:

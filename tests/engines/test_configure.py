@@ -54,4 +54,4 @@ def test_other_flags_stay():
     assert with_option(f"--a=1 {extra}{option}=7", False) == "--a=1"
     assert with_option(f"{extra}b=2", False) == f"{extra}b=2"
     with pytest.raises(TypeError, match="must be True or False, but 'yes'"):
-        dx.configure(fast_loops="yes")  # pyright: ignore[reportArgumentType]
+        dx.configure(fast_loops="yes")

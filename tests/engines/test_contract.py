@@ -224,6 +224,6 @@ def test_what_is_no_engine_is_refused():
         with pytest.raises(error, match=words):
             dx.simulate(system, dx.LagrangeDAlembert(), **run, engine=wrong)
     with pytest.raises(TypeError, match="linear_solver must be"):
-        Xla(linear_solver=jnp.linalg.solve)  # pyright: ignore[reportArgumentType]
+        Xla(linear_solver=jnp.linalg.solve)
     with pytest.raises(ValueError, match="scalars must be"):
-        Xla(scalars="always")  # pyright: ignore[reportArgumentType]
+        Xla(scalars="always")

@@ -39,7 +39,7 @@ def rows_of(sol) -> jax.Array:
 
 
 def swing(engine, q, v, params, h: Any = 0.02, scheme: Any = MIDPOINT, **more: Any):
-    return dx.simulate(PENDULUMS, scheme, q=q, v=v, params=params, step=h, engine=engine, **({"steps": 30} | more))  # pyright: ignore[reportArgumentType]
+    return dx.simulate(PENDULUMS, scheme, q=q, v=v, params=params, step=h, engine=engine, **({"steps": 30} | more))
 
 
 def roll(engine, q, v, g, **more):

@@ -360,7 +360,7 @@ def test_errors_say_what_is_wrong_and_by_how_much():
         with pytest.raises(ValueError, match="needs a whole number n ≥"):
             space(n)
     with pytest.raises(TypeError, match="factors of Product"):
-        Product(Sphere(3), 3)  # pyright: ignore[reportArgumentType]
+        Product(Sphere(3), 3)
     jax.jit(lambda x: sphere.check_point(x))(2.0 * x)  # traced values are not looked at
     assert bool(sphere.contains(x))
     assert not bool(sphere.contains(1.001 * x))

@@ -395,9 +395,9 @@ def test_maps_that_cannot_be():
     with pytest.raises(TypeError, match="LieGroupExp\\(SE3"):
         RiemannianExp(Product(Sphere(3), SE3()))
     with pytest.raises(TypeError, match="needs a group"):
-        LieGroupExp(Sphere(3))  # pyright: ignore[reportArgumentType]
+        LieGroupExp(Sphere(3))
     with pytest.raises(TypeError, match="needs a discretization map"):
-        cotangent_lift(Sphere(3))  # pyright: ignore[reportArgumentType]
+        cotangent_lift(Sphere(3))
     with pytest.raises(TypeError, match="on vector spaces can be lifted twice"):
         cotangent_lift(cotangent_lift(SphereProjection()))(jnp.zeros(12), jnp.zeros(12))
     with pytest.raises(ValueError, match=r"trace 1\.2 at .* whole number"):

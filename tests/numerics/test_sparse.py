@@ -24,7 +24,7 @@ def running(sizes: Longs, x: Doubles, y: Doubles):
     for i in range(sizes[0] - 1, -1, -1):
         y[i] = 0.0
         if (i % 2 == 0 and not x[i] > 4.0) or i == 3:
-            s += abs(x[i]) * WEIGHT  # pyright: ignore[reportUndefinedVariable]
+            s += abs(x[i]) * WEIGHT
         elif i > 8:
             continue
         else:

@@ -64,7 +64,7 @@ def test_has_the_entries_of_the_jacobian(name):
 
 def test_steps_are_read_through_the_primitives_of_dirax():
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - padded(q), holonomic=lambda q: links(q)[::4])
-    equation: dx.StepEquation = make_step_equation(dx.LagrangeDAlembert(), system, Shape(N, 0, 2))  # pyright: ignore[reportAssignmentType]
+    equation: dx.StepEquation = make_step_equation(dx.LagrangeDAlembert(), system, Shape(N, 0, 2))
     rng, k, s = np.random.default_rng(1), equation.unknowns, equation.state_size
     residual = lambda u, state, t, h: equation.residual(u, state, t, h, None)
     given = rng.normal(size=k), rng.normal(size=s), 0.3, 0.1

@@ -74,4 +74,4 @@ def test_mistakes():
     with pytest.raises(ValueError, match="independent rows"):
         dx.adapted_basis([[1.0, 0.0, 1.0], [2.0, 0.0, 2.0]])
     with pytest.raises(TypeError, match=r"in_coordinates takes a dx\.LagrangeDirac"):
-        dx.in_coordinates(3, lambda y: y)  # pyright: ignore[reportArgumentType]
+        dx.in_coordinates(3, lambda y: y)

@@ -75,7 +75,7 @@ def test_mistakes():
     with pytest.raises(ValueError, match="does not fit a system of 2"):
         check_invariance(CENTRAL, Translations([2]), q=[1.0, 0.0], params=1.0)
     with pytest.raises(TypeError, match=r"action must be one such as dx\.Translations"):
-        check_invariance(CENTRAL, [0], q=[1.0, 0.0], params=1.0)  # pyright: ignore[reportArgumentType]
+        check_invariance(CENTRAL, [0], q=[1.0, 0.0], params=1.0)
     with pytest.raises(TypeError, match=r"a Lagrangian L\(q, v\), such as a dx\.LagrangeDirac, but one of type DiracSystem was"):
         cyclic_coordinates(dx.DiracSystem(dx.induced_dirac(None, 1), lambda x: x @ x), [1.0, 0.0])
     with pytest.raises(TypeError, match="takes params, which were not given"):

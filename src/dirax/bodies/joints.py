@@ -78,7 +78,8 @@ class Joint:
         start = 0
         for motion in self.order:
             end = start + len(motion.names)
-            frame, start = motion.move(frame, q[start:end], v[start:end], params), end
+            # Of a ray nothing but a shift is asked.
+            frame, start = motion.move(frame, q[start:end], v[start:end], params), end  # pyrefly: ignore[bad-argument-type]
         return frame
 
     def defect(self, parent: AnyFrame, body: AnyFrame, params: Any) -> list[Any]:

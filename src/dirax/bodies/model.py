@@ -14,7 +14,7 @@ from dirax.bodies.contacts import Contact
 from dirax.bodies.drawing import scene_of
 from dirax.bodies.forces import Damper, Motor, Spring
 from dirax.bodies.frames import GROUND as GROUND_FRAME
-from dirax.bodies.frames import AnyFrame, Vector, vector
+from dirax.bodies.frames import AnyFrame, Vector, scalar, vector
 from dirax.bodies.joints import Joint
 from dirax.bodies.model_constraints import MachineConstraints
 from dirax.bodies.motion import Direct, Quaternion
@@ -145,8 +145,7 @@ class Model:
         total = jnp.zeros(())
         for body in self.bodies:
             if body.mass != 0:
-                mass = params[body.mass] if isinstance(body.mass, str) else body.mass
-                total -= mass * (gravity @ frames[body.name].point(vector(body.centre, params)))
+                total -= scalar(body.mass, params) * (gravity @ frames[body.name].point(vector(body.centre, params)))
         for force in self.forces:
             if isinstance(force, Spring):
                 total += force.energy(frames, self.named(q), params)

@@ -95,7 +95,7 @@ class Convergence:
 
     def _table(self):
         header = ("step", *(f"error of {name}" for name in self.slopes))
-        rows = []
+        rows: list[tuple[str, ...]] = []
         for i, h in enumerate(self.step_sizes):
             cells = [number(s.errors[i]) + ("" if s.used[i] else " (not used)") for s in self.slopes.values()]
             rows.append((number(h, 6), *cells))

@@ -65,7 +65,7 @@ def _is_nan(g: Graph, node: int) -> bool:
 
 def _through_residual(g: Graph, old: int, parts: dict[int, float], rows: list[dict[int, float]]) -> int | None:
     for row in rows:
-        sign = row.get(old)
+        sign = row.get(old, 0.0)
         if sign not in (1.0, -1.0):
             continue
         combined = {n: parts.get(n, 0.0) + sign * row.get(n, 0.0) for n in {*parts, *row}}

@@ -269,7 +269,7 @@ class StepsInNumbers:
             t = t + fraction * h
         if len(parts) == 1:
             return parts[0]
-        whole = {}
+        whole: dict[str, Any] = {}
         for name, about in self.equation.fields.items():
             arrays = [about.weight(f) * row[name] for row, (_, f) in zip(parts, self.program.stages, strict=True)]
             each = about.rule == "each"

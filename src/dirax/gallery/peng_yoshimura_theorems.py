@@ -13,12 +13,12 @@ STEP, STEPS = 0.05, 40
 MASS = np.array([[2.0, 0.3, 0.0], [0.3, 1.5, 0.1], [0.0, 0.1, 1.0]])
 
 
-def lagrangian(q, v, xp=np):
+def lagrangian(q, v, xp: Any = np):
     """½⟨v, Mv⟩ − cos q0 − q1² q2/2."""
     return v @ (MASS @ v) / 2 - xp.cos(q[0]) - q[1] ** 2 * q[2] / 2
 
 
-def row(q, xp=np):
+def row(q, xp: Any = np):
     """The one-form of the skate."""
     return xp.stack([xp.sin(q[2]), -xp.cos(q[2]), 0.3 * q[0]])
 
@@ -51,7 +51,10 @@ def _structures() -> list[Theorem]:
     from dirax.geometry.tulczyjew import FiniteDifferenceTriple
 
     x, omega = np.array([0.3, -0.2, 0.7, 0.1]), np.array([[0, 1, 2, 0], [-1, 0, 0, 3], [-2, 0, 0, 1], [0, -3, -1, 0.0]])
-    w = lambda x, xp=np: xp.stack([x[1], xp.ones(()), -x[0], xp.sin(x[2])])
+
+    def w(x, xp: Any = np):
+        return xp.stack([x[1], xp.ones(()), -x[0], xp.sin(x[2])])
+
     structure = FiniteDifferenceDirac(lambda x: jnp.asarray(omega), lambda x: w(x, jnp)[None], step=STEP).at(jnp.asarray(x))
     free, normal = kernel(w(x)[None]), w(x)[:, None]
     ours = np.concatenate([np.block([free, np.zeros((4, 1))]), np.block([omega.T @ free, normal])])

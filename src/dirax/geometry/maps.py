@@ -246,7 +246,7 @@ class ProductMap(AbstractDiscretizationMap):
     def manifold(self, ambient_dimension):
         """The product of the manifolds of the maps; raises `ValueError` for points of another length."""
         factors = [map.manifold(size) for map, size in zip(self.maps, self.sizes, strict=True)]
-        return _same_size(Product(*factors), ambient_dimension)  # pyright: ignore[reportArgumentType]
+        return _same_size(Product(*factors), ambient_dimension)  # pyrefly: ignore[bad-argument-type]  # it refuses others
 
     @property
     def base_fraction(self):

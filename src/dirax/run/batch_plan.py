@@ -29,7 +29,7 @@ class BatchPlan:
         self.checks = checks_of(equation)
         self.complete: Any = program_of_completion(settings.system, case, settings.project)
         self.begun: Any = program_of_beginning(equation, case, initial.data)
-        self.matrix = None
+        self.matrix: np.ndarray | None = None
         if initial.constraints is not None and np.size(initial.constraints):
             self.matrix = _scales(initial.constraints)
         self.fraction, self.unknowns = equation.stages[0][1], equation.stages[0][0].unknowns

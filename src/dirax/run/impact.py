@@ -120,10 +120,9 @@ class Numbers:
 
     def one(self, *values: Any) -> np.ndarray:
         """The numbers of the results at one place."""
-        floats = self.program and self.program.in_floats
-        if self.program is None or floats is None:
+        if self.program is None:
             return np.concatenate([np.ravel(a) for a in self.many(*(np.asarray(value)[None] for value in values))])
-        flat = [x for value in values for x in np.ravel(value).tolist()]
+        floats, flat = self.program.in_floats, [x for value in values for x in np.ravel(value).tolist()]
         try:
             return np.array(floats((*flat, *self.fixed)))
         except (ArithmeticError, ValueError):

@@ -186,7 +186,10 @@ def _terms(flight: Flight) -> np.ndarray:
 def _events(flights: list[Flight], p: Problem) -> Events:
     hits, layout = [(lane, *hit) for lane, flight in enumerate(flights) for hit in flight.hits], flights[0].search.layout
     n = layout["q"][0]
-    array = lambda i, shape=(), kind=float: np.array([hit[i] for hit in hits], kind).reshape(len(hits), *shape)
+
+    def array(i: int, shape: tuple[int, ...] = (), kind: type = float) -> np.ndarray:
+        return np.array([hit[i] for hit in hits], kind).reshape(len(hits), *shape)
+
     fields = {"q": array(3, (n,)), "p": array(4, (n,))}
     if CLOCK in layout:
         fields |= {STEP_DENSITY: array(6), CLOCK: array(7), PART: array(5) % 1.0}

@@ -45,7 +45,7 @@ class Plan:
         self.first_step: Any = None
         self.data_size = sum(np.size(a) for a in jax.tree.leaves(initial.data))
         self.defects, self.has_lagrangian = np.size(initial.defect), initial.lagrangian is not None
-        self.matrix = None
+        self.matrix: list[list[float]] | None = None
         if initial.constraints is not None and np.size(initial.constraints):
             self.matrix = scales_of(np.asarray(initial.constraints)).tolist()
         self.state_size, self.guesses = len(start.state), [len(guess) for guess in start.guess]
@@ -128,7 +128,7 @@ class Plan:
         if self.hessian is None:
             values = np.asarray(case.t0), np.array(q), np.array(v), case.params
             program = program_at(self.settings.system.velocity_hessian, values)
-            self.hessian = program and program.in_floats
+            self.hessian = None if program is None else program.in_floats
         if self.hessian is None:
             return False
         entries, n = self.hessian((case.t0, *q, *v, *last[:-2])), len(q)

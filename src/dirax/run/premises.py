@@ -55,6 +55,7 @@ class KeptPremise:
         found = system.premise(data, params)
         self.premise, self.of_params = found, system.premise_of_params
         self.program: Floats | None = None
+        self.known: tuple[float, ...] | None = None
         if found is None:
             return
         values = self._values(case, 0)
@@ -63,7 +64,7 @@ class KeptPremise:
         leaves, self.structure = jax.tree.flatten(numbers)
         ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves]).tolist()
         self.places = [(slice(end - math.prod(leaf.shape), end), leaf.shape) for end, leaf in zip(ends, leaves, strict=True)]
-        self.program, self.known = program and program.in_floats, None
+        self.program = None if program is None else program.in_floats
 
     def holds(self, case: Case, regular: Regular) -> bool:
         """Whether it holds; False where the general way is to say so. Raises `ValueError` where it does not hold."""

@@ -54,7 +54,8 @@ class Stream:
 
     def __post_init__(self):
         self.offset = int(self.row0 is not None)
-        self.hold, self.store = Hold(), None
+        self.hold = Hold()
+        self.store: RunStore | None = None
         self.layout = layout_of(self.problem.fields)
         self.compile_seconds, self.run_seconds = 0.0, 0.0
 

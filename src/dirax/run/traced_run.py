@@ -69,7 +69,8 @@ def _kind(carried: Callable[[Case], Carried], case: Case, leaves: list, moves: t
         data, params, h, t0 = jax.tree.unflatten(structure, [next(rest) if m else s for s, m in zip(still, moves, strict=True)])
         problem, outcome, more = carried(replace(case, data=data, params=params, h=h, t0=t0))
         kind.problem = problem.with_numbers(state=None, guess=None, params=None, h=None, t0=None)
-        kind.outcome = replace(outcome, **dict.fromkeys(COMPUTED))
+        nothing: dict[str, Any] = dict.fromkeys(COMPUTED)
+        kind.outcome = replace(outcome, **nothing)
         return {name: getattr(outcome, name) for name in COMPUTED}, more
 
     kind = Kind(jax.jit(run))

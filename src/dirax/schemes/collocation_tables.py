@@ -162,8 +162,8 @@ def _tableau(nodes: list[Decimal]) -> Tableau:
     symplectic = max(abs(conjugate[i][j] - matrix[i][j]) for i in range(s) for j in range(s)) < Decimal(10) ** (30 - DIGITS)
     for i, j in zip(*np.nonzero(shares >= 0.5), strict=True) if symplectic else ():
         shares[j, i] = 1.0 - shares[i, j]  # exact from ½ to 2
-    matrices = map(rounded, (matrix, conjugate, extrapolation, second))
-    made = Tableau(vector(nodes), vector(weights), *matrices, shares)  # pyright: ignore[reportCallIssue]
+    arrays = [vector(nodes), vector(weights), *map(rounded, (matrix, conjugate, extrapolation, second)), shares]
+    made = Tableau(*arrays)
     for array in vars(made).values():
         array.flags.writeable = False
     return made

@@ -161,7 +161,7 @@ class DiscreteConstraintSearch:
         unpack = jax.jit(lambda x, u: self.equation.unpack(x, u, 0.0, self.h, self.params))
         for point in self.around(self.last)[:count]:
             x, u = jnp.asarray(point[: self.size]), jnp.asarray(point[self.size :])
-            row = {name: np.asarray(value) for name, value in unpack(x, u).items()}
+            row: dict[str, np.ndarray] = {name: np.asarray(value) for name, value in unpack(x, u).items()}
             found.append(row["x"] if "x" in row else np.concatenate([row["q"], row["p"]]))
         return found
 

@@ -113,4 +113,4 @@ class Layout(Mapping[str, tuple[int, ...]]):
 @lru_cache(maxsize=256)
 def _kind(names: tuple[str, ...]) -> type:
     """The named tuple of parts with these names."""
-    return namedtuple("Parts", names)
+    return namedtuple("Parts", names)  # pyrefly: ignore[bad-class-definition]  # names known when it runs

@@ -44,7 +44,7 @@ class VariableSteps(AbstractScheme):
             raise TypeError(f"scheme must be a dirax scheme such as dx.Collocation(4), but {scheme!r:.80} was given.")
         self.scheme = scheme
         given = isinstance(density, UserFunction) or density is None
-        self.density = density if given else UserFunction(density, "density", ("q",), timed=True)  # type: ignore[assignment]
+        self.density = density if given else UserFunction(density, "density", ("q",), timed=True)
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         if system.quotient_form() is not None:

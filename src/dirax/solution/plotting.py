@@ -226,7 +226,8 @@ def plot_section(
         raise ValueError(f"points must be states ({', '.join(names)}), {len(names)} numbers, but they have {lanes[0].shape[-1]}.")
     ax = given_or_new(ax)
     for lane, kwargs in zip(lanes, _lines(len(lanes), marks), strict=True):
-        ax.plot(lane[:, i], lane[:, j], "o", **{"ms": 2.0, "mew": 0, **kwargs, "lw": 0})
+        look: dict[str, Any] = {"ms": 2.0, "mew": 0, **kwargs, "lw": 0}
+        ax.plot(lane[:, i], lane[:, j], "o", **look)
     units = [*units_of(sol), *[""] * len(names)]
     ax.set(xlabel=label(state_symbol(names[i]), units[i]), ylabel=label(state_symbol(names[j]), units[j]))
     if through is not None:

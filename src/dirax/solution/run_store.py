@@ -67,7 +67,8 @@ class Reached:
         about = {name: value for name, value in vars(self).items() if name != "record"}
         text = np.frombuffer(json.dumps(about).encode(), np.uint8)
         file = io.BytesIO()
-        np.savez(file, about=text, **{f"record_{i}": a for i, a in enumerate(self.record)})  # pyright: ignore[reportArgumentType]
+        record: dict[str, Any] = {f"record_{i}": a for i, a in enumerate(self.record)}
+        np.savez(file, about=text, **record)
         return file.getvalue()
 
     @classmethod

@@ -87,7 +87,7 @@ class Case:
             )
         return settled
 
-    def at(self, values: Values) -> tuple[dict[str, np.ndarray], Any]:
+    def at(self, values: Values) -> tuple[dict[str, Any], Any]:
         """Initial data (B, n) by name and the params, None or a pytree whose leaves have the axis of the points, too, at points
         with these values (B,). Raises `PointError`."""
         register_dataclasses(self.like)  # in a process that has not called the function yet

@@ -133,7 +133,7 @@ def results(plan: Plan, values: Values, stopping: Callable[[], bool] | None = No
 
     def part(low: int, high: int) -> dict[str, np.ndarray]:
         own = {name: axis[low:high] for name, axis in values.items()}
-        given = {name: array[low:high] for name, array in data.items()}
+        given: dict[str, Any] = {name: array[low:high] for name, array in data.items()}
         shared = jax.tree.map(lambda leaf: leaf[low:high], params) if batched else plan.params
         try:
             sol = simulate(

@@ -95,10 +95,8 @@ def _spread(size: int, most: int) -> np.ndarray:
 def _run(system: Any, scheme: Any, values: Values, case: Case, options: dict[str, Any], params: Any) -> Solution:
     data, own = case.at(values)
     batched = own is not None
-    every = max(1, options["steps"] // 2)
-    return simulate(
-        system, scheme, **data, params=own if batched else params, batch_params=batched, **{**options, "save_every": every}
-    )
+    rest: dict[str, Any] = {**options, "save_every": max(1, options["steps"] // 2)}
+    return simulate(system, scheme, **data, params=own if batched else params, batch_params=batched, **rest)
 
 
 def _first(run: Callable, axes: Axes, numbers: np.ndarray, few: np.ndarray, steps: int) -> tuple[np.ndarray, Solution, int]:

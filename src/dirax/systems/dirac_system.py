@@ -100,7 +100,8 @@ class DiracSystem(AbstractSystem):
         relation = self.independent(shape).relation
         form = RelationForm(relation, len(shape.kept), labels, saved, shape.spread, canonical=self.canonical, dirac="(ẋ, dH) ∈ D")
         if self.holonomic is None and self.is_graph:
-            return form._replace(**{self.structure.representation: lambda x, params: self.structure.evaluate(x, params)[0]})
+            matrix: dict[str, Any] = {self.structure.representation: lambda x, params: self.structure.evaluate(x, params)[0]}
+            return form._replace(**matrix)
         return form
 
     def energy_form(self, shape: Shape) -> EnergyForm:

@@ -2,10 +2,11 @@
 
 import html
 import math
+from collections.abc import Sequence
 from typing import Any
 
 
-def text_table(header: tuple[str, ...], rows: list[tuple[str, ...]], title: str = "") -> str:
+def text_table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]], title: str = "") -> str:
     """The rows under the header, columns aligned, with a rule between."""
     lines = [header, *rows]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
@@ -14,7 +15,7 @@ def text_table(header: tuple[str, ...], rows: list[tuple[str, ...]], title: str 
     return "\n".join([*([title] if title else []), text[0], rule, *text[1:]])
 
 
-def html_table(header: tuple[str, ...], rows: list[tuple[str, ...]], title: str = "", bold: tuple[str, ...] = ()) -> str:
+def html_table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]], title: str = "", bold: tuple[str, ...] = ()) -> str:
     """The same as an HTML table; cells whose text is in `bold` stand out. An empty header leaves its row out."""
     show = lambda cell: f"<b>{html.escape(cell)}</b>" if cell in bold else html.escape(cell)
     cells = lambda tag, line: "".join(f"<{tag} style='text-align:left'>{show(cell)}</{tag}>" for cell in line)

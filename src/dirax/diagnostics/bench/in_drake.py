@@ -18,9 +18,9 @@ def is_stated(model: Any) -> bool:
 
 def built(machine: Any, step: float) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """The machine as a plant, its joints by name, and its bodies by name."""
-    from pydrake.math import RigidTransform  # pyright: ignore[reportMissingImports]
-    from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant  # pyright: ignore[reportMissingImports]
-    from pydrake.multibody.tree import (  # pyright: ignore[reportMissingImports]
+    from pydrake.math import RigidTransform
+    from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
+    from pydrake.multibody.tree import (
         PrismaticJoint,
         RevoluteJoint,
         RotationalInertia,
@@ -51,7 +51,7 @@ def built(machine: Any, step: float) -> tuple[Any, dict[str, Any], dict[str, Any
 
 
 def _fixed(name: str, body: Any, place: Any) -> Any:
-    from pydrake.multibody.tree import FixedOffsetFrame  # pyright: ignore[reportMissingImports]
+    from pydrake.multibody.tree import FixedOffsetFrame
 
     return FixedOffsetFrame(f"{name} holds", body.body_frame(), place)
 
@@ -59,7 +59,7 @@ def _fixed(name: str, body: Any, place: Any) -> Any:
 def measured(example: Any, steps: int, end: np.ndarray, repeats: int) -> str:
     """µs a step, the distance of q at the end from `end`, the range of the energy relative to the largest, and the largest gap of
     a loop, by steps of the example's size."""
-    from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator  # pyright: ignore[reportMissingImports]
+    from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
     machine, h = example.model, example.step
     plant, joints, bodies = built(machine, h)

@@ -21,8 +21,8 @@ def is_stated(model: Any) -> bool:
 
 def built(example: Any) -> tuple[Any, dict[str, Any]]:
     """The machine at the example's initial data as Exudyn's `MainSystem`, and its bodies by name."""
-    import exudyn  # pyright: ignore[reportMissingImports]
-    from exudyn.rigidBodyUtilities import RigidBodyInertia  # pyright: ignore[reportMissingImports]
+    import exudyn
+    from exudyn.rigidBodyUtilities import RigidBodyInertia
 
     model = example.model
     frames = model.frames(np.asarray(example.initial["q"], float), np.asarray(example.initial["v"], float))
@@ -66,7 +66,7 @@ def built(example: Any) -> tuple[Any, dict[str, Any]]:
 def measured(example: Any, steps: int, end: np.ndarray, repeats: int) -> str:
     """µs a step, how far mass centres are at the end from those at the coordinates `end`, and the relative change of the energy:
     by its trapezoidal rule of index 2 with the example's step."""
-    import exudyn  # pyright: ignore[reportMissingImports]
+    import exudyn
 
     settings, seconds = exudyn.SimulationSettings(), []
     settings.timeIntegration.numberOfSteps, settings.timeIntegration.endTime = steps, steps * example.step
@@ -92,7 +92,7 @@ def measured(example: Any, steps: int, end: np.ndarray, repeats: int) -> str:
 
 
 def _energy(model: Any, mbs: Any, made: dict[str, Any]) -> float:
-    import exudyn  # pyright: ignore[reportMissingImports]
+    import exudyn
 
     total, kinds = 0.0, exudyn.OutputVariableType
     for body in model.bodies:

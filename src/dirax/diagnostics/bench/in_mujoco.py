@@ -50,7 +50,7 @@ def _text(values: Any) -> str:
 
 def measured(example: Any, steps: int, end: np.ndarray, repeats: int) -> str:
     """µs a step, the distance of q at the end from `end`, and the largest gap of a loop, by RK4 with the example's step."""
-    import mujoco  # pyright: ignore[reportMissingImports]
+    import mujoco
 
     model, names = mujoco.MjModel.from_xml_string(mjcf(example.model, example.step)), example.model.coordinates
     places = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) for name in names]

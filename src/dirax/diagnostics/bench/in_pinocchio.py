@@ -20,7 +20,7 @@ worse or break it."""
 
 def built(machine: Any) -> tuple[Any, Any, dict[str, int]]:
     """The machine as pinocchio's model, the constraints of its loops, and its joints by body."""
-    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+    import pinocchio as pin
 
     model, starts, made, loops = pin.Model(), joint_frames(machine), {"ground": 0}, pin.StdVec_RigidConstraintModel()
     model.gravity.linear = np.asarray(machine.gravity, float)
@@ -43,7 +43,7 @@ def built(machine: Any) -> tuple[Any, Any, dict[str, int]]:
 
 def acceleration(model: Any, loops: Any) -> tuple[Callable, Any]:
     """The function (q, v) of the accelerations, and the data that it fills."""
-    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+    import pinocchio as pin
 
     data, still = model.createData(), np.zeros(model.nv)
     if len(loops) == 0:
@@ -58,7 +58,7 @@ def acceleration(model: Any, loops: Any) -> tuple[Callable, Any]:
 def measured(example: Any, steps: int, end: np.ndarray, repeats: int) -> str:
     """µs a step, the distance of q at the end from `end`, the range of the energy relative to the largest, and the largest gap of
     a loop, by steps of order four of the example's size."""
-    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+    import pinocchio as pin
 
     model, loops, made = built(example.model)
     rate, data = acceleration(model, loops)

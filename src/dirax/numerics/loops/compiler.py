@@ -19,7 +19,7 @@ KINDS = {"f8": DOUBLE, "i8": INDEX, "i4": INT}
 Doubles: TypeAlias = Annotated[np.ndarray, "f8"]
 Ints: TypeAlias = Annotated[np.ndarray, "i4"]
 Longs: TypeAlias = Annotated[np.ndarray, "i8"]
-COMPARED = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
+COMPARED: dict[type[ast.cmpop], str] = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 
 
 def argument_kinds(function: Callable) -> dict[str, str]:

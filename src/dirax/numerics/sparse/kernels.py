@@ -4,7 +4,7 @@ Index arrays are those of compressed rows: the entries of row i are `columns[sta
 """
 
 # Names in capitals are constants that a kernel is given.
-# pyright: reportUndefinedVariable=false
+# pyrefly: ignore-errors[unknown-name]
 
 from dirax.numerics.loops.compiler import Doubles, Ints, Longs
 

@@ -1,6 +1,7 @@
 """Rules of elementwise primitives."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -116,10 +117,10 @@ def rounded(interpreter: Interpreter, equation: Any, x):
 def logical(interpreter: Interpreter, equation: Any, *operands):
     g, name = interpreter.graph, equation.primitive.name
     if equation.outvars[0].aval.dtype != np.bool_:
-        values = [interpreter.static(o) for o in operands]
-        if any(v is None for v in values):
+        values = [v for o in operands if (v := interpreter.static(o)) is not None]
+        if len(values) < len(operands):
             raise Unsupported("acts on bits that depend on the state")
-        bitwise = {"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "not": np.invert}
+        bitwise: dict[str, Callable] = {"and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "not": np.invert}
         return [interpreter.constants(bitwise[name](*values))]
     return [elementwise(functools.partial(g.make, "ne" if name == "xor" else name), *operands)]
 

@@ -114,18 +114,18 @@ def progressions(of: np.ndarray, number: np.ndarray, periods: Sequence[int]) -> 
     for period in sorted({p for p in periods if 0 < p <= LONGEST_PERIOD} | {*USUAL_PERIODS}):
         if best is not None and len(best) <= period:
             break
-        found: list[tuple[int, ...]] | None = []
+        found: list[tuple[int, ...]] = []
         for c in range(min(period, len(of))):
             runs = _runs(of[c::period], number[c::period])
             if runs is None:
-                found = None
                 break
             for first, count in runs:
                 at = c + period * first
                 along = int(number[at + period] - number[at]) if count > 1 else 0
                 found.append((at, period if count > 1 else 1, count, int(of[at]), int(number[at]), along))
-        if found is not None and (best is None or len(found) < len(best)):
-            best = found
+        else:
+            if best is None or len(found) < len(best):
+                best = found
     return best
 
 

@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from dirax.engines.native.loops.record import Record
 from dirax.engines.newton_step import Factors
@@ -141,7 +142,7 @@ class MeanPlan:
     quadrature: Quadrature
     rows: list[tuple[str, list[int]]]
     terms: list[int] = field(default_factory=list)
-    gain = None
+    gain: ClassVar[None] = None
 
     def __post_init__(self):
         g, r = self.graph, self.relation

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 from dirax.engines.native.ir.lower import Region
 from dirax.engines.native.loops.collocation_nodes import Nodes
@@ -29,7 +30,7 @@ class Sweep(ABC):
     of_accelerations = False
     """Whether the iterates are accelerations, not rates."""
 
-    continued = True, False
+    continued: ClassVar[tuple[bool, bool]] = True, False
     """Whether the first attempt and the second one begin with the polynomial of the step before, or with its last values."""
 
     together = False
