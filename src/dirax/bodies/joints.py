@@ -76,10 +76,10 @@ class Joint:
     def move(self, frame: Any, q: Any, v: Any, params: Any) -> AnyFrame:
         """The body's frame from its parent's, for the joint's coordinates and their rates."""
         start = 0
-        for motion in self.order:
+        order: Sequence[Any] = self.order  # of a ray nothing but a shift is asked
+        for motion in order:
             end = start + len(motion.names)
-            # Of a ray nothing but a shift is asked.
-            frame, start = motion.move(frame, q[start:end], v[start:end], params), end  # pyrefly: ignore[bad-argument-type]
+            frame, start = motion.move(frame, q[start:end], v[start:end], params), end
         return frame
 
     def defect(self, parent: AnyFrame, body: AnyFrame, params: Any) -> list[Any]:

@@ -209,6 +209,8 @@ class _Body:
 
     def _Compare(self, node: ast.Compare) -> Any:
         (operator,), (right,) = node.ops, node.comparators
+        if type(operator) not in COMPARED:
+            self._unknown(node)
         a, b = self.alike(self.value(node.left), self.value(right))
         sign = COMPARED[type(operator)]
         return self.b.fcmp_ordered(sign, a, b) if a.type == DOUBLE else self.b.icmp_signed(sign, a, b)
