@@ -263,3 +263,14 @@ def test_nodes_that_float_are_named_with_the_way_out():
 def test_laws_of_sources_alone_hold_up_to_rounding(netlist):
     """The potential that a source fixes is a number, found to a rounding: what is left of its law has terms all the same."""
     assert dx.simulate(dx.circuit(netlist), MIDPOINT, x=[0.3], step=0.05, steps=3).ok
+
+
+def test_a_nonlinear_resistor_has_no_chain():
+    """The algorithm would take its slope at no voltage for all of it."""
+    of_resistor = lambda r: dx.circuit(
+        [("V", 1, 0, jnp.sin), ("L", 1, 2, 1.0), ("C", 2, 0, 1.0), ("R", 2, 3, 1.0), ("R", 3, 0, r)]
+    )
+    assert dx.constraint_algorithm(of_resistor(2.0), near=[0.3, 0.1]).verdict == "determined"
+    assert dx.constraint_algorithm(of_resistor(lambda u: u / 2), near=[0.3, 0.1]).verdict == "determined"
+    with pytest.raises(TypeError, match=r"those of this Circuit are not in potential of node 3.*linearized"):
+        dx.constraint_algorithm(of_resistor(lambda u: u + u**3), near=[0.3, 0.1])

@@ -1,6 +1,6 @@
 """Implicit forms E(x) ẋ = f(x) + B(x) u, on which the constraint algorithm works; the time as a coordinate."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -9,8 +9,12 @@ import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from dirax.program.tracing import jacobian
+from dirax.program.user_functions import constant_entries
 from dirax.systems.forms import ImplicitForm
 from dirax.systems.shape import Shape
+
+AFFINE = 1e-9
+"""How much slopes that are not constant as they are written may differ, relative to the largest of their equation."""
 
 
 def of_relation(system: Any, near: Any, params: Any) -> ImplicitForm:
@@ -38,9 +42,30 @@ def of_relation(system: Any, near: Any, params: Any) -> ImplicitForm:
         y = jnp.asarray(unknowns)
         return jacobian(lambda y: defect(t, x, y, params))(y), -defect(t, x, y, params)
 
+    _refuse_nonlinear(system, lambda y: defect(t, x, y, params), unknowns, form.labels)
     energy = lambda t, x, params: system.energy_at({"x": x, "t": t}, params)
     timed = uses_time(defect, x, unknowns, params)
     return in_time(timed, t, equations, x, names("x", n), names("u", form.multipliers), energy, "its relation of x and ẋ")
+
+
+def _refuse_nonlinear(system: Any, defect: Callable, unknowns: np.ndarray, labels: Sequence[str]) -> None:
+    """Raise `TypeError` for equations that are not affine in their unknowns, of which no matrix says what they determine."""
+    slopes = lambda y: jacobian(defect)(y)
+    found = constant_entries(slopes, unknowns)
+    if found is not None and not np.any(np.isnan(found)):
+        return
+    here, random = np.asarray(slopes(unknowns)), np.random.default_rng(0).normal(size=unknowns.size)
+    size = np.max(np.abs(here), axis=1, keepdims=True)
+    bends = lambda moved: bool(np.any(np.abs(np.asarray(slopes(random * moved)) - here) > AFFINE * size))
+    if bends(np.ones(unknowns.size)):
+        rates = unknowns.size - len(labels)
+        names = [label if bends(one) else "" for label, one in zip(labels, np.eye(unknowns.size)[rates:], strict=True)]
+        where = f" in {', '.join(filter(None, names))}" if any(names) else ""
+        raise TypeError(
+            "the constraint algorithm takes equations that are affine in the rates ẋ and the multipliers, but those of this "
+            f"{type(system).__name__} are not{where}, as with a resistor whose current is a function of its voltage: state it "
+            "linearized about a working point."
+        )
 
 
 def in_time(timed: bool, t: float, equations: Callable, x: np.ndarray, coordinates, multipliers, energy, about) -> ImplicitForm:
