@@ -15,6 +15,7 @@ from dirax import gallery
 from dirax.diagnostics.drift import SMALLEST_SERIES, judge, oscillations
 from dirax.diagnostics.energy_lines import energy_line
 from dirax.diagnostics.one_step import differentiated_step
+from dirax.diagnostics.regularity_line import regularity
 from dirax.diagnostics.report import Line, Report
 from dirax.diagnostics.verdicts import EPSILON, ROUNDINGS
 from dirax.diagnostics.verify import verify
@@ -673,3 +674,34 @@ def test_residuals_of_a_batch_are_relative_to_the_terms_of_all_its_trajectories(
     masses = {"params": {"m": np.array([1.0, 1e12, 1e-6])}, "batch_params": True}
     sol = dx.simulate(pendulum, dx.LagrangeDAlembert(), q=np.ones((3, 1)), v=np.zeros((3, 1)), step=0.1, steps=40, **masses)
     assert sol.stats["max_residual"] > 1e-6 and dx.verify(sol)["steps solved"].verdict == "ok"
+
+
+ENDING = dx.LagrangeDirac(lambda q, v, params: params * q[0] * v[0] ** 2 / 2 - q[0])
+"""Falls towards q = 0, where it has no mass left and its motion ends, in less than a second."""
+
+
+def test_a_step_over_a_place_without_a_motion_is_seen():
+    run = {"v": [-0.5], "step": 0.05, "steps": 30, "params": 1.0}
+    over, before = (dx.verify(dx.simulate(ENDING, dx.PlusLagrangeDirac(), q=[1.0], **run | {"steps": n})) for n in (30, 10))
+    assert (
+        over["regular Lagrangian"].verdict == "VIOLATED" and "between t = 0.75 and 0.8" in over["regular Lagrangian"].explanation
+    )
+    assert before.ok and "regular Lagrangian" not in [line.quantity for line in before.lines]
+    several = dx.simulate(ENDING, dx.PlusLagrangeDirac(), q=[[9.0], [1.0]], **run | {"v": [[-0.5]] * 2})
+    assert dx.verify(several)["regular Lagrangian"].explanation.count("trajectory 1") == 1
+
+
+@pytest.mark.parametrize(
+    ("lagrangian", "more"),
+    [
+        (lambda q, v: (1 + q[0] ** 2) * (v[0] ** 2 - v[1] ** 2) / 2 - q @ q / 2, {}),  # of no sign, regular
+        (lambda q, v: -jnp.sqrt(1 - v @ v) * (1 + q @ q), {}),
+        (lambda q, v: (v[0] ** 2 - q[0] ** 2) / 2 + q[0] * v[1] ** 2 / 2, {"one_forms": lambda q: jnp.array([[0.0, 1.0]])}),
+        (lambda q, v: (v[0] ** 2 - q[0] ** 2) / 2 + q[0] * v[1] ** 2 / 2, {"holonomic": lambda q: q[1:] - 0.2}),
+    ],
+)
+def test_lagrangians_that_are_regular_on_the_way_are_not_accused(lagrangian, more):
+    sol = dx.simulate(
+        dx.LagrangeDirac(lagrangian, **more), dx.LagrangeDAlembert(), q=[0.5, 0.2], v=[0.1, 0.0], step=0.1, steps=60
+    )
+    assert np.min(sol.q[:, 0]) < 0 < np.max(sol.q[:, 0]) and regularity(sol) is None

@@ -11,6 +11,7 @@ from dirax.diagnostics.flights import longest_flight
 from dirax.diagnostics.manifold_lines import points
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.premise_line import premise_line
+from dirax.diagnostics.regularity_line import regularity
 from dirax.diagnostics.replay_lines import replayed
 from dirax.diagnostics.report import OK, VIOLATED, Line, Report
 from dirax.diagnostics.residuals import residual_size
@@ -62,6 +63,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
       H − H(0) less what was supplied plus what was dissipated: 32 ε, however many steps;
     - premise: there, and violated, where J, R, a metric or a Dirac structure is none at one of 64 rows, as is asked where a run
       begins;
+    - regular Lagrangian: there, and violated, where a run steps over a place where ∂²L/∂v² is singular, as 512 rows say;
     - energy: "bounded" or "drifts", told apart by windowed means (`dirax.diagnostics.drift`); a drift below
       32 ε · steps · (|E| + |∂E| |row|) is roundoff. The tolerance shown is the drift that could have been told. Violated where
       the energy has a jump between two rows (L or H has one there), which kinks and stiff springs are told from.
@@ -103,6 +105,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         energy_line(flight if sol.stats.get(WALLS_WORK) else sol),
         *port_lines(sol, tolerance),
         premise_line(sol),
+        regularity(sol),
         *(momentum(sol, name, generator, tolerance) for name, generator in generators.items()),
         *quotient_momentum(sol, tolerance),
         *casimir_lines(sol, tolerance),
