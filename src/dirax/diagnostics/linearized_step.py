@@ -9,7 +9,7 @@ import numpy as np
 from dirax.diagnostics.linearized_field import FieldAt, equations_of, filled, scaled_matrix
 from dirax.numerics.equilibration import balanced_inverse
 from dirax.numerics.newton import AT_FLOOR, sizes_of_unknowns
-from dirax.program.memo import Memo
+from dirax.program.memo import Memo, Same
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.redundancy import redundant_constraints
@@ -147,8 +147,8 @@ def _kept(matrix: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 
 
 def _stage(system: AbstractSystem, equation: Any, t: float, h: float) -> _Stage:
-    """The same object for equal equations, so that they are traced once."""
-    return _stages.get((system, equation, t, h), lambda: _Stage(system, equation, t, h))
+    """The same object for an equation that is one of those kept, so that it is traced once."""
+    return _stages.get((system, Same(equation), t, h), lambda: _Stage(system, equation, t, h))
 
 
 def _lift(stage: _Stage, layout: Layout, case: Case) -> np.ndarray:
