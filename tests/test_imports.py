@@ -213,7 +213,7 @@ def test_public_names():
 
     assert len(set(public.__all__)) == len(public.__all__) >= 93
     assert all(getattr(dirax, name) is getattr(public, name) for name in public.__all__)
-    assert set(public.__all__) <= set(dir(dirax)) and dirax.__all__ is public.__all__
+    assert set(public.__all__) == {name for name in dir(dirax) if not name.startswith("_")} and dirax.__all__ is public.__all__
     imported = {
         alias.name
         for node in ast.parse(Path(public.__file__).read_text("utf-8")).body
