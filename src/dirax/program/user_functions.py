@@ -214,7 +214,8 @@ def scalar_program(function: Callable, *values: Any) -> Any:
 
 
 def constant_entries(function: Callable, *values: Any) -> np.ndarray | None:
-    """The array `function(*values)` with NaN for the entries that depend on the values; None where that is not found."""
+    """The array `function(*values)`, or the first of several, with NaN for the entries that depend on the values; None where that
+    is not found."""
     from dirax.program.evaluation.functions import constants
 
     return constants(function, values)

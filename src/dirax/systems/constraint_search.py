@@ -72,9 +72,8 @@ class Search:
 
     def constant_entries(self, equations: Callable) -> np.ndarray:
         """A of the equations (A, b), with NaN for what depends on x or is not known not to."""
-        matrix = lambda x, params: equations(x, params)[0]
-        found = constant_entries(matrix, self.x, self.params)
-        return np.full(jax.eval_shape(matrix, self.x, self.params).shape, np.nan) if found is None else found
+        found = constant_entries(equations, self.x, self.params)
+        return np.full(jax.eval_shape(equations, self.x, self.params)[0].shape, np.nan) if found is None else found
 
     def constraints(self) -> Callable:
         """(x, params) ↦ the constraints of all levels so far."""
