@@ -99,9 +99,9 @@ def in_scalars(function: Callable, values: tuple) -> tuple | None:
 def constants(function: Callable, values: tuple) -> np.ndarray | None:
     """The array that `function(*values)` is, or the first of several, NaN in entries that are not constant; None where it has no
     program."""
-    found = program_at(function, values)
+    leaves, structure = jax.tree.flatten(values)
+    found = None if any(isinstance(leaf, Tracer) for leaf in leaves) else program_at(function, values)
     if found is None or found.opaque:  # what NumPy computes may be written out, and constant
-        leaves, structure = jax.tree.flatten(values)
         shapes = [jax.ShapeDtypeStruct(np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
         traced = _traced(_flat(function, structure), shapes, False)
         found = traced and traced[0]
