@@ -545,3 +545,26 @@ def test_three_one_forms_of_a_car_with_a_trailer_are_native():
     q, v = np.array([0.0, 0.0, 0.1, 0.2, 0.0]), np.array([1.0, 0.1, 0.2, 0.1, 0.0])
     sol = dx.simulate(car, dx.EnergyCollocation(1), q=q, v=v, project=True, step=0.05, steps=40)
     assert sol.stats["engine"] == "native" and np.ptp(sol.energy()) < 1e-14
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_euler_poincare_equations_are_the_lie_poisson_ones(engine):
+    run = {"x": [0.3, 0.8, 1.2, 0.0, 0.6, 0.8], "step": 0.1, "steps": 10, "engine": engine}
+    ours, theirs = (dx.simulate(s, dx.EnergyCollocation(2), **run) for s in (TOP, TOP.lie_poisson()))
+    np.testing.assert_allclose(ours.x, theirs.x, rtol=0, atol=1e-13)
+
+
+def test_the_power_of_steps_of_their_own_length_is_balanced():
+    oscillator = dx.PortHamiltonian(
+        lambda x: x[0] ** 2 / 2 + x[0] ** 4 / 4 + x[1] ** 2 / 2,
+        J=np.array([[0.0, 1.0], [-1.0, 0.0]]),
+        B=np.array([[0.0], [1.0]]),
+        R=np.diag([0.0, 0.1]),
+        inputs=lambda t, x: jnp.array([jnp.sin(1.3 * t) / 2]),
+    )
+    scheme = dx.VariableSteps(dx.DiscreteGradient(), lambda x: 1 + 0.2 * x[0] ** 2)
+    sol = dx.simulate(oscillator, scheme, x=[1.0, 0.3], step=0.05, steps=100)
+    assert dx.verify(sol)["power balance of every step"].verdict == "ok"
+    power = np.array(sol.power)
+    power[50, 0] += 1e-6
+    assert dx.verify(sol.replace(fields=sol.fields | {"power": power}))["power balance of every step"].verdict == "VIOLATED"

@@ -9,6 +9,7 @@ from dirax.diagnostics.replay_lines import moved_numbers
 from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line
 from dirax.diagnostics.rows import energy_of, over_rows
 from dirax.diagnostics.verdicts import relative_to, roundoff_limit
+from dirax.schemes.step import CLOCK
 from dirax.solution.solution import Solution
 
 PORTS = 2
@@ -45,7 +46,7 @@ def _step_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
     stored, supplied, dissipated = np.moveaxis(np.asarray(sol.fields["power"]), -1, 0)
     if stored.size == 0:
         return Line(name, None, None, NOT_CHECKED, "no step was saved")
-    h = float(sol.step)
+    h = _lengths(sol)
     sizes = np.abs(stored) + np.abs(supplied) + np.abs(dissipated) + energy_scale / h + _flow(sol)
     missed = np.abs(stored - supplied + dissipated)
     text = "power stored ⟨dH, ẋ⟩ less supplied plus dissipated, at the base points"
@@ -58,6 +59,14 @@ def _step_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
     if np.any(missed > limit * sizes):  # a difference quotient of H over a small Δx is off by more
         sizes = np.maximum(sizes, np.sum(moved_numbers(sol, "power")))
     return _line(name, float(np.nanmax(relative_to(missed, sizes))), limit, text)
+
+
+def _lengths(sol: Solution) -> Any:
+    """The length of a step, or the lengths (…, rows − 1) of those that leave the rows, where each has its own."""
+    if CLOCK not in sol.fields:
+        return float(sol.step)
+    taken = np.diff(np.asarray(sol.fields[CLOCK]), axis=-1)
+    return taken if sol.save_every == 1 else taken / sol.save_every
 
 
 def _flow(sol: Solution) -> float:

@@ -11,7 +11,7 @@ from dirax.schemes.hamiltonian_energy_collocation_step import HamiltonianEnergyC
 from dirax.schemes.hidden_constraint_premise import nothing_hidden_in_relation
 from dirax.schemes.lagrangian_energy_collocation_step import LagrangianEnergyCollocation
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
-from dirax.systems.forms import RelationForm
+from dirax.systems.forms import EnergyForm, RelationForm
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.system import AbstractSystem
 
@@ -104,7 +104,7 @@ class EnergyCollocation(AbstractScheme):
             return FramedEnergyCollocation(*tables, self._in_a_frame(system), shape, self.frame).equation()
         energy = system.energy_form(shape)
         relation = system.relation_form(shape) or system.final_relation(shape)
-        relation = RelationForm(energy.residual) if relation is None and energy is not None else relation
+        relation = _with_its_differential(energy) if relation is None and energy is not None else relation
         if relation is not None and energy is not None and not relation.multipliers:
             step = HamiltonianEnergyCollocation(*tables, relation, energy, shape.n)
             if step.sparse:  # of so many coordinates there is no matrix
@@ -134,3 +134,9 @@ class EnergyCollocation(AbstractScheme):
             f"dx.EnergyCollocation takes frame= for Lagrangians with linear one-forms that do not take the time, but {what}: "
             "leave it out."
         )
+
+
+def _with_its_differential(energy: EnergyForm) -> RelationForm:
+    """The relation of a system that has no other than that of its energy form."""
+    at = lambda x, velocity, u, t, params: energy.residual(x, velocity, u, t, params, energy.differential(x, params))
+    return RelationForm(at)
