@@ -7,8 +7,9 @@ import numpy as np
 
 from dirax.diagnostics.one_step import differentiated_steps
 from dirax.diagnostics.power_balance import keeps_books
+from dirax.diagnostics.replay_lines import moved_numbers
 from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
-from dirax.diagnostics.rounding import differences_by_rounding, with_rounding
+from dirax.diagnostics.rounding import differences_by_rounding, with_moved_rows, with_rounding
 from dirax.diagnostics.rows import consecutive, over_rows, sampled_rows, shape_of
 from dirax.diagnostics.symplecticity_of_many import symplecticity_of_many
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
@@ -63,6 +64,10 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     values = _relative(terms, structure.counts, follow)
     if np.any(values > limit):
         terms = with_rounding(terms, np.max(values, axis=(0, 2)), of_rows, sol, (items,))
+        values = _relative(terms, structure.counts, follow)
+    if np.any(values > limit):  # what a step solves for may be made of differences, and be off by more than a rounding
+        by = {name: moved_numbers(sol, name) for name in structure.reads}
+        terms = with_moved_rows(terms, np.max(values, axis=(0, 2)), of_rows, sol, (items,), by)
         values = _relative(terms, structure.counts, follow)
     own = terms.copy()
     own[:, :, 0, follow] = 0.0
