@@ -34,6 +34,42 @@ def test_it_is_a_discretization_map():
     assert max(report.point_defect, report.derivative_defect, report.inverse_defect) < 1e-14
 
 
+class Stretched(dx.AbstractDiscretizationMap):
+    """R_d(x, v) = (x − v/2, x + end v): a discretization map where end = ½."""
+
+    end: float
+
+    def manifold(self, ambient_dimension):
+        return dx.Euclidean(ambient_dimension)
+
+    def forward(self, x, v):
+        return x - v / 2, x + self.end * v
+
+    def backward(self, x0, x1):
+        v = (x1 - x0) / (0.5 + self.end)
+        return x0 + v / 2, v
+
+    def reach(self, x, v):
+        return jnp.zeros(())
+
+
+OSCILLATORS = [
+    (dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2), {"q": [1.0], "v": [0.5]}),
+    (dx.DiracSystem(dx.induced_dirac(None, 1), lambda x: x @ x / 2), {"x": [1.0, 0.5]}),
+]
+
+
+@pytest.mark.parametrize(("system", "start"), OSCILLATORS)
+def test_a_map_that_is_none_is_refused(system, start):
+    run = lambda end: dx.simulate(system, dx.DiscreteDirac(Stretched(end)), **start, step=0.1, steps=9)
+    midpoint = dx.simulate(system, dx.DiscreteDirac(), **start, step=0.1, steps=9)
+    for name, values in run(0.5).fields.items():
+        np.testing.assert_allclose(values, midpoint.fields[name], atol=1e-15)
+    with pytest.raises(ValueError, match=r"Stretched is not a discretization map .*\(D2\).* fails by 0\.5"):
+        run(1.0)
+    assert "derivative_defect=0.5" in repr(dx.check_discretization_map(Stretched(1.0), np.ones(2), np.ones(2)))
+
+
 def rate_of(steps_and_errors):
     steps, errors = map(np.asarray, zip(*steps_and_errors, strict=True))
     return -np.diff(np.log(errors), axis=0).T / np.diff(np.log(steps))

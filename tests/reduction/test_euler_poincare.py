@@ -193,3 +193,17 @@ def test_reduced_is_unreduced_on_matrices(case):
     if forms is not None:
         assert np.abs(sol.constraint).max() < 1e-14
         assert np.abs(sol.multipliers[1:] - unknowns[:, len(xi) :]).max() < 1e-11
+
+
+def test_steps_of_their_own_length_and_what_makes_no_motion():
+    body = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ (jnp.array([1.0, 2.0, 3.0]) * xi) / 2)
+    by = lambda scheme, end, steps, of=body: dx.simulate(of, scheme, x=[0.3, 1.8, -1.2], step=end / steps, steps=steps)
+    for density in (None, lambda x: 1 + 0.1 * x[0] ** 2):
+        errors = []
+        for steps in (40, 80):
+            sol = by(dx.VariableSteps(dx.DiscreteEulerPoincare(), density), 2.0, steps)
+            exact = by(dx.Collocation(6), float(sol.fields["clock"][-1]), 100, body.lie_poisson())
+            errors.append(np.max(np.abs(sol.x[-1] - exact.x[-1])))
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.05)
+    with pytest.raises(ValueError, match=r"Collocation hold no steps on the group.*DiscreteEulerPoincare"):
+        dx.reconstruct(exact)

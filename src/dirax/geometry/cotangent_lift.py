@@ -88,6 +88,11 @@ class CotangentLift(AbstractDiscretizationMap):
 
     map: AbstractDiscretizationMap
 
+    @property
+    def is_known(self):
+        """Where the map on Q is."""
+        return self.map.is_known
+
     def manifold(self, ambient_dimension):
         """T*Q for the manifold Q of the map; `ValueError` for points of odd length, `TypeError` for a second lift off R^n."""
         if ambient_dimension % 2:

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from dirax.geometry.manifolds import AbstractManifold, Vector
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.program.tracing import once
-from dirax.program.user_functions import evaluated
+from dirax.program.user_functions import evaluated, is_traced
 
 
 class DiscretizationMapReport(eqx.Module):
@@ -24,6 +24,11 @@ class DiscretizationMapReport(eqx.Module):
     """Largest component of R_d⁻¹(R_d(x, v)) − (x, v)."""
     condition_number: Float[Array, ""]
     """Condition number of D R_d(x, v) in the manifold's frames: the map is invertible near (x, v) if it is finite."""
+
+    def __repr__(self):
+        if is_traced(self):
+            return super().__repr__()
+        return f"DiscretizationMapReport({', '.join(f'{name}={float(value):.3g}' for name, value in vars(self).items())})"
 
 
 def check_discretization_map(map: AbstractDiscretizationMap, x: ArrayLike, v: ArrayLike) -> DiscretizationMapReport:

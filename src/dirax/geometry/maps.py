@@ -30,6 +30,11 @@ class AbstractDiscretizationMap(eqx.Module):
     the same functions without any check.
     """
 
+    @property
+    def is_known(self) -> bool:
+        """Whether it is known to have (D1) and (D2); schemes ask it of others at initial data."""
+        return False
+
     @abstractmethod
     def manifold(self, ambient_dimension: int) -> AbstractManifold:
         """The manifold M of the map, for points of length `ambient_dimension`; `ValueError` if it has another one."""
@@ -94,6 +99,11 @@ class Theta(AbstractDiscretizationMap):
     def __check_init__(self):
         _check_theta(self.theta)
 
+    @property
+    def is_known(self):
+        """It is."""
+        return True
+
     def manifold(self, ambient_dimension):
         """R^N."""
         return Euclidean(ambient_dimension)
@@ -141,6 +151,11 @@ class RiemannianExp(AbstractDiscretizationMap):
                     f"geodesics: use LieGroupExp({type(factor).__name__}(), theta)."
                 )
 
+    @property
+    def is_known(self):
+        """It is."""
+        return True
+
     def manifold(self, ambient_dimension):
         """`space`; raises `ValueError` for points of another length."""
         return _same_size(self.space, ambient_dimension)
@@ -177,6 +192,11 @@ class LieGroupExp(AbstractDiscretizationMap):
         if not isinstance(self.group, AbstractLieGroup):
             raise TypeError(f"LieGroupExp needs a group such as SO3(), but {self.group!r} came.")
 
+    @property
+    def is_known(self):
+        """It is."""
+        return True
+
     def manifold(self, ambient_dimension):
         """`group`; raises `ValueError` for elements of another length."""
         return _same_size(self.group, ambient_dimension)
@@ -208,6 +228,11 @@ class SphereProjection(AbstractDiscretizationMap):
 
     Its inverse is (x0, x1) ↦ ((x0 + x1)/‖x0 + x1‖, 2(x1 − x0)/‖x0 + x1‖); every pair but antipodes is reached.
     """
+
+    @property
+    def is_known(self):
+        """It is."""
+        return True
 
     def manifold(self, ambient_dimension):
         """The unit sphere of R^N."""
@@ -247,6 +272,11 @@ class ProductMap(AbstractDiscretizationMap):
         """The product of the manifolds of the maps; raises `ValueError` for points of another length."""
         factors = [map.manifold(size) for map, size in zip(self.maps, self.sizes, strict=True)]
         return _same_size(Product(*factors), ambient_dimension)  # pyrefly: ignore[bad-argument-type]  # it refuses others
+
+    @property
+    def is_known(self):
+        """Where all of its maps are."""
+        return all(map.is_known for map in self.maps)
 
     @property
     def base_fraction(self):

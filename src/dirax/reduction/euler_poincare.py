@@ -156,6 +156,13 @@ class EulerPoincare(AbstractSystem):
 
         return EnergyForm(hamiltonian, differential, residual)
 
+    def velocity_at(self, row: Data, params: Any) -> Array:
+        """ẋ by the Lie–Poisson bivector. Raises `TypeError` where constraints push as well."""
+        form = self.energy_form(Shape(0))
+        if form is None:
+            raise TypeError("the rate of a dx.EulerPoincare with constraints is not at hand: dx.VariableSteps does not take it.")
+        return self.space.bivector(row["x"]) @ form.differential(row["x"], params)
+
     def sizes(self, data: Data, params: Any) -> tuple[int, int]:
         """(d + r, m)."""
         if set(data) - {"t"} == {"q"}:

@@ -16,6 +16,7 @@ from dirax.schemes.growth_premise import nothing_grows
 from dirax.schemes.hidden_constraint_premise import nothing_hidden_in_lagrangian, nothing_hidden_in_relation
 from dirax.schemes.look_ahead_step import LookAheadStep
 from dirax.schemes.map_lift import ThetaLift, lift_of
+from dirax.schemes.map_premise import by_a_discretization_map
 from dirax.schemes.projected_field import projected_field
 from dirax.schemes.projected_lift_step import ProjectedLiftStep
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
@@ -50,8 +51,8 @@ class DiscreteDirac(AbstractScheme):
     Takes systems with a relation form or a Lagrangian form: DiracSystem, PortHamiltonian, ImplicitSystem, LiePoisson,
     LagrangeDirac, NonholonomicMechanics, PhaseSpaceLagrangian, ManifoldLagrangian and systems of one's own; and what
     `ConstraintChain.resolved` returns, on which it is Method 2 for any system. Raises `TypeError` for others, and `ValueError`
-    for maps that do not fit the system's space and for Method 2 of a system with constraints that are not stated as such,
-    those of a singular Lagrangian say.
+    for maps that do not fit the system's space, for one of your own that is no discretization map at the initial data, and for
+    Method 2 of a system with constraints that are not stated as such, those of a singular Lagrangian say.
     """
 
     map: AbstractDiscretizationMap
@@ -80,7 +81,7 @@ class DiscreteDirac(AbstractScheme):
                 "PortHamiltonian, ImplicitSystem, LagrangeDirac, NonholonomicMechanics and PhaseSpaceLagrangian systems, but a "
                 f"{type(system).__name__} was given."
             )
-        return equation
+        return by_a_discretization_map(self.map, equation)
 
     def _discretized(self, system: AbstractSystem, shape: Shape) -> StepEquation | None:
         """Method 1."""

@@ -34,7 +34,8 @@ def reconstruct(solution: Solution, g0: Any = None) -> Solution:
     Ad*_{g⁻¹} μ (d,), and the reduced fields as they were; `g0` is an element (N,), a matrix (k, k), in a batch also (B, N),
     or the identity, as for a run that started from q=.
 
-    Raises `TypeError` for a solution of another system, `ValueError` for a g0 that is no element of the group.
+    Raises `TypeError` for a solution of another system, `ValueError` for a g0 that is no element of the group, and
+    for a run on a group by a scheme other than `dx.DiscreteEulerPoincare`, which saves no steps on it.
     """
     stated = solution.system
     if stated is not None and (on_algebra := stated.lie_algebra_form()) is not None:
@@ -97,6 +98,11 @@ def _multipliers_at(solution: Solution, q: Any) -> Any:
 
 
 def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> Solution:
+    if "g" not in solution.fields:
+        raise ValueError(
+            f"the rows of this run by dx.{type(solution.scheme).__name__} hold no steps on the group, of which a motion is made: "
+            "run it by dx.DiscreteEulerPoincare()."
+        )
     start = _element(group, g0, solution.batch)
     batched = start.ndim == 2
 

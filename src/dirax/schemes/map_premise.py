@@ -1,0 +1,40 @@
+"""The premise of steps by a discretization map of one's own: that it is one, asked at initial data."""
+
+import dataclasses
+
+import numpy as np
+
+from dirax.geometry.cotangent_lift import CotangentLift
+from dirax.geometry.map_report import check_discretization_map
+from dirax.geometry.maps import AbstractDiscretizationMap
+from dirax.schemes.step import StepEquation
+
+KEPT = 1e-6
+"""How far (D1), relative to the point, (D2) and the inverse may fail."""
+
+
+def by_a_discretization_map(map: AbstractDiscretizationMap, equation: StepEquation) -> StepEquation:
+    """The equation of steps by a map, which refuses initial data at which the map is not known to be one and is none."""
+    if map.is_known:
+        return equation
+
+    def check(data, h, params):
+        equation.check(data, h, params)
+        x = np.asarray(next(data[name] for name in ("q0", "q", "x") if name in data), dtype=float)
+        own = map
+        if isinstance(map, CotangentLift):
+            own, x = map.map, x if "x" not in data else x[: len(x) // 2]
+        found = check_discretization_map(own, x, np.zeros_like(x))
+        failed = {
+            "(D1) R_d(x, 0) = (x, x)": found.point_defect / (np.max(np.abs(x)) or 1.0),
+            "(D2) D_v R_d²(x, 0) − D_v R_d¹(x, 0) = id": found.derivative_defect,
+            "R_d⁻¹(R_d(x, 0)) = (x, 0)": found.inverse_defect / (np.max(np.abs(x)) or 1.0),
+        }
+        missed = [f"{law} fails by {float(off):.2g}" for law, off in failed.items() if float(off) > KEPT]
+        if missed:
+            raise ValueError(
+                f"{type(own).__name__} is not a discretization map at the initial point: {', '.join(missed)}. With one that is "
+                "none the steps are those of another system; dx.check_discretization_map(map, x, v) says how far it is off."
+            )
+
+    return dataclasses.replace(equation, check=check)
