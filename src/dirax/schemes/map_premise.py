@@ -13,17 +13,18 @@ KEPT = 1e-6
 """How far (D1), relative to the point, (D2) and the inverse may fail."""
 
 
-def by_a_discretization_map(map: AbstractDiscretizationMap, equation: StepEquation) -> StepEquation:
-    """The equation of steps by a map, which refuses initial data at which the map is not known to be one and is none."""
+def by_a_discretization_map(map: AbstractDiscretizationMap, equation: StepEquation, of_relation: bool) -> StepEquation:
+    """The equation of steps by a map on the points of a relation form, or on Q, which refuses initial data where the map is not
+    known to be one and is none."""
     if map.is_known:
         return equation
 
     def check(data, h, params):
         equation.check(data, h, params)
-        x = np.asarray(next(data[name] for name in ("q0", "q", "x") if name in data), dtype=float)
-        own = map
+        names = ("x",) if "x" in data else ("q", "p") if of_relation else ("q0",) if "q0" in data else ("q",)
+        own, x = map, np.concatenate([np.asarray(data[name], dtype=float) for name in names])
         if isinstance(map, CotangentLift):
-            own, x = map.map, x if "x" not in data else x[: len(x) // 2]
+            own, x = map.map, x[: len(x) // 2] if of_relation else x
         found = check_discretization_map(own, x, np.zeros_like(x))
         failed = {
             "(D1) R_d(x, 0) = (x, x)": found.point_defect / (np.max(np.abs(x)) or 1.0),
