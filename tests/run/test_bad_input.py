@@ -422,6 +422,12 @@ def test_a_step_without_a_solution_from_rest_is_not_too_small():
     assert not sol.ok and "a smaller step may help" in sol.message and "too small" not in sol.message
 
 
+def test_a_run_that_grows_beyond_all_bounds_is_not_told_to_take_larger_steps():
+    linear = dx.LagrangeDirac(lambda q, v: jnp.stack([-q[1] - q[1] ** 3 / 15, 0.15 * q[0] ** 2]) @ v - q @ q / 2)
+    sol = dx.simulate(linear, dx.PlusLagrangeDirac(), q=[0.8, 0.3], v=[0.0, 0.0], step=0.1, steps=40)
+    assert not sol.ok and np.max(np.abs(sol.q)) > 1e30 and "too small" not in sol.message
+
+
 @pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.PlusLagrangeDirac()])
 def test_a_step_that_is_too_small_for_double_precision(scheme):
     """g(q)/h carries ε/h ≈ 2·10⁻⁸ of noise: more of it in a smaller step, which is not what is advised. Method 2 has none."""

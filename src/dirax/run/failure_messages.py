@@ -29,6 +29,9 @@ COUNTS, NAMED = 0.1, 8
 NEARLY = 1e-9
 """Singular values that say no more of an unknown than that it floats."""
 
+BOUNDLESS = 1e12
+"""Changes by rounding, relative to the unknowns, that are those of a state which has grown beyond all bounds."""
+
 brief: ContextVar[bool] = ContextVar("brief", default=False)
 """Whether the failed step is not computed again to see where it breaks: of a million trajectories many may fail."""
 
@@ -227,7 +230,7 @@ def _advice(stage, numbers: InNumbers | InJax, u, args, sizes) -> str:
         here, there = (_roundoff(numbers, u, (state, t, step), sizes) for step in (h, 10 * h))
     except GraphTooLarge:  # so large a step is run without these derivatives
         return SMALLER
-    hidden = (here > STALLED) & (there < here / 2)
+    hidden = (here > STALLED) & (there < here / 2) & (here < BOUNDLESS)
     if not np.any(hidden):
         return SMALLER
     here = np.max(here[hidden])
