@@ -65,8 +65,7 @@ def _lengths(sol: Solution) -> Any:
     """The length of a step, or the lengths (…, rows − 1) of those that leave the rows, where each has its own."""
     if CLOCK not in sol.fields:
         return float(sol.step)
-    taken = np.diff(np.asarray(sol.fields[CLOCK]), axis=-1)
-    return taken if sol.save_every == 1 else taken / sol.save_every
+    return np.diff(np.asarray(sol.fields[CLOCK]), axis=-1) / sol.save_every
 
 
 def _flow(sol: Solution) -> float:

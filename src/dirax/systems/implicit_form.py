@@ -50,7 +50,7 @@ def of_relation(system: Any, near: Any, params: Any) -> ImplicitForm:
 
 def _refuse_nonlinear(system: Any, defect: Callable, unknowns: np.ndarray, labels: Sequence[str]) -> None:
     """Raise `TypeError` for equations that are not affine in their unknowns, of which no matrix says what they determine."""
-    slopes = lambda y: jacobian(defect)(y)
+    slopes = jacobian(defect)
     found = constant_entries(slopes, unknowns)
     if found is not None and not np.any(np.isnan(found)):
         return
