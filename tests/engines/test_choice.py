@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import dirax as dx
-from dirax import gallery
 from dirax.engines import policy as choice
 from dirax.engines.step_program import step_program
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -66,9 +65,3 @@ def test_a_step_whose_elimination_is_too_large_goes_to_arrays(monkeypatch):
     assert sol.ok and sol.stats["engine"] == "xla" and "more than 150 scalar operations" in sol.stats["not_native"]
     with pytest.raises(UnsupportedPrimitive, match="more than 150 scalar operations"):
         dx.simulate(system, dx.LagrangeDAlembert(), **run, engine="native")
-
-
-def test_blocks_whose_equations_hold_unknowns_of_later_ones_are_run_by_the_xla_engine():
-    example = gallery.get("flyball-governor")
-    sol = example.simulate(dx.LagrangeDAlembert(), steps=5)
-    assert sol.ok and (sol.stats["engine"] == "native" or "unknowns of later ones" in sol.stats["not_native"])

@@ -22,7 +22,8 @@ TOTAL = frozenset(("add", "sub", "mul", "neg", "sin", "cos", "held", "ruled"))
 
 def without_equals(target: Graph, source: Graph, outputs: list[int]) -> list[int]:
     """The nodes of `target` that are equal to the `outputs` of `source`, a copy of it with more nodes: of nodes that are equal,
-    or opposite, one alone is taken over, but none in place of another that is finite where it is not. Raises `GraphTooLarge`."""
+    or opposite, one alone is taken over, but none in place of another that is finite where it is not, or that does without an
+    input of it. Raises `GraphTooLarge`."""
     first, nodes = len(target), source.reachable(outputs)
     values, risks = values_modulo_prime(source, nodes), _risks(source, nodes)
     found: dict[int, int] = {}
@@ -48,13 +49,13 @@ def without_equals(target: Graph, source: Graph, outputs: list[int]) -> list[int
 
 
 def _risks(g: Graph, nodes: Iterable[int]) -> dict[int, int]:
-    """For each of these nodes, of which operands come first, a bit for every node below it, and itself, that may be infinite or
-    nan where its own operands are finite."""
+    """For each of these nodes, of which operands come first, a bit for every node below it, and itself, that is an input, or that
+    may be infinite or nan where its own operands are finite."""
     found: dict[int, int] = {}
     own = 1
     for node in nodes:
         found[node] = reduce(or_, (found[a] for a in g.args[node]), 0)
-        if g.args[node] and g.op[node] not in TOTAL:
+        if g.op[node] not in TOTAL and not g.is_constant(node):
             found[node] |= own
             own <<= 1
     return found

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable
 from dirax.engines.native.functions import MACHINE_CODE, trigonometric
 from dirax.engines.native.ir.emitter import Emitter
 from dirax.program.graph import Graph
-from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.operations import OPERATIONS
 
 CIRCULAR = tuple(trigonometric.MACHINE_CODE)
@@ -129,8 +128,6 @@ class Region:
 
     def _instruction(self, node: int) -> str:
         op, args = self.graph.op[node], [self.value(a) for a in self.graph.args[node]]
-        if op == "input":  # nothing has bound it
-            raise UnsupportedPrimitive("the step as a whole", "has equations that hold unknowns of later ones", "its blocks")
         formula = OPERATIONS[op].formula
         return by_formula(self.emitter, formula, args) if formula else MACHINE_CODE[op](self.emitter, *args)
 
