@@ -64,11 +64,12 @@ def block(steps, q=(3.0,), mu=MU, slip=SLIP, **options):
     return dx.simulate(system, dx.LagrangeDAlembert(), q=q, v=v, step=H, steps=steps, params=mu, **options)
 
 
+@pytest.mark.parametrize("engine", ["native", "xla"])
 @pytest.mark.parametrize("slip", [SLIP, 1e-5])
-def test_where_friction_stops_a_block(slip):
+def test_where_friction_stops_a_block(slip, engine):
     """Against the roots of the same equations in one number, which brackets find: at rest its velocity alternates, and what steps
     before say of it leads the wrong way."""
-    sol, q, p = block(400, slip=slip), 3.0, 0.0
+    sol, q, p = block(400, slip=slip, engine=engine), 3.0, 0.0
     for k in range(400):
         half = lambda v: H / 2 * (-4.0 * (q + H / 2 * v) - MU * np.tanh(v / slip))  # noqa: B023
         v = brentq(lambda v: v - half(v) - p, -20.0, 20.0, xtol=1e-16)  # noqa: B023
@@ -77,12 +78,15 @@ def test_where_friction_stops_a_block(slip):
     assert "followed" in sol.stats["iteration"]
 
 
-def test_bits_of_a_block_that_friction_stops():
-    sol = block(400)
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_bits_of_a_block_that_friction_stops(engine):
+    """Ever so many trajectories that stop in different steps: natively each has the bits that it has alone."""
+    sol = block(400, engine=engine)
     assert dx.verify(sol).ok
-    assert np.array_equal(block(313).extend(87).q, sol.q)
-    assert np.array_equal(block(400, q=[[2.5], [3.0]]).q[1], sol.q)
-    assert np.array_equal(block(400, save_every=10).q, sol.q[::10])
+    assert np.array_equal(block(313, engine=engine).extend(87).q, sol.q)
+    many = block(403, q=[[2.5], [3.0], [3.3]], engine=engine, save_every=10)
+    assert np.all(many.ok) and "followed" in many.stats["iteration"]
+    np.testing.assert_allclose(many.q[1, :-1], sol.q[::10], rtol=0.0, atol=1e-14 if engine == "xla" else 0.0)
 
 
 def test_many_that_stop_have_the_bits_of_each_alone():

@@ -9,7 +9,7 @@ import dirax as dx
 from dirax.engines import sizes
 from dirax.engines.contract import NOT_FINITE, OK, Problem
 from dirax.engines.sizes import sizes_of, sizes_of_traced
-from dirax.engines.xla import Xla, engine, loop
+from dirax.engines.xla import Xla, loop, run
 from dirax.program.graph import GraphTooLarge
 from dirax.schemes.step import Field, Shape, StepEquation, explicit_step, make_step_equation
 
@@ -114,8 +114,8 @@ def test_chunks_leave_no_trace(monkeypatch, save_every):
     """The bits of a run do not depend on where its chunks end, within rows or between them, nor on how many there are."""
     whole = dx.simulate(PENDULUMS, MIDPOINT, **SWING, steps=200, save_every=save_every)
     monkeypatch.setattr(loop, "CHUNK_ROWS", 16)
-    monkeypatch.setattr(engine, "FIRST_CHUNK", 7)
-    monkeypatch.setattr(engine, "CHUNK_SECONDS", 1e-9)
+    monkeypatch.setattr(run, "FIRST_CHUNK", 7)
+    monkeypatch.setattr(run, "CHUNK_SECONDS", 1e-9)
     calls = []
     pieces = dx.simulate(
         PENDULUMS, MIDPOINT, **SWING, steps=200, save_every=save_every, progress=lambda done, _: calls.append(done)
@@ -197,8 +197,8 @@ def test_dead_trajectories_cost_nothing():
 
 
 def test_an_interrupted_run_keeps_what_was_computed(monkeypatch):
-    monkeypatch.setattr(engine, "FIRST_CHUNK", 50)
-    monkeypatch.setattr(engine, "CHUNK_SECONDS", 1e-9)
+    monkeypatch.setattr(run, "FIRST_CHUNK", 50)
+    monkeypatch.setattr(run, "CHUNK_SECONDS", 1e-9)
     swing = problem(OSCILLATOR, [1.0, 0.0], [0.0], 0.1, 10_000, params=1.0)
     seen = []
 

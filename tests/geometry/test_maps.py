@@ -349,6 +349,19 @@ def test_orthogonal_projection_to_the_image_of_an_oblique_projector():
     assert surface.dimension == 2
 
 
+@pytest.mark.parametrize("x", [np.zeros(4), np.ones(4), np.array([1.0, -1.0, 0.5, 0.5])], ids=str)
+def test_a_frame_does_not_turn_with_a_rounding(x):
+    """The projections to tangent spaces have one singular value, of which singular vectors are any: a run chose others in each
+    update of Newton's method and never ended."""
+    surface = Submanifold(lambda x: jnp.array([x[0], x[1], x[2], x[0] * x[1]]), 4)
+    point = surface.nearest(x)
+    frame = np.asarray(surface.frame(point))
+    np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(surface.projection(point, frame.T[0]), frame.T[0], atol=1e-15)
+    moved = point * (1.0 + 1e-15 * random_arrays(18, 4)) + 1e-16
+    np.testing.assert_allclose(surface.frame(surface.nearest(moved)), frame, atol=1e-14)
+
+
 # ---------------------------------------------------------------------- bad input
 
 

@@ -108,6 +108,11 @@ def test_gauss_nodes_in_other_units():
     assert compared("charged-particle", SCHEMES["gauss"])
 
 
+def test_a_board_that_starts_from_rest_in_other_units():
+    """All that its wheels hold is the roundoff of zero in the first step, which was called unsolved in some: no size was left."""
+    assert compared("snakeboard-gait", SCHEMES["suzuki4"], steps=3)
+
+
 @pytest.mark.parametrize("name", ["heisenberg", "contact-particle"])
 def test_systems_that_begin_without_a_root_have_every_bit(name):
     assert compared(name, dx.DiscreteDirac())

@@ -155,16 +155,19 @@ def _looked_at(at: Entries) -> list[np.ndarray]:
 
 
 def _closely(at: Entries) -> list[np.ndarray]:
-    """The sizes looked at closely, and where they are far above the unknowns, no larger than the solution of the step allows, or
-    where none is found the guess, which may be far from one; or, where the step is too large to be solved in numbers, what is not
-    zero of it. Raises `GraphTooLarge` where the sizes themselves are too large."""
+    """The sizes looked at closely, and where they are far above the unknowns, no larger than the solution of the step allows in
+    any of its parts by the same equations, or where none is found the guess, which may be far from one; or, where the step is too
+    large to be solved in numbers, what is not zero of it. Raises `GraphTooLarge` where the sizes themselves are too large."""
     found = close_sizes(at)
     far = [np.any(a > FAR * np.abs(u), axis=1) for a, u in zip(found, at.guesses, strict=True)]
     if not np.any(far):
         return found
     try:
-        _, sizes, good = StepsInNumbers(None, at.program).solved(at.state, at.guesses, at.t, at.h, at.leaves, follow=True)
-        most = [np.where(good[:, None], MOST * a, FAR * np.abs(u)) for a, u in zip(sizes, at.guesses, strict=True)]
+        here = at.state, at.guesses, at.t, at.h, at.leaves
+        _, sizes, good = StepsInNumbers(None, at.program).solved(*here, follow=True, sizes=found)
+        of_equations = lambda stage: np.max([a for (s, _), a in zip(at.stages, sizes, strict=True) if s is stage], axis=0)
+        solutions = [MOST * of_equations(stage) for stage, _ in at.stages]
+        most = [np.where(good[:, None], a, FAR * np.abs(u)) for a, u in zip(solutions, at.guesses, strict=True)]
         bounded = ~good[:, None]
     except GraphTooLarge:
         most, bounded = [FAR * np.abs(u) for u in at.guesses], np.zeros((len(at.state), 1), bool)

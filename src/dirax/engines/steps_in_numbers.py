@@ -212,19 +212,21 @@ class StepsInNumbers:
         h: float | np.ndarray,
         params: np.ndarray,
         follow: bool = False,
+        sizes: Sequence[np.ndarray] | None = None,
     ) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
         """A step of each state, followed as of `step`: the unknowns of each part, their sizes (states, k), which are their values
         and what a typical rounding of each term of the equations comes to, and whether the equations are solved to roundoff of
-        these, (states,)."""
+        these, (states,). `sizes` that unknowns may have tell which terms are but the roundoff of zero."""
         near = self.nothing_near(len(t))
         made = self.step(states, guesses, t, h, params, near=near, follow=follow)
-        sizes, good = [], made.good
+        found, good = [], made.good
         for stage, ((_, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
-            of_part, solved = self._judged(stage, u, state, (t, np.full(len(t), fraction * h), params), near.inverses[stage])
-            sizes.append(of_part)
+            at, least = (t, np.full(len(t), fraction * h), params), 0.0 if sizes is None else sizes[stage]
+            of_part, solved = self._judged(stage, u, state, at, near.inverses[stage], least)
+            found.append(of_part)
             good = good & solved & np.all(np.isfinite(of_part), axis=1)
             t = t + fraction * h
-        return made.unknowns, sizes, good
+        return made.unknowns, found, good
 
     def _terms(self, stage: int, u, state, t, h, params, sizes: np.ndarray | None = None) -> np.ndarray:
         """The sizes (states, k) of the terms of a stage's equations, however they cancel, with unknowns of their own sizes."""
@@ -373,17 +375,18 @@ class StepsInNumbers:
         unknowns[beyond], reached[beyond] = np.nan, 0.0  # across a place where the equations are singular
         return unknowns, reached
 
-    def _judged(self, stage: int, u, states, at, inverses: Inverses) -> tuple[np.ndarray, np.ndarray]:
+    def _judged(self, stage: int, u, states, at, inverses: Inverses, least: Any = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """The sizes of unknowns, as of `solved`, and whether the equations are solved, (states,): to roundoff of their terms,
         however they cancel. One that has none but the roundoff of zero has those of unknowns of the sizes that equations give
-        them which are solved for sure: at a place that solves nothing, near a singular Jacobian, unknowns have any size."""
+        them which are solved for sure, or `least`: at a place that solves nothing, near a singular Jacobian, unknowns have any
+        size."""
         if not u.size:
             return u, np.ones(len(u), bool)
         terms, index = self._terms(stage, u, states, *at), self.program.stages[stage][0]
         missed = self._read(self._values(index, u, states, at), self.program.equations[index].residual)
         within = lambda terms: np.abs(missed) <= STALLED * terms
         of_terms = lambda terms: np.maximum(np.abs(u), TYPICAL * applied_sizes(inverses, terms))
-        others = self._terms(stage, u, states, *at, sizes=of_terms(np.where(within(terms), terms, 0.0)))
+        others = self._terms(stage, u, states, *at, sizes=np.maximum(of_terms(np.where(within(terms), terms, 0.0)), least))
         larger = np.where(terms < NOTHING * others, others, terms)
         good = np.isfinite(larger) & (within(larger) | (np.abs(missed) <= SMALLEST))
         return of_terms(terms), np.all(good, axis=1)

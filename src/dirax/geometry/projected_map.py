@@ -51,9 +51,14 @@ class Submanifold(AbstractManifold):
 
     def projection(self, x, v):
         """The orthogonal projection to the image of DP(x)."""
-        # A the projection DP(x), oblique: the orthogonal projection with the same image is A (A + Aᵀ − 1)⁻¹.
+        oblique, apart = self._oblique(x)
+        return oblique @ solve(apart, v)
+
+    def _oblique(self, x):
+        """A, (A + Aᵀ − 1) for the projection A = DP(x), which is oblique: the orthogonal one with the same image is
+        A (A + Aᵀ − 1)⁻¹."""
         oblique = jax.jacfwd(self.projector)(x)
-        return oblique @ solve(oblique + oblique.T - jnp.eye(self.ambient_dimension), v)
+        return oblique, oblique + oblique.T - jnp.eye(self.ambient_dimension)
 
     def representative(self, x, near):
         """x."""
@@ -65,10 +70,19 @@ class Submanifold(AbstractManifold):
         return lambda r: self.projector(x + basis @ r)
 
     def frame(self, x):
-        """An orthonormal basis of the image of DP(x), by singular values."""
-        # A choice of coordinates, held fixed under differentiation: singular vectors have no derivative here.
-        oblique = jax.jacfwd(self.projector)(jax.lax.stop_gradient(x))
-        return jax.lax.stop_gradient(jnp.linalg.svd(oblique)[0][:, : self.dimension])
+        """An orthonormal basis of the image of DP(x): of the orthogonal projection to it the longest column, then that of what
+        is left of it, and so on."""
+        # A choice of coordinates, held fixed under differentiation, which a rounding of DP(x) must not turn into another one:
+        # singular vectors of a projection are all of one singular value, and columns may be equally long.
+        oblique, apart = self._oblique(jax.lax.stop_gradient(x))
+        rest = oblique @ jnp.linalg.inv(apart)
+        unequal, columns = 1.0 + np.cos(1.0 + np.arange(self.ambient_dimension)) / 4.0, []
+        for _ in range(self.dimension):
+            lengths = jnp.diagonal(rest) * unequal
+            longest = rest @ (lengths == jnp.max(lengths)).astype(float)
+            columns.append(longest / jnp.sqrt(longest @ longest))
+            rest = rest - jnp.outer(columns[-1], columns[-1])
+        return jax.lax.stop_gradient(jnp.stack(columns, axis=1))
 
     def coordinates(self, x, v):
         """Fᵀv with the frame F."""

@@ -10,17 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines import policy
-from dirax.engines.contract import OK, Outcome, Problem, Progress, finished
+from dirax.engines.contract import UNSOLVED, Outcome, Problem, Progress, finished
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.engines.sizes import sizes_of, sizes_of_traced
+from dirax.engines.stuck import by_other_ways
 from dirax.engines.xla.lane import Lane, Numerics, first_lane
-from dirax.engines.xla.loop import Clock, axes_of, by_lane, compiled_chunk, make_step, next_row, row_capacity, unpack_rows
-
-FIRST_CHUNK = 64
-"""Steps of the first chunk; those after it are as many as take CHUNK_SECONDS."""
-
-CHUNK_SECONDS = 0.25
+from dirax.engines.xla.loop import Clock, axes_of, by_lane, make_step, unpack_rows
+from dirax.engines.xla.run import Run, StuckRun
 
 
 class Xla(AbstractEngine):
@@ -56,47 +53,22 @@ class Xla(AbstractEngine):
         """Run `problem`, saving into host arrays; Ctrl-C and failing steps keep what was computed."""
         started = time.perf_counter()
         p, numerics, notes = self._planned(problem)
-        chunk = compiled_chunk(jax.default_backend(), numerics.sparse is not None)
-        axes, capacity, params = axes_of(p), row_capacity(p), jax.device_put(p.params)
-        sizes = self._sizes(problem, sizes_of)
-        lanes = first_lane(np.asarray(p.state), tuple(map(np.asarray, p.guess)), np, numerics.increments is not None)
-        if p.record is not None:
-            lanes = jax.tree.unflatten(jax.tree.structure(lanes), p.record)
-
-        def call(lanes, start, stop, closing=False):
-            t0, h, first_step = map(np.float64, (p.t0, p.h, p.first_step))
-            every, start, stop = map(np.int64, (p.save_every, start, stop))
-            clock = Clock(t0, h, first_step, every, start, stop, np.bool_(closing))
-            after, rows = chunk(p.equation, lanes, params, sizes, clock, capacity, axes, p.max_iterations, numerics)
-            return after, {name: by_lane(np.asarray(values), p.batch, np) for name, values in rows.items()}
-
-        _, empty = call(lanes, 0, 0)  # compile
+        run = Run(p, numerics, self._sizes(problem, sizes_of))
         compile_seconds, started, solved = time.perf_counter() - started, time.perf_counter(), numerics.seconds
-
-        fields = _host_arrays(p, empty)
-        done, count, interrupted = p.after, FIRST_CHUNK, False
+        interrupted, stuck, with_sizes, others = False, StuckRun(run, problem), False, []
         try:
-            while done < p.steps and not np.all(np.asarray(lanes.counts)[..., 1] != OK):
-                first = next_row(done, p.save_every)
-                stop = min(done + count, (first + capacity) * p.save_every, p.steps)
-                tick = time.perf_counter()
-                after, rows = call(lanes, done, stop)
-                last, before = next_row(stop, p.save_every), p.first_row
-                for name, values in rows.items():
-                    fields[name][:, first - before : last - before] = values[:, : last - first]
-                rate = (stop - done) / max(time.perf_counter() - tick, 1e-9)
-                lanes, done = after, stop
-                count = max(1, int(rate * CHUNK_SECONDS))
-                if progress:
-                    progress(done, p.steps)
+            run.onwards(progress)
+            if self.scalars != "never" and len(stuck.ended(UNSOLVED)):
+                with_sizes, others = by_other_ways(stuck)
         except KeyboardInterrupt:
             interrupted = True
-        _, rows = call(lanes, 0, 1, closing=True)
-        lanes = jax.tree.map(np.asarray, lanes)
-        outcome = _outcome(p, lanes, fields, {name: values[:, 0] for name, values in rows.items()}, notes, self.name)
+        closing = run.closing()
+        outcome = _outcome(p, run.lanes, run.fields, closing, notes, self.name)
         outcome.interrupted, outcome.compile_seconds = interrupted, compile_seconds
-        outcome.record = None if interrupted else tuple(jax.tree.leaves(lanes))
+        outcome.record = None if interrupted or with_sizes or others else tuple(jax.tree.leaves(run.lanes))
         outcome.run_seconds = time.perf_counter() - started
+        if others:
+            outcome.notes |= {"iteration": "; then ".join(["Newton's method", *others])}
         if solved is not None:
             spent = (numerics.seconds or 0.0) - solved
             outcome.notes |= {"evaluation_seconds": outcome.run_seconds - spent, "solution_seconds": spent}
@@ -182,9 +154,3 @@ def _outcome(
         engine=name,
         notes=notes,
     )
-
-
-def _host_arrays(p: Problem, rows: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Arrays for the whole run, given those of a chunk."""
-    shapes = {name: (len(values), p.rows - (not p.is_node(name)), *values.shape[2:]) for name, values in rows.items()}
-    return {name: np.full(shape, np.nan) for name, shape in shapes.items()}
