@@ -16,7 +16,7 @@ from dirax.program.compiled import compiled
 jax.config.update("jax_enable_compilation_cache", False)
 
 def folded(x):
-    return x + jax.lax.reduce_window(jnp.arange(6000.0), 0.0, jax.lax.add, (200,), (1,), "VALID").sum()
+    return x + jax.lax.reduce_window(jnp.arange(12000.0), 0.0, jax.lax.add, (300,), (1,), "VALID").sum()
 
 compiled(folded)(jnp.ones(()))
 print("then", file=sys.stderr, flush=True)

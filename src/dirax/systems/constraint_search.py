@@ -276,12 +276,14 @@ class Search:
         ranks = {rank_of(constraints_of_level(y)[1]) for y in samples}
         self.parts.append(part)
         self.levels.append(ConstraintLevel(number, self.size - old - new, new, rank, part, note))
-        if rest > 1e-7 * max(reference.max(), 1e-300) * (1.0 + np.abs(x).max()) or len(ranks) > 1:
-            return self.end(
-                IRREGULAR,
-                f"the derivatives of the conditions of level {number} have rank {sorted(ranks)} on M_{number} and leave some of "
-                f"them at {rest:.3g}: their rank is not constant around the point.",
-            )
+        said = ""
+        if len(ranks) > 1:
+            said = f"have ranks from {min(ranks)} to {max(ranks)} on M_{number}"
+        elif rest > 1e-7 * max(reference.max(), 1e-300) * (1.0 + np.abs(x).max()):
+            said = f"do not let all of them vanish on M_{number}, by {rest:.3g}"
+        if said:
+            said = f"the derivatives of the conditions of level {number} {said}"
+            return self.end(IRREGULAR, f"{said}: their rank is not constant around the point.")
         return None
 
     # ------------------------------------------------------------------ ends
