@@ -157,7 +157,7 @@ def test_a_killed_run_goes_on_with_its_bits(tmp_path):
 import sys, numpy as np, jax.numpy as jnp, dirax as dx
 sys.path.insert(0, {here!r})
 from test_streaming import CHAIN, WAVE
-dx.simulate(CHAIN, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, step=0.05, steps=3_000_000, save_every=100, to={path!r})
+dx.simulate(CHAIN, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, step=0.05, steps=1_000_000_000, save_every=1000, to={path!r})
 """
     path = tmp_path / "run.zarr"
     child = subprocess.Popen([sys.executable, "-c", code.format(here=os.path.dirname(__file__), path=str(path))])
@@ -167,9 +167,9 @@ dx.simulate(CHAIN, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, step=0.05, steps=
     child.send_signal(signal.SIGKILL)
     child.wait()
     there = dx.load(path)
-    steps = 100 * (there.rows - 1)
+    steps = 1000 * (there.rows - 1)
     assert steps > 1000 and not there.ok
-    theirs = dx.simulate(CHAIN, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, step=0.05, steps=steps, save_every=100)
+    theirs = dx.simulate(CHAIN, dx.LagrangeDAlembert(), q=WAVE, v=0 * WAVE, step=0.05, steps=steps, save_every=1000)
     assert np.array_equal(there.q, theirs.q)
 
 

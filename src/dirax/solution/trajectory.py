@@ -217,36 +217,46 @@ class Trajectory:
     def row_fields(self) -> dict[str, Any]:
         """What a function of a row is given, (…, rows, …): the fields of nodes, the time "t", and `about`, near which the system
         searches for the velocity or the parameters of the row."""
-        nodes = {k: a for k, a in self.fields.items() if self.field_info[k].place == "node"}
+        return self._row_fields(0, self.rows)
+
+    def _row_fields(self, first: int, stop: int) -> dict[str, Any]:
+        """The same of the rows from `first` to before `stop`."""
+        lead = (slice(None),) * (self.batch is not None)
+        low, high = max(0, first - 1), min(self.rows, stop + 1)  # with their neighbours
+        taken = lambda a, first, stop: a if (first, stop) == (0, self.rows) else a[(*lead, slice(first, stop))]
+        nodes = {k: taken(a, first, stop) for k, a in self.fields.items() if self.field_info[k].place == "node"}
         xp = jnp if is_traced(self.t) else np
-        nodes["t"] = xp.broadcast_to(self.t, (self.rows,) if self.batch is None else (self.batch, self.rows))
+        times = xp.broadcast_to(self.t, (self.rows,) if self.batch is None else (self.batch, self.rows))
+        nodes["t"] = taken(times, first, stop)
         names = () if self.system is None else self.system.searches_near
         if not names or self.rows < 2 or not self.fields.keys() >= set(names):
             return nodes
-        axis, lengths = int(self.batch is not None), xp.diff(nodes["t"], axis=-1)[..., None]
+        axis, lengths = len(lead), xp.diff(taken(times, low, high), axis=-1)[..., None]
         near = []
         for name in names:
-            of_steps = self.fields[name].reshape(*np.shape(self.fields[name])[: axis + 1], -1)
+            field = self.fields[name]
+            of_steps = taken(field, low, high) if name in nodes else field[(*lead, slice(low, high - 1))]
+            of_steps = of_steps.reshape(*np.shape(of_steps)[: axis + 1], -1)
             if name in nodes:
                 of_steps = (jnp if is_traced(of_steps) else np).diff(of_steps, axis=axis) / lengths
                 if self.impacts is not None:  # between such rows no velocity is a mean one
-                    divided = self.divided.reshape(*of_steps.shape[:-1], 1)
+                    divided = self.divided[:, low : high - 1].reshape(*of_steps.shape[:-1], 1)
                     of_steps = xp.where(divided, xp.nan, of_steps)
-            near.append(_at_nodes(of_steps, axis))
+            near.append(_at_nodes(of_steps, axis)[(*lead, slice(first - low, stop - low))])
         return nodes | {"about": (jnp if is_traced(near) else np).concatenate(near, axis=-1)}
 
     def map_rows(self, function: Callable):
         """`function(row, params)` for every saved row, stacked; `row` is the dict of node fields of one trajectory and of
         the time `t`."""
-        nodes, batched = self.row_fields, self.batch is not None
+        batched = self.batch is not None
         axes = (0, 0 if self.batch_params and self.params is not None else None) if batched else None
-        size = self.rows if is_traced(nodes, self.params) else self.rows_at_a_time
+        size = self.rows if is_traced(self.t, self.fields, self.step, self.params) else self.rows_at_a_time
         if size >= self.rows:
-            return _along(function, {k: jnp.asarray(a) for k, a in nodes.items()}, self.params, axes)
+            return _along(function, {k: jnp.asarray(a) for k, a in self.row_fields.items()}, self.params, axes)
         blocks, lead = [], (slice(None),) * batched
         for begin in range(0, self.rows, size):
             first = min(begin, self.rows - size)  # full blocks only: one compilation
-            block = {k: jnp.asarray(a[(*lead, slice(first, first + size))]) for k, a in nodes.items()}
+            block = {k: jnp.asarray(a) for k, a in self._row_fields(first, first + size).items()}
             found, new = _along(function, block, self.params, axes), (*lead, slice(begin - first, None))
             blocks.append(jax.tree.map(lambda a, new=new: np.asarray(a)[new], found))
         return jax.tree.map(lambda *parts: np.concatenate(parts, axis=int(batched)), *blocks)
@@ -285,11 +295,12 @@ class Trajectory:
     def _without_compiling(self, function: Callable, key: Hashable) -> np.ndarray | None:
         """The array that `function(row, params)` is at every row by its scalar program, which is ready sooner than XLA's; None
         for long trajectories, where XLA is faster, and where there is no such program. Functions with equal keys are equal."""
-        nodes = self.row_fields
         leaves, structure = jax.tree.flatten(self._params)
         count = self.batch or 1
-        many = self.rows * count > BY_NUMPY or self.rows * count * self._width > NUMBERS_BY_NUMPY
-        if many or is_traced(nodes, leaves) or not all(map(_is_numeric, leaves)):
+        if self.rows * count > BY_NUMPY or self.rows * count * self._width > NUMBERS_BY_NUMPY:
+            return None
+        nodes = self.row_fields
+        if is_traced(nodes, leaves) or not all(map(_is_numeric, leaves)):
             return None
         lead = (self.rows,) if self.batch is None else (self.batch, self.rows)
         rows = {k: np.asarray(a).reshape(self.rows * count, *np.shape(a)[len(lead) :]) for k, a in nodes.items()}
