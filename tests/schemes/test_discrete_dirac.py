@@ -295,6 +295,10 @@ def test_method_2_of_a_hamiltonian_with_one_forms():
     one, other = (dx.simulate(rolling, projected, **data, **run) for data in (start, whole))
     assert one.ok and np.array_equal(one.x, other.x)
     np.testing.assert_allclose(one.x[-1], sol.x[-1], atol=1e-3)
+    assert one.stats["engine"] == "native"
+    halfway = lambda x: (x + onto(x)) / 2
+    with pytest.raises(ValueError, match=r"P\(P\(x\)\) = P\(x\) does not hold near the initial point"):
+        dx.simulate(rolling, dx.DiscreteDirac(dx.ProjectedMap(dx.Midpoint(), halfway, 3)), **whole, **run)
 
 
 # ---------------------------------------------------------------------- where the base point lies in time

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from dirax.geometry.manifolds import AbstractManifold, Vector
@@ -34,10 +35,15 @@ class DiscretizationMapReport(eqx.Module):
 def check_discretization_map(map: AbstractDiscretizationMap, x: ArrayLike, v: ArrayLike) -> DiscretizationMapReport:
     """How far (D1), (D2) and invertibility ([BLM] Definition 4.5, Proposition 4.6) fail at the tangent vector v at x."""
     x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
-    return jax.tree.map(jnp.asarray, evaluated(once(_report, map), x, v))
+    return jax.tree.map(jnp.asarray, evaluated(once(_report, map, True), x, v))
 
 
-def _report(map: AbstractDiscretizationMap, x: Vector, v: Vector) -> DiscretizationMapReport:
+def defects_at(map: AbstractDiscretizationMap, x: ArrayLike) -> DiscretizationMapReport:
+    """The same at the zero vector, in numbers; a root that is searched for is none but the inverse."""
+    return evaluated(once(_report, map, map.has_explicit_inverse), x, np.zeros_like(x))
+
+
+def _report(map: AbstractDiscretizationMap, inverse: bool, x: Vector, v: Vector) -> DiscretizationMapReport:
     manifold = map.manifold(x.shape[0])
     d = manifold.dimension
 
@@ -49,14 +55,14 @@ def _report(map: AbstractDiscretizationMap, x: Vector, v: Vector) -> Discretizat
 
     (starts, ends), (start_derivatives, end_derivatives) = jax.vmap(with_derivative)(jnp.stack([jnp.zeros_like(v), v]))
     difference_in_v = (end_derivatives - start_derivatives)[0, :, d:]
-    components = jax.vmap(jax.vmap(manifold.coordinates, (None, 1), 1))
-    jacobian = components(jnp.stack([starts[1], ends[1]]), jnp.stack([start_derivatives[1], end_derivatives[1]]))
-    found, velocity = map.backward(starts[1], ends[1])
+    components = jax.vmap(manifold.coordinates, (None, 1), 1)
+    jacobian = jnp.concatenate([components(starts[1], start_derivatives[1]), components(ends[1], end_derivatives[1])])
+    found, velocity = map.backward(starts[1], ends[1]) if inverse else (x, v)
     return DiscretizationMapReport(
         point_defect=_largest(starts[0] - x, ends[0] - x),
         derivative_defect=_largest(difference_in_v - manifold.frame(x)),
         inverse_defect=_largest(found - x, velocity - v),
-        condition_number=jnp.linalg.cond(jacobian.reshape(2 * d, 2 * d)),
+        condition_number=jnp.linalg.cond(jacobian),
     )
 
 

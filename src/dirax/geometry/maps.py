@@ -48,6 +48,11 @@ class AbstractDiscretizationMap(eqx.Module):
         """R_d⁻¹(x0, x1)."""
 
     @property
+    def has_explicit_inverse(self) -> bool:
+        """Whether `backward` is a formula, and not a root that is searched for."""
+        return True
+
+    @property
     def base_fraction(self) -> float:
         """The fraction of a step at which the base point x of R_d⁻¹(x0, x1) lies: ½, the choice for symmetric maps, unless the
         map says otherwise. Explicit time is taken there."""

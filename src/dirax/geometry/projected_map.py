@@ -10,9 +10,14 @@ import numpy as np
 from dirax.geometry.manifolds import AbstractManifold
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.squared_angles import norm
+from dirax.numerics.tolerances import POINT_DEFECT
 from dirax.program.linear_solves import solve
 from dirax.program.roots import regular_root
-from dirax.program.user_functions import evaluated
+from dirax.program.tracing import jacobian
+from dirax.program.user_functions import evaluated, is_traced
+
+PROJECTOR_DEFECT = 1e-9
+"""How far the derivative of a projector may miss that of P ∘ P."""
 
 
 class Submanifold(AbstractManifold):
@@ -49,6 +54,19 @@ class Submanifold(AbstractManifold):
         """P(x)."""
         return self.projector(x)
 
+    def check_point(self, x, name="x", tolerance=POINT_DEFECT):
+        """As of every manifold; and `ValueError` where P is no projector there, D(P ∘ P) = DP."""
+        super().check_point(x, name, tolerance)
+        if is_traced(x):
+            return
+        slope = np.asarray(evaluated(jacobian(self.projector), x))
+        missed = float(np.max(np.abs(slope @ slope - slope), initial=0.0))
+        if not missed <= PROJECTOR_DEFECT * max(1.0, float(np.max(np.abs(slope)))):
+            raise ValueError(
+                f"P(P(x)) = P(x) does not hold near {name}: its derivative misses DP DP = DP by {missed:.3g} there, so that the "
+                "points P(x) are no manifold to which P projects."
+            )
+
     def projection(self, x, v):
         """The orthogonal projection to the image of DP(x)."""
         oblique, apart = self._oblique(x)
@@ -57,7 +75,7 @@ class Submanifold(AbstractManifold):
     def _oblique(self, x):
         """A, (A + Aᵀ − 1) for the projection A = DP(x), which is oblique: the orthogonal one with the same image is
         A (A + Aᵀ − 1)⁻¹."""
-        oblique = jax.jacfwd(self.projector)(x)
+        oblique = jacobian(self.projector)(x)
         return oblique, oblique + oblique.T - jnp.eye(self.ambient_dimension)
 
     def representative(self, x, near):
@@ -75,7 +93,7 @@ class Submanifold(AbstractManifold):
         # A choice of coordinates, held fixed under differentiation, which a rounding of DP(x) must not turn into another one:
         # singular vectors of a projection are all of one singular value, and columns may be equally long.
         oblique, apart = self._oblique(jax.lax.stop_gradient(x))
-        rest = oblique @ jnp.linalg.inv(apart)
+        rest = oblique @ solve(apart, jnp.eye(self.ambient_dimension))
         unequal, columns = 1.0 + np.cos(1.0 + np.arange(self.ambient_dimension)) / 4.0, []
         for _ in range(self.dimension):
             lengths = jnp.diagonal(rest) * unequal
@@ -104,6 +122,11 @@ class ProjectedMap(AbstractDiscretizationMap):
     def manifold(self, ambient_dimension):
         """The image of P."""
         return Submanifold(self.projector, ambient_dimension, self.dimension)
+
+    @property
+    def has_explicit_inverse(self):
+        """It has none."""
+        return False
 
     @property
     def base_fraction(self):

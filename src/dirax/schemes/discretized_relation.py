@@ -9,26 +9,30 @@ import jax.numpy as jnp
 from dirax.geometry.cotangent_lift import CotangentLift
 from dirax.geometry.maps import AbstractDiscretizationMap, Theta
 from dirax.geometry.spaces import Euclidean
+from dirax.program.tracing import value_along
 from dirax.schemes.labels import Labels
 from dirax.schemes.step import Field, StepEquation
 from dirax.systems.forms import RelationForm
 
 
 class Stepping(NamedTuple):
-    """`move(x0, u, h) -> (x, v, x1)` with map(x, h v) = (x0, x1), for `dimension` unknowns u ≈ v; `tangent(x0, x)` (d, N)
-    spans the tangent space at x, by rows, and pairs a residual with it; `initial(x0, v)` is a first guess of u."""
+    """`move(x0, u, h) -> (x, v, x1)` with map(x, h v) = (x0, x1), for `unknowns` numbers u, where the `equations` (d,) of
+    (x0, u, h) hold, if there are any; `tangent(x0, x)` (d, N) spans the tangent space at x, by rows, and pairs a residual with
+    it; `initial(x0, v)` is a first guess of u."""
 
-    dimension: int
+    unknowns: int
     move: Callable
     tangent: Callable | None
     initial: Callable
+    equations: Callable | None = None
 
 
 def stepping(map: AbstractDiscretizationMap, size: int) -> Stepping:
     """The Stepping of a map for points of length `size`; raises `ValueError` where the map's manifold has another size.
 
     For the θ maps and their lifts q_1 = q_0 + h v is used as it stands, so that v keeps the digits that a difference of
-    the points would lose; else x1 is found in a local parametrization at x0, and stays on the manifold to roundoff.
+    the points would lose; else x1 is found in a local parametrization at x0, and stays on the manifold to roundoff. Where the
+    inverse of the map is no formula, x and v are unknowns beside the others: map(x, h v) begins at x0.
     """
     manifold = map.manifold(size)
     theta = _theta(map)
@@ -43,15 +47,35 @@ def stepping(map: AbstractDiscretizationMap, size: int) -> Stepping:
 
         return Stepping(size, move, None, lambda x0, v: v)
 
-    def move_on_manifold(x0, u, h):
-        x1 = manifold.local_parametrization(x0)(h * u)
-        x, w = map.backward(x0, x1)
-        return x, w / h, x1
-
     def tangent(x0, x):
         # fixed vectors, projected at x: their span is the tangent space and its dependence on x is differentiable
         fixed = jax.lax.stop_gradient(manifold.frame(x0))
         return jax.vmap(lambda f: manifold.projection(x, f))(fixed.T)
+
+    if not map.has_explicit_inverse:
+        d = manifold.dimension
+
+        def base(x0, u, h):
+            return value_along(manifold.local_parametrization(x0), (h * u[d:],), (u[:d],))
+
+        def move_forward(x0, u, h):
+            x, v = base(x0, u, h)
+            return x, v, map.forward(x, h * v)[1]
+
+        def begins_there(x0, u, h):
+            x, v = base(x0, u, h)
+            return manifold.coordinates(x0, map.forward(x, h * v)[0] - x0)
+
+        def initial(x0, v):
+            rate = manifold.coordinates(x0, v)
+            return jnp.concatenate([rate, map.base_fraction * rate])
+
+        return Stepping(2 * d, move_forward, tangent, initial, begins_there)
+
+    def move_on_manifold(x0, u, h):
+        x1 = manifold.local_parametrization(x0)(h * u)
+        x, w = map.backward(x0, x1)
+        return x, w / h, x1
 
     return Stepping(manifold.dimension, move_on_manifold, tangent, lambda x0, v: manifold.coordinates(x0, v))
 
@@ -79,16 +103,16 @@ def discretized_relation(
     Explicit time and ports are taken at t + `map.base_fraction` h, the time of the base point.
     """
     step, m, fraction = stepping(map, size), form.multipliers, map.base_fraction
-    d = step.dimension
+    d, tangential = step.unknowns, map.manifold(size).dimension
 
     def residual(u, state, t, h, params):
         x, velocity, _ = step.move(state, u[:d], h)
         r = form.residual(x, velocity, u[d:], t + fraction * h, params)
         if on_constraints:
-            return r[:size]
-        if step.tangent is None:
-            return r
-        return jnp.concatenate([step.tangent(state, x) @ r[:size], r[size:]])
+            r = r[:size]
+        elif step.tangent is not None:
+            r = jnp.concatenate([step.tangent(state, x) @ r[:size], r[size:]])
+        return r if step.equations is None else jnp.concatenate([r, step.equations(state, u[:d], h)])
 
     def advance(u, state, t, h, params):
         return step.move(state, u[:d], h)[2]
@@ -115,7 +139,10 @@ def discretized_relation(
         saved = jax.vmap(form.spread)(jnp.eye(m)) @ data["multipliers"]
         return state, jnp.concatenate([u[:d], jnp.where(jnp.isfinite(saved), saved, u[d:])])
 
-    labels = () if on_constraints else form.labels
+    labels = Labels.numbered("component {} of the Dirac condition", size if on_constraints else tangential)
+    labels += () if on_constraints else form.labels
+    if step.equations is not None:
+        labels += Labels.numbered("component {} of where the step begins", tangential)
     fields = {name: Field((size,)) for name in form.names}
     if form.saved:
         fields["multipliers"] = Field((form.saved,), "step", (form.axis,), "multipliers at the base point")
@@ -129,6 +156,6 @@ def discretized_relation(
         state_size=size,
         unknowns=d + m,
         fields=fields,
-        labels=Labels.numbered("component {} of the Dirac condition", size if on_constraints else d) + labels,
+        labels=labels,
         canonical=form.canonical,
     )

@@ -2,10 +2,11 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 
 from dirax.geometry.cotangent_lift import CotangentLift
-from dirax.geometry.map_report import check_discretization_map
+from dirax.geometry.map_report import defects_at
 from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.schemes.step import StepEquation
 
@@ -25,7 +26,8 @@ def by_a_discretization_map(map: AbstractDiscretizationMap, equation: StepEquati
         own, x = map, np.concatenate([np.asarray(data[name], dtype=float) for name in names])
         if isinstance(map, CotangentLift):
             own, x = map.map, x[: len(x) // 2] if of_relation else x
-        found = check_discretization_map(own, x, np.zeros_like(x))
+        own.manifold(len(x)).check_point(jnp.asarray(x), "the initial point")
+        found = defects_at(own, x)
         failed = {
             "(D1) R_d(x, 0) = (x, x)": found.point_defect / (np.max(np.abs(x)) or 1.0),
             "(D2) D_v R_d²(x, 0) − D_v R_d¹(x, 0) = id": found.derivative_defect,
