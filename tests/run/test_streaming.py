@@ -149,6 +149,11 @@ def test_refusals(tmp_path):
     chunk.write_bytes(data)
     with pytest.raises(ValueError, match="damaged"):
         np.asarray(dx.load(path).q)
+    for write, about in ((np.savez_compressed, np.zeros(10**7, np.uint8)), (np.savez, np.zeros(3, np.uint8))):
+        write(path / "time" / "reached.npz", about=about)
+        for read in (lambda: dx.load(path), lambda: run("native", 30, to=path)):
+            with pytest.raises(ValueError, match=r"run\.zarr.*reached\.npz is"):
+                read()
 
 
 @pytest.mark.soak

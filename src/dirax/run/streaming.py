@@ -24,6 +24,7 @@ from dirax.solution.loading import stored_run
 from dirax.solution.run_store import CHUNK_BYTES, MOST_ROWS, Growing, Reached, RunStore, is_growing
 from dirax.solution.saving import file_form
 from dirax.solution.solution import Solution
+from dirax.solution.stored import Unreadable
 from dirax.text.tables import plain
 
 FIRST_PIECE = 16
@@ -138,7 +139,10 @@ class Stream:
         if not is_growing(path):
             raise FileExistsError(f"{path} exists and is not the store of a run that to= has written: choose another path.")
         taken(path, self.hold)
-        reached = Reached.of(path)
+        try:
+            reached = Reached.of(path)
+        except Unreadable as error:
+            raise ValueError(f"{path} cannot be gone on with: {error}. Choose another path for to=, or remove it.") from error
         if found := fingerprint.differences(reached.marks, self.marks()):
             raise ValueError(
                 f"{path} belongs to another run, which differs in {'; '.join(found)}: choose another path for to=, or remove it."

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import uuid
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,8 +74,15 @@ class Reached:
 
     @classmethod
     def of(cls, path: Path) -> "Reached":
-        """What a store says. Raises `Unreadable`."""
-        with reading(f"its {REACHED} is damaged", np.load, path / REACHED) as file:
+        """What a store says, from no more memory than its file takes. Raises `Unreadable`."""
+        return reading(f"its {REACHED} is damaged", cls._read, path / REACHED)
+
+    @classmethod
+    def _read(cls, path: Path) -> "Reached":
+        with zipfile.ZipFile(path) as members:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in members.infolist()):
+                raise Unreadable(f"its {REACHED} is damaged (it is compressed, which dirax does not do)")
+        with np.load(path) as file:
             about = json.loads(file["about"].tobytes())
             about["arrays"] = {n: Growing(batch, tuple(inner), ends) for n, (batch, inner, ends) in about["arrays"].items()}
             return cls(**about, record=tuple(file[f"record_{i}"] for i in range(len(file.files) - 1)))
@@ -196,7 +204,7 @@ def is_growing(path: Path) -> bool:
 
 def open_growing(path: Path) -> Stored:
     """What such a store holds, with the rows that are whole. Raises `Unreadable`."""
-    whole, reached = open_store(path), reading(f"its {REACHED} is not one that dirax wrote", Reached.of, path)
+    whole, reached = open_store(path), Reached.of(path)
     if whole.attributes.get(SEAL) != seal(whole.attributes):
         raise Unreadable("its description is not what was saved: the store is damaged or was edited")
     ok = np.array(reached.said.pop("lanes_ok"), np.int8)
