@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import dirax as dx
 
@@ -250,6 +251,25 @@ def test_nodes_that_float_are_named_with_the_way_out():
     assert not sol.ok and "nothing determines the potential of node 1" in sol.message and "a large resistor" in sol.message
     helped = dx.simulate(dx.circuit([*netlist, ("R", 1, 0, 1e9)]), MIDPOINT, **run)
     assert helped.rows > sol.rows or helped.ok, helped.message
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_a_diode_behind_a_source_that_is_switched(engine):
+    """The first update of Newton's method leaves all the voltage on the diode, e¹⁹³, and every other one takes a kT/e of it off.
+    Against the roots of the same equations in one number, which brackets find."""
+    source = lambda t, xp: 5.0 * xp.where(xp.sin(2 * xp.pi * 50 * t) > 0, 1.0, -1.0)
+    diode = lambda u: 1e-12 * jnp.expm1(u / 0.02585)
+    rectifier = dx.circuit(
+        [("V", 1, 0, lambda t: source(t, jnp)), ("R", 1, 2, 10.0), ("R", 2, 3, diode), ("C", 3, 0, 1e-5), ("R", 3, 0, 1e3)]
+    )
+    sol, h, charge = dx.simulate(rectifier, MIDPOINT, x=[0.0], step=1e-4, steps=250, engine=engine), 1e-4, 0.0
+    assert sol.ok and "followed" in sol.stats["iteration"]
+    for k, found in enumerate(sol.x[1:, 0]):
+        over = lambda i, q=charge: (q + h / 2 * i) / (1e-5 + h / 2 / 1e3)  # the capacitor's voltage in the middle of the step
+        missed = lambda i, k=k, over=over: 10.0 * i + 0.02585 * np.log1p(i / 1e-12) + over(i) - source((k + 0.5) * h, np)
+        current = -1e-12 if missed(0.0) > 0.0 else brentq(missed, 0.0, 10.0, xtol=1e-22, rtol=1e-15)
+        charge += h * (current - over(current) / 1e3)
+        assert found == pytest.approx(charge, rel=1e-9, abs=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 """Trajectories for which Newton's method has not converged, whatever the engine: they go on with the sizes that unknowns have
-where they stand, or from the solution that those of short steps lead to."""
+where they stand, or from the solution that those of easier equations lead to."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -61,8 +61,14 @@ class AbstractStuck(ABC):
 
 def by_other_ways(stuck: AbstractStuck) -> tuple[bool, list[str]]:
     """Go on with trajectories that are stuck. Returns whether some did with other sizes, and what `stats` say of other ways."""
-    found, steps = with_present_sizes(stuck), by_following(stuck)
-    return found, [f"{counted(steps, 'step')} followed from shorter ones on"] if steps else []
+    found, steps, tried = False, 0, 0
+    while len(stuck.ended(UNSOLVED)):
+        found = with_present_sizes(stuck) or found
+        count, tried = by_following(stuck, tried), tried + 1
+        if not count:
+            break
+        steps += count
+    return found, [f"{counted(steps, 'step')} followed from easier ones on"] if steps else []
 
 
 def with_present_sizes(stuck: AbstractStuck) -> bool:
@@ -81,28 +87,23 @@ def with_present_sizes(stuck: AbstractStuck) -> bool:
     return found
 
 
-def by_following(stuck: AbstractStuck) -> int:
-    """Go on with trajectories whose next step has a solution that those of shorter steps lead to, but not Newton's method: where
-    friction stops what slides, say. Returns how many steps were found like that."""
-    p, count = stuck.problem, 0
+def by_following(stuck: AbstractStuck, tried: int) -> int:
+    """Go on with trajectories whose next step has a solution that others lead to, but not Newton's method: where friction stops
+    what slides, say. Returns how many; `tried`, how often that was done before."""
+    p, failed = stuck.problem, stuck.ended(UNSOLVED)
     if max(stage.unknowns for stage, _ in p.equation.stages) > FOLLOWED or p.max_iterations < OF_FOLLOWING:
         return 0
-    failed, tried = stuck.ended(UNSOLVED), 0
     try:
         steps = StepsInNumbers.of(p.equation, p.params, p.batch_params) if len(failed) else None
     except (UnsupportedPrimitive, GraphTooLarge):
         return 0
-    while steps is not None and len(failed):
-        at = stuck.standing(failed)
-        may = tried < BEFORE + OF_STEPS * at.completed
-        failed, at, tried = failed[may], at[may], tried + 1
-        if not len(failed):
-            break
-        params = steps.parameters(p.params, p.batch if p.batch_params else None, failed)
-        t = p.t0 + (p.first_step + at.completed) * p.h
-        found = steps.step(at.state, at.unknowns, t, p.h, params, alone=True)
-        if not np.any(found.good):
-            break
-        chosen, status = stuck.further(failed[found.good], unknowns=[u[found.good] for u in found.unknowns])
-        count, failed = count + len(chosen), chosen[np.isin(status, UNSOLVED)]
-    return count
+    at = stuck.standing(failed)
+    may = tried < BEFORE + OF_STEPS * at.completed
+    failed, at = failed[may], at[may]
+    if steps is None or not len(failed):
+        return 0
+    params = steps.parameters(p.params, p.batch if p.batch_params else None, failed)
+    found = steps.step(at.state, at.unknowns, p.t0 + (p.first_step + at.completed) * p.h, p.h, params, alone=True)
+    if not np.any(found.good):
+        return 0
+    return len(stuck.further(failed[found.good], unknowns=[u[found.good] for u in found.unknowns])[0])

@@ -167,7 +167,7 @@ def _of_nodes(names: list[str]) -> str:
 
 
 def _where_it_ends(numbers: InNumbers | InJax, guess, args) -> str:
-    """Whether there is a solution, found from shorter steps on."""
+    """Whether there is a solution, found from easier equations on."""
     state, t, h = args
     if not 0 < len(guess) <= FOLLOWED or not isinstance(numbers, InNumbers):
         return ""
@@ -178,8 +178,8 @@ def _where_it_ends(numbers: InNumbers | InJax, guess, args) -> str:
         return ""
     if part == 1.0:
         return (
-            " (there is a solution, to which those of shorter steps lead, but not Newton's method from these values; the native "
-            "engine follows them where max_iterations is not below 8)"
+            " (there is a solution, to which those of easier equations lead, but not Newton's method from these values; they are "
+            "followed where max_iterations is not below 8)"
         )
     return f" (the solutions of shorter steps lead to h = {part * h:.3g} and turn back there: longer ones have none near)"
 
