@@ -112,16 +112,15 @@ class StuckRun(AbstractStuck):
     def further(
         self, some: np.ndarray, sizes: Sizes | None = None, unknowns: Sequence[np.ndarray] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        lanes: Any = jax.tree.map(lambda a: self._all(a).copy(), self.run.lanes)
-        counts, history, of_all = lanes.counts, lanes.history, tuple(self._all(a).copy() for a in self.run.sizes)
-        completed = counts[some, 0].copy()
+        both = self.run.lanes, self.run.sizes
+        lanes, of_all = jax.tree.map(lambda a: self._all(a).copy(), both)
+        counts, completed, good = lanes.counts, self._all(self.run.lanes.completed)[some], np.zeros(len(some), bool)
         for stage, own in enumerate(sizes or ()):
             of_all[stage][some] = own
         for stage, u in enumerate(unknowns or ()):
-            history[stage][some, 0], history[stage][some, 1:] = u, 0.0
-        good = np.zeros(len(some), bool)
+            lanes.history[stage][some, 0], lanes.history[stage][some, 1:] = u, 0.0
         for first in np.unique(completed):
-            here = np.flatnonzero(completed == first)
+            here = completed == first
             ended, counts[:, 1] = counts[:, 1].copy(), ENDED
             counts[some[here], 1] = OK
             after, save = self.run.attempt(some[here], int(first), *jax.tree.map(self._own, (lanes, of_all)))
@@ -129,22 +128,17 @@ class StuckRun(AbstractStuck):
             after = jax.tree.map(self._all, after)
             good[here] = further = after.counts[some[here], 0] > first
             save(further)
-            for own, new in zip(jax.tree.leaves(lanes), jax.tree.leaves(after), strict=True):
-                own[some[here[further]]] = new[some[here[further]]]
-        kept = jax.tree.map(lambda new, old: self._own(_where(new, self._all(old), some[good])), lanes, self.run.lanes)
-        self.run.lanes = kept
-        self.run.sizes = tuple(
-            self._own(_where(new, self._all(old), some[good])) for new, old in zip(of_all, self.run.sizes, strict=True)
-        )
-        return some[good], self._all(kept.status)[some[good]]
+            _put(lanes, after, some[here][further])
+        _put((lanes, of_all), jax.tree.map(self._all, both), some[~good])
+        self.run.lanes, self.run.sizes = jax.tree.map(self._own, (lanes, of_all))
+        return some[good], counts[some[good], 1]
 
 
 ENDED = -1
 """The outcome of lanes that stay as they are."""
 
 
-def _where(new: np.ndarray, old: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """The old array with the new rows of some."""
-    both = old.copy()
-    both[some] = new[some]
-    return both
+def _put(arrays: Any, others: Any, some: np.ndarray) -> None:
+    """Take the entries `some` of other arrays, in place."""
+    for own, other in zip(jax.tree.leaves(arrays), jax.tree.leaves(others), strict=True):
+        own[some] = other[some]
