@@ -39,6 +39,23 @@ def test_derivatives_of_two_bounces():
     np.testing.assert_allclose(jacobian[8], jax.grad(lambda a: fall(*a))(jnp.asarray(at)), rtol=1e-11)
 
 
+def test_the_last_row_of_a_pendulum_is_as_of_runs_that_nothing_traces():
+    """Its momentum, which takes the step that leaves it, was off by h²."""
+    pendulum = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params * q[1], holonomic=lambda q: jnp.array([(q @ q - 1) / 2]))
+    wall = dx.Impact(lambda q: q[0] + 0.2)
+
+    def run(g):
+        start = {"q": [0.6, -0.8], "v": [-0.4, -0.3], "step": 0.1, "steps": 20}
+        sol = dx.simulate(pendulum, dx.LagrangeDAlembert(), **start, events=[wall], params=g)
+        assert len(sol.events)
+        return sol.q, sol.p, sol.multipliers, sol.energy()
+
+    for traced, plain in zip(jax.jit(run)(1.0), run(1.0), strict=True):
+        np.testing.assert_allclose(traced, plain, rtol=0, atol=1e-12)
+    _, slopes = jax.jvp(lambda g: run(g)[1][-1], (1.0,), (1.0,))
+    np.testing.assert_allclose(slopes, (run(1 + 1e-5)[1][-1] - run(1 - 1e-5)[1][-1]) / 2e-5, atol=1e-8)
+
+
 @pytest.mark.soak
 def test_reverse_mode_and_second_derivatives():
     """A ball falls from height y onto a floor at 0, e = .8: y(T) = .8 u s − s²/2 with u = √(2y) = t₁ and s = T − t₁."""

@@ -65,20 +65,23 @@ class TracedFlight:
 
     def fly(self, state, u, params, t0, h):
         """Rows (steps + 1, …), impacts (steps, MOST, …) with NaN where there are none, the last state and its unknowns."""
-        step = lambda carry, k: self._step(carry[0], carry[1], t0 + k * h, h, params)
-        (state, u), (rows, hits) = jax.lax.scan(step, (state, u), jnp.arange(self.problem.steps, dtype=float))
-        t = t0 + self.problem.steps * h
-        closing = self.equation.unpack(state, u, t, h, params)
-        node = self.problem.is_node
-        rows = {name: jnp.concatenate([a, closing[name][None]]) if node(name) else a for name, a in rows.items()}
-        return rows, hits, state, u
+        steps = self.problem.steps
 
-    def _step(self, state, u, t, h, params):
-        """One step with its impacts: what is carried on, and its row with them."""
+        def step(carry, k):
+            """The last row is that of one more step, which no wall is in and which is undone."""
+            after, found = self._step(*carry, t0 + k * h, h, params, k == steps)
+            return jax.tree.map(lambda a, b: jnp.where(k < steps, a, b), after, carry), found
+
+        (state, u), (rows, hits) = jax.lax.scan(step, (state, u), jnp.arange(steps + 1, dtype=float))
+        rows = {name: a if self.problem.is_node(name) else a[:steps] for name, a in rows.items()}
+        return rows, jax.tree.map(lambda a: a[:steps], hits), state, u
+
+    def _step(self, state, u, t, h, params, free):
+        """One step with its impacts, or without any where it is `free` of them: what is carried on, and its row with them."""
 
         def part(carry, _):
             state, u, at, _ = carry
-            end, wall, hit = self._next(*jax.lax.stop_gradient((state, u, t, at, h, params, begun[0])))
+            end, wall, hit = self._next(*jax.lax.stop_gradient((state, u, t, at, h, params, begun[0])), free)
             there, of_part, length = self._part(end, wall, hit, state, t, at, h, params)
             at = jnp.where(hit, at + length, 1.0)
             bounced, guess = self._bounced(there, of_part, wall, t + at * h, h, params)
@@ -95,7 +98,8 @@ class TracedFlight:
 
         begun = (state, u, jnp.zeros(()), jnp.array(False))
         (after, then, _, ended), (hits, unknowns, lengths) = jax.lax.scan(next_part, begun, None, length=MOST + 1)
-        row = self.equation.unpack(state, unknowns[0], t, lengths[0], params)
+        solved = jnp.all(jnp.isfinite(unknowns[0])) & jnp.isfinite(lengths[0])
+        row = self.equation.unpack(state, jnp.where(solved, unknowns[0], u), t, jnp.where(solved, lengths[0], h), params)
         return (jnp.where(ended, after, jnp.nan), then), (row, jax.tree.map(lambda a: a[:MOST], hits))
 
     def number(self, wall):
@@ -109,8 +113,9 @@ class TracedFlight:
         after, guess, _, _ = jump(self.system, self.equation, own, restitution, state, self.time(state, t), h, params)
         return after, jax.lax.stop_gradient(guess)
 
-    def _next(self, state, u, t, at, h, params, origin):
-        """The end of the next part of a step that began at the state `origin`, which wall is hit there, and whether one is."""
+    def _next(self, state, u, t, at, h, params, origin, free):
+        """The end of the next part of a step that began at the state `origin`, which wall is hit there, and whether one is; in a
+        `free` step none is."""
         places = jnp.arange(PARTS + 1) / PARTS * (1.0 - at)
 
         def seen(x):
@@ -124,7 +129,7 @@ class TracedFlight:
             """Between two places, of walls that are in front of the first and behind the second; the last place where none is."""
             small = ON_WALL * self.terms(t + at * h, state, (ends.state[-1], origin), params)
             gaps = ends.gaps.at[0].set(jnp.where(ends.gaps[0] < small, 0.0, ends.gaps[0]))
-            below = gaps < -small[None]
+            below = (gaps < -small[None]) & ~free
             behind = jnp.any(below, axis=1)
             last = jnp.where(jnp.any(behind), jnp.argmax(behind), PARTS)
             first, walls = jnp.maximum(last - 1, 0), below[last]

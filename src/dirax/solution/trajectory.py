@@ -241,7 +241,7 @@ class Trajectory:
                 of_steps = (jnp if is_traced(of_steps) else np).diff(of_steps, axis=axis) / lengths
                 if self.impacts is not None:  # between such rows no velocity is a mean one
                     divided = self.divided[:, low : high - 1].reshape(*of_steps.shape[:-1], 1)
-                    of_steps = xp.where(divided, xp.nan, of_steps)
+                    of_steps = (jnp if is_traced(of_steps) else np).where(divided, np.nan, of_steps)
             near.append(_at_nodes(of_steps, axis)[(*lead, slice(first - low, stop - low))])
         return nodes | {"about": (jnp if is_traced(near) else np).concatenate(near, axis=-1)}
 
