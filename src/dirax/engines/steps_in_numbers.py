@@ -370,7 +370,7 @@ class StepsInNumbers:
             return self._read(known, e.residual), found
 
         unknowns, reached = followed(slopes, guess, sizes)
-        if len(cut := np.flatnonzero(reached == 0.0)):  # of steps that are not any simpler for being short
+        if len(cut := np.flatnonzero(reached < 1.0)):
             begun = self._read(self._values(index, guess[cut], states[cut], tuple(a[cut] for a in at)), e.residual)
 
             def less(some, u, part):
@@ -381,7 +381,7 @@ class StepsInNumbers:
                 return residual - (1.0 - part)[:, None] * begun[some], found
 
             unknowns[cut], part = followed(less, guess[cut], sizes[cut])
-            reached[cut] = part == 1.0
+            reached[cut] = np.where(part == 1.0, 1.0, reached[cut])
         orientation = lambda u: np.linalg.slogdet(self._linearized(index, self._values(index, u, states, at))[0])[0]
         beyond = np.isfinite(unknowns[:, 0]) & (orientation(guess) != orientation(unknowns))
         unknowns[beyond], reached[beyond] = np.nan, 0.0  # across a place where the equations are singular

@@ -179,7 +179,7 @@ def _where_it_ends(numbers: InNumbers | InJax, guess, args) -> str:
     if part == 1.0:
         return (
             " (there is a solution, to which those of easier equations lead, but not Newton's method from these values; they are "
-            "followed where max_iterations is not below 8)"
+            "followed in 16 steps and one in eight, where max_iterations is not below 8)"
         )
     return f" (the solutions of shorter steps lead to h = {part * h:.3g} and turn back there: longer ones have none near)"
 

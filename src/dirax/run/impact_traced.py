@@ -69,7 +69,8 @@ class TracedFlight:
 
         def step(carry, k):
             """The last row is that of one more step, which no wall is in and which is undone."""
-            after, found = self._step(*carry, t0 + k * h, h, params, k == steps)
+            state, u = carry
+            after, found = self._step(state, u, t0 + k * h, h, params, k == steps)
             return jax.tree.map(lambda a, b: jnp.where(k < steps, a, b), after, carry), found
 
         (state, u), (rows, hits) = jax.lax.scan(step, (state, u), jnp.arange(steps + 1, dtype=float))

@@ -106,9 +106,11 @@ def take_step(
         running = status == OK
         args = (state, t, fraction * h, params)
         fixed = passing(args, False) if differentiable else args
-        guess = stage.guess(fixed[0], jnp.sum(before, axis=0), *fixed[2:])
-        guess = jax.lax.stop_gradient(guess) if differentiable else guess
-        u, count, converged = newton_root(residual, guess, fixed, max_iterations, sizes, running, jacobian, linear_solver)
+        guess, other = (stage.guess(fixed[0], u, *fixed[2:]) for u in (jnp.sum(before, axis=0), before[0]))
+        if differentiable:
+            guess, other = jax.lax.stop_gradient((guess, other))
+        how = max_iterations, sizes, running, jacobian, linear_solver
+        u, count, converged = newton_root(residual, guess, fixed, *how, other)
         new, left = stage.advance(u, *fixed), residual(u, *fixed)
         # a sum keeps every nan, where XLA's vectorized maximum loses some; 0·x is nan where x is not finite
         nothing, largest = folded((0.0 * left, jnp.add, 0.0), (jnp.abs(left), jnp.maximum, 0.0))

@@ -16,11 +16,11 @@ from dirax.program.given_tangents import implicit
 
 class Search(NamedTuple):
     """Where the iteration stands: the unknowns, and (the last update relative to |u_i| + size_i, its ratio to the
-    update before, the number of updates, the update relative to |u_i| + OWN·size_i) as one array, which costs XLA one kernel and
-    not four."""
+    update before, the number of updates, the update relative to |u_i| + OWN·size_i, the number of updates from the first guess
+    where that led nowhere) as one array, which costs XLA one kernel and not five."""
 
     u: Float[Array, " k"]
-    measures: Float[Array, "4"]
+    measures: Float[Array, "5"]
 
     @property
     def update(self) -> Float[Array, ""]:
@@ -42,6 +42,16 @@ class Search(NamedTuple):
         """inf before the first update."""
         return self.measures[3]
 
+    @property
+    def spent(self) -> Float[Array, ""]:
+        """Those from the first guess, a whole number; 0 where the iteration is from there."""
+        return self.measures[4]
+
+
+def begun(u: Float[Array, " k"], spent: Any = 0.0) -> Search:
+    """Before the first update."""
+    return Search(u, jnp.stack([jnp.inf, jnp.nan, 0.0, jnp.inf, spent]))
+
 
 def newton_root(
     residual: Callable[..., Float[Array, " k"]],
@@ -52,19 +62,21 @@ def newton_root(
     running: Any = True,
     jacobian: Callable[..., Any] | None = None,
     linear_solver: AbstractLinearSolver | None = None,
+    other: Float[Array, " k"] | None = None,
 ) -> tuple[Float[Array, " k"], Int[Array, ""], Bool[Array, ""]]:
     """(u, number of updates, converged) of residual(u, *args) = 0; not for reverse mode, see `as_function`.
 
     `sizes` are those of the unknowns (`dirax/engines/sizes.py`), 1 where they are not given. The guess comes
     back where `running` is false. `jacobian(u, *args)` is that of the residual, derived here where it is not given, or what
-    `linear_solver` takes for it, without sizes; that is `Dense()` where none is.
+    `linear_solver` takes for it, without sizes; that is `Dense()` where none is. Where the guess leads nowhere the iteration
+    begins once more, from the `other` one.
     """
     if guess.shape[0] == 0:
         return guess, jnp.zeros((), jnp.int64), jnp.array(True)
     equation = lambda u: residual(u, *args)
     slopes = (lambda u: jacobian(u, *args)) if jacobian else jacobian_by_jax(equation)
-    found = newton(equation, slopes, linear_solver or Dense(), guess, max_iterations, sizes, running)
-    return found.u, found.updates.astype(int), at_floor(found)
+    found = newton(equation, slopes, linear_solver or Dense(), guess, other, max_iterations, sizes, running)
+    return found.u, (found.updates + found.spent).astype(int), at_floor(found)
 
 
 def as_function(
@@ -109,11 +121,13 @@ def newton(
     jacobian: Callable,
     linear_solver: AbstractLinearSolver,
     guess: Float[Array, " k"],
+    other: Float[Array, " k"] | None,
     max_iterations: int,
     sizes: Float[Array, " k"] | None,
     running: Any,
 ) -> Search:
-    """Newton's method in which a Jacobian serves several updates while they contract quickly, and is renewed otherwise."""
+    """Newton's method in which a Jacobian serves several updates while they contract quickly, and is renewed otherwise; from
+    the guess, and from the other one, if there is one, where that leads nowhere."""
     size = 1.0 if sizes is None else sizes
 
     def updated(s: Search, factors: Any, unit: Any) -> Search:
@@ -122,24 +136,27 @@ def newton(
         of_size, of_own = (jnp.abs(change) / (jnp.abs(u) + share * size) for share in (1.0, OWN))
         update, own = folded((of_size, jnp.maximum, 0.0), (of_own, jnp.maximum, 0.0))
         ratio = jnp.where(s.updates > 0, update / jnp.minimum(s.update, 1.0), jnp.nan)
-        return Search(u, jnp.stack([update, ratio, s.updates + 1, own]))
+        return Search(u, jnp.stack([update, ratio, s.updates + 1, own, s.spent]))
+
+    lost = lambda s: jnp.isnan(s.update) | (s.updates >= max_iterations)
 
     def unfinished(s: Search):
-        return running & ~at_floor(s) & ~jnp.isnan(s.update) & (s.updates < max_iterations)
+        return running & ~at_floor(s) & ~(lost(s) & ((s.spent > 0) | (other is None)))
 
     def contracting(s: Search):
         little = jnp.where(jnp.isnan(s.ratio), s.update < NEAR, s.update < STALLED)
-        return unfinished(s) & ((s.ratio < CONTRACTING) | little)
+        return running & ~at_floor(s) & ~lost(s) & ((s.ratio < CONTRACTING) | little)
 
     def with_new_jacobian(s: Search) -> Search:
+        if other is not None:
+            s = jax.tree.map(lambda a, b: jnp.where(lost(s), a, b), begun(other, s.updates), s)
         matrix, unit = jacobian(s.u), 1.0
         if sizes is not None:
             matrix, unit = linear_solver.in_units(matrix, jnp.abs(s.u) + sizes)
         factors = linear_solver.factorise(matrix)
         return jax.lax.while_loop(contracting, lambda s: updated(s, factors, unit), updated(s, factors, unit))
 
-    start = Search(guess, jnp.array([jnp.inf, jnp.nan, 0.0, jnp.inf]))
-    return jax.lax.while_loop(unfinished, with_new_jacobian, start)
+    return jax.lax.while_loop(unfinished, with_new_jacobian, begun(guess))
 
 
 def folded(*parts: tuple[Float[Array, " k"], Callable, float]) -> tuple[Float[Array, ""], ...]:
