@@ -311,3 +311,20 @@ def test_lengths_of_composed_steps_are_summed():
     sol = dx.simulate(pendulum, scheme, q=[0.6, -0.8], v=[0.4, 0.3], step=0.05, steps=20)
     np.testing.assert_allclose(sol.step_length, np.diff(sol.t), atol=1e-14)
     assert "step_length" not in LOW.step_equation(EXAMPLE.system, dx.Shape(2)).fields
+
+
+def test_on_a_sphere():
+    """Natively, of order 2, and a shifted point is seen: a search for the velocity in every step was left to XLA."""
+    lagrangian = lambda q, v: v @ v / 2 * (1 + 0.3 * q[0] ** 2) - 0.8 * q[2] - 0.2 * q[0]
+    system, start = dx.ManifoldLagrangian(lagrangian, dx.Sphere(3)), {"q": [0.6, 0.0, -0.8], "v": [0.4, 0.7, 0.3]}
+    exact = dx.simulate(system, dx.Collocation(4), **start, step=0.01, steps=130).q[-1]
+    scheme, errors = dx.VariableSteps(dx.LagrangeDAlembert(), density=lambda q: 2.0 + q[0]), []
+    for n in (80, 160):
+        sol = dx.simulate(system, scheme, **start, step=4.0 / n, steps=n)
+        assert sol.ok and sol.stats["engine"] == "native"
+        errors.append(np.max(np.abs(sol.at(1.3).q - exact)))
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+    assert dx.verify(sol).ok
+    q = sol.q.copy()
+    q[50] += 1e-8 * np.array([0.8, 0.0, 0.6])
+    assert not dx.verify(sol.replace(fields=sol.fields | {"q": q})).ok

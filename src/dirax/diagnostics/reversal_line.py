@@ -27,6 +27,12 @@ def taken_back(sol: Solution, tolerance: float | None) -> Line | None:
     except CannotReplay as reason:
         return Line(NAME, None, None, NOT_CHECKED, str(reason))
     lanes, rows = np.nonzero(np.arange(sol.rows)[None] < replay.ends[:, None])
+    if "chart" in sol.fields:  # whoever takes a step back does not return to a chart that it left
+        charts = np.asarray(sol.fields["chart"]).reshape(sol.batch or 1, sol.rows, -1)
+        stays = np.all(charts[lanes, rows] == charts[lanes, rows + 1], axis=1)
+        lanes, rows = lanes[stays], rows[stays]
+    if not len(rows):
+        return Line(NAME, None, None, NOT_CHECKED, "every step changes the chart")
     some = spread(len(rows), SAMPLED)
     at, steps, h = replay.resumed(lanes[some], rows[some]), replay.steps, float(sol.step)
     guesses = steps.step(at.states, at.guesses, at.t, h, at.params).unknowns

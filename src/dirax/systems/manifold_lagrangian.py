@@ -13,6 +13,7 @@ from dirax.geometry.products import Product
 from dirax.geometry.spaces import AbstractFlat
 from dirax.numerics.arrays import Data, Numbers
 from dirax.numerics.tolerances import POINT_DEFECT
+from dirax.program.legendre import constrained_velocity, moves
 from dirax.program.linear_solves import solve
 from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian
@@ -222,6 +223,15 @@ class ManifoldLagrangian(AbstractSystem):
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy at the saved point and momentum."""
         return self.energy(row["q"], self.inverse_legendre(row["q"], row["p"], params, row.get("about")), params)
+
+    def velocity_at(self, row: Data, params: Any) -> Float[Numbers, " N"]:
+        """The tangent vector v that belongs to the momentum at a row, on the constraints on it where L is quadratic in v."""
+        q, t, frame = row["q"], row["t"], self.manifold.frame(row["q"])
+        along_frame, rest = lambda s: self.lagrangian(q, frame @ s, params), jnp.zeros(self.manifold.dimension)
+        if moves(jax.hessian(along_frame), rest):
+            return self.inverse_legendre(q, row["p"], params)
+        rows, offset = self.constraints.matrix(t, q, params), self.constraints.velocity_defect(t, q, jnp.zeros_like(q), params)
+        return frame @ constrained_velocity(along_frame, frame.T @ row["p"], rows @ frame, offset, rest)[0]
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
         """How far the point is from the manifold, and (W v + b, g, G v + ∂g/∂t) with the velocity of the saved momentum."""
