@@ -123,15 +123,17 @@ class StepsInNumbers:
         near: Near | None = None,
         follow: bool = True,
         alone: bool = False,
+        far: bool = False,
     ) -> Attempts:
         """A step of each state (states, s), with one guess (states, k) a stage; h is one number, or one a state. `follow`: a
-        solution that Newton's method does not find is followed from a short step on. `alone`: no bit depends on other states."""
+        solution that Newton's method does not find is followed from a short step on, and where it is `far`, from equations that
+        the guess solves. `alone`: no bit depends on other states."""
         parts, h = [], np.broadcast_to(h, t.shape)
         for low in range(0, max(len(states), 1), LANES):
             some = slice(low, low + LANES)
             here = self.nothing_near(len(states[some])) if near is None else near[some]
             at = states[some], [g[some] for g in guesses], t[some], h[some], params[some]
-            parts.append(self._step(*at, noise, here, follow, alone))
+            parts.append(self._step(*at, noise, here, follow, alone, far))
         join = np.concatenate
         return Attempts(
             [join(a) for a in zip(*(p.unknowns for p in parts), strict=True)],
@@ -141,11 +143,11 @@ class StepsInNumbers:
         )
 
     @np.errstate(all="ignore")
-    def _step(self, states, guesses, t, h, params, noise, near: Near, follow: bool, alone: bool) -> Attempts:
+    def _step(self, states, guesses, t, h, params, noise, near: Near, follow: bool, alone: bool, far: bool) -> Attempts:
         unknowns, begun, good = [], [], np.ones(len(states), bool)
         for stage, ((index, fraction), guess) in enumerate(zip(self.program.stages, guesses, strict=True)):
             e, at = self.program.equations[index], (t, fraction * h, params)
-            u, solved = self._solved(stage, guess, states, at, noise, near, follow, alone)
+            u, solved = self._solved(stage, guess, states, at, noise, near, follow, alone, far)
             known = self._values(index, u, states, at, noise)
             begun.append(states)
             unknowns.append(u)
@@ -218,7 +220,7 @@ class StepsInNumbers:
         and what a typical rounding of each term of the equations comes to, and whether the equations are solved to roundoff of
         these, (states,). `sizes` that unknowns may have tell which terms are but the roundoff of zero."""
         near = self.nothing_near(len(t))
-        made = self.step(states, guesses, t, h, params, near=near, follow=follow)
+        made = self.step(states, guesses, t, h, params, near=near, follow=follow, far=True)
         found, good = [], made.good
         for stage, ((_, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
             at, least = (t, np.full(len(t), fraction * h), params), 0.0 if sizes is None else sizes[stage]
@@ -279,7 +281,7 @@ class StepsInNumbers:
         return whole
 
     def _solved(
-        self, stage: int, guess, states, at, noise, near: Near, follow: bool, alone: bool
+        self, stage: int, guess, states, at, noise, near: Near, follow: bool, alone: bool, far: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """The unknowns (states, k) of a stage by Newton's method, and where it has a solution.
 
@@ -324,9 +326,9 @@ class StepsInNumbers:
             stalled = own[left] & (moved >= last[left] / 2) & (moved < STALLED)
             found = _largest_ratio(change, np.maximum(np.abs(u[left]), OWN * size[left])) <= FLOOR
             ended = found | stalled
-            far = ended & np.any(size[left] > FAR * np.abs(u[left]), axis=1)
-            if np.any(far):
-                ended[far] = is_solved(left[far])
+            loose = ended & np.any(size[left] > FAR * np.abs(u[left]), axis=1)
+            if np.any(loose):
+                ended[loose] = is_solved(left[loose])
             ended |= fresh & np.isnan(moved)
             renewed[left] = ~fresh & ~contracts & ~(own[left] & (moved < STALLED)) & ~ended
             last[left] = np.where(renewed[left], np.inf, moved)
@@ -339,7 +341,7 @@ class StepsInNumbers:
         if len(left):
             good[left] &= is_solved(left)
         if follow and len(lost := np.flatnonzero(~good)) and k <= FOLLOWED:
-            there, _ = self.followed(stage, begun[lost], states[lost], tuple(a[lost] for a in at))
+            there, _ = self.followed(stage, begun[lost], states[lost], tuple(a[lost] for a in at), far)
             if len(some := lost[np.isfinite(there[:, 0])]):
                 u[some] = there[np.isfinite(there[:, 0])]
                 of_them = u[some], inverse[some], states[some], tuple(a[some] for a in at), noise, alone
@@ -355,9 +357,10 @@ class StepsInNumbers:
         return u, inverse
 
     @np.errstate(all="ignore")
-    def followed(self, stage: int, guess, states, at) -> tuple[np.ndarray, np.ndarray]:
+    def followed(self, stage: int, guess, states, at, far: bool) -> tuple[np.ndarray, np.ndarray]:
         """`following.followed` of the equations of a stage, from a guess (states, k) on, in the sizes that unknowns have there:
-        where Newton's method went from it, they may have any."""
+        where Newton's method went from it, they may have any; where it is `far` that of the equations less what the guess misses,
+        too."""
         index, (t, h, params) = self.program.stages[stage][0], at
         e, of_step = self.program.equations[index], self.program.shared.h
         inverses = inverted(self._linearized(index, self._values(index, guess, states, at))[0], alone=True)
@@ -370,7 +373,7 @@ class StepsInNumbers:
             return self._read(known, e.residual), found
 
         unknowns, reached = followed(slopes, guess, sizes)
-        if len(cut := np.flatnonzero(reached < 1.0)):
+        if far and len(cut := np.flatnonzero(reached < 1.0)):
             begun = self._read(self._values(index, guess[cut], states[cut], tuple(a[cut] for a in at)), e.residual)
 
             def less(some, u, part):

@@ -61,13 +61,14 @@ class AbstractStuck(ABC):
 
 def by_other_ways(stuck: AbstractStuck) -> tuple[bool, list[str]]:
     """Go on with trajectories that are stuck. Returns whether some did with other sizes, and what `stats` say of other ways."""
-    found, steps, tried = False, 0, 0
+    found, steps, tried = with_present_sizes(stuck), 0, 0
     while len(stuck.ended(UNSOLVED)):
-        found = with_present_sizes(stuck) or found
         count, tried = by_following(stuck, tried), tried + 1
-        if not count:
-            break
         steps += count
+        if not count:
+            if not with_present_sizes(stuck):
+                break
+            found = True
     return found, [f"{counted(steps, 'step')} followed from easier ones on"] if steps else []
 
 
@@ -103,7 +104,8 @@ def by_following(stuck: AbstractStuck, tried: int) -> int:
     if steps is None or not len(failed):
         return 0
     params = steps.parameters(p.params, p.batch if p.batch_params else None, failed)
-    found = steps.step(at.state, at.unknowns, p.t0 + (p.first_step + at.completed) * p.h, p.h, params, alone=True)
+    t = p.t0 + (p.first_step + at.completed) * p.h
+    found = steps.step(at.state, at.unknowns, t, p.h, params, alone=True, far=True)
     if not np.any(found.good):
         return 0
     return len(stuck.further(failed[found.good], unknowns=[u[found.good] for u in found.unknowns])[0])

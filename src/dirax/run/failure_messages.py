@@ -173,7 +173,7 @@ def _where_it_ends(numbers: InNumbers | InJax, guess, args) -> str:
         return ""
     one = lambda a: np.asarray(a, float)[None]
     of_step = one(t), one(h), one(numbers.params)
-    part = float(StepsInNumbers(None, numbers.step).followed(0, one(guess), one(state), of_step)[1][0])
+    part = float(StepsInNumbers(None, numbers.step).followed(0, one(guess), one(state), of_step, True)[1][0])
     if part == 0.0:
         return ""
     if part == 1.0:
