@@ -301,6 +301,32 @@ def test_method_2_of_a_hamiltonian_with_one_forms():
         dx.simulate(rolling, dx.DiscreteDirac(dx.ProjectedMap(dx.Midpoint(), halfway, 3)), **whole, **run)
 
 
+@pytest.mark.parametrize("composed", [False, True])
+def test_lagrangians_by_a_projected_map_are_those_of_its_formula(composed):
+    """On the sphere the projected midpoint map has an inverse in closed form; both with a one-form, a force and time."""
+    lagrangian, form = (
+        lambda q, v: v @ v / 2 * (1 + 0.3 * q[0] ** 2) - 0.8 * q[2],
+        lambda q: jnp.stack([q[1], q[2], 0.2 + q[0]])[None],
+    )
+    force = lambda t, q, v: -0.2 * v + jnp.stack([0.0 * t, jnp.sin(t), 0.0 * t])
+    normalize = lambda x: x / jnp.sqrt(x @ x)
+    runs, q = [], np.array([0.6, 0.0, -0.8])
+    for manifold, map in (
+        (dx.Sphere(3), SphereProjection()),
+        (dx.Submanifold(normalize, 3), dx.ProjectedMap(dx.Midpoint(), normalize)),
+    ):
+        scheme = dx.DiscreteDirac(map)
+        scheme = dx.Composition(scheme, "suzuki4") if composed else scheme
+        system = dx.ManifoldLagrangian(lagrangian, manifold, form, forces=force)
+        sol = dx.simulate(system, scheme, q=q, v=[0.4, 0.5, 0.3], step=0.05, steps=30, project=True)
+        assert sol.ok and sol.stats["engine"] == "native"
+        runs.append(sol)
+    for name in runs[0].fields:
+        np.testing.assert_allclose(runs[1].fields[name], runs[0].fields[name], atol=1e-12, err_msg=name)
+    with pytest.raises(ValueError, match="starts from q= with v= or p="):
+        dx.simulate(runs[1].system, dx.DiscreteDirac(dx.ProjectedMap(dx.Midpoint(), normalize)), q0=q, q1=q, step=0.1, steps=1)
+
+
 # ---------------------------------------------------------------------- where the base point lies in time
 
 CLOCK = dx.PortHamiltonian(lambda x: x @ x / 2, np.zeros((1, 1)), B=np.ones((1, 1)))

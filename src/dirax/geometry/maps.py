@@ -284,6 +284,11 @@ class ProductMap(AbstractDiscretizationMap):
         return all(map.is_known for map in self.maps)
 
     @property
+    def has_explicit_inverse(self):
+        """Where all factors have one."""
+        return all(map.has_explicit_inverse for map in self.maps)
+
+    @property
     def base_fraction(self):
         """That of its maps where they agree, else ½."""
         fractions = {map.base_fraction for map in self.maps}

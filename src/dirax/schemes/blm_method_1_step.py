@@ -71,7 +71,9 @@ class MethodOneStep(LagrangianStep):
     def _at_base(self, u: Array, q0: Array, t: Any, h: Any, params: Any) -> tuple[Base, Array, Array]:
         """The base point, and (ṗ, p) there."""
         velocity, multipliers = self.unknowns.split(u)
-        at = self.lift.step(q0, velocity, t, h)
+        return self._rates_at(self.lift.step(q0, velocity, t, h), multipliers, params)
+
+    def _rates_at(self, at: Base, multipliers: Array, params: Any) -> tuple[Base, Array, Array]:
         rate, momentum = self.rates(at.t, at.q, at.v, params)
         if self.rows.count:
             rate = rate + self.rows.force(at.t, at.q, multipliers, params)

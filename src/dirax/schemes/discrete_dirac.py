@@ -6,6 +6,7 @@ from dirax.geometry.cotangent_lift import CotangentLift, cotangent_lift
 from dirax.geometry.maps import AbstractDiscretizationMap, Midpoint, Theta
 from dirax.geometry.projected_map import ProjectedMap
 from dirax.geometry.spaces import Euclidean
+from dirax.schemes.blm_method_1_forward_step import MethodOneForwardStep
 from dirax.schemes.blm_method_1_step import MethodOnePart, MethodOneStep
 from dirax.schemes.blm_method_2_step import NonholonomicStep, ProjectedThetaStep
 from dirax.schemes.constraint_manifold_premise import where_the_constraints_hold
@@ -191,7 +192,8 @@ def _method_one(map: AbstractDiscretizationMap, system: AbstractSystem, shape: S
     if lagrangian is not None and theta is not None:
         return MethodOneStep(lagrangian, shape, ThetaLift(theta, shape.n))
     lagrangian = system.manifold_form() if lagrangian is None else lagrangian
-    return MethodOneStep(lagrangian, shape, lift_of(_map_on_q(map), lagrangian, shape.n))
+    of_lift = MethodOneStep if _map_on_q(map).has_explicit_inverse else MethodOneForwardStep
+    return of_lift(lagrangian, shape, lift_of(_map_on_q(map), lagrangian, shape.n))
 
 
 def _is_flat(map: AbstractDiscretizationMap, shape: Shape) -> bool:
