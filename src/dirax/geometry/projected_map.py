@@ -12,15 +12,12 @@ from dirax.geometry.maps import AbstractDiscretizationMap
 from dirax.geometry.squared_angles import norm
 from dirax.numerics.tolerances import POINT_DEFECT
 from dirax.program.linear_solves import solve
-from dirax.program.roots import nearest_root
+from dirax.program.roots import regular_root
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated, is_traced
 
 PROJECTOR_DEFECT = 1e-9
 """How far the derivative of a projector may miss that of P ∘ P."""
-
-FOUND = 1e-9
-"""What the equations of the inverse may miss, relative to 1 + its size."""
 
 
 class Submanifold(AbstractManifold):
@@ -156,9 +153,7 @@ class ProjectedMap(AbstractDiscretizationMap):
             y0, y1 = self.forward(x, v)
             return jnp.concatenate([y0 - x0 + z[:n] - x, y1 - x1 + z[n:] - v])
 
-        found = nearest_root(residual, jnp.concatenate(self.map.backward(x0, x1)))
-        missed = jnp.max(jnp.abs(jax.lax.stop_gradient(residual(found))))
-        return tangent(jnp.where(missed <= FOUND * (1.0 + jnp.max(jnp.abs(found))), found, jnp.nan))
+        return tangent(regular_root(residual, jnp.concatenate(self.map.backward(x0, x1))))
 
     def reach(self, x, v):
         """That of the map around it."""

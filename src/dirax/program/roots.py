@@ -106,31 +106,11 @@ def sparse_equations(residual: Callable, unknowns: Any, *others: Any) -> Any:
 def regular_root(
     residual: Callable, guess: Float[Array, " k"], tolerance: float = 1e-9, max_steps: int = 40
 ) -> Float[Array, " k"]:
-    """A root of `residual` (k,) → (k,) with a regular Jacobian, by Newton's method to the roundoff floor; NaN where it does not
-    converge.
-
-    Traceable, and differentiable any number of times, forwards and backwards, by the implicit function theorem.
-    `tolerance` is on the last residual, relative to 1 + ‖root‖.
-    """
-    closed, captured, _ = closed_over(residual, [guess])
-    of_captured = _unknowns_first(closed)
-    fixed = lambda z: of_captured(z, *lax.stop_gradient(captured))
-
-    def step(carry):
-        z, size, _, count = carry
-        update = jnp.linalg.solve(jax.jacfwd(fixed)(z), fixed(z))
-        return z - update, jnp.max(jnp.abs(update)), size, count + 1
-
-    def unfinished(carry):
-        _, size, previous, count = carry
-        still_shrinking = (size < 0.5 * previous) | (size > 1e-6)
-        return (count < max_steps) & (size > 0.0) & still_shrinking
-
-    start = (lax.stop_gradient(guess), jnp.asarray(1e300), jnp.asarray(jnp.inf), 0)
-    z, *_ = lax.while_loop(unfinished, step, start)
-    converged = jnp.max(jnp.abs(fixed(z))) <= tolerance * (1.0 + jnp.max(jnp.abs(z)))
-    root = jnp.where(converged, z, jnp.nan)
-    return implicit(lambda u, captured: of_captured(u, *captured), root, captured, jnp.linalg.solve)
+    """A root of `residual` (k,) → (k,) with a regular Jacobian, as `nearest_root` finds it; NaN where it finds none: where the
+    residual is above `tolerance`, relative to 1 + ‖root‖."""
+    root = nearest_root(residual, guess, max_steps)
+    missed = jnp.max(jnp.abs(lax.stop_gradient(residual(root))))
+    return jnp.where(missed <= tolerance * (1.0 + jnp.max(jnp.abs(root))), root, jnp.nan)
 
 
 def _unknowns_first(residual: ClosedJaxpr) -> Callable:
