@@ -86,6 +86,9 @@ def test_mistakes():
     for fibre in ([1.5], "z", []):
         with pytest.raises(ValueError, match=r"different non-negative indices of coordinates, such as \[0\], but"):
             dx.LinearConnection(fibre)
+    for scheme in (dx.Collocation(2), dx.VariableSteps(dx.LagrangeDAlembert()), dx.DiscreteDirac()):
+        with pytest.raises(TypeError, match=r"\. Reduced systems are stepped by dx\.LagrangeDAlembert, .* step the system that"):
+            dx.simulate(dx.reduce(free, dx.LinearConnection([1])), scheme, **run)
     pulling = lambda q0, q1, h: (q1 - q0) @ (q1 - q0) / (2 * h) - h * q1[1] ** 2
     for scheme in (dx.PlusLagrangeDirac(pulling), dx.DiscreteRouth(pulling)):
         with pytest.raises(ValueError, match=r"discrete_lagrangian is not invariant .* q\[1\]: its derivative .* is 0\.0"):

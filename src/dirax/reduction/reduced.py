@@ -41,6 +41,14 @@ class AbstractReducedSystem(AbstractSystem):
     connection: eqx.AbstractVar[Any]
 
     @property
+    def stepped_by(self) -> str:
+        """Those whose steps descend to the quotient."""
+        return (
+            "Reduced systems are stepped by dx.LagrangeDAlembert, dx.PlusLagrangeDirac, dx.MinusLagrangeDirac and "
+            "dx.DiscreteRouth: with another scheme step the system that dx.reduce was given."
+        )
+
+    @property
     @abstractmethod
     def action(self) -> AbstractAction:
         """The action of the group on Q."""

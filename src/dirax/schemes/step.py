@@ -316,5 +316,16 @@ _equations: Memo[StepEquation | StepSequence] = Memo(256)
 
 
 def make_step_equation(scheme: AbstractScheme, system: Any, shape: Shape) -> StepEquation | StepSequence:
-    """`scheme.step_equation(system, shape)`, the same object for equal arguments, so that compiled code is reused."""
-    return _equations.get((scheme, system, shape), lambda: scheme.step_equation(system, shape))
+    """`scheme.step_equation(system, shape)`, the same object for equal arguments, so that compiled code is reused. Raises
+    `TypeError` for a system that the scheme does not step, with what the system says of those that do."""
+
+    def made() -> StepEquation | StepSequence:
+        try:
+            return scheme.step_equation(system, shape)
+        except TypeError as error:
+            advice = getattr(system, "stepped_by", "")
+            if not advice or type(scheme).__name__ in advice:
+                raise
+            raise TypeError(f"{str(error).rstrip('.')}. {advice}") from error
+
+    return _equations.get((scheme, system, shape), made)

@@ -48,7 +48,7 @@ class VariableSteps(AbstractScheme):
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:
         if system.quotient_form() is not None:
-            raise TypeError("dx.VariableSteps takes systems that are not reduced: step the system that dx.reduce was given.")
+            raise TypeError("dx.VariableSteps takes systems that are not reduced.")
         # momenta that are means over both steps at a row are those of equal steps: as in compositions
         inner = make_step_equation(self.scheme.part(system, shape), system, shape)
         if not isinstance(inner, StepEquation):

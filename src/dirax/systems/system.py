@@ -104,6 +104,11 @@ class AbstractSystem(eqx.Module):
         rows, offset = form.constraints.matrix(t, q, params), form.constraints.velocity_defect(t, q, rest, params)
         return constrained_velocity(lambda v: form.lagrangian.at(t, q, v, params), row["p"], rows, offset, rest)[0]
 
+    @property
+    def stepped_by(self) -> str:
+        """Which schemes step it, a sentence for those that do not; empty where many do."""
+        return ""
+
     # ------------------------------------------------------------------ the forms in which it can be discretized
 
     def relation_form(self, shape: Shape) -> RelationForm | None:
