@@ -57,7 +57,7 @@ class Xla(AbstractEngine):
         compile_seconds, started, solved = time.perf_counter() - started, time.perf_counter(), numerics.seconds
         interrupted, stuck, with_sizes, others = False, StuckRun(run, problem), False, []
         try:
-            run.onwards(progress)
+            run.onwards(p.after, p.steps, progress)
             if self.scalars != "never" and len(stuck.ended(UNSOLVED)):
                 with_sizes, others = by_other_ways(stuck)
         except KeyboardInterrupt:
