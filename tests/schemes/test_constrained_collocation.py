@@ -213,3 +213,16 @@ def test_self_adjoint_and_the_same_on_both_engines(kind):
 def test_what_it_does_not_keep_is_refused():
     with pytest.raises(TypeError, match="at Gauss nodes does not keep constraints"):
         dx.simulate(KINDS["nonholonomic"][2], dx.Collocation(3), q=[0.0, 0.0, 0.0], v=[0.0, 1.0, 0.0], step=0.1, steps=1)
+
+
+def test_compositions_of_lobatto_nodes_with_one_forms_are_not_promised_more_than_order_four():
+    """Kahan and Li's of order 6 has 4.0: λ of the step before is a part of the state."""
+    rows = lambda q: jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0.0])[None]
+    skate = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 0.2 * v[0] * v[2] - jnp.cos(q[0]) - q[1] ** 2 / 2, rows)
+    start = {"q": [0.1, 0.2, 0.3], "v": [np.cos(0.3), np.sin(0.3), 0.5]}
+    run = lambda scheme, n: dx.simulate(skate, scheme, **start, step=2.0 / n, steps=n).q[-1]
+    exact = run(dx.Composition(dx.LagrangeDAlembert(), "suzuki8"), 64)
+    lobatto = dx.Composition(dx.Collocation(2, nodes="lobatto"), "kahan-li6")
+    with pytest.warns(RuntimeWarning, match=r"compositions of Collocation\(stages=2, nodes='lobatto'\) have order 4 here"):
+        errors = [np.abs(run(lobatto, n) - exact).max() for n in (16, 32)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.1)

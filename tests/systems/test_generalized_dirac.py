@@ -1,5 +1,7 @@
 """(D, 𝓛) with 𝓛 from dH, from dL and from Morse families, beside the systems that they are, SciPy, and equations by hand."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -155,3 +157,24 @@ def test_matrices_of_no_dirac_structure():
     skew_above = lambda x: jnp.array([[0.0, 1.0], [-1.0, jnp.minimum(x[0] - 0.9, 0.0)]])
     sol = run(dx.GeneralizedDiracSystem(dx.DiracStructure.from_bivector(skew_above), of_energy), x=[1.0, 0.0])
     assert sol.ok and not dx.verify(sol).ok and "bivector is not skew" in str(dx.verify(sol))
+
+
+def test_method_1_of_a_constrained_family_warns_that_its_index_is_three():
+    """A pendulum by H(x) + s g(x): its momenta did not converge and its multipliers grew like 1/h, without a word. Two
+    constraints whose bracket does not vanish are of index 2, and have none."""
+    structure = dx.DiracStructure.from_bivector(lambda x: dx.canonical_two_form(2))
+    energy = lambda x: x[2:] @ x[2:] / 2 + 9.8 * x[1]
+    held = lambda g, count: dx.GeneralizedDiracSystem(
+        structure, dx.LagrangianSubmanifold.from_morse_family(lambda x, s: energy(x) + s @ g(x), count)
+    )
+    pendulum, run = held(lambda x: (x[:2] @ x[:2] - 1)[None], 1), {"step": 0.05, "steps": 20}
+    x = np.array([np.sin(1), -np.cos(1), 0.5 * np.cos(1), 0.5 * np.sin(1)])
+    with pytest.warns(RuntimeWarning, match="GeneralizedDiracSystem are of index 3 or more: Method 1 does not keep"):
+        dx.simulate(pendulum, dx.DiscreteDirac(), x=x, **run)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        chain = dx.constraint_algorithm(pendulum, near=x)
+        sol = dx.simulate(chain.resolved(), dx.DiscreteDirac(), x=chain.point, **run)
+        assert np.abs(np.sum(sol.x[:, :2] ** 2, axis=1) - 1.0).max() < 1e-2
+        falling = dx.simulate(held(lambda x: x[jnp.array([0, 2])], 2), dx.DiscreteDirac(), x=[0.0, 1.0, 0.0, 0.3], **run)
+        np.testing.assert_allclose(falling.x[-1], [0.0, 1.3 - 4.9, 0.0, 0.3 - 9.8], atol=1e-12)

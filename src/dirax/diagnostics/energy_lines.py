@@ -49,7 +49,8 @@ def energy_line(sol: Solution) -> Line:
         return kicked
     if changes:
         change = float(np.nanmax(np.abs(energy - energy[:, :1])))
-        return Line(name, change, None, NOT_CHECKED, f"the system {changes}; it changed by {change:.3g}")
+        text = f"the system {changes}; {'less sol.work ' * forced}it changed by {change:.3g}"
+        return Line(name, change, None, NOT_CHECKED, text)
     times, found = sol.times, []
     for lane, series in enumerate(energy):
         good = np.isfinite(series)

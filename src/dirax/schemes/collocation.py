@@ -61,6 +61,10 @@ class Collocation(AbstractScheme):
         """The order of convergence on smooth systems: 2s, or 2s − 2 with Lobatto nodes."""
         return 2 * self.stages - 2 * (self.nodes == "lobatto")
 
+    def composed_order(self, system: AbstractSystem, shape: Shape) -> int | None:
+        """With one-forms 4, as measured, or its own: λ of the step before is in the state, and parts are of other lengths."""
+        return max(4, self.order) if self.nodes == "lobatto" and shape.m else None
+
     def adjoint(self, system: AbstractSystem) -> "Collocation":
         """The scheme itself, for nodes that lie symmetrically."""
         return self

@@ -1,5 +1,6 @@
 """Compositions of a scheme with itself, or with its adjoint, to higher order."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,7 +25,8 @@ class Composition(AbstractScheme):
     scheme or of Method 1 on a Lagrangian with constraints end at the momentum whose velocity satisfies them, so that p and the
     multipliers have the order of q; a Lagrangian that is singular on the constraint distribution determines no such momentum,
     and is refused at the start. So are Method 1 and discrete gradients of systems in x that leave their constraints: what is off
-    them changes its sign in every step, and stays of second order. Method 2 composes to the order that is named.
+    them changes its sign in every step, and stays of second order. Method 2 composes to the order that is named. Lobatto
+    collocation with one-forms, whose state holds a multiplier of the step before, has order 4 at most: more is warned of.
 
     Raises `ValueError` for unknown names and for numbers that do not sum to 1, `TypeError` for what is neither.
     """
@@ -48,6 +50,14 @@ class Composition(AbstractScheme):
 
     def step_equation(self, system: Any, shape: Shape) -> StepSequence:
         inner = make_step_equation(self.scheme.part(system, shape), system, shape)
+        most = self.scheme.composed_order(system, shape)
+        if most is not None and most < order_by_powers(self.coefficients):
+            warnings.warn(
+                f"compositions of {self.scheme!r} have order {most} here, whatever their coefficients: those of "
+                "dx.LagrangeDAlembert and dx.DiscreteDirac have the order that is named.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
         return StepSequence(tuple((eq, a * c) for c in self.coefficients for eq, a in inner.stages))
 
     def discrete_structure(self, system: Any, shape: Shape, step: Any) -> str:
@@ -60,6 +70,15 @@ class Composition(AbstractScheme):
     @property
     def constraints_at_rows(self) -> bool:
         return self.scheme.constraints_at_rows
+
+
+def order_by_powers(coefficients: Sequence[float]) -> int:
+    """The order up to which Σ γ^3 = Σ γ^5 = … = 0 holds, as it does for compositions of that order of self-adjoint schemes of
+    order 2; 2 where none does."""
+    order = 2
+    while order < 8 and abs(sum(c ** (order + 1) for c in coefficients)) < 1e-9:
+        order += 2
+    return order
 
 
 def _no_coefficients(given: Any) -> str:

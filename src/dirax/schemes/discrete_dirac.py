@@ -15,6 +15,7 @@ from dirax.schemes.discrete_structure_maps import PROJECTED, RelationPairs, stru
 from dirax.schemes.discretized_relation import discretized_relation
 from dirax.schemes.growth_premise import nothing_grows
 from dirax.schemes.hidden_constraint_premise import nothing_hidden_in_lagrangian, nothing_hidden_in_relation
+from dirax.schemes.index_premise import warned_of_index_three
 from dirax.schemes.look_ahead_step import LookAheadStep
 from dirax.schemes.map_lift import ThetaLift, lift_of
 from dirax.schemes.map_premise import by_a_discretization_map
@@ -89,7 +90,7 @@ class DiscreteDirac(AbstractScheme):
         if (relation := system.relation_form(shape)) is not None:
             if self._looks_ahead(system):
                 return LookAheadStep(system.phase_space_form(), shape, relation).equation()
-            return discretized_relation(relation, shape.n, self.map)
+            return warned_of_index_three(system, relation, shape.n, discretized_relation(relation, shape.n, self.map))
         if system.lagrangian_form() is None and system.manifold_form() is None:
             return None
         return _method_one(self.map, system, shape).equation()

@@ -251,6 +251,10 @@ class AbstractScheme(eqx.Module):
         where there is none."""
         return None
 
+    def composed_order(self, system: Any, shape: Shape) -> int | None:
+        """The order that compositions of it have at most; None where that of their coefficients is had."""
+        return None
+
     def part(self, system: Any, shape: Shape) -> "AbstractScheme":
         """The scheme as a part of a composed step: itself, or one with the same q whose saved p has the order of q there."""
         return self
