@@ -69,6 +69,8 @@ def _leaves_rates_open(of_rates: Any, of_points: Any, size: int) -> bool:
     if not np.any(zero):
         return False
     rows = (left[:, zero] / of_rows).T @ b
+    if not np.all(np.max(np.abs(rows), axis=1) > SINGULAR * np.max(np.abs(b))):
+        return False  # equations of no x at all, of which nothing is to be differentiated
     more = np.concatenate([a, np.pad(rows, ((0, 0), (0, a.shape[1] - size)))])
     scaled = equilibrated(more)[0]
     _, values, right = np.linalg.svd(scaled)
