@@ -32,7 +32,7 @@ def taken_back(sol: Solution, tolerance: float | None) -> Line | None:
         stays = np.all(charts[lanes, rows] == charts[lanes, rows + 1], axis=1)
         lanes, rows = lanes[stays], rows[stays]
     if not len(rows):
-        return Line(NAME, None, None, NOT_CHECKED, "every step changes the chart")
+        return Line(NAME, None, None, NOT_CHECKED, "no step that stays in one chart was computed")
     some = spread(len(rows), SAMPLED)
     at, steps, h = replay.resumed(lanes[some], rows[some]), replay.steps, float(sol.step)
     guesses = steps.step(at.states, at.guesses, at.t, h, at.params).unknowns

@@ -94,14 +94,14 @@ def by_following(stuck: AbstractStuck, tried: int) -> int:
     p, failed = stuck.problem, stuck.ended(UNSOLVED)
     if max(stage.unknowns for stage, _ in p.equation.stages) > FOLLOWED or p.max_iterations < OF_FOLLOWING:
         return 0
-    try:
-        steps = StepsInNumbers.of(p.equation, p.params, p.batch_params) if len(failed) else None
-    except (UnsupportedPrimitive, GraphTooLarge):
-        return 0
     at = stuck.standing(failed)
     may = tried < BEFORE + OF_STEPS * at.completed
     failed, at = failed[may], at[may]
-    if steps is None or not len(failed):
+    if not len(failed):
+        return 0
+    try:
+        steps = StepsInNumbers.of(p.equation, p.params, p.batch_params)
+    except (UnsupportedPrimitive, GraphTooLarge):
         return 0
     params = steps.parameters(p.params, p.batch if p.batch_params else None, failed)
     t = p.t0 + (p.first_step + at.completed) * p.h
