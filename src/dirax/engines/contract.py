@@ -145,7 +145,8 @@ def saved_steps(problem: Problem) -> np.ndarray:
     """The step number of each saved row, counted from the problem's first state: 0, s, 2s, …, steps, as exact floats."""
     first = problem.first_row
     numbers = np.arange(first, first + problem.rows, dtype=float)  # in place from here on: a long run has no memory to waste
-    numbers *= problem.save_every
+    if problem.save_every != 1:
+        numbers *= problem.save_every
     numbers[-1] = problem.steps
     return numbers
 

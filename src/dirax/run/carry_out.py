@@ -68,7 +68,7 @@ class Kind:
         steps -= int(case.two_points)
         problem = found.problem.with_numbers(steps=steps, save_every=save_every, params=case.params)
         refuse_more_than_memory(problem)
-        return replace(found, case=case, problem=problem, save_every=asked)
+        return found.with_numbers(case=case, problem=problem, save_every=asked)
 
     def keep(self, case: Case, found: "Begun", seconds: float) -> None:
         """Keep a start that took a while; those of batches are large, and a plan finds them in a small part of their steps."""
@@ -120,6 +120,12 @@ class Begun:
     """Makes the plan for others of its kind."""
     engine: Callable | None = field(default=None, kw_only=True)
     """The engine that ran it, where it is not that of its kind."""
+
+    def with_numbers(self, **numbers: Any) -> "Begun":
+        """The same beginning with other numbers."""
+        begun = object.__new__(Begun)
+        begun.__dict__.update(self.__dict__, **numbers)
+        return begun
 
 
 def carried_out(
@@ -309,7 +315,7 @@ class Continuation:
         problem = old.with_numbers(steps=old.steps + more, save_every=every, after=after, record=self.record)
         refuse_more_than_memory(problem)
         before = _rows_before(sol, problem)
-        found = replace(self.begun, problem=problem, rows=before)
+        found = self.begun.with_numbers(problem=problem, rows=before)
         longer = _run(self.settings, self.kind, found, self.steps + more, progress, 0.0, began)
         longer.metadata, longer.example = sol.metadata, sol.example
         return longer

@@ -94,7 +94,7 @@ class KeptPremise:
 
 def bytes_of(params: Any) -> tuple:
     """Equal for equal params of one kind."""
-    return tuple([leaf.tobytes() for leaf in jax.tree.leaves(params)])
+    return () if params is None else tuple([leaf.tobytes() for leaf in jax.tree.leaves(params)])
 
 
 def checks_of(equation: Any) -> list[Callable]:

@@ -87,7 +87,7 @@ class PreparedRun:
             array = plain_floats(value)
             if array is None or name not in data or array.shape != data[name].shape:
                 return None, None
-            data = data | {name: array}
+            data[name] = array
         return data, params
 
     def _other(self, given: dict[str, Any]) -> tuple[dict[str, Any], Any]:

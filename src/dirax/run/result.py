@@ -82,9 +82,11 @@ def times_of(p: Problem, numbers: np.ndarray, traced: bool):
     """The times of the steps of the given numbers, in the same array where nothing that is traced can hold it."""
     if traced:
         return p.t0 + (numbers + p.first_step) * p.h
-    numbers += p.first_step
+    if p.first_step:
+        numbers += p.first_step
     numbers *= p.h
-    numbers += p.t0
+    if p.t0:
+        numbers += p.t0
     return numbers
 
 

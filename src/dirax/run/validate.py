@@ -282,7 +282,7 @@ def refuse_clock_that_stands(t0: Any, h: Any, steps: int) -> None:
     end = t0 + steps * h if steps < EXACT_STEPS else t0
     if not math.isfinite(end):
         raise ValueError(f"the run would end at t = t0 + steps·step = {end}: take fewer steps, smaller ones, or another t0.")
-    at = max(t0, end, key=abs)
+    at = end if abs(end) > abs(t0) else t0
     if math.ulp(at) > h:
         raise ValueError(
             f"the times of this run are as large as {at:.6g}, where floats are {np.spacing(abs(at)):.3g} apart, and a step of "

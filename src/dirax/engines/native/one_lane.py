@@ -13,30 +13,30 @@ from dirax.engines.native.loops.record import DOUBTFUL
 
 class Places:
     """Where things stand in the array of a run of so many rows, in numbers: record · its copy · parameters · addresses of the
-    rows · addresses of the closing row · closing row · rows."""
+    rows · addresses of the closing row of a trajectory that ends early · of one that does not, whose closing row is the last of
+    the rows · closing row · rows."""
 
     def __init__(self, p: Problem, made: Kernels | CollocationKernels, rows: int):
         self.rows, saved = rows, arrays_saved(p, made)
         self.record = made.record.size
         self.params = 2 * self.record
         self.outs = self.params + made.step.parameters.size
-        self.closing_outs = self.outs + len(saved)
-        at = self.closing_outs + len(saved)
-        self.fields, self.closing, starts, closing, last = [], [], [], [], []
+        self.early_outs = self.outs + len(saved)
+        self.last_outs = self.early_outs + len(saved)
+        self.guesses = [made.record.unknowns(i, stage.unknowns) for i, (stage, _) in enumerate(p.equation.stages)]
+        at = self.last_outs + len(saved)
+        self.fields, self.early, self.last = [], [], []
+        """(name, first number, the one after the last, shape) of the saved arrays and of either closing row."""
         for name, shape, size, _ in saved:
-            self.closing.append((name, at, at + size, (1, *shape)))
-            closing.append(at)
+            self.early.append((name, at, at + size, (1, *shape)))
             at += size
-        for name, shape, size, ends_before in saved:
-            count = rows - ends_before
-            self.fields.append((name, at, at + count * size, (1, count, *shape)))
-            starts.append(at)
-            last.append(closing[len(last)] if ends_before else at + (count - 1) * size)
-            at += count * size
+        for (name, shape, size, ends_before), early in zip(saved, self.early, strict=True):
+            stop = at + (rows - ends_before) * size
+            self.fields.append((name, at, stop, (1, rows - ends_before, *shape)))
+            self.last.append(early if ends_before else (name, stop - size, stop, (1, *shape)))
+            at = stop
         self.size = at
-        self.ended, self.completed = (8 * np.array([*starts, *others]) for others in (closing, last))
-        """The addresses in bytes, for a trajectory that ends early and for one whose closing row is the last one."""
-        self.nodes = [(name, a, b - a, shape) for (name, a, b, shape), s in zip(self.closing, saved, strict=True) if not s[3]]
+        self.addresses = 8 * np.array([first for _, first, _, _ in (*self.fields, *self.early, *self.last)])
 
 
 class OneLane:
@@ -50,22 +50,18 @@ class OneLane:
         if p.record is None:
             memory[: places.record] = 0.0
             memory[self.record.state] = p.state
-            for stage, guess in enumerate(p.guess):
-                memory[self.record.unknowns(stage, np.shape(guess)[-1])] = guess
+            for place, guess in zip(places.guesses, p.guess, strict=True):
+                memory[place] = guess
         else:
             memory[: places.record] = p.record[0][0]
         if places.outs > places.params:
             memory[places.params : places.outs] = made.step.parameters.flatten(p.params, None)
-        self.address, self._words = memory.__array_interface__["data"][0], memory.view(np.int64)
-        self._point(places.ended)
+        self.address = memory.__array_interface__["data"][0]
+        pointers = memory[places.outs : places.outs + len(places.addresses)].view(np.int64)
+        np.add(places.addresses, self.address, out=pointers)
         self.numbers = p.t0, p.h, p.first_step
         self.fields = {name: memory[a:b].reshape(shape) for name, a, b, shape in places.fields}
         """The saved arrays."""
-
-    def _point(self, addresses: np.ndarray) -> None:
-        """Have the kernel write there."""
-        places = self.places
-        np.add(addresses, self.address, out=self._words[places.outs : places.outs + len(addresses)])
 
     def advance(self, kernel, first: int, stop: int, threads: int = 1) -> None:
         """Steps `first` to `stop` − 1."""
@@ -105,13 +101,11 @@ class OneLane:
         """The row of the last state, which is the last one saved where the trajectory did not end early."""
         memory, places, at = self.memory, self.places, self.address
         done = memory[self.record.completed] == self.problem.steps
-        if done:
-            self._point(places.completed)
+        outs, closing = (places.last_outs, places.last) if done else (places.early_outs, places.early)
         memory[places.record : places.params] = memory[: places.record]
-        kernel(at + 8 * places.record, at + 8 * places.params, at + 8 * places.closing_outs, 1, *self.numbers, 0, 1, 1,
+        kernel(at + 8 * places.record, at + 8 * places.params, at + 8 * outs, 1, *self.numbers, 0, 1, 1,
                self.problem.max_iterations)  # fmt: skip
-        closing = {name: memory[a:b].reshape(shape) for name, a, b, shape in places.closing}
-        return closing | {name: self.fields[name][:, -1] for name, *_ in places.nodes} if done else closing
+        return {name: memory[a:b].reshape(shape) for name, a, b, shape in closing}
 
     def table(self) -> np.ndarray:
         """The record, (1, quantities)."""

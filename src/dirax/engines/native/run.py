@@ -2,7 +2,6 @@
 
 import math
 import time
-from typing import Any
 
 import numpy as np
 
@@ -117,15 +116,12 @@ class Ready:
             run_seconds=run_seconds,
             record=None if interrupted or others else (table,),
             engine="native",
-            notes={**self.notes, **_told(self.notes, others), "kernel_cached": cached, "threads": lanes.threads},
+            notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
         )
+        if others:
+            outcome.notes["iteration"] = "; then ".join([self.notes.get("iteration", "Newton's method"), *others])
         whole = places is not None and outcome.completed[0] == p.steps  # then the closing row stands where it belongs
         return outcome if whole else finished(p, outcome)
-
-
-def _told(notes: dict[str, Any], others: list[str]) -> dict[str, str]:
-    """What `stats` say of the iteration, with the other ones that followed it."""
-    return {"iteration": "; then ".join([notes.get("iteration", "Newton's method"), *others])} if others else {}
 
 
 def _by_newton(lanes: Lanes | OneLane, made: CollocationKernels) -> list[str]:
