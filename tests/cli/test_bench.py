@@ -147,7 +147,8 @@ def test_elimination_with_fixed_pivots():
     [
         (dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - q @ q / 2), {"q": [1.0, 0.0], "v": [0.0, 0.0]}, "singular"),
         (dx.PortHamiltonian(lambda x: x @ x / 2, np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]), closed=True),
-         {"x": [0.0, 0.0]}, "closed ports"),
+         {"x": [0.0, 1.0]}, "off the final manifold"),
+        (dx.ImplicitSystem(lambda x: jnp.array([[1.0, 1.0]]), lambda x: x[:1]), {"x": [1.0, 0.0]}, "gauge freedom"),
     ],
 )  # fmt: skip
 def test_systems_without_an_explicit_equation_are_left_out(system, data, reason):

@@ -6,9 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 import dirax as dx
+from dirax.diagnostics.explicit_solution import explicit_solution
 
 H = 0.05
 FORMS = lambda q: jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0.3 * q[0]])[None]
@@ -170,7 +172,9 @@ def test_method_1_of_a_constrained_family_warns_that_its_index_is_three():
     pendulum, run = held(lambda x: (x[:2] @ x[:2] - 1)[None], 1), {"step": 0.05, "steps": 20}
     x = np.array([np.sin(1), -np.cos(1), 0.5 * np.cos(1), 0.5 * np.sin(1)])
     with pytest.warns(RuntimeWarning, match="GeneralizedDiracSystem are of index 3 or more: Method 1 does not keep"):
-        dx.simulate(pendulum, dx.DiscreteDirac(), x=x, **run)
+        sol = dx.simulate(pendulum, dx.DiscreteDirac(), x=x, **run)
+    of = lambda sol: {line.quantity: line.verdict for line in dx.verify(sol).lines}
+    assert of(sol)["final manifold"] == "VIOLATED" and not dx.verify(sol).ok
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         chain = dx.constraint_algorithm(pendulum, near=x)
@@ -178,3 +182,26 @@ def test_method_1_of_a_constrained_family_warns_that_its_index_is_three():
         assert np.abs(np.sum(sol.x[:, :2] ** 2, axis=1) - 1.0).max() < 1e-2
         falling = dx.simulate(held(lambda x: x[jnp.array([0, 2])], 2), dx.DiscreteDirac(), x=[0.0, 1.0, 0.0, 0.3], **run)
         np.testing.assert_allclose(falling.x[-1], [0.0, 1.3 - 4.9, 0.0, 0.3 - 9.8], atol=1e-12)
+        assert "final manifold" not in of(falling)
+
+
+def test_the_motion_of_constraints_of_any_index_is_a_reference():
+    """That of the constraint algorithm: of index 3 Method 1 comes to something else, which its own refinement does not show; of a
+    closed port it comes to the motion of the reduced circuit."""
+    structure = dx.DiracStructure.from_bivector(lambda x: dx.canonical_two_form(2))
+    family = lambda x, s: x[2:] @ x[2:] / 2 + 9.8 * x[1] + s[0] * (x[:2] @ x[:2] - 1)
+    pendulum = dx.GeneralizedDiracSystem(structure, dx.LagrangianSubmanifold.from_morse_family(family, 1))
+    x, times = np.array([np.sin(1), -np.cos(1), 0.5 * np.cos(1), 0.5 * np.sin(1)]), np.array([0.5, 1.0])
+    angle = solve_ivp(lambda t, y: [y[1], -9.8 * np.sin(y[0])], (0, 1), [1, 0.5], rtol=1e-12, atol=1e-13, t_eval=times).y
+    expected = np.stack([np.sin(angle[0]), -np.cos(angle[0]), angle[1] * np.cos(angle[0]), angle[1] * np.sin(angle[0])], axis=1)
+    np.testing.assert_allclose(explicit_solution(pendulum, {"x": x})(times)["x"], expected, atol=1e-10)
+    steps = {"step_sizes": [0.1, 0.05, 0.025], "time": 1.0}
+    with pytest.warns(RuntimeWarning, match="index 3"):
+        found = dx.convergence(pendulum, dx.DiscreteDirac(), x=x, **steps)
+    assert found.agrees is False and "does not come to the explicit equations" in found.notes[0]
+
+    capacitors = lambda x: x[0] ** 2 / 2 + x[0] ** 4 / 8 + x[1] ** 2 / 4 + x[2] ** 2 / 2
+    J, B = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), np.array([[1.0], [-1.0], [0.0]])
+    parallel = dx.PortHamiltonian(capacitors, J, B=B, closed=True)
+    found = dx.convergence(parallel, dx.DiscreteDirac(), x=[0.5, 1.125, 0.3], **steps)
+    assert found.agrees and "explicit" in found.reference and abs(found.order - 2) < 0.01

@@ -67,14 +67,13 @@ class ExplicitSolution:
     def _solved(self, t: np.ndarray) -> dict[str, np.ndarray]:
         y = extrapolated(self._field, self.t0, self.ode.start, t)
         n, params = self.ode.shown, self.params
-        if len(self.ode.start) == 2 * n:
-            lagrangian = self.system.lagrangian_form()
-            assert lagrangian is not None
+        lagrangian = self.system.lagrangian_form()
+        if lagrangian is not None and len(self.ode.start) == 2 * n:
             momentum = lambda t, q, v: lagrangian.legendre(q, v, params, t)
             rows = [np.asarray(t, float), y[:, :n], y[:, n:]]
             p = in_numpy(momentum, rows, (Same(self), "p"))
             return {"q": y[:, :n], "p": np.asarray(jax.vmap(momentum)(*rows)) if p is None else p}
-        return {"q": y} if isinstance(self.system, PhaseSpaceLagrangian) else {"x": y}
+        return {"q": y} if isinstance(self.system, PhaseSpaceLagrangian) else {"x": y[:, :n]}
 
 
 def explicit_solution(system: AbstractSystem, run: Mapping[str, Any]) -> ExplicitSolution:

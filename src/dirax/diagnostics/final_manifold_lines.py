@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.diagnostics.report import NOT_CHECKED, VIOLATED, Line
+from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line
 from dirax.diagnostics.rows import initial_of_one, over_rows, shape_of, times_at
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, worst_place
 from dirax.numerics.ranks import rank_of_equations
@@ -14,16 +14,21 @@ from dirax.numerics.tolerances import MANIFOLD_RANK
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.composition_premise import KEPT
-from dirax.run.final_manifold import MOST, chain_at, left_manifold
+from dirax.run.final_manifold import LOOKED_AT, MOST, VISIBLE, chain_at, left_manifold, moved_onto, slope_of
+from dirax.schemes.index_premise import is_of_index_three
 from dirax.solution.solution import Solution
-from dirax.systems.constraint_chain import ConstraintChain
+from dirax.systems.constraint_algorithm import constraint_algorithm
+from dirax.systems.constraint_chain import IRREGULAR, ConstraintChain
 
 NOTICED = 1e-6
 """Jumps below this, relative to the positions, are not called so."""
 
 
 def final_manifold(sol: Solution, tolerance: float | None) -> Line | None:
-    """The constraints of M_f at every row of a run with a singular Lagrangian; None for others."""
+    """The constraints of M_f at every row of a run with a singular Lagrangian, or with a relation of x whose constraints are of
+    index 3 or more; None for others."""
+    if sol.system is not None and "x" in sol.fields:
+        return _of_index_three(sol, tolerance)
     if sol.system is None or not {"q", "p"} <= sol.fields.keys() or sol.q.shape[-1] > MOST:
         return None
     chain = _chain_of(sol)
@@ -48,6 +53,37 @@ def final_manifold(sol: Solution, tolerance: float | None) -> Line | None:
         return Line(name, line.value, line.tolerance, VIOLATED, left)
     text = f"the scheme imposes it inside each step, and not at the rows, which are off by {line.value:.2g}"
     return Line(name, line.value, None, NOT_CHECKED, text)
+
+
+def _of_index_three(sol: Solution, tolerance: float | None) -> Line | None:
+    """Of rows x, and of no multipliers, which those nearest to M_f stand for."""
+    assert sol.system is not None
+    first, n, params = initial_of_one(sol), sol.x.shape[-1], sol.params_of_one
+    form = sol.system.relation_form(shape_of(sol))
+    if form is None or not is_of_index_three(sol.system, form, n, first, params):
+        return None
+    rows = np.asarray(sol.x).reshape(-1, sol.rows, n)[0]
+    try:
+        chain = constraint_algorithm(sol.system, rows[0], params)
+    except (TypeError, ValueError):
+        return None
+    if chain.empty or chain.verdict == IRREGULAR or chain.clock:
+        return None
+    pad = np.zeros(len(chain.coordinates) - n)
+    asked = np.unique(np.linspace(0, len(rows) - 1, LOOKED_AT).astype(int))
+    points = [moved_onto(chain, np.append(x, pad), slice(n, None), params) for x in rows[asked] if np.all(np.isfinite(x))]
+    values = np.array([np.abs(np.asarray(chain.constraints(jnp.asarray(x), params))) for x in points])
+    slopes = np.array([np.abs(np.asarray(evaluated(slope_of(chain), x, params))) @ np.abs(x) for x in points])
+    sizes = np.max(slopes, axis=0)
+    off = np.max(values / np.where(sizes > 0, sizes, 1.0), axis=1, initial=0.0)
+    worst, limit = int(np.argmax(off)), roundoff_limit(tolerance, 1)
+    value, first_of = float(off[worst]), " of the first trajectory" if sol.batch is not None else ""
+    text = f"the constraints of M_f, the hidden ones too, worst at t = {sol.time_of(int(asked[worst])):.6g}{first_of}"
+    if value <= limit:
+        return Line("final manifold", value, limit, OK, text)
+    if value > VISIBLE:
+        return Line("final manifold", value, limit, VIOLATED, f"a constraint of index 3 hides others, which are not kept: {text}")
+    return Line("final manifold", value, None, NOT_CHECKED, f"the scheme does not impose it: {text}")
 
 
 def _left(sol: Solution, chain: ConstraintChain) -> str:

@@ -49,7 +49,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     - steps solved: the largest residual of a run, relative to the terms of its equations, however they cancel, which Newton's
       method brings to their roundoff;
     - final manifold of a singular Lagrangian: 32 ε where a scheme keeps it, and violated where the run starts off it, or jumps
-      across it from one solution of the discrete equations to the other;
+      across it from one solution of the discrete equations to the other; of relations of x with constraints of index 3 or more:
+      violated where rows are off what these hide;
     - momentum maps, and of Euler–Poincaré and Lie–Poisson systems the Casimirs and the spatial momentum (where quantities
       are advected, its part that leaves them alone): 32 ε · steps, the most that 32 roundings a step add up to (a random
       walk gives √steps of that);

@@ -128,8 +128,12 @@ def on_chain(chain: ConstraintChain, q: Any, p: Any, v: Any, t: Any, params: Any
     n, time = len(q), [float(t)] if chain.clock else []
     without_v = len(chain.coordinates) - chain.clock == 2 * n
     x = np.concatenate([q, p, time] if without_v else [q, v, p, time])
-    moved = slice(n, len(x) - chain.clock if q_alone else n if without_v else 2 * n)
-    for _ in range(UPDATES if moved.stop > n else 0):
+    return moved_onto(chain, x, slice(n, len(x) - chain.clock if q_alone else n if without_v else 2 * n), params)
+
+
+def moved_onto(chain: ConstraintChain, x: np.ndarray, moved: slice, params: Any) -> np.ndarray:
+    """The point x with some of its coordinates moved, by least squares, to where the chain admits it."""
+    for _ in range(UPDATES if x[moved].size else 0):
         value = np.asarray(chain.constraints(jnp.asarray(x), params))
         slope = np.asarray(evaluated(slope_of(chain), x, params)) * chain.units
         change = np.linalg.lstsq(slope[:, moved], value, rcond=1e-10)[0]

@@ -25,27 +25,12 @@ _asked: Memo[bool] = Memo(256)
 
 
 def warned_of_index_three(system: AbstractSystem, form: RelationForm, size: int, equation: StepEquation) -> StepEquation:
-    """The equation, which warns where the relation and the first derivatives of its constraints do not determine ẋ at the initial
-    data: Method 1 then keeps no constraint but those that are stated, its momenta do not converge and its multipliers grow like
-    1/h. Asked once of a system."""
-    if not form.multipliers or size + form.multipliers > LARGEST:
-        return equation
-
-    def slopes(data: Any, params: Any) -> Any:
-        complete, t = system.complete(data, params, False), data["t"]
-        x, u = complete["x"], complete.get("guess", jnp.zeros(form.multipliers))
-        both = jnp.concatenate([complete["velocity"], u])
-        of_rates = jacobian(lambda z: form.residual(x, z[:size], z[size:], t, params))(both)
-        return of_rates, jacobian(lambda x: form.residual(x, both[:size], both[size:], t, params))(x)
+    """The equation, which warns of constraints of index 3 or more: Method 1 keeps no constraint but those that are stated, its
+    momenta do not converge and its multipliers grow like 1/h."""
 
     def check(data: Any, h: Any, params: Any) -> None:
         equation.check(data, h, params)
-
-        def ask() -> bool:
-            of_rates, of_points = evaluated(slopes, {"t": np.zeros(()), **data}, params)
-            return _leaves_rates_open(of_rates, of_points, size)
-
-        if _asked.get(Same(system), ask):
+        if is_of_index_three(system, form, size, data, params):
             warnings.warn(
                 f"the constraints of this {type(system).__name__} are of index 3 or more: Method 1 does not keep those that are "
                 "hidden in it, its multipliers grow like 1/h, and what is off the final manifold may grow whatever the step. "
@@ -55,6 +40,26 @@ def warned_of_index_three(system: AbstractSystem, form: RelationForm, size: int,
             )
 
     return dataclasses.replace(equation, check=check)
+
+
+def is_of_index_three(system: AbstractSystem, form: RelationForm, size: int, data: Any, params: Any) -> bool:
+    """Whether the relation and the first derivatives of its constraints do not determine ẋ at initial data. Asked once of a
+    system."""
+    if not form.multipliers or size + form.multipliers > LARGEST:
+        return False
+
+    def slopes(data: Any, params: Any) -> Any:
+        complete, t = system.complete(data, params, False), data["t"]
+        x, u = complete["x"], complete.get("guess", jnp.zeros(form.multipliers))
+        both = jnp.concatenate([complete["velocity"], u])
+        of_rates = jacobian(lambda z: form.residual(x, z[:size], z[size:], t, params))(both)
+        return of_rates, jacobian(lambda x: form.residual(x, both[:size], both[size:], t, params))(x)
+
+    def ask() -> bool:
+        of_rates, of_points = evaluated(slopes, {"t": np.zeros(()), **data}, params)
+        return _leaves_rates_open(of_rates, of_points, size)
+
+    return _asked.get(Same(system), ask)
 
 
 def _leaves_rates_open(of_rates: Any, of_points: Any, size: int) -> bool:

@@ -13,11 +13,15 @@ from dirax.diagnostics.bench.subject import Skipped
 from dirax.numerics.equilibration import equilibrated, geometric_scales
 from dirax.program.memo import Same
 from dirax.program.user_functions import evaluated
+from dirax.run.final_manifold import moved_onto
+from dirax.systems.constraint_algorithm import constraint_algorithm
+from dirax.systems.constraint_chain import DETERMINED
 from dirax.systems.dirac_system import DiracSystem
 from dirax.systems.lagrange_dirac import LagrangeDirac
 from dirax.systems.nonholonomic import NonholonomicMechanics
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 from dirax.systems.port_hamiltonian import PortHamiltonian
+from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
 SINGULAR = 1e12
@@ -53,8 +57,9 @@ def explicit_ode(system: AbstractSystem, data: Mapping[str, Array], params: Any)
     """The equations of motion solved for the derivatives, multipliers eliminated; `data` are initial data of one trajectory.
 
     y is (q, v) for a regular Lagrangian, also with constraints c(t, q, v) = 0: M v̇ = ∂L/∂q + f − (∂²L/∂v∂q) v + (∂c/∂v)ᵀλ
-    with ċ = 0, without any term that would bring y back to the constraints. It is q for a phase-space Lagrangian, and x for a
-    Dirac or port-Hamiltonian system. Raises `Skipped` where the equations do not determine ẏ, or are stated in
+    with ċ = 0, without any term that would bring y back to the constraints. It is q for a phase-space Lagrangian, x for a
+    Dirac or port-Hamiltonian system, and of other relations of x the point of the final manifold that the constraint algorithm
+    finds, x first. Raises `Skipped` where the equations do not determine ẏ, or are stated in
     another way.
     """
     match system:
@@ -68,15 +73,13 @@ def explicit_ode(system: AbstractSystem, data: Mapping[str, Array], params: Any)
             return _solved(_newton_equations(system, len(complete["q"]), params), start, len(complete["q"]))
         case PhaseSpaceLagrangian():
             return _solved(_hamilton_equations(system, params), data["q"], len(data["q"]))
-        case DiracSystem() if system.holonomic is not None and not system.is_graph:
-            raise Skipped("its constraints make it a differential-algebraic equation")
-        case DiracSystem():
+        case DiracSystem() if system.holonomic is None or system.is_graph:
             x = completed(system, data, params)["x"]
             return _solved(_dirac_equations(system, params), x, len(x))
         case PortHamiltonian() if not system.closed:
             return ExplicitODE(_open_ports(system, params), np.asarray(data["x"]), len(data["x"]))
-        case PortHamiltonian():
-            raise Skipped("closed ports make it a differential-algebraic equation")
+    if "x" in data and system.relation_form(Shape(*system.sizes(dict(data), params))) is not None:
+        return _on_final_manifold(system, data, params)
     raise Skipped(f"no ordinary differential equation is derived for {type(system).__name__} systems")
 
 
@@ -126,6 +129,19 @@ def _open_ports(system: PortHamiltonian, params: Any) -> Callable:
         return velocity if system.inputs is None else velocity + system.open_matrix(x, params) @ system.input(t, x, params)
 
     return derivative
+
+
+def _on_final_manifold(system: AbstractSystem, data: Mapping[str, Array], params: Any) -> ExplicitODE:
+    """ẏ = the field that the constraint algorithm finds; of data on the final manifold alone."""
+    x = np.asarray(completed(system, data, params)["x"])
+    chain = constraint_algorithm(system, {"x": x, "t": float(data.get("t", 0.0))} if "t" in data else x, params)
+    if chain.verdict != DETERMINED:
+        raise Skipped(f"the constraint algorithm ends with {chain.verdict}")
+    own = np.asarray(chain.point)[len(x) :]
+    start = moved_onto(chain, np.concatenate([x, own]), slice(len(x), len(x) + len(own) - chain.clock), params)
+    if off := chain.off_level(jnp.asarray(start), params):
+        raise Skipped(f"the data are off the final manifold: {off}")
+    return ExplicitODE(lambda t, y: chain.field(y, params), start, len(x))
 
 
 def _solved(equations: LinearEquations, start: Any, shown: int) -> ExplicitODE:

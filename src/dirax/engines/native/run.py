@@ -119,7 +119,7 @@ class Ready:
             notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
         )
         if others:
-            outcome.notes["iteration"] = "; then ".join([self.notes.get("iteration", "Newton's method"), *others])
+            outcome.notes["iteration"] = "; then ".join([str(self.notes.get("iteration", "Newton's method")), *others])
         whole = places is not None and outcome.completed[0] == p.steps  # then the closing row stands where it belongs
         return outcome if whole else finished(p, outcome)
 
