@@ -452,6 +452,16 @@ def test_steps_of_a_discretization_map_are_in_its_dirac_structure():
     assert broken.value > 0.1
 
 
+@pytest.mark.parametrize("frequency", [10.0, 1.0])
+def test_an_energy_that_blows_up_is_called_so_however_few_rows_there_are(frequency):
+    """Steps of .3 are beyond the stability of the symplectic Euler method at ω = 10: q grows by a factor of 7 a step."""
+    oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - frequency**2 * (q @ q) / 2)
+    sol = dx.simulate(oscillator, dx.PlusLagrangeDirac(), q=[1.0], v=[0.0], step=0.3, steps=30)
+    line = dx.verify(sol)["energy"]
+    assert sol.ok and line.verdict == ("VIOLATED" if frequency == 10.0 else "not checked")
+    assert ("the steps are too long" in line.explanation) == (frequency == 10.0)
+
+
 def test_a_dissipative_system_may_lose_energy():
     system = dx.PortHamiltonian(lambda x: x @ x / 2, np.array([[0.0, 1.0], [-1.0, 0.0]]), R=np.diag([0.0, 0.1]))
     line = verify(dx.simulate(system, dx.DiscreteDirac(), step=0.1, steps=400, x=[1.0, 0.0]))["energy"]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import dirax as dx
+from dirax import gallery
 from dirax.diagnostics import rows
 from dirax.diagnostics.replay_of_many import replayed_of_many
 from dirax.diagnostics.report import VIOLATED
@@ -42,6 +43,13 @@ def test_a_right_run_passes(sol, monkeypatch):
     assert lines["energy"].verdict == "bounded" and "6 of 12 rows" in lines["steps replayed"].explanation
     assert "5 of 11 steps" in lines["saved p"].explanation
     assert lines[SYMPLECTIC].verdict == "ok" and "2 pairs of random directions at 2 of 12 rows" in lines[SYMPLECTIC].explanation
+
+
+def test_nothing_of_a_machine_is_compiled(monkeypatch):
+    """The derivative of a step of the bicycle has 441 numbers: XLA took half a minute for what the scalar program does in two
+    seconds."""
+    monkeypatch.setattr(rows, "_compiled", lambda function, *rest: pytest.fail(f"{function.func} is compiled"))
+    assert dx.verify(gallery.get("bicycle").simulate(steps=20)).ok
 
 
 def test_changed_numbers_are_found(sol):

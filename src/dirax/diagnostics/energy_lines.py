@@ -17,6 +17,9 @@ from dirax.solution.solution import Solution
 BY_WALLS = 10.0
 """A change in a step that a wall divides is one by the wall where it is so many times that of any other step."""
 
+FAR, BALANCED = 1000.0, 0.1
+"""An energy has blown up that moves by so many times its terms at the start, and by such a part of its terms in the run."""
+
 SITES = 64
 """Numbers of each field that show how fast a large system moves."""
 
@@ -51,6 +54,8 @@ def energy_line(sol: Solution) -> Line:
         change = float(np.nanmax(np.abs(energy - energy[:, :1])))
         text = f"the system {changes}; {'less sol.work ' * forced}it changed by {change:.3g}"
         return Line(name, change, None, NOT_CHECKED, text)
+    if blown := _blown_up(sol, energy, size):
+        return blown
     times, found = sol.times, []
     for lane, series in enumerate(energy):
         good = np.isfinite(series)
@@ -66,6 +71,24 @@ def energy_line(sol: Solution) -> Line:
     others = sorted({f.verdict for f in found} - {worst.verdict})
     text += "".join(f"; {details['verdicts'].count(other)} of {len(found)} {other}" for other in others)
     return Line(name, abs(worst.drift), worst.told, worst.verdict, text, details)
+
+
+def _blown_up(sol: Solution, energy: np.ndarray, size: float) -> Line | None:
+    """The line of a run whose energy (B, rows) goes FAR beyond all that it is made of at the start, and is not exchanged with other
+    terms; None for others."""
+    moved = np.nanmax(np.abs(energy - energy[:, :1]), axis=1)
+    if sol.system is None or not np.any(moved > BALANCED * size):
+        return None
+    start = np.abs(energy[:, 0]) + np.ravel(sampled_terms(sol, at_rows(sol, energy_at))[:, 0])
+    lane = int(np.argmax(np.where(start > 0.0, moved / np.where(start > 0.0, start, 1.0), 0.0)))
+    if not moved[lane] > max(FAR * start[lane], BALANCED * size):
+        return None
+    row = int(np.nanargmax(np.abs(energy[lane] - energy[lane, 0])))
+    text = (
+        f"it moved by {moved[lane]:.2g} up to t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}, and its terms at the start are "
+        f"{start[lane]:.2g}: the steps are too long for this motion"
+    )
+    return Line("energy", float(moved[lane]), float(FAR * start[lane]), VIOLATED, text)
 
 
 def _changed_by_walls(sol: Solution, energy: np.ndarray, size: float) -> Line | None:

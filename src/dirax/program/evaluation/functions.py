@@ -23,7 +23,7 @@ from dirax.program.scalar_program import ScalarProgram, program_p
 KEPT = 128
 """Functions kept in memory."""
 
-MOST_NUMBERS = 512
+MOST_NUMBERS = 1024
 """Numbers that a function takes from which on it is not taken apart into operations on scalars: compiling is quicker."""
 
 _programs: Memo[tuple[ScalarProgram, Any] | None] = Memo(KEPT)
