@@ -74,8 +74,8 @@ def energy_line(sol: Solution) -> Line:
 
 
 def _blown_up(sol: Solution, energy: np.ndarray, size: float) -> Line | None:
-    """The line of a run whose energy (B, rows) goes FAR beyond all that it is made of at the start, and is not exchanged with other
-    terms; None for others."""
+    """The line of a run whose energy (B, rows) goes FAR beyond its terms at the start, and is not exchanged with others; None for
+    other runs."""
     moved = np.nanmax(np.abs(energy - energy[:, :1]), axis=1)
     if sol.system is None or not np.any(moved > BALANCED * size):
         return None
@@ -85,8 +85,8 @@ def _blown_up(sol: Solution, energy: np.ndarray, size: float) -> Line | None:
         return None
     row = int(np.nanargmax(np.abs(energy[lane] - energy[lane, 0])))
     text = (
-        f"it moved by {moved[lane]:.2g} up to t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}, and its terms at the start are "
-        f"{start[lane]:.2g}: the steps are too long for this motion"
+        f"it moved by {moved[lane]:.2g} up to t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}, and its terms at the start "
+        f"are {start[lane]:.2g}: the steps are too long for this motion"
     )
     return Line("energy", float(moved[lane]), float(FAR * start[lane]), VIOLATED, text)
 
