@@ -40,3 +40,12 @@ def test_the_condition_of_singular_matrices_is_infinite():
     matrices = np.array([np.eye(2), [[1.0, 1.0], [1.0, -1.0]], [[1.0, 0.0], [2.0**-90, 0.0]], np.zeros((2, 2))])
     for xp in (np, jnp):
         np.testing.assert_allclose(condition_number(xp.asarray(matrices), xp), [1.0, 1.0, np.inf, np.inf], rtol=1e-12)
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_entries_near_the_smallest_floats_have_scales(xp):
+    """A step at the end of a trajectory that comes to rest: its scales were no floats, and nothing could be said of the step."""
+    matrix = xp.asarray([[0.0, -9.5e-306], [9.5e-306, -3.9e-263]])
+    rows, columns = geometric_scales(xp.abs(matrix), xp)
+    assert xp.all(xp.isfinite(1.0 / rows)) and xp.all(xp.isfinite(1.0 / columns))
+    assert condition_number(matrix, xp) == condition_number(matrix * 2.0**900, xp) < 3.0

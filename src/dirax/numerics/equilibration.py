@@ -63,9 +63,17 @@ def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
         rows, columns = (np.reshape(a, (*lead, *a[0].shape)) for a in zip(*each, strict=True))
     else:
         rows, columns = _mean_exponents(exponents, xp)
+    if k * l and (xp is not np or np.any(np.abs(columns) > WIDEST)):  # no exponents of floats: rows share them
+        middle = lambda e: (xp.max(e, axis=(-2, -1), keepdims=True) + xp.min(e, axis=(-2, -1), keepdims=True)) // 2
+        wide = xp.any(xp.abs(columns) > WIDEST, axis=(-2, -1), keepdims=True)
+        shift = xp.where(wide, (middle(columns) - middle(rows)) // 2, 0)
+        rows, columns = rows + shift, columns - shift
     power = lambda exponents: xp.ldexp(xp.ones(exponents.shape), exponents)  # XLA's exp2 is not exact
     return power(rows), power(columns)
 
+
+WIDEST = 1000
+"""Exponents of scales that floats have, and their reciprocals."""
 
 NOTHING = -(2**20)
 """Stands for the exponent of zero."""
@@ -166,12 +174,6 @@ def balanced_inverse(matrix: Any, xp: ModuleType = np) -> Any:
     return found / turned(columns) / turned(rows)
 
 
-def balanced_condition(matrix: np.ndarray) -> float:
-    """The condition number of a matrix whose rows and columns have units of their own."""
-    rows, columns = geometric_scales(np.abs(matrix))
-    return float(np.linalg.cond(matrix / rows / columns))
-
-
 def _inverted(matrices: np.ndarray) -> np.ndarray:
     try:
         return np.linalg.inv(matrices)
@@ -188,7 +190,10 @@ def _inverted(matrices: np.ndarray) -> np.ndarray:
 def condition_number(matrix: Any, xp: ModuleType = np) -> Any:
     """That of matrices whose rows and columns have units of their own, ≥ 1; infinite for a singular one."""
     rows, columns = geometric_scales(xp.abs(matrix), xp)
-    values = xp.linalg.svd(matrix / rows / columns, compute_uv=False)
+    with np.errstate(all="ignore"):
+        scaled = matrix / rows / columns
+    finite = xp.all(xp.isfinite(scaled), axis=(-2, -1), keepdims=True)  # what floats cannot say counts as singular
+    values = xp.linalg.svd(xp.where(finite, scaled, 0.0), compute_uv=False)
     largest, least = values[..., 0], values[..., -1]
     return xp.where(least == 0.0, xp.inf, largest / _nonzero(xp, least))
 

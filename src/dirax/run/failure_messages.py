@@ -14,7 +14,7 @@ from dirax.engines.sizes import Sizes
 from dirax.engines.stage_in_numbers import InJax, InNumbers, in_numbers
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.stopping import STALLED
-from dirax.numerics.equilibration import balanced_condition, balanced_inverse
+from dirax.numerics.equilibration import balanced_inverse, condition_number
 from dirax.numerics.tolerances import EPSILON, LARGEST_CONDITION
 from dirax.program.graph import GraphTooLarge
 from dirax.program.roots import FEWEST_SPARSE, sparse_equations
@@ -190,7 +190,7 @@ def _dense(numbers: InNumbers | InJax, args) -> Callable:
     def linearized(u):
         residual, jacobian = numbers.linearized(u, *args)
         broken = ~np.isfinite(residual) | ~np.all(np.isfinite(jacobian), axis=1)
-        condition = np.inf if np.any(broken) else balanced_condition(jacobian)
+        condition = np.inf if np.any(broken) else float(condition_number(jacobian))
         return residual, broken, lambda right: np.linalg.lstsq(jacobian, right)[0], condition
 
     return linearized
@@ -246,6 +246,6 @@ def _roundoff(numbers: InNumbers | InJax, u, args, sizes) -> np.ndarray:
     is a function of."""
     by_u, by_state = numbers.slopes(u, *args)
     left = np.abs(by_u) @ np.abs(u) + np.abs(by_state) @ np.abs(args[0])
-    if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and balanced_condition(by_u) < LARGEST_CONDITION):
+    if not (np.all(np.isfinite(by_u)) and np.all(np.isfinite(left)) and condition_number(by_u) < LARGEST_CONDITION):
         return np.full(len(u), np.inf)
     return EPSILON * np.abs(balanced_inverse(by_u)) @ left / (np.abs(u) + sizes)
