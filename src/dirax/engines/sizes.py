@@ -164,7 +164,7 @@ def _closely(at: Entries) -> list[np.ndarray]:
         return found
     try:
         here = at.state, at.guesses, at.t, at.h, at.leaves
-        _, sizes, good = StepsInNumbers(None, at.program).solved(*here, follow=True, sizes=found)
+        _, sizes, good = StepsInNumbers.of_program(at.program).solved(*here, follow=True, sizes=found)
         of_equations = lambda stage: np.max([a for (s, _), a in zip(at.stages, sizes, strict=True) if s is stage], axis=0)
         solutions = [MOST * of_equations(stage) for stage, _ in at.stages]
         most = [np.where(good[:, None], a, FAR * np.abs(u)) for a, u in zip(solutions, at.guesses, strict=True)]

@@ -93,7 +93,11 @@ class StepsInNumbers:
     def of(cls, equation: StepEquation | StepSequence, params: Any, batch_params: bool) -> "StepsInNumbers":
         """Made once for an equation. Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for too
         large a Jacobian."""
-        program = step_program(equation, params, batch_params)
+        return cls.of_program(step_program(equation, params, batch_params), equation)
+
+    @classmethod
+    def of_program(cls, program: StepProgram, equation: StepEquation | StepSequence | None = None) -> "StepsInNumbers":
+        """The same, made once for a program."""
         return _made.get((Same(equation), Same(program)), lambda: cls(equation, program))
 
     def operations(self, states: int = 1, call: int = 1) -> int:
