@@ -296,7 +296,7 @@ def test_sizes_of_a_step_that_is_too_large_to_be_solved_in_numbers(monkeypatch):
 
     at = sizes._entries(far, 0.0, np)
     assert sizes._closely(at)[0][0, 0] > 2 * sizes.FAR * 1e-9
-    monkeypatch.setattr(sizes, "StepsInNumbers", too_large)
+    monkeypatch.setattr(sizes.StepsInNumbers, "of_program", too_large)
     assert 0.0 < sizes._closely(at)[0][0, 0] <= 2 * sizes.FAR * 1e-9
 
 
