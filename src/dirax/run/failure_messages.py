@@ -173,7 +173,10 @@ def _where_it_ends(numbers: InNumbers | InJax, guess, args) -> str:
         return ""
     one = lambda a: np.asarray(a, float)[None]
     of_step = one(t), one(h), one(numbers.params)
-    part = float(StepsInNumbers(None, numbers.step).followed(0, one(guess), one(state), of_step, True)[1][0])
+    try:
+        part = float(StepsInNumbers.of_program(numbers.step).followed(0, one(guess), one(state), of_step, True)[1][0])
+    except GraphTooLarge:
+        return ""
     if part == 0.0:
         return ""
     if part == 1.0:

@@ -76,9 +76,10 @@ class CollocationKernels:
         return {"iteration": f"{FIXED_POINT} {kind}, {side}"}
 
     def _run(self, width: int, levels: tuple[int, ...]) -> Linked:
-        """The code of `run` for a width, which is compiled in little time, and so is quick at once."""
+        """The code of `run` for a width."""
         text = lambda: collocation_module(self.plan, width, llvm.has_fma(), self.newton)
-        return linked("run", (self.digest, width, "collocation", "newton" * self.newton), text, lambda: self.operations)
+        key = self.digest, width, "collocation", "newton" * self.newton
+        return linked("run", key, text, lambda: self.operations, levels)
 
 
 _kernels: Memo[CollocationKernels | None] = Memo(KEPT)
@@ -99,7 +100,7 @@ def _made(stage: Any, step: StepProgram) -> CollocationKernels | None:
     """The relation at one node is traced into a copy of the step's graph."""
     equation = step.equations[0]
     rows = [(name, equation.rows[name].ravel().tolist()) for name in sorted(equation.rows)]
-    g = step.graph.copy(NODE_LIMIT)
+    g = step.graph.copy(len(step.graph) + NODE_LIMIT)
     if depends(g, [node for _, nodes in rows for node in nodes], [*equation.unknowns, step.shared.t, step.shared.h]):
         return None
     try:
