@@ -64,9 +64,10 @@ class ManifoldCollocation(AbstractStep):
         return sum(numbered, Labels())
 
     def frame(self, q):
-        """The basis F (N, d) of the tangent space at q in which its chart has coordinates; the step does not depend on it, and it
-        may not be smooth."""
-        return jax.lax.stop_gradient(self.manifold.frame(q))
+        """The basis F (N, d) of the tangent space at q in which its chart has coordinates. The step does not depend on it, and it
+        may not be smooth: fixed vectors, whose projections turn with the tangent space, on which the chart does depend."""
+        fixed = jax.lax.stop_gradient(self.manifold.frame(q))
+        return jax.vmap(lambda f: self.manifold.projection(q, f), 1, 1)(fixed)
 
     @once
     def slopes(self, point, velocity, params):
