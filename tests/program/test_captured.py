@@ -71,7 +71,18 @@ def _inside_another():
     return functools.partial(lambda a, q, v: a * v @ v / 2 - potential(q), 1.0), lambda: own.update(k=4.0)
 
 
+def _class_attribute():
+    class Constants:
+        k = 1.0
+
+    class Of(Constants):
+        pass
+
+    return (lambda q, v: v @ v / 2 - Of.k * q @ q / 2), lambda: setattr(Constants, "k", 4.0)
+
+
 WAYS = {
+    "class": _class_attribute,
     **{"cell": _cell, "array": _array, "attribute": _attribute, "object": lambda: _attribute(Called)},
     **{"dictionary": _dictionary, "inside another": _inside_another},
 }
@@ -114,6 +125,19 @@ def test_what_is_the_same_value_is_no_change(monkeypatch):
     monkeypatch.setitem(globals(), "stiffness", float("1.0"))
     assert calls and not system.lagrangian.captured.changed()
     assert pickle.loads(pickle.dumps(Captured(by_global))).watched[0].before == 1.0
+
+
+@pytest.mark.parametrize("kind", [dx.Event, dx.Impact])
+def test_events_and_walls_are_looked_at_too(kind):
+    level, ball = {"w": 0.8}, dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0])
+    height = lambda q: q[0] - level["w"]
+    event, fall = kind(height), {"q": [1.0], "v": [0.0], "step": 0.01, "steps": 150}
+    found = lambda event: dx.simulate(ball, MIDPOINT, events=[event], **fall).events.t[0]
+    assert found(event) == pytest.approx(np.sqrt(0.4), abs=1e-4)
+    level["w"] = 0.5
+    with pytest.raises(ValueError, match=r"reads level\['w'\], which was 0\.8 when it was stated"):
+        found(event)
+    assert found(kind(height)) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_functions_that_were_defined_anew_alike_are_the_same(monkeypatch):

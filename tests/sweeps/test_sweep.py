@@ -17,6 +17,7 @@ import xarray as xr
 
 import dirax as dx
 import swept_pendulums
+from dirax.solution.fingerprint import of_code
 from dirax.solution.flushed_files import Hold
 from dirax.solution.stored import TYPES
 from dirax.sweeps import arrange, commit, executors, store, sweep, task, trial
@@ -60,6 +61,18 @@ def test_every_point_has_the_bits_of_a_run_by_itself(done):
     assert np.all(data.status == 1) and not np.any(data.message.values != "")
     assert np.array_equal(data.g, OVER["g"]) and np.array_equal(data.angle, OVER["angle"])
     assert data.attrs["scheme"] == repr(dx.LagrangeDAlembert()) and data.attrs["step"] == 0.01
+
+
+def test_rows_of_constraints_have_the_name_that_files_give_them(tmp_path):
+    """Every task of a scheme that saves `constraint` failed: it is `constraint_residual` in a store."""
+    one_form = lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
+    skate = dx.LagrangeDirac(lambda q, v, g: v @ v / 2 - g * q[0], one_form)
+    begun = lambda g: {"q": [0.0, 0.0, 0.0], "v": [0.0, 0.0, 1.0], "params": g}
+    run = {"step": 0.02, "steps": 21, "save_every": 4}
+    data = dx.sweep(skate, dx.LagrangeDAlembert(), over={"g": [0.5, 2.0]}, case=begun, to=tmp_path / "skate.zarr", **run)
+    sol = dx.simulate(skate, dx.LagrangeDAlembert(), **begun(2.0), **run)
+    assert np.all(data.status == 1) and np.array_equal(data.constraint_residual.values[1], sol.constraint)
+    assert np.array_equal(data.multipliers.values[1], sol.multipliers)
 
 
 def test_any_zarr_library_opens_the_store_and_so_does_load(done):
@@ -229,6 +242,17 @@ def test_more_points_side_by_side(tmp_path, ran):
     assert sum(ran) == 5 and np.array_equal(data.q.values[1], single(OVER["g"][3], OVER["angle"][3]).q)
 
 
+class Above:
+    def __init__(self, level):
+        self.level = level
+
+    def __call__(self, sol):
+        return self.count(sol)
+
+    def count(self, sol):
+        return {"count": np.sum(sol.q > self.level)}
+
+
 def test_the_store_of_another_sweep_is_refused_with_what_differs(done):
     _, path = done
     before = {name: (path / name).read_bytes() for name in files(path)}
@@ -239,6 +263,8 @@ def test_the_store_of_another_sweep_is_refused_with_what_differs(done):
         study(path, case=other)
     with pytest.raises(ValueError, match="differs in keep"):
         study(path, keep=lambda sol: {"end": sol.q[-1]})
+    codes = [of_code(Above(1.0)), of_code(Above(2.0)), of_code(Above(1.0).count), of_code(Above(2.0).count)]
+    assert len(set(codes)) == 4 and of_code(Above(1.0)) == codes[0]
     assert before == {name: (path / name).read_bytes() for name in files(path)}
     renamed = lambda g, angle: dict(v=[0.0, 0.0], q=[1.0 * angle, 0.0], params={"g": g})
     assert renamed(1.0, 2.0) == case(1.0, 2.0)

@@ -159,8 +159,8 @@ def refuse_changed(captured: Iterable[tuple[str, Captured]]) -> None:
     for name, each in captured:
         if words := each.changed():
             raise ValueError(
-                f"{name} reads {words}; what was traced of it keeps the old value: state the system again for the new one, or "
-                "hand the value over in params."
+                f"{name} reads {words}; what was traced of it keeps the old value: state it again for the new one, or hand the "
+                "value over in params."
             )
 
 
@@ -185,7 +185,8 @@ def _attribute(value: Any, name: str) -> Any:
     """As it is stored: nothing is computed."""
     if name in value.__dict__:
         return value.__dict__[name]
-    return next((kind.__dict__[name] for kind in type(value).__mro__ if name in kind.__dict__), ABSENT)
+    kinds = value.__mro__ if isinstance(value, type) else type(value).__mro__
+    return next((kind.__dict__[name] for kind in kinds if name in kind.__dict__), ABSENT)
 
 
 def _with_methods(value: Any, names: frozenset[str]) -> frozenset[str]:
@@ -206,6 +207,8 @@ def _contents(cell: Any) -> Any:
 
 
 def _is_of_library(value: Any) -> bool:
+    if isinstance(value, type):
+        return (value.__module__ or "").partition(".")[0] in LIBRARIES | {"dirax"}
     name = value.__name__ if isinstance(value, types.ModuleType) else type(value).__module__ or ""
     file = getattr(value, "__file__", None) or "" if isinstance(value, types.ModuleType) else ""
     return name.partition(".")[0] in LIBRARIES or "site-packages" in file

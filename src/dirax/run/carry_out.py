@@ -96,7 +96,7 @@ def kind_for(settings: Settings, case: Case) -> Kind | None:
 
 
 def _reads(settings: Settings) -> list[tuple[str, Captured]]:
-    return list(functions_in([settings.system, settings.scheme]))
+    return list(functions_in([settings.system, settings.scheme, *settings.events]))
 
 
 @dataclass

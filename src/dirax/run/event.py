@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from dirax.program.captured import as_stated
 from dirax.program.user_functions import reads_outside
 from dirax.text.representation import value_text
 
@@ -42,11 +43,14 @@ class Event:
     Raises `TypeError` for something that is no function of such arguments, `ValueError` for another direction.
     """
 
+    name = "the function of a dx.Event"
+
     def __init__(self, function: Callable, direction: int = 0, terminal: bool = False):
         if isinstance(direction, bool) or direction not in (-1, 0, 1):
             raise ValueError(f"direction must be +1 (rising), −1 (falling) or 0 (both), but {direction!r} was given.")
-        self.function, self.direction, self.terminal = function, int(direction), bool(terminal)
+        self.direction, self.terminal = int(direction), bool(terminal)
         self.arguments = names_of(function, "the function of an event")
+        self.captured, self.function = as_stated(function)
 
     def __call__(self, known: dict[str, Any]) -> Any:
         """The function of what is known of one moment, by name."""

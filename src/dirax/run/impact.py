@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dirax.program.captured import as_stated
 from dirax.program.evaluation.functions import program_of
 from dirax.program.linear_solves import solve
 from dirax.program.tracing import once
@@ -47,13 +48,15 @@ class Impact:
     """
 
     terminal = False
+    name = "the gap of a dx.Impact"
 
     def __init__(self, gap: Callable, restitution: float = 1.0):
         number = not isinstance(restitution, bool) and isinstance(restitution, int | float | np.number)
         if not number or not 0.0 <= restitution <= 1.0:
             raise ValueError(f"restitution must be a number from 0 to 1, but {restitution!r} was given.")
         self.arguments = names_of(gap, "gap", KNOWN)
-        self.gap, self.restitution = gap, float(restitution)
+        self.captured, self.gap = as_stated(gap)
+        self.restitution = float(restitution)
 
     @property
     def works(self) -> bool:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from dirax.program.captured import reads
+from dirax.program.captured import Captured, reads
 from dirax.solution.plain_forms import encode_scheme
 
 ADDRESS = re.compile(r"0x[0-9a-fA-F]+")
@@ -56,9 +56,13 @@ def of_scheme(scheme: Any) -> str:
 
 
 def of_code(function: Any) -> str:
-    """A digest of the code of a function, with the values and functions that it refers to."""
+    """A digest of the code of a function, or of an object that is called, with the values and functions that it refers to."""
     digest = hashlib.sha256()
-    _add_code(digest.update, function, set())
+    seen: set[int] = set()
+    _add_code(digest.update, function, seen)
+    for words, _, value in Captured(function).watched:
+        digest.update(words.encode())
+        _add_code(digest.update, value, seen)
     return digest.hexdigest()[:SHOWN]
 
 

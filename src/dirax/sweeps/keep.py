@@ -15,6 +15,7 @@ import numpy as np
 
 from dirax.numerics.arrays import agree
 from dirax.program.memo import Memo, Same
+from dirax.solution.description import layout_of
 from dirax.solution.solution import Solution
 from dirax.solution.stored import TYPES
 from dirax.solution.trajectory import BLOCK
@@ -73,7 +74,7 @@ class Keep:
     def at(self, sol: Solution, values: Values) -> dict[str, np.ndarray]:
         """What is kept of a batch, arrays (B, …) by name. Raises `PointError`."""
         if self.mode == "rows":
-            return {name: np.asarray(array) for name, array in sol.fields.items()}
+            return {entry["variable"]: np.asarray(sol.fields[entry["name"]]) for entry in layout_of(sol.field_info)}
         size = sol.batch or 0
         if self.quick:
             sol.derived["energy"] = energy_of(sol)
