@@ -135,3 +135,28 @@ def test_an_entry_that_there_is_not_is_refused_and_one_looked_up_is_not():
             dx.simulate(free, dx.LagrangeDAlembert(), events=[event], **start)
     looked_up = dx.Event(lambda q: q[jnp.argmax(q)] - 0.5 + jnp.array([0.0, 1.0])[jnp.int64(q[0] > 7)])
     assert not len(dx.simulate(free, dx.LagrangeDAlembert(), events=[looked_up], **start).events)
+
+
+@pytest.mark.parametrize(
+    "scheme",
+    [
+        dx.PlusLagrangeDirac(),
+        dx.MinusLagrangeDirac("midpoint"),
+        dx.DiscreteDirac(dx.Theta(0.0)),
+        dx.DiscreteDirac(dx.Theta(1.0), constraints="resolve"),
+    ],
+)
+def test_schemes_of_first_order_have_no_bend_of_the_velocity_of_their_own(scheme):
+    """Rows have velocities of half a step before or after: a cubic through them crossed zero two or three times."""
+    stiffening = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2 - q[0] ** 4)
+    events = [dx.Event(lambda p: p[0]), dx.Event(lambda v: v[0])]
+    sol = dx.simulate(stiffening, scheme, q=[1.0], v=[0.3], step=0.02, steps=400, events=events)
+    crossings = np.flatnonzero(np.diff(np.sign(sol.p[:, 0])))
+    for number in (0, 1):
+        found = sol.events.t[sol.events.index == number]
+        assert len(found) == 6 and np.all(np.floor(found / 0.02) == crossings)
+    rows = sol.at(sol.t)
+    np.testing.assert_allclose(rows.p, sol.p, atol=1e-14)
+    inside = sol.at(np.linspace(0.0, 8.0, 4001))
+    slope, mean = np.diff(inside.q[:, 0]) / 0.002, (inside.p[1:, 0] + inside.p[:-1, 0]) / 2
+    assert np.max(np.abs(slope - mean)) < 0.06  # half a step of the largest force

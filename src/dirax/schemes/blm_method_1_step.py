@@ -37,6 +37,10 @@ class MethodOneStep(LagrangianStep):
         return self.lift.flat and super().canonical
 
     @property
+    def one_sided(self) -> bool:
+        return isinstance(self.lift, ThetaLift) and self.lift.theta != 0.5
+
+    @property
     def labels(self) -> Labels:
         balance = Labels.numbered("momentum balance {}", self.lift.dimension)
         return balance + tuple(f"constraint {r} at the base point" for r in self.rows.kept)
@@ -92,6 +96,10 @@ class MethodOnePart(PartOfStep):
     """
 
     inner: MethodOneStep
+
+    @property
+    def one_sided(self) -> bool:
+        return self.inner.one_sided
 
     @property
     def unknowns(self) -> Layout:

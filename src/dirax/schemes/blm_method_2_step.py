@@ -26,6 +26,10 @@ class ThetaStep(LagrangianStep):
     theta: float
 
     @property
+    def one_sided(self) -> bool:
+        return self.theta != 0.5
+
+    @property
     def labels(self) -> tuple[str, ...]:
         return numbered(self.unknowns.size)
 

@@ -26,6 +26,9 @@ the momentum."""
 
 PROJECTION = "projection of the momentum"
 
+ONE_SIDED = "left", "right"
+"""Quadratures of first order."""
+
 
 @dataclass(frozen=True, eq=False)
 class LagrangeDAlembertStep(AbstractStep):
@@ -182,7 +185,8 @@ class LagrangeDAlembertStep(AbstractStep):
 
     @property
     def hermite(self):
-        return hermite(self.system)
+        one_sided = self.rule in ONE_SIDED or (self.shape.m > 0 and self.constraint in ONE_SIDED)
+        return hermite(self.system, one_sided)
 
     # ------------------------------------------------------------------------------------------------------ the start
 

@@ -10,7 +10,7 @@ from dirax.schemes.discrete_structure import AbstractDiscreteStructure
 from dirax.schemes.discrete_structure_charts import PairsInCharts
 from dirax.schemes.discrete_structure_pairs import structure_on_pairs
 from dirax.schemes.lagrange_dalembert_part import LagrangeDAlembertPart
-from dirax.schemes.lagrange_dalembert_step import MOMENTA, LagrangeDAlembertStep
+from dirax.schemes.lagrange_dalembert_step import MOMENTA, ONE_SIDED, LagrangeDAlembertStep
 from dirax.schemes.lagrange_poincare_dirac import LagrangePoincareDiracStep
 from dirax.schemes.reduced_step_in_charts import ReducedStepInCharts
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
@@ -66,7 +66,7 @@ class LagrangeDAlembert(AbstractScheme):
     ):
         self.discrete_lagrangian = checked_rule(discrete_lagrangian, RULES, "discrete_lagrangian")
         self.constraint = checked_rule(constraint, CONSTRAINTS, "constraint")
-        one_sided = self.constraint in ("left", "right")
+        one_sided = self.constraint in ONE_SIDED
         self.momentum = checked_momentum(("incoming" if one_sided else "mean") if momentum is None else momentum)
 
     def step_equation(self, system: Any, shape: Shape) -> StepEquation:

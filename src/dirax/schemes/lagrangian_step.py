@@ -56,7 +56,12 @@ class LagrangianStep(AbstractStep):
     @property
     def hermite(self):
         system = self.system.lagrangian_form()
-        return None if system is None else hermite(system)
+        return None if system is None else hermite(system, self.one_sided)
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether the velocities of rows belong to another place in the steps."""
+        return False
 
     def row(self, state: Float[Array, " s"]) -> dict[str, Array]:
         """What is saved of a state."""
