@@ -462,6 +462,18 @@ def test_an_energy_that_blows_up_is_called_so_however_few_rows_there_are(frequen
     assert ("the steps are too long" in line.explanation) == (frequency == 10.0)
 
 
+def test_rows_without_an_energy_are_no_good_rows():
+    """A bead in a potential log q reaches q = 0 in finite time; the equations have 1/q alone, and go on beyond."""
+    bead = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - jnp.log(q[0]))
+    sol = dx.simulate(bead, dx.Collocation(2), q=[0.9], v=[0.0], step=0.001, steps=1400)
+    line = dx.verify(sol)["energy"]
+    assert sol.ok and line.verdict == "VIOLATED" and "not finite in 273 of 1401 rows, first at t = 1.128" in line.explanation
+    ended = dx.simulate(bead, dx.LagrangeDAlembert(), q=[0.9], v=[0.0], step=0.001, steps=1400)
+    assert not ended.ok and dx.verify(ended)["energy"].verdict != "VIOLATED"
+    found = dx.compare(bead, [dx.Collocation(2)], q=[0.9], v=[0.0], step=0.01, steps=140)
+    assert found.entries[0].drift == "not finite"
+
+
 def test_a_dissipative_system_may_lose_energy():
     system = dx.PortHamiltonian(lambda x: x @ x / 2, np.array([[0.0, 1.0], [-1.0, 0.0]]), R=np.diag([0.0, 0.1]))
     line = verify(dx.simulate(system, dx.DiscreteDirac(), step=0.1, steps=400, x=[1.0, 0.0]))["energy"]

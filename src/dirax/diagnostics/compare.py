@@ -35,7 +35,7 @@ class Entry:
     """One scheme's row. `error` is the largest, relative as in `dx.convergence`, over the stretch over which the order was
     measured; None is not known.
 
-    `drift` is the verdict on the energy, less the work of the forces ("bounded", "drifts", "not checked"), `slope`
+    `drift` is the verdict on the energy, less the work of the forces ("bounded", "drifts", "not checked", "not finite"), `slope`
     its least-squares slope per unit of time.
     """
 
@@ -197,7 +197,8 @@ def _entry(name: str, sol: Solution, order, precision, note: str, seconds: float
         motion = np.asarray(sol.fields["q"] if "q" in sol.fields else sol.fields["x"])
         size = energy_scale(sol, energy)
         roundoff = 8 * EPSILON * np.sqrt(steps) * size
-        drift = "not checked" if changes else judge(sol.t, energy, motion, roundoff, size).verdict
+        finite = np.all(np.isfinite(energy))
+        drift = "not finite" if not finite else "not checked" if changes else judge(sol.t, energy, motion, roundoff, size).verdict
     constraint = np.asarray(sol.constraint_residual())
     return Entry(
         scheme=name,

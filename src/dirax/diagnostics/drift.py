@@ -75,7 +75,7 @@ def judge(
         return Judgement(NOT_CHECKED, "fewer than two rows were computed", 0.0, roundoff)
     width = float(np.ptp(series))
     if width <= roundoff:
-        return Judgement(BOUNDED, f"constant up to roundoff, within {width:.2g}", width, roundoff, {"band": width})
+        return Judgement(BOUNDED, f"within {width:.2g}, no more than roundings may add up to", width, roundoff, {"band": width})
     if len(series) < SMALLEST_SERIES:
         text = f"it moved by {width:.2g}; {len(series)} rows are too few to tell a drift ({SMALLEST_SERIES} needed)"
         return Judgement(NOT_CHECKED, text, width, roundoff, {"band": width})

@@ -11,6 +11,7 @@ from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Lin
 from dirax.diagnostics.rows import LARGE, at_rows, energy_at, energy_of, row_numbers
 from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled_terms, spread, steps_of
 from dirax.numerics.tolerances import EPSILON
+from dirax.schemes.energy_collocation_step import NOTICED as DEFECT
 from dirax.schemes.step import CLOCK
 from dirax.solution.solution import Solution
 
@@ -44,6 +45,8 @@ def energy_line(sol: Solution) -> Line:
     energy = energy.reshape(-1, energy.shape[-1])
     if not np.any(np.isfinite(energy)):
         return Line(name, None, None, NOT_CHECKED, "the system states no energy")
+    if outside := _outside(sol, energy):
+        return outside
     size = energy_scale(sol, energy)
     roundoff = ROUNDINGS * EPSILON * steps_of(sol) * size
     if jump := energy_jump(sol, energy, size):
@@ -54,8 +57,8 @@ def energy_line(sol: Solution) -> Line:
         change = float(np.nanmax(np.abs(energy - energy[:, :1])))
         text = f"the system {changes}; {'less sol.work ' * forced}it changed by {change:.3g}"
         return Line(name, change, None, NOT_CHECKED, text)
-    if blown := _blown_up(sol, energy, size):
-        return blown
+    if broken := _blown_up(sol, energy, size) or _not_kept(sol):
+        return broken
     times, found = sol.times, []
     for lane, series in enumerate(energy):
         good = np.isfinite(series)
@@ -71,6 +74,33 @@ def energy_line(sol: Solution) -> Line:
     others = sorted({f.verdict for f in found} - {worst.verdict})
     text += "".join(f"; {details['verdicts'].count(other)} of {len(found)} {other}" for other in others)
     return Line(name, abs(worst.drift), worst.told, worst.verdict, text, details)
+
+
+def _outside(sol: Solution, energy: np.ndarray) -> Line | None:
+    """The line of a run with rows (B, rows) that have no energy, though they were computed; None for others."""
+    place = np.asarray(sol.fields["q" if "q" in sol.fields else "x"]).reshape(*energy.shape, -1)
+    missing = np.all(np.isfinite(place), axis=2) & ~np.isfinite(energy)
+    if not np.any(missing) or not np.any(np.isfinite(energy[:, 0])):
+        return None
+    lane, row = np.argwhere(missing)[0].tolist()
+    count, where = int(np.sum(missing)), f"t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
+    text = (
+        f"it is not finite in {count} of {energy.size} rows, first at {where}: the trajectory has left the domain of the system's "
+        "functions, whose derivatives may go on as if nothing were there"
+    )
+    return Line("energy", None, None, VIOLATED, text)
+
+
+def _not_kept(sol: Solution) -> Line | None:
+    """The line of a run by a scheme that keeps the energy, and did not in a step; None for others."""
+    defect = float(np.nanmax(sol.fields["energy_defect"], initial=0.0)) if "energy_defect" in sol.fields else 0.0
+    if defect <= DEFECT:
+        return None
+    text = (
+        "changes by so much of its terms in a step, less its work: the quadrature is not exact for such steps, or one of them "
+        "passed a place where the equations are nearly singular; take smaller steps, or more points="
+    )
+    return Line("energy", defect, DEFECT, VIOLATED, text)
 
 
 def _blown_up(sol: Solution, energy: np.ndarray, size: float) -> Line | None:
