@@ -85,8 +85,8 @@ def _outside(sol: Solution, energy: np.ndarray) -> Line | None:
     lane, row = np.argwhere(missing)[0].tolist()
     count, where = int(np.sum(missing)), f"t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
     text = (
-        f"it is not finite in {count} of {energy.size} rows, first at {where}: the trajectory has left the domain of the system's "
-        "functions, whose derivatives may go on as if nothing were there"
+        f"it is not finite in {count} of {energy.size} rows, first at {where}: the trajectory has left the domain of the "
+        "system's functions, whose derivatives may go on as if nothing were there"
     )
     return Line("energy", None, None, VIOLATED, text)
 
