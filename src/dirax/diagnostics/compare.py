@@ -160,7 +160,8 @@ def compare(
             label = f"{best} refined"
             _, precision, note = _order(system, named[name], step, steps, target, run)
         entries.append(_entry(name, sol, order, precision, note, float(np.median(seconds[name]))))
-    return Comparison(f"{type(system).__name__}: {steps} steps of {step:g}, errors against {label}", tuple(entries))
+    stretch = f" of the first {ORDER_STEPS}" if steps > ORDER_STEPS else ""
+    return Comparison(f"{type(system).__name__}: {steps} steps of {step:g}, errors{stretch} against {label}", tuple(entries))
 
 
 def _named(schemes: Sequence[AbstractScheme]) -> dict[str, AbstractScheme]:
