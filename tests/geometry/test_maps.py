@@ -10,6 +10,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dirax import Collocation, DiscreteGradient, ManifoldLagrangian, PortHamiltonian, simulate
 from dirax.geometry.cotangent_lift import CotangentBundle, CotangentLift, cotangent_lift, symplecticity_defect
 from dirax.geometry.lie_groups import SE2, SE3, SO2, SO3
 from dirax.geometry.map_report import check_discretization_map
@@ -349,6 +350,17 @@ def test_orthogonal_projection_to_the_image_of_an_oblique_projector():
     assert surface.dimension == 2
 
 
+def test_the_dimension_of_an_image_is_asked_where_a_run_begins():
+    """It is the trace of DP; a wrong one was believed, and ran."""
+    wrong = ManifoldLagrangian(lambda q, v: v @ v / 2, Submanifold(to_parabola, 3, dimension=1))
+    x = np.array([0.5, 0.2, 0.25 + 0.1])
+    with pytest.raises(ValueError, match="has dimension 2 at q, the trace of DP, but dimension=1 was given"):
+        simulate(wrong, Collocation(2), q=Submanifold(to_parabola, 3).nearest(x), v=[0.0, 0.0, 0.0], step=0.1, steps=2)
+    near_one = lambda x: x / jnp.sqrt(x[0] - 1.0)  # not defined at the place where its dimension is found
+    with pytest.raises(ValueError, match="trace nan"):
+        Submanifold(near_one, 2)
+
+
 @pytest.mark.parametrize("x", [np.zeros(4), np.ones(4), np.array([1.0, -1.0, 0.5, 0.5])], ids=str)
 def test_a_frame_does_not_turn_with_a_rounding(x):
     """The projections to tangent spaces have one singular value, of which singular vectors are any: a run chose others in each
@@ -415,3 +427,20 @@ def test_maps_that_cannot_be():
         cotangent_lift(cotangent_lift(SphereProjection()))(jnp.zeros(12), jnp.zeros(12))
     with pytest.raises(ValueError, match=r"trace 1\.2 at .* whole number"):
         Submanifold(lambda x: 0.4 * x, 3)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ProductMap(SphereProjection(), Midpoint()), "pairs of a map and the number of coordinates"),
+        (lambda: ProductMap((Midpoint(), -3)), "pairs of a map and the number"),
+        (lambda: Theta("a"), "theta must be in"),
+        (lambda: DiscreteGradient("mean-value", 2.5), "nodes must be a whole number"),
+        (lambda: PortHamiltonian(lambda x: x @ x, J="a"), "J must be a matrix or a function"),
+        (lambda: PortHamiltonian(lambda x: x @ x, np.zeros((2, 2)), B=np.eye(2), closed=(1.5,)), "numbers of the columns of B"),
+        (lambda: PortHamiltonian(lambda x: x @ x, np.zeros((2, 2)), B=np.eye(2), closed="ab"), "numbers of the columns of B"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_in_words(make, words):
+    with pytest.raises((TypeError, ValueError), match=words):
+        make()

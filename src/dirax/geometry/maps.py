@@ -17,7 +17,9 @@ from dirax.geometry.manifolds import AbstractGeodesicManifold, AbstractManifold,
 from dirax.geometry.products import Product
 from dirax.geometry.spaces import Euclidean, Sphere
 from dirax.geometry.squared_angles import Scalar, norm
+from dirax.numerics.arrays import is_whole
 from dirax.program.user_functions import is_traced
+from dirax.text.representation import value_text
 
 Pair = tuple[Vector, Vector]
 
@@ -261,7 +263,7 @@ class SphereProjection(AbstractDiscretizationMap):
 class ProductMap(AbstractDiscretizationMap):
     """Several maps side by side, on the product of their manifolds: `ProductMap((map, N), (map, N), …)`.
 
-    Each map comes with the ambient dimension N of its block:
+    Each map comes with the ambient dimension N of its block; raises `TypeError` for anything else:
 
         pendulum = dx.ProductMap((dx.SphereProjection(), 3), (dx.SphereProjection(), 3))   # on S² × S²
     """
@@ -270,6 +272,13 @@ class ProductMap(AbstractDiscretizationMap):
     sizes: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, *blocks: tuple[AbstractDiscretizationMap, int]):
+        for block in blocks:
+            whole = isinstance(block, tuple | list) and len(block) == 2 and is_whole(block[1]) and block[1] > 0
+            if not whole or not isinstance(block[0], AbstractDiscretizationMap):
+                raise TypeError(
+                    "dx.ProductMap takes pairs of a map and the number of coordinates that it moves, like "
+                    f"(dx.SphereProjection(), 3), but {value_text(block)} was given."
+                )
         self.maps = tuple(map for map, _ in blocks)
         self.sizes = tuple(int(size) for _, size in blocks)
 
@@ -320,8 +329,8 @@ def _times(theta: float) -> Float[Array, " 2"]:
 
 
 def _check_theta(theta: float) -> None:
-    if not 0.0 <= theta <= 1.0:
-        raise ValueError(f"theta must be in [0, 1], but {theta} came; ½ is the midpoint rule.")
+    if not isinstance(theta, int | float | np.number) or not 0.0 <= theta <= 1.0:
+        raise ValueError(f"theta must be in [0, 1], but {theta!r} came; ½ is the midpoint rule.")
 
 
 def _same_size(manifold: AbstractManifold, ambient_dimension: int) -> AbstractManifold:

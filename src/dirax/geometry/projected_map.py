@@ -39,7 +39,7 @@ class Submanifold(AbstractManifold):
         with jax.ensure_compile_time_eval():
             x = np.asarray(evaluated(self.projector, np.cos(1.0 + np.arange(self.ambient_dimension))))
             trace = float(np.trace(np.asarray(evaluated(jax.jacfwd(self.projector), x))))
-        if not abs(trace - round(trace)) < 1e-6:
+        if not (np.isfinite(trace) and abs(trace - round(trace)) < 1e-6):
             raise ValueError(
                 f"The projector's derivative has trace {trace:.6g} at a point of its image, where a projector has a "
                 "whole number: P(P(x)) = P(x) must hold, and P be defined at that point; otherwise give dimension=."
@@ -55,8 +55,17 @@ class Submanifold(AbstractManifold):
         return self.projector(x)
 
     def check_point(self, x, name="x", tolerance=POINT_DEFECT):
-        """As of every manifold; and `ValueError` where P is no projector there, D(P ∘ P) = DP."""
+        """As of every manifold; and `ValueError` where P is no projector there, D(P ∘ P) = DP, or one to a manifold of another
+        dimension."""
         super().check_point(x, name, tolerance)
+        self._check_projector(x, name)
+
+    def check_tangent(self, x, v, name="v", **more):
+        """As `check_point` and of every manifold."""
+        super().check_tangent(x, v, name, **more)
+        self._check_projector(x, more.get("point") or "x")
+
+    def _check_projector(self, x, name):
         if is_traced(x):
             return
         slope = np.asarray(evaluated(jacobian(self.projector), x))
@@ -65,6 +74,11 @@ class Submanifold(AbstractManifold):
             raise ValueError(
                 f"P(P(x)) = P(x) does not hold near {name}: its derivative misses DP DP = DP by {missed:.3g} there, so that the "
                 "points P(x) are no manifold to which P projects."
+            )
+        if round(float(np.trace(slope))) != self.dimension:
+            raise ValueError(
+                f"the image of P has dimension {round(float(np.trace(slope)))} at {name}, the trace of DP, but "
+                f"dimension={self.dimension} was given: leave dimension out, or give that."
             )
 
     def projection(self, x, v):

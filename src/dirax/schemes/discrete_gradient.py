@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from dirax.numerics.arrays import is_whole
 from dirax.schemes.discrete_gradient_step import DiscreteGradientStep
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 
@@ -36,8 +37,8 @@ class DiscreteGradient(AbstractScheme):
     def __init__(self, kind: str = "gonzalez", nodes: int = 4):
         if kind not in KINDS:
             raise ValueError(f"kind must be one of {', '.join(map(repr, KINDS))}, but {kind!r} was given.")
-        if nodes < 1:
-            raise ValueError(f"nodes must be at least 1, but {nodes} was given.")
+        if not is_whole(nodes) or nodes < 1:
+            raise ValueError(f"nodes must be a whole number, at least 1, but {nodes!r} was given.")
         self.kind, self.nodes = kind, int(nodes)
 
     def adjoint(self, system: Any) -> "DiscreteGradient":

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from dirax.geometry.linear import LinearDirac
 from dirax.geometry.structures import DiracStructure
 from dirax.geometry.subspaces import PontryaginSubspace
-from dirax.numerics.arrays import Data, Numbers
+from dirax.numerics.arrays import Data, Numbers, is_whole
 from dirax.program.sparse_matrix import SparseMatrix
 from dirax.program.tracing import gradient
 from dirax.program.user_functions import UserFunction
@@ -65,6 +65,10 @@ class PortHamiltonian(AbstractSystem):
         self.B = None if B is None else matrix_function(B, "B")
         self.R = None if R is None else matrix_function(R, "R")
         self.inputs = None if inputs is None else UserFunction(inputs, "inputs", ("t", "x"))
+        if not isinstance(closed, bool) and (isinstance(closed, str) or not all(map(is_whole, closed))):
+            raise ValueError(
+                f"closed must be True, False or the numbers of the columns of B that are closed, but {closed!r} came."
+            )
         self.closed = closed if isinstance(closed, bool) else tuple(int(port) for port in closed)
         if self.closed and B is None:
             raise ValueError("a closed port-Hamiltonian system needs B: its columns are the ports that are closed.")

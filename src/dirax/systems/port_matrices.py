@@ -19,7 +19,10 @@ def matrix_function(value: Any, name: str) -> UserFunction:
         return UserFunction(value, name, ("x",))
     if is_sparse(value):
         return ConstantFunction(value, name)
-    constant = np.asarray(value, dtype=float)
+    try:
+        constant = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} must be a matrix or a function of x that returns one, but {value!r:.60} was given.") from None
     return UserFunction(lambda x: jnp.asarray(constant), name, ("x",))
 
 
