@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -635,3 +636,51 @@ def test_functions_in_params_are_refused_with_the_way_to_learn_a_network():
         TypeError, match=r"params\['act'\] is .*eqx\.filter\(module, eqx\.is_array\), and join it there by eqx\.combine"
     ):
         dx.simulate(dx.LagrangeDirac(lambda q, v, params: v @ v), PLUS, params={"act": jnp.tanh}, **GOOD)
+
+
+class OwnMidpoint(dx.AbstractScheme):
+    """The midpoint rule for q̇ = p, ṗ = −q, with one function of the step equation replaced."""
+
+    name: str = ""
+    function: Callable = lambda *_: None
+
+    def step_equation(self, system, shape):
+        turned = lambda x: jnp.concatenate([x[1:], -x[:1]])
+        functions = {
+            "start": lambda data, h, params: (jnp.concatenate([data["q"], data["p"]]), jnp.zeros(2)),
+            "residual": lambda u, x, t, h, params: u - turned(x + h / 2 * u),
+            "advance": lambda u, x, t, h, params: x + h * u,
+            "unpack": lambda x, u, t, h, params: {"q": x[:1], "p": x[1:]},
+        }
+        fields = {"q": dx.Field((1,)), "p": dx.Field((1,))}
+        return dx.StepEquation(
+            **functions | ({self.name: self.function} if self.name else {}), state_size=2, unknowns=2, fields=fields
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "function", "words"),
+    [
+        (
+            "start",
+            lambda data, h, params: (data["q"], jnp.zeros(2)),
+            r"start .* the state of shape \(2,\).* float64 of shape \(1,\)",
+        ),
+        ("start", lambda data, h, params: data["q"], r"start .* two vectors"),
+        ("residual", lambda u, x, t, h, params: u[:1], r"residual .* r of shape \(2,\) in float64, as unknowns=2 says"),
+        ("residual", lambda u, x, t, h, params: (u - x).astype(jnp.float32), "it returned float32"),
+        ("residual", lambda u, x, t, h, params: None, "it returned None"),
+        ("advance", lambda u, x, t, h, params: x[:1], "advance .* the next state"),
+        ("unpack", lambda x, u, t, h, params: {"q": x[:1]}, "a dict of its fields, q, p, but it returned q"),
+        ("unpack", lambda x, u, t, h, params: {"q": x, "p": x[1:]}, r"q of shape \(1,\), as fields say"),
+    ],
+)
+def test_a_step_equation_whose_functions_return_other_sizes(name, function, words):
+    run = {"q": [1.0], "v": [0.0], "step": 0.1, "steps": 5}
+    oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    with pytest.raises(ValueError, match=words):
+        dx.simulate(oscillator, OwnMidpoint(name, function), **run)
+    sol = dx.simulate(oscillator, OwnMidpoint(), **run)
+    assert abs(sol.q[-1, 0] - np.cos(0.5)) < 1e-3 and dx.verify(sol).ok
+    nowhere = OwnMidpoint("unpack", lambda x, u, t, h, params: {"q": x[:1], "p": jnp.arccos(x[:1] + t)})
+    assert "p is not finite in a row or more, first at t = 0.1" in str(dx.verify(dx.simulate(oscillator, nowhere, **run)))

@@ -17,7 +17,7 @@ from dirax.diagnostics.report import OK, VIOLATED, Line, Report
 from dirax.diagnostics.residuals import residual_size
 from dirax.diagnostics.reversal_line import taken_back
 from dirax.diagnostics.structure_lines import membership, structure_of, symplecticity
-from dirax.diagnostics.verdicts import steps_of
+from dirax.diagnostics.verdicts import of_lane, steps_of
 from dirax.engines.stopping import STALLED
 from dirax.numerics.one_thread import one_thread
 from dirax.program.memo import patience
@@ -120,6 +120,8 @@ def _completion(sol: Solution) -> Line:
     ok, messages = np.atleast_1d(sol.ok), np.atleast_1d(sol.message)
     residual = float(np.max(sol.stats["max_residual"])) if "max_residual" in sol.stats else None
     if np.all(ok):
+        if broken := _not_numbers(sol):
+            return Line("steps solved", residual, None, VIOLATED, broken)
         text = f"every step was solved, up to t = {sol.time_of(-1):.6g}"
         if residual is None or (size := residual_size(sol)) is None:
             return Line("steps solved", residual, None, OK, text)
@@ -129,6 +131,19 @@ def _completion(sol: Solution) -> Line:
     which = f"trajectory {failed[0]}: " if sol.batch is not None else ""
     more = f" (and {len(failed) - 1} more)" if len(failed) > 1 else ""
     return Line("steps solved", residual, None, VIOLATED, f"{which}{messages[failed[0]]}{more}")
+
+
+def _not_numbers(sol: Solution) -> str:
+    """In words, that a saved array of a run without failed steps is not finite somewhere; "" where all are."""
+    if sol.events is not None:  # one may have ended a trajectory, of which the rows after it are NaN
+        return ""
+    for name, values in sol.fields.items():
+        if isinstance(values, np.ndarray) and not np.all(np.isfinite(values)):
+            rows = values.reshape(sol.batch or 1, values.shape[int(sol.batch is not None)], -1)
+            lane, row = np.argwhere(~np.all(np.isfinite(rows), axis=2))[0].tolist()
+            where = f"t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
+            return f"every step was solved, but {name} is not finite in a row or more, first at {where}"
+    return ""
 
 
 def _title(sol: Solution) -> str:

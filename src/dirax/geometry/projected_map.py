@@ -60,10 +60,10 @@ class Submanifold(AbstractManifold):
         super().check_point(x, name, tolerance)
         self._check_projector(x, name)
 
-    def check_tangent(self, x, v, name="v", **more):
+    def check_tangent(self, x, v, name="v", tolerance=POINT_DEFECT, point=None):
         """As `check_point` and of every manifold."""
-        super().check_tangent(x, v, name, **more)
-        self._check_projector(x, more.get("point") or "x")
+        super().check_tangent(x, v, name, tolerance, point)
+        self._check_projector(x, point or "x")
 
     def _check_projector(self, x, name):
         if is_traced(x):

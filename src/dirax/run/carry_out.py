@@ -24,6 +24,7 @@ from dirax.run.final_manifold import (
     refuse_off_final_manifold,
     warn_of_leaving,
 )
+from dirax.run.own_equation import refuse_wrong_shapes
 from dirax.run.plan import AnyPlan, planned
 from dirax.run.premises import bytes_of, check_premise
 from dirax.run.progress import reported, reporting
@@ -221,6 +222,9 @@ def _begun(settings: Settings, case: Case, steps: int, save_every: int, asked: i
     shape = Shape(shape.n, shape.m, shape.c, redundant=redundant) if redundant else shape
     equation = make_step_equation(scheme, system, shape)
     # start
+    if not traced:
+        complete = {name: a if case.batch is None else a[0] for name, a in initial.data.items()}
+        refuse_wrong_shapes(equation, {**complete, "t": np.asarray(case.t0)}, case.h, own)
     start = begun(equation, case, initial, by_jax)
     # user functions that close over a traced value make the start traced although nothing that was passed is
     if not (traced := traced or is_traced(start)):

@@ -81,7 +81,7 @@ def sweep(
     `point`. `case(**values)` gives the initial data and the params of one point as `simulate` takes them; it is written
     for numbers, in NumPy or JAX, and evaluated for many points at once where that gives the same. It may take `rng`, a
     generator of NumPy, or `key`, of JAX: random numbers that depend on the point and on `seed` alone. `params`, if `case`
-    gives none, and the other arguments are those of `simulate`.
+    gives none, and the other arguments are those of `simulate`; `events` are not looked for.
 
     What is kept are the saved rows, or with `keep(sol)`, of the Solution of one trajectory, the numbers and arrays that it
     returns by name. `status` says of each point whether it has not been run (0), ran to the end (1), failed (2: NaN from

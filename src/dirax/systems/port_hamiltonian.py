@@ -66,9 +66,7 @@ class PortHamiltonian(AbstractSystem):
         self.R = None if R is None else matrix_function(R, "R")
         self.inputs = None if inputs is None else UserFunction(inputs, "inputs", ("t", "x"))
         if not isinstance(closed, bool) and (isinstance(closed, str) or not all(map(is_whole, closed))):
-            raise ValueError(
-                f"closed must be True, False or the numbers of the columns of B that are closed, but {closed!r} came."
-            )
+            raise ValueError(f"closed must be True, False or the numbers of the columns of B that are closed, not {closed!r}.")
         self.closed = closed if isinstance(closed, bool) else tuple(int(port) for port in closed)
         if self.closed and B is None:
             raise ValueError("a closed port-Hamiltonian system needs B: its columns are the ports that are closed.")
