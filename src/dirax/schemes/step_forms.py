@@ -201,6 +201,8 @@ def form_of_steps(
         return kind(system, step, lambda x, params: system.dual.bivector(x), ("x",))
     if constrained:
         return structure if isinstance(structure, str) else structure.step_form
+    if canonical and shape.m + shape.c:
+        return "steps under constraints may be symplectic on the manifold of these alone, of which the rows hold no multipliers"
     if canonical:
         return (CanonicalPoints if "x" in fields else CanonicalForm)(system, step)
     if (on_manifold := system.manifold_form()) is not None:
