@@ -154,8 +154,8 @@ class Rattle(dx.AbstractScheme):
     def step_equation(self, system, shape):
         n, c = shape.n, shape.c
         state, unknowns = dx.Layout(q=n, p=n), dx.Layout(v=n, first=c, last=c)
-        force = lambda q: jax.grad(system.lagrangian)(q, jnp.zeros(n))
-        slope = jax.jacfwd(lambda q: system.holonomic(q))
+        force = lambda q: jax.grad(lambda q: system.lagrangian(q, jnp.zeros(n), None))(q)
+        slope = jax.jacfwd(lambda q: system.holonomic(q, None))
 
         def end(u, x, h):
             u, q = unknowns.split(u), state.split(x).q + h * unknowns.split(u).v
@@ -164,7 +164,7 @@ class Rattle(dx.AbstractScheme):
         def residual(u, x, t, h, params):
             (q1, p1), (q, p), u = end(u, x, h), state.split(x), unknowns.split(u)
             begun = u.v - p - h / 2 * force(q) + h / 2 * slope(q).T @ u.first
-            return jnp.concatenate([begun, system.holonomic(q1) / h, slope(q1) @ p1])
+            return jnp.concatenate([begun, system.holonomic(q1, None) / h, slope(q1) @ p1])
 
         return dx.StepEquation(
             start=lambda data, h, params: (
