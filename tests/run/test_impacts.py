@@ -384,3 +384,18 @@ def test_verify_sees_an_energy_that_a_wall_at_rest_has_changed():
     after = sol.t > sol.events.t[0]
     p = np.asarray(sol.p) + np.outer(after, [0.1, 0.0])
     assert dx.verify(sol.replace(fields=sol.fields | {"p": p}))["energy"].verdict == "VIOLATED"
+
+
+@pytest.mark.parametrize("row", [0, 1])
+@pytest.mark.parametrize("name", ["q", "p", "work"])
+def test_the_rows_beside_a_wall_are_looked_at_too(row, name):
+    """The one before ends a step of the scheme, and from the one after another begins."""
+    driven = dx.LagrangeDirac(
+        lambda q, v: v @ v / 2 - q[1] - q[0] ** 4, forces=lambda t, q, v: jnp.stack([jnp.sin(t), -0.1 * v[1]])
+    )
+    wall = dx.Impact(lambda q: q[1], restitution=0.9)
+    sol = dx.simulate(driven, dx.LagrangeDAlembert(), q=[0.5, 0.3], v=[0.1, 0.0], step=0.02, steps=120, events=[wall])
+    assert len(sol.events) >= 2 and dx.verify(sol)["steps replayed"].verdict == "ok"
+    values = np.array(sol.fields[name])
+    values[int(np.searchsorted(sol.t, sol.events.t[0])) - 1 + row] += 1e-6
+    assert dx.verify(sol.replace(fields=sol.fields | {name: values}))["steps replayed"].verdict == "VIOLATED"

@@ -168,8 +168,8 @@ class Replay:
         return self._steps_a_row > max(1.0, LONGEST / self.steps.operations(FEWEST, CALL))
 
     def chosen(self) -> tuple[np.ndarray, np.ndarray]:
-        """(trajectory, row) of the rows whose steps are taken again: all that were reached and that are beside no step which a
-        wall divides, or as many as there is time for. Raises `CannotReplay` where there are none."""
+        """(trajectory, row) of the rows whose steps are taken again: all that were reached, but for those that do not hold their
+        states beside steps which walls divide, or as many as there is time for. Raises `CannotReplay` where there are none."""
         lanes, rows = np.nonzero((np.arange(self.sol.rows)[None] <= self.ends[:, None]) & ~self.beside_walls)
         if not len(rows):
             raise CannotReplay("walls divide every step")
@@ -182,11 +182,17 @@ class Replay:
 
     @property
     def beside_walls(self) -> np.ndarray:
-        """The rows (B, rows) before and after a step that a wall divides: their momenta and multipliers are of parts of it."""
-        beside, divided = np.zeros((self.sol.batch or 1, self.sol.rows), bool), self.sol.divided
-        beside[:, :-1] |= divided
-        beside[:, 1:] |= divided
+        """The rows (B, rows) before and after a step that a wall divides where rows do not hold their states: their momenta and
+        multipliers are of parts of it."""
+        beside = np.zeros((self.sol.batch or 1, self.sol.rows), bool)
+        if self.hides:
+            beside[:, :-1] |= self.sol.divided
+            beside[:, 1:] |= self.sol.divided
         return beside
+
+    def crosses(self, lanes: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Whether walls divide the steps that leave these rows."""
+        return np.pad(self.sol.divided, ((0, 0), (0, 1)))[lanes, rows]
 
     def begun(self, lanes: np.ndarray, rows: np.ndarray) -> Rows:
         """Where the steps that leave these rows, in order, begin. Raises `CannotReplay` where the rows do not say it.

@@ -39,6 +39,9 @@ class Comparison:
         self.starts = dict(zip(self.sizes, np.cumsum([0, *self.sizes.values()]).tolist(), strict=False))
         self.held = {i: self.starts[name] + place for i, (name, place) in replay.held.items()}
         self.next, self.previous = neighbours(at.lanes, at.rows, replay.sol.rows)
+        self.divided = replay.crosses(at.lanes, at.rows)
+        self.previous[self.next[self.divided & (self.next >= 0)]] = -1
+        self.next[self.divided] = -1
         self.saved = self._saved()
         self.again = replay.again(at)
         self.expected = np.full_like(self.saved, np.nan)
@@ -127,7 +130,8 @@ class Comparison:
         of_step = [sol.field_info[name].place == "step" for name, size in self.sizes.items() for _ in range(size)]
         said = np.isin(np.arange(self.saved.shape[1] - 1), list(self.held.values()), invert=True)
         lacking = np.where(ok[:, None], np.array(of_step)[None], said)
-        return np.pad(~(last[:, None] & lacking), ((0, 0), (0, 1)), constant_values=True)
+        parted = self.divided[entries][:, None] & said  # of a step that a wall divides the state that it leaves is known
+        return np.pad(~(last[:, None] & lacking | parted), ((0, 0), (0, 1)), constant_values=True)
 
     def _expect_given_points(self) -> None:
         """Row 0 is what was given, and row 1 follows from it alone."""
