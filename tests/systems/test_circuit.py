@@ -294,3 +294,27 @@ def test_a_nonlinear_resistor_has_no_chain():
     assert dx.constraint_algorithm(of_resistor(lambda u: u / 2), near=[0.3, 0.1]).verdict == "determined"
     with pytest.raises(TypeError, match=r"those of this Circuit are not in potential of node 3.*linearized"):
         dx.constraint_algorithm(of_resistor(lambda u: u + u**3), near=[0.3, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("netlist", "near"),
+    [
+        ([("C", 1, 0, 1.69), ("L", 2, 3, 1.39), ("L", 1, 2, 1.83)], [-0.0346, 1e-16, -2e-16]),
+        ([("L", 1, 0, 0.7), ("L", 2, 0, 1.3), ("C", 2, 0, 1.3), ("L", 1, 3, 0.3), ("R", 2, 3, 0.5), ("L", 3, 4, 0.9)], None),
+        ([("L", 0, 1, 1.357), ("T", (2, 0), (1, 0), 0.4505), ("L", 2, 1, 1.581), ("L", 2, 0, 0.5255)], None),
+    ],
+    ids=["open", "star with an open branch", "inductors alone"],
+)
+def test_a_current_that_is_zero_has_the_size_that_it_could_have(netlist, near):
+    """Its equation has one term, which is the roundoff of zero: points that the constraint algorithm had found were refused, with
+    residuals of 1e-15, and right runs called VIOLATED."""
+    system, count = dx.circuit(netlist), sum(element[0] in "CL" for element in netlist)
+    near = np.random.default_rng(2).normal(size=count) / 2 if near is None else np.array(near)
+    chain = dx.constraint_algorithm(system, near=near)
+    x = chain.project(near)
+    run = {"x": x, "step": 0.02, "steps": 100}
+    sol, other = dx.simulate(system, dx.DiscreteDirac(), **run), dx.simulate(chain.resolved(), dx.DiscreteDirac(), **run)
+    assert sol.ok and other.ok and dx.verify(sol).ok and dx.verify(other).ok, (dx.verify(sol), dx.verify(other))
+    np.testing.assert_allclose(sol.x, other.x, atol=1e-4)
+    with pytest.raises(ValueError, match="off the constraint"):
+        dx.simulate(system, dx.DiscreteDirac(), **(run | {"x": x + np.eye(count)[-1] * 1e-6}))

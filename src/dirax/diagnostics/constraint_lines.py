@@ -118,7 +118,14 @@ def _constraint_scale(sol: Solution, structure: AbstractDiscreteStructure | str,
         return float(np.nanmax(sampled_terms(sol, at_rows(sol, energy_at)))) or TINY
     if form is not None and form.constraints.any and "p" in sol.fields:
         return _largest(sampled(sol, at_rows(sol, _constraint_terms, form)))[:count]  # steps say no hidden ones
-    return float(np.nanmax(sampled_terms(sol, at_rows(sol, constraint_at)))) or TINY
+    size = float(np.nanmax(sampled_terms(sol, at_rows(sol, constraint_at))))
+    if sol.system.has_constraint_sizes:
+        size = max(size, float(np.nanmax(sampled(sol, at_rows(sol, _sizes_at)), initial=0.0)))
+    return size or TINY
+
+
+def _sizes_at(system: Any, row: dict, params: Any):
+    return system.constraint_sizes_at(row, params)
 
 
 def _own_size(structure: AbstractDiscreteStructure, speed, row: dict, params: Any):

@@ -1,5 +1,7 @@
 """Saved rows of a run beside what their steps make of them, and how far rounding may move each number."""
 
+from functools import cached_property
+
 import numpy as np
 
 from dirax.diagnostics.replay import Again, Replay, Rows, times_of
@@ -15,6 +17,9 @@ OFTEN = 4
 TYPICAL = 0.9
 """The share of the sampled steps in which a number moves by no more than its scale: one in which the chart changes does not set
 the scale of all."""
+
+FAINT = 2.0**-140
+"""Of the largest number of a field, what is zero: another one of it may have a unit that is so many times as large."""
 
 DOUBTED = 2000
 """Rows of which it is asked how far rounding moves them: the worst."""
@@ -75,7 +80,17 @@ class Comparison:
     def missed(self) -> np.ndarray:
         """|saved − expected|, 0 where nothing is expected, infinite where a number should be and none is."""
         missed = np.abs(self.saved - self.expected)
+        missed = np.where(missed <= self.faint, 0.0, missed)
         return np.where(np.isfinite(self.expected), np.where(np.isfinite(missed), missed, np.inf), 0.0)
+
+    @cached_property
+    def faint(self) -> np.ndarray:
+        """Differences (numbers,) that are none in any unit: what is left of coordinates that are zero, after projections."""
+        found = np.zeros(self.saved.shape[1])
+        for name, size in self.sizes.items():
+            place = slice(self.starts[name], self.starts[name] + size)
+            found[place] = FAINT * np.max(np.abs(self.saved[:, place]), initial=0.0, where=np.isfinite(self.saved[:, place]))
+        return found
 
     def _saved(self) -> np.ndarray:
         pieces = []

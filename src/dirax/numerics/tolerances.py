@@ -91,7 +91,7 @@ FRAME_DEFECT = 1e-9
 CONSTRAINT_DEFECT = 1e-9
 """Of constraints at initial data and at nodes, relative to the sizes of their terms."""
 
-SOLVED_ROUNDOFF = 1e-6
+SOLVED_ROUNDOFF = 1e-5
 """How much of the largest unknown of linear equations counts in every other one where CONSTRAINT_DEFECT compares what they leave:
 together they are the roundoff of a decomposition."""
 

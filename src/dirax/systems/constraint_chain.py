@@ -258,3 +258,11 @@ class ResolvedSystem(AbstractSystem):
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " m"]:
         return self.chain.constraints(row["x"], params)
+
+    @property
+    def has_constraint_sizes(self) -> bool:
+        return True
+
+    def constraint_sizes_at(self, row: Data, params: Any) -> Float[Numbers, " m"]:
+        """Those of `initial_terms`: a constraint of one term, that a current is zero, has no other size."""
+        return self.initial_terms(row, params)

@@ -17,9 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.numerics.equilibration import NOISE, ODD
-from dirax.program.tracing import jacobian, once
+from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import evaluated
 from dirax.systems.forms import ImplicitForm
+from dirax.systems.magnitudes import MOST as MOST_OF_ENERGY
+from dirax.systems.magnitudes import as_large_as_energy
 
 UNDETERMINED = 2.0**-24
 """Weight of a logarithm's being zero, beside what determines it."""
@@ -39,6 +41,10 @@ FEW = 2**16
 """Slopes of the entries of A up to which they are looked at."""
 
 
+ROUNDOFF = 2.0**-40
+"""Of a size, what counts as zero."""
+
+
 class Units(NamedTuple):
     """Sizes of the coordinates (N,), of the time, of the multipliers (k,) and of the equations (r,)."""
 
@@ -53,7 +59,8 @@ class Units(NamedTuple):
 
 
 def natural_units(form: ImplicitForm, params) -> Units:
-    """Those of an implicit form at its point."""
+    """Those of an implicit form at its point, in which coordinates that are the roundoff of zero have no size."""
+    form = form._replace(point=_without_roundoff(form, params))
     matrix, right = (np.asarray(a) for a in evaluated(form.equations, form.point, params))
     count, size = matrix.shape[0], form.point.size
     plain = Units(np.ones(size), 1.0, np.ones(matrix.shape[1] - size), np.ones(count))
@@ -81,6 +88,19 @@ def natural_units(form: ImplicitForm, params) -> Units:
     terms.add(form.point[there], None, (there, 1.0))
     units = terms.units((slice(0, size), form.coordinates))
     return Units(units[:size], float(units[size]), units[size + 1 : unknowns], units[unknowns:])
+
+
+def _without_roundoff(form: ImplicitForm, params: Any) -> np.ndarray:
+    """The point, with 0 for coordinates that are roundoff beside what they would be with all the energy there, and beside others
+    of their letter: one that hardly has any energy could be large."""
+    point = np.asarray(form.point, float)
+    if point.size > MOST_OF_ENERGY:
+        return point
+    slope = gradient(lambda x: form.energy(x, params))
+    possible = np.asarray(evaluated(lambda x: as_large_as_energy(slope, x), point))
+    letters = np.array([name.rstrip("0123456789") for name in form.coordinates])
+    others = np.max(np.where(letters[:, None] == letters, np.abs(point), 0.0), axis=1, initial=0.0)
+    return np.where(np.abs(point) <= ROUNDOFF * np.minimum(possible, others), 0.0, point)  # of no energy NaN: none is
 
 
 class Terms:

@@ -326,7 +326,9 @@ class DiracSystem(AbstractSystem):
         sizes = {name: jnp.abs(a) for name, a in data.items()} | {"x": largest}
         if self.holonomic is not None and self.is_graph:
             return sizes
-        rates = of_solution(self._rates(x, params)[0], jnp.concatenate([data["velocity"], data["multipliers"]]), RATE_RANK)
+        rates = of_solution(
+            self._rates(x, params)[0], jnp.concatenate([data["velocity"], data["multipliers"]]), tolerance=RATE_RANK
+        )
         return sizes | {"velocity": rates[: x.shape[0]], "multipliers": rates[x.shape[0] :]}
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:

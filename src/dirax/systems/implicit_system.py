@@ -8,10 +8,11 @@ from jaxtyping import Float
 
 from dirax.numerics.arrays import Data, Numbers
 from dirax.program.linear_solves import scaled_pseudo_inverse
+from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import UserFunction
 from dirax.systems.forms import ImplicitForm, RelationForm
 from dirax.systems.implicit_form import energy_of_x, names, point_of, without_time
-from dirax.systems.magnitudes import of_solution
+from dirax.systems.magnitudes import MOST, as_large_as_energy, of_solution
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -90,11 +91,16 @@ class ImplicitSystem(AbstractSystem):
         return self.relation(data["x"], data["velocity"], data["multipliers"], 0.0, params)
 
     def sizes_of_data(self, data: Data, params: Any) -> Data:
-        """Rates that are zero up to roundoff of the others."""
-        x, names = data["x"], ("velocity", "multipliers")
-        rates = of_solution(self.equations(x, params)[0], jnp.concatenate([data[name] for name in names]))
+        """Rates that are zero up to roundoff of the others, and of the terms of f, which may cancel; coordinates that are so
+        beside others with as much energy."""
+        x, solution = data["x"], jnp.concatenate([data["velocity"], data["multipliers"]])
+        largest = jnp.abs(x)
+        if self.hamiltonian is not None:
+            largest = largest + as_large_as_energy(gradient(lambda x: self.hamiltonian(x, params)), x)
+        terms = jnp.abs(jacobian(lambda x: self.equations(x, params)[1])(x)) @ largest if x.size <= MOST else None
+        rates = of_solution(self.equations(x, params)[0], solution, terms)
         sizes = {name: jnp.abs(a) for name, a in data.items()}
-        return sizes | {"velocity": rates[: x.size], "multipliers": rates[x.size :]}
+        return sizes | {"x": largest, "velocity": rates[: x.size], "multipliers": rates[x.size :]}
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(x); NaN for a system stated without one."""

@@ -256,6 +256,15 @@ class AbstractSystem(eqx.Module):
         """Whether the constraint is that dE lie in a subspace, so that it has the size of dE."""
         return False
 
+    @property
+    def has_constraint_sizes(self) -> bool:
+        """Whether `constraint_sizes_at` says more of the sizes of constraints than their derivatives do."""
+        return False
+
+    def constraint_sizes_at(self, row: Data, params: Any) -> Float[Numbers, " k"]:
+        """How large the terms of `constraint_at` count as at one saved row."""
+        return jnp.abs(self.constraint_at(row, params))
+
     def flow_size(self, x: Float[Numbers, " N"], params: Any) -> Float[Numbers, ""]:
         """The sum of the sizes of the terms of ⟨dH, ẋ⟩, which may cancel; 0 where it is not balanced against ports."""
         return jnp.zeros(())
