@@ -99,3 +99,13 @@ def test_what_does_not_see_the_multipliers_says_so():
 def test_verify_says_what_it_cannot_check():
     sol = dx.simulate(HOOP, SLIDES[0], q=[1.0, 0.0], v=[0.0, 1.0], step=0.1, steps=20)
     assert "the forces see the multipliers" in str(dx.verify(sol))
+
+
+def test_a_norm_of_multipliers_that_begin_at_zero_is_named():
+    bead = dx.LagrangeDirac(
+        lambda q, v: v @ v / 2 - q[2],
+        holonomic=lambda q: jnp.array([q[0] - jnp.cos(q[2]), q[1] - jnp.sin(q[2])]),
+        forces=lambda t, q, v, multipliers: -0.3 * jnp.linalg.norm(multipliers) * v / jnp.sqrt(v @ v),
+    )
+    with pytest.raises(ValueError, match="have no derivative at multipliers of zero, with which a run begins"):
+        dx.simulate(bead, dx.LagrangeDAlembert(), q=[1.0, 0.0, 0.0], v=[0.0, 1.0, 1.0], step=0.01, steps=2)

@@ -16,6 +16,13 @@ from dirax.schemes.lagrange_dalembert_step import PROJECTION
 from dirax.schemes.lagrangian_step import METHOD_2
 from dirax.systems.system import AbstractSystem
 
+OUTSIDE = "the data lie outside the domain of the system's functions, or on its edge"
+
+AT_ZERO = (
+    f"{OUTSIDE}, or forces(…, multipliers) have no derivative at multipliers of zero, with which a run begins, as a norm has none: "
+    "write jnp.sqrt(multipliers @ multipliers + small**2)"
+)
+
 
 def refuse_bad_start(
     system: AbstractSystem,
@@ -44,7 +51,9 @@ def refuse_bad_start(
         raise ValueError(f"collocation takes regular Lagrangians, and ∂²L/∂v² is singular at the initial data: it {needed()}.")
     if start.jacobian is not None:
         once = functools.cache(shorter) if start.row0 is None else None
-        _refuse_singular_step(start, labels, needed, initial.lagrangian is not None, once)
+        form = system.lagrangian_form()
+        outside = AT_ZERO if form is not None and form.forces_see_multipliers else OUTSIDE
+        _refuse_singular_step(start, labels, needed, initial.lagrangian is not None, once, outside)
 
 
 def _refuse_outside_the_domain(initial: Initial) -> None:
@@ -113,6 +122,7 @@ def _refuse_singular_step(
     needed: Callable[[], str] | None,
     lagrangian: bool,
     shorter: Callable[[], Any] | None,
+    outside: str,
 ) -> None:
     residual, sparse = _lanes(start.residual, 1), isinstance(start.jacobian, SparseJacobians)
     jacobian = start.jacobian.product[:, 0, :, None] if sparse else _lanes(start.jacobian, 2)
@@ -125,10 +135,7 @@ def _refuse_singular_step(
                 f"and this scheme {needed()}."
             )
         row = int(np.argmin(rows[np.argmin(finite)]))
-        raise ValueError(
-            f"the first step is not finite at the initial data{_which(~finite)} (in {labels[row]}): the data lie outside the "
-            "domain of the system's functions, or on its edge."
-        )
+        raise ValueError(f"the first step is not finite at the initial data{_which(~finite)} (in {labels[row]}): {outside}.")
     if sparse:
         return _refuse_singular_sparse_step(start.jacobian, labels, shorter)
     ranks, directions = rank_of_equations(jacobian)
