@@ -19,8 +19,8 @@ from dirax.systems.system import AbstractSystem
 OUTSIDE = "the data lie outside the domain of the system's functions, or on its edge"
 
 AT_ZERO = (
-    f"{OUTSIDE}, or forces(…, multipliers) have no derivative at multipliers of zero, with which a run begins, as a norm has none: "
-    "write jnp.sqrt(multipliers @ multipliers + small**2)"
+    f"{OUTSIDE}, or forces(…, multipliers) have no derivative at multipliers of zero, with which a run begins, as a norm has "
+    "none: write jnp.sqrt(multipliers @ multipliers + small**2)"
 )
 
 
