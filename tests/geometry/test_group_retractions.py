@@ -74,3 +74,19 @@ def test_mistakes():
     system = dx.EulerPoincare(dx.SO3(), lambda xi, a: xi @ xi, advected=4, representation=lambda m, a: m @ a[:3])
     with pytest.raises(ValueError, match=r"representation\(matrix, a\) must return shape \(4,\)"):
         dx.simulate(system, dx.DiscreteEulerPoincare(), x=np.ones(7), step=0.1, steps=1)
+
+
+@pytest.mark.parametrize(
+    ("act", "words"),
+    [
+        (lambda m, a: m.T @ a, r"one of the group, \(gh\)·a"),
+        (lambda m, a: m @ a * (1.0 + a @ a), "linear in a"),
+        (lambda m, a: m @ a + 1e-5, "linear in a"),
+        (lambda m, a: m @ a * (1.0 + 1e-5 * jnp.trace(m)), "one of the group"),
+    ],
+)
+def test_what_is_no_representation_is_refused(act, words):
+    """Such systems ran with ok=True; verify called them not symplectic."""
+    top = dx.EulerPoincare(dx.SO3(), lambda xi, a: xi @ xi / 2 - a[2], advected=3, representation=act)
+    with pytest.raises(ValueError, match=words):
+        dx.simulate(top, dx.DiscreteEulerPoincare(), x=[0.1, 0.2, 0.3, 0.0, 0.6, 0.8], step=0.1, steps=2)

@@ -1,18 +1,27 @@
 """The dual of a semidirect product 𝔤 ⋉ V: body momenta of a group, with quantities that it carries along."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from dirax.geometry.group_retractions import coadjoint, rotate
 from dirax.geometry.lie_group import AbstractLieGroup, Algebra
 from dirax.geometry.lie_groups import cross, quarter_turn
 from dirax.geometry.manifolds import Vector
+from dirax.program.memo import Memo, Same
+from dirax.program.user_functions import evaluated, is_traced
 
 Advected = Float[Array, " r"]
+
+KEPT = 1e-9
+"""By how much of its values a representation may miss what makes it one."""
+
+_asked: Memo[Any] = Memo(64)
 
 
 class SemidirectProduct(eqx.Module):
@@ -67,6 +76,32 @@ class SemidirectProduct(eqx.Module):
             return self.representation(self.group.matrix(g), a)
         k = self.vector_size
         return jnp.concatenate([rotate(self.group, g, a[i : i + k]) for i in range(0, self.advected, k)])
+
+    def refuse_no_representation(self, a: Advected) -> None:
+        """Raise `ValueError` where `representation` is not linear in a, or not one of the group: (gh)·a = g·(h·a). Asked once, of
+        concrete quantities of the size of a."""
+        if self.representation is None or is_traced(a):
+            return
+        size = float(np.max(np.abs(a), initial=0.0)) or 1.0
+        key = type(self.group).__name__, self.advected, Same(self.representation)
+        off, sizes = np.asarray(_asked.get(key, lambda: evaluated(self._missed, np.asarray(size))))
+        if np.max(off) <= KEPT * sizes[0]:
+            return
+        law = ("linear in a", "one of the group, (gh)·a = g·(h·a)")[int(off[0] <= KEPT * sizes[0])]
+        raise ValueError(
+            f"representation(matrix, a) is not {law}: it is off by {np.max(off):.2g} where its values are {sizes[0]:.2g}. It "
+            "says what g makes of a, of the matrix of g; that bodies see a as g⁻¹·a is seen to by dirax."
+        )
+
+    def _missed(self, size: Any) -> Float[Array, "2 2"]:
+        """The most by which either law is missed at elements and quantities of one kind, and the size of the values."""
+        xi, eta = (jnp.cos(k + jnp.arange(1.0, self.dimension + 1.0)) for k in (0.0, 2.0))
+        a, b = (size * jnp.cos(k + jnp.arange(1.0, self.advected + 1.0)) for k in (1.0, 4.0))
+        g, h = self.group.group_exp(xi), self.group.group_exp(eta)
+        whole = self.act(g, a + 2.0 * b)
+        nonlinear = jnp.max(jnp.abs(whole - self.act(g, a) - 2.0 * self.act(g, b)))
+        twice = jnp.max(jnp.abs(self.act(self.group.multiply(g, h), a) - self.act(g, self.act(h, a))))
+        return jnp.stack([jnp.stack([nonlinear, twice]), jnp.full(2, jnp.max(jnp.abs(whole)))])
 
     def carried(self, g: Vector, a: Advected) -> Advected:
         """g⁻¹·a."""

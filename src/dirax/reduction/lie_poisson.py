@@ -111,4 +111,5 @@ def checked_point(space: SemidirectProduct, data: Data, kind: str, way: str) -> 
     a = data["x"][d:]
     if r and jax.eval_shape(lambda a: space.act(space.group.identity(), a), a).shape != (r,):
         raise ValueError(f"representation(matrix, a) must return shape ({r},) like a.")
+    space.refuse_no_representation(a)
     return data["x"][:d], a
