@@ -31,8 +31,9 @@ class Event:
         section = dx.Event(lambda q, v: q[0], direction=+1)
 
     Zeros are found inside the steps, on what `sol.at` is there, to a float's precision of the step. The function is looked at in
-    rows, at points between them, and at more where it comes near to zero. What is found is each change of sign: a function that
-    touches zero and goes back, and one that dips below it for less than 10⁻⁴ of a step, may count as two zeros or as none. At the
+    rows, at points between them, a quarter of a step apart at most, and at more where it comes near to zero. What is found is
+    each change of sign: a function that touches zero and goes back, and one that dips below it for less than 10⁻⁴ of a step, may
+    count as two zeros or as none, and so do zeros of one that swings to and fro between these points: take smaller steps. At the
     first row nothing is found, if the function is zero there. Where steps have neither a polynomial nor the cubic, and in runs of
     many steps, dips are looked for where a cubic through rows and velocities shows them.
 
