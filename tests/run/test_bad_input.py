@@ -1,5 +1,6 @@
 """Bad input gets one or two sentences that name the argument, what came, what was expected and the way out; nothing is lost."""
 
+import dataclasses
 import os
 import re
 import signal
@@ -684,3 +685,19 @@ def test_a_step_equation_whose_functions_return_other_sizes(name, function, word
     assert abs(sol.q[-1, 0] - np.cos(0.5)) < 1e-3 and dx.verify(sol).ok
     nowhere = OwnMidpoint("unpack", lambda x, u, t, h, params: {"q": x[:1], "p": jnp.arccos(x[:1] + t)})
     assert "p is not finite in a row or more, first at t = 0.1" in str(dx.verify(dx.simulate(oscillator, nowhere, **run)))
+
+
+@dataclasses.dataclass
+class Spring:
+    stiffness: float
+
+    def __post_init__(self):
+        if not self.stiffness > 0.0:
+            raise ValueError("a spring pulls back")
+
+
+def test_params_that_ask_for_their_values_are_named():
+    """JAX makes them of what has no values; the Lagrangian was blamed for an if that is not its."""
+    system = dx.LagrangeDirac(lambda q, v, spring: v @ v / 2 - spring.stiffness * q @ q / 2)
+    message = complaint(TypeError, r"Spring.__post_init__ asks for the values", system=system, params=Spring(2.0))
+    assert "Python's if" not in message
