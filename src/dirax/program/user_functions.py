@@ -268,8 +268,8 @@ def _way_out(error: Exception, params: Any) -> str:
         return "; write it with jax.numpy instead of numpy."
     if isinstance(error, jax.errors.ConcretizationTypeError) and (maker := _maker_in(error)):
         return (
-            f"; {maker} asks for the values of fields, and JAX makes params of what has none: check them before they are made, or "
-            "only where isinstance(value, float)."
+            f"; {maker} asks for the values of fields, and JAX makes params of what has none: check them before they are made, "
+            "or only where isinstance(value, float)."
         )
     if isinstance(error, jax.errors.ConcretizationTypeError):
         return "; write it without Python's if and float(), e.g. with jnp.where."
