@@ -78,9 +78,12 @@ def energy_line(sol: Solution) -> Line:
 
 def _outside(sol: Solution, energy: np.ndarray) -> Line | None:
     """The line of a run with rows (B, rows) that have no energy, though they were computed; None for others."""
+    missing = ~np.isfinite(energy)
+    if not np.any(missing) or np.all(missing[:, 0]):
+        return None
     place = np.asarray(sol.fields["q" if "q" in sol.fields else "x"]).reshape(*energy.shape, -1)
-    missing = np.all(np.isfinite(place), axis=2) & ~np.isfinite(energy)
-    if not np.any(missing) or not np.any(np.isfinite(energy[:, 0])):
+    missing &= np.all(np.isfinite(place), axis=2)
+    if not np.any(missing):
         return None
     lane, row = np.argwhere(missing)[0].tolist()
     count, where = int(np.sum(missing)), f"t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
