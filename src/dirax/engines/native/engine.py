@@ -55,7 +55,7 @@ class Native(AbstractEngine):
 
     def run_traced(self, problem: Problem) -> Outcome:
         """The same as one primitive of JAX, with derivatives by loops over the steps; those of the second order and higher are
-        by the xla engine. Raises `UnsupportedPrimitive` as well."""
+        those of the run with a tangent, of large steps by the xla engine. Raises `UnsupportedPrimitive` as well."""
         from dirax.engines.native.gradients.differentiate import run_traced  # imported when it is used
 
         return run_traced(problem)

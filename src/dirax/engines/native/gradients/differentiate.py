@@ -2,7 +2,8 @@
 
 A run's states and unknowns at the saved rows are functions of the first state, the parameters, t0 and h. `run` computes
 them, `jvp` their tangents, `vjp` the cotangents of what they depend on, each on the host
-(tangents_on_host.py). Derivatives of the second order and higher are those of the xla engine's run.
+(tangents_on_host.py). Derivatives of the second order and higher are those of the run with a tangent (prolonged.py); of runs
+for which that is too large those of the xla engine's run.
 """
 
 import functools
@@ -16,6 +17,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from dirax.engines.contract import Outcome, Problem, finished, saved_steps
+from dirax.engines.native.gradients.prolonged import Prolonged
 from dirax.engines.native.gradients.recording import INPUTS, Recorded
 from dirax.engines.native.gradients.tangents_on_host import jvp, vjp
 from dirax.engines.native.kernels import kernels
@@ -23,6 +25,7 @@ from dirax.engines.native.run import run
 from dirax.engines.parameters import parameters
 from dirax.engines.xla import Xla
 from dirax.engines.xla.loop import unpacked_rows
+from dirax.program.primitives import plain_primitive
 
 # ----------------------------------------------------------------------------------------------------- the primitives
 
@@ -112,14 +115,67 @@ def _run_jvp(primals, tangents, *, task):
     return found, [*rows, *(ad.zeros_like_aval(jax.typeof(x)) for x in found[2:])]
 
 
-def _linear_jvp(made: Primitive, reference: Callable) -> Callable:
+def _linear_jvp(made: Primitive, second: Callable, reference: Callable) -> Callable:
+    """The rule of a primitive that is linear in what follows the inputs; `second` is that by the run with a tangent."""
+
     def rule(primals, tangents, *, task):
         if all(type(t) is ad.Zero for t in tangents[: INPUTS + 1]):
             along = map(ad.instantiate_zeros, tangents[INPUTS + 1 :])
             return made.bind(*primals, task=task), made.bind(*primals[: INPUTS + 1], *along, task=task)
-        return jax.jvp(functools.partial(reference, task), tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))
+        tangents = tuple(map(ad.instantiate_zeros, tangents))
+        with_tangent = Prolonged.of(task, primals[2].shape[1])
+        if with_tangent is None:
+            return jax.jvp(functools.partial(reference, task), tuple(primals), tangents)
+        return made.bind(*primals, task=task), second(task, with_tangent, primals, tangents)
 
     return rule
+
+
+def _second_jvp(task: Recorded, whole: Prolonged, primals, tangents) -> list:
+    inputs, completed, tangent = primals[:INPUTS], primals[INPUTS], primals[INPUTS + 1 :]
+    state, _, *others = tangents[:INPUTS]
+    given = whole.inputs(inputs, tangent)
+    moved = whole.tangents(inputs, tangent, (state, *others), tangents[INPUTS + 1 :])
+    return whole.tangent_of_rows(*jvp_p.bind(*given, completed, *moved, task=whole))
+
+
+def _second_vjp(task: Recorded, whole: Prolonged, primals, tangents) -> list:
+    (state, _, *others), of_cotangents = tangents[:INPUTS], tangents[INPUTS + 1 :]
+    turned = curvature_p.bind(*primals, state, *others, whole=whole)
+    moved = vjp_p.bind(*primals[: INPUTS + 1], *of_cotangents, task=task)
+    return [a + b for a, b in zip(turned, moved, strict=True)]
+
+
+def _curvature(*arrays, whole: Prolonged) -> list:
+    """∂²⟨cotangents, run⟩ along a tangent of the inputs, from (inputs, completed, cotangents, tangent): mixed derivatives are
+    symmetric, and so these are the cotangents of the inputs for the tangents of the rows."""
+    inputs, completed, (states, unknowns), tangent = arrays[:INPUTS], arrays[INPUTS], arrays[-6:-4], arrays[-4:]
+    given, h, of_h = whole.inputs(inputs, tangent), inputs[-1], tangent[-1]
+    of_state, of_c, of_t, of_step = vjp_p.bind(*given, completed, *whole.cotangents(states, unknowns), task=whole)
+    s, m = inputs[0].shape[1], inputs[2].shape[1]
+    return [of_state[:, :s], of_c[:, :m], of_t, of_step - of_c[:, -1] * of_h / h**2]
+
+
+curvature_p = plain_primitive("dirax_curvature", _curvature, lambda *arrays, **_: list(arrays[-4:]))
+"""It is linear in the tangent, and symmetric."""
+_along_all = ad.primitive_jvps[curvature_p]
+
+
+def _curvature_jvp(primals, tangents, *, whole):
+    if any(type(t) is not ad.Zero for t in tangents[:-4]):
+        return _along_all(primals, tangents, whole=whole)
+    along = map(ad.instantiate_zeros, tangents[-4:])
+    return curvature_p.bind(*primals, whole=whole), curvature_p.bind(*primals[:-4], *along, whole=whole)
+
+
+def _curvature_transposed(cotangents, *arguments, whole):
+    found = curvature_p.bind(*arguments[:-4], *map(ad.instantiate_zeros, cotangents), whole=whole)
+    wanted = [a if ad.is_undefined_primal(x) else None for a, x in zip(found, arguments[-4:], strict=True)]
+    return [*(None for _ in arguments[:-4]), *wanted]
+
+
+ad.primitive_jvps[curvature_p] = _curvature_jvp
+ad.primitive_transposes[curvature_p] = _curvature_transposed
 
 
 def _transposed(other: Primitive) -> Callable:
@@ -133,8 +189,8 @@ def _transposed(other: Primitive) -> Callable:
 
 
 ad.primitive_jvps[run_p] = _run_jvp
-ad.primitive_jvps[jvp_p] = _linear_jvp(jvp_p, _reference_jvp)
-ad.primitive_jvps[vjp_p] = _linear_jvp(vjp_p, _reference_vjp)
+ad.primitive_jvps[jvp_p] = _linear_jvp(jvp_p, _second_jvp, _reference_jvp)
+ad.primitive_jvps[vjp_p] = _linear_jvp(vjp_p, _second_vjp, _reference_vjp)
 ad.primitive_transposes[jvp_p] = _transposed(vjp_p)
 ad.primitive_transposes[vjp_p] = _transposed(jvp_p)
 
