@@ -462,6 +462,28 @@ def test_an_energy_that_blows_up_is_called_so_however_few_rows_there_are(frequen
     assert ("the steps are too long" in line.explanation) == (frequency == 10.0)
 
 
+def test_a_driven_motion_from_rest_has_not_blown_up():
+    """Its terms at the start are nothing: the energy came in by the work of the force."""
+    driven = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2, forces=lambda t, q, v: jnp.sin(0.7 * t)[None])
+    sol = dx.simulate(driven, dx.PlusLagrangeDirac(), q=[0.0], v=[0.0], step=0.2, steps=200)
+    assert dx.verify(sol)["energy"].verdict != "VIOLATED"
+
+
+@pytest.mark.parametrize("event", [dx.Event(lambda q: q[0]), dx.Impact(lambda q: q[0] + 0.5)])
+def test_missing_rows_are_seen_beside_events(event):
+    """Rows after a terminal event are missing rightly, and others are not."""
+    oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    run = {"step": 0.05, "steps": 80, "events": [event]}
+    sol = dx.simulate(oscillator, dx.LagrangeDAlembert(), q=[1.0], v=[0.0], **run)
+    q = np.array(sol.q)
+    q[50:] = np.nan
+    assert dx.verify(sol).ok and not dx.verify(sol.replace(fields=sol.fields | {"q": q})).ok
+    if isinstance(event, dx.Event):
+        last = dx.Event(lambda q: q[0], terminal=True)
+        both = dx.simulate(oscillator, dx.LagrangeDAlembert(), q=[[1.0], [2.0]], v=[[0.0], [-1.0]], **(run | {"events": [last]}))
+        assert np.isnan(both.q[:, -1]).all() and dx.verify(both).ok
+
+
 def test_rows_without_an_energy_are_no_good_rows():
     """A bead in a potential log q reaches q = 0 in finite time; the equations have 1/q alone, and go on beyond."""
     bead = dx.LagrangeDirac(lambda q, v: v[0] ** 2 / 2 - jnp.log(q[0]))

@@ -71,7 +71,8 @@ def _of_index_three(sol: Solution, tolerance: float | None) -> Line | None:
         return None
     pad = np.zeros(len(chain.coordinates) - n)
     asked = np.unique(np.linspace(0, len(rows) - 1, LOOKED_AT).astype(int))
-    points = [moved_onto(chain, np.append(x, pad), slice(n, None), params) for x in rows[asked] if np.all(np.isfinite(x))]
+    asked = asked[np.all(np.isfinite(rows[asked]), axis=1)]
+    points = [moved_onto(chain, np.append(x, pad), slice(n, None), params) for x in rows[asked]]
     values = np.array([np.abs(np.asarray(chain.constraints(jnp.asarray(x), params))) for x in points])
     slopes = np.array([np.abs(np.asarray(evaluated(slope_of(chain), x, params))) @ np.abs(x) for x in points])
     sizes = np.max(slopes, axis=0)

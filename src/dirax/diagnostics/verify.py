@@ -135,15 +135,31 @@ def _completion(sol: Solution) -> Line:
 
 def _not_numbers(sol: Solution) -> str:
     """In words, that a saved array of a run without failed steps is not finite somewhere; "" where all are."""
-    if sol.events is not None:  # one may have ended a trajectory, of which the rows after it are NaN
-        return ""
     for name, values in sol.fields.items():
         if isinstance(values, np.ndarray) and not np.all(np.isfinite(values)):
             rows = values.reshape(sol.batch or 1, values.shape[int(sol.batch is not None)], -1)
-            lane, row = np.argwhere(~np.all(np.isfinite(rows), axis=2))[0].tolist()
+            missing = ~np.all(np.isfinite(rows), axis=2) & ~_ended_by_events(sol)[:, : rows.shape[1]]
+            if not np.any(missing):
+                continue
+            lane, row = np.argwhere(missing)[0].tolist()
             where = f"t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
             return f"every step was solved, but {name} is not finite in a row or more, first at {where}"
     return ""
+
+
+def _ended_by_events(sol: Solution) -> np.ndarray:
+    """The rows (B, rows) of a batch from the end of those on which an event has ended the trajectory: they are NaN from the one
+    after it on."""
+    ended = np.zeros((sol.batch or 1, sol.rows), bool)
+    if sol.batch is None or sol.events is None or not len(sol.events):
+        return ended
+    place = np.asarray(sol.fields["q" if "q" in sol.fields else "x"])
+    for lane in np.unique(sol.events.lane).tolist():
+        good = np.flatnonzero(np.all(np.isfinite(place[lane]), axis=-1))
+        last, at = int(good[-1]) if len(good) else 0, sol.events.t[sol.events.lane == lane]
+        if last + 1 < sol.rows and np.any((at >= sol.time_of(last, lane)) & (at <= sol.time_of(last + 1, lane))):
+            ended[lane, last:] = True  # of the last good row no step is saved
+    return ended
 
 
 def _title(sol: Solution) -> str:
