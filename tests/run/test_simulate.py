@@ -1,6 +1,7 @@
 """simulate(): rows and times, batches, parameters, gradients, transformations, starts, progress, reuse of compiled code."""
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import dirax as dx
+from dirax import gallery
 
 PLUS = dx.PlusLagrangeDirac()
 OSCILLATOR = dx.LagrangeDirac(lambda q, v: (v @ v - q @ q) / 2)
@@ -330,3 +332,13 @@ def test_params_are_dataclasses_that_nobody_has_registered():
     assert jax.grad(end)(2.0) == pytest.approx(expected, rel=1e-7)
     with pytest.raises(TypeError, match=r"params\.spring\.k is 'stiff'"):
         dx.simulate(system, PLUS, params=Oscillator(Spring("stiff")), **given)
+
+
+def test_a_last_row_that_needs_a_step_which_has_no_solution_is_warned_of():
+    """The saved momentum is that between two steps: with ok=True it was off by a fifth, without a word."""
+    chain = gallery.get("hanging-chain")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert chain.simulate(step=4 * chain.step, steps=35).ok
+    with pytest.warns(RuntimeWarning, match="the last row is made of the step after it"):
+        chain.simulate(step=4 * chain.step, steps=36)

@@ -1,6 +1,7 @@
 """A run carried out: by the plan for its kind where there is one, else discretize → start → engine; then its Solution."""
 
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -288,6 +289,15 @@ def _run(
     solution = solution_of(settings.system, settings.scheme, found.case, problem, outcome, found.row0, traced)
     if found.singular and not traced:
         warn_of_leaving(solution)
+    if outcome.unsaid is not None and np.any(outcome.unsaid):
+        which = f" of trajectory {int(np.argmax(outcome.unsaid))}" if problem.batch is not None else ""
+        warnings.warn(
+            f"the last row{which} is made of the step after it, as a momentum between two steps is, and no solution of that step "
+            "was found: what it says of momenta and multipliers is not to be trusted. End the run a row before, or take smaller "
+            "steps.",
+            RuntimeWarning,
+            stacklevel=4,
+        )
     if not traced:
         solution.continuation = Continuation(settings, kind, found, outcome.record, steps)
         getting_ready, compiling = ready - started, outcome.compile_seconds  # an engine may compile when it runs, too

@@ -105,6 +105,8 @@ class Kernels:
         self.operations = 0
         self.sizing = 0.0
         """Seconds that runs have spent on sizes without a kernel for them."""
+        self.rows_need_step: bool | None = None
+        """Whether the rows of nodes are made of the step that leaves them, once it is known."""
         self.saved: Any = None
         """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
         self.places: Any = None

@@ -112,8 +112,14 @@ class Lanes:
     def close(self, kernel) -> dict[str, np.ndarray]:
         """The rows of the last states."""
         closing, outs = self.arrays(2)
-        self.call(kernel, self.records.copy(), outs, 0, 1, 1, self.threads)
+        self.closed = self.records.copy()
+        self.call(kernel, self.closed, outs, 0, 1, 1, self.threads)
         return {name: rows[:, 0] for name, rows in closing.items()}
+
+    @property
+    def closing_status(self) -> np.ndarray:
+        """How the steps ended that leave the last states."""
+        return self.closed[:, self.record.status].reshape(-1)[: self.lanes]
 
     def attempt(self, numbers: np.ndarray, made: Kernels | CollocationKernels, table: np.ndarray) -> np.ndarray:
         """The records (n, quantities) after some of the trajectories went on from others, which are not kept: one by one, since

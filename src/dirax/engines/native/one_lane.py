@@ -107,6 +107,11 @@ class OneLane:
                self.problem.max_iterations)  # fmt: skip
         return {name: memory[a:b].reshape(shape) for name, a, b, shape in closing}
 
+    @property
+    def closing_status(self) -> np.ndarray:
+        """How the step ended that leaves the last state."""
+        return self.memory[self.places.record + self.record.status][None]
+
     def table(self) -> np.ndarray:
         """The record, (1, quantities)."""
         return self.memory[: self.places.record][None]

@@ -9,6 +9,7 @@ from dirax.engines.contract import ALL_UNKNOWNS, NOT_CONVERGED, OK, TOO_LARGE, O
 from dirax.engines.native.collocation_kernels import CollocationKernels, collocation_kernels
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
+from dirax.engines.native.loops.collocation_plan import depends
 from dirax.engines.native.one_lane import OneLane, places_of
 from dirax.engines.native.sizes_of_lanes import find_sizes
 from dirax.engines.native.stuck_lanes import otherwise
@@ -44,6 +45,10 @@ class Ready:
         self.quick = kernel if made.runs.is_quick(self.width) else None
         if p.often and isinstance(made, Kernels) and made.record.kept:
             made.of_sizes(self.width, often=True)
+        if isinstance(made, Kernels) and made.rows_need_step is None:
+            first = made.step.equations[0]
+            of_nodes = [n for name, nodes in first.rows.items() if p.is_node(name) for n in nodes.ravel().tolist()]
+            made.rows_need_step = depends(made.step.graph, of_nodes, first.unknowns)
         self.first_unknowns = made.record.unknowns(0, p.equation.stages[0][0].unknowns)
         self.notes = {
             "unknowns": sum(len(made.step.equations[i].unknowns) for i, _ in made.step.stages),
@@ -118,6 +123,8 @@ class Ready:
             engine="native",
             notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
         )
+        if isinstance(self.made, Kernels) and self.made.rows_need_step and not interrupted:
+            outcome.unsaid = (lanes.closing_status != OK) & (outcome.completed == p.steps)
         if others:
             outcome.notes["iteration"] = "; then ".join([str(self.notes.get("iteration", "Newton's method")), *others])
         whole = places is not None and outcome.completed[0] == p.steps  # then the closing row stands where it belongs
