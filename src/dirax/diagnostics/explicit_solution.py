@@ -5,7 +5,7 @@ integrated by Gragg's midpoint rule with extrapolation in h² (Hairer, Nørsett,
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from dirax.diagnostics.bench.ode import ExplicitODE, completed, explicit_ode
 from dirax.diagnostics.bench.subject import Skipped
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.memo import Same
+from dirax.run.event import Event, checked_events
 from dirax.run.impact import Impact
 from dirax.systems.phase_space import PhaseSpaceLagrangian
 from dirax.systems.system import AbstractSystem
@@ -82,8 +83,7 @@ def explicit_solution(system: AbstractSystem, run: Mapping[str, Any]) -> Explici
     data = {name: jnp.asarray(run[name], float) for name in GIVEN if run.get(name) is not None}
     if run.get("batch_params") or any(a.ndim != 1 for a in data.values()):
         raise Skipped("there are several trajectories")
-    events = run.get("events") or ()
-    if any(isinstance(event, Impact) for event in (events if isinstance(events, Sequence) else [events])):
+    if any(isinstance(event, Impact) for event in checked_events(run.get("events") or (), (Event, Impact))):
         raise Skipped("the equations of motion know nothing of walls")
     inputs, params = run.get("inputs"), jax.tree.map(jnp.asarray, run.get("params"))
     system, t0 = system if inputs is None else system.with_inputs(inputs), float(run.get("t0", 0.0))

@@ -25,6 +25,7 @@ from dirax.program.user_functions import refuse_traced
 from dirax.solution.events import WALLS_WORK
 from dirax.solution.reconstruction import reconstruct
 from dirax.solution.solution import Solution
+from dirax.solution.trajectory import last_rows
 
 
 @patience()
@@ -135,12 +136,13 @@ def _completion(sol: Solution) -> Line:
 
 def _not_numbers(sol: Solution) -> str:
     """In words, that a saved array of a run without failed steps is not finite somewhere; "" where all are."""
-    for name, values in sol.fields.items():
-        if isinstance(values, np.ndarray) and not np.all(np.isfinite(values)):
-            rows = values.reshape(sol.batch or 1, values.shape[int(sol.batch is not None)], -1)
-            missing = ~np.all(np.isfinite(rows), axis=2) & ~_ended_by_events(sol)[:, : rows.shape[1]]
-            if not np.any(missing):
-                continue
+    broken = [name for name, a in sol.fields.items() if isinstance(a, np.ndarray) and not np.all(np.isfinite(a))]
+    ended = _ended_by_events(sol) if broken else np.zeros((0, 0), bool)
+    for name in broken:
+        values = sol.fields[name]
+        rows = values.reshape(sol.batch or 1, values.shape[int(sol.batch is not None)], -1)
+        missing = ~np.all(np.isfinite(rows), axis=2) & ~ended[:, : rows.shape[1]]
+        if np.any(missing):
             lane, row = np.argwhere(missing)[0].tolist()
             where = f"t = {sol.time_of(row, lane):.6g}{of_lane(sol, lane)}"
             return f"every step was solved, but {name} is not finite in a row or more, first at {where}"
@@ -153,10 +155,9 @@ def _ended_by_events(sol: Solution) -> np.ndarray:
     ended = np.zeros((sol.batch or 1, sol.rows), bool)
     if sol.batch is None or sol.events is None or not len(sol.events):
         return ended
-    place = np.asarray(sol.fields["q" if "q" in sol.fields else "x"])
+    lasts = np.maximum(last_rows([np.asarray(sol.fields["q" if "q" in sol.fields else "x"])]), 0)
     for lane in np.unique(sol.events.lane).tolist():
-        good = np.flatnonzero(np.all(np.isfinite(place[lane]), axis=-1))
-        last, at = int(good[-1]) if len(good) else 0, sol.events.t[sol.events.lane == lane]
+        last, at = int(lasts[lane]), sol.events.t[sol.events.lane == lane]
         if last + 1 < sol.rows and np.any((at >= sol.time_of(last, lane)) & (at <= sol.time_of(last + 1, lane))):
             ended[lane, last:] = True  # of the last good row no step is saved
     return ended

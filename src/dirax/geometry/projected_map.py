@@ -75,9 +75,9 @@ class Submanifold(AbstractManifold):
                 f"P(P(x)) = P(x) does not hold near {name}: its derivative misses DP DP = DP by {missed:.3g} there, so that the "
                 "points P(x) are no manifold to which P projects."
             )
-        if round(float(np.trace(slope))) != self.dimension:
+        if (found := round(float(np.trace(slope)))) != self.dimension:
             raise ValueError(
-                f"the image of P has dimension {round(float(np.trace(slope)))} at {name}, the trace of DP, but "
+                f"the image of P has dimension {found} at {name}, the trace of DP, but "
                 f"dimension={self.dimension} was given: leave dimension out, or give that."
             )
 

@@ -266,20 +266,19 @@ def _way_out(error: Exception, params: Any) -> str:
         return f"; params {_what_it_is(params)}."
     if isinstance(error, jax.errors.TracerArrayConversionError):
         return "; write it with jax.numpy instead of numpy."
-    if isinstance(error, jax.errors.ConcretizationTypeError) and (maker := _maker_in(error)):
-        return (
-            f"; {maker} asks for the values of fields, and JAX makes params of what has none: check them before they are made, "
-            "or only where isinstance(value, float)."
-        )
     if isinstance(error, jax.errors.ConcretizationTypeError):
+        if maker := _maker_in(error):
+            return (
+                f"; {maker} asks for the values of fields, and JAX makes params of what has none: check them before they are "
+                "made, or only where isinstance(value, float)."
+            )
         return "; write it without Python's if and float(), e.g. with jnp.where."
     return "."
 
 
 def _maker_in(error: Exception) -> str:
     """The name of the method that makes an object in which an error was raised; "" where it was another one."""
-    frames = [frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)]
-    names = [code.co_qualname if hasattr(code, "co_qualname") else code.co_name for code in frames]
+    names = [frame.f_code.co_qualname for frame, _ in traceback.walk_tb(error.__traceback__)]
     return next((name.split("<locals>.")[-1] for name in names if name.endswith("__post_init__")), "")
 
 

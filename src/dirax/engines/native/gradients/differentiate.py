@@ -115,84 +115,83 @@ def _run_jvp(primals, tangents, *, task):
     return found, [*rows, *(ad.zeros_like_aval(jax.typeof(x)) for x in found[2:])]
 
 
-def _linear_jvp(made: Primitive, second: Callable, reference: Callable) -> Callable:
-    """The rule of a primitive that is linear in what follows the inputs; `second` is that by the run with a tangent."""
+KNOWN = INPUTS + 1
+"""Operands of `jvp` and `vjp` before those in which they are linear: the inputs and the good steps."""
+
+
+def _linear_jvp(made: Primitive, known: int, otherwise: Callable) -> Callable:
+    """The rule of a primitive that is linear in what follows the `known` operands; `otherwise` is that where these move too."""
 
     def rule(primals, tangents, *, task):
-        if all(type(t) is ad.Zero for t in tangents[: INPUTS + 1]):
-            along = map(ad.instantiate_zeros, tangents[INPUTS + 1 :])
-            return made.bind(*primals, task=task), made.bind(*primals[: INPUTS + 1], *along, task=task)
+        if any(type(t) is not ad.Zero for t in tangents[:known]):
+            return otherwise(primals, tangents, task=task)
+        along = map(ad.instantiate_zeros, tangents[known:])
+        return made.bind(*primals, task=task), made.bind(*primals[:known], *along, task=task)
+
+    return rule
+
+
+def _transposed(other: Primitive, known: int) -> Callable:
+    def rule(cotangents, *arguments, task):
+        found = other.bind(*arguments[:known], *map(ad.instantiate_zeros, cotangents), task=task)
+        wanted = [a if ad.is_undefined_primal(x) else None for a, x in zip(found, arguments[known:], strict=True)]
+        return [*(None for _ in arguments[:known]), *wanted]
+
+    return rule
+
+
+def _by_prolonging(made: Primitive, second: Callable, reference: Callable) -> Callable:
+    """The rule where the inputs move: `second` of the run with a tangent, of one that is too large the `reference`."""
+
+    def rule(primals, tangents, *, task):
         tangents = tuple(map(ad.instantiate_zeros, tangents))
         with_tangent = Prolonged.of(task, primals[2].shape[1])
         if with_tangent is None:
             return jax.jvp(functools.partial(reference, task), tuple(primals), tangents)
-        return made.bind(*primals, task=task), second(task, with_tangent, primals, tangents)
+        return made.bind(*primals, task=task), second(with_tangent, primals, tangents)
 
     return rule
 
 
-def _second_jvp(task: Recorded, whole: Prolonged, primals, tangents) -> list:
-    inputs, completed, tangent = primals[:INPUTS], primals[INPUTS], primals[INPUTS + 1 :]
+def _second_jvp(whole: Prolonged, primals, tangents) -> list:
+    inputs, completed, tangent = primals[:INPUTS], primals[INPUTS], primals[KNOWN:]
     state, _, *others = tangents[:INPUTS]
     given = whole.inputs(inputs, tangent)
-    moved = whole.tangents(inputs, tangent, (state, *others), tangents[INPUTS + 1 :])
+    moved = whole.tangents(inputs, tangent, (state, *others), tangents[KNOWN:])
     return whole.tangent_of_rows(*jvp_p.bind(*given, completed, *moved, task=whole))
 
 
-def _second_vjp(task: Recorded, whole: Prolonged, primals, tangents) -> list:
-    (state, _, *others), of_cotangents = tangents[:INPUTS], tangents[INPUTS + 1 :]
-    turned = curvature_p.bind(*primals, state, *others, whole=whole)
-    moved = vjp_p.bind(*primals[: INPUTS + 1], *of_cotangents, task=task)
+def _second_vjp(whole: Prolonged, primals, tangents) -> list:
+    (state, _, *others), of_cotangents = tangents[:INPUTS], tangents[KNOWN:]
+    turned = curvature_p.bind(*primals, state, *others, task=whole)
+    moved = vjp_p.bind(*primals[:KNOWN], *of_cotangents, task=whole.task)
     return [a + b for a, b in zip(turned, moved, strict=True)]
 
 
-def _curvature(*arrays, whole: Prolonged) -> list:
+CURVED = KNOWN + 2
+"""Operands of `curvature` before the tangent: those of `jvp` and `vjp`, and the cotangents of states and unknowns."""
+
+
+def _curvature(*arrays, task: Prolonged) -> list:
     """∂²⟨cotangents, run⟩ along a tangent of the inputs, from (inputs, completed, cotangents, tangent): mixed derivatives are
     symmetric, and so these are the cotangents of the inputs for the tangents of the rows."""
-    inputs, completed, (states, unknowns), tangent = arrays[:INPUTS], arrays[INPUTS], arrays[-6:-4], arrays[-4:]
-    given, h, of_h = whole.inputs(inputs, tangent), inputs[-1], tangent[-1]
-    of_state, of_c, of_t, of_step = vjp_p.bind(*given, completed, *whole.cotangents(states, unknowns), task=whole)
+    inputs, completed, cotangents, tangent = arrays[:INPUTS], arrays[INPUTS], arrays[KNOWN:CURVED], arrays[CURVED:]
+    given, h, of_h = task.inputs(inputs, tangent), inputs[-1], tangent[-1]
+    of_state, of_c, of_t, of_step = vjp_p.bind(*given, completed, *task.cotangents(*cotangents), task=task)
     s, m = inputs[0].shape[1], inputs[2].shape[1]
     return [of_state[:, :s], of_c[:, :m], of_t, of_step - of_c[:, -1] * of_h / h**2]
 
 
-curvature_p = plain_primitive("dirax_curvature", _curvature, lambda *arrays, **_: list(arrays[-4:]))
-"""It is linear in the tangent, and symmetric."""
-_along_all = ad.primitive_jvps[curvature_p]
-
-
-def _curvature_jvp(primals, tangents, *, whole):
-    if any(type(t) is not ad.Zero for t in tangents[:-4]):
-        return _along_all(primals, tangents, whole=whole)
-    along = map(ad.instantiate_zeros, tangents[-4:])
-    return curvature_p.bind(*primals, whole=whole), curvature_p.bind(*primals[:-4], *along, whole=whole)
-
-
-def _curvature_transposed(cotangents, *arguments, whole):
-    found = curvature_p.bind(*arguments[:-4], *map(ad.instantiate_zeros, cotangents), whole=whole)
-    wanted = [a if ad.is_undefined_primal(x) else None for a, x in zip(found, arguments[-4:], strict=True)]
-    return [*(None for _ in arguments[:-4]), *wanted]
-
-
-ad.primitive_jvps[curvature_p] = _curvature_jvp
-ad.primitive_transposes[curvature_p] = _curvature_transposed
-
-
-def _transposed(other: Primitive) -> Callable:
-    def rule(cotangents, *arguments, task):
-        known, linear = arguments[: INPUTS + 1], arguments[INPUTS + 1 :]
-        found = other.bind(*known, *map(ad.instantiate_zeros, cotangents), task=task)
-        wanted = [a if ad.is_undefined_primal(x) else None for a, x in zip(found, linear, strict=True)]
-        return [*(None for _ in known), *wanted]
-
-    return rule
-
+curvature_p = plain_primitive("dirax_curvature", _curvature, lambda *arrays, **_: list(arrays[CURVED:]))
+"""It is linear in the tangent, and symmetric: its own transpose."""
 
 ad.primitive_jvps[run_p] = _run_jvp
-ad.primitive_jvps[jvp_p] = _linear_jvp(jvp_p, _second_jvp, _reference_jvp)
-ad.primitive_jvps[vjp_p] = _linear_jvp(vjp_p, _second_vjp, _reference_vjp)
-ad.primitive_transposes[jvp_p] = _transposed(vjp_p)
-ad.primitive_transposes[vjp_p] = _transposed(jvp_p)
+ad.primitive_jvps[jvp_p] = _linear_jvp(jvp_p, KNOWN, _by_prolonging(jvp_p, _second_jvp, _reference_jvp))
+ad.primitive_jvps[vjp_p] = _linear_jvp(vjp_p, KNOWN, _by_prolonging(vjp_p, _second_vjp, _reference_vjp))
+ad.primitive_jvps[curvature_p] = _linear_jvp(curvature_p, CURVED, ad.primitive_jvps[curvature_p])
+ad.primitive_transposes[jvp_p] = _transposed(vjp_p, KNOWN)
+ad.primitive_transposes[vjp_p] = _transposed(jvp_p, KNOWN)
+ad.primitive_transposes[curvature_p] = _transposed(curvature_p, CURVED)
 
 
 # ------------------------------------------------------------------------------------------------------------ the run
