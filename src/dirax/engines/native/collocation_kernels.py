@@ -39,8 +39,9 @@ class CollocationKernels:
             digest.update(repr(part).encode() + b"\0")
         self.digest = digest.hexdigest()
         self.saved: Any = None
-        """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
-        self.places: Any = None
+        """The arrays that kernels save, once they are known."""
+        self.idle: list[Any] = []
+        """The memory of the last short run, for the next one."""
         self.runs = Runs(self._run)
 
     @functools.cached_property

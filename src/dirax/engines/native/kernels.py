@@ -108,8 +108,9 @@ class Kernels:
         self.rows_need_step: bool | None = None
         """Whether the rows of nodes are made of the step that leaves them, once it is known."""
         self.saved: Any = None
-        """The arrays that kernels save, and where they stood in memory in the last short run, once they are known."""
-        self.places: Any = None
+        """The arrays that kernels save, once they are known."""
+        self.idle: list[Any] = []
+        """The memory of the last short run, for the next one."""
         self.digest = _digest(self, step)
         self.repeated = len(step.stages) / len(step.equations)
         """How often, in the mean, an equation is solved in a step, which is compiled once."""

@@ -38,6 +38,16 @@ class Saved(NamedTuple):
     ends_before: bool
 
 
+class Closed(NamedTuple):
+    """What was found of trajectories: their records (B, quantities), the saved arrays, the rows of their last states, and how
+    the steps ended that leave these."""
+
+    table: np.ndarray
+    fields: dict[str, np.ndarray]
+    closing: dict[str, np.ndarray]
+    closing_status: np.ndarray
+
+
 def arrays_saved(p: Problem, made: Kernels | CollocationKernels) -> list[Saved]:
     """The arrays of a kernel, in its order."""
     if made.saved is None:
@@ -109,17 +119,13 @@ class Lanes:
         """Whether there is a trajectory whose step has not been solved."""
         return bool(np.isin(self.records[:, self.record.status], UNSOLVED).any())
 
-    def close(self, kernel) -> dict[str, np.ndarray]:
-        """The rows of the last states."""
+    def close(self, kernel) -> Closed:
+        """What was found, with the rows of the last states."""
         closing, outs = self.arrays(2)
-        self.closed = self.records.copy()
-        self.call(kernel, self.closed, outs, 0, 1, 1, self.threads)
-        return {name: rows[:, 0] for name, rows in closing.items()}
-
-    @property
-    def closing_status(self) -> np.ndarray:
-        """How the steps ended that leave the last states."""
-        return self.closed[:, self.record.status].reshape(-1)[: self.lanes]
+        closed = self.records.copy()
+        self.call(kernel, closed, outs, 0, 1, 1, self.threads)
+        status = closed[:, self.record.status].reshape(-1)[: self.lanes]
+        return Closed(self.table(), self.fields, {name: rows[:, 0] for name, rows in closing.items()}, status)
 
     def attempt(self, numbers: np.ndarray, made: Kernels | CollocationKernels, table: np.ndarray) -> np.ndarray:
         """The records (n, quantities) after some of the trajectories went on from others, which are not kept: one by one, since

@@ -10,7 +10,7 @@ from dirax.engines.native.collocation_kernels import CollocationKernels, colloca
 from dirax.engines.native.kernels import Kernels, kernels
 from dirax.engines.native.lanes import Lanes, width_for
 from dirax.engines.native.loops.collocation_plan import depends
-from dirax.engines.native.one_lane import OneLane, places_of
+from dirax.engines.native.one_lane import OneLane, one_lane
 from dirax.engines.native.sizes_of_lanes import find_sizes
 from dirax.engines.native.stuck_lanes import otherwise
 from dirax.program.interpreter import UnsupportedPrimitive
@@ -69,9 +69,7 @@ class Ready:
         entered, runs = time.perf_counter(), self.made.runs
         kernel, ready = (self.quick, True) if self.quick else runs.kernel(self.width, self._steps(p))
         waited = 0.0 if ready else time.perf_counter() - entered
-        places = places_of(p, self.made)
-        lanes = Lanes(p, self.made, self.width) if places is None else OneLane(p, self.made, places)
-        fields = lanes.fields
+        lanes = one_lane(p, self.made) or Lanes(p, self.made, self.width)
         if p.record is None and isinstance(self.made, Kernels):  # a fixed point finds its own
             waited += find_sizes(lanes, self.made)
         started, before, done, interrupted, threads = time.perf_counter(), waited, p.after, False, 1
@@ -102,10 +100,13 @@ class Ready:
         except KeyboardInterrupt:
             interrupted = True
         run_seconds = time.perf_counter() - started - (waited - before)
-        closing = lanes.close(kernel)
+        table, fields, closing, closing_status = lanes.close(kernel)
+        alone = isinstance(lanes, OneLane)
+        if alone:
+            self.made.idle[:] = [lanes]
         compile_seconds, cached = self.compile_seconds + waited, self.notes["kernel_cached"] and ready
         self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
-        table, record = lanes.table(), lanes.record
+        record = lanes.record
         counts = table[:, record.completed : record.iterations + 1].astype(np.int64)
         outcome = Outcome(
             fields=fields,
@@ -124,10 +125,10 @@ class Ready:
             notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
         )
         if isinstance(self.made, Kernels) and self.made.rows_need_step and not interrupted:
-            outcome.unsaid = (lanes.closing_status != OK) & (outcome.completed == p.steps)
+            outcome.unsaid = (closing_status != OK) & (outcome.completed == p.steps)
         if others:
             outcome.notes["iteration"] = "; then ".join([str(self.notes.get("iteration", "Newton's method")), *others])
-        whole = places is not None and outcome.completed[0] == p.steps  # then the closing row stands where it belongs
+        whole = alone and outcome.completed[0] == p.steps  # then the closing row stands where it belongs
         return outcome if whole else finished(p, outcome)
 
 
