@@ -7,7 +7,7 @@ from dirax.diagnostics.casimir_lines import casimir_lines
 from dirax.diagnostics.constraint_lines import constraint, hidden_constraint
 from dirax.diagnostics.energy_lines import energy_line, port_lines
 from dirax.diagnostics.final_manifold_lines import final_manifold
-from dirax.diagnostics.flights import longest_flight
+from dirax.diagnostics.flights import longest_flight, run_again
 from dirax.diagnostics.manifold_lines import points
 from dirax.diagnostics.momentum_lines import Symmetries, generators_of, momentum, quotient_momentum
 from dirax.diagnostics.premise_line import premise_line
@@ -59,7 +59,8 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
       where there are constraints ([PY] §3.2): 32 ε · 2n · the condition number of the step's equations, at a few steps, of
       each entry of the form;
     - variable steps: a step and the step back, 32 ε of what it would be off if every operation were;
-    - runs with impacts: steps replayed but those that a wall divides, momentum maps over the run, and the energy where no wall
+    - runs with impacts: all rows and impacts by the run once more, with its walls (of one that took longer than 2 s, its first
+      part); steps replayed but those that a wall divides, momentum maps over the run, and the energy where no wall
       changes it; all else in the longest flight between two of them;
     - systems with ports ([BLM] §7.1): the power balance of every step and, with a discrete gradient, the books over the run,
       H − H(0) less what was supplied plus what was dissipated: 32 ε, however many steps;
@@ -99,6 +100,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
         replayed(sol, tolerance),
         points(sol, tolerance),
         impacts,
+        run_again(sol),
         *membership(whole, structure, tolerance),
         stationary_action(whole, structure, tolerance),
         constraint(whole, structure, tolerance),

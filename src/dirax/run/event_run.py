@@ -118,7 +118,12 @@ class Searched:
         kept.example = sol.example
         if sol.continuation is not None:
             kept.continuation = LongerWithEvents(self, save_every, steps)
+            kept.again = self.again if sol.impacts is not None else None
         return kept
+
+    def again(self, steps: int) -> Solution:
+        """The first so many steps of a run with walls once more, with every row."""
+        return self.sol.continuation(self.sol, steps - int(self.sol.stats["steps"]), False)
 
     def _ending(self, lane: int) -> str:
         assert self.found is not None

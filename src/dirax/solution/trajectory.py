@@ -74,6 +74,10 @@ class Trajectory:
     impacts: Any = None
     """Those of the events that are impacts, which divide steps; None for a run without walls."""
 
+    again: Any = None
+    """steps ↦ the first so many steps of a run that walls divide, once more from its beginning, with every row; None for other
+    runs, and where it is not known how it was run."""
+
     def __init__(
         self,
         *,

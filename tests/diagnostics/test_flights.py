@@ -1,0 +1,74 @@
+"""What `verify` says of runs with walls: every row and impact of the run once more."""
+
+import numpy as np
+import pytest
+
+import dirax as dx
+from dirax.diagnostics import flights
+
+BALL = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1])
+BOX = [dx.Impact(lambda q: q[1], restitution=0.9), dx.Impact(lambda q: 0.5 - q[0]), dx.Impact(lambda q, t: q[0] + 0.5 + 0.1 * t)]
+ROOM = {"q": [0.0, 1.0], "v": [0.7, 0.0], "events": BOX}
+LINE = "run once more"
+
+
+def changed(sol, name, place, by):
+    """The solution with a number of a field, or of all of its impacts, that is another one."""
+    other = sol.replace(fields=dict(sol.fields))
+    other.impacts, other.events, other.again = sol.impacts[:], sol.events, sol.again
+    held = other.impacts.fields if place is None else other.fields
+    if name == "t":
+        other.impacts.t = other.impacts.t + by
+    else:
+        held[name] = np.array(held[name])
+        held[name][place] += by
+    return other
+
+
+@pytest.fixture(scope="module")
+def sol():
+    return dx.simulate(BALL, dx.LagrangeDAlembert(), step=0.05, steps=120, **ROOM)
+
+
+def test_the_run_once_more_has_the_same_bits(sol):
+    assert len(sol.impacts) >= 5
+    assert dx.verify(sol)[LINE].value == 0.0 and dx.verify(sol.extend(20))[LINE].value == 0.0
+    batch = dx.simulate(BALL, dx.Collocation(2), step=0.05, steps=121, save_every=3, **ROOM | {"q": [[0.0, 1.0], [0.1, 1.3]]})
+    assert dx.verify(batch)[LINE].value == 0.0 and dx.verify(batch).ok
+
+
+def test_what_was_changed_is_found_beside_walls_and_at_impacts(sol):
+    row = int(sol.impacts.t[2] / 0.05)
+    for name, place in [("q", (row, 0)), ("p", (row + 1, 1)), ("q", (-1, 1)), ("q", (0, 0)), ("t", None), ("p", None)]:
+        line = dx.verify(changed(sol, name, place, 1e-8))[LINE]
+        assert line.verdict == "VIOLATED" and line.explanation, (name, place)
+    assert f"q at t = {0.05 * row:.6g}" in dx.verify(changed(sol, "q", (row, 0), 1e-8))[LINE].explanation
+    lost = sol.replace()
+    lost.again, lost.impacts, lost.events = sol.again, sol.impacts[1:], sol.events
+    assert dx.verify(lost)[LINE].verdict == "VIOLATED"
+
+
+def test_a_whole_motion_after_a_wall_that_is_another_one_is_found(sol):
+    """Every step of it is one of the scheme, but the wall gave it all of its energy back."""
+    other = dx.simulate(
+        BALL, dx.LagrangeDAlembert(), step=0.05, steps=120, **ROOM | {"events": [dx.Impact(BOX[0].gap), *BOX[1:]]}
+    )
+    other.again = sol.again
+    report = dx.verify(other)
+    assert report["steps replayed"].verdict == "ok" and report[LINE].verdict == "VIOLATED"
+
+
+def test_roundoff_of_another_machine_is_none(sol):
+    line = dx.verify(changed(sol, "q", (40, 0), 1e-15))[LINE]
+    assert line.verdict == "ok" and "roundoff" in line.explanation
+
+
+def test_of_a_long_run_the_first_part_is_run_once_more(sol, monkeypatch):
+    monkeypatch.setattr(flights, "LONGEST", sol.stats["run_seconds"] / 2.0)
+    line = dx.verify(sol)[LINE]
+    assert line.value == 0.0 and "up to t = 2.95" in line.explanation
+    assert dx.verify(changed(sol, "q", (30, 0), 1e-8))[LINE].verdict == "VIOLATED"
+
+
+def test_parts_of_a_run_do_not_know_its_walls(sol):
+    assert dx.verify(sol[:60])[LINE].verdict == "not checked" and dx.verify(sol[:60]).ok
