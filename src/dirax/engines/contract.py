@@ -122,8 +122,8 @@ class Outcome:
     unknowns before it, for the message. `iterations` (B,) are updates of Newton's method, `max_residual` (B,) the largest
     entry of the residual that any good step left, or of the last change of the rates where a fixed point of these was
     iterated. `notes` go to `Solution.stats`. `record` is what the engine needs to go on after the last step, a tuple of NumPy
-    arrays; None where it would begin anew. `unsaid` (B,) says of trajectories that ended well whether nodes are made of the step
-    that leaves them, and none was found at the last; None where that is not known.
+    arrays; None where it would begin anew. `unsaid` (B,) says of trajectories whether nodes are made of the step that leaves
+    them, and none was found at the last; None where that is not known.
     """
 
     fields: dict[str, Any]

@@ -1,7 +1,6 @@
 """A run carried out: by the plan for its kind where there is one, else discretize → start → engine; then its Solution."""
 
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -31,7 +30,7 @@ from dirax.run.premises import bytes_of, check_premise
 from dirax.run.progress import reported, reporting
 from dirax.run.redundancy import redundant_constraints, without_redundant
 from dirax.run.refused_start import SHORTER, refuse_bad_start
-from dirax.run.result import solution_of
+from dirax.run.result import solution_of, warn_of_last_rows
 from dirax.run.settings import Settings, kind_of
 from dirax.run.start import begun, completed
 from dirax.run.streaming import Stream
@@ -289,15 +288,7 @@ def _run(
     solution = solution_of(settings.system, settings.scheme, found.case, problem, outcome, found.row0, traced)
     if found.singular and not traced:
         warn_of_leaving(solution)
-    if outcome.unsaid is not None and np.any(outcome.unsaid):
-        which = f" of trajectory {int(np.argmax(outcome.unsaid))}" if problem.batch is not None else ""
-        warnings.warn(
-            f"the last row{which} is made of the step after it, as a momentum between two steps is, and no solution of that step "
-            "was found: what it says of momenta and multipliers is not to be trusted. End the run a row before, or take smaller "
-            "steps.",
-            RuntimeWarning,
-            stacklevel=4,
-        )
+    warn_of_last_rows(problem, outcome)
     if not traced:
         solution.continuation = Continuation(settings, kind, found, outcome.record, steps)
         getting_ready, compiling = ready - started, outcome.compile_seconds  # an engine may compile when it runs, too

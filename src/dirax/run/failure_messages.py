@@ -51,6 +51,8 @@ def explain(problem: Problem, outcome: Outcome, lane: int, kept: int, sizes: Cal
         return f"interrupted by the user; {rows}."
     at = time_of(completed)
     reason = _by_status(outcome, lane) if brief.get() else _reason(p, outcome, lane, at, sizes) + _remark(p, outcome, lane, at)
+    if kept == completed and outcome.unsaid is not None and outcome.unsaid[lane]:
+        rows += ", whose momenta and multipliers are made of the step that failed too, and not to be trusted"
     return f"step {p.first_step + completed + 1} (from t = {at:.6g}) failed: {reason}; {rows}."
 
 

@@ -1,6 +1,7 @@
 """From what an engine gives back to a Solution: rows, times, messages, and what is reported of the run."""
 
 import functools
+import warnings
 from typing import Any
 
 import jax.numpy as jnp
@@ -76,6 +77,19 @@ def messages(p: Problem, outcome: Outcome, numbers: np.ndarray, said: list[str] 
         explained = explain if which < EXPLAINED else in_few_words
         found[lane] = (said[lane] if said else "") or explained(p, outcome, lane, int(kept[lane]), sizes)
     return found
+
+
+def warn_of_last_rows(p: Problem, outcome: Outcome) -> None:
+    """Warn of trajectories that have ended well, the last rows of which are made of steps without solutions."""
+    if outcome.unsaid is None or not np.any(bad := outcome.unsaid & (outcome.completed == p.steps)):
+        return
+    which = f" of trajectory {int(np.argmax(bad))}" if p.batch is not None else ""
+    warnings.warn(
+        f"the last row{which} is made of the step after it, as a momentum between two steps is, and no solution of that step was "
+        "found: what it says of momenta and multipliers is not to be trusted. End the run a row before, or take smaller steps.",
+        RuntimeWarning,
+        stacklevel=5,
+    )
 
 
 def times_of(p: Problem, numbers: np.ndarray, traced: bool):

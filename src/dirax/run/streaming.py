@@ -13,7 +13,7 @@ import numpy as np
 
 from dirax.engines.contract import OK, Outcome, Problem, cut, saved_steps
 from dirax.run.progress import reporting
-from dirax.run.result import messages, solution_of, stats_of, times_of
+from dirax.run.result import messages, solution_of, stats_of, times_of, warn_of_last_rows
 from dirax.run.settings import Settings
 from dirax.run.validate import Case, refuse_more_than_memory
 from dirax.solution import fingerprint
@@ -208,6 +208,8 @@ class Stream:
         """What the attributes of the store say of the run so far."""
         p = self.problem
         good = (outcome.completed == p.steps) & last
+        if last:
+            warn_of_last_rows(p, outcome)
         text = messages(p, outcome, saved_steps(p), None) if last else [STOPPED] * len(good)
         outcome = replace(outcome, compile_seconds=self.compile_seconds, run_seconds=self.run_seconds)
         by_lane = text[0] if p.batch is None else {lane: one for lane, one in enumerate(text) if one}

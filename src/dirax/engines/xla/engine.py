@@ -62,9 +62,10 @@ class Xla(AbstractEngine):
                 with_sizes, others = by_other_ways(stuck)
         except KeyboardInterrupt:
             interrupted = True
-        closing = run.closing()
+        closing, unsaid = run.closing()
         outcome = _outcome(p, run.lanes, run.fields, closing, notes, self.name)
         outcome.interrupted, outcome.compile_seconds = interrupted, compile_seconds
+        outcome.unsaid = None if interrupted else unsaid
         outcome.record = None if interrupted or with_sizes or others else tuple(jax.tree.leaves(run.lanes))
         outcome.run_seconds = time.perf_counter() - started
         if others:

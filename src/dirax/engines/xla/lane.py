@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK
+from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem
 from dirax.engines.linear_solver import AbstractLinearSolver
 from dirax.engines.xla.newton import as_function, folded, newton_root
 from dirax.schemes.step import composed_row, needs_every_part
@@ -197,6 +198,16 @@ def packed_row(equation, lane: Lane, unknowns, states) -> Any:
 def parts_of_row(equation) -> int:
     """How many parts of a step its row takes, from the first on: one, or all."""
     return len(equation.stages) if needs_every_part(equation) else 1
+
+
+def nodes_need_step(p: Problem, state: np.ndarray, params: Any) -> bool:
+    """Whether the fields of nodes are made of the step that leaves them, at a state of one trajectory: then they are not finite
+    where its unknowns are not."""
+    sizes = [(stage.state_size, stage.unknowns) for stage, _ in p.equation.stages[: parts_of_row(p.equation)]]
+    packed = np.full(sum(map(sum, sizes)) + 1, np.nan)
+    packed[: len(state)], packed[-1] = state, p.steps
+    row = unpacked_row(p.equation, jnp.asarray(packed), p.t0, p.h, p.first_step, params)
+    return not all(np.all(np.isfinite(a)) for name, a in row.items() if p.is_node(name))
 
 
 def unpacked_row(equation, packed, t0, h, first_step, params) -> dict:

@@ -10,7 +10,7 @@ import numpy as np
 from dirax.engines.contract import NOT_CONVERGED, OK, Problem, Progress
 from dirax.engines.sizes import Sizes
 from dirax.engines.stuck import AbstractStuck, Standing
-from dirax.engines.xla.lane import Lane, Numerics, first_lane
+from dirax.engines.xla.lane import Lane, Numerics, first_lane, nodes_need_step
 from dirax.engines.xla.loop import Clock, axes_of, by_lane, compiled_chunk, next_row, row_capacity
 
 FIRST_CHUNK = 64
@@ -52,11 +52,18 @@ class Run:
             if progress:
                 progress(done, p.steps)
 
-    def closing(self) -> dict[str, np.ndarray]:
-        """The row of the state at which each lane ended."""
-        _, rows = self._call(self.lanes, 0, 1, closing=True)
-        self.lanes = jax.tree.map(np.asarray, self.lanes)
-        return {name: values[:, 0] for name, values in rows.items()}
+    def closing(self) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+        """The row of the state at which each lane ended; and which (B,) have nodes there made of a step without a solution, None
+        where none has."""
+        after, rows = self._call(self.lanes, 0, 1, closing=True)
+        lanes = self.lanes = jax.tree.map(np.asarray, self.lanes)
+        closing = {name: values[:, 0] for name, values in rows.items()}
+        unsaid, p = np.atleast_1d(np.asarray(after.status) != OK), self.p
+        if not np.any(unsaid):
+            return closing, None
+        lane = int(np.argmax(unsaid))
+        params = jax.tree.map(lambda leaf: leaf[lane], p.params) if p.batch_params else p.params
+        return closing, unsaid if nodes_need_step(p, lanes.state if p.batch is None else lanes.state[lane], params) else None
 
     def _call(self, lanes: Lane, start: int, stop: int, closing: bool = False) -> tuple[Lane, dict[str, np.ndarray]]:
         p = self.p
