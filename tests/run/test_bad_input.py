@@ -687,6 +687,7 @@ def test_a_step_equation_whose_functions_return_other_sizes(name, function, word
     assert "p is not finite in a row or more, first at t = 0.1" in str(dx.verify(dx.simulate(oscillator, nowhere, **run)))
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass
 class Spring:
     stiffness: float
@@ -701,3 +702,20 @@ def test_params_that_ask_for_their_values_are_named():
     system = dx.LagrangeDirac(lambda q, v, spring: v @ v / 2 - spring.stiffness * q @ q / 2)
     message = complaint(TypeError, r"Spring.__post_init__ asks for the values", system=system, params=Spring(2.0))
     assert "Python's if" not in message
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass
+class Degrees:
+    angle: float
+
+    def __post_init__(self):
+        self.angle = np.pi / 180 * self.angle
+
+
+def test_params_that_change_what_they_are_made_of_are_refused():
+    """An angle in degrees was turned into radians once more wherever JAX went through it."""
+    system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["slope"].angle * q @ q / 2)
+    for angle in (90.0, np.float32(90.0)):
+        given = {"system": system, "params": {"slope": Degrees(angle)}}
+        complaint(ValueError, "params['slope'].angle is 1.5707963", "but 0.0274155", **given)

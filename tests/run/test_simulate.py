@@ -334,6 +334,34 @@ def test_params_are_dataclasses_that_nobody_has_registered():
         dx.simulate(system, PLUS, params=Oscillator(Spring("stiff")), **given)
 
 
+@dataclasses.dataclass
+class Incline:
+    """A slope that is given in degrees, checks itself, and keeps what it makes of that."""
+
+    slope: float
+    steep: float = dataclasses.field(init=False)
+
+    def __post_init__(self):
+        if not abs(self.slope) < 90.0:
+            raise ValueError("a slope falls by less than a right angle")
+        self.slope = jnp.deg2rad(self.slope)
+        self.steep, self._pull = jnp.sin(self.slope), 9.81 * jnp.sin(self.slope)
+
+
+@pytest.mark.parametrize("engine", ["native", "xla"])
+def test_params_are_not_made_twice(engine):
+    """What __post_init__ does to the numbers of a user was done again to its own result."""
+    system = dx.LagrangeDirac(lambda q, v, on: v @ v / 2 - 9.81 * on.steep * q[0] / 2 - on._pull * q[0] / 2)
+    given = {"q": [0.0], "v": [1.0], "step": 0.1, "steps": 10, "engine": engine}
+    end = lambda on: dx.simulate(system, PLUS, params=on, **given).q[-1, 0]
+    fall = end(Incline(30.0))
+    assert abs(fall - (1.0 - 9.81 * np.sin(np.pi / 6) * 0.55)) <= 1e-14
+    with pytest.raises(ValueError, match="right angle"):
+        Incline(100.0)
+    by_leaves = jax.grad(end)(Incline(30.0))
+    assert by_leaves.slope == 0.0 and by_leaves.steep == pytest.approx(-9.81 * 0.55 / 2) == by_leaves._pull * 9.81
+
+
 @pytest.mark.parametrize("engine", ["native", "xla", "sparse"])
 def test_a_last_row_that_needs_a_step_which_has_no_solution_is_warned_of(engine):
     """The saved momentum is that between two steps: with ok=True it was off by a fifth, without a word."""

@@ -9,9 +9,10 @@ import jax
 
 from dirax.engines.engine import AbstractEngine
 from dirax.run.carry_out import Kind, carried_out, prepared
+from dirax.run.params import params_of_case, plain_floats
 from dirax.run.scalars import count, finite, positive
 from dirax.run.settings import Settings, stated
-from dirax.run.validate import KINDS, Case, batch_size, initial_data, params_of_case, plain_floats
+from dirax.run.validate import KINDS, Case, batch_size, initial_data
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem

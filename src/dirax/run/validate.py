@@ -1,6 +1,5 @@
 """The arguments of a run, checked: each mistake is one error that names the argument, what came and what was expected."""
 
-import dataclasses
 import functools
 import math
 import os
@@ -16,16 +15,14 @@ import numpy as np
 from dirax.engines.engine import AbstractEngine
 from dirax.engines.policy import ENGINES, engine_of
 from dirax.program.user_functions import check_finite, is_traced
-from dirax.run.scalars import finite, is_number, is_real, positive
+from dirax.run.params import params_of_case, plain_floats, refuse_masked
+from dirax.run.scalars import finite, is_real, positive
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.atomic_files import checked_name
 from dirax.systems.system import AbstractSystem
 
 ROOM = 4
 """How many times the rows of a run should fit into memory."""
-
-FEW = 32
-"""Numbers up to which Python is quicker than NumPy to see whether they are finite."""
 
 MOST_ITERATIONS = 1_000_000
 """Of Newton's method in a step: what has not converged by then goes round in circles, and a compiled loop hears no Ctrl-C."""
@@ -88,51 +85,6 @@ def validated_case(given: dict[str, Any], params: Any, batch_params: bool, step:
     data, batch = initial_data({name: a for name, a in given.items() if a is not None})
     params = params_of_case(params)
     return Case(data, params, h, t0, batch_size(batch, params, batch_params), batch_params)
-
-
-def params_of_case(params: Any) -> Any:
-    """The params with arrays for leaves; dataclasses in them become pytrees. Raises `TypeError` and `ValueError` for leaves that
-    are no finite numbers, and for dictionaries whose keys have no order."""
-    register_dataclasses(params)
-    leaves, structure = jax.tree.flatten(params)
-    plain = [plain_floats(leaf) for leaf in leaves]
-    if not any([leaf is None for leaf in plain]):
-        return jax.tree.unflatten(structure, plain)
-    params = arrays_of_params(params)
-    check_finite("params", params)
-    return params
-
-
-def register_dataclasses(params: Any) -> None:
-    """Have JAX look into the dataclasses in params. Raises `TypeError` for dictionaries whose keys have no order."""
-    try:
-        _register_dataclasses(params)
-    except (TypeError, ValueError):
-        if (keys := _without_order(params)) is None:
-            raise
-        text = f"params has a dictionary with the keys {keys:.60}, which have no order: name all of them by texts."
-        raise TypeError(text) from None
-
-
-def _without_order(params: Any) -> str | None:
-    """The keys of a dictionary in params that cannot be sorted, as JAX has to; None where there is none."""
-    inside = params.values() if isinstance(params, dict) else params if isinstance(params, list | tuple) else ()
-    if isinstance(params, dict):
-        try:
-            sorted(params)
-        except TypeError:
-            return ", ".join(map(repr, params))
-    return next((keys for part in inside if (keys := _without_order(part)) is not None), None)
-
-
-def _register_dataclasses(params: Any) -> None:
-    """Have JAX look into dataclasses, whose fields are all taken for pytrees; into those that it knows it does already."""
-    for leaf in jax.tree.leaves(params):
-        if dataclasses.is_dataclass(leaf) and not isinstance(leaf, type):
-            names = [field.name for field in dataclasses.fields(leaf)]
-            jax.tree_util.register_dataclass(type(leaf), data_fields=names, meta_fields=[])
-            for name in names:
-                _register_dataclasses(getattr(leaf, name))
 
 
 def check_kinds(system: Any, scheme: Any) -> None:
@@ -199,33 +151,13 @@ def _real_array(name: str, value: Any) -> Any:
     except ValueError as error:
         reason = str(error).split(". ")[0].rstrip(".")
         raise ValueError(f"{name} must be an array of numbers, but it could not be made one: {reason}.") from error
-    _refuse_masked(value, name)
+    refuse_masked(value, name)
     if not is_real(array.dtype):
         raise TypeError(f"{name} must hold real numbers, but its dtype is {array.dtype}.")
     if array.ndim not in (1, 2) or 0 in array.shape:
         raise ValueError(f"{name} must have shape (n,), or (B, n) for a batch of B trajectories, but its shape is {array.shape}.")
     check_finite(name, array)
     return array.astype(np.float64)
-
-
-def _refuse_masked(value: Any, name: str) -> None:
-    if isinstance(value, np.ma.MaskedArray) and np.any(np.ma.getmaskarray(value)):
-        where = np.argwhere(np.ma.getmaskarray(value))[0].tolist()
-        raise ValueError(f"{name} has no number at {where}, where it is masked: give one, by {name}.filled(…) for instance.")
-
-
-def plain_floats(value: Any) -> np.ndarray | None:
-    """A copy of finite float64 numbers that need no further look; None for anything else."""
-    if type(value) not in (list, tuple, np.ndarray, float):
-        return None
-    try:
-        array = np.array(value)
-    except Exception:  # values that JAX traces among them, or what is no array
-        return None
-    if array.dtype.char != "d":
-        return None
-    finite = all(map(math.isfinite, array.ravel().tolist())) if array.size <= FEW else np.isfinite(array).all()
-    return array if finite else None
 
 
 def refuse_more_than_memory(problem: Any) -> None:
@@ -288,30 +220,6 @@ def refuse_clock_that_stands(t0: Any, h: Any, steps: int) -> None:
             f"the times of this run are as large as {at:.6g}, where floats are {np.spacing(abs(at)):.3g} apart, and a step of "
             f"{h:.3g} is lost in them (t + h = t, or another step): take a larger step, or count time from a t0 near 0."
         )
-
-
-def _is_boolean(leaf) -> bool:
-    return isinstance(leaf, bool) or jnp.issubdtype(getattr(leaf, "dtype", object), jnp.bool_)
-
-
-def arrays_of_params(params):
-    """The pytree with arrays for its leaves: NumPy's where they can be, for JAX's start JAX and compile what takes a part.
-    Raises `TypeError` and `ValueError` for leaves that are no numbers."""
-    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
-        if not is_number(leaf) and not _is_boolean(leaf):
-            found = f"{leaf!r:.60}: use such a value in the system's functions directly"
-            if callable(leaf):
-                found += " (of an equinox module give eqx.filter(module, eqx.is_array), and join it there by eqx.combine)"
-            if jnp.issubdtype(getattr(leaf, "dtype", object), jax.dtypes.prng_key):
-                found = "a key of JAX: pass jax.random.key_data(key), and have jax.random.wrap_key_data in the system's functions"
-            raise TypeError(f"params must be a pytree of numbers and arrays, but params{jax.tree_util.keystr(path)} is {found}.")
-        _refuse_masked(leaf, f"params{jax.tree_util.keystr(path)}")
-        if isinstance(leaf, int) and not -(2**63) <= leaf < 2**63:
-            raise ValueError(
-                f"params{jax.tree_util.keystr(path)} is a whole number of {leaf.bit_length()} bits, and arrays hold 64: write "
-                "it as a float."
-            )
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf) if is_traced(leaf) else np.array(leaf), params)
 
 
 def batch_size(batch: int | None, params, batch_params: bool) -> int | None:

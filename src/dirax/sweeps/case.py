@@ -16,7 +16,7 @@ import numpy as np
 
 from dirax.numerics.arrays import agree
 from dirax.program.memo import Memo, Same
-from dirax.run.validate import arrays_of_params, register_dataclasses
+from dirax.run.params import arrays_of_params, register_dataclasses
 from dirax.sweeps.axes import PointError, described, identities
 from dirax.sweeps.columns import Column, spread
 
