@@ -16,11 +16,6 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from dirax.program.memo import Memo
-
-STATED, VERSIONS = 512, 8
-"""Functions whose values are kept in mind, so that two systems of one function are equal, and values that one of them had."""
-
 DEEPEST, MOST, MOST_BYTES = 6, 400, 2**20
 """How far values are followed, how many are watched, and how large an array is whose entries are compared."""
 
@@ -67,7 +62,8 @@ class Watched(NamedTuple):
 
 
 class Captured:
-    """The values that a function reads from outside, as they were when this was made."""
+    """The values that a function reads from outside, as they were when this was made. All are equal, so that functions are equal
+    without them."""
 
     def __init__(self, function: Callable):
         self.watched: list[Watched] = []
@@ -75,6 +71,12 @@ class Captured:
         self._follow(function, "", frozenset(), 0)
         del self._seen
         self.function = function
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Captured)
+
+    def __hash__(self) -> int:
+        return hash(Captured)
 
     def __reduce__(self) -> tuple:
         return Captured, (self.function,)
@@ -132,26 +134,11 @@ class Captured:
             self._follow(part, "a default", found.attributes, depth + 1)
         for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
             if name not in found.own:
-                self._watch(name, functools.partial(_contents, cell), found.attributes, depth)
+                self._watch(name, functools.partial(contents, cell), found.attributes, depth)
         if root != "dirax":
             for name in sorted(found.globals - found.own):
                 if name in function.__globals__:
                     self._watch(name, functools.partial(_item, function.__globals__, name), found.attributes, depth)
-
-
-_stated: Memo[list[tuple[Captured, Callable]]] = Memo(STATED)
-
-
-def as_stated(function: Callable) -> tuple[Captured, Callable]:
-    """What a function reads now, and the function: under another identity where it has read something else before, so that
-    nothing that was traced then is taken for it."""
-    known: list[tuple[Captured, Callable]] = _stated.get(function, list)
-    for captured, stated in known:
-        if not captured.changed():
-            return captured, stated
-    captured = Captured(function)
-    known[:] = [*known[1 - VERSIONS :], (captured, _again(function) if known else function)]
-    return known[-1]
 
 
 def refuse_changed(captured: Iterable[tuple[str, Captured]]) -> None:
@@ -162,16 +149,6 @@ def refuse_changed(captured: Iterable[tuple[str, Captured]]) -> None:
                 f"{name} reads {words}; what was traced of it keeps the old value: state it again for the new one, or hand the "
                 "value over in params."
             )
-
-
-def _again(function: Callable) -> Callable:
-    """The same function as another object."""
-    if not isinstance(function, types.FunctionType):
-        return functools.partial(function)
-    code, name = function.__code__, function.__name__
-    other = types.FunctionType(code, function.__globals__, name, function.__defaults__, function.__closure__)
-    other.__kwdefaults__, other.__module__, other.__doc__ = function.__kwdefaults__, function.__module__, function.__doc__
-    return other
 
 
 def _item(holder: Any, key: Any) -> Any:
@@ -199,10 +176,11 @@ def _with_methods(value: Any, names: frozenset[str]) -> frozenset[str]:
     return found
 
 
-def _contents(cell: Any) -> Any:
+def contents(cell: types.CellType) -> Any:
+    """What a cell of a closure holds; `ABSENT` for one that is not filled yet."""
     try:
         return cell.cell_contents
-    except ValueError:  # not yet filled
+    except ValueError:
         return ABSENT
 
 

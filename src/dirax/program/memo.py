@@ -56,6 +56,15 @@ class Same:
         return id(self.object)
 
 
+def by_value(object: Any) -> Hashable:
+    """An object as part of a key, equal to those of the same value where these have a hash; else to itself alone."""
+    try:
+        hash(object)
+    except TypeError:
+        return Same(object)
+    return object
+
+
 class Memo(Generic[Made]):
     """The `size` things that were used last, by their keys."""
 

@@ -15,12 +15,13 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental import checkify
 
-from dirax.program.captured import Captured, as_stated, refuse_changed
+from dirax.program.captured import Captured, refuse_changed
 from dirax.program.compiled import compiled
 from dirax.program.derivatives_by_jax import differentiated
 from dirax.program.indexed import clamps, indexes
 from dirax.program.memo import Memo
 from dirax.program.signatures import parameters_of, refuse_other_places, takes_params, takes_time
+from dirax.program.stated import as_stated
 from dirax.program.tracing import once
 from dirax.text.representation import value_text
 
@@ -68,6 +69,7 @@ class UserFunction(eqx.Module):
     takes_params: bool = eqx.field(static=True)
     takes_time: bool = eqx.field(static=True)
     captured: Captured = eqx.field(static=True)
+    held: Captured = eqx.field(static=True)
 
     def __init__(self, function: Callable, name: str, arguments: tuple[str, ...], timed: bool = False):
         expected = f"{name}({', '.join(arguments)}[, params])"
@@ -85,7 +87,7 @@ class UserFunction(eqx.Module):
         self.arguments = ("t", *arguments) if self.takes_time else tuple(arguments)
         self.takes_params = takes_params(function, name, expected, len(self.arguments))
         refuse_other_places(function, name, expected, self.arguments)
-        self.name, (self.captured, self.function) = name, as_stated(_hashable(function))
+        self.name, (self.captured, self.held, self.function) = name, as_stated(_hashable(function))
 
     def __call__(self, *values: Any):
         *args, params = values
@@ -94,7 +96,7 @@ class UserFunction(eqx.Module):
                 f"{self._call} is not called with its {len(self.arguments)} arguments here, but with {len(args)}"
                 + (f": {NO_MULTIPLIERS}." if "multipliers" in self.arguments else "; params, which may be None, come last.")
             )
-        refuse_changed([(self.name, self.captured)])
+        refuse_changed([(self.name, self.held), *[(self.name, self.captured)] * (not is_traced(values))])
         with differentiated(self._call, values):
             return once(self.function)(*args, *((params,) if self.takes_params else ()))
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from dirax.engines.contract import Outcome, Problem
 from dirax.numerics.one_thread import one_thread
-from dirax.program.captured import Captured, functions_in, refuse_changed
+from dirax.program.captured import refuse_changed
 from dirax.program.memo import Memo, patience
 from dirax.program.user_functions import is_traced, values_matter
 from dirax.run.composition_premise import refuse_leaving_final_manifold
@@ -58,8 +58,6 @@ class Kind:
     plan: AnyPlan | None = None
     engine: Callable | None = None
     starts: dict[tuple, "Begun"] = field(default_factory=dict)
-    reads: list[tuple[str, Captured]] = field(default_factory=list)
-    """What their functions read from outside."""
 
     def again(self, case: Case, steps: int, save_every: int, asked: int) -> "Begun | None":
         """The start of a run from the same numbers, of so many steps."""
@@ -93,11 +91,7 @@ def kind_for(settings: Settings, case: Case) -> Kind | None:
     values are traced."""
     if not case.plain:
         return None
-    return _kinds.get((settings.key, kind_of(case)), lambda: Kind(reads=_reads(settings)))
-
-
-def _reads(settings: Settings) -> list[tuple[str, Captured]]:
-    return list(functions_in([settings.system, settings.scheme, *settings.events]))
+    return _kinds.get((settings.key, kind_of(case)), Kind)
 
 
 @dataclass
@@ -134,12 +128,12 @@ def carried_out(
 ) -> Solution:
     """The Solution of a run. Raises `ValueError` for data that a premise excludes."""
     if settings.events:
-        refuse_changed(_reads(settings))  # walls begin runs of their own
+        refuse_changed(settings.reads)  # walls begin runs of their own
         return run_with_events(carried_out, _begun, settings, case, steps, save_every, progress, kind, entered)
     began, progress = time.perf_counter(), reported(progress)
     every = _checked_times(case, steps, save_every)
     kind = None if settings.to is not None else kind or kind_for(settings, case)
-    refuse_changed(_reads(settings) if kind is None else kind.reads)
+    refuse_changed(settings.reads)
     if kind is None and case.traced:
         case = without_redundant(settings.system, case, settings.project)
         problem, outcome, row0 = carried_by_jax(_by_jax(settings, steps, every), settings, case, steps, every)

@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from dirax.program.memo import Same
 from dirax.program.user_functions import is_traced
 from dirax.run.event import TRACED, Event, captures_traced, evaluated, refuse_unknown
 from dirax.run.event_search import EventSearch, places_for
@@ -203,7 +202,7 @@ def run_with_events(
         if case.traced:
             known = without_redundant(plain.system, case, plain.project)
             by_jax = lambda case: flown(plain.system, begun_at(case)[0], own, tuple(walls))
-            found = carried_by_jax(by_jax, plain, known, count, *walls, *map(Same, own))
+            found = carried_by_jax(by_jax, plain, known, count, *walls, *own)
             return flight_of(plain, case, *found)
         begun, captured = begun_at(case)
         if begun.traced or captured:

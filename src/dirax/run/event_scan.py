@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.program.evaluation.functions import graph_program_of
-from dirax.program.memo import Memo, Same
+from dirax.program.memo import Memo, Same, by_value
 from dirax.program.scalar_program import ScalarProgram
 from dirax.run.event import Event, evaluated
 from dirax.schemes.hermite import cubic
@@ -46,7 +46,7 @@ class EventScan:
 
     def run(self) -> Any:
         """The compiled scan; None where the function or the inside of a step is no scalar program, and without the compiler."""
-        sol, key = self.dense.sol, (Same(self.dense.equation), Same(self.dense.sol.system), Same(self.event), self.structure)
+        sol, key = self.dense.sol, (Same(self.dense.equation), by_value(self.dense.sol.system), self.event, self.structure)
         one = 1 if sol.batch is None else 2
         shapes = [jax.ShapeDtypeStruct(np.shape(sol.fields[name])[one:], jnp.float64) for name in self.names]
         of_params = [np.shape(leaf)[bool(sol.batch_params and sol.batch is not None) :] for leaf in self.leaves]

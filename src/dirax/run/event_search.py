@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dirax.numerics.brackets import bracketed_roots
-from dirax.program.memo import Same
 from dirax.run.dips import changes, changes_beside_dips, dips
 from dirax.run.event import Event, evaluated, refuse_unknown
 from dirax.run.event_scan import FEWEST, EventScan
@@ -68,7 +67,7 @@ class EventSearch:
             fields = fields | {"v": dense.velocity(lanes, fields, t)}
         known = {name: fields[name] for name in event.arguments if name in fields} | {"t": t}
         one = lambda known, params: evaluated(event, number, known, params)
-        return self._finite(dense.entries(one, lanes, known, "event", Same(event)), t)
+        return self._finite(dense.entries(one, lanes, known, "event", event), t)
 
     def _finite(self, values: np.ndarray, t: np.ndarray) -> np.ndarray:
         """The values. Raises `ValueError` where one is not finite."""

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from dirax.program.given_tangents import implicit
-from dirax.program.memo import Same
+from dirax.program.memo import Same, by_value
 from dirax.run.event import Event, evaluated, refuse_unknown
 from dirax.run.impact_traced import bracketed_fall
 from dirax.schemes.step import CLOCK
@@ -41,7 +41,7 @@ def with_traced_events(sol: Solution, events: tuple[Event, ...], points: int) ->
         return jax.lax.map(lane, (nodes, steps, params))
 
     structure = jax.tree.structure((nodes, steps, params))
-    same = Same(dense.equation), Same(sol.system), *map(Same, events)
+    same = Same(dense.equation), by_value(sol.system), *events
     t, index, direction, fields = compiled_call(Keyed(all_of, *same, points, structure), nodes, steps, params, times, h)
     flat = lambda a: a.reshape(lanes, -1, *a.shape[4:])
     t, index, direction, fields = flat(t), flat(index), flat(direction), {name: flat(a) for name, a in fields.items()}

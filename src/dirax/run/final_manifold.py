@@ -12,7 +12,7 @@ import numpy as np
 from dirax.numerics.equilibration import equilibrated
 from dirax.numerics.ranks import rank_of_equations
 from dirax.numerics.tolerances import MANIFOLD_RANK, ON_MANIFOLD
-from dirax.program.memo import Memo, Same
+from dirax.program.memo import Memo, Same, by_value
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.run.start import Initial, completed
@@ -51,7 +51,7 @@ def is_singular(system: AbstractSystem, shape: Shape, case: Case, initial: Initi
         return False
     given = tuple(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(case.params))
     ask = lambda: _is_singular(system, shape, *(_at_either_point(system, case)[0] if case.two_points else (case, initial)))
-    return _singular.get((Same(system), given, case.batch, *case.data), ask)
+    return _singular.get((by_value(system), given, case.batch, *case.data), ask)
 
 
 def _at_either_point(system: AbstractSystem, case: Case) -> list[tuple[Case, Initial]]:
@@ -111,7 +111,7 @@ def chain_at(system: AbstractSystem, q: Any, v: Any, t: float, params: Any) -> C
             return None
         return None if chain.verdict == IRREGULAR else chain
 
-    return _chains.get((Same(system), given, jax.tree.structure(params)), found)
+    return _chains.get((by_value(system), given, jax.tree.structure(params)), found)
 
 
 def needed_at(system: AbstractSystem, case: Case, initial: Initial) -> str:
@@ -199,7 +199,7 @@ def _on_known_manifold(system: AbstractSystem, q: Any, p: Any, v: Any, t: float,
     """Whether a point is on the final manifold beyond doubt, by the chain that was first found for the system, elsewhere: in no
     units but those of the point, since those of the chain belong to other data. Zeros among params may make it another one."""
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(params)]
-    key = Same(system), jax.tree.structure(params), *((leaf.shape, (leaf != 0).tobytes()) for leaf in leaves)
+    key = by_value(system), jax.tree.structure(params), *((leaf.shape, (leaf != 0).tobytes()) for leaf in leaves)
     chain = _chains.get(key, lambda: chain_at(system, q, v, t, params))
     if chain is None or chain.empty:
         return False

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.program.captured import as_stated
 from dirax.program.evaluation.functions import program_of
 from dirax.program.linear_solves import solve
+from dirax.program.stated import as_stated
 from dirax.program.tracing import once
 from dirax.run.event import names_of
 from dirax.schemes.collision_step import bounced, least_squares
@@ -55,7 +55,7 @@ class Impact:
         if not number or not 0.0 <= restitution <= 1.0:
             raise ValueError(f"restitution must be a number from 0 to 1, but {restitution!r} was given.")
         self.arguments = names_of(gap, "gap", KNOWN)
-        self.captured, self.gap = as_stated(gap)
+        self.captured, _, self.gap = as_stated(gap)
         self.restitution = float(restitution)
 
     @property
@@ -67,6 +67,16 @@ class Impact:
         """The gap at one place."""
         known = {"t": t, "q": q, "params": params}
         return self.gap(**{name: known[name] for name in self.arguments})
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Impact) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple:
+        return self.gap, self.arguments, self.restitution
 
     def __repr__(self) -> str:
         own = getattr(self.gap, "__name__", type(self.gap).__name__).replace("<lambda>", "lambda")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Outcome, Problem, finished
-from dirax.program.memo import Memo, Same
+from dirax.program.memo import Memo, Same, by_value
 from dirax.run.event import OutsideIndex, captures_traced
 from dirax.run.flight import Flight, alerted
 from dirax.run.impact import Impact, Numbers, gaps_of, jump
@@ -94,9 +94,8 @@ def _flights(
     """What makes the flight of a trajectory, for those that differ in numbers alone from this one."""
     stage = p.equation.stages[0][0]
     gaps = gaps_of(walls)
-    same = tuple(map(Same, walls))
     watched, collision = _steps.get(
-        ("walls", Same(system), Same(p.equation), *same),
+        ("walls", by_value(system), Same(p.equation), *walls),
         lambda: (
             WatchedStep(stage, system, gaps).equation(),
             CollisionStep(stage, system, gaps, tuple(wall.restitution for wall in walls)).equation(),
@@ -110,12 +109,12 @@ def _flights(
         return many, many.with_numbers(steps=1), hit
 
     t, q, state = np.zeros(()), np.zeros(stage.state_layout["q"][0]), np.asarray(p.state)
-    gap = Numbers(gaps, [t, q], p.params, "gaps", *same)
+    gap = Numbers(gaps, [t, q], p.params, "gaps", *walls)
     sizes = lambda t, q, end, params: gap_terms(gaps, t, q, [end], params)
-    terms = Numbers(sizes, [t, q, q], p.params, "terms of gaps", *same)
+    terms = Numbers(sizes, [t, q, q], p.params, "terms of gaps", *walls)
     jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, wall.restitution, state, t, h, params)
-    key = "jump", Same(system), Same(p.equation)
-    jumps = [Numbers(jumped(wall), [state, t, t], p.params, *key, own) for wall, own in zip(walls, same, strict=True)]
+    key = "jump", by_value(system), Same(p.equation)
+    jumps = [Numbers(jumped(wall), [state, t, t], p.params, *key, wall) for wall in walls]
     many, _, hit = problems(p)
     watch, collide = engine.walks(many), engine.walks(hit)
 

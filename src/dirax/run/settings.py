@@ -10,6 +10,7 @@ from typing import Any
 import jax
 
 from dirax.engines.engine import AbstractEngine
+from dirax.program.captured import Captured, functions_in
 from dirax.program.memo import Memo, Same
 from dirax.program.user_functions import UserFunction
 from dirax.run.event import Event, checked_events
@@ -30,6 +31,9 @@ X64 = "jax_enable_x64"
 """JAX's option for 64-bit floats, which dirax turns on."""
 
 
+_reads: Memo[list[tuple[str, Captured]]] = Memo(256)
+
+
 @dataclass(frozen=True)
 class Settings:
     """What is run and how; `system` is with its inputs, and `engine` is one."""
@@ -44,6 +48,13 @@ class Settings:
     events: tuple = ()
     to: Path | None = None
     """The store that the rows go to."""
+
+    @cached_property
+    def reads(self) -> list[tuple[str, Captured]]:
+        """What the functions of this system and scheme, and of these events, read from outside, which may have changed where
+        that of others that are equal has not."""
+        stated = self.system, self.scheme, *self.events
+        return _reads.get(tuple(map(Same, stated)), lambda: list(functions_in(stated)))
 
     @cached_property
     def key(self) -> tuple:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.numerics.equilibration import balancing_scales, equilibrated
-from dirax.program.memo import Memo, Same
+from dirax.program.memo import Memo, by_value
 from dirax.program.tracing import jacobian
 from dirax.program.user_functions import evaluated
 from dirax.schemes.step import StepEquation
@@ -59,7 +59,7 @@ def is_of_index_three(system: AbstractSystem, form: RelationForm, size: int, dat
         of_rates, of_points = evaluated(slopes, {"t": np.zeros(()), **data}, params)
         return _leaves_rates_open(of_rates, of_points, size)
 
-    return _asked.get(Same(system), ask)
+    return _asked.get(by_value(system), ask)
 
 
 def _leaves_rates_open(of_rates: Any, of_points: Any, size: int) -> bool:

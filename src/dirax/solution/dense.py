@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from dirax.program.memo import Same
+from dirax.program.memo import by_value
 from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.solution.between_rows import BetweenRows, velocity_of
 from dirax.solution.divided_steps import AT_ROW, DividedSteps, step_for
@@ -72,7 +72,7 @@ class Dense(BetweenRows):
         if self.about is not None:
             given["about"] = self.about[lanes, self._row(self.place(lanes, t)[0])]
         function = lambda values, params: velocity_of(system, values[0], values[1], params)
-        return self.entries(function, lanes, (given, t), "velocity", Same(system))
+        return self.entries(function, lanes, (given, t), "velocity", by_value(system))
 
     def place(self, lanes: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The number of the step in which each time lies, and where in it, from 0 to 1."""

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dirax.program.memo import Same
+from dirax.program.memo import Same, by_value
 from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.solution.between_rows import BetweenRows, velocity_of
 from dirax.solution.divided_steps import AT_ROW, step_for
@@ -47,7 +47,7 @@ class TracedDense(BetweenRows):
             lane if sol.batch is None else jax.vmap(lane, in_axes=(0, 0, 0 if sol.batch_params else None, None, None, None, None))
         )
         structure = jax.tree.structure((rows, steps, sol.params))
-        whole = Keyed(own, Same(self.equation), Same(sol.system), sol.batch is None, sol.batch_params, structure)
+        whole = Keyed(own, Same(self.equation), by_value(sol.system), sol.batch is None, sol.batch_params, structure)
         return compiled_call(whole, rows, steps, jax.tree.map(jnp.asarray, sol.params), times, numbers, t0, h)
 
     def _at_one(self, row, after, of_step, time, t, h, params) -> dict[str, Any]:

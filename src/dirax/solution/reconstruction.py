@@ -12,7 +12,7 @@ from dirax.geometry.group_retractions import coadjoint
 from dirax.geometry.lie_group import AbstractLieGroup
 from dirax.numerics.tolerances import GROUP_DEFECT
 from dirax.program.evaluation.functions import in_numpy
-from dirax.program.memo import Same
+from dirax.program.memo import by_value
 from dirax.program.user_functions import is_traced
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.routh import DiscreteRouth
@@ -88,7 +88,7 @@ def _multipliers_at(solution: Solution, q: Any) -> Any:
     if not is_traced(t, rows, multipliers, solution.given_params):
         batch, flat = solution.batch or 1, lambda a: np.reshape(a, (-1, np.shape(a)[-1]))
         values, lanes = (np.tile(t, batch), flat(rows), flat(multipliers)), np.repeat(np.arange(batch), len(t))
-        key = _multipliers_at, Same(system), tuple(kept.tolist())
+        key = _multipliers_at, by_value(system), tuple(kept.tolist())
         each = lambda values, params: at(values[0], values[1], values[2], params)
         return Entries(solution)(each, lanes, values, *key).reshape(np.shape(multipliers))
     along = jax.vmap(at, in_axes=(0, 0, 0, None))

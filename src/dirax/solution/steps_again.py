@@ -21,7 +21,7 @@ from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
-from dirax.program.memo import Memo, Same
+from dirax.program.memo import Memo, Same, by_value
 from dirax.program.on_host import called_on_host
 from dirax.schemes.step import CLOCK, Field, StepEquation, composed_row, needs_every_part
 from dirax.solution.trajectory import Trajectory
@@ -228,7 +228,7 @@ class StepsAgain:
     @property
     def key(self) -> tuple:
         """Equal for runs of one equation."""
-        return Same(self.equation), Same(self.sol.system)
+        return Same(self.equation), by_value(self.sol.system)
 
     def time(self, number: np.ndarray) -> np.ndarray:
         """The times at which steps begin."""

@@ -12,7 +12,8 @@ import numpy as np
 
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
-from dirax.program.memo import Same
+from dirax.program.memo import Same, by_value
+from dirax.program.stated import as_stated
 from dirax.program.user_functions import is_traced
 from dirax.schemes.step import CLOCK, Field, Shape, make_step_equation
 from dirax.text.representation import counted, fields_html
@@ -201,7 +202,7 @@ class Trajectory:
 
     def momentum_map(self, generator: Callable):
         """⟨p, ξ_Q(q)⟩ along the trajectory, (…, rows), for the infinitesimal generator `generator(q) -> (n,)`."""
-        momentum = Momentum(Same(generator))
+        momentum = Momentum(Same(as_stated(generator).function))
         values = self._without_compiling(momentum, momentum)
         return self.map_rows(momentum) if values is None else values
 
@@ -291,7 +292,7 @@ class Trajectory:
                     "use dx.load(path, system=system)."
                 )
             function = getattr(self.system, method)
-            values = self._without_compiling(function, (Same(self.system), method))
+            values = self._without_compiling(function, (by_value(self.system), method))
             values = self.map_rows(function) if values is None else values
             self.derived[name] = values if is_traced(values) else np.asarray(values)
         return self.derived[name]

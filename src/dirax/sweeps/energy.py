@@ -11,7 +11,7 @@ import dirax.program.rules  # noqa: F401  (registers the rules)
 from dirax.numerics.arrays import agree
 from dirax.program.graph import NODE_LIMIT, Graph, GraphTooLarge
 from dirax.program.interpreter import Interpreter, Nodes, Unsupported, UnsupportedPrimitive
-from dirax.program.memo import Memo, Same
+from dirax.program.memo import Memo, by_value
 from dirax.program.rules.linear_algebra import solve_blocks
 from dirax.program.scalar_program import ScalarProgram
 from dirax.program.tracing import jacobian, of_one_result
@@ -55,7 +55,7 @@ def _compiled(sol: Solution) -> Callable[[Solution], np.ndarray] | None:
     kinds = tuple(np.asarray(leaf).dtype for leaf in leaves)
     if any(kind.kind not in "fiub" for kind in kinds):
         return None
-    key = Same(sol.system), names, structure, shapes, tuple(kind.str for kind in kinds)
+    key = by_value(sol.system), names, structure, shapes, tuple(kind.str for kind in kinds)
 
     def make() -> Callable | None:
         row = [jax.ShapeDtypeStruct(sol.field_info[name].shape, np.float64) for name in names]
