@@ -11,6 +11,7 @@ import dirax as dx
 from dirax.engines.contract import Problem
 from dirax.engines.native import Native
 from dirax.engines.native.gradients import differentiate, tangents_on_host
+from dirax.geometry.squared_angles import arc_over_sine
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.schemes.step import Field, StepEquation
 
@@ -300,3 +301,47 @@ def test_what_the_kernel_cannot_take_is_run_by_xla_under_auto():
     assert np.all(np.isfinite(slope)) and engines[0]["engine"] == "xla" and "sort" in engines[0]["not_native"]
     with pytest.raises(UnsupportedPrimitive, match="sort"):
         jax.grad(lambda q: run(q, "native").q[-1].sum())(jnp.array([1.0, 0.5]))
+
+
+def test_a_formula_moves_as_its_slopes_say_in_every_order():
+    """φ/sin φ of sin² and cos² of φ/2 knows its slope by the first alone, and is asked where the two do not add up to one."""
+    bent = dx.LagrangeDirac(lambda q, v: v @ v / 2 - arc_over_sine(0, q @ q / 4, 1.0 - q[0] / 2))
+    run = {"v": [0.1, 0.3], "step": 0.1, "steps": 2}
+    native, xla = (lambda z, e=engine: dx.simulate(bent, MIDPOINT, q=z, engine=e, **run).p[-1, 0] for engine in ("native", "xla"))
+    z = jnp.array([0.4, 0.7])
+    np.testing.assert_allclose(jax.jit(jax.grad(native))(z), jax.jit(jax.grad(xla))(z), rtol=1e-12)
+    wanted = jax.jit(jax.jacfwd(jax.grad(xla)))(z)
+    for outer, inner in ((jax.jacfwd, jax.grad), (jax.grad, jax.grad), (jax.jacfwd, jax.jacfwd)):
+        along = outer(lambda s, inner=inner: inner(native)(z + s * jnp.array([0.6, 0.8]))[1])
+        np.testing.assert_allclose(jax.jit(along)(0.0), wanted[1] @ jnp.array([0.6, 0.8]), rtol=1e-11)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("way", ["group", "exponential of a sphere"])
+def test_second_derivatives_where_steps_take_logarithms(way):
+    """On manifolds gradients have parts across them, which depend on how functions go on there: all orders agree on it."""
+    if way == "group":
+        group, inertia, w = dx.SO3(), jnp.array([1.0, 2.0, 3.0]), jnp.array([0.3, 0.5, 1.2])
+        spin = lambda q, v: group.to_algebra(q, v)
+        system, scheme = (
+            dx.ManifoldLagrangian(lambda q, v: spin(q, v) @ (inertia * spin(q, v)) / 2, group),
+            dx.LagrangeDAlembert(),
+        )
+        half = lambda a: jnp.stack([jnp.cos(a / 2), 0.6 * jnp.sin(a / 2), 0.8 * jnp.sin(a / 2), 0 * a])
+        along = lambda q: 0.5 * jnp.concatenate([-(q[1:] @ w)[None], q[0] * w + jnp.cross(q[1:], w)])
+        start = lambda a: {"q": half(a), "v": along(half(a))}
+    else:
+        system, scheme = (
+            dx.ManifoldLagrangian(lambda q, v: v @ v / 2, dx.Sphere(3)),
+            dx.DiscreteDirac(dx.RiemannianExp(dx.Sphere(3))),
+        )
+        turned = lambda c, s: jnp.stack([c, 0.6 * s, 0.8 * s])
+        start = lambda a: {
+            "q": turned(jnp.cos(a), jnp.sin(a)),
+            "v": turned(-jnp.sin(a), jnp.cos(a)) + 0.2 * jnp.array([0.0, 0.8, -0.6]),
+        }
+    end = lambda a: dx.simulate(system, scheme, step=0.05, steps=2, **start(a)).p[-1, 0]
+    slope = jax.jit(jax.grad(end))
+    wanted = (slope(0.4 + 1e-4) - slope(0.4 - 1e-4)) / 2e-4
+    for outer, inner in ((jax.jacfwd, jax.grad), (jax.grad, jax.grad), (jax.jacfwd, jax.jacfwd)):
+        assert float(jax.jit(outer(inner(end)))(0.4)) == pytest.approx(float(wanted), abs=1e-7)

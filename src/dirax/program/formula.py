@@ -26,6 +26,12 @@ class Formula(ABC):
     def slopes(self) -> tuple[Slope, ...]:
         """The derivative by each argument as (factor, function of the same arguments), None for zero."""
 
+    @property
+    def is_restricted(self) -> bool:
+        """Whether it is a function only where its arguments belong together: written out, it moves in another way than its slopes
+        say where they do not."""
+        return None in self.slopes()
+
     def __call__(self, *x: Float[Array, ""]) -> Float[Array, ""]:
         """The formula at x, differentiable any number of times."""
         if binds(*x) and not any(map(jnp.ndim, x)):

@@ -149,7 +149,8 @@ class Derived:
     def _formula(self, interpreter: Interpreter, equation: Any, *operands: Nodes):
         """A formula, which says what its derivatives are."""
         g, formula, nodes = self.graph, equation.params["formula"], [operand.item() for operand in operands]
-        return self._single(nodes, formulas.slopes(g, formula, nodes), formulas.written(g, formula, nodes))
+        node_of = formulas.differentiable if self.kept else formulas.written
+        return self._single(nodes, formulas.slopes(g, formula, nodes, node_of), formulas.written(g, formula, nodes))
 
     def _single(self, operands: list[int], slopes: list[int | None], written: int):
         """A function of the operands as one node."""

@@ -14,7 +14,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, jaxprs_in_params
 
 from dirax.program.interpreter import Interpreter, Nodes, Rule, Unavailable, Unsupported, elementwise
 from dirax.program.memo import Memo, Same
-from dirax.program.rules import derivative_primitives
+from dirax.program.rules import derivative_primitives, formulas
 from dirax.program.rules.control import closed, inner_jaxpr
 
 KEPT = 256
@@ -85,8 +85,15 @@ def tangent(equation: Any) -> ClosedJaxpr:
 BACKWARD = ("custom_vjp_call", "custom_vjp_call_jaxpr")
 """Functions that JAX derives in reverse mode alone."""
 
+
+def formula(interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
+    nodes = [operand.item() for operand in operands]
+    return [np.array(formulas.differentiable(interpreter.graph, equation.params["formula"], nodes), np.int64)]
+
+
 RULED: dict[str, Rule] = {
     "stop_gradient": stopped,
+    "dirax_formula": formula,
     **dict.fromkeys(("custom_jvp_call", *BACKWARD), by_its_rule),
 }
 DIFFERENTIABLE = dict(RULED)
@@ -100,10 +107,13 @@ def has_rules(jaxpr: Any, names: Container[str] = RULED) -> bool:
     """Whether a function in a jaxpr has a rule of its own for its derivative, of the primitives of these names."""
     known: dict[int, bool] = {}
 
+    def is_needed(equation: Any) -> bool:
+        return "formula" not in equation.params or equation.params["formula"].is_restricted
+
     def found(jaxpr: Any) -> bool:
         if id(jaxpr) not in known:
             inner = (getattr(j, "jaxpr", j) for e in jaxpr.eqns for j in jaxprs_in_params(e.params))
-            known[id(jaxpr)] = any(e.primitive.name in names for e in jaxpr.eqns) or any(map(found, inner))
+            known[id(jaxpr)] = any(e.primitive.name in names and is_needed(e) for e in jaxpr.eqns) or any(map(found, inner))
         return known[id(jaxpr)]
 
     return found(jaxpr)

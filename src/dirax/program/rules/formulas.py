@@ -1,5 +1,7 @@
 """Formulas on the graph: the same code on expressions that it runs on arrays of JAX."""
 
+import functools
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -9,6 +11,7 @@ from dirax.program.graph import Graph
 from dirax.program.interpreter import Interpreter, Nodes, rule
 
 Operand: TypeAlias = "Expression | float"
+NodeOf: TypeAlias = Callable[[Graph, Formula, list[int]], int]
 
 
 class Expression:
@@ -85,11 +88,21 @@ def written(graph: Graph, formula: Formula, operands: list[int]) -> int:
     return formula.value(Expressions(graph), tuple(Expression(graph, node) for node in operands)).node
 
 
-def slopes(graph: Graph, formula: Formula, operands: list[int]) -> list[int | None]:
+def slopes(graph: Graph, formula: Formula, operands: list[int], node_of: NodeOf = written) -> list[int | None]:
     """The nodes of its derivatives by each operand; None for zero."""
     known = zip(formula.slopes(), operands, strict=True)
     wanted = [None if slope is None or graph.is_constant(node) else slope for slope, node in known]
-    return [None if s is None else graph.mul(graph.constant(s[0]), written(graph, s[1], operands)) for s in wanted]
+    return [None if s is None else graph.mul(graph.constant(s[0]), node_of(graph, s[1], operands)) for s in wanted]
+
+
+def differentiable(graph: Graph, formula: Formula, operands: list[int]) -> int:
+    """The node of a formula that moves as its slopes say."""
+    value = written(graph, formula, operands)
+    if not formula.is_restricted or graph.is_constant(value):
+        return value
+    pairs = [(x, s) for x, s in zip(operands, slopes(graph, formula, operands), strict=True) if s is not None]
+    moved = [graph.mul(graph.make("held", s), graph.make("motion", x)) for x, s in pairs]
+    return graph.make("ruled", value, functools.reduce(graph.add, moved, graph.zero))
 
 
 @rule("dirax_formula")
