@@ -48,6 +48,29 @@ def test_what_was_changed_is_found_beside_walls_and_at_impacts(sol):
     assert dx.verify(lost)[LINE].verdict == "VIOLATED"
 
 
+def test_impacts_are_those_that_a_user_is_given(sol):
+    other = changed(sol, "q", (0, 0), 0.0)
+    other.events = sol.events[:]
+    other.events.t = other.events.t + 1e-6
+    assert dx.verify(other)[LINE].verdict == "VIOLATED"
+
+
+def test_a_trajectory_that_an_event_ends_has_no_impacts_after_it():
+    apart = [dx.Impact(lambda q: q[1]), dx.Event(lambda q: q[0] - 0.6, terminal=True)]
+    batch = {"q": [[0.0, 1.0], [0.0, 1.0]], "v": [[0.1, 0.0], [1.0, 0.0]], "step": 0.05, "steps": 60}
+    assert dx.verify(dx.simulate(BALL, dx.LagrangeDAlembert(), events=apart, **batch))[LINE].value == 0.0
+
+
+@pytest.mark.parametrize("step, steps", [(1.1, 10), (0.5, 1)])
+def test_walls_may_divide_every_step(step, steps):
+    """It raised NumPy's ValueError."""
+    free = dx.LagrangeDirac(lambda q, v: v @ v / 2)
+    tube = [dx.Impact(lambda q: q[0]), dx.Impact(lambda q: 1.0 - q[0])]
+    for scheme in (dx.LagrangeDAlembert(), dx.Collocation(2)):
+        report = dx.verify(dx.simulate(free, scheme, q=[0.5], v=[1.3], step=step, steps=steps, events=tube))
+        assert report.ok and report[LINE].verdict == "ok" and "walls divide every" in report["steps replayed"].explanation
+
+
 def test_a_whole_motion_after_a_wall_that_is_another_one_is_found(sol):
     """Every step of it is one of the scheme, but the wall gave it all of its energy back."""
     other = dx.simulate(

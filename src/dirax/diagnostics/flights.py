@@ -55,13 +55,15 @@ def run_again(sol: Solution) -> Line | None:
     rows = np.flatnonzero(counts < part if part < steps else counts <= steps)  # a row is also made of the step that leaves it
     other, lanes = sol.again(part), sol.batch or 1
     differing, worst, where = [], 0.0, ""
+    walls = np.union1d(hits.index, other.impacts.index)
+    pairs = [(found, other.impacts) for found in (hits, sol.events) if found is not None]
     for lane in range(lanes):
         one, two = (run if run.batch is None else run[lane] for run in (sol, other))
         difference, field, row = _first_difference(one, two, rows, counts)
-        until = sol.time_of(min(row, int(rows[-1])), lane)
-        known, found = (run.impacts[(run.impacts.lane == lane) & (run.impacts.t < until)] for run in (sol, other))
-        what = f"another {field} at t = {sol.time_of(min(row, int(rows[-1])), lane):.6g}"
-        if (off := _apart(known, found)) > max(difference, SAME):
+        until = sol.time_of(min(row, int(rows[-1]), one.rows - 1), lane)
+        what = f"another {field} at t = {until:.6g}"
+        off = max(_apart(*(_before(found, walls, lane, until) for found in pair)) for pair in pairs)
+        if off > max(difference, SAME):
             difference, what = off, f"other impacts before t = {until:.6g}"
         if difference > 0.0:
             differing.append(lane)
@@ -97,6 +99,11 @@ def _first_difference(one: Solution, two: Solution, rows: np.ndarray, counts: np
         return 0.0, "", int(rows[-1]) + 1
     first = int(np.flatnonzero(apart)[0])
     return float(apart[first]), fields[first], int(rows[first])
+
+
+def _before(found: Events, walls: np.ndarray, lane: int, until: float) -> Events:
+    """The impacts of a trajectory up to a time."""
+    return found[np.isin(found.index, walls) & (found.lane == lane) & (found.t < until)]
 
 
 def _apart(one: Events, two: Events) -> float:

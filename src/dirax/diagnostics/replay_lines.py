@@ -36,6 +36,8 @@ def replayed(sol: Solution, tolerance: float | None) -> Line:
         return Line(NAME, None, None, NOT_CHECKED, str(reason))
     limit = roundoff_limit(tolerance, 1)
     found = Comparison(replay, at)
+    if np.all(found.next < 0):
+        return Line(NAME, None, None, NOT_CHECKED, "walls divide every step, or all of those that were chosen")
     ratio = _ratios(found, limit)
     entry, number = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
     lane, row = int(at.lanes[entry]), int(at.rows[entry])
