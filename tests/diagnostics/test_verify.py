@@ -749,3 +749,21 @@ def test_lagrangians_that_are_regular_on_the_way_are_not_accused(lagrangian, mor
         dx.LagrangeDirac(lagrangian, **more), dx.LagrangeDAlembert(), q=[0.5, 0.2], v=[0.1, 0.0], step=0.1, steps=60
     )
     assert np.min(sol.q[:, 0]) < 0 < np.max(sol.q[:, 0]) and regularity(sol) is None
+
+
+@pytest.mark.parametrize("way", ["as stated", "resolved"])
+def test_what_equations_do_to_the_energy_is_measured_where_they_alone_say_it(way):
+    """A capacitor at rest that a source charges was called VIOLATED, and one that a resistor discharges bounded."""
+    resolved = dx.DiscreteDirac(constraints="resolve")
+    for netlist, x in (
+        ([("V", 1, 0, 1.0), ("R", 1, 2, 1.0), ("C", 2, 0, 1.0)], [0.0]),
+        ([("R", 1, 0, 1.0), ("C", 1, 0, 1.0)], [1.0]),
+        ([("C", 1, 0, 1.0), ("L", 1, 0, 1.0)], [1.0, 0.0]),
+    ):
+        system = dx.circuit(netlist)
+        system = system if way == "as stated" else dx.constraint_algorithm(system, near={"x": x}).resolved()
+        run = {"x": x, "step": 0.05, "steps": 1200}
+        report = dx.verify(dx.simulate(system, dx.DiscreteDirac() if way == "as stated" else resolved, **run))
+        moves = len(netlist) != 2 or netlist[0][0] == "R"
+        assert report.ok and report["energy"].verdict == ("not checked" if moves else "bounded"), netlist
+        assert ("by its own equations, at a rate of up to" in report["energy"].explanation) == moves

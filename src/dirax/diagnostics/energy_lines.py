@@ -8,7 +8,7 @@ from dirax.diagnostics.drift import judge
 from dirax.diagnostics.energy_jumps import NOTICED, energy_jump
 from dirax.diagnostics.power_balance import balances, has_power, keeps_books
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Line
-from dirax.diagnostics.rows import LARGE, at_rows, energy_at, energy_of, row_numbers
+from dirax.diagnostics.rows import LARGE, at_rows, energy_at, energy_of, over_rows, power_at, row_numbers
 from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled_terms, spread, steps_of
 from dirax.numerics.tolerances import EPSILON
 from dirax.schemes.energy_collocation_step import NOTICED as DEFECT
@@ -21,8 +21,11 @@ BY_WALLS = 10.0
 FAR, BALANCED = 1000.0, 0.1
 """An energy has blown up that moves by so many times its terms at the start, and by such a part of its terms in the run."""
 
+POWER = 1e-9
+"""The rate of an energy is none that is such a part of its terms."""
+
 SITES = 64
-"""Numbers of each field that show how fast a large system moves."""
+"""Rows that show how an energy changes; numbers of each field that show how fast a large system moves."""
 
 
 def energy_less_work(sol: Solution) -> tuple[np.ndarray, bool, str]:
@@ -47,6 +50,7 @@ def energy_line(sol: Solution) -> Line:
         return Line(name, None, None, NOT_CHECKED, "the system states no energy")
     if outside := _outside(sol, energy):
         return outside
+    changes = changes or _power(sol)
     size = energy_scale(sol, energy)
     roundoff = ROUNDINGS * EPSILON * steps_of(sol) * size
     if jump := energy_jump(sol, energy, size):
@@ -74,6 +78,19 @@ def energy_line(sol: Solution) -> Line:
     others = sorted({f.verdict for f in found} - {worst.verdict})
     text += "".join(f"; {details['verdicts'].count(other)} of {len(found)} {other}" for other in others)
     return Line(name, abs(worst.drift), worst.told, worst.verdict, text, details)
+
+
+def _power(sol: Solution) -> str:
+    """Why the equations of the system change its energy along this run, where they alone say whether they do; "" where they do
+    not."""
+    if sol.system is None or not sol.system.has_power:
+        return ""
+    rows, axis = spread(sol.rows, SITES), int(sol.batch is not None)
+    nodes = {name: np.take(np.asarray(a), rows, axis=axis) for name, a in sol.row_fields.items()}
+    rate, size = np.moveaxis(over_rows(at_rows(sol, power_at), sol, (nodes,), few=True), -1, 0)
+    largest = np.nanmax(np.abs(rate), initial=0.0)
+    moves = largest > POWER * np.nanmax(size, initial=0.0)
+    return f"changes its energy by its own equations, at a rate of up to {largest:.3g}" if moves else ""
 
 
 def _outside(sol: Solution, energy: np.ndarray) -> Line | None:

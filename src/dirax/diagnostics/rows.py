@@ -138,6 +138,11 @@ def energy_at(system: AbstractSystem, row: dict, params: Any):
     return system.energy_at(row, params)
 
 
+def power_at(system: AbstractSystem, row: dict, params: Any):
+    """The rate of the energy at a row, and the size of its terms."""
+    return system.power_at(row, params)
+
+
 def constraint_at(system: AbstractSystem, row: dict, params: Any):
     """The constraint of a row."""
     return system.constraint_at(row, params)

@@ -15,6 +15,7 @@ from dirax.program.roots import nearest_root
 from dirax.program.tracing import gradient, jacobian, once
 from dirax.program.user_functions import evaluated, is_traced, scalar_program
 from dirax.systems.forms import FinalManifold
+from dirax.systems.magnitudes import power_of
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -255,6 +256,13 @@ class ResolvedSystem(AbstractSystem):
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """The energy of the system that the chain came from."""
         return self.chain._energy(row["x"], self.chain._with(params))
+
+    @property
+    def has_power(self) -> bool:
+        return True
+
+    def power_at(self, row: Data, params: Any) -> Float[Numbers, " 2"]:
+        return power_of(self.chain._energy, row["x"], self.chain.field(row["x"], params), self.chain._with(params))
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " m"]:
         return self.chain.constraints(row["x"], params)

@@ -12,7 +12,7 @@ from dirax.program.tracing import gradient, jacobian
 from dirax.program.user_functions import UserFunction
 from dirax.systems.forms import ImplicitForm, RelationForm
 from dirax.systems.implicit_form import energy_of_x, names, point_of, without_time
-from dirax.systems.magnitudes import MOST, as_large_as_energy, of_solution
+from dirax.systems.magnitudes import MOST, as_large_as_energy, of_solution, power_of
 from dirax.systems.shape import Shape
 from dirax.systems.system import AbstractSystem
 
@@ -105,6 +105,15 @@ class ImplicitSystem(AbstractSystem):
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
         """H(x); NaN for a system stated without one."""
         return jnp.array(jnp.nan) if self.hamiltonian is None else self.hamiltonian(row["x"], params)
+
+    @property
+    def has_power(self) -> bool:
+        return self.hamiltonian is not None
+
+    def power_at(self, row: Data, params: Any) -> Float[Numbers, " 2"]:
+        """dH·ẋ, with the ẋ of least norm where the equations leave one open."""
+        assert self.hamiltonian is not None
+        return power_of(self.hamiltonian, row["x"], self.complete({"x": row["x"]}, params, False)["velocity"], params)
 
     def constraint_at(self, row: Data, params: Any) -> Float[Numbers, " r"]:
         return self.initial_defect(self.complete({"x": row["x"]}, params, False), params)

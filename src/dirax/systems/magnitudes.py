@@ -9,7 +9,7 @@ from jaxtyping import Float
 from dirax.numerics.arrays import Numbers
 from dirax.numerics.tolerances import EQUATION_RANK, SOLVED_ROUNDOFF
 from dirax.program.linear_solves import scaled_inverse
-from dirax.program.tracing import jacobian
+from dirax.program.tracing import gradient, jacobian
 
 MOST = 200
 """Numbers up to which a matrix of all of them is made for this."""
@@ -21,6 +21,12 @@ def as_large(metric: Float[Numbers, "n n"], x: Float[Numbers, " n"], more: Any =
     metric = jnp.abs(metric)
     energy, own = jnp.abs(x) @ metric @ jnp.abs(x) + more, jnp.diagonal(metric)
     return jnp.sqrt(jnp.where(own > 0.0, energy / jnp.where(own > 0.0, own, 1.0), 0.0))
+
+
+def power_of(energy: Callable, x: Float[Numbers, " n"], velocity: Float[Numbers, " n"], params: Any) -> Float[Numbers, " 2"]:
+    """The rate of `energy(x, params)` along a velocity, and the sum of the absolute values of its terms."""
+    terms = gradient(lambda x: energy(x, params))(x) * velocity
+    return jnp.stack([jnp.sum(terms), jnp.sum(jnp.abs(terms))])
 
 
 def as_large_as_kinetic(slope: Callable, x: Float[Numbers, " n"]) -> Float[Numbers, " n"]:

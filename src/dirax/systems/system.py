@@ -252,6 +252,15 @@ class AbstractSystem(eqx.Module):
         return ""
 
     @property
+    def has_power(self) -> bool:
+        """Whether `power_at` says how the equations change the energy, where `energy_changes` does not know."""
+        return False
+
+    def power_at(self, row: Data, params: Any) -> Float[Numbers, " 2"]:
+        """The rate of the energy at a row, and the sum of the absolute values of its terms."""
+        raise TypeError(f"a {type(self).__name__} does not say the rate of its energy at a row.")
+
+    @property
     def constrains_differential(self) -> bool:
         """Whether the constraint is that dE lie in a subspace, so that it has the size of dE."""
         return False
