@@ -522,8 +522,21 @@ def test_a_wrong_keep_is_one_error(tmp_path):
         study(tmp_path / "wrong.zarr", keep=lambda sol: {"x": sol.fields["x"]})
     with pytest.raises(ValueError, match="keep must return a dict"):
         study(tmp_path / "wrong.zarr", keep=lambda sol: sol.q)
+    for name in ("status", "message", "E/m", "", "..", "../out"):
+        with pytest.raises(ValueError, match=r"keep returned an array named .*but names are folders of the store"):
+            study(tmp_path / "wrong.zarr", keep=lambda sol, name=name: {name: sol.q[-1]})
+    with pytest.raises(ValueError, match="keep must return numbers and arrays, but rows is none: ValueError"):
+        study(tmp_path / "wrong.zarr", keep=lambda sol: {"rows": [[1], [1, 2]]})
     with pytest.raises(ValueError, match="'g' is the name of an axis and of what is kept"):
         study(tmp_path / "wrong.zarr", keep=lambda sol: {"g": sol.q[-1]})
+
+
+def test_an_axis_of_truths_stays_one(tmp_path):
+    start = lambda on: {"q": [1.0 + on], "v": [0.0]}
+    oscillator = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    run = {"case": start, "keep": lambda sol: {"e (J)": sol.q[0, 0]}, "step": 0.1, "steps": 2, "to": tmp_path / "on.zarr"}
+    data = dx.sweep(oscillator, dx.LagrangeDAlembert(), over={"on": [False, True]}, **run)
+    assert data.on.dtype == bool and data["e (J)"].sel(on=True) == 2.0
 
 
 # ------------------------------------------------------------------ points that fail

@@ -403,3 +403,22 @@ def test_points_of_a_chain_with_a_clock_with_and_without_the_time():
 def test_points_of_the_wrong_length(pendulum):
     with pytest.raises(ValueError, match=r"x must have shape \(4,\) = \(x0, x1, x2, x3\), but it has shape \(3,\)\.$"):
         pendulum.project(np.zeros(3))
+
+
+def test_the_times_of_a_run_are_those_of_its_clock():
+    """The rows of t = 1 to 2 were labelled by those from t0 on."""
+    netlist = [("V", 1, 0, jnp.sin), ("C", 1, 0, 0.4), ("R", 1, 2, 1.0), ("C", 2, 0, 0.5)]
+    chain = constraint_algorithm(dx.circuit(netlist), near={"x": [0.4 * np.sin(1.0), 0.0], "t": 1.0})
+    system, resolved, later = chain.resolved(), dx.DiscreteDirac(constraints="resolve"), chain.project([0.36, 0.0, 2.0])
+    run = {"x": chain.point, "step": 0.01, "steps": 20}
+    for given in ({}, {"t0": 1.0}):
+        sol = dx.simulate(system, resolved, **run, **given)
+        assert sol.t[0] == 1.0 and np.max(np.abs(sol.t - sol.x[:, -1])) <= 1e-14
+    prepared = dx.prepare(system, resolved, **run)
+    assert prepared(x=later).t[0] == 2.0 and prepared().t[0] == 1.0 and prepared(t0=1.0, x=chain.point).t[0] == 1.0
+    with pytest.raises(ValueError, match=r"t0 is 3, but the time is a coordinate of this system, and 1 at the start"):
+        dx.simulate(system, resolved, t0=3.0, **run)
+    with pytest.raises(ValueError, match=r"t0 is 1, but .* 2 at the start"):
+        prepared(x=later, t0=1.0)
+    with pytest.raises(ValueError, match=r"1 in the first one and 2 in another: run them one by one"):
+        dx.simulate(system, resolved, **run | {"x": np.stack([chain.point, later])})

@@ -126,7 +126,12 @@ def arrays_of_params(params: Any) -> Any:
         if isinstance(leaf, int) and not -(2**63) <= leaf < 2**63:
             raise ValueError(f"{place} is a whole number of {leaf.bit_length()} bits, and arrays hold 64: write it as a float.")
     leaves, structure = jax.tree.flatten(params)
-    return _made(params, structure, [jnp.asarray(leaf) if is_traced(leaf) else np.array(leaf) for leaf in leaves])
+    return _made(params, structure, [jnp.asarray(leaf) if is_traced(leaf) else _native(np.array(leaf)) for leaf in leaves])
+
+
+def _native(array: np.ndarray) -> np.ndarray:
+    """The array in the byte order of this machine."""
+    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
 def _is_boolean(leaf: Any) -> bool:
@@ -148,7 +153,7 @@ def plain_floats(value: Any) -> np.ndarray | None:
         array = np.array(value)
     except Exception:  # values that JAX traces among them, or what is no array
         return None
-    if array.dtype.char != "d":
+    if array.dtype.char != "d" or not array.dtype.isnative:
         return None
     finite = all(map(math.isfinite, array.ravel().tolist())) if array.size <= FEW else np.isfinite(array).all()
     return array if finite else None

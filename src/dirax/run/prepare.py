@@ -12,7 +12,7 @@ from dirax.run.carry_out import Kind, carried_out, prepared
 from dirax.run.params import params_of_case, plain_floats
 from dirax.run.scalars import count, finite, positive
 from dirax.run.settings import Settings, stated
-from dirax.run.validate import KINDS, Case, batch_size, initial_data
+from dirax.run.validate import KINDS, Case, batch_size, first_time, initial_data
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
 from dirax.systems.system import AbstractSystem
@@ -54,7 +54,7 @@ class PreparedRun:
             data,
             params,
             base.h if step is None else positive(step, "step"),
-            base.t0 if t0 is None else finite(t0, "t0"),
+            self._first_time(data, t0),
             base.batch if data is base.data and params is base.params else batch_size(_batch_of(data), params, base.batch_params),
             base.batch_params,
         )
@@ -69,6 +69,12 @@ class PreparedRun:
             kind,
             entered,
         )
+
+    def _first_time(self, data: Mapping[str, Any], t0: Any) -> Any:
+        """That of the prepared run where none is given, but that of the data where they have a clock."""
+        if t0 is None and (data is self._case.data or self._settings.system.clock(data) is None):
+            return self._case.t0
+        return first_time(self._settings.system, data, 0.0 if t0 is None else finite(t0, "t0"))
 
     def _alike(self, given: dict[str, Any]) -> tuple[Any, Any]:
         """Data and params where all that is given is finite floats of the shapes that were prepared; else (None, None)."""

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from dirax.run.validate import (
     check_kinds,
     checked_store,
     engine_from,
+    first_time,
     validated_case,
 )
 from dirax.schemes.step import AbstractScheme
@@ -80,6 +81,8 @@ def stated(
     max_iterations = count(max_iterations, "max_iterations", MOST_ITERATIONS)
     events = checked_events(events, (Event, Impact))
     case = validated_case(data, params, flag(batch_params, "batch_params"), step, t0)
+    if (first := first_time(system, case.data, case.t0)) is not case.t0:
+        case = replace(case, t0=first)
     system = system if inputs is None else system.with_inputs(inputs)
     path = checked_store(to, events, case.traced)
     given = {"project": project, "check_initial": check_initial, "compensated": compensated}

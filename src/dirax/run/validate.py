@@ -87,6 +87,25 @@ def validated_case(given: dict[str, Any], params: Any, batch_params: bool, step:
     return Case(data, params, h, t0, batch_size(batch, params, batch_params), batch_params)
 
 
+def first_time(system: AbstractSystem, data: Mapping[str, Any], t0: Any) -> Any:
+    """The time of the first row: `t0`, and where the time is a coordinate of the system what that is. Raises `ValueError` where
+    both are given and differ."""
+    clock = system.clock(data)
+    if clock is None or is_traced(clock, t0):
+        return t0
+    times = np.ravel(clock)
+    if np.any(wrong := times != t0) and t0 != 0.0:
+        raise ValueError(
+            f"t0 is {t0:.9g}, but the time is a coordinate of this system, and {times[wrong][0]:.9g} at the start: leave t0 out."
+        )
+    if np.any(other := times != times[0]):
+        raise ValueError(
+            "trajectories of a batch have the same times, but the time is a coordinate of this system, "
+            f"{times[0]:.9g} in the first one and {times[other][0]:.9g} in another: run them one by one."
+        )
+    return float(times[0])
+
+
 def check_kinds(system: Any, scheme: Any) -> None:
     """Raise `TypeError` for a system or a scheme that is none."""
     for value, kind, name, example in (

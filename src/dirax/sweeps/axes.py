@@ -132,7 +132,7 @@ def _axis(name: Any, given: Any) -> np.ndarray:
         raise ValueError(f"over[{name!r}] must be a row of numbers or of texts, but {came} was given.")
     if axis.dtype.kind == "f" and not np.all(np.isfinite(axis)):
         raise ValueError(f"over[{name!r}] must be finite, but its entry {int(np.argmin(np.isfinite(axis)))} is not.")
-    return axis.astype({"f": np.float64, "i": np.int64, "u": np.int64, "b": np.int64}.get(axis.dtype.kind, axis.dtype))
+    return axis.astype({"f": np.float64, "i": np.int64, "u": np.int64}.get(axis.dtype.kind, axis.dtype))
 
 
 def _places(pairs: list[tuple[list, list]]) -> tuple[np.ndarray, ...] | None:

@@ -5,6 +5,7 @@ that agrees with single calls for some trajectories: with the Solution of a batc
 compiled by JAX; or else one by one.
 """
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -23,6 +24,10 @@ from dirax.sweeps.axes import PointError, described
 from dirax.sweeps.case import Values, in_words
 from dirax.sweeps.columns import Column, spread
 from dirax.sweeps.energy import energy_of, is_quick
+from dirax.sweeps.layout import MESSAGE, STATUS
+
+NAME = re.compile(r"\w[\w \-+.,()\[\]=%]{0,99}")
+"""What kept arrays, which are folders of a store, may be called."""
 
 SAME = 1e-9
 """How far two ways may be from each other, relative to the largest number of an array."""
@@ -134,7 +139,13 @@ class Keep:
             raise PointError(f"keep fails for the trajectory at {described(values, lane)}: {in_words(error)}") from error
         if not isinstance(found, Mapping) or not found or not all(isinstance(name, str) for name in found):
             raise PointError(f"keep must return a dict of numbers and arrays, but it returned {found!r:.60}.")
-        return {name: _storable(name, np.asarray(value)) for name, value in found.items()}
+        wrong = [name for name in found if name in (STATUS, MESSAGE) or not NAME.fullmatch(name)]
+        if wrong:
+            raise PointError(
+                f"keep returned an array named {wrong[0]!r:.60}, but names are folders of the store: a letter or digit, then "
+                f"letters, digits, spaces and _-+.,()[]=%, and neither {STATUS} nor {MESSAGE}, which it has itself."
+            )
+        return {name: _storable(name, value) for name, value in found.items()}
 
     def _stacked(self, sol: Solution, ones: list[dict[str, np.ndarray]], values: Values) -> dict[str, np.ndarray]:
         form = lambda one: {name: array.shape for name, array in one.items()}
@@ -211,8 +222,12 @@ def single(sol: Solution, lane: int) -> Solution:
     )
 
 
-def _storable(name: str, array: np.ndarray) -> np.ndarray:
-    """The array, in the next type that stores hold where they do not hold its own. Raises `PointError`."""
+def _storable(name: str, value: Any) -> np.ndarray:
+    """The value as an array, in the next type that stores hold where they do not hold its own. Raises `PointError`."""
+    try:
+        array = np.asarray(value)
+    except Exception as error:
+        raise PointError(f"keep must return numbers and arrays, but {name} is none: {in_words(error)}") from error
     if array.dtype.name in TYPES:
         return array
     wider = [kind for kind in ("int64", "float32", "float64") if np.can_cast(array.dtype, kind)]

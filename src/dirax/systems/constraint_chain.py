@@ -1,6 +1,6 @@
 """ConstraintChain: what the constraint algorithm found, as functions; and the resolved system on the final manifold."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -231,6 +231,9 @@ class ResolvedSystem(AbstractSystem):
     def complete(self, data: Data, params: Any, project: bool) -> Data:
         x = self.chain.project(data["x"], params) if project else data["x"]
         return {"x": x, "velocity": self.chain.field(x, params)}
+
+    def clock(self, data: Mapping[str, Any]) -> Any:
+        return data["x"][..., -1] if self.chain.clock else None
 
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " m"]:
         """φ(x)."""

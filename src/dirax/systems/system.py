@@ -1,7 +1,7 @@
 """AbstractSystem: what every system says of itself to schemes, to the constraint algorithm, to `simulate` and to `verify`."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -243,6 +243,10 @@ class AbstractSystem(eqx.Module):
     def explain(self, x: Numbers) -> str:
         """Which constraint the point x is off, and the way back, in words for a message; "" where there is no more to say."""
         return ""
+
+    def clock(self, data: Mapping[str, Any]) -> Any:
+        """The time of initial data of which it is a coordinate, (B,) of a batch; None where it is none."""
+        return None
 
     # ------------------------------------------------------------------ what `verify` asks
 
