@@ -207,3 +207,20 @@ def test_steps_of_their_own_length_and_what_makes_no_motion():
         assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.05)
     with pytest.raises(ValueError, match=r"Collocation hold no steps on the group.*DiscreteEulerPoincare"):
         dx.reconstruct(exact)
+
+
+def test_reconstructed_motions_between_rows():
+    """Of the reduced motion at that time, not of a row that its steps do not make."""
+    group, inertia = dx.SO3(), jnp.array([1.0, 2.0, 3.0])
+    kinetic = lambda spin: spin @ (inertia * spin) / 2
+    top = dx.ManifoldLagrangian(lambda q, v: kinetic(group.to_algebra(q, v)), group)
+    start = {"q": [1.0, 0.0, 0.0, 0.0], "v": [0.0, 0.1, 0.2, 0.3]}
+    reduced = dx.simulate(dx.reduce(top, group), dx.DiscreteEulerPoincare(), step=0.1, steps=20, **start)
+    whole, t = dx.reconstruct(reduced), np.array([0.5, 0.55, 1.23])
+    exact = dx.simulate(top, dx.Collocation(3), step=0.05, steps=40, **start)
+    found = whole.at(t)
+    assert np.max(np.abs(found.q - exact.at(t).q)) <= 1e-4 and np.max(np.abs(found.p - exact.at(t).p)) <= 1e-3
+    assert np.max(np.abs(found.q[0] - whole.q[5])) <= 1e-15 and np.array_equal(found.x, reduced.at(t).x)
+    assert np.array_equal(whole.at(0.55).q, found.q[1])
+    with pytest.raises(ValueError, match=r"p, q, spatial_momentum are known at the rows of this run alone"):
+        whole[2:9].at(0.55)

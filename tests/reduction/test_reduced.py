@@ -126,3 +126,12 @@ def test_events_are_lifted_with_the_motion():
     events = dx.reconstruct(spun).events
     assert set(events.lane) == {0, 1}
     np.testing.assert_allclose(events.spatial_momentum, start[events.lane], atol=1e-12)
+
+
+def test_reduction_by_all_coordinates_is_reconstructed_and_verified():
+    """The shape space is a point; NumPy could not reshape its rows."""
+    free = dx.reduce(dx.LagrangeDirac(lambda q, v: v @ v / 2), dx.LinearConnection([0, 1]))
+    for scheme in (dx.LagrangeDAlembert(), dx.PlusLagrangeDirac(), dx.DiscreteRouth()):
+        sol = dx.simulate(free, scheme, q=[0.0, 1.0], v=[1.0, 2.0], step=0.1, steps=10)
+        assert np.max(np.abs(dx.reconstruct(sol).q - np.array([0.0, 1.0]) - np.outer(sol.t, [1.0, 2.0]))) <= 1e-14
+        assert dx.verify(sol).ok

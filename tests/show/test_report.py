@@ -144,3 +144,15 @@ def test_in_a_notebook_it_is_a_small_page_in_a_frame_of_its_own(sol):
     assert frame is not None and "&lt;html lang=&quot;en&quot; class=&quot;small&quot;&gt;" in frame[1]
     assert "<table>" in shown[frame.end() :]
     assert sol[0:1]._repr_html_().startswith("<table>")
+
+
+@pytest.mark.parametrize("group", [[0], [0, 1]])
+def test_shapes_of_one_and_of_no_coordinate(group, tmp_path):
+    """The page asked for places of a scene that the user had not named."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - (q[1] ** 2 if group == [0] else 0.0))
+    run = {"q": [0.0, 1.0], "v": [0.4, 0.2], "step": 0.1, "steps": 5}
+    sol = dx.simulate(dx.reduce(system, dx.LinearConnection(group)), dx.LagrangeDAlembert(), **run)
+    sol.report(tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    assert '"kind": "phase"' not in text and '"kind":"phase"' not in text and "structure holds" in text
+    sol.animate(tmp_path / "motion.gif")

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+import dirax as dx
 from dirax import gallery
 from dirax.solution import plotting
 from dirax.solution.section import crossings
 from dirax.solution.style import new_figure, save_figure
 
+MIDPOINT = dx.LagrangeDAlembert()
 DISK = gallery.get("rolling-disk").simulate(step=0.01, steps=300)
 BATCH_Q = np.array([[0.0, 0.1 + 0.01 * k] for k in range(14)])
 BATCH = gallery.get("henon-heiles").simulate(q=BATCH_Q, v=np.full((14, 2), 0.2), steps=50)
@@ -159,3 +161,17 @@ def test_nothing_is_drawn_inside_of_transformations():
         return sol.q[-1, 0]
 
     assert np.isfinite(jax.grad(end)(0.1))
+
+
+def test_one_coordinate_is_drawn_over_time_and_none_is_said():
+    one = dx.simulate(dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2), MIDPOINT, q=[1.0], v=[0.0], step=0.1, steps=5)
+    assert np.array_equal(lines(plotting.plot_trajectory(one))[0], [one.t, one.q[:, 0]])
+    shape = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1] ** 2)
+    run = {"q": [0.0, 1.0], "v": [0.4, 0.2], "step": 0.1, "steps": 5}
+    by_one, by_all = (
+        dx.simulate(dx.reduce(system, dx.LinearConnection(group)), MIDPOINT, **run)
+        for system, group in ((shape, [0]), (dx.LagrangeDirac(lambda q, v: v @ v / 2), [0, 1]))
+    )
+    assert np.array_equal(lines(plotting.plot_coordinate(by_one))[0], [by_one.t, by_one.x[:, 0]])
+    with pytest.raises(ValueError, match=r"no coordinates.*dx.reconstruct"):
+        plotting.plot_trajectory(by_all)

@@ -110,11 +110,11 @@ def sampled_terms(sol: Solution, function: eqx.Partial) -> np.ndarray:
         items[name] = many = np.repeat(np.take(values, rows, axis=axis), count, axis=axis).astype(float)
         if name in KNOWN:
             continue
-        many = many.reshape(*many.shape[:axis], len(rows), count, -1)
+        many = many.reshape(*many.shape[:axis], len(rows), count, math.prod(values.shape[axis + 1 :]))
         for i in range(many.shape[-1]):
             many[..., first + i, i] *= 1.0 + DISTURBANCE
         first += many.shape[-1]
-        items[name] = many.reshape(*many.shape[:axis], -1, *values.shape[axis + 1 :])
+        items[name] = many.reshape(*many.shape[:axis], len(rows) * count, *values.shape[axis + 1 :])
     found = over_rows(function, sol, (items,))
     found = found.reshape(len(found), len(rows), count, -1)
     return np.sum(np.abs(found[:, :, 1:] - found[:, :, :1]), axis=2) / DISTURBANCE

@@ -31,6 +31,8 @@ def scene_of(given: Any, dimension: int) -> Scene:
         return given
     if given is not None:
         return Scene(tuple(given) if isinstance(given, Sequence) else (given,))
+    if dimension == 0:  # the shape space of a system that is reduced by all of its coordinates
+        return Scene((axes(),))
     if dimension == 1:
         place, view = (lambda q, t: jnp.stack([t, jnp.zeros(()), q[0]])), "front"
     else:
@@ -125,7 +127,9 @@ def _names(place: Callable, frames: Mapping[str, np.ndarray]) -> tuple[str, ...]
     arguments = inspect.signature(place).parameters.values()
     names = tuple(a.name for a in arguments if a.default is a.empty)  # others are the function's own
     if len(names) == 1 and names[0] not in frames and names[0] not in ("p", "params", "x"):
-        names = ("q" if "q" in frames else "x",)
+        names = ("q",)
+    if "q" not in frames:
+        names = tuple("x" if name == "q" else name for name in names)
     return names if all(name in frames or name == "params" for name in names) else None
 
 

@@ -91,8 +91,10 @@ def charts(runs: Sequence[Run], plane: tuple[int, ...], units: dict[str, Any]) -
         columns = whole.columns
         momenta = [k for k, name in enumerate(columns) if name.startswith("p_")]
         positions = [k for k in range(len(columns)) if k not in momenta]
-        found.append(_phase(columns, positions, momenta, plane))
-        found.append(_over_time("Coordinates", "state", positions, ["value", "change", "log"]))
+        if len(positions) > 1 or (positions and momenta):
+            found.append(_phase(columns, positions, momenta, plane))
+        if positions:
+            found.append(_over_time("Coordinates", "state", positions, ["value", "change", "log"]))
         if momenta:
             found.append(_over_time("Momenta", "state", momenta, ["value", "change", "log"]))
     for name, table in tables.items():
@@ -119,7 +121,6 @@ def _phase(columns: Sequence[str], positions: list[int], momenta: list[int], pla
     pairs += [chosen] if len(set(chosen)) == 2 and momenta else []
     if not momenta:
         pairs += [[i, j] for i in positions for j in positions if i < j and [i, j] not in pairs][:20]
-    pairs = pairs or [[positions[0], positions[0]]]
     return {
         "kind": "phase",
         "title": "Phase plane",

@@ -115,6 +115,11 @@ class Dense(BetweenRows):
         return DividedSteps(self)
 
     def _by_steps(self, lanes, numbers, theta, t, h) -> dict[str, np.ndarray]:
+        if lacking := [name for name in self.nodes if name not in self.again.equation.fields]:
+            raise ValueError(
+                f"{', '.join(lacking)} are known at the rows of this run alone, for its steps do not say them: call at() of the "
+                "solution that dx.reconstruct returned, before a part of it is taken or it is saved."
+            )
         row, at_row = self._saved_row(numbers, theta)
         found = {name: self.saved[name][lanes, row].astype(float) for name in self.nodes}
         if not np.all(at_row):

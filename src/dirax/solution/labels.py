@@ -52,6 +52,10 @@ def entry(names: list[str], which: int | str) -> int:
         return names.index(str(which))
     if isinstance(which, int | np.integer) and -len(names) <= which < len(names):
         return int(which) % len(names)
+    if not names:
+        raise ValueError(
+            "this run has no coordinates, for its shape space is a point: dx.reconstruct(sol) gives the motion of the group."
+        )
     raise ValueError(f"no coordinate {which!r}: give an index from 0 to {len(names) - 1} or one of {', '.join(names)}.")
 
 

@@ -1,5 +1,6 @@
 """The fields of a run at any time: `sol.at`."""
 
+import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -46,6 +47,8 @@ def at(sol: Trajectory, t: Any) -> Moments:
 
     Raises `ValueError` for times outside of the run and NaN, `TypeError` for what is no array of numbers.
     """
+    if sol.lifted is not None:
+        return _lifted_at(sol, t)
     if is_traced(t, sol.t, sol.fields, sol.step, sol.params):
         times = jnp.asarray(t, float)
         if times.ndim > 1:
@@ -64,6 +67,17 @@ def at(sol: Trajectory, t: Any) -> Moments:
     if not times.ndim:
         found = {name: a[:, 0] for name, a in found.items()}
     return Moments(times, found if sol.batch is not None else {name: a[0] for name, a in found.items()})
+
+
+def _lifted_at(sol: Trajectory, t: Any) -> Moments:
+    """The fields at these times of a run that was reconstructed, from those of the one before."""
+    before, lift = sol.lifted
+    found = at(before, t)
+    lead = np.shape(found.t) if before.batch is None else (before.batch, *np.shape(found.t)[-1:])
+    flat = {name: a.reshape(math.prod(lead), *a.shape[len(lead) :]) for name, a in found.fields.items()}
+    lanes = np.repeat(np.arange(before.batch or 1), math.prod(lead) // (before.batch or 1))
+    whole = {name: a.reshape(*lead, *a.shape[1:]) for name, a in lift(flat, lanes).items()}
+    return Moments(found.t, {name: a for name, a in found.fields.items() if name in sol.fields} | whole)
 
 
 def _around(sol: Trajectory, times: np.ndarray) -> Trajectory:

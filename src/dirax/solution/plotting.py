@@ -53,15 +53,18 @@ def picture(draw: Callable) -> Callable:
 
 @picture
 def plot_trajectory(
-    sol: Any, x: int | str = 0, y: int | str = 1, z: int | str | None = None, *, ax: "Axes | None" = None, **line: Any
+    sol: Any, x: int | str = 0, y: int | str | None = None, z: int | str | None = None, *, ax: "Axes | None" = None, **line: Any
 ) -> "Axes":
     """The path in the plane of two coordinates, or in the space of three, one curve a trajectory, a dot where each begins;
-    equal scales where the coordinates have the same unit and are not angles.
+    equal scales where the coordinates have the same unit and are not angles. Of a system with one coordinate it is the one of
+    `plot_coordinate`.
 
-    `x`, `y`, `z`: index or name of an entry of q (of `sol.x` where there is no q). `ax`: for three coordinates one of
-    matplotlib's projection "3d". Raises `ValueError` for unknown ones.
+    `x`, `y`, `z`: index or name of an entry of q (of `sol.x` where there is no q), by default the first two. `ax`: for three
+    coordinates one of matplotlib's projection "3d". Raises `ValueError` for unknown ones.
     """
-    chosen = [index_of(sol, each) for each in (x, y, z) if each is not None]
+    if y is None and z is None and len(names_of(sol)) == 1:
+        return plot_coordinate(sol, x, ax=ax, **line)
+    chosen = [index_of(sol, each) for each in (x, 1 if y is None else y, z) if each is not None]
     space = len(chosen) == 3
     ax = given_or_new(ax, projection="3d") if space else given_or_new(ax)
     if space and not hasattr(ax, "set_zlabel"):
@@ -80,12 +83,13 @@ def plot_trajectory(
 
 @picture
 def plot_coordinate(sol: Any, i: int | str = 0, *, field: str = "q", ax: "Axes | None" = None, **line: Any) -> "Axes":
-    """One entry of a saved field against time: `field` is "q", "p", "x" or another name of an array at nodes.
+    """One entry of a saved field against time: `field` is "q" (x where there is none), "p" or another array of nodes.
 
     Raises `ValueError` for an unknown entry.
     """
     index = index_of(sol, i)
     ax = given_or_new(ax)
+    field = "x" if field == "q" and "q" not in sol.fields else field
     lanes = _lanes(sol, np.asarray(sol.fields[field]))
     for t, values, kwargs in zip(sol.times, lanes, _lines(len(lanes), line), strict=True):
         ax.plot(t, values[:, index], **kwargs)

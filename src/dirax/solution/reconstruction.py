@@ -126,7 +126,9 @@ def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> S
         "spatial_momentum": Field((d,), dims=("algebra",), description="Ad*_{g⁻¹} μ"),
     }
     about |= {name: solution.field_info[name] for name in kept}
-    return _lifted(solution, solution.system, lifted | kept, about, of_events, solution.equation)
+    whole = _lifted(solution, solution.system, lifted | kept, about, of_events, solution.equation)
+    whole.lifted = solution, of_events
+    return whole
 
 
 def _element(group: AbstractLieGroup, g0: Any, batch: int | None) -> jax.Array:
@@ -154,7 +156,7 @@ def _each_row(rows: dict[str, Any], function: Callable) -> dict[str, Any]:
     """`function(row)` of every row, in NumPy where it has a scalar program."""
     names, lead = tuple(rows), np.shape(rows["x"])[:-1]
     if not is_traced(rows) and math.prod(lead):
-        entries = [np.asarray(a).reshape(-1, *np.shape(a)[len(lead) :]) for a in rows.values()]
+        entries = [np.asarray(a).reshape(math.prod(lead), *np.shape(a)[len(lead) :]) for a in rows.values()]
         found = in_numpy(lambda *values: function(dict(zip(names, values, strict=True))), entries, (function, names))
         if found is not None:
             return {name: a.reshape(*lead, *a.shape[1:]) for name, a in found.items()}

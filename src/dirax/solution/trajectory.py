@@ -79,6 +79,10 @@ class Trajectory:
     """steps ↦ the first so many steps of a run that walls divide, once more from its beginning, with every row; None for other
     runs, and where it is not known how it was run."""
 
+    lifted: Any = None
+    """(the solution that this one was reconstructed from, (its fields at some moments, their trajectories) ↦ fields of this one)
+    where the steps of that one make no rows of this one; None for others."""
+
     def __init__(
         self,
         *,
