@@ -289,3 +289,12 @@ def test_systems_that_it_does_not_step_are_refused():
     body = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ xi / 2)
     with pytest.raises(TypeError, match="EulerPoincare was given"):
         dx.simulate(body, dx.Collocation(2), x=body.state([0.0, 1.0, 0.0]), step=0.1, steps=1)
+
+
+@pytest.mark.parametrize("scheme", [dx.Collocation(3), dx.EnergyCollocation(2), dx.DiscreteDirac(constraints="resolve")])
+def test_a_structure_that_leaves_rates_open_is_refused(scheme):
+    """Gauss ran, and verify called the constraint violated; the other named the inverse of a singular matrix."""
+    knife = lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
+    system = dx.DiracSystem(dx.induced_dirac(knife, 3), lambda x: x[3:] @ x[3:] / 2 + x[0])
+    with pytest.raises(ValueError, match=r"the matrix of ẋ has rank 5 of 6 .*resolved\(\) instead of the system"):
+        dx.simulate(system, scheme, q=[0.0, 0.0, 0.3], p=[np.cos(0.3), np.sin(0.3), 0.7], step=0.05, steps=3)

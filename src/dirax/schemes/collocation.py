@@ -6,6 +6,7 @@ from dirax.numerics.arrays import is_whole
 from dirax.schemes.collocation_step import LagrangianCollocation, RelationCollocation
 from dirax.schemes.collocation_tables import MOST_STAGES, Tableau, gauss, lobatto
 from dirax.schemes.constrained_collocation_step import ConstrainedCollocation
+from dirax.schemes.hidden_constraint_premise import nothing_hidden_in_relation
 from dirax.schemes.manifold_collocation_step import ManifoldCollocation
 from dirax.schemes.step import AbstractScheme, Shape, StepEquation
 from dirax.systems.manifold_lagrangian import ManifoldLagrangian
@@ -83,7 +84,9 @@ class Collocation(AbstractScheme):
                     f"Lobatto nodes are for Lagrangians, whose positions and momenta they treat apart, but a "
                     f'{type(system).__name__} was given: take nodes="gauss".'
                 )
-            return RelationCollocation(tableau, shape.n, relation).equation()
+            equation = RelationCollocation(tableau, shape.n, relation).equation()
+            known = relation.explicit or system.final_relation(shape) is not None
+            return equation if known else nothing_hidden_in_relation(system, relation, equation, "dx.Collocation")
         lagrangian = system.lagrangian_form()
         if lagrangian is not None:
             return LagrangianCollocation(tableau, shape.n, lagrangian).equation()

@@ -57,9 +57,11 @@ def nothing_hidden_in_lagrangian(system: LagrangeDirac | ManifoldLagrangian, equ
 
 def _refusing(system: AbstractSystem, at: Callable, equation: StepEquation, scheme: str = METHOD_2) -> StepEquation:
     def check(data, h, params):
+        if (found := at(data, h, params)) is not None:
+            refuse(found, params)
         equation.check(data, h, params)
-        if (found := at(data, h, params)) is None:
-            return
+
+    def refuse(found, params):
         matrix, what, near = np.asarray(found[0]), *found[1:]
         rank = rank_of(matrix)
         if rank < max(matrix.shape):

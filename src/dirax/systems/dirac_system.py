@@ -101,7 +101,7 @@ class DiracSystem(AbstractSystem):
         form = RelationForm(relation, len(shape.kept), labels, saved, shape.spread, canonical=self.canonical, dirac="(ẋ, dH) ∈ D")
         if self.holonomic is None and self.is_graph:
             matrix: dict[str, Any] = {self.structure.representation: lambda x, params: self.structure.evaluate(x, params)[0]}
-            return form._replace(**matrix)
+            return form._replace(**matrix, explicit=self.structure.representation == "bivector")
         return form
 
     def energy_form(self, shape: Shape) -> EnergyForm:

@@ -42,7 +42,8 @@ class RelationForm(NamedTuple):
     multipliers among all `saved` ones, whose axis is called `axis`. `observed` is what else is saved.
     `canonical`: x is (q, p) on T*Q. `dirac` tells the relation where it is one of a Dirac structure. A node is saved as
     `node(x, params)`, a dict with the keys `names`, arrays (N,) each. `two_form(x, params)` (N, N) is the two-form whose graph D
-    is, up to its sign, `bivector(x, params)` (N, N) the bivector, where D is one or the other.
+    is, up to its sign, `bivector(x, params)` (N, N) the bivector, where D is one or the other. `explicit`: without multipliers
+    it is ẋ less a function of x, so that it determines ẋ everywhere.
     """
 
     residual: Callable
@@ -58,6 +59,7 @@ class RelationForm(NamedTuple):
     node: Callable = lambda x, params: {"x": x}
     two_form: Callable | None = None
     bivector: Callable | None = None
+    explicit: bool = False
 
 
 class EnergyForm(NamedTuple):

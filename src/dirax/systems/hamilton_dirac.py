@@ -64,7 +64,7 @@ class HamiltonDirac(AbstractSystem):
 
         labels = tuple(f"constraint {a} at the base point" for a in shape.kept)
         return RelationForm(
-            relation, len(shape.kept), labels, shape.m, shape.spread, canonical=not shape.m, dirac="(ẋ, dH) ∈ D_Δ"
+            relation, len(shape.kept), labels, shape.m, shape.spread, canonical=not shape.m, dirac="(ẋ, dH) ∈ D_Δ", explicit=True
         )
 
     def sizes(self, data: Data, params: Any) -> tuple[int, int]:

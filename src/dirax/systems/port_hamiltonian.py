@@ -145,7 +145,15 @@ class PortHamiltonian(AbstractSystem):
         dirac = "ẋ = (J − R) dH + B u" + ", Bᵀ dH = 0 at the closed ports" * bool(shape.m)
         alone = None if self.R is not None or self.B is not None else lambda x, params: self.J(x, params)
         return RelationForm(
-            self.relation, shape.m, labels, shape.m, axis="closed_port", observed=observed, dirac=dirac, bivector=alone
+            self.relation,
+            shape.m,
+            labels,
+            shape.m,
+            axis="closed_port",
+            observed=observed,
+            dirac=dirac,
+            bivector=alone,
+            explicit=True,
         )
 
     def ports(
