@@ -13,7 +13,7 @@ from dirax.solution.steps_again import Entries, StepsAgain
 from dirax.solution.trajectory import last_rows
 
 SHORT = 1e-3
-"""Part of a step from which on there is no doubt that it can be solved."""
+"""Part of a step from which on there is no doubt that it can be solved, and that its impulses have most of their digits."""
 
 SLACK = 1e-9
 """Part of a step by which a time may lie outside of the run: what rounding does to t0 + k·h."""
@@ -122,9 +122,12 @@ class Dense(BetweenRows):
             )
         row, at_row = self._saved_row(numbers, theta)
         found = {name: self.saved[name][lanes, row].astype(float) for name in self.nodes}
-        if not np.all(at_row):
-            off = ~at_row
-            lanes_all, lanes, t, part = lanes, lanes[off], t[off], theta[off] * h[off]
+        near = ~at_row & (theta > AT_ROW) & (theta < SHORT)
+        if np.any(near):
+            for name, values in self._near_row(lanes[near], numbers[near], theta[near]).items():
+                found[name][near] = values
+        if np.any(off := ~at_row & ~near):
+            lanes, t, part = lanes[off], t[off], theta[off] * h[off]
             if self.sol.has_own_times:
                 at = numbers[off]
                 length = self.time_at(lanes, at + 1, 0.0) - t
@@ -137,10 +140,6 @@ class Dense(BetweenRows):
             made = self.again.row(lanes, states, u, t + part, np.where(inside, part, h[off]))
             for name, values in found.items():
                 values[off] = made[name]
-            fails = np.flatnonzero(off)[~np.isfinite(states).all(axis=1) & (theta[off] < SHORT)]
-            if len(fails):
-                for name, values in self._near_row(lanes_all[fails], numbers[fails], theta[fails]).items():
-                    found[name][fails] = values
         return found
 
     def _saved_row(self, numbers: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,8 +149,8 @@ class Dense(BetweenRows):
         return row, (np.abs(numbers + theta - nearest) <= AT_ROW) & (self.counts[row] == nearest)
 
     def _near_row(self, lanes: np.ndarray, numbers: np.ndarray, theta: np.ndarray) -> dict[str, np.ndarray]:
-        """The same so near to a row that the equations of a step of this length are not solved in floats: by the cubic through
-        the row and longer steps."""
+        """The same so near to a row that a step of this length is not solved in floats, or its impulses are lost in them: by the
+        cubic through the row and longer steps."""
         places = np.arange(4) * 2 * SHORT
         points = [self.inside(lanes, numbers, np.full(len(theta), place)) for place in places]
         weights = [np.prod([(theta - b) / (a - b) for b in places if b != a], axis=0) for a in places]
