@@ -188,6 +188,15 @@ def gather(interpreter: Interpreter, equation: Any, x, indices):
         fill = interpreter.graph.constant(bool(value) if boolean else float(value))
     kept = [a for a in range(x.ndim) if a not in d.collapsed_slice_dims and a not in d.operand_batching_dims]
     batch_axes = [a for a in range(len(shape)) if a not in d.offset_dims]
+    if (fixed := interpreter.static(indices)) is not None:
+        batching = dict(zip(d.operand_batching_dims, d.start_indices_batching_dims, strict=True))
+        starts, offsets = _grids(
+            fixed, shape, batch_axes, d.start_index_map, batching, dict(zip(kept, d.offset_dims, strict=True)), x.ndim
+        )
+        tops = [n - size for n, size in zip(x.shape, sizes, strict=True)]
+        within = np.logical_and.reduce([(s >= 0) & (s <= top) for s, top in zip(starts, tops, strict=True)])
+        found = x[tuple(np.clip(s, 0, top) + o for s, top, o in zip(starts, tops, offsets, strict=True))]
+        return [found if fill is None else np.where(within, found, fill)]
     out = np.empty(shape, dtype=np.int64)
     for index in np.ndindex(*shape):
         batch = tuple(index[a] for a in batch_axes)
@@ -199,6 +208,24 @@ def gather(interpreter: Interpreter, equation: Any, x, indices):
             offset[axis] = index[where]
         out[index] = read_at(interpreter, x, starts, sizes, offset, fill)
     return [out]
+
+
+def _grids(
+    fixed: np.ndarray, shape, batch_axes: list[int], index_map, batching: dict[int, int], window: dict[int, int], rank: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Where each of the entries of this shape begins along each axis of an array by known indices, and how far from there it is.
+    `batching` and `window` say of axes of the array at which of the batch and of the entries they are."""
+    grid = np.indices(shape, sparse=False)
+    batch = tuple(grid[a] for a in batch_axes)
+    nothing = np.zeros(shape, np.int64)
+    starts, offsets = [nothing] * rank, [nothing] * rank
+    for k, axis in enumerate(index_map):
+        starts[axis] = np.broadcast_to(fixed[(*batch, k)], shape)
+    for axis, along in batching.items():
+        starts[axis] = batch[along]
+    for axis, where in window.items():
+        offsets[axis] = grid[where]
+    return starts, offsets
 
 
 def _starts(interpreter: Interpreter, indices, batch, index_map, rank: int) -> list[int]:
@@ -219,6 +246,20 @@ def scatter(interpreter: Interpreter, equation: Any, x, indices, updates):
     for axis, where in zip(window, d.update_window_dims, strict=True):
         sizes[axis] = updates.shape[where]
     clip, out = "CLIP" in str(equation.params["mode"]), x.copy()
+    if (fixed := interpreter.static(indices)) is not None:
+        batching = dict(zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True))
+        inside = dict(zip(window, d.update_window_dims, strict=True))
+        starts, offsets = _grids(fixed, updates.shape, batch_axes, d.scatter_dims_to_operand_dims, batching, inside, x.ndim)
+        tops = [n - size for n, size in zip(x.shape, sizes, strict=True)]
+        if clip:
+            starts = [np.clip(s, 0, top) for s, top in zip(starts, tops, strict=True)]
+        within = np.logical_and.reduce([(s >= 0) & (s <= top) for s, top in zip(starts, tops, strict=True)])
+        index = tuple((s + o)[within] for s, o in zip(starts, offsets, strict=True))
+        flat = np.ravel_multi_index(index, x.shape) if x.ndim else np.zeros(int(np.sum(within)), np.int64)
+        nodes = out.ravel().tolist()
+        for place, new in zip(flat.tolist(), updates[within].tolist(), strict=True):
+            nodes[place] = combine(nodes[place], new)
+        return [np.array(nodes, np.int64).reshape(out.shape)]
     for index in np.ndindex(*updates.shape):
         batch = tuple(index[a] for a in batch_axes)
         starts = _starts(interpreter, indices, batch, d.scatter_dims_to_operand_dims, x.ndim)
