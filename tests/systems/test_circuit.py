@@ -135,8 +135,23 @@ def test_sources_that_contradict_each_other(netlist, message):
 def test_sources_that_agree_are_not_refused():
     dx.circuit([("V", 1, 0, 0.1), ("V", 2, 1, 0.2), ("V", 2, 0, 0.3), ("C", 1, 0, 1.0)])
     dx.circuit([("V", 1, 0, 1.0), ("V", 1, 0, jnp.cos), ("C", 1, 0, 1.0)])  # what functions are is not looked at
-    dx.circuit([("I", 0, 1, 2.0), ("I", 1, 0, 2.0), ("I", 1, 2, 1.0), ("R", 2, 0, 1.0), ("R", 1, 0, 1.0)])
+    dx.circuit([("I", 0, 1, 2.0), ("I", 1, 0, 2.0), ("I", 1, 2, 1.0), ("R", 2, 0, 1.0), ("C", 1, 0, 1.0)])
     dx.circuit([("I", 0, 1, 2.0), ("T", (1, 0), (2, 0), 3.0), ("L", 2, 0, 1.0)])
+
+
+def test_a_circuit_without_state_is_refused_and_arrays_of_one_number_are_numbers():
+    with pytest.raises(ValueError, match="no capacitor and no inductor"):
+        dx.circuit([("V", 1, 0, 1.0), ("R", 1, 0, 2.0)])
+    ends = []
+    for value in (2.0, np.array(2.0), jnp.asarray(2.0), np.float32(2.0)):
+        tank = dx.circuit([("C", 1, 0, value), ("L", 1, 0, 1.0)])
+        ends.append(dx.simulate(tank, dx.DiscreteDirac(), x=[1.0, 0.0], step=0.1, steps=5).x[-1])
+    assert all(np.array_equal(end, ends[0]) for end in ends)
+
+
+def test_circuits_that_are_stated_anew_are_equal():
+    stated = lambda: dx.circuit([("V", 1, 0, lambda t: jnp.sin(t)), ("R", 1, 2, lambda u: u + u**3), ("C", 2, 0, 1.0)])
+    assert stated() == stated()
 
 
 OF_PARAMS = [

@@ -19,9 +19,9 @@ from dirax.systems.circuit_elements import (
     GROUND,
     TRIED,
     Element,
-    check_element,
     check_result,
     check_values,
+    checked,
     function_of,
 )
 from dirax.systems.circuit_sources import refuse_contradictions
@@ -63,13 +63,17 @@ def circuit(netlist: Sequence[Element]) -> "ImplicitSystem | Circuit":
         sol = dx.simulate(rectifier, dx.DiscreteDirac(), x=[0.0], step=0.02, steps=3000, params={"load": 5.0})
 
     Raises `ValueError` for unknown kinds, values that are not positive, resistors that give energy, parts that are not
-    connected to the ground, and constant sources that contradict each other; `TypeError` for what is no number and no function
-    of one number where it has to be one, and for nodes that are no whole numbers.
+    connected to the ground, a circuit without C and L, and constant sources that contradict each other; `TypeError` for what is
+    no number and no function of one number where it has to be one, and for nodes that are no whole numbers.
     """
     if not isinstance(netlist, list | tuple) or not netlist:
         raise TypeError(f"netlist must be a list of elements {ELEMENT}, but {netlist!r:.100} was given.")
-    for element in netlist:
-        check_element(element)
+    netlist = [checked(element) for element in netlist]
+    if not any(element[0] in "CL" for element in netlist):
+        raise ValueError(
+            "the circuit has no capacitor and no inductor, and so no state that could move: its currents follow from its sources "
+            "at every moment."
+        )
     made = Circuit(netlist)
     return made.implicit() if made.is_linear and not made.is_large else made
 
@@ -84,8 +88,9 @@ class Circuit(AbstractSystem):
 
     def __init__(self, netlist: Sequence[Element]):
         hashable = lambda ends: tuple(ends) if isinstance(ends, list) else ends
-        self.netlist = tuple((kind, hashable(a), hashable(b), value) for kind, a, b, value in netlist)
-        self.functions = tuple(map(function_of, self.netlist))
+        self.functions = tuple(map(function_of, netlist))
+        stated = [f.function if callable(e[3]) and f is not None else e[3] for e, f in zip(netlist, self.functions, strict=True)]
+        self.netlist = tuple((e[0], hashable(e[1]), hashable(e[2]), value) for e, value in zip(netlist, stated, strict=True))
         self.nodes = tuple(sorted({node for pair in _pairs(netlist) for node in pair} - {GROUND}))
         _refuse_islands(netlist, self.nodes)
         refuse_contradictions([(*e[:3], f or e[3]) for e, f in zip(self.netlist, self.functions, strict=True)], GROUND)

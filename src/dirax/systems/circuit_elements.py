@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
+from jax.core import Tracer
 
 from dirax.numerics.arrays import is_whole
 from dirax.program.signatures import parameters_of
@@ -55,12 +57,15 @@ def function_of(element: Element) -> UserFunction | None:
     return function
 
 
-def check_element(element: Any) -> None:
-    """Raise `ValueError` and `TypeError` for what is no element."""
+def checked(element: Any) -> Element:
+    """The element, with a number for an array of one. Raises `ValueError` and `TypeError` for what is no element."""
     given = f"{element!r:.100} was given"
     if not isinstance(element, tuple | list) or len(element) != 4 or not isinstance(element[0], str) or element[0] not in KINDS:
         raise ValueError(f"an element is {ELEMENT}, but {given}.")
-    kind, start, end, value = stated = tuple(element)
+    kind, start, end, value = element
+    if isinstance(value, np.ndarray | np.number | jax.Array) and not isinstance(value, Tracer) and value.shape == ():
+        value = value.item()
+    stated = kind, start, end, value
     sides = (start, end) if kind == "T" else ((start, end),)
     if not all(isinstance(ends, tuple | list) and len(ends) == 2 for ends in sides):
         raise ValueError(f"a transformer is (T, (a, b), (c, d), ratio), but {given}.")
@@ -69,7 +74,8 @@ def check_element(element: Any) -> None:
     if any(a == b for a, b in sides):
         raise ValueError(f"an element is {ELEMENT} between two nodes, but {given}.")
     if isinstance(value, str) or callable(value):
-        return _check_function(stated, given)
+        _check_function(stated, given)
+        return stated
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not np.isfinite(value):
         raise TypeError(
             "the value of an element must be a finite number, or, but for T, the name of one of the params or a function, but "
@@ -78,6 +84,7 @@ def check_element(element: Any) -> None:
     check_values(stated, value)
     if kind == "T" and value == 0:
         raise ValueError(f"the ratio of a transformer is not zero, but {given}.")
+    return stated
 
 
 def _check_function(element: Element, given: str) -> None:

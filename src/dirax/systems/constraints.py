@@ -78,6 +78,7 @@ class Constraints(eqx.Module):
             out = self.holonomic.shape(*self.holonomic.given(t, q, params))
             if len(out.shape) != 1 or not out.shape[0]:
                 hint = ": put it in a pair of brackets" if out.shape == () else ""
+                hint = ": leave holonomic out where there are none" if out.shape == (0,) else hint
                 raise ValueError(
                     f"holonomic({', '.join(self.holonomic.arguments)}) must return an array of shape (c,), one number a "
                     f"constraint g = 0, but it returned shape {out.shape}{hint}."
