@@ -224,3 +224,18 @@ def test_reconstructed_motions_between_rows():
     assert np.array_equal(whole.at(0.55).q, found.q[1])
     with pytest.raises(ValueError, match=r"p, q, spatial_momentum are known at the rows of this run alone"):
         whole[2:9].at(0.55)
+
+
+@pytest.mark.parametrize("field", ["q", "p", "spatial_momentum", "xi", "x"])
+def test_what_is_reconstructed_is_verified(field):
+    """Momenta that were three times as large were called ok."""
+    group = dx.SO3()
+    kinetic = lambda spin: spin @ (jnp.array([1.0, 2.0, 3.0]) * spin) / 2
+    body = dx.reduce(dx.ManifoldLagrangian(lambda q, v: kinetic(group.to_algebra(q, v)), group), group)
+    start = {"q": [[1.0, 0.0, 0.0, 0.0]] * 2, "v": [[0.0, 0.1, 0.2, 0.3], [0.0, 0.3, 0.1, 0.3]]}
+    whole = dx.reconstruct(dx.simulate(body, dx.DiscreteEulerPoincare(), step=0.1, steps=8, **start))
+    assert dx.verify(whole)["reconstruction"].verdict == "ok"
+    whole.fields[field] = np.array(whole.fields[field])
+    whole.fields[field][1, 3] *= 1.0 + 1e-9
+    line = dx.verify(whole)["reconstruction"]
+    assert line.verdict == "VIOLATED" and f"{field} at t = 0.3 (trajectory 1)" in line.explanation

@@ -1,0 +1,35 @@
+"""Motions that were reconstructed from reduced ones: the fields that are made of rows of these, made once more."""
+
+import math
+
+import numpy as np
+
+from dirax.diagnostics.report import Line
+from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit
+from dirax.solution.solution import Solution
+
+
+def reconstruction(sol: Solution, tolerance: float | None) -> Line | None:
+    """The line: how far the fields are from what is made of the reduced rows, relative to the largest number of each; None for
+    other runs, and those whose steps make these fields."""
+    if sol.lifted is None:
+        return None
+    before, lift = sol.lifted
+    lanes, rows = sol.batch or 1, sol.rows
+    flat = lambda a: np.asarray(a).reshape(lanes * rows, *np.shape(a)[1 + (sol.batch is not None) :])
+    nodes = {field: flat(a) for field, a in before.fields.items() if before.field_info[field].place == "node"}
+    made = lift(nodes, np.repeat(np.arange(lanes), rows))
+    expected = {field: a for field, a in before.fields.items() if field in sol.fields} | made
+    off, where = np.zeros(lanes), ""
+    for field, values in expected.items():
+        size = np.nanmax(np.abs(values), initial=0.0) or 1.0
+        width = math.prod(sol.field_info[field].shape)
+        found, wanted = (np.asarray(a).reshape(lanes, -1, width) for a in (sol.fields[field], values))
+        apart = np.where(np.isnan(found) & np.isnan(wanted), 0.0, np.abs(found - wanted) / size)
+        apart = np.max(np.nan_to_num(apart, nan=np.inf), axis=2)
+        lane, row = np.unravel_index(int(np.argmax(apart)), apart.shape)
+        if apart[lane, row] >= np.max(off, initial=0.0):
+            where = f"{field} at t = {sol.time_of(int(row), int(lane)):.6g}{of_lane(sol, int(lane))}"
+        off = np.maximum(off, np.max(apart, axis=1))
+    text = f"{', '.join(made)} as they are made of the reduced rows; worst {where}"
+    return judged(sol, "reconstruction", off, roundoff_limit(tolerance, 1), text)
