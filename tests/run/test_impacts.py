@@ -399,3 +399,11 @@ def test_the_rows_beside_a_wall_are_looked_at_too(row, name):
     values = np.array(sol.fields[name])
     values[int(np.searchsorted(sol.t, sol.events.t[0])) - 1 + row] += 1e-6
     assert dx.verify(sol.replace(fields=sol.fields | {name: values}))["steps replayed"].verdict == "VIOLATED"
+
+
+def test_walls_that_close_in_on_a_motion_end_it():
+    """After half a million impacts, and as a motion on one of the walls."""
+    free, walls = dx.LagrangeDirac(lambda q, v: v @ v / 2), [dx.Impact(lambda t, q: q[0] - 0.2 * t)]
+    walls.append(dx.Impact(lambda t, q: 1.0 - 0.2 * t - q[0]))
+    sol = dx.simulate(free, dx.LagrangeDAlembert(), q=[0.5], v=[1.0], step=0.05, steps=60, events=walls)
+    assert not sol.ok and "walls close in on the motion" in sol.message and 2.4 < sol.t[-1] < 2.5

@@ -22,6 +22,10 @@ AGAIN = 3
 """How often."""
 
 
+MOST_IN_STEP = 10_000
+"""Impacts in one step from which on walls are said to close in on the motion."""
+
+
 @dataclass
 class Flight:
     """One trajectory of a run with impacts."""
@@ -132,6 +136,11 @@ class Flight:
         self.last[wall] = at
         if self.close[wall] >= AGAIN:
             return self._accumulated(number, t)
+        if len(self.hits) >= MOST_IN_STEP and self.hits[-MOST_IN_STEP][4] > at - 1.0:
+            return self._end(
+                f"{MOST_IN_STEP} impacts within one step up to t = {t:.6g}, the last one on events[{number}]: walls close in on "
+                "the motion, or the step is far too long for it"
+            )
         self.hits.append((t, number, state[self.q].copy(), state[self.p].copy(), at, *(state[i][0] for i in self.extra)))
         return True
 
