@@ -72,7 +72,7 @@ class PreparedRun:
 
     def _first_time(self, data: Mapping[str, Any], t0: Any) -> Any:
         """That of the prepared run where none is given, but that of the data where they have a clock."""
-        if t0 is None and (data is self._case.data or self._settings.system.clock(data) is None):
+        if t0 is None and (data is self._case.data or not self._settings.system.has_clock):
             return self._case.t0
         return first_time(self._settings.system, data, 0.0 if t0 is None else finite(t0, "t0"))
 

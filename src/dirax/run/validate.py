@@ -90,8 +90,7 @@ def validated_case(given: dict[str, Any], params: Any, batch_params: bool, step:
 def first_time(system: AbstractSystem, data: Mapping[str, Any], t0: Any) -> Any:
     """The time of the first row: `t0`, and where the time is a coordinate of the system what that is. Raises `ValueError` where
     both are given and differ."""
-    clock = system.clock(data)
-    if clock is None or is_traced(clock, t0):
+    if not system.has_clock or is_traced(clock := system.clock(data), t0):
         return t0
     times = np.ravel(clock)
     if np.any(wrong := times != t0) and t0 != 0.0:

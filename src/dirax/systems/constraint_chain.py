@@ -232,8 +232,12 @@ class ResolvedSystem(AbstractSystem):
         x = self.chain.project(data["x"], params) if project else data["x"]
         return {"x": x, "velocity": self.chain.field(x, params)}
 
+    @property
+    def has_clock(self) -> bool:
+        return self.chain.clock
+
     def clock(self, data: Mapping[str, Any]) -> Any:
-        return data["x"][..., -1] if self.chain.clock else None
+        return data["x"][..., -1]
 
     def initial_defect(self, data: Data, params: Any) -> Float[Numbers, " m"]:
         """φ(x)."""

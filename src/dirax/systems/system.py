@@ -244,9 +244,14 @@ class AbstractSystem(eqx.Module):
         """Which constraint the point x is off, and the way back, in words for a message; "" where there is no more to say."""
         return ""
 
+    @property
+    def has_clock(self) -> bool:
+        """Whether the time is a coordinate, which `clock` reads."""
+        return False
+
     def clock(self, data: Mapping[str, Any]) -> Any:
-        """The time of initial data of which it is a coordinate, (B,) of a batch; None where it is none."""
-        return None
+        """The time of initial data, (B,) of a batch."""
+        raise TypeError(f"the time is no coordinate of a {type(self).__name__}.")
 
     # ------------------------------------------------------------------ what `verify` asks
 

@@ -125,7 +125,8 @@ class Ready:
             notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
         )
         if isinstance(self.made, Kernels) and self.made.rows_need_step and not interrupted:
-            outcome.unsaid = closing_status != OK
+            bad = closing_status != OK
+            outcome.unsaid = bad if bad.any() else None
         if others:
             outcome.notes["iteration"] = "; then ".join([str(self.notes.get("iteration", "Newton's method")), *others])
         whole = alone and outcome.completed[0] == p.steps  # then the closing row stands where it belongs
