@@ -1,5 +1,7 @@
 """Functions that are stated anew: systems of the same code and values are equal, and share all that was made for one of them."""
 
+import pickle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -137,3 +139,14 @@ def test_a_function_that_calls_itself_and_one_that_is_not_ready_are_taken_as_the
         return end(dx.LagrangeDirac(function))
 
     assert np.array_equal(early(), end(spring(1.0)))
+
+
+def with_default(q, v, k=np.array([2.0, 1.0])):
+    return v @ v / 2 - k @ q**2 / 2
+
+
+def test_functions_of_modules_stand_for_themselves_and_are_sent_by_name():
+    system = dx.LagrangeDirac(with_default)
+    assert system.lagrangian.function is with_default
+    run = dx.prepare(system, MIDPOINT, **RUN)
+    assert np.array_equal(pickle.loads(pickle.dumps(run))().q, run().q)

@@ -2,6 +2,7 @@
 which is stated anew, in a loss function for instance, is equal to the one before and nothing is traced or compiled again."""
 
 import functools
+import sys
 import types
 import weakref
 from collections.abc import Callable, Hashable
@@ -66,11 +67,18 @@ def _is_of_values(function: Any) -> bool:
     """Whether a function is one of the user's that is known by its code and what it reads, and keeps no record in that."""
     if not isinstance(function, types.FunctionType) or vars(function) or function.__kwdefaults__:
         return False
-    if (function.__module__ or "").partition(".")[0] in LIBRARIES:
+    if (function.__module__ or "").partition(".")[0] in LIBRARIES or _is_of_module(function):
         return False
     found, cells = reads(function.__code__), function.__closure__ or ()
     keeps = found.writes or found.attributes & CHANGES or found.own & {*function.__code__.co_freevars, *found.globals}
     return not keeps and all(contents(cell) is not ABSENT for cell in cells)
+
+
+def _is_of_module(function: types.FunctionType) -> bool:
+    """Whether a function is what a module has under its name, and is sent to other processes by that name; in the main module
+    it may be defined anew."""
+    module = sys.modules.get(function.__module__ or "")
+    return function.__module__ != "__main__" and getattr(module, function.__qualname__, None) is function
 
 
 def _key(value: Any, depth: int) -> Hashable:
@@ -98,11 +106,16 @@ def _held(value: Any, depth: int) -> Any:
         return type(value)(_held(part, depth + 1) for part in value)
     if depth < DEEPEST and type(value) is dict:
         return {name: _held(part, depth + 1) for name, part in value.items()}
-    if depth < DEEPEST and _is_of_values(value) and (value.__closure__ or value.__defaults__):
+    if depth < DEEPEST and _is_of_values(value) and _has_to_hold(value):
         held = lambda part: _held(part, depth + 1)
         closure = tuple(types.CellType(held(cell.cell_contents)) for cell in value.__closure__ or ())
         return _with(value, tuple(map(held, value.__defaults__ or ())) or None, closure or None)
     return value
+
+
+def _has_to_hold(function: types.FunctionType) -> bool:
+    """Whether a function reads values that may be others later."""
+    return bool(function.__closure__) or any(type(value) not in WRITTEN for value in function.__defaults__ or ())
 
 
 def _is_small(value: Any) -> bool:
