@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from dirax.program.captured import ABSENT, LIBRARIES, MOST_BYTES, Captured, contents, reads
+from dirax.program.captured import ABSENT, LIBRARIES, Captured, contents, reads
 from dirax.program.memo import Memo, Same
 
 STATED, VERSIONS = 512, 8
@@ -20,6 +20,9 @@ STATED, VERSIONS = 512, 8
 
 DEEPEST = 4
 """How many functions, lists and dictionaries one in another are compared by what is in them."""
+
+MOST_BYTES = 2**16
+"""How large an array is that is compared by its numbers, which are kept."""
 
 WRITTEN = float, complex, int, bool, str, bytes, type(None)
 """Kinds of values that their representation tells apart, −0.0 from 0.0 too."""

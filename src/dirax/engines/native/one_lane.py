@@ -15,6 +15,18 @@ SHORT = 2**13
 """Numbers to save up to which a run is short, whose memory is kept for the next one."""
 
 
+class Rows(dict):
+    """Arrays by name that are made of a part of the memory of a run where they are asked for."""
+
+    def __init__(self, memory: np.ndarray, places: dict[str, tuple[int, int, tuple[int, ...]]]):
+        self._memory, self._places = memory, places
+
+    def __missing__(self, name: str) -> np.ndarray:
+        first, stop, shape = self._places[name]
+        found = self[name] = self._memory[first:stop].reshape(shape)
+        return found
+
+
 class OneLane:
     """What `Lanes` is for many trajectories, for runs of so many rows.
 
@@ -32,23 +44,24 @@ class OneLane:
         params = 2 * record
         outs = params + made.step.parameters.size
         at = outs + 3 * len(saved)
-        fields, early, last = [], [], []  # (name, first number, the one after the last, shape)
+        fields, early, last = {}, {}, {}  # (first number, the one after the last, shape)
         for name, shape, size, _ in saved:
-            early.append((name, at, at + size, (1, *shape)))
+            early[name] = at, at + size, (1, *shape)
             at += size
-        for (name, shape, size, ends_before), row in zip(saved, early, strict=True):
+        for name, shape, size, ends_before in saved:
             stop = at + (rows - ends_before) * size
-            fields.append((name, at, stop, (1, rows - ends_before, *shape)))
-            last.append(row if ends_before else (name, stop - size, stop, (1, *shape)))
+            fields[name] = at, stop, (1, rows - ends_before, *shape)
+            last[name] = early[name] if ends_before else (stop - size, stop, (1, *shape))
             at = stop
         self._fields, self._early, self._last = fields, early, last
         memory = self.memory = np.zeros(at)
         first = self._at = memory.ctypes.data
-        pointers = [first + 8 * begin for _, begin, _, _ in (*fields, *early, *last)]
+        pointers = [first + 8 * begin for part in (fields, early, last) for begin, _, _ in part.values()]
         memory[outs : outs + len(pointers)].view(np.int64)[:] = pointers
         self._params_at, self._outs_at = first + 8 * params, first + 8 * outs
         self._size, self._early_at, self._last_at = record, self._outs_at + 8 * len(saved), self._outs_at + 16 * len(saved)
-        self._own, self._copy = memory[:record], memory[record:params]
+        self._own, self._copy, self._status = memory[:record], memory[record:params], made.record.status
+        self._completed = made.record.completed
         self._state, self._params = self._own[made.record.state], memory[params:outs] if outs > params else None
         self._guesses = [self._own[made.record.unknowns(i, stage.unknowns)] for i, (stage, _) in enumerate(p.equation.stages)]
 
@@ -74,17 +87,17 @@ class OneLane:
     @property
     def going(self) -> bool:
         """Whether the trajectory has neither failed nor ended before its time."""
-        return self._own[self.record.status] == OK
+        return self._own[self._status] == OK
 
     @property
     def doubtful(self) -> bool:
         """Whether the sizes are in doubt."""
-        return bool(self._own[self.record.status] == DOUBTFUL)
+        return bool(self._own[self._status] == DOUBTFUL)
 
     @property
     def stuck(self) -> bool:
         """Whether its step has not been solved."""
-        return self._own[self.record.status] in UNSOLVED
+        return self._own[self._status] in UNSOLVED
 
     def attempt(self, numbers: np.ndarray, made: Kernels | CollocationKernels, table: np.ndarray) -> np.ndarray:
         """The record after going on from one, which is not kept."""
@@ -100,14 +113,14 @@ class OneLane:
 
     def close(self, kernel) -> Closed:
         """What was found, with the row of the last state, which is the last one saved where the trajectory did not end early."""
-        size, done = self._size, self._own[self.record.completed] == self.problem.steps
+        size, done = self._size, self._own[self._completed] == self.problem.steps
         outs, closing = (self._last_at, self._last) if done else (self._early_at, self._early)
         self._copy[:] = self._own
         limit = self.problem.max_iterations
         kernel(self._at + 8 * size, self._params_at, outs, 1, *self._numbers, 0, 1, 1, limit)
         found = self.memory.copy()
-        part = lambda places: {name: found[a:b].reshape(shape) for name, a, b, shape in places}
-        return Closed(found[None, :size], part(self._fields), part(closing), found[None, size + self.record.status])
+        fields = {name: found[a:b].reshape(shape) for name, (a, b, shape) in self._fields.items()}
+        return Closed(found[None, :size], fields, Rows(found, closing), found[None, size + self._status])
 
     def table(self) -> np.ndarray:
         """The record, (1, quantities)."""

@@ -40,6 +40,7 @@ class Ready:
         nodes = collocation_kernels(p.equation, p.params, p.batch_params)
         made = nodes or kernels(p.equation, p.params, p.batch_params, p.compensated)
         self.made = made
+        self.newton = made if isinstance(made, Kernels) else None
         self.width = width_for(p.batch or 1) if nodes is None or nodes.wide else 1
         kernel, cached = made.runs.kernel(self.width, self._steps(p))
         self.quick = kernel if made.runs.is_quick(self.width) else None
@@ -70,10 +71,10 @@ class Ready:
         kernel, ready = (self.quick, True) if self.quick else runs.kernel(self.width, self._steps(p))
         waited = 0.0 if ready else time.perf_counter() - entered
         lanes = one_lane(p, self.made) or Lanes(p, self.made, self.width)
-        if p.record is None and isinstance(self.made, Kernels):  # a fixed point finds its own
-            waited += find_sizes(lanes, self.made)
+        if p.record is None and self.newton is not None:  # a fixed point finds its own
+            waited += find_sizes(lanes, self.newton)
         started, before, done, interrupted, threads = time.perf_counter(), waited, p.after, False, 1
-        count, others = max(1, FIRST_CHUNK // max(1, p.batch or 1)), []
+        count, others = FIRST_CHUNK if p.batch is None else max(1, FIRST_CHUNK // p.batch), []
         try:
             while done < p.steps and (done == p.after or lanes.going):
                 count = min(count, p.steps - done)
@@ -124,7 +125,7 @@ class Ready:
             engine="native",
             notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
         )
-        if isinstance(self.made, Kernels) and self.made.rows_need_step and not interrupted:
+        if self.newton is not None and self.newton.rows_need_step and not interrupted:
             bad = closing_status != OK
             outcome.unsaid = bad if bad.any() else None
         if others:
