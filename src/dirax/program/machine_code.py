@@ -104,5 +104,5 @@ def load(code: bytes, names: tuple[str, ...]):
 def function(library: Any, name: str, signature: Any) -> Any:
     """A function of linked code, which keeps that code in memory: another thread may have linked it anew meanwhile."""
     made = signature(library[name])
-    made.library = library
+    made.library, made.address = library, library[name]
     return made

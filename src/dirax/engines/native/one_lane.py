@@ -1,11 +1,13 @@
 """A single short trajectory: its record, its parameters and all that it saves in one array, which the next run takes over."""
 
 import math
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from dirax.engines.contract import OK, UNSOLVED, Problem
+from dirax.engines.native.at_once import Orders
 from dirax.engines.native.collocation_kernels import CollocationKernels
 from dirax.engines.native.kernels import Kernels
 from dirax.engines.native.lanes import Closed, arrays_saved
@@ -111,14 +113,33 @@ class OneLane:
         """Have it go on from a record."""
         self._own[:] = table[0]
 
-    def close(self, kernel) -> Closed:
+    @cached_property
+    def orders(self) -> Orders:
+        """What a call for the whole run is told of this memory."""
+        at, size = self._at, 8 * self._size
+        return Orders(
+            record=at, params=self._params_at, outs=self._outs_at, early=self._early_at, last=self._last_at, copy=at + size,
+            status=at + 8 * self._status, completed=at + 8 * self._completed, bytes=size,
+        )  # fmt: skip
+
+    def at_once(self, sizes: Any, kernel: Any) -> Closed | None:
+        """What a run from its first step has found in one call; None, and where it was, for one that is in doubt or stuck."""
+        self.orders.carry_out(sizes, kernel, self.problem)
+        if self.going and self._own[self._completed] == self.problem.steps:
+            return self._found(self._last)
+        self.begin(self.problem)
+        return None
+
+    def close(self, kernel: Any) -> Closed:
         """What was found, with the row of the last state, which is the last one saved where the trajectory did not end early."""
-        size, done = self._size, self._own[self._completed] == self.problem.steps
+        done, limit = self._own[self._completed] == self.problem.steps, self.problem.max_iterations
         outs, closing = (self._last_at, self._last) if done else (self._early_at, self._early)
         self._copy[:] = self._own
-        limit = self.problem.max_iterations
-        kernel(self._at + 8 * size, self._params_at, outs, 1, *self._numbers, 0, 1, 1, limit)
-        found = self.memory.copy()
+        kernel(self._at + 8 * self._size, self._params_at, outs, 1, *self._numbers, 0, 1, 1, limit)
+        return self._found(closing)
+
+    def _found(self, closing: dict[str, tuple[int, int, tuple[int, ...]]]) -> Closed:
+        size, found = self._size, self.memory.copy()
         fields = {name: found[a:b].reshape(shape) for name, (a, b, shape) in self._fields.items()}
         return Closed(found[None, :size], fields, Rows(found, closing), found[None, size + self._status])
 

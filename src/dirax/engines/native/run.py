@@ -2,13 +2,14 @@
 
 import math
 import time
+from typing import NamedTuple
 
 import numpy as np
 
 from dirax.engines.contract import ALL_UNKNOWNS, NOT_CONVERGED, OK, TOO_LARGE, Outcome, Problem, Progress, finished
 from dirax.engines.native.collocation_kernels import CollocationKernels, collocation_kernels
 from dirax.engines.native.kernels import Kernels, kernels
-from dirax.engines.native.lanes import Lanes, width_for
+from dirax.engines.native.lanes import Closed, Lanes, width_for
 from dirax.engines.native.loops.collocation_plan import depends
 from dirax.engines.native.one_lane import OneLane, one_lane
 from dirax.engines.native.sizes_of_lanes import find_sizes
@@ -22,6 +23,18 @@ WORTH_THREADS = 2e-3
 
 FIRST_CHUNK = 2_000
 """Lane-steps of the first call, from which the speed is estimated."""
+
+
+class Taken(NamedTuple):
+    """A run that was taken: what was found, how long that took, how long its code was waited for, whether it was ready, whether
+    Ctrl-C ended the run, and by which other ways trajectories went on."""
+
+    closed: Closed
+    run_seconds: float
+    waited: float
+    ready: bool
+    interrupted: bool
+    others: list[str]
 
 
 def run(p: Problem, progress: Progress | None = None) -> Outcome:
@@ -67,10 +80,60 @@ class Ready:
 
     def __call__(self, p: Problem, progress: Progress | None = None) -> Outcome:
         """Run `p`, as `Native.run` has it."""
+        lanes = one_lane(p, self.made) or Lanes(p, self.made, self.width)
+        alone = isinstance(lanes, OneLane)
+        taken = self._at_once(lanes, p) if alone and progress is None else None
+        taken = taken or self._by_chunks(lanes, p, progress)
+        if alone:
+            self.made.idle[:] = [lanes]
+        (table, fields, closing, closing_status), run_seconds, waited, ready, interrupted, others = taken
+        compile_seconds, cached = self.compile_seconds + waited, self.notes["kernel_cached"] and ready
+        self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
+        record = lanes.record
+        counts = table[:, record.completed : record.iterations + 1].astype(np.int64)
+        outcome = Outcome(
+            fields=fields,
+            closing=closing,
+            completed=counts[:, 0],
+            status=counts[:, 1],
+            iterations=counts[:, 2],
+            max_residual=table[:, record.max_residual],
+            last_state=table[:, record.state],
+            last_unknowns=table[:, self.first_unknowns],
+            interrupted=interrupted,
+            compile_seconds=compile_seconds,
+            run_seconds=run_seconds,
+            record=None if interrupted or others else (table,),
+            engine="native",
+            notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
+        )
+        if self.newton is not None and self.newton.rows_need_step and not interrupted:
+            bad = closing_status != OK
+            outcome.unsaid = bad if bad.any() else None
+        if others:
+            outcome.notes["iteration"] = "; then ".join([str(self.notes.get("iteration", "Newton's method")), *others])
+        whole = alone and outcome.completed[0] == p.steps  # then the closing row stands where it belongs
+        return outcome if whole else finished(p, outcome)
+
+    def _at_once(self, lanes: OneLane, p: Problem) -> Taken | None:
+        """A short run from its first step by code that is ready, in one call; None for other runs, and those that stop."""
+        if self.quick is None or self.newton is None or p.record is not None or p.steps > FIRST_CHUNK:
+            return None
+        sizes = self.newton.of_sizes(1)[0] if lanes.record.kept else None
+        if sizes is None and lanes.record.kept:
+            return None
+        started, interrupted = time.perf_counter(), False
+        try:
+            closed = lanes.at_once(sizes, self.quick)
+        except KeyboardInterrupt:  # what the call has found is there
+            closed, interrupted = lanes.close(self.quick), True
+        return None if closed is None else Taken(closed, time.perf_counter() - started, 0.0, True, interrupted, [])
+
+    def _by_chunks(self, lanes: Lanes | OneLane, p: Problem, progress: Progress | None) -> Taken:
+        """A run chunk by chunk, between which Ctrl-C is heard, and on several threads where that pays."""
         entered, runs = time.perf_counter(), self.made.runs
         kernel, ready = (self.quick, True) if self.quick else runs.kernel(self.width, self._steps(p))
         waited = 0.0 if ready else time.perf_counter() - entered
-        lanes = one_lane(p, self.made) or Lanes(p, self.made, self.width)
         if p.record is None and self.newton is not None:  # a fixed point finds its own
             waited += find_sizes(lanes, self.newton)
         started, before, done, interrupted, threads = time.perf_counter(), waited, p.after, False, 1
@@ -101,37 +164,7 @@ class Ready:
         except KeyboardInterrupt:
             interrupted = True
         run_seconds = time.perf_counter() - started - (waited - before)
-        table, fields, closing, closing_status = lanes.close(kernel)
-        alone = isinstance(lanes, OneLane)
-        if alone:
-            self.made.idle[:] = [lanes]
-        compile_seconds, cached = self.compile_seconds + waited, self.notes["kernel_cached"] and ready
-        self.compile_seconds, self.notes["kernel_cached"] = 0.0, True  # those of the first run
-        record = lanes.record
-        counts = table[:, record.completed : record.iterations + 1].astype(np.int64)
-        outcome = Outcome(
-            fields=fields,
-            closing=closing,
-            completed=counts[:, 0],
-            status=counts[:, 1],
-            iterations=counts[:, 2],
-            max_residual=table[:, record.max_residual],
-            last_state=table[:, record.state],
-            last_unknowns=table[:, self.first_unknowns],
-            interrupted=interrupted,
-            compile_seconds=compile_seconds,
-            run_seconds=run_seconds,
-            record=None if interrupted or others else (table,),
-            engine="native",
-            notes={**self.notes, "kernel_cached": cached, "threads": lanes.threads},
-        )
-        if self.newton is not None and self.newton.rows_need_step and not interrupted:
-            bad = closing_status != OK
-            outcome.unsaid = bad if bad.any() else None
-        if others:
-            outcome.notes["iteration"] = "; then ".join([str(self.notes.get("iteration", "Newton's method")), *others])
-        whole = alone and outcome.completed[0] == p.steps  # then the closing row stands where it belongs
-        return outcome if whole else finished(p, outcome)
+        return Taken(lanes.close(kernel), run_seconds, waited, ready, interrupted, others)
 
 
 def _by_newton(lanes: Lanes | OneLane, made: CollocationKernels) -> list[str]:
