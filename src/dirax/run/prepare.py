@@ -33,6 +33,7 @@ class PreparedRun:
     def __init__(self, settings: Settings, case: Case, steps: int, save_every: int, kind: Kind | None):
         self._settings, self._case, self._steps, self._save_every, self._kind = settings, case, steps, save_every, kind
         self._leaves, self._structure = jax.tree.flatten(case.params)
+        self._has_clock = settings.system.has_clock
 
     def __call__(
         self,
@@ -72,7 +73,7 @@ class PreparedRun:
 
     def _first_time(self, data: Mapping[str, Any], t0: Any) -> Any:
         """That of the prepared run where none is given, but that of the data where they have a clock."""
-        if t0 is None and (data is self._case.data or not self._settings.system.has_clock):
+        if t0 is None and (data is self._case.data or not self._has_clock):
             return self._case.t0
         return first_time(self._settings.system, data, 0.0 if t0 is None else finite(t0, "t0"))
 

@@ -31,16 +31,14 @@ def solution_of(
 ) -> Solution:
     """The Solution of a run; `row0` is the given row 0 of a two-point start, `said` why trajectories ended, where it is known."""
     p, fields, numbers = problem, outcome.fields, saved_steps(problem)
-    ok, message = outcome.completed == p.steps, ""
-    if not traced and p.batch is None and ok[0]:
-        ok = True
-    elif traced:
+    message: Any = ""
+    if traced or p.batch is not None:
+        ok = outcome.completed == p.steps
         ok = ok if p.batch is not None else ok[0]
-    else:
-        message = messages(p, outcome, numbers, said)
-        if p.batch is None:
-            ok, message = bool(ok[0]), message[0]
-            numbers, fields = cut(p, outcome)
+        message = message if traced else messages(p, outcome, numbers, said)
+    elif not (ok := bool(outcome.completed[0] == p.steps)):
+        message = messages(p, outcome, numbers, said)[0]
+        numbers, fields = cut(p, outcome)
     if row0 is not None:
         join = jnp.concatenate if traced else np.concatenate
         lead = lambda a: a if p.batch is not None else a[None]
