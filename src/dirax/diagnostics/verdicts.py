@@ -19,8 +19,9 @@ ROUNDINGS = 32
 SAMPLED_ROWS = 64
 """Rows at which natural scales are taken, of small systems and few trajectories."""
 
-SAMPLED_ENTRIES = 2**13
-"""Rows, each with one of its numbers changed, that are evaluated for a scale, unless four of each trajectory are more."""
+SAMPLED_ENTRIES, SAMPLED_NUMBERS = 2**13, 2**17
+"""Rows, each with one of its numbers changed, that are evaluated for a scale, and the numbers in them, unless four of each
+trajectory are more."""
 
 DISTURBANCE = 2.0**-26
 """By how much, relatively, a number is changed for a scale."""
@@ -104,7 +105,8 @@ def sampled_terms(sol: Solution, function: eqx.Partial) -> np.ndarray:
     if row_numbers(sol) > MANY:
         return _terms_of_many(sol, nodes, function)
     axis, count = int(sol.batch is not None), 1 + row_numbers(sol)
-    rows = spread(sol.rows, min(SAMPLED_ROWS, max(4, SAMPLED_ENTRIES // (count * (sol.batch or 1)))))
+    most = min(SAMPLED_ENTRIES, SAMPLED_NUMBERS // count) // (count * (sol.batch or 1))
+    rows = spread(sol.rows, min(SAMPLED_ROWS, max(4, most)))
     items, first = {}, 1
     for name, values in nodes.items():
         items[name] = many = np.repeat(np.take(values, rows, axis=axis), count, axis=axis).astype(float)
