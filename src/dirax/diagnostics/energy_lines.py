@@ -8,8 +8,8 @@ from dirax.diagnostics.drift import judge
 from dirax.diagnostics.energy_jumps import NOTICED, energy_jump
 from dirax.diagnostics.power_balance import balances, has_power, keeps_books
 from dirax.diagnostics.report import BOUNDED, DRIFTS, NOT_CHECKED, VIOLATED, Line
-from dirax.diagnostics.rows import LARGE, at_rows, energy_at, energy_of, over_rows, power_at, row_numbers
-from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled_terms, spread, steps_of
+from dirax.diagnostics.rows import LARGE, at_rows, energy_at, energy_of, power_at, row_numbers
+from dirax.diagnostics.verdicts import ROUNDINGS, of_lane, sampled, sampled_terms, spread, steps_of
 from dirax.numerics.tolerances import EPSILON
 from dirax.schemes.energy_collocation_step import NOTICED as DEFECT
 from dirax.schemes.step import CLOCK
@@ -25,7 +25,7 @@ POWER = 1e-9
 """The rate of an energy is none that is such a part of its terms."""
 
 SITES = 64
-"""Rows that show how an energy changes; numbers of each field that show how fast a large system moves."""
+"""Numbers of each field that show how fast a large system moves."""
 
 
 def energy_less_work(sol: Solution) -> tuple[np.ndarray, bool, str]:
@@ -85,9 +85,7 @@ def _power(sol: Solution) -> str:
     not."""
     if sol.system is None or not sol.system.has_power:
         return ""
-    rows, axis = spread(sol.rows, SITES), int(sol.batch is not None)
-    nodes = {name: np.take(np.asarray(a), rows, axis=axis) for name, a in sol.row_fields.items()}
-    rate, size = np.moveaxis(over_rows(at_rows(sol, power_at), sol, (nodes,), few=True), -1, 0)
+    rate, size = np.moveaxis(sampled(sol, at_rows(sol, power_at)), -1, 0)
     largest = np.nanmax(np.abs(rate), initial=0.0)
     moves = largest > POWER * np.nanmax(size, initial=0.0)
     return f"changes its energy by its own equations, at a rate of up to {largest:.3g}" if moves else ""

@@ -5,7 +5,7 @@ import numpy as np
 
 from dirax.diagnostics.replay import steps_before
 from dirax.diagnostics.report import NOT_CHECKED, OK, VIOLATED, Line
-from dirax.diagnostics.verdicts import of_lane
+from dirax.diagnostics.verdicts import of_lane, rows_apart
 from dirax.solution.events import Events
 from dirax.solution.solution import Solution
 
@@ -89,9 +89,7 @@ def _first_difference(one: Solution, two: Solution, rows: np.ndarray, counts: np
         some = rows[(rows < len(mine)) & (counts[rows] < len(theirs))]
         some = some if node or not len(some) else some[some < rows[-1]]
         a, b = (x.reshape(len(x), -1) for x in (mine[some], theirs[counts[some]]))
-        size = np.max(np.abs(b), initial=0.0, where=np.isfinite(b)) or 1.0
-        off = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b) / size)
-        off = np.max(np.nan_to_num(off, nan=np.inf), axis=1, initial=0.0)
+        off = rows_apart(a, b)
         place = np.searchsorted(rows, some)
         larger = off > apart[place]
         apart[place[larger]], fields[place[larger]] = off[larger], name

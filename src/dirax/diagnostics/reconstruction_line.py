@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from dirax.diagnostics.report import Line
-from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit
+from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, rows_apart
 from dirax.solution.solution import Solution
 
 
@@ -14,19 +14,15 @@ def reconstruction(sol: Solution, tolerance: float | None) -> Line | None:
     other runs, and those whose steps make these fields."""
     if sol.lifted is None:
         return None
-    before, lift = sol.lifted
-    lanes, rows = sol.batch or 1, sol.rows
-    flat = lambda a: np.asarray(a).reshape(lanes * rows, *np.shape(a)[1 + (sol.batch is not None) :])
-    nodes = {field: flat(a) for field, a in before.fields.items() if before.field_info[field].place == "node"}
-    made = lift(nodes, np.repeat(np.arange(lanes), rows))
+    before, lanes = sol.lifted.before, sol.batch or 1
+    nodes = {field: np.asarray(a) for field, a in before.fields.items() if before.field_info[field].place == "node"}
+    made = sol.lifted.at(nodes, (sol.rows,) if sol.batch is None else (sol.batch, sol.rows))
     expected = {field: a for field, a in before.fields.items() if field in sol.fields} | made
     off, where = np.zeros(lanes), ""
     for field, values in expected.items():
-        size = np.nanmax(np.abs(values), initial=0.0) or 1.0
         width = math.prod(sol.field_info[field].shape)
         found, wanted = (np.asarray(a).reshape(lanes, -1, width) for a in (sol.fields[field], values))
-        apart = np.where(np.isnan(found) & np.isnan(wanted), 0.0, np.abs(found - wanted) / size)
-        apart = np.max(np.nan_to_num(apart, nan=np.inf), axis=2)
+        apart = rows_apart(found, wanted)
         lane, row = np.unravel_index(int(np.argmax(apart)), apart.shape)
         if apart[lane, row] >= np.max(off, initial=0.0):
             where = f"{field} at t = {sol.time_of(int(row), int(lane)):.6g}{of_lane(sol, int(lane))}"

@@ -53,6 +53,14 @@ def roundoff_limit(tolerance: float | None, growth: float) -> float:
     return ROUNDINGS * EPSILON * growth if tolerance is None else float(tolerance)
 
 
+def rows_apart(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """How far apart rows (…, numbers) are, relative to the largest number of all that are wanted; infinite where one alone of two
+    numbers is NaN."""
+    size = np.max(np.abs(wanted), initial=0.0, where=np.isfinite(wanted)) or 1.0
+    off = np.where((found == wanted) | (np.isnan(found) & np.isnan(wanted)), 0.0, np.abs(found - wanted) / size)
+    return np.max(np.nan_to_num(off, nan=np.inf), axis=-1, initial=0.0)
+
+
 def relative_changes(values: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The largest change of values (B, rows, c) since the first row, (B,), and the same relative to a scale (B,)."""
     change = np.nanmax(np.abs(values - values[:, :1]), axis=(1, 2))

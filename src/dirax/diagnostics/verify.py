@@ -63,7 +63,7 @@ def verify(sol: Solution, symmetries: Symmetries = None, tolerance: float | None
     - runs with impacts: all rows and impacts by the run once more, with its walls (of one that took longer than 2 s, its first
       part); steps replayed but those that a wall divides, momentum maps over the run, and the energy where no wall
       changes it; all else in the longest flight between two of them;
-    - motions that were reconstructed on a group: what is made of the reduced rows, ROUNDOFF of the largest number of a field;
+    - motions that were reconstructed on a group: what is made of the reduced rows, 32 ε of the largest number of a field;
     - systems with ports ([BLM] §7.1): the power balance of every step and, with a discrete gradient, the books over the run,
       H − H(0) less what was supplied plus what was dissipated: 32 ε, however many steps;
     - premise: there, and violated, where J, R, a metric or a Dirac structure is none at one of 64 rows, as is asked where a run

@@ -56,6 +56,18 @@ class Same:
         return id(self.object)
 
 
+class OfKey:
+    """Compared by its `key`, with others of its class."""
+
+    key: tuple
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, type(self)) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
 def by_value(object: Any) -> Hashable:
     """An object as part of a key, equal to those of the same value where these have a hash; else to itself alone."""
     try:

@@ -51,12 +51,12 @@ def as_stated(function: Callable) -> Stated:
     changed since. What stands for a function holds the values of its closure as they are now, whatever is assigned to their names
     later, and is another object where the function, or one like it, has read something else before.
     """
-    captured, of_values = Captured(function), _is_of_values(function)
+    of_values = _is_of_values(function)
     known = _stated.get(_key(function, 0) if of_values else function, list)
     for held, stands in known:
         if not held.changed():
-            return Stated(captured, held, stands)
-    stands = _held(function, 0) if of_values else function
+            return Stated(held if stands is function else Captured(function), held, stands)
+    captured, stands = Captured(function), _held(function, 0) if of_values else function
     if stands is function and (known or (isinstance(function, types.FunctionType) and function in _standing)):
         stands = _again(function)
     held = captured if stands is function else Captured(stands)

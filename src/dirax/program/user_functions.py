@@ -96,7 +96,8 @@ class UserFunction(eqx.Module):
                 f"{self._call} is not called with its {len(self.arguments)} arguments here, but with {len(args)}"
                 + (f": {NO_MULTIPLIERS}." if "multipliers" in self.arguments else "; params, which may be None, come last.")
             )
-        refuse_changed([(self.name, self.held), *[(self.name, self.captured)] * (not is_traced(values))])
+        own = () if is_traced(values) else ((self.name, self.captured),)
+        refuse_changed(((self.name, self.held), *own))
         with differentiated(self._call, values):
             return once(self.function)(*args, *((params,) if self.takes_params else ()))
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from dirax.program.memo import OfKey
 from dirax.program.stated import as_stated
 from dirax.program.user_functions import reads_outside
 from dirax.text.representation import value_text
@@ -21,7 +22,7 @@ TRACED = (
 )
 
 
-class Event:
+class Event(OfKey):
     """Where a function of the motion goes through zero: `dx.simulate(…, events=[dx.Event(function)])`.
 
     `function` returns one number of what the names of its arguments say: the time `t`, `q`, `v`, `p` or `x` at that time, and
@@ -52,20 +53,11 @@ class Event:
         self.direction, self.terminal = int(direction), bool(terminal)
         self.arguments = names_of(function, "the function of an event")
         self.captured, _, self.function = as_stated(function)
+        self.key = self.function, self.arguments, self.direction, self.terminal
 
     def __call__(self, known: dict[str, Any]) -> Any:
         """The function of what is known of one moment, by name."""
         return self.function(**{name: known[name] for name in self.arguments})
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Event) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    @property
-    def _key(self) -> tuple:
-        return self.function, self.arguments, self.direction, self.terminal
 
     def __repr__(self) -> str:
         own = getattr(self.function, "__name__", type(self.function).__name__).replace("<lambda>", "lambda")

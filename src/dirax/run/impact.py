@@ -10,6 +10,7 @@ import numpy as np
 
 from dirax.program.evaluation.functions import program_of
 from dirax.program.linear_solves import solve
+from dirax.program.memo import OfKey
 from dirax.program.stated import as_stated
 from dirax.program.tracing import once
 from dirax.run.event import names_of
@@ -20,7 +21,7 @@ KNOWN = ("t", "q", "params")
 """What the gap may be given, by the names of its arguments."""
 
 
-class Impact:
+class Impact(OfKey):
     """A wall: the motion bounces where `gap` becomes zero, `dx.simulate(…, events=[dx.Impact(gap, restitution=1.0)])`.
 
     `gap` returns one number of `q`, the time `t` and `params`, by the names of its arguments: positive off the wall.
@@ -57,6 +58,7 @@ class Impact:
         self.arguments = names_of(gap, "gap", KNOWN)
         self.captured, _, self.gap = as_stated(gap)
         self.restitution = float(restitution)
+        self.key = self.gap, self.arguments, self.restitution
 
     @property
     def works(self) -> bool:
@@ -67,16 +69,6 @@ class Impact:
         """The gap at one place."""
         known = {"t": t, "q": q, "params": params}
         return self.gap(**{name: known[name] for name in self.arguments})
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Impact) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    @property
-    def _key(self) -> tuple:
-        return self.gap, self.arguments, self.restitution
 
     def __repr__(self) -> str:
         own = getattr(self.gap, "__name__", type(self.gap).__name__).replace("<lambda>", "lambda")

@@ -1,6 +1,5 @@
 """The fields of a run at any time: `sol.at`."""
 
-import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -71,13 +70,11 @@ def at(sol: Trajectory, t: Any) -> Moments:
 
 def _lifted_at(sol: Trajectory, t: Any) -> Moments:
     """The fields at these times of a run that was reconstructed, from those of the one before."""
-    before, lift = sol.lifted
+    before = sol.lifted.before
     found = at(before, t)
     lead = np.shape(found.t) if before.batch is None else (before.batch, *np.shape(found.t)[-1:])
-    flat = {name: a.reshape(math.prod(lead), *a.shape[len(lead) :]) for name, a in found.fields.items()}
-    lanes = np.repeat(np.arange(before.batch or 1), math.prod(lead) // (before.batch or 1))
-    whole = {name: a.reshape(*lead, *a.shape[1:]) for name, a in lift(flat, lanes).items()}
-    return Moments(found.t, {name: a for name, a in found.fields.items() if name in sol.fields} | whole)
+    kept = {name: a for name, a in found.fields.items() if name in sol.fields}
+    return Moments(found.t, kept | sol.lifted.at(found.fields, lead))
 
 
 def _around(sol: Trajectory, times: np.ndarray) -> Trajectory:

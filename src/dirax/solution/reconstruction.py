@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -127,8 +127,22 @@ def _on_group(solution: Solution, group: AbstractLieGroup, d: int, g0: Any) -> S
     }
     about |= {name: solution.field_info[name] for name in kept}
     whole = _lifted(solution, solution.system, lifted | kept, about, of_events, solution.equation)
-    whole.lifted = solution, of_events
+    whole.lifted = Lifted(solution, of_events)
     return whole
+
+
+class Lifted(NamedTuple):
+    """What a motion on a group was reconstructed from: `function(fields, trajectories)` of reduced rows one after the other."""
+
+    before: Solution
+    function: Callable
+
+    def at(self, fields: dict[str, Any], lead: tuple[int, ...]) -> dict[str, Any]:
+        """The fields that are made of reduced ones at moments, (…, size) with this `lead`, the trajectories of a batch first."""
+        count, lanes = math.prod(lead), self.before.batch or 1
+        flat = {name: a.reshape(count, *np.shape(a)[len(lead) :]) for name, a in fields.items()}
+        made = self.function(flat, np.repeat(np.arange(lanes), count // lanes))
+        return {name: a.reshape(*lead, *a.shape[1:]) for name, a in made.items()}
 
 
 def _element(group: AbstractLieGroup, g0: Any, batch: int | None) -> jax.Array:

@@ -21,7 +21,7 @@ from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
 from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
-from dirax.program.memo import Memo, Same, by_value
+from dirax.program.memo import Memo, OfKey, Same, by_value
 from dirax.program.on_host import called_on_host
 from dirax.schemes.step import CLOCK, Field, StepEquation, composed_row, needs_every_part
 from dirax.solution.trajectory import Trajectory
@@ -166,17 +166,11 @@ class Entries:
         return found
 
 
-class Keyed:
+class Keyed(OfKey):
     """A function that is compared by its key."""
 
     def __init__(self, function: Callable, *key: Any):
         self.function, self.key = function, key
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Keyed) and self.key == other.key
-
-    def __hash__(self) -> int:
-        return hash(self.key)
 
 
 def _call(function: Keyed, *values: Any) -> Any:

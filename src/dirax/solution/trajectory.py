@@ -80,8 +80,7 @@ class Trajectory:
     runs, and where it is not known how it was run."""
 
     lifted: Any = None
-    """(the solution that this one was reconstructed from, (its fields at some moments, their trajectories) ↦ fields of this one)
-    where the steps of that one make no rows of this one; None for others."""
+    """What this one was reconstructed from, a `Lifted`, where the steps of that make no rows of this one; None for others."""
 
     def __init__(
         self,

@@ -53,16 +53,16 @@ class Ready:
         nodes = collocation_kernels(p.equation, p.params, p.batch_params)
         made = nodes or kernels(p.equation, p.params, p.batch_params, p.compensated)
         self.made = made
-        self.newton = made if isinstance(made, Kernels) else None
+        newton = self.newton = made if isinstance(made, Kernels) else None
         self.width = width_for(p.batch or 1) if nodes is None or nodes.wide else 1
         kernel, cached = made.runs.kernel(self.width, self._steps(p))
         self.quick = kernel if made.runs.is_quick(self.width) else None
-        if p.often and isinstance(made, Kernels) and made.record.kept:
-            made.of_sizes(self.width, often=True)
-        if isinstance(made, Kernels) and made.rows_need_step is None:
-            first = made.step.equations[0]
+        if p.often and newton is not None and newton.record.kept:
+            newton.of_sizes(self.width, often=True)
+        if newton is not None and newton.rows_need_step is None:
+            first = newton.step.equations[0]
             of_nodes = [n for name, nodes in first.rows.items() if p.is_node(name) for n in nodes.ravel().tolist()]
-            made.rows_need_step = depends(made.step.graph, of_nodes, first.unknowns)
+            newton.rows_need_step = depends(newton.step.graph, of_nodes, first.unknowns)
         self.first_unknowns = made.record.unknowns(0, p.equation.stages[0][0].unknowns)
         self.notes = {
             "unknowns": sum(len(made.step.equations[i].unknowns) for i, _ in made.step.stages),

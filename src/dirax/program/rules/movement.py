@@ -190,13 +190,9 @@ def gather(interpreter: Interpreter, equation: Any, x, indices):
     batch_axes = [a for a in range(len(shape)) if a not in d.offset_dims]
     if (fixed := interpreter.static(indices)) is not None:
         batching = dict(zip(d.operand_batching_dims, d.start_indices_batching_dims, strict=True))
-        starts, offsets = _grids(
-            fixed, shape, batch_axes, d.start_index_map, batching, dict(zip(kept, d.offset_dims, strict=True)), x.ndim
-        )
-        tops = [n - size for n, size in zip(x.shape, sizes, strict=True)]
-        within = np.logical_and.reduce([(s >= 0) & (s <= top) for s, top in zip(starts, tops, strict=True)])
-        found = x[tuple(np.clip(s, 0, top) + o for s, top, o in zip(starts, tops, offsets, strict=True))]
-        return [found if fill is None else np.where(within, found, fill)]
+        window = dict(zip(kept, d.offset_dims, strict=True))
+        index, within = _known_places(fixed, shape, batch_axes, d.start_index_map, batching, window, x.shape, sizes)
+        return [x[index] if fill is None else np.where(within, x[index], fill)]
     out = np.empty(shape, dtype=np.int64)
     for index in np.ndindex(*shape):
         batch = tuple(index[a] for a in batch_axes)
@@ -210,22 +206,22 @@ def gather(interpreter: Interpreter, equation: Any, x, indices):
     return [out]
 
 
-def _grids(
-    fixed: np.ndarray, shape, batch_axes: list[int], index_map, batching: dict[int, int], window: dict[int, int], rank: int
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Where each of the entries of this shape begins along each axis of an array by known indices, and how far from there it is.
-    `batching` and `window` say of axes of the array at which of the batch and of the entries they are."""
-    grid = np.indices(shape, sparse=False)
+def _known_places(
+    fixed: np.ndarray, shape, batch_axes: list[int], index_map, batching: dict[int, int], window: dict[int, int], inside, sizes
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Where the entries of this shape are in an array whose shape is `inside`, by known indices of slices of these `sizes`, which
+    are clamped into it; and which of them are there without that. `batching` and `window` say of axes of the array at which of
+    the batch and of the entries they are."""
+    grid, nothing = np.indices(shape), np.zeros(shape, np.int64)
     batch = tuple(grid[a] for a in batch_axes)
-    nothing = np.zeros(shape, np.int64)
-    starts, offsets = [nothing] * rank, [nothing] * rank
-    for k, axis in enumerate(index_map):
-        starts[axis] = np.broadcast_to(fixed[(*batch, k)], shape)
-    for axis, along in batching.items():
-        starts[axis] = batch[along]
-    for axis, where in window.items():
-        offsets[axis] = grid[where]
-    return starts, offsets
+    starts = {axis: np.broadcast_to(fixed[(*batch, k)], shape) for k, axis in enumerate(index_map)}
+    starts |= {axis: batch[along] for axis, along in batching.items()}
+    index, within = [], np.ones(shape, bool)
+    for axis, (n, size) in enumerate(zip(inside, sizes, strict=True)):
+        start, offset = starts.get(axis, nothing), grid[window[axis]] if axis in window else nothing
+        index.append(np.clip(start, 0, n - size) + offset)
+        within &= (start >= 0) & (start <= n - size)
+    return tuple(index), within
 
 
 def _starts(interpreter: Interpreter, indices, batch, index_map, rank: int) -> list[int]:
@@ -248,14 +244,11 @@ def scatter(interpreter: Interpreter, equation: Any, x, indices, updates):
     clip, out = "CLIP" in str(equation.params["mode"]), x.copy()
     if (fixed := interpreter.static(indices)) is not None:
         batching = dict(zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True))
-        inside = dict(zip(window, d.update_window_dims, strict=True))
-        starts, offsets = _grids(fixed, updates.shape, batch_axes, d.scatter_dims_to_operand_dims, batching, inside, x.ndim)
-        tops = [n - size for n, size in zip(x.shape, sizes, strict=True)]
-        if clip:
-            starts = [np.clip(s, 0, top) for s, top in zip(starts, tops, strict=True)]
-        within = np.logical_and.reduce([(s >= 0) & (s <= top) for s, top in zip(starts, tops, strict=True)])
-        index = tuple((s + o)[within] for s, o in zip(starts, offsets, strict=True))
-        flat = np.ravel_multi_index(index, x.shape) if x.ndim else np.zeros(int(np.sum(within)), np.int64)
+        known = dict(zip(window, d.update_window_dims, strict=True))
+        at = fixed, updates.shape, batch_axes, d.scatter_dims_to_operand_dims, batching, known, x.shape, sizes
+        index, within = _known_places(*at)
+        within |= clip
+        flat = np.ravel_multi_index(tuple(i[within] for i in index), x.shape) if x.ndim else np.zeros(updates.size, np.int64)
         nodes = out.ravel().tolist()
         for place, new in zip(flat.tolist(), updates[within].tolist(), strict=True):
             nodes[place] = combine(nodes[place], new)
