@@ -55,7 +55,50 @@ def test_times_and_places_of_events():
     assert np.array_equal(np.isfinite(q).all(axis=1), np.arange(41) * 0.07 <= t[2])
 
 
-@pytest.mark.soak
+SWING = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params["k"] * q @ q / 2 - q[0] ** 4 / 4)
+PASSES = [dx.Event(lambda t, q, v, params: q[0] - params["c"] * (1 + t / 50) + v[0] / 30)]
+
+
+def swung(a, step=0.1, steps=40, events=PASSES):
+    params = {"k": 1.2, "c": a[1]}
+    return dx.simulate(SWING, dx.LagrangeDAlembert(), q=[a[0]], v=[0.3], params=params, step=step, steps=steps, events=events)
+
+
+def test_events_are_those_of_plain_runs_and_nothing_is_lost_by_vmap():
+    """Dips between the points at which a function is looked at, functions that close over what is traced, several steps."""
+    at, lowest = jnp.array([1.0, 0.2]), dx.simulate(
+        SWING, dx.LagrangeDAlembert(), q=[1.0], v=[0.3], params={"k": 1.2, "c": 0.0}, step=0.1, steps=40
+    ).at(np.linspace(0, 4, 40001)).q.min()  # fmt: skip
+    graze = dx.Event(lambda q: q[0] - (lowest + 1e-6))
+    plain = swung(at, events=[graze])
+    traced = jax.jit(lambda a: swung(a, events=[graze]).events.t)(at)
+    assert len(plain.events.t) == 2 and np.ptp(plain.events.t) < 0.02
+    np.testing.assert_allclose(traced[:2], plain.events.t, rtol=0, atol=1e-13)
+    assert np.all(np.isnan(traced[2:]))
+
+    def closing(a):
+        return swung(a, events=[dx.Event(lambda t, q, v: q[0] - a[1] * (1 + t / 50) + v[0] / 30)]).events.t[:2]
+
+    ours, theirs = (jax.jacrev(f)(at) for f in (lambda a: swung(a).events.t[:2], closing))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-11)
+    first = lambda h: swung(at, h, 60).events.t[0]
+    steps = jnp.array([0.1, 0.05, 0.1])
+    np.testing.assert_array_equal(jax.vmap(jax.grad(first))(steps), [jax.grad(first)(h) for h in steps])
+
+
+def test_second_derivatives_of_an_event():
+    def cost(a):
+        events = swung(a).events
+        return jnp.sin(events.t[1]) * events.p[0, 0] + events.q[1, 0] ** 2
+
+    at, d = jnp.array([1.0, 0.2]), 1e-3
+    hessian = jax.jit(jax.hessian(cost))(at)
+    slope = jax.jit(jax.grad(cost))
+    for i, unit in enumerate(np.eye(2)):
+        change = lambda step, unit=unit: slope(at + step * unit) - slope(at - step * unit)
+        np.testing.assert_allclose(hessian[i], (8 * change(d) - change(2 * d)) / (12 * d), rtol=0, atol=1e-7)
+
+
 @pytest.mark.parametrize(
     "scheme",
     [

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
 from jax.dtypes import float0
-from jax.extend.core import Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
@@ -74,6 +74,11 @@ def _over(function: Callable, axes: Axes) -> Callable:
     for one in axes:
         function = jax.vmap(function, in_axes=one)
     return function
+
+
+def value_jaxpr(shapes: Sequence, *, value: Callable, tangent: Callable, axes: Axes) -> ClosedJaxpr:
+    """What a function of arguments of these shapes is, but for its derivative."""
+    return jax.make_jaxpr(_over(value, axes))(*shapes)
 
 
 def _by_jax(*operands, value: Callable, tangent: Callable, axes: Axes) -> Array:

@@ -38,9 +38,10 @@ class Event(OfKey):
     first row nothing is found, if the function is zero there. Where steps have neither a polynomial nor the cubic, and in runs of
     many steps, dips are looked for where a cubic through rows and velocities shows them.
 
-    Under `jax.grad`, `jit` and `vmap` the times and places of events are differentiated: those that are seen by the sign of the
-    function at four points of a step, or one more than a polynomial has stages. `sol.events` then has a place for each of them in
-    the order of time in each trajectory, NaN where there is no event; after a terminal one rows are NaN as well.
+    Under `jax.grad`, `jit` and `vmap` the times and places of events are differentiated. `sol.events` then has four places for
+    each step and event, or one more than a polynomial has stages: in the order of time in each trajectory, NaN after the last
+    event; after a terminal one rows are NaN as well. On a GPU, and for functions that close over traced values or are no scalar
+    program, only those are seen that change the sign of the function at so many points of a step.
 
     Raises `TypeError` for something that is no function of such arguments, `ValueError` for another direction.
     """

@@ -32,11 +32,12 @@ def with_events(run: Any, events: tuple[Any, ...], steps: int, save_every: int, 
     """
     watch = any(event.terminal for event in events) and not any(isinstance(event, Impact) for event in events)
     sol = run(min(steps, FIRST_STRETCH) if watch and not traced else steps)
-    if traced or is_traced(sol.t, sol.fields) or _capture_traced(sol, events):
+    closed = _capture_traced(sol, events)
+    if traced or is_traced(sol.t, sol.fields) or closed:
         if any(isinstance(event, Impact) for event in events):
             raise ValueError(TRACED)
         sol = run(steps) if int(sol.rows) <= steps else sol
-        found = with_traced_events(sol, events, places_for(sol.equation))
+        found = with_traced_events(sol, events, places_for(sol.equation), closed)
         kept = thinned(found, save_every)
         kept.events = found.events
         return kept
@@ -57,8 +58,8 @@ def _capture_traced(sol: Solution, events: tuple[Any, ...]) -> bool:
         if isinstance(event, Event):
             refuse_unknown(event, number, nodes)
             own = {name: known[name] for name in event.arguments if name in known}
-            value = lambda own, number=number, event=event: evaluated(event, number, own, sol.params_of_one)
-            if captures_traced(f"the function of events[{number}]", value, own)[1]:
+            value = lambda own, params, number=number, event=event: evaluated(event, number, own, params)
+            if captures_traced(f"the function of events[{number}]", value, own, sol.params_of_one)[1]:
                 return True
     return False
 

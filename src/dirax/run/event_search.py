@@ -35,6 +35,15 @@ class Brackets(NamedTuple):
     fb: np.ndarray
 
 
+class Places(NamedTuple):
+    """Where the function of an event is zero: trajectories, numbers of steps, parts of these, and +1 or −1 for where it leads."""
+
+    lanes: np.ndarray
+    numbers: np.ndarray
+    theta: np.ndarray
+    direction: np.ndarray
+
+
 class EventSearch:
     """Looks for one event in the steps of a run, of which every row was saved."""
 
@@ -81,6 +90,10 @@ class EventSearch:
 
     def found(self, first: int, last: int) -> Events:
         """The events in the steps from number `first` to before `last`."""
+        return self.events(self.places(first, last))
+
+    def places(self, first: int, last: int) -> Places:
+        """Where they are."""
         lanes, numbers = self._steps(first, last)
         blocks = [slice(i, i + TOGETHER) for i in range(0, len(lanes), TOGETHER)]
         parts = [self._brackets(lanes[block], numbers[block]) for block in blocks]
@@ -131,21 +144,23 @@ class EventSearch:
         which, *found = changes_beside_dips(lambda x, which: self.value(lanes[which], base[which], x), low, high)
         return Brackets(lanes[which], base[which], *found)
 
-    def _located(self, brackets: Brackets) -> Events:
-        """The events in brackets, of the direction that is asked for."""
+    def _located(self, brackets: Brackets) -> Places:
+        """The places in brackets, of the direction that is asked for."""
         rises = np.where(brackets.fa != 0.0, brackets.fa < 0.0, brackets.fb > 0.0)
         direction = np.where(rises, 1, -1)
         asked = direction == self.event.direction if self.event.direction else np.ones(len(direction), bool)
         lanes, base, a, b, fa, fb = (array[asked] for array in brackets)
         x = bracketed_roots(lambda x, which: self.value(lanes[which], base[which], x), a, b, fa, fb)
-        dense = self.dense
         numbers, theta = self._place(lanes, base, x)
+        order = np.lexsort((theta, numbers, lanes))
+        return Places(*(a[order] for a in (lanes, numbers, theta, direction[asked])))
+
+    def events(self, places: Places) -> Events:
+        """What the run is like there."""
+        dense, (lanes, numbers, theta, direction) = self.dense, places
         inside = dense.inside(lanes, numbers, theta)
         fields: dict[str, Any] = {name: inside.get(name, dense.of_rows(name, lanes, numbers)) for name in dense.nodes}
-        t = dense.time_at(lanes, numbers, theta)
-        order = np.lexsort((t, lanes))
-        index, found = np.full(len(t), self.number), {name: array[order] for name, array in fields.items()}
-        return Events(t[order], index, direction[asked][order], lanes[order], found)
+        return Events(dense.time_at(lanes, numbers, theta), np.full(len(lanes), self.number), direction, lanes, fields)
 
 
 def _none() -> Brackets:

@@ -10,7 +10,7 @@ from dirax.program.memo import Same, by_value
 from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.solution.between_rows import BetweenRows, velocity_of
 from dirax.solution.divided_steps import AT_ROW, step_for
-from dirax.solution.steps_again import Keyed, begun, compiled_call, row_of, stepped
+from dirax.solution.steps_again import Keyed, begun, compiled_call, row_of, stepped, with_roots
 
 
 class TracedDense(BetweenRows):
@@ -56,18 +56,24 @@ class TracedDense(BetweenRows):
         step = row, after, of_step, t, h, params
         return self.inside(self.solved(*step), *step)((time - begins) / length)
 
-    def solved(self, row, after, of_step, t, h, params) -> tuple:
+    def solved(self, row, after, of_step, t, h, params, roots=None) -> tuple:
         """What has to be solved for the inside of the step between two rows, with the fields of the step: once, not at every
-        place in it."""
+        place in it. `roots`: the unknowns of the steps that are taken for it, those here and those in `inside`, where they are
+        known as numbers."""
         begins, ends = row.get(CLOCK, t), after.get(CLOCK, t + h)
         length = ends - begins
         if self.interpolate is None and self.between is not None:
             about = {"about": (after["q"] - row["q"]) / length}
             return tuple(velocity_of(self.sol.system, a | about, s, params) for a, s in ((row, begins), (after, ends)))
         state, guess = begun(self.equation, self.sol.system, row | of_step, begins, h, params)
-        return state, guess if self.interpolate is None else stepped(self.equation, state, guess, begins, h, params)[1]
+        return state, guess if self.interpolate is None else self._step(roots, 0, state, guess, begins, h, params)[1]
 
-    def inside(self, solved, row, after, of_step, t, h, params) -> Callable:
+    def _step(self, roots, which, state, guess, *args) -> tuple[Any, tuple, tuple]:
+        if roots is None:
+            return stepped(self.equation, state, guess, *args)
+        return with_roots(self.equation, roots[which], state, *args)
+
+    def inside(self, solved, row, after, of_step, t, h, params, roots=None) -> Callable:
         """θ ↦ the fields of nodes at a part θ of that step, as JAX traces them."""
         begins, ends = row.get(CLOCK, t), after.get(CLOCK, t + h)
         if self.interpolate is None and (between := self.between) is not None:
@@ -86,8 +92,8 @@ class TracedDense(BetweenRows):
             part = jnp.maximum(theta, AT_ROW) * h
             if CLOCK in row:
                 part = step_for(part / h, row[STEP_DENSITY], ends - begins, h)
-            there, u, _ = stepped(self.equation, state, guess, begins, part, params)
-            _, unknowns, states = stepped(self.equation, there, u, begins + part, part, params)
+            there, u, _ = self._step(roots, 0, state, guess, begins, part, params)
+            _, unknowns, states = self._step(roots, 1, there, u, begins + part, part, params)
             made = row_of(self.equation, unknowns, states, begins + part, part, params)
             return {name: jnp.where(theta > AT_ROW, made[name], row[name]) for name in row}
 

@@ -76,6 +76,11 @@ def stepped(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any
     roots = _roots_on_host(equation, state, guess, t, h, params)
     if roots is None:
         return sized_step(equation, state, guess, t, h, params)[:3]
+    return with_roots(equation, roots, state, t, h, params)
+
+
+def with_roots(equation: Any, roots: Any, state: Any, t: Any, h: Any, params: Any) -> tuple[Any, tuple, tuple]:
+    """The same of a step of which the unknowns of each stage are known as numbers."""
     unknowns, states = [], []
     for (stage, fraction), root in zip(equation.stages, roots, strict=True):
         args = state, t, fraction * h, params

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
+from dirax.program.given_tangents import value_jaxpr
 from dirax.program.interpreter import (
     LOOP_LIMIT,
     Interpreter,
@@ -35,6 +36,11 @@ def call(interpreter: Interpreter, equation: Any, *operands):
 @rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", lazy=True)
 def custom_derivative(interpreter: Interpreter, equation: Any, *operands):
     return interpreter.run(closed(inner_jaxpr(equation)), *operands)
+
+
+@rule("dirax_given_tangent", lazy=True)
+def given_tangent(interpreter: Interpreter, equation: Any, *operands):
+    return interpreter.run(value_jaxpr([v.aval for v in equation.invars], **equation.params), *operands)
 
 
 def inner_jaxpr(equation: Any) -> Any:
