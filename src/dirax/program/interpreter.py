@@ -34,6 +34,14 @@ class Unavailable:
         self.error = error
 
 
+class Held(Unavailable):
+    """A constant that nodes do not hold, such as a key of `jax.random`: an error only if something else than JAX needs it."""
+
+    def __init__(self, value: Any, error: UnsupportedPrimitive):
+        super().__init__(error)
+        self.value = value
+
+
 Rule = Callable[..., Sequence[Any]]
 RULES: dict[str, Rule] = {}
 """Primitive name → rule(interpreter, equation, *operands) returning one Nodes array per result."""
@@ -83,9 +91,12 @@ class Interpreter:
         """The nodes of a concrete array."""
         if isinstance(value, Tracer):
             return Unavailable(UnsupportedPrimitive("constant", "is a value that JAX traces", "a captured array"))
+        known = isinstance(value, jax.Array | np.ndarray | np.generic)
+        dtype = value.dtype if known else np.asarray(value).dtype
+        if not is_held_by_nodes(dtype):
+            failure = UnsupportedPrimitive("constant", f"has dtype {dtype}", "a captured array")
+            return Held(value, failure) if known else Unavailable(failure)
         array = np.asarray(value)
-        if not (array.dtype == np.bool_ or np.issubdtype(array.dtype, np.integer) or array.dtype == np.float64):
-            return Unavailable(UnsupportedPrimitive("constant", f"has dtype {array.dtype}", "a captured array"))
         nodes = [self.graph.constant(item) for item in array.ravel().tolist()]
         return np.array(nodes, dtype=np.int64).reshape(array.shape)
 
@@ -106,28 +117,41 @@ class Interpreter:
 
     def _known(self, equation: Any, operands: list[Any]) -> list[Any] | None:
         """The results of constants that have no rule, by JAX; None where an operand is no constant."""
-        if not folds(equation) or any(isinstance(o, Unavailable) for o in operands):
+        if not folds(equation) or any(isinstance(o, Unavailable) and not isinstance(o, Held) for o in operands):
             return None
         values = []
         for nodes, atom in zip(operands, equation.invars, strict=True):
+            if isinstance(nodes, Held):
+                values.append(nodes.value)
+                continue
             numbers = [self.graph.value[n] for n in nodes.ravel().tolist() if self.graph.is_constant(n)]
             if len(numbers) < nodes.size:
                 return None
             values.append(np.array(numbers, dtype=float).reshape(nodes.shape).astype(atom.aval.dtype))
         with jax.ensure_compile_time_eval():
             found = equation.primitive.bind(*values, **equation.params)
-        results = list(map(np.asarray, found if equation.primitive.multiple_results else [found]))
-        if any(a.dtype.kind in "iu" and np.any(np.abs(a.astype(float)) > EXACT) for a in (*values, *results)):
-            return None
-        return list(map(self.constants, results))
+        return [self._of_known(value, equation) for value in (found if equation.primitive.multiple_results else [found])]
+
+    def _of_known(self, value: Any, equation: Any) -> Nodes | Unavailable:
+        """The nodes of a concrete array, which is held where it is of whole numbers that they do not hold."""
+        if is_held_by_nodes(value.dtype) and not (
+            value.dtype.kind in "iu" and np.any(np.abs(np.asarray(value).astype(float)) > EXACT)
+        ):
+            return self.constants(value)
+        return Held(value, self._failure(equation.primitive.name, "has a result that float64 does not hold"))
+
+    def _failure(self, name: str, reason: str) -> UnsupportedPrimitive:
+        # equations inside a library's jitted functions have no line of the user's: the calling equation has it
+        line = next(filter(None, map(source_line, reversed(self._equations))), "unknown line")
+        return UnsupportedPrimitive(name, reason, line)
 
     def _equation(self, equation: Any, operands: list[Any]) -> Sequence[Any]:
         name = equation.primitive.name
         lost = next((o for o in operands if isinstance(o, Unavailable)), None)
-        if lost is not None and name not in LAZY:
-            return [lost] * len(equation.outvars)
         self._equations.append(equation)
         try:
+            if lost is not None and name not in LAZY:
+                return self._known(equation, operands) or [lost] * len(equation.outvars)
             if name not in self.rules:
                 raise Unsupported("is not supported")
             check_dtypes(equation)
@@ -136,10 +160,7 @@ class Interpreter:
         except Unsupported as error:
             if (known := self._known(equation, operands)) is not None:
                 return known
-            # equations inside a library's jitted functions have no line of the user's: the calling equation has it
-            line = next(filter(None, map(source_line, reversed(self._equations))), "unknown line")
-            failure = UnsupportedPrimitive(name, str(error), line)
-            return [Unavailable(failure)] * len(equation.outvars)
+            return [Unavailable(self._failure(name, str(error)))] * len(equation.outvars)
         finally:
             self._equations.pop()
 
@@ -147,7 +168,7 @@ class Interpreter:
 def folds(equation: Any) -> bool:
     """Whether an equation is one primitive of JAX alone, with results that nodes can hold."""
     inner = any(hasattr(p, "eqns") or hasattr(p, "jaxpr") for p in jax.tree.leaves(list(equation.params.values())))
-    return not inner and not equation.effects and not equation.primitive.name.startswith("dirax_") and not has_others(equation)
+    return not inner and not equation.effects and not equation.primitive.name.startswith("dirax_")
 
 
 def check_dtypes(equation: Any) -> None:
@@ -159,7 +180,12 @@ def check_dtypes(equation: Any) -> None:
 def has_others(equation: Any) -> list[Any]:
     """The dtypes of results that are none of these."""
     dtypes = [getattr(variable.aval, "dtype", None) for variable in equation.outvars]
-    return [d for d in dtypes if d is None or not (d == np.float64 or d == np.bool_ or np.issubdtype(d, np.integer))]
+    return [d for d in dtypes if d is None or not is_held_by_nodes(d)]
+
+
+def is_held_by_nodes(dtype: Any) -> bool:
+    """Whether nodes stand for values of this dtype, which may be one of JAX's own."""
+    return isinstance(dtype, np.dtype) and (dtype == np.float64 or dtype.kind in "biu")
 
 
 def source_line(equation: Any) -> str:
@@ -169,7 +195,7 @@ def source_line(equation: Any) -> str:
 
 def is_integer(variable: Any) -> bool:
     """Whether a jaxpr variable holds whole numbers."""
-    return bool(np.issubdtype(variable.aval.dtype, np.integer))
+    return isinstance(dtype := variable.aval.dtype, np.dtype) and dtype.kind in "iu"
 
 
 def elementwise(function: Callable[..., int], *operands: Nodes) -> Nodes:

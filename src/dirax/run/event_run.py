@@ -18,7 +18,11 @@ from dirax.run.redundancy import without_redundant
 from dirax.run.traced_run import carried_by_jax
 from dirax.solution.dense import Dense
 from dirax.solution.events import Events, joined
+from dirax.solution.restarts import refuse_restarting
 from dirax.solution.solution import Solution
+
+FIRST_STEPS = 3
+"""Steps by which it is found out whether a step from a row goes on with the run."""
 
 FIRST_STRETCH = 256
 """Steps of the first stretch of a run that may end at an event; every other one is as long as all before it."""
@@ -198,7 +202,11 @@ def run_with_events(
 
         def begun_at(case: Any) -> tuple[Any, bool]:
             begun = begin(plain, case, count, 1, 1)
-            return begun, check_walls(plain.system, begun.problem, own, tuple(walls))
+            captured = check_walls(plain.system, begun.problem, own, tuple(walls))
+            first = begun.problem.equation.stages[0][0]
+            if first.resume is first.start and not (begun.traced or captured):
+                refuse_restarting(Dense(carry_out(plain, case, min(count, FIRST_STEPS), 1, False)).again)
+            return begun, captured
 
         if case.traced:
             known = without_redundant(plain.system, case, plain.project)

@@ -38,6 +38,8 @@ class Flight:
     """One such step."""
     collide: AbstractWalk
     """One step onto a wall."""
+    row: Numbers
+    """(state, u, t, h) ↦ the fields of nodes there but q, p, time and density, one after the other."""
     hits: list[tuple] = field(default_factory=list)
     message: str = ""
     status: int = OK
@@ -47,6 +49,7 @@ class Flight:
         p, layout = self.search.problem, self.search.layout
         self.q, self.p = layout.place("q"), layout.place("p")
         self.extra = [layout.place(name) for name in (STEP_DENSITY, CLOCK) if name in layout]
+        self.others = [name for name in p.fields if p.is_node(name) and name not in ("q", "p", STEP_DENSITY, CLOCK)]
         self.rows = self.walk.rows
         self.closing: dict[str, np.ndarray] = {name: np.full(f.shape, np.nan) for name, f in p.fields.items()}
         self.close, self.last = [0] * len(self.jumps), [-np.inf] * len(self.jumps)
@@ -118,7 +121,7 @@ class Flight:
                 self._keep(step, self.collide.rows)
             at += (1.0 - at) * self.collide.unknowns[-1]
             state, u = self.collide.state[:-3], self.collide.rows[LEAVING][0].copy()
-            if not self._noted(state, int(wall), step + at):
+            if not self._noted(state, u, int(wall), step + at):
                 return None
 
     def _onto(self, wall: float, place: float, state: np.ndarray, t: float, h: float) -> bool:
@@ -129,8 +132,8 @@ class Flight:
         low = np.floor(place * PARTS) / PARTS
         return bool(low <= self.collide.unknowns[-1] <= low + 1.0 / PARTS)
 
-    def _noted(self, state: np.ndarray, wall: int, at: float) -> bool:
-        """Note an impact, of which this is the state after it; whether the run goes on."""
+    def _noted(self, state: np.ndarray, u: np.ndarray, wall: int, at: float) -> bool:
+        """Note an impact, of which these are the state after it and a guess of the unknowns; whether the run goes on."""
         t, number = self.search.time(state, at), self.search.numbers[wall]
         self.close[wall] = self.close[wall] + 1 if at - self.last[wall] < ACCUMULATED else 0
         self.last[wall] = at
@@ -141,7 +144,8 @@ class Flight:
                 f"{MOST_IN_STEP} impacts within one step up to t = {t:.6g}, the last one on events[{number}]: walls close in on "
                 "the motion, or the step is far too long for it"
             )
-        self.hits.append((t, number, state[self.q].copy(), state[self.p].copy(), at, *(state[i][0] for i in self.extra)))
+        others = self.row.one(state, u, t, self.search.problem.h) if self.others else np.zeros(0)
+        self.hits.append((t, number, state[self.q].copy(), state[self.p].copy(), at, others, *(state[i][0] for i in self.extra)))
         return True
 
     def _accumulated(self, number: int, t: float) -> bool:
@@ -189,7 +193,7 @@ class Flight:
         if speed >= 0.0:
             self._accumulated(number, t)
             return None
-        return (after, u) if self._noted(after, wall, at) else None
+        return (after, u) if self._noted(after, u, wall, at) else None
 
 
 def alerted(state: np.ndarray, alert: float) -> np.ndarray:

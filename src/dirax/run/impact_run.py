@@ -115,13 +115,20 @@ def _flights(
     jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, wall.restitution, state, t, h, params)
     key = "jump", by_value(system), Same(p.equation)
     jumps = [Numbers(jumped(wall), [state, t, t], p.params, *key, wall) for wall in walls]
+    others = [name for name in p.fields if p.is_node(name) and name not in ("q", "p", STEP_DENSITY, CLOCK)]
+
+    def row_of(state, u, t, h, params):
+        row = stage.unpack(state, u, t, h, params)
+        return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(row[name]) for name in others)])
+
+    row = Numbers(row_of, [state, np.asarray(p.guess[0]), t, t], p.params, "row", by_value(system), Same(p.equation))
     many, _, hit = problems(p)
     watch, collide = engine.walks(many), engine.walks(hit)
 
     def flight(p: Problem) -> Flight:
         many, one, hit = problems(p)
         search = ImpactSearch(p, numbers, run, gap.of(p.params), terms.of(p.params))
-        return Flight(search, [one.of(p.params) for one in jumps], watch(many), watch(one), collide(hit))
+        return Flight(search, [one.of(p.params) for one in jumps], watch(many), watch(one), collide(hit), row.of(p.params))
 
     return flight
 
@@ -191,5 +198,10 @@ def _events(flights: list[Flight], p: Problem) -> Events:
 
     fields = {"q": array(3, (n,)), "p": array(4, (n,))}
     if CLOCK in layout:
-        fields |= {STEP_DENSITY: array(6), CLOCK: array(7), PART: array(5) % 1.0}
+        fields |= {STEP_DENSITY: array(7), CLOCK: array(8), PART: array(5) % 1.0}
+    names = flights[0].others
+    sizes = [int(np.prod(p.fields[name].shape)) for name in names]
+    parts = np.split(array(6, (sum(sizes),)), np.cumsum(sizes)[:-1], axis=1)
+    for name, part in zip(names, parts, strict=False):
+        fields[name] = part.reshape(len(hits), *p.fields[name].shape)
     return Events(array(1), array(2, (), int), np.full(len(hits), -1), array(0, (), int), fields)

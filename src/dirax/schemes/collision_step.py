@@ -13,7 +13,7 @@ from dirax.program.tracing import gradient, once
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
-from dirax.schemes.step import CLOCK, STEP_DENSITY, Field, StepEquation
+from dirax.schemes.step import CLOCK, STEP_DENSITY, Field, RowAtState, StepEquation
 from dirax.schemes.watched_step import ON_WALL, gap_terms, velocity
 
 SUMS = ("work", "energy_defect")
@@ -143,7 +143,9 @@ def bounced(
     if not quadratic:
         after = _with_momentum(system, momentum, projected, (t, q, params), normal, rate, restitution, v, after, strength)
     data = {"q": q, "p": momentum(after), "v": after, "t": t}
-    own, u = stage.resume(data | {name: now[name] for name in (STEP_DENSITY, CLOCK) if name in now}, h, params)
+    data |= {name: now[name] for name in (STEP_DENSITY, CLOCK) if name in now}
+    row = lambda: stage.unpack(state, jnp.zeros(stage.unknowns), t, h, params)
+    own, u = stage.resume(RowAtState(data, row), h, params)
     kept = {name: now[name] for name in SUMS if name in now}
     return stage.state_layout.replace(own, **kept), u, speed, (normal @ lifted) / (normal @ solve(metric, normal))
 

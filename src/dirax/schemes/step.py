@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -16,6 +17,9 @@ from dirax.schemes.stage_relation import MeanRelation, StageRelation
 from dirax.schemes.step_forms import form_of_steps
 from dirax.systems.shape import Shape
 from dirax.text.representation import counted, fields_html, module_html, module_text
+
+PLACES = ("node", "step")
+"""Where a field is known: at the rows of a trajectory, or between two of them."""
 
 COMPOSED = ("first", "sum", "mean", "each")
 """How the row of a composed step is made of those of its parts."""
@@ -45,7 +49,7 @@ class Field(eqx.Module):
     along a new axis in front). A field of nodes is "first" unless it says otherwise, one of steps "mean".
     `chosen` says that steps may begin with any value of it, and that the one in a row is not what the step before led to: the
     centre of a chart, where a row was not computed in charts. `dx.verify` begins there, and does not expect it.
-    Raises `ValueError` for another `composed`.
+    Raises `ValueError` for another `place` or `composed`.
     """
 
     shape: tuple[int, ...] = eqx.field(static=True)
@@ -56,6 +60,8 @@ class Field(eqx.Module):
     chosen: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
+        if self.place not in PLACES:
+            raise ValueError(f"place must be {' or '.join(map(repr, PLACES))}, but {self.place!r} was given.")
         if self.composed not in ("", *COMPOSED):
             raise ValueError(f"composed must be one of {', '.join(map(repr, COMPOSED))}, but {self.composed!r} was given.")
 
@@ -91,7 +97,8 @@ class StepEquation(eqx.Module):
     - `review(fields) -> dict`, which looks at the saved arrays of a run, concrete ones, for what is to stand in its `stats`, and
       warns of what is wrong with them;
     - `resume(data, h, params) -> (state, u)`: where the step that leaves a saved row begins, of which `data` has the fields too,
-      and which need not be the first: `start` sets sums since the start to zero, and may choose another chart, or take longer;
+      and which need not be the first: `start` sets sums since the start to zero, and may choose another chart, or take longer.
+      Without it `start` is asked, and a run whose rows it does not lead from one to the next is not looked into between them;
     - `interpolate(theta, u, state, t, h, params) -> dict`, the fields of nodes at t + θh inside the step, 0 ≤ θ ≤ 1, by the
       polynomial of the method, which joins both ends;
     - `between(theta, row, after, h, params) -> dict`, the same of the rows at both ends, which hold the time `t` and the velocity
@@ -206,6 +213,17 @@ class StepSequence(eqx.Module):
     def __repr__(self) -> str:
         fractions = ", ".join(f"{fraction:.6g}" for _, fraction in self.stages)
         return f"StepSequence({counted(len(self.stages), 'stage')} of h·({fractions}); first {self.first!r})"
+
+
+class RowAtState(dict):
+    """Data from which a step is resumed at a state that is no saved row: what is not among them is asked of its row."""
+
+    def __init__(self, data: dict[str, Any], row: Callable[[], dict[str, Any]]):
+        super().__init__(data)
+        self._row = row
+
+    def __missing__(self, name: str) -> Any:
+        return self._row()[name]
 
 
 def first_of_each(stages: Sequence[tuple[StepEquation, float]]) -> list[int]:
@@ -325,7 +343,8 @@ def make_step_equation(scheme: AbstractScheme, system: Any, shape: Shape) -> Ste
 
     def made() -> StepEquation | StepSequence:
         try:
-            return scheme.step_equation(system, shape)
+            with jax.ensure_compile_time_eval():  # arrays that it makes are numbers in whatever trace it is made first
+                return scheme.step_equation(system, shape)
         except TypeError as error:
             advice = getattr(system, "stepped_by", "")
             if not advice or type(scheme).__name__ in advice:

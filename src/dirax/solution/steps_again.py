@@ -24,6 +24,7 @@ from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, OfKey, Same, by_value
 from dirax.program.on_host import called_on_host
 from dirax.schemes.step import CLOCK, Field, StepEquation, composed_row, needs_every_part
+from dirax.solution.restarts import refuse_restarting
 from dirax.solution.trajectory import Trajectory
 
 MANY = 2000
@@ -207,7 +208,7 @@ class StepsAgain:
         stages = [stage for stage, _ in self.equation.stages]
         shape = (sol.batch or 1, int(counts[-1]))
         self.ends = np.cumsum([stage.unknowns for stage in stages])
-        self.known = np.zeros(shape, bool)
+        self.known, self.checked = np.zeros(shape, bool), False
         self.states = np.empty((*shape, stages[0].state_size))
         self.unknowns = np.empty((*shape, self.ends[-1]))
 
@@ -235,6 +236,9 @@ class StepsAgain:
 
     def at(self, lanes: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States and unknowns of these steps, NaN where a step has no solution."""
+        if not self.checked:
+            refuse_restarting(self)
+            self.checked = True
         missing = ~self.known[lanes, numbers]
         if np.any(missing):
             self._find(lanes[missing], numbers[missing])

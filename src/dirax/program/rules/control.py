@@ -8,6 +8,7 @@ from jax.extend.core import ClosedJaxpr
 from dirax.program.given_tangents import value_jaxpr
 from dirax.program.interpreter import (
     LOOP_LIMIT,
+    Held,
     Interpreter,
     Unavailable,
     Unsupported,
@@ -71,7 +72,14 @@ def branches(interpreter: Interpreter, equation: Any, which, *operands):
 
 
 def _lost(*operands: Any) -> Unavailable | None:
-    return next((o for o in operands if isinstance(o, Unavailable)), None)
+    lost = next((o for o in operands if isinstance(o, Unavailable)), None)
+    return lost and Unavailable(lost.error)
+
+
+def _entry(along: Any, i: int) -> Any:
+    if isinstance(along, Held):
+        return Held(along.value[i], along.error)
+    return along if isinstance(along, Unavailable) else along[i]
 
 
 @rule("platform_index")
@@ -91,7 +99,7 @@ def scan(interpreter: Interpreter, equation: Any, *operands):
     consts, carry, along = operands[:fixed], list(operands[fixed : fixed + carried]), operands[fixed + carried :]
     rows: list[Any] = [None] * length
     for i in reversed(range(length)) if p["reverse"] else range(length):
-        here = [x if isinstance(x, Unavailable) else x[i] for x in along]
+        here = [_entry(x, i) for x in along]
         out = interpreter.run(p["jaxpr"], *consts, *carry, *here)
         carry, rows[i] = out[:carried], out[carried:]
     if length == 0:

@@ -23,8 +23,9 @@ class Prolonged(Recorded):
 
     def __init__(self, task: Recorded, parameters: int):
         self.task, self.parts = task, task.parts
-        self.equation, self.every_stage = (prolonged(e, task.unknowns) for e in (task.equation, task.every_stage))
-        self.state_size, self.unknowns = 2 * task.state_size + 1, 2 * task.unknowns
+        self.state_size = 2 * task.state_size + 1
+        self.unknowns = max(1, *(2 * stage.unknowns for stage, _ in task.equation.stages))  # as a recorded run has at least one
+        self.equation, self.every_stage = (prolonged(e, self.unknowns) for e in (task.equation, task.every_stage))
         self.rows, self.steps, self.numbers = task.rows, task.steps, task.numbers
         made = kernels(self.every_stage, np.zeros((1, 2 * parameters + 1)), True, self.numbers["compensated"])
         made.check()
@@ -92,7 +93,7 @@ _prolonged: Memo[StepSequence] = Memo(KEPT)
 
 
 def prolonged(equation: StepSequence, size: int) -> StepSequence:
-    """The equation of the tangent, whose rows have `size` unknowns and their tangents; the same object for the same arguments."""
+    """The equation of the tangent, whose rows have `size` unknowns and tangents; the same object for the same arguments."""
     return _prolonged.get((Same(equation), size), lambda: _made(equation, size))
 
 
@@ -117,9 +118,9 @@ def _made(equation: StepSequence, size: int) -> StepSequence:
             return jnp.concatenate([stage.guess(x, previous[:k], h, own), previous[k:]])
 
         def unpack(state, u, t, h, c):
-            return {"state": state, "unknowns": jnp.concatenate([u, jnp.zeros(2 * (size - k))])}
+            return {"state": state, "unknowns": jnp.concatenate([u, jnp.zeros(size - 2 * k)])}
 
-        shapes = {"state": (2 * s + 1,), "unknowns": (2 * size,)}
+        shapes = {"state": (2 * s + 1,), "unknowns": (size,)}
         fields = {name: dataclasses.replace(stage.fields[name], shape=shape) for name, shape in shapes.items()}
         return StepEquation(
             start=lambda data, h, c: (jnp.zeros(2 * s + 1), jnp.zeros(2 * k)),

@@ -1,0 +1,43 @@
+"""Equations that do not say how a step is resumed, and whose start does not do it: a sum of theirs would begin again."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dirax.solution.trajectory import last_rows
+
+if TYPE_CHECKING:
+    from dirax.solution.steps_again import StepsAgain
+
+RESUMED = 1e-6
+"""How near, relative to the largest of its numbers, a step that is resumed must come to what was saved."""
+
+FEW = 100
+"""Steps between two rows up to which this is looked at."""
+
+
+def refuse_restarting(again: "StepsAgain") -> None:
+    """Raise `ValueError` where steps from the last row but one do not lead to the last one, and the equation has no `resume`."""
+    sol, (first, _) = again.sol, again.equation.stages[0]
+    if first.resume is not first.start or sol.impacts is not None:
+        return
+    nodes = {name: np.asarray(a) for name, a in sol.fields.items() if sol.field_info[name].place == "node"}
+    nodes = nodes if sol.batch is not None else {name: a[None] for name, a in nodes.items()}
+    lane, row = np.zeros(1, int), int(last_rows(list(nodes.values()))[0]) - 1
+    if row < 1 or (count := int(again.counts[row + 1] - again.counts[row])) > FEW:
+        return
+    h, number = np.full(1, float(sol.step)), again.counts[row : row + 1]
+    state, u = again.begun_at(lane, np.array([row]), again.time(number))
+    for _ in range(count):
+        (state, u), number = again.step(lane, state, u, again.time(number), h), number + 1
+    for name, made in again.row(lane, state, u, again.time(number), h).items():
+        if name not in nodes or sol.field_info[name].chosen:
+            continue
+        there, size = nodes[name][0, row + 1], np.nanmax(np.abs(nodes[name][0]), initial=0.0)
+        if not np.all(np.abs(made[0] - there) <= RESUMED * size):
+            came, expected = (np.array2string(a, precision=6) for a in (made[0], there))
+            raise ValueError(
+                f"the equation of {sol.scheme!r} does not say how the step that leaves a saved row begins, and its start() leads "
+                f"from row {row} to {name} = {came}, where the run has {expected}: give dx.StepEquation(resume=…), a function of "
+                f"(data, h, params) that makes the state of what is saved, such as data[{name!r}]."
+            )

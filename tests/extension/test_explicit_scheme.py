@@ -1,0 +1,104 @@
+"""A scheme with nothing to solve, with a sum of its own in the state: derivatives, first uses under JAX, resumed steps, walls."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+
+
+class Euler(dx.AbstractScheme):
+    """Symplectic Euler, with the sum of h|p|² as a field "work_done" of its nodes, and a zero that JAX makes."""
+
+    resumes: bool = True
+
+    def step_equation(self, system, shape):
+        n, state, rest = shape.n, dx.Layout(q=shape.n, p=shape.n, s=1), jnp.zeros(shape.n)
+
+        def advance(u, x, t, h, params):
+            q, p, s = state.split(x)
+            p = p + h * jax.grad(system.lagrangian)(q, rest, params)
+            return state.join(q=q + h * p, p=p, s=s + h * (p @ p))
+
+        def unpack(x, u, t, h, params):
+            q, p, s = state.split(x)
+            return {"q": q, "p": p, "work_done": s}
+
+        def begin(data, sum_before):
+            return state.join(q=data["q"], p=data["p"], s=sum_before), jnp.zeros(0)
+
+        equation = dx.StepEquation(
+            start=lambda data, h, params: begin(data, jnp.zeros(1)),
+            residual=lambda u, x, t, h, params: jnp.zeros(0),
+            advance=advance,
+            unpack=unpack,
+            state_layout=state,
+            unknowns=0,
+            fields={"q": dx.Field((n,)), "p": dx.Field((n,)), "work_done": dx.Field((1,))},
+        )
+        resume = lambda data, h, params: begin(data, data["work_done"])
+        return dataclasses.replace(equation, resume=resume) if self.resumes else equation
+
+
+SYSTEM = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params * (q @ q) ** 2 / 4)
+GIVEN = {"q": [1.0, 0.3], "v": [0.2, 0.5], "step": 0.02}
+
+
+def end(k, steps=60, **more):
+    return dx.simulate(SYSTEM, Euler(), **GIVEN, params=k, steps=steps, **more).q[-1, 0]
+
+
+def test_the_first_use_may_be_a_traced_one():
+    """What a scheme makes of JAX's arrays is kept with its equation, and is no value of that trace."""
+    dx.clear_caches()
+    slope = jax.grad(end)(1.3)
+    np.testing.assert_allclose(slope, (end(1.3 + 1e-6) - end(1.3 - 1e-6)) / 2e-6, rtol=1e-8)
+    np.testing.assert_allclose(end(1.3, engine="xla"), end(1.3), rtol=1e-13)
+
+
+@pytest.mark.parametrize("twice", [jax.hessian, lambda f: jax.jacrev(jax.jacrev(f)), lambda f: jax.jacfwd(jax.jacfwd(f))])
+def test_second_derivatives(twice):
+    slope = jax.jit(jax.grad(end))
+    np.testing.assert_allclose(twice(end)(1.3), (slope(1.3 + 1e-5) - slope(1.3 - 1e-5)) / 2e-5, rtol=1e-8)
+
+
+def test_steps_from_rows_go_on_with_the_sum():
+    """Between rows, at events, behind walls: what is saved there lies between its neighbours."""
+    sol = dx.simulate(SYSTEM, Euler(), **GIVEN, params=1.3, steps=200)
+    inside = sol.at(1.21).work_done[0]
+    assert sol.work_done[60, 0] < inside < sol.work_done[61, 0]
+    event = dx.Event(lambda q: q[1])
+    found = dx.simulate(SYSTEM, Euler(), **GIVEN, params=1.3, steps=200, events=[event]).events
+    rows = np.searchsorted(sol.t, found.t) - 1
+    assert len(rows) and np.all((found.work_done >= sol.work_done[rows]) & (found.work_done <= sol.work_done[rows + 1]))
+    hit = dx.simulate(SYSTEM, Euler(), **GIVEN, params=1.3, steps=200, events=[dx.Impact(lambda q: q[0] + 0.2)])
+    assert len(hit.events) and np.all(np.diff(hit.work_done[:, 0]) > 0)
+    assert abs(hit.work_done[-1, 0] - np.trapezoid(np.sum(hit.p**2, axis=1), hit.t)) < 0.02
+    assert dx.verify(hit)["run once more"].verdict == "ok"
+
+
+def test_one_that_does_not_say_how_it_goes_on_is_refused():
+    with pytest.raises(ValueError, match="resume"):
+        dx.simulate(SYSTEM, Euler(False), **GIVEN, params=1.3, steps=200).at(1.21)
+    for event in (dx.Event(lambda q: q[1]), dx.Impact(lambda q: q[0] + 0.2)):
+        with pytest.raises(ValueError, match="resume"):
+            dx.simulate(SYSTEM, Euler(False), **GIVEN, params=1.3, steps=200, events=[event])
+
+
+def test_python_that_leaves_out_assertions():
+    """Nothing may be done by a line that is not there with `python -O`."""
+    code = "import dirax as dx; s = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2); " + (
+        "print(dx.simulate(s, dx.LagrangeDAlembert(), q=[[1.0], [0.5]], v=[[0.0], [0.1]], step=0.1, steps=9000).ok.all())"
+    )
+    done = subprocess.run([sys.executable, "-OO", "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.split() == ["True"], done.stderr
+
+
+def test_a_place_that_there_is_not():
+    with pytest.raises(ValueError, match="'node' or 'step', but 'nodes'"):
+        dx.Field((2,), place="nodes")

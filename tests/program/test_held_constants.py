@@ -1,0 +1,44 @@
+"""Constants that no node of a graph holds: keys of jax.random, single precision, whole numbers above 2⁵³."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import dirax as dx
+
+WEIGHTS = jnp.asarray(np.linspace(0.2, 0.8, 3), jnp.float32)
+
+
+def drawn(q, key):
+    return jnp.sum(jnp.tanh(jax.random.normal(key, (3,)) * q[0]) ** 2)
+
+
+def split_in_a_loop(q):
+    keys = jax.random.split(jax.random.key(1), 3)
+    return q[0] ** 2 * jax.lax.scan(lambda sum, key: (sum + jax.random.uniform(key) / 4, None), 0.0, keys)[0]
+
+
+@pytest.mark.parametrize(
+    "potential",
+    [
+        lambda q: drawn(q, jax.random.key(0)),
+        lambda q: drawn(q, jax.random.PRNGKey(0)),
+        split_in_a_loop,
+        lambda q: jnp.sum(WEIGHTS.astype(float) * q[0] ** jnp.arange(2.0, 5.0)),
+        lambda q: q[0] ** 2 * (jnp.uint64(2**63 + 12345) >> 60).astype(float) / 16,
+    ],
+)
+def test_both_engines_take_them(potential):
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2 - potential(q))
+    run = dict(q=[1.0], v=[0.2], step=0.1, steps=20)
+    native, xla = (dx.simulate(system, dx.Collocation(2), **run, engine=engine) for engine in ("native", "xla"))
+    np.testing.assert_allclose(native.q, xla.q, rtol=0, atol=1e-13)
+    plain = dx.simulate(dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2), dx.Collocation(2), **run)
+    assert np.max(np.abs(native.q - plain.q)) > 1e-3
+
+
+def test_single_precision_of_the_state_is_said():
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - (q.astype(jnp.float32).astype(float) ** 2).sum() / 2)
+    with pytest.raises(Exception, match="float32"):
+        dx.simulate(system, dx.LagrangeDAlembert(), q=[1.0], v=[0.2], step=0.1, steps=20, engine="native")
