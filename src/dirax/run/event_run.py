@@ -213,10 +213,18 @@ def run_with_events(
             by_jax = lambda case: flown(plain.system, begun_at(case)[0], own, tuple(walls))
             found = carried_by_jax(by_jax, plain, known, count, *walls, *own)
             return flight_of(plain, case, *found)
+        began = time.perf_counter()
         begun, captured = begun_at(case)
         if begun.traced or captured:
             return flight_of(plain, case, *flown(plain.system, begun, own, tuple(walls)))
+        started = time.perf_counter()
         sol = fly_all(plain, begun, own, tuple(walls))
+        known = sol.stats["compile_seconds"] + sol.stats["run_seconds"]
+        sol.stats |= {
+            "validate_seconds": began - entered if entered else 0.0,
+            "start_seconds": started - began,
+            "result_seconds": max(0.0, time.perf_counter() - started - known),
+        }
         sol.continuation = lambda _, more, progress: run(count + more)
         return sol
 

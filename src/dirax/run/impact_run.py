@@ -45,6 +45,7 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
     run, interrupted = settings.engine.prepared(own[0]), False
     flights: list[Flight] = []
     flight_of = _flights(settings.engine, run, system, own[0], walls, numbers)
+    made = time.perf_counter()
     for number, lane in enumerate(own):
         flight = flight_of(lane)
         _refuse_behind(flight, number if p.batch is not None else None)
@@ -59,7 +60,7 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
     closing = {name: np.stack([flight.closing[name] for flight in flights]) for name in p.fields}
     for name in filter(p.is_node, closing):
         fields[name] = np.concatenate([fields[name], closing[name][:, None]], axis=1)
-    seconds = time.perf_counter() - started
+    seconds = time.perf_counter() - made
     sample = run(own[0].with_numbers(steps=1, save_every=1), None)
     outcome = Outcome(
         fields=fields,
@@ -72,6 +73,7 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
         last_unknowns=np.stack([flight.unknowns for flight in flights]),
         engine=sample.engine,
         interrupted=interrupted,
+        compile_seconds=made - started,
         run_seconds=seconds,
         notes={
             **sample.notes,
