@@ -23,6 +23,9 @@ DEPENDENT = 1e-9
 ASIDE = (0.1, 0.3, 1.0)
 """How far from a start at which a machine is not assembled others are tried, in every coordinate (rad, machine lengths)."""
 
+PART = 0.5
+"""How far given coordinates are moved at a time from rest to where they are (rad, machine lengths)."""
+
 MOST_STEPS = 200
 RANK = 1e-10
 
@@ -30,13 +33,17 @@ RANK = 1e-10
 class Assembly:
     """The functions that the search for initial data evaluates, each traced once for a model."""
 
-    def __init__(self, constraints: Any):
-        self.constraints = constraints
+    def __init__(self, constraints: Any, demands: Any):
+        self.constraints, self.demands = constraints, demands
 
     def position(self, q: Any, params: Any) -> tuple[Any, Any, Any]:
         """g, ∂g/∂q, and the sizes of the terms of g."""
         g = lambda q: self.constraints.position_defect(0.0, q, params)
         return g(q), jacobian(g)(q), rounding(g, q)
+
+    def turned_over(self, q: Any, params: Any) -> Any:
+        """Of the joints that may be, in a tuple."""
+        return (self.demands.turned_over(q, params),)
 
     def rows(self, q: Any, params: Any) -> Any:
         """[W; ∂g/∂q]."""
@@ -49,28 +56,49 @@ def assembled(model: Any, q: Any, v: Any, params: Any) -> dict[str, np.ndarray]:
     system, units = model.system, coordinate_units(model, params)
     place = start
     if system.holonomic is not None:
-        positions = lambda q: tuple(map(np.asarray, evaluated(model.assembly.position, q, params)))
-        place = _assembled_place(model, positions, start, fixed, units)
+        place = _assembled_place(model, start, fixed, units, params)
     speed, kept = _given(model, v, "v", np.zeros(len(start)))
     if system.constraints.any:
         speed = _moving(model, place, speed, kept, units, params)
     return {"q": place, "v": speed}
 
 
-def _assembled_place(model: Any, positions: Callable, start: np.ndarray, fixed: np.ndarray, units: np.ndarray) -> np.ndarray:
+def _assembled_place(model: Any, start: np.ndarray, fixed: np.ndarray, units: np.ndarray, params: Any) -> np.ndarray:
     """Where the machine is assembled: from the start, and where that is a dead centre, at which no joint knows which way to give,
-    from places beside it."""
-    free = units * ~fixed
-    place, rng = _solved(positions, start, free), np.random.default_rng(0)
-    for size in (0.0, *ASIDE):
-        other = place if size == 0 else _solved(positions, start + size * rng.uniform(-1, 1, len(start)) * free, free)
-        if not _unmet(model, positions(other), units):
-            return other
+    or leads to a body that is turned over, from places beside it."""
+    free, names, rng = units * ~fixed, model.demands.may_turn_over, np.random.default_rng(0)
+    positions, over = (_numbers(f, params) for f in (model.assembly.position, model.assembly.turned_over))
+    is_over = lambda q: over(q)[0] > 1.0 if names else np.zeros(0, bool)
+    beside = lambda size: start + size * rng.uniform(-1, 1, len(start)) * free
+    place, turned = _solved(positions, start, free), None
+    tries = [lambda: place, lambda: _in_parts(positions, _rest(model), start, free, units)]
+    for found in (*tries, *(lambda size=size: _solved(positions, beside(size), free) for size in ASIDE)):
+        if not _unmet(model, positions(other := found()), units):
+            if not np.any(is_over(other)):
+                return other
+            turned = other if turned is None else turned
     missed = _unmet(model, positions(place), units)
     listed = ", ".join(f"{name} by {value:.3g}" for name, value in missed)
+    if turned is not None:
+        which = [name for name, one in zip(names, is_over(turned), strict=True) if one]
+        listed = f"{', '.join(which)} met with the body turned over, by half a turn, alone"
     kept = [name for name, given in zip(model.coordinates, fixed, strict=True) if given]
     way = f"Leave some of the given coordinates ({', '.join(kept)}) open" if kept else "Change the lengths of the bodies"
     raise ValueError(f"the machine cannot be assembled near these data: {listed}. {way}, or start from others.")
+
+
+def _numbers(function: Callable, params: Any) -> Callable:
+    """q ↦ the arrays of `function(q, params)`."""
+    return lambda q: tuple(map(np.asarray, evaluated(function, q, params)))
+
+
+def _in_parts(positions: Callable, rest: np.ndarray, start: np.ndarray, free: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """The place to which the machine comes when the given coordinates are moved to where they are little by little."""
+    moved = np.where(free == 0, start - rest, 0.0)
+    count, place = np.ceil(np.max(np.abs(moved) / units, initial=0.0) / PART), rest
+    for part in np.linspace(0.0, 1.0, int(min(count, MOST_STEPS)) + 1)[1:]:
+        place = _solved(positions, np.where(free == 0, rest + part * moved, place), free)
+    return place
 
 
 def _rest(model: Any) -> np.ndarray:

@@ -11,6 +11,9 @@ from dirax.bodies.parts import Body
 
 GROUND = "ground"
 
+SYMMETRIC = 1e-9
+"""Relative to the largest entry of an inertia: what its entries beside the diagonal may differ."""
+
 MEASURED = 1e-6
 """Relative to the largest moment of inertia: what measured ones may be off."""
 
@@ -99,7 +102,8 @@ def check_masses(model: Any) -> None:
                 f"{np.shape(body.inertia)}."
             )
         mass, inertia = float(body.mass), np.asarray(body.inertia_matrix(None), float)
-        if np.any(inertia != inertia.T):
+        stated = np.asarray(body.inertia, float)
+        if stated.ndim == 2 and not np.all(np.abs(stated - stated.T) <= SYMMETRIC * np.abs(stated).max()):
             raise ValueError(f"the inertia of body {body.name!r} must be a symmetric matrix, but it is not.")
         moments = np.linalg.eigvalsh(inertia)
         size = max(abs(moments).max(), 1e-300)

@@ -70,7 +70,14 @@ class Motor:
         if not callable(push):
             return scalar(push, params) * w[self.coordinate]
         more = (params,) if len(inspect.signature(push).parameters) > 3 else ()
-        return push(t, q, v, *more) * w[self.coordinate]
+        try:
+            found = jnp.asarray(push(t, q, v, *more))
+        except Exception as error:
+            said = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+            raise TypeError(f"the push of {self.name!r} at {self.coordinate!r} could not be traced by JAX: {said}") from error
+        if found.shape != ():
+            raise ValueError(f"the push of {self.name!r} must be one number, but its shape is {found.shape}.")
+        return found * w[self.coordinate]
 
 
 def apart_of(between: Points, frames: Mapping[str, AnyFrame], params: Any) -> Any:

@@ -84,12 +84,9 @@ class Joint:
 
     def defect(self, parent: AnyFrame, body: AnyFrame, params: Any) -> list[Any]:
         """By how much the conditions are violated, in their order, seen from the parent: lengths and sines of angles."""
-        turned = turn_of(self.turned)
+        turned, (between, axis, own) = turn_of(self.turned), self._between(parent, body)
         apart = parent.turn.T @ (body.point(vector(self.on, params)) - parent.point(vector(self.at, params)))
-        between = turned.T @ parent.turn.T @ body.turn
-        axis = unit(self.axis)
         first, second = (turned @ e for e in across(axis))
-        own = unit(self.axis if self.axis_on is None else self.axis_on)
         tilts = lambda: [e @ (between @ own) for e in across(axis)]
         turns = lambda: [(between[k, j] - between[j, k]) / 2 for j, k in ((1, 2), (2, 0), (0, 1))]
         places = [apart[0], apart[1], apart[2]]
@@ -101,6 +98,19 @@ class Joint:
             "ball": lambda: places,
             "planar": lambda: [(turned @ axis) @ apart, *tilts()],
         }[self.kind]()
+
+    def turned_over(self, parent: AnyFrame, body: AnyFrame) -> list[Any]:
+        """1 − cos of the angle, of the rotation or of the axis, by which the body is turned out of place: its sine, which the
+        conditions have, is zero too where it is turned over by half a turn. Nothing where no condition is of this kind."""
+        between, axis, own = self._between(parent, body)
+        if self.kind in ("fixed", "prismatic"):
+            return [(3.0 - jnp.trace(between)) / 2]
+        return [1.0 - axis @ (between @ own)] if self.kind in ("revolute", "planar") else []
+
+    def _between(self, parent: AnyFrame, body: AnyFrame) -> tuple[Any, Any, Any]:
+        """The rotation of the body as seen from the parent, beyond the joint's own; its axis, and the same seen from the body."""
+        between = turn_of(self.turned).T @ parent.turn.T @ body.turn
+        return between, unit(self.axis), unit(self.axis if self.axis_on is None else self.axis_on)
 
 
 def turn_of(turned: tuple[Vector, float] | None) -> np.ndarray:

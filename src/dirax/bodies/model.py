@@ -171,6 +171,9 @@ class Model:
         """Of one trajectory, from its q and p: "energy" (rows,), "momentum" and "angular_momentum" (rows, 3), and `more`
         functions (q, v) by name."""
 
+        if solution.batch is not None:
+            raise ValueError("observables are those of one trajectory: give solution[i], one of the batch.")
+
         def at(q, p, params):
             v = self.system.inverse_legendre(q, p, params)
             known = self.energy(q, v, params), self.momentum(q, v, params), self.angular_momentum(q, v, params)
@@ -220,7 +223,7 @@ class Model:
     @cached_property
     def assembly(self) -> Assembly:
         """What the search for initial data evaluates."""
-        return Assembly(self.system.constraints)
+        return Assembly(self.system.constraints, self.demands)
 
     def state(self, q: Any = None, v: Any = None, params: Any = None) -> dict[str, np.ndarray]:
         """Initial data {"q", "v"} of a run: the machine assembled.

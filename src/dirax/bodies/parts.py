@@ -33,7 +33,8 @@ class Body:
         if np.ndim(self.inertia) == 1:
             return vector(self.inertia, params) * np.eye(3)  # type: ignore[arg-type]
         rows = [vector(row, params) for row in self.inertia]  # type: ignore[arg-type]
-        return np.stack(rows) if all(isinstance(row, np.ndarray) for row in rows) else jnp.stack(rows)
+        matrix = np.stack(rows) if all(isinstance(row, np.ndarray) for row in rows) else jnp.stack(rows)
+        return (matrix + matrix.T) / 2  # what was turned is symmetric to rounding alone
 
     def kinetic_energy(self, frame: AnyFrame, params: Any) -> Any:
         """m |ċ|²/2 + ω·I ω/2."""
