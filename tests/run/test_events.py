@@ -118,13 +118,27 @@ def test_many_steps_are_looked_through_as_few_are(scheme, monkeypatch):
     )
     events = [dx.Event(lambda q: q[0]), dx.Event(lambda t, q, v: v[1] - 0.35 + 0.0 * t), dx.Event(lambda q: q[1] + 9.0)]
     start = {"q": [[0.0, 0.1], [0.1, 0.0]], "v": [[0.4, 0.1], [0.3, 0.2]], "step": 0.3, "steps": 1000, "events": events}
-    found = []
-    for fewest in (1, 10**9):
-        monkeypatch.setattr(event_search, "FEWEST", fewest)
-        found.append(dx.simulate(system, scheme, **start).events)
-    few, many = found
+    few, many = found_by_both(system, scheme, start, monkeypatch)
     assert len(few) > 200 and np.array_equal(few.t, many.t) and np.array_equal(few.q, many.q)
     assert np.array_equal(few.index, many.index) and np.array_equal(few.lane, many.lane)
+
+
+def found_by_both(system, scheme, start, monkeypatch):
+    """The events of a run whose steps are looked at first by machine code, and of one of which each is looked into."""
+    for fewest in (1, 10**9):
+        monkeypatch.setattr(event_search, "FEWEST", fewest)
+        yield dx.simulate(system, scheme, **start).events
+
+
+def test_large_steps_of_a_composition_are_looked_into(monkeypatch):
+    """Where the step says nothing of its inside, and the cubic through rows and velocities is off by what matters: the
+    difference of the velocities, with zeros a third of a step apart."""
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] ** 2 / 2 - 1.7 * q[1] ** 2 / 2 - 0.3 * q[0] * q[1] ** 2)
+    apart = [dx.Event(lambda v: v[0] - v[1])]
+    places = np.random.default_rng(0).normal(size=(8, 2)) / 10
+    start = {"q": [0.8, 0.3] + places, "v": [0.1, 0.4] - places, "step": 0.9, "steps": 700, "events": apart}
+    few, many = found_by_both(system, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"), start, monkeypatch)
+    assert len(few) > 1000 and np.array_equal(few.t, many.t)
 
 
 def test_an_entry_that_there_is_not_is_refused_and_one_looked_up_is_not():

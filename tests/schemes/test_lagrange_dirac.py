@@ -610,3 +610,33 @@ def test_the_momentum_that_is_saved_can_be_chosen(scheme):
         assert dx.verify(sol).ok
     with pytest.raises(ValueError, match="momentum must be one of"):
         scheme(momentum="left")
+
+
+@pytest.mark.parametrize(
+    "of_another_system",
+    [
+        lambda q0, q1, h: PLAIN((q0 + q1) / 2, (q1 - q0) / h),  # without the factor h
+        lambda q0, q1, h: -h * PLAIN((q0 + q1) / 2, (q1 - q0) / h),
+        lambda q0, q1, h: h * PLAIN(q0 + q1, (q1 - q0) / h),  # the middle is half of the sum
+        lambda q0, q1, h: h * PLAIN(q0, (q1 - q0) / h) + q1[0] * q1[1] - q0[0] * q0[1],  # p is not that of L
+    ],
+)
+def test_a_discrete_lagrangian_of_another_system_is_refused(of_another_system):
+    """Energy went from .5 to 118, and every line of verify was ok: these are structure-preserving steps of something else."""
+    system = dx.LagrangeDirac(PLAIN)
+    for data in ({"q": [0.8, 0.3], "v": [0.1, 0.5]}, {"q": [0.8, 0.3], "v": [0.0, 0.0]}, {"q": [0.0, 0.0], "v": [0.0, 2e-9]}):
+        for _ in range(2):
+            with pytest.raises(ValueError, match="none of this Lagrangian"):
+                dx.simulate(system, dx.LagrangeDAlembert(of_another_system), **data, step=0.05, steps=2)
+
+
+@pytest.mark.parametrize("step", [1e-7, 0.05, 0.7])
+def test_a_discrete_lagrangian_of_the_system_is_taken(step):
+    system = dx.LagrangeDirac(PLAIN)
+    right = dx.LagrangeDAlembert(lambda q0, q1, h: h * (PLAIN(q0, (q1 - q0) / h) + PLAIN(q1, (q1 - q0) / h)) / 2)
+    for data in ({"q": [0.8, 0.3], "v": [0.1, 0.5]}, {"q": [1.0, 1e-7], "v": [0.0, 1e-5]}, {"q": [0.0, 0.0], "v": [0.0, 2e-9]}):
+        ours, theirs = (dx.simulate(system, s, **data, step=step, steps=4) for s in (right, dx.LagrangeDAlembert("trapezoidal")))
+        np.testing.assert_allclose(ours.q, theirs.q, rtol=1e-7, atol=1e-12 * np.abs(theirs.q).max())
+
+
+PLAIN = lambda q, v: v @ v / 2 - q @ q / 2 - q[0] ** 2 * q[1] / 5

@@ -108,6 +108,8 @@ def regular_root(
 ) -> Float[Array, " k"]:
     """A root of `residual` (k,) → (k,) with a regular Jacobian, as `nearest_root` finds it; NaN where it finds none: where the
     residual is above `tolerance`, relative to 1 + ‖root‖."""
+    if guess.shape[0] == 0:
+        return guess
     root = nearest_root(residual, guess, max_steps)
     missed = jnp.max(jnp.abs(lax.stop_gradient(residual(root))))
     return jnp.where(missed <= tolerance * (1.0 + jnp.max(jnp.abs(root))), root, jnp.nan)

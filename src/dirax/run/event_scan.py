@@ -10,7 +10,7 @@ from dirax.program.evaluation.functions import graph_program_of
 from dirax.program.memo import Memo, Same, by_value
 from dirax.program.scalar_program import ScalarProgram
 from dirax.run.event import Event, evaluated
-from dirax.schemes.hermite import cubic
+from dirax.schemes.hermite import cubic, hermite
 from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.schemes.watched_step import velocity
 from dirax.solution.dense import Dense
@@ -79,6 +79,10 @@ class EventScan:
             side = jnp.where(g[k] < 0.0, -1.0, 1.0)
             low, middle, high = side * g[k - 1], side * g[k], side * g[k + 1]
             found = found | ((middle <= low) & (middle <= high) & ((2.0 + 2.0 / MORE) * middle <= low + high))
+        if self.dense.interpolate is None and self.dense.between is None:  # the cubic is not what the scheme says of the inside
+            ends, inner = (g[1] + g[-2]) / 2.0, g[2:-2]
+            bend = jnp.max(jnp.abs(jnp.stack([value - ends for value in inner])))
+            found = found | (jnp.min(jnp.abs(jnp.stack([g[1], *inner, g[-2]]))) <= bend)
         return jnp.where(found, 1.0, 0.0)
 
     def _value(self, fields: dict, params: Any) -> Any:
@@ -114,7 +118,7 @@ class EventScan:
             return by_polynomial
         place = "q" if "q" in row else "x"
         v, v_after = (self._velocity(end, end["about"], params) for end in (first, last))
-        between = self.dense.between
+        between = self.dense.between or self._between_rows(row)
 
         def by_cubic(x):
             t = begins + x * length
@@ -125,6 +129,12 @@ class EventScan:
             return {**others, place: moved, "t": t, "about": first["about"]}
 
         return by_cubic
+
+    def _between_rows(self, row: dict) -> Any:
+        """`between` of a StepEquation for Lagrangians in coordinates, whose v and p are those of the cubic; None for others."""
+        system = self.dense.sol.system
+        form = None if system.manifold_form() is not None else system.lagrangian_form()
+        return None if form is None or not {"q", "p"} <= row.keys() else hermite(form)
 
     def steps(self, run: Any, first: int, last: int) -> tuple[np.ndarray, np.ndarray] | None:
         """(trajectories, numbers) of the steps, of those from number `first` to before `last`, that are to be looked into; None

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dirax.program.roots import nearest_root
-from dirax.program.tracing import once
+from dirax.program.tracing import gradient, once
 from dirax.program.user_functions import UserFunction
 from dirax.schemes.abstract_step import AbstractStep
 from dirax.schemes.constraint_rows import ConstraintRows, step_constraints
 from dirax.schemes.discrete_lagrangian import derivatives_by_slots, discrete_constraint, discrete_forces
+from dirax.schemes.discrete_lagrangian_premise import ConsistentWith
 from dirax.schemes.hermite import hermite
 from dirax.schemes.labels import Labels
 from dirax.schemes.layout import Layout
@@ -74,6 +75,18 @@ class LagrangeDAlembertStep(AbstractStep):
     def derivatives(self):
         """(D1 L_d, D2 L_d) as a function (t0, q0, v, h, params)."""
         return derivatives_by_slots(self.system.lagrangian, self.rule)
+
+    @cached_property
+    def consistent(self) -> ConsistentWith | None:
+        """The premise of a discrete Lagrangian of the user's."""
+        if not isinstance(self.rule, UserFunction):
+            return None
+        at = self.system.lagrangian.at
+        return ConsistentWith(self.derivatives, lambda *given: gradient(at, (2, 1))(*given))
+
+    def check(self, data, h, params):
+        if self.consistent is not None:
+            self.consistent.check(data, h, params)
 
     @cached_property
     def discrete_constraint(self):

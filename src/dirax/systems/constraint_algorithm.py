@@ -49,5 +49,5 @@ def final_manifold_needed(system: AbstractSystem, near: Any, params: Any) -> str
     point = ", ".join(f'"{name}": …' for name in near if name != "t") if isinstance(near, dict) else ""
     return (
         f"needs its final manifold: simulate dx.constraint_algorithm(system, near={f'{{{point}}}' if point else 'x'})"
-        ".resolved() instead of the system, from x=chain.point"
+        ".resolved() instead of the system, from x=chain.point, with dx.DiscreteDirac()"
     )
