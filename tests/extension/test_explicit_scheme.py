@@ -102,3 +102,34 @@ def test_python_that_leaves_out_assertions():
 def test_a_place_that_there_is_not():
     with pytest.raises(ValueError, match="'node' or 'step', but 'nodes'"):
         dx.Field((2,), place="nodes")
+
+
+class InParts(dx.AbstractScheme):
+    """What a scheme of one's own may return by mistake."""
+
+    fractions: tuple[float, ...] = ()
+
+    def step_equation(self, system, shape):
+        whole = Euler().step_equation(system, shape)
+        return dx.StepSequence(tuple((whole, fraction) for fraction in self.fractions)) if self.fractions else None
+
+
+def test_what_is_no_whole_step_is_refused():
+    """A run of steps of .9 h had the times of steps of h, and every line of verify was ok."""
+    run = lambda scheme: dx.simulate(SYSTEM, scheme, **GIVEN, params=1.3, steps=3)
+    with pytest.raises(ValueError, match=r"must sum up to 1, a whole step, but their sum is 0\.9"):
+        run(InParts((0.5, 0.4)))
+    with pytest.raises(TypeError, match="but it returned NoneType"):
+        run(InParts())
+    assert run(InParts((0.3, 0.3, 0.4))).ok
+
+
+def test_a_state_of_q_and_p_that_is_not_called_canonical():
+    class Plain(dx.AbstractScheme):
+        def step_equation(self, system, shape):
+            equation = dx.make_step_equation(dx.DiscreteDirac(), system, shape)
+            return dataclasses.replace(equation, canonical=False)
+
+    free = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    report = dx.verify(dx.simulate(free, Plain(), q=[0.3], v=[0.1], step=0.1, steps=20))
+    assert "canonical=True" in report["symplecticity of one step"].explanation

@@ -136,7 +136,7 @@ def test_large_steps_of_a_composition_are_looked_into(monkeypatch):
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] ** 2 / 2 - 1.7 * q[1] ** 2 / 2 - 0.3 * q[0] * q[1] ** 2)
     apart = [dx.Event(lambda v: v[0] - v[1])]
     places = np.random.default_rng(0).normal(size=(8, 2)) / 10
-    start = {"q": [0.8, 0.3] + places, "v": [0.1, 0.4] - places, "step": 0.9, "steps": 700, "events": apart}
+    start = {"q": np.array([0.8, 0.3]) + places, "v": np.array([0.1, 0.4]) - places, "step": 0.9, "steps": 700, "events": apart}
     few, many = found_by_both(system, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"), start, monkeypatch)
     assert len(few) > 1000 and np.array_equal(few.t, many.t)
 
@@ -174,3 +174,13 @@ def test_schemes_of_first_order_have_no_bend_of_the_velocity_of_their_own(scheme
     inside = sol.at(np.linspace(0.0, 8.0, 4001))
     slope, mean = np.diff(inside.q[:, 0]) / 0.002, (inside.p[1:, 0] + inside.p[:-1, 0]) / 2
     assert np.max(np.abs(slope - mean)) < 0.06  # half a step of the largest force
+
+
+def test_a_long_run_of_rows_without_velocities():
+    """It ended in a KeyError, of a reduced system from 20 000 steps on."""
+    inertia = np.array([1.0, 2.0, 3.5])
+    body = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ (inertia * xi) / 2)
+    crosses = dx.Event(lambda x: x[1])
+    run = lambda steps: dx.simulate(body, dx.DiscreteEulerPoincare(), x=[0.1, 2.0, 0.05], step=0.5, steps=steps, events=[crosses])
+    long, short = run(20_000), run(4_000)
+    assert len(short.events) > 100 and np.array_equal(long.events.t[: len(short.events)], short.events.t)

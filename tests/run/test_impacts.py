@@ -407,3 +407,27 @@ def test_walls_that_close_in_on_a_motion_end_it():
     walls.append(dx.Impact(lambda t, q: 1.0 - 0.2 * t - q[0]))
     sol = dx.simulate(free, dx.LagrangeDAlembert(), q=[0.5], v=[1.0], step=0.05, steps=60, events=walls)
     assert not sol.ok and "walls close in on the motion" in sol.message and 2.4 < sol.t[-1] < 2.5
+
+
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(2)], ids=lambda s: type(s).__name__)
+def test_thin_pegs_are_hit_wherever_they_are_in_a_step(scheme):
+    """A free particle and round pegs of a tenth of a step across, at the row and on it too: four of forty were passed through."""
+    free, centres = dx.LagrangeDirac(lambda q, v, c: v @ v / 2 + 0.0 * c), np.append(2.0 + 0.8 * np.arange(32) / 32, [2.02, 2.42])
+    peg = dx.Impact(lambda q, params: (q[0] - params) ** 2 + q[1] ** 2 - 0.02**2)
+    given = {"q": np.zeros((34, 2)), "v": np.tile([1.0, 1e-9], (34, 1)), "params": centres, "batch_params": True}
+    sol = dx.simulate(free, scheme, **given, step=0.4, steps=8, events=[peg])
+    assert np.array_equal(sol.events.lane, np.arange(34))
+    np.testing.assert_allclose(sol.events.t, centres - 0.02, rtol=0, atol=1e-12)
+
+
+def test_a_thin_peg_is_hit_after_a_wall_in_the_same_step():
+    free, wall = dx.LagrangeDirac(lambda q, v, c: v @ v / 2 + 0.0 * c[0]), dx.Impact(lambda q: 1.1 - q[0] - 0.2 * q[1])
+    normal = np.array([1.0, 0.2]) / np.hypot(1.0, 0.2)
+    back = np.array([1.0, 0.0]) - 2 * normal[0] * normal
+    distances = np.array([0.12, 0.2, 0.28, 0.42, 0.61])
+    places = np.array([1.1, 0.0]) + distances[:, None] * back
+    peg = dx.Impact(lambda q, params: (q[0] - params[0]) ** 2 + (q[1] - params[1]) ** 2 - 0.02**2)
+    given = {"q": np.zeros((5, 2)), "v": np.tile([1.0, 0.0], (5, 1)), "params": places, "batch_params": True}
+    sol = dx.simulate(free, dx.LagrangeDAlembert(), **given, step=0.4, steps=8, events=[wall, peg])
+    second = [sol.events.t[(sol.events.lane == lane) & (sol.events.index == 1)][0] for lane in range(5)]
+    np.testing.assert_allclose(second, 1.1 + distances - 0.02, rtol=0, atol=1e-12)

@@ -55,7 +55,7 @@ class EventScan:
         whole = [*shapes, *shapes, *inside, number, number, *(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in of_params)]
         try:
             program = graph_program_of(self._flat, whole, ("scan", *key))
-        except (TypeError, ValueError):  # as the search will say
+        except (TypeError, ValueError, KeyError):  # as the search will say, or rows without velocities
             return None
         return None if program is None else _compiled.get(Same(program), lambda: _machine_code(program))
 

@@ -10,7 +10,7 @@ from dirax.numerics.brackets import bracketed_roots
 from dirax.run.dips import changes_beside_dips, dips
 from dirax.run.impact import Numbers
 from dirax.schemes.step import CLOCK
-from dirax.schemes.watched_step import ON_WALL, PARTS
+from dirax.schemes.watched_step import EARLY, ON_WALL, PARTS
 
 SHORTEST = 1e-12
 """The shortest flight, in steps."""
@@ -78,8 +78,15 @@ class ImpactSearch:
                 values[part] = np.full(len(self.numbers), np.nan) if moved is None else self.gaps_at(moved[0], at + part)
             return values[part]
 
-        places = np.linspace(0.0, rest, PARTS + 1)
-        g = np.array([gap(float(x)) for x in places])
+        def beyond(part: float) -> np.ndarray:
+            """The same outside of the rest, where it need not be a number."""
+            try:
+                return gap(part)
+            except ValueError:
+                return np.full(len(self.numbers), np.nan)
+
+        places = rest * np.arange(-1, PARTS + 2) / PARTS  # one before and one after it, for dips at its ends
+        g = np.array([beyond(places[0]), *(gap(float(x)) for x in places[1:-1]), beyond(places[-1])])
         walls = range(len(self.numbers))
         hits = [found for wall in walls if (found := self._hit(wall, gap, places, g[:, wall], -small[wall])) is not None]
         return min(hits) if hits else None
@@ -99,17 +106,22 @@ class ImpactSearch:
         return found
 
     def _hit(self, wall: int, gap: Any, places: np.ndarray, g: np.ndarray, behind: float) -> tuple[float, int] | None:
-        """When a wall is hit, and the wall, behind which gaps are less than `behind`: others there are by rounding alone."""
+        """When a wall is hit, and the wall, behind which gaps are less than `behind`: others there are by rounding alone. The
+        first and the last of the places are outside."""
         function = lambda x, _: np.array([gap(float(part))[wall] for part in x])
-        below, near = np.flatnonzero(g < behind), np.flatnonzero(dips(g[:-2], g[1:-1], g[2:])) + 1
+        above = lambda g: np.where(np.abs(g) <= -behind, -behind, g)  # a dip may have a place on the wall
+        lifted = above(g)
+        below, near = np.flatnonzero(g[1:-1] < behind) + 1, np.flatnonzero(dips(lifted[:-2], lifted[1:-1], lifted[2:])) + 1
         near = near[near < below[0]] if len(below) else near
-        found = changes_beside_dips(function, places[near - 1], places[near + 1])
-        falls = np.flatnonzero((found.fa > 0.0) & (found.fb < behind))
+        found = changes_beside_dips(lambda x, which: above(function(x, which)), places[near - 1], places[near + 1])
+        falls = np.flatnonzero((found.fa > 0.0) & (found.fb < behind) & (found.a >= 0.0) & (found.a < places[-2]))
         if len(falls):
             first = falls[np.argmin(found.a[falls])]
             a, b = float(found.a[first]), float(found.b[first])
         elif len(below):
             a, b = float(places[below[0] - 1]), float(places[below[0]])
+        elif g[1] == 0.0 and len(early := np.flatnonzero(function(soon := places[2] * np.arange(1, EARLY) / EARLY, 0) < behind)):
+            a, b = 0.0, float(soon[early[0]])  # it begins on the wall, and is behind and in front of it again soon
         else:
             return None
         while gap(a)[wall] <= 0.0:  # it begins on the wall: off it, and back in less than a part of a step?

@@ -36,6 +36,9 @@ STEP_LENGTH = "step_length"
 PART = "part_of_step"
 """The field of an impact that says where in its step it is, by `step`, of steps that have lengths of their own."""
 
+WHOLE = 1e-12
+"""How far the fractions of the parts of a step may sum up to another number than 1, relative to them."""
+
 SHOWN = 200
 """Equations that are named where a step is shown."""
 
@@ -299,6 +302,22 @@ class AbstractScheme(eqx.Module):
         return True
 
 
+def _checked(scheme: AbstractScheme, equation: Any) -> "StepEquation | StepSequence":
+    """What a scheme returned. Raises `TypeError` for something else, and `ValueError` for parts that make no whole step."""
+    if not isinstance(equation, StepEquation | StepSequence):
+        raise TypeError(
+            f"step_equation of {type(scheme).__name__} must return a dx.StepEquation or a dx.StepSequence, but it returned "
+            f"{type(equation).__name__}."
+        )
+    fractions = [fraction for _, fraction in equation.stages]
+    if not abs(sum(fractions) - 1.0) <= WHOLE * sum(map(abs, fractions)):
+        raise ValueError(
+            f"the fractions of the stages of {type(scheme).__name__} must sum up to 1, a whole step, but their sum is "
+            f"{sum(fractions):.9g}."
+        )
+    return equation
+
+
 def _layout(part: str, layout: Layout | None, name: str, size: int | None) -> tuple[Layout, int]:
     """The layout and the size of the state or of the unknowns, of which one at least is given."""
     if layout is None:
@@ -344,7 +363,7 @@ def make_step_equation(scheme: AbstractScheme, system: Any, shape: Shape) -> Ste
     def made() -> StepEquation | StepSequence:
         try:
             with jax.ensure_compile_time_eval():  # arrays that it makes are numbers in whatever trace it is made first
-                return scheme.step_equation(system, shape)
+                return _checked(scheme, scheme.step_equation(system, shape))
         except TypeError as error:
             advice = getattr(system, "stepped_by", "")
             if not advice or type(scheme).__name__ in advice:

@@ -219,6 +219,10 @@ def _form_of_points(system: Any, shape: Shape, step: Any, equation: Any, theta: 
     """That of the points x of a relation, whose D is the graph of one."""
     relation = system.final_relation(shape) or system.relation_form(shape)
     if relation is None or not set(relation.names) <= set(equation.fields):
+        if list(equation.state_layout)[:2] == ["q", "p"] and equation.state_size == 2 * shape.n:
+            return (
+                "the equation of this scheme does not say that its state is (q, p) on T*Q: give dx.StepEquation(canonical=True)"
+            )
         return f"the state of this scheme is {equation.state_layout!r}, not (q, p) on T*Q"
     if relation.two_form is not None:
         return TwoFormOfPoints(system, step, relation.two_form, relation.names, theta)

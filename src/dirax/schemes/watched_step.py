@@ -17,6 +17,9 @@ from dirax.schemes.step import CLOCK, Field, StepEquation
 PARTS = 4
 """Places of a step at which gaps are looked at."""
 
+EARLY = 16
+"""Parts of the first of them at which it is seen whether a motion that begins on a wall goes behind it."""
+
 ON_WALL = 1e-13
 """Gaps below this are none, relative to their terms at coordinates as large as they are in the step (`gap_terms`)."""
 
@@ -82,7 +85,7 @@ class WatchedStep(AbstractStep):
         """(wall, place) of the step from one state of `inner` to another."""
         places = [k / PARTS for k in range(-1, PARTS + 2)]  # one before the step and one after it, for dips at its ends
         inside = self.inside(u, state, after, t, h, params)
-        gaps = [self.gaps(*inside(x), params) for x in places]
+        gaps, early = [self.gaps(*inside(x), params) for x in places], self.gaps(*inside(1 / (PARTS * EARLY)), params)
         ends, (begins, q) = [vector[self.inner.state_layout.place("q")] for vector in (state, after)], inside(0.0)
         small = ON_WALL * gap_terms(self.gaps, begins, q, ends, params)
         count, far = gaps[0].shape[0], jnp.asarray(jnp.inf)
@@ -93,10 +96,10 @@ class WatchedStep(AbstractStep):
             for k in range(PARTS + 1, 1, -1):
                 share = jnp.where(g[k - 1] > 0.0, g[k - 1] / (g[k - 1] - g[k]), 0.0)
                 first = jnp.where(g[k] < 0.0, places[k - 1] + share / PARTS, first)
-            doubt = jnp.where((g[1] <= small[i]) & (g[2] < 0.0), -1.0, doubt)  # it begins on the wall
+            doubt = jnp.where((g[1] <= small[i]) & ((g[2] < 0.0) | (early[i] < 0.0)), -1.0, doubt)  # it begins on the wall
             for k in range(1, PARTS + 2):
                 doubt = jnp.where(jnp.isfinite(g[k]), doubt, -1.0)
-                near = (g[k] > 0.0) & (g[k] <= g[k - 1]) & (g[k] <= g[k + 1]) & (3.0 * g[k] <= g[k - 1] + g[k + 1])
+                near = (g[k] >= 0.0) & (g[k] <= g[k - 1]) & (g[k] <= g[k + 1]) & (3.0 * g[k] <= g[k - 1] + g[k + 1])
                 doubt = jnp.where(near & (places[k] < doubt), places[k], doubt)
             wall, place = jnp.where(first < place, float(i), wall), jnp.where(first < place, first, place)
         return jnp.where(doubt < place, UNSURE, wall), jnp.where(place < far, place, 0.0)
