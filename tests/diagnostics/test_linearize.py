@@ -257,3 +257,11 @@ def test_steps_with_multipliers_or_the_energy_in_their_state(scheme, error, at_r
     found = dx.linearize(LEANING, at_rest, scheme, step=0.02)
     assert found.stable and exact.shape == found.eigenvalues.shape == (5,)
     np.testing.assert_allclose(found.eigenvalues, exact, atol=error)
+
+
+def test_what_grows_like_t_is_not_called_stable():
+    """A free particle, one in a round valley, which moves along it, and one of a molecule's mass that does neither."""
+    word = lambda lagrangian, q: str(dx.linearize(dx.LagrangeDirac(lagrangian), {"q": q, "v": np.zeros(len(q))})).splitlines()[0]
+    free, valley = lambda q, v: v @ v / 2, lambda q, v: v @ v / 2 - (q @ q - 1) ** 2
+    assert "may grow like t" in word(free, [0.3]) and "may grow like t" in word(valley, [1.0, 0.0])
+    assert ": stable," in word(lambda q, v: 1e-26 * v @ v / 2 - 1e3 * q @ q, [0.0, 0.0])

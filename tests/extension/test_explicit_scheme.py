@@ -133,3 +133,25 @@ def test_a_state_of_q_and_p_that_is_not_called_canonical():
     free = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
     report = dx.verify(dx.simulate(free, Plain(), q=[0.3], v=[0.1], step=0.1, steps=20))
     assert "canonical=True" in report["symplecticity of one step"].explanation
+
+
+class WithSpeed(dx.AbstractScheme):
+    """A scheme of dirax that saves another quantity of nodes."""
+
+    scheme: dx.AbstractScheme
+
+    def step_equation(self, system, shape):
+        inner = dx.make_step_equation(self.scheme, system, shape)
+        unpack = lambda x, u, t, h, params: (row := inner.unpack(x, u, t, h, params)) | {"square": row["p"] @ row["p"]}
+        return dataclasses.replace(inner, unpack=unpack, fields=inner.fields | {"square": dx.Field((), "node", ())})
+
+
+@pytest.mark.parametrize("scheme", [dx.LagrangeDAlembert(), dx.Collocation(2)], ids=lambda s: type(s).__name__)
+def test_what_a_polynomial_says_nothing_of_is_made_by_a_part_of_the_step(scheme):
+    """It was that of the row before, all along the step."""
+    given = {"q": [1.0, 0.3], "v": [0.2, 0.5], "params": 1.3, "step": 0.02, "steps": 60}
+    sol = dx.simulate(SYSTEM, WithSpeed(scheme), **given, events=[dx.Event(lambda q: q[0] - 0.8)])
+    for t in (0.70001, 0.71, 0.7199, 0.72):
+        moment = sol.at(t)
+        np.testing.assert_allclose(moment.square, moment.p @ moment.p, rtol=1e-3)
+    np.testing.assert_allclose(sol.events.square, np.sum(sol.events.p**2, axis=1), rtol=1e-3)

@@ -431,3 +431,16 @@ def test_a_thin_peg_is_hit_after_a_wall_in_the_same_step():
     sol = dx.simulate(free, dx.LagrangeDAlembert(), **given, step=0.4, steps=8, events=[wall, peg])
     second = [sol.events.t[(sol.events.lane == lane) & (sol.events.index == 1)][0] for lane in range(5)]
     np.testing.assert_allclose(second, 1.1 + distances - 0.02, rtol=0, atol=1e-12)
+
+
+def test_an_exact_corner_is_the_limit_of_near_ones():
+    """Seven reflections at one moment were called Zeno, with a restitution of 1 too."""
+    metric = np.array([[1.0, 0.9], [0.9, 1.0]])
+    system, walls = dx.LagrangeDirac(lambda q, v: v @ metric @ v / 2), [dx.Impact(lambda q: q[0]), dx.Impact(lambda q: q[1])]
+    run = lambda off: dx.simulate(
+        system, dx.LagrangeDAlembert(), q=[1.0, 1.0 + off], v=[-1.0, -1.0], step=0.3, steps=8, events=walls
+    )
+    exact, near = run(0.0), run(1e-8)
+    assert exact.ok and len(exact.events) == len(near.events) == 7
+    np.testing.assert_allclose(exact.p[-1], near.p[-1], rtol=1e-7)
+    np.testing.assert_allclose(exact.energy()[-1], exact.energy()[0], rtol=1e-13)

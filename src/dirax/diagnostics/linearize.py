@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 
 from dirax.diagnostics.linearized_field import FieldAt, linearized_chain, linearized_lagrangian
 from dirax.diagnostics.linearized_step import linearized_step
@@ -29,6 +30,9 @@ OF_STEPS = (
 
 ROUNDOFF = 2e-14
 """Error of an entry of the linear equations, relative to the largest one, where nothing is known of more."""
+
+PARALLEL = 1e-9
+"""How near to 1 the cosine between two eigenvectors must be to be called one."""
 
 MULTIPLE = 1e-6
 """Error of eigenvalues of which several are one, relative to the largest one, at most."""
@@ -73,10 +77,26 @@ class Linearization:
             rows = [(*row, _complex(value), f"{abs(value):.6g}") for row, value in zip(rows, multipliers, strict=True)]
             header = ("eigenvalue", "multiplier", "its size")
         of = "" if self.step is None else f" of a step of {self.step:.6g}"
-        title = f"{len(self.matrix)} linear equations of small motions{of}: {'stable' if self.stable else 'unstable'}"
+        title = f"{len(self.matrix)} linear equations of small motions{of}: {self._verdict}"
         return text_table(header, rows, f"{title}, at a place with the residual {self.residual:.2g}")
 
     __repr__ = __str__
+
+    @property
+    def _verdict(self) -> str:
+        if not self.stable:
+            return "unstable"
+        return "none grows exponentially, but some may grow like t" if self.defective else "stable"
+
+    @property
+    def defective(self) -> bool:
+        """Whether eigenvalues that are one, to 1e-6 of the largest, have one eigenvector alone: then some small motions grow like
+        t times what the eigenvalue says, as those of a free particle do at rest, q = v t."""
+        if not len(self.matrix):
+            return False
+        values, own = np.linalg.eig(scipy.linalg.matrix_balance(self.matrix)[0])  # in units in which rows are as large as columns
+        near = np.abs(values[:, None] - values[None]) <= MULTIPLE * np.abs(values).max(initial=0.0)
+        return bool(np.any(np.triu(near & (np.abs(own.conj().T @ own) > 1.0 - PARALLEL), 1)))
 
     @property
     def modes(self) -> np.ndarray:

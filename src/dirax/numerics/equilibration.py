@@ -56,7 +56,7 @@ def geometric_scales(sizes: Any, xp: ModuleType = np) -> tuple[Any, Any]:
     """
     *lead, k, l = sizes.shape
     exponents = xp.where(sizes > 0.0, xp.frexp(sizes)[1].astype(int), NOTHING)
-    if not k * l:
+    if not k * l or 0 in lead:
         rows, columns = xp.zeros((*lead, k, 1), int), xp.zeros((*lead, 1, l), int)
     elif xp is np and math.prod(lead) <= REMEMBERED:
         each = [_remembered(one.tobytes(), k, l) for one in exponents.reshape(-1, k, l)]

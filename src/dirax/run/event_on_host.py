@@ -59,7 +59,7 @@ class EventsOnHost:
             t0 + number.astype(float) * h, jnp.broadcast_to(h, size), jax.tree.map(lambda a: a[lane], params),
         )  # fmt: skip
         operands, of_step = jax.tree.flatten(step)
-        t, fields = jnp.full(size, jnp.nan), {name: jnp.full(a.shape, jnp.nan) for name, a in row.items()}
+        t, fields = jnp.full(size, jnp.nan), {}
         for i, event in enumerate(self.events):
             one = EventPlace(self.dense, event, i)
 
@@ -75,7 +75,7 @@ class EventsOnHost:
                 return None
             there = lambda a, own=own: own.reshape(-1, *(1,) * (a.ndim - 1))
             t = jnp.where(own, found[0], t)
-            fields = {name: jnp.where(there(a), found[1][name], a) for name, a in fields.items()}
+            fields = {name: jnp.where(there(a), a, fields.get(name, jnp.nan)) for name, a in found[1].items()}
         found = t, which, direction, fields
         return jax.tree.map(lambda a: a.reshape(lanes, most, *a.shape[1:]), found), endings
 

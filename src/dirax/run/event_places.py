@@ -26,7 +26,7 @@ class EventPlace:
         residual = lambda x, whole: self.along(*whole, roots=roots)(x[0])[None]
         theta = implicit(residual, root[None], (step, solved), lambda m, r: r / m[0])[0]
         (begins, length), known = _clock(step), self.dense.inside(solved, *step, roots=roots)(theta)
-        return begins + theta * length, {name: known[name] for name in step[0]}
+        return begins + theta * length, {name: known[name] for name in step[0] if name in known}
 
     def along(self, step: tuple, solved: tuple, roots: Any = None) -> Any:
         """θ ↦ the function of the event in a step, of which everything is known that has to be solved."""

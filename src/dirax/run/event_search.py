@@ -158,8 +158,7 @@ class EventSearch:
     def events(self, places: Places) -> Events:
         """What the run is like there."""
         dense, (lanes, numbers, theta, direction) = self.dense, places
-        inside = dense.inside(lanes, numbers, theta)
-        fields: dict[str, Any] = {name: inside.get(name, dense.of_rows(name, lanes, numbers)) for name in dense.nodes}
+        fields = dense.fields_at(lanes, numbers, theta)
         return Events(dense.time_at(lanes, numbers, theta), np.full(len(lanes), self.number), direction, lanes, fields)
 
 

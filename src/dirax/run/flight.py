@@ -16,11 +16,14 @@ FIRST_STRETCH, LONGEST_STRETCH = 16, 2**14
 """Steps after which a flight looks up first, and at the latest; others are twice as long as the flight before."""
 
 ACCUMULATED = 1e-9
-"""Part of a step: when impacts on one wall follow each other faster, again and again, they are called accumulating."""
+"""Part of a step: when impacts on one wall alone follow each other faster, again and again, they are called accumulating."""
 
 AGAIN = 3
 """How often."""
 
+
+MOST_AT_ONCE = 400
+"""Impacts in a corner, at one moment, from which on they are said to accumulate."""
 
 MOST_IN_STEP = 10_000
 """Impacts in one step from which on walls are said to close in on the motion."""
@@ -52,7 +55,7 @@ class Flight:
         self.others = [name for name in p.fields if p.is_node(name) and name not in ("q", "p", STEP_DENSITY, CLOCK)]
         self.rows = self.walk.rows
         self.closing: dict[str, np.ndarray] = {name: np.full(f.shape, np.nan) for name, f in p.fields.items()}
-        self.close, self.last = [0] * len(self.jumps), [-np.inf] * len(self.jumps)
+        self.close, self.last, self.wall = [0] * len(self.jumps), [-np.inf] * len(self.jumps), -1
         self.done, self.state, self.unknowns = 0, np.asarray(p.state), np.asarray(p.guess[0])
 
     @property
@@ -135,9 +138,12 @@ class Flight:
     def _noted(self, state: np.ndarray, u: np.ndarray, wall: int, at: float) -> bool:
         """Note an impact, of which these are the state after it and a guess of the unknowns; whether the run goes on."""
         t, number = self.search.time(state, at), self.search.numbers[wall]
-        self.close[wall] = self.close[wall] + 1 if at - self.last[wall] < ACCUMULATED else 0
-        self.last[wall] = at
+        alone = self.wall == wall  # in a corner, walls are hit in turn, and as often as it takes
+        self.close[wall] = self.close[wall] + 1 if alone and at - self.last[wall] < ACCUMULATED else 0
+        self.last[wall], self.wall = at, wall
         if self.close[wall] >= AGAIN:
+            return self._accumulated(number, t)
+        if len(self.hits) >= MOST_AT_ONCE and self.hits[-MOST_AT_ONCE][4] > at - ACCUMULATED:
             return self._accumulated(number, t)
         if len(self.hits) >= MOST_IN_STEP and self.hits[-MOST_IN_STEP][4] > at - 1.0:
             return self._end(

@@ -152,7 +152,7 @@ class Dense(BetweenRows):
         """The same so near to a row that a step of this length is not solved in floats, or its impulses are lost in them: by the
         cubic through the row and longer steps."""
         places = np.arange(4) * 2 * SHORT
-        points = [self.inside(lanes, numbers, np.full(len(theta), place)) for place in places]
+        points = [self.fields_at(lanes, numbers, np.full(len(theta), place)) for place in places]
         weights = [np.prod([(theta - b) / (a - b) for b in places if b != a], axis=0) for a in places]
         column = lambda w, a: w.reshape(-1, *(1,) * (a.ndim - 1)) * a
         whole = lambda name: np.sum([column(w, p[name]) for w, p in zip(weights, points, strict=True)], axis=0)
@@ -166,8 +166,7 @@ class Dense(BetweenRows):
         self._refuse_outside(times)
         lanes, flat = np.repeat(np.arange(batch), times.shape[1]), times.ravel()
         numbers, theta = self.place(lanes, flat)
-        found = self.inside(lanes, numbers, theta)
-        fields: dict[str, Any] = {name: found.get(name, self.of_rows(name, lanes, numbers)) for name in self.nodes}
+        fields = self.fields_at(lanes, numbers, theta)
         row, there = self._saved_row(numbers, theta)
         if sol.impacts is None:  # which may be at rows
             for name, values in fields.items():
@@ -181,9 +180,16 @@ class Dense(BetweenRows):
                 a[beyond] = np.nan
         return {name: a.reshape(batch, times.shape[1], *a.shape[1:]) for name, a in fields.items()}
 
-    def of_rows(self, name: str, lanes: np.ndarray, numbers: np.ndarray) -> Any:
-        """A field of which a polynomial says nothing: that of the row before."""
-        return self.saved[name][lanes, self._row(numbers)]
+    def fields_at(self, lanes: np.ndarray, numbers: np.ndarray, theta: np.ndarray) -> dict[str, Any]:
+        """The fields of nodes inside steps; those of which the polynomial or the cubic says nothing by a part of the step, of
+        which a row is made, and for rows that steps do not make, those of the row before."""
+        found = self.inside(lanes, numbers, theta)
+        lacking = [name for name in self.nodes if name not in found]
+        if lacking and set(self.nodes) <= set(self.equation.fields):
+            t, h = self.time_at(lanes, numbers, 0.0), np.full(len(theta), float(self.sol.step))
+            made = self._by_steps(lanes, numbers, theta, t, h)
+            found |= {name: made[name] for name in lacking}
+        return {name: found[name] if name in found else self.saved[name][lanes, self._row(numbers)] for name in self.nodes}
 
     def _row(self, numbers: np.ndarray) -> np.ndarray:
         """The last rows that are not after the beginnings of these steps."""

@@ -74,7 +74,7 @@ class TracedDense(BetweenRows):
         return with_roots(self.equation, roots[which], state, *args)
 
     def inside(self, solved, row, after, of_step, t, h, params, roots=None) -> Callable:
-        """θ ↦ the fields of nodes at a part θ of that step, as JAX traces them."""
+        """θ ↦ the fields of nodes at a part θ of that step, as JAX traces them; of a polynomial those that it knows."""
         begins, ends = row.get(CLOCK, t), after.get(CLOCK, t + h)
         if self.interpolate is None and (between := self.between) is not None:
             first, last = ({**a, "t": s, "v": v} for a, s, v in zip((row, after), (begins, ends), solved, strict=True))
@@ -84,7 +84,7 @@ class TracedDense(BetweenRows):
 
             def by_polynomial(theta):
                 found = interpolate(theta, guess[0], state, begins, h, params)
-                return {name: found.get(name, row[name]) for name in row}
+                return {name: found[name] for name in row if name in found}
 
             return by_polynomial
 
