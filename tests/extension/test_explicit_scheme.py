@@ -155,3 +155,46 @@ def test_what_a_polynomial_says_nothing_of_is_made_by_a_part_of_the_step(scheme)
         moment = sol.at(t)
         np.testing.assert_allclose(moment.square, moment.p @ moment.p, rtol=1e-3)
     np.testing.assert_allclose(sol.events.square, np.sum(sol.events.p**2, axis=1), rtol=1e-3)
+
+
+class Positions(dx.AbstractScheme):
+    """Symplectic Euler in (q, v), which saves q, and v where it `says` it."""
+
+    says: tuple[str, ...] = ("q", "v")
+
+    def step_equation(self, system, shape):
+        n, state = shape.n, dx.Layout(q=shape.n, v=shape.n)
+
+        def advance(u, x, t, h, params):
+            q, v = state.split(x)
+            v = v - h * q
+            return state.join(q=q + h * v, v=v)
+
+        return dx.StepEquation(
+            start=lambda data, h, params: (state.join(q=data["q"], v=data["v"]), jnp.zeros(0)),
+            residual=lambda u, x, t, h, params: jnp.zeros(0),
+            advance=advance,
+            unpack=lambda x, u, t, h, params: {name: getattr(state.split(x), name) for name in self.says},
+            state_layout=state,
+            unknowns=0,
+            fields={name: dx.Field((n,)) for name in self.says},
+        )
+
+
+@pytest.mark.parametrize("says", [("q", "v"), ("q",)], ids="-".join)
+def test_rows_without_momenta_are_saved_and_compared(says, tmp_path):
+    free, given = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2), {"q": [1.0, 0.0], "v": [0.0, 1.0], "step": 0.05}
+    sol = dx.simulate(free, Positions(says), **given, steps=40)
+    sol.save(tmp_path / "run.nc")
+    assert np.array_equal(dx.load(tmp_path / "run.nc").q, sol.q)
+    assert ("energy" in sol.to_dataframe().columns) == ("energy" in sol.to_xarray()) == ("v" in says)
+    compared = dx.compare(free, {"own": Positions(says), "midpoint": dx.LagrangeDAlembert()}, **given, steps=200)
+    own = compared["own"]
+    assert round(own.order) == 1 and (own.energy_band is None) == ("v" not in says)
+    if "v" in says:
+        np.testing.assert_allclose(sol.energy(), (np.sum(sol.q**2, axis=1) + np.sum(sol.v**2, axis=1)) / 2, rtol=1e-13)
+        np.testing.assert_allclose(sol.at(0.51).q, sol.q[10] + 0.2 * (sol.q[11] - sol.q[10]), rtol=1e-3)
+    else:
+        for read in (sol.energy, lambda: sol.at(0.51)):
+            with pytest.raises(ValueError, match="needs p, but the rows hold q alone"):
+                read()

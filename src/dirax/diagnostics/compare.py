@@ -19,6 +19,7 @@ from dirax.run.simulate import simulate
 from dirax.schemes.step import AbstractScheme
 from dirax.solution.solution import Solution
 from dirax.solution.style import COLOURS, MARKERS, given_or_new, style
+from dirax.solution.trajectory import NotSaved
 from dirax.systems.system import AbstractSystem
 from dirax.text.tables import html_table, number, plain, text_table
 
@@ -188,11 +189,19 @@ def _order(system, scheme, step, steps, reference, run) -> tuple[float | None, t
     return first.order if np.isfinite(first.order) else None, precision, " ".join(found.notes) if told else ""
 
 
+def _energy(sol: Solution) -> tuple | None:
+    """As of `energy_less_work`; None for rows that do not say it."""
+    try:
+        return energy_less_work(sol)
+    except NotSaved:
+        return None
+
+
 def _entry(name: str, sol: Solution, order, precision, note: str, seconds: float) -> Entry:
     steps = max(1, (sol.rows - 1) * sol.save_every)
     energy, band, drift, slope = None, None, "not checked", None
-    if sol.rows > 1:
-        energy, _, changes = energy_less_work(sol)
+    if sol.rows > 1 and (found := _energy(sol)) is not None:
+        energy, _, changes = found
         band = float(np.ptp(energy))
         slope = float(np.polyfit(sol.t - sol.t.mean(), energy, 1)[0])
         motion = np.asarray(sol.fields["q"] if "q" in sol.fields else sol.fields["x"])

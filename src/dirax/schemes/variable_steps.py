@@ -56,6 +56,11 @@ class VariableSteps(AbstractScheme):
                 f"dx.VariableSteps takes a scheme of one part, but {type(self.scheme).__name__} has {len(inner.stages)}: "
                 "compose the variable steps instead, dx.Composition(dx.VariableSteps(scheme), …)."
             )
+        if not ("x" in inner.fields or {"q", "p"} <= set(inner.fields)):
+            raise TypeError(
+                f"dx.VariableSteps takes schemes that save q and p, or x, but {type(self.scheme).__name__} saves "
+                f"{', '.join(inner.fields)}."
+            )
         if (density := self.density) is None:
             if system.lagrangian_form() is None and "x" not in inner.fields:
                 raise TypeError(

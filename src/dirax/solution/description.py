@@ -15,7 +15,7 @@ import numpy as np
 from dirax.schemes.step import Field
 from dirax.solution.plain_forms import NotPlain, code_of_params, encode_params, encode_scheme
 from dirax.solution.stored_events import KINDS, WHOLE_ARRAYS, arrays_of, record_of
-from dirax.solution.trajectory import Trajectory
+from dirax.solution.trajectory import NotSaved, Trajectory
 from dirax.text.tables import plain
 
 FORMAT = 1
@@ -153,7 +153,7 @@ def _derived(sol: Trajectory, variables) -> dict[str, np.ndarray]:
             continue
         try:
             values = np.asarray(getattr(sol, name)())
-        except KeyError:  # a scheme of the user's that saves no momentum, say
+        except NotSaved:  # a scheme of the user's that saves no momentum, say
             continue
         if values.size:
             derived[name] = values

@@ -90,7 +90,7 @@ def _times(t: Any, batch: int | None) -> np.ndarray:
             raise TypeError
     except (TypeError, ValueError):
         raise TypeError(f"sol.at takes a time or an array of times, but {t!r:.80} was given.") from None
-    if times.ndim > 2 or (times.ndim == 2 and times.shape[0] != batch) or not times.size:
+    if times.ndim > 2 or (times.ndim == 2 and times.shape[0] != batch):
         expected = "a number or an array (T,)" + (f" or ({batch}, T), of a batch of {batch}" if batch is not None else "")
         raise ValueError(f"sol.at takes times as {expected}, but an array of shape {times.shape} was given.")
     return times.astype(float)

@@ -25,7 +25,7 @@ from dirax.program.memo import Memo, OfKey, Same, by_value
 from dirax.program.on_host import called_on_host
 from dirax.schemes.step import CLOCK, Field, StepEquation, composed_row, needs_every_part
 from dirax.solution.restarts import refuse_restarting
-from dirax.solution.trajectory import Trajectory
+from dirax.solution.trajectory import SavedRow, Trajectory
 
 MANY = 2000
 """Steps from which on it pays to compile them."""
@@ -40,7 +40,7 @@ UPDATES = 50
 def begun(equation: Any, system: Any, row: dict[str, Any], t: Any, h: Any, params: Any) -> tuple[Any, tuple]:
     """State and first guesses of all stages of the step that leaves a row: what the scheme says, and sums since the start."""
     t = row.get(CLOCK, t)
-    data = {**row, **system.complete({**row, "t": t}, params, False), "t": t}
+    data = {**row, **system.complete(SavedRow({**row, "t": t}), params, False), "t": t}
     (first, fraction), *others = equation.stages
     state, u = first.resume(data, fraction * h, params)
     parts, layout = first.state_layout.split(state)._asdict(), first.state_layout

@@ -42,12 +42,16 @@ GIVEN = (
 Some = TypeVar("Some", bound="Trajectory")
 
 
+class NotSaved(ValueError):
+    """Something was asked of rows that do not hold what it takes."""
+
+
 class SavedRow(dict):
     """The node fields of one row, its time "t" and `about`, which say so where something is asked of them that was not saved."""
 
     def __missing__(self, name: str):
         held = ", ".join(key for key in self if key not in ("t", "about"))
-        raise ValueError(f"needs {name}, but the rows hold {held} alone (a scheme saves what its `fields` name)")
+        raise NotSaved(f"needs {name}, but the rows hold {held} alone (a scheme saves what its `fields` name)")
 
 
 @dataclass(frozen=True)

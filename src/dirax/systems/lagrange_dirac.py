@@ -259,7 +259,9 @@ class LagrangeDirac(AbstractSystem):
         return ("q",)
 
     def _velocity(self, row: Data, params: Any) -> Float[Numbers, " n"]:
-        """The velocity that belongs to the saved momentum."""
+        """The velocity that belongs to the saved momentum, or the saved one, of schemes that save no momentum."""
+        if "v" in row and "p" not in row:
+            return row["v"]
         return self.inverse_legendre(row["q"], row["p"], params, row.get("about"), row.get("t", 0.0))
 
     def energy_at(self, row: Data, params: Any) -> Float[Numbers, ""]:
