@@ -10,6 +10,7 @@ from dirax.numerics.tolerances import STRUCTURE_DEFECT
 from dirax.program.linear_solves import solve
 from dirax.program.roots import FEWEST_SPARSE, nearest_root
 from dirax.program.tracing import jacobian
+from dirax.program.user_functions import evaluated
 from dirax.schemes.energy_collocation_step import EnergyCollocationStep
 from dirax.schemes.layout import Layout
 from dirax.schemes.step import Field
@@ -53,6 +54,10 @@ class HamiltonianEnergyCollocation(EnergyCollocationStep):
         zero = jnp.zeros(self.n)
         return nearest_root(defect, zero) if self.sparse else solve(jacobian(defect)(zero), -defect(zero))
 
+    def _bracket(self, a, t, params):
+        """Π of ẋ = Π dH (n, n)."""
+        return jacobian(lambda mean: self._rate(a, mean, t, params))(jnp.zeros(self.n))
+
     def rates(self, a, mean, t, params):
         return self._with_books(a, self._rate(a, mean, t, params), mean, t, params)
 
@@ -77,15 +82,16 @@ class HamiltonianEnergyCollocation(EnergyCollocationStep):
         if self.form.ports is not None:
             return
         point = data["x"] if "x" in data else data["q"]
-        x = jnp.asarray(point if len(point) == self.n else np.concatenate([point, data["p"]]))
-        rate = lambda mean: self._rate(x, mean, data.get("t", 0.0), params)
+        x = np.asarray(point if len(point) == self.n else np.concatenate([point, data["p"]]), float)
+        t = np.asarray(data.get("t", 0.0), float)
         if self.sparse:
+            rate = lambda mean: self._rate(jnp.asarray(x), mean, t, params)
             along = np.random.default_rng(0).normal(size=(DIRECTIONS, self.n))
             terms = along * np.asarray(jax.lax.map(rate, jnp.asarray(along)))
             worst, scale = np.max(np.abs(np.sum(terms, axis=1))), np.max(np.abs(terms))
             defect = f"⟨α, Πα⟩ = {worst:.3g} for numbers α of size 1 at random"
         else:
-            bracket = np.asarray(jacobian(rate)(jnp.zeros(self.n)))
+            bracket = np.asarray(evaluated(self._bracket, x, t, params))
             worst, scale = np.max(np.abs(bracket + bracket.T)), np.max(np.abs(bracket))
             defect = f"max |Π + Πᵀ| = {worst:.3g}"
         if worst > STRUCTURE_DEFECT * scale:
