@@ -194,3 +194,10 @@ def test_momenta_just_after_a_row_have_their_digits(scheme):
     moved = sol.at(sol.t[7] + later).p - sol.p[7]
     rate = moved[0] / later[0]
     assert np.max(np.abs(moved - later[:, None] * rate) / later[:, None]) <= 1e-3 * np.max(np.abs(rate)) + 1e-16 / later[-1]
+
+
+@pytest.mark.parametrize("q", [[1.0, 0.0], [[1.0, 0.0], [0.5, 0.0]]], ids=["one", "batch"])
+def test_no_times_are_no_moments(q):
+    free = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q / 2)
+    sol = dx.simulate(free, dx.LagrangeDAlembert(), q=q, v=np.zeros_like(q), step=0.1, steps=4)
+    assert sol.at([]).q.shape == (*np.shape(q)[:-1], 0, 2)

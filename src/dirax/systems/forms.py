@@ -39,7 +39,8 @@ class RelationForm(NamedTuple):
 
     `residual(x, ẋ, u, t, params)` is zero where (x, ẋ) satisfies the system with multipliers u (k,): N numbers, which are
     paired with the tangent space where M is a submanifold of R^N, and k more, named by `labels`. `spread(u)` puts the
-    multipliers among all `saved` ones, whose axis is called `axis`. `observed` is what else is saved.
+    multipliers among all `saved` ones, whose axis is called `axis`. `observed` is what else is saved by
+    steps of a discretization map.
     `canonical`: x is (q, p) on T*Q. `dirac` tells the relation where it is one of a Dirac structure. A node is saved as
     `node(x, params)`, a dict with the keys `names`, arrays (N,) each. `two_form(x, params)` (N, N) is the two-form whose graph D
     is, up to its sign, `bivector(x, params)` (N, N) the bivector, where D is one or the other. `explicit`: without multipliers
