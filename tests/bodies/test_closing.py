@@ -79,3 +79,16 @@ def test_observables_are_those_of_one_trajectory():
     with pytest.raises(ValueError, match=r"solution\[i\]"):
         model.observables(batch)
     assert model.observables(batch[1])["energy"].shape == (4,)
+
+
+def test_a_thin_rod_that_turns_in_all_ways_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"'stick' has no moment of inertia about an axis .* rotation=\"axis\""):
+        b.Model([b.rod("stick", (0, 0, -1.0))], [b.ball("ground", "stick")])
+    for joint in (b.free("ground", "stick"), b.free("ground", "stick", rotation="zxz")):
+        with pytest.raises(ValueError, match="no moment of inertia"):
+            b.Model([b.rod("stick", (0, 0, -1.0))], [joint])
+    model = b.Model([b.rod("stick", (0, 0, -1.0))], [b.ball("ground", "stick", rotation="axis")])
+    assert dx.simulate(model.system, dx.LagrangeDAlembert(), **model.state(), step=0.01, steps=5).ok
+    b.Model([b.rod("stick", (0, 0, -1.0))], [b.ball("ground", "stick", at=(0, 0, 1), on=(0.2, 0, 0))])  # beside its axis
+    with pytest.raises(ValueError, match="which have no direction"):
+        b.Model(PAIR[:1], [b.ball("ground", "arm")]).state(np.zeros(4))

@@ -121,6 +121,11 @@ def _given(model: Any, values: Any, name: str, start: np.ndarray) -> tuple[np.nd
                 f"{name} must be numbers by coordinate or an array of shape {start.shape}, but its shape is {array.shape}: "
                 f"the coordinates are {', '.join(model.coordinates)}."
             )
+        for joint, motion, place in model.unit_vectors if name == "q" else ():
+            if not np.any(array[place]):
+                raise ValueError(
+                    f"the {motion.norm} of joint {joint.name!r} is that of zeros, which have no direction: {array[place]}."
+                )
         return array.copy(), fixed
     start = start.copy()
     for key, value in values.items():

@@ -14,6 +14,9 @@ GROUND = "ground"
 SYMMETRIC = 1e-9
 """Relative to the largest entry of an inertia: what its entries beside the diagonal may differ."""
 
+MASSLESS = 1e-13
+"""Relative to the largest moment of inertia: what is none."""
+
 MEASURED = 1e-6
 """Relative to the largest moment of inertia: what measured ones may be off."""
 
@@ -89,6 +92,29 @@ def check_coordinates(model: Any) -> None:
             raise ValueError(f"{force.name!r} acts nowhere: give it between=((body, point), (body, point)) or coordinate=.")
         if getattr(force, "between", None) is None and force.coordinate not in names:
             raise ValueError(f"{force.name!r} is at coordinate {force.coordinate!r}, but the coordinates are {', '.join(names)}.")
+
+
+def check_turns(model: Any) -> None:
+    """Raise `ValueError` for a body that turns in all ways, with no moment of inertia about an axis, where nothing else keeps it
+    from turning about that: no equation says how it does."""
+    for body in model.bodies:
+        joint = next(joint for joint in model.tree if joint.body == body.name)
+        others = {name for other in model.joints if other is not joint for name in (other.parent, other.body)}
+        others |= {contact.body for contact in model.contacts}
+        numbers = (body.mass, *body.centre, *joint.on, *np.ravel(np.asarray(body.inertia, dtype=object)))
+        if joint.kind not in ("ball", "free", "gliding") or joint.is_axis or body.name in others:
+            continue
+        if any(isinstance(x, str) for x in numbers) or body.mass == 0:
+            continue
+        arm = np.asarray(body.centre, float) - np.asarray(joint.on, float) if joint.kind == "ball" else np.zeros(3)
+        about = np.asarray(body.inertia_matrix(None), float) + float(body.mass) * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        moments = np.linalg.eigvalsh(about)
+        if moments[0] <= MASSLESS * moments[2]:
+            raise ValueError(
+                f"body {body.name!r} has no moment of inertia about an axis through joint {joint.name!r}, and can turn about it, "
+                f"so that nothing says how it does: its moments there are {moments}. Give it one, or the joint "
+                'rotation="axis", the direction of its axis z alone.'
+            )
 
 
 def check_masses(model: Any) -> None:

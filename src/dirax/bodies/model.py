@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.bodies.assembly import Assembly, assembled, dependent
-from dirax.bodies.checks import GROUND, check_axes, check_coordinates, check_masses, check_names, sorted_tree
+from dirax.bodies.checks import GROUND, check_axes, check_coordinates, check_masses, check_names, check_turns, sorted_tree
 from dirax.bodies.contacts import Contact
 from dirax.bodies.drawing import scene_of
 from dirax.bodies.forces import Damper, Motor, Spring
@@ -60,6 +60,7 @@ class Model:
         check_coordinates(self)
         check_numbers(self)
         check_axes(self)
+        check_turns(self)
         unknown = [name for name in self.dropped if name not in (*self.demands.all_holonomic, *self.demands.all_rows)]
         if unknown:
             raise ValueError(f"no constraint is called {unknown[0]!r}: there are {', '.join(self.constraints)}.")
