@@ -198,3 +198,10 @@ def test_rows_without_momenta_are_saved_and_compared(says, tmp_path):
         for read in (sol.energy, lambda: sol.at(0.51)):
             with pytest.raises(ValueError, match="needs p, but the rows hold q alone"):
                 read()
+
+
+def test_an_energy_that_forces_change_is_not_called_bounded():
+    """By a scheme that does not see the forces, it was."""
+    damped = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params * q @ q, forces=lambda t, q, v, params: -0.1 * v)
+    line = dx.verify(dx.simulate(damped, Euler(), **GIVEN, params=1.3, steps=200))["energy"]
+    assert line.verdict == "not checked" and "has forces, whose work this scheme does not save" in line.explanation

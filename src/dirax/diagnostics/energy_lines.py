@@ -50,7 +50,7 @@ def energy_line(sol: Solution) -> Line:
         return Line(name, None, None, NOT_CHECKED, "the system states no energy")
     if outside := _outside(sol, energy):
         return outside
-    changes = changes or _power(sol)
+    changes = changes or _unbooked(sol) or _power(sol)
     size = energy_scale(sol, energy)
     roundoff = ROUNDINGS * EPSILON * steps_of(sol) * size
     if jump := energy_jump(sol, energy, size):
@@ -78,6 +78,12 @@ def energy_line(sol: Solution) -> Line:
     others = sorted({f.verdict for f in found} - {worst.verdict})
     text += "".join(f"; {details['verdicts'].count(other)} of {len(found)} {other}" for other in others)
     return Line(name, abs(worst.drift), worst.told, worst.verdict, text, details)
+
+
+def _unbooked(sol: Solution) -> str:
+    """Why forces change the energy by what nothing that was saved says; "" where there are none, or their work was saved."""
+    form = None if sol.system is None or "work" in sol.fields else sol.system.lagrangian_form()
+    return "" if form is None or form.forces is None else "has forces, whose work this scheme does not save"
 
 
 def _power(sol: Solution) -> str:
