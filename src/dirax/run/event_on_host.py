@@ -47,7 +47,8 @@ class EventsOnHost:
         most = (rows - 1) * len(self.events) * self.points
         size = lanes * most
         widths = [size, size, size, size, size * self.width, lanes]
-        find = lambda *flat: self._find([leaf.shape for leaf in leaves], structure, flat, widths)
+        kinds = [(leaf.shape, leaf.dtype) for leaf in leaves]
+        find = lambda *flat: self._find(kinds, structure, flat, widths)
         flat = called_on_host(find, widths, *(a.reshape(-1).astype(float) for a in leaves), jnp.stack([t0, h]))
         theta, number, which, direction = flat[:4]
         roots, endings = flat[4].reshape(size, self.width), flat[5]
@@ -83,14 +84,16 @@ class EventsOnHost:
         """The unknowns of each stage."""
         return tuple(jnp.split(flat, np.cumsum(self.stages)[:-1].tolist()))
 
-    def _find(self, shapes: list[tuple], structure: Any, flat: tuple, widths: list[int]) -> list[np.ndarray]:
+    def _find(self, kinds: list[tuple], structure: Any, flat: tuple, widths: list[int]) -> list[np.ndarray]:
         """What the host finds in several such runs, arrays (runs, …) with the numbers of each in one row."""
         many, times = len(flat[-1]), np.asarray(flat[-1])
         results = [np.full((many, width), np.nan) for width in widths]
         results[-1][:] = np.inf
         for t0, h in np.unique(times, axis=0):  # those of equal times are one batch
             own = np.flatnonzero((times == (t0, h)).all(axis=1))
-            arrays = [np.asarray(a)[own].reshape(-1, *shape[1:]) for a, shape in zip(flat, shapes, strict=False)]
+            arrays = [
+                np.asarray(a)[own].reshape(-1, *shape[1:]).astype(dtype) for a, (shape, dtype) in zip(flat, kinds, strict=False)
+            ]
             if len(own):
                 found = self._found(jax.tree.unflatten(structure, arrays), float(t0), float(h))
                 for result, a in zip(results, found, strict=True):
