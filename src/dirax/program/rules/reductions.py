@@ -7,7 +7,11 @@ from typing import Any
 import numpy as np
 
 from dirax.program.convolved import factors
+from dirax.program.graph import Graph
 from dirax.program.interpreter import Interpreter, rule
+
+LARGE = 256
+"""Multiplications of a product of arrays from which on it pays to ask whether all of them are of constants."""
 
 FOLDS = {
     "reduce_sum": "add",
@@ -79,6 +83,9 @@ def position_of_extreme(interpreter: Interpreter, equation: Any, x):
 def dot_general(interpreter: Interpreter, equation: Any, a, b):
     g = interpreter.graph
     rows, columns = factors_of_product(equation, a, b)
+    of_floats = equation.outvars[0].aval.dtype == np.float64
+    if of_floats and rows.size * columns.shape[1] >= LARGE and (known := _product_of_constants(g, rows, columns)) is not None:
+        return [interpreter.constants(known.reshape(equation.outvars[0].aval.shape))]
     out = [
         fold(interpreter, "add", [g.mul(x, y) for x, y in zip(row, column, strict=True)])
         for one, other in zip(rows.tolist(), columns.tolist(), strict=True)
@@ -86,6 +93,22 @@ def dot_general(interpreter: Interpreter, equation: Any, a, b):
         for column in other
     ]
     return [np.array(out, dtype=np.int64).reshape(equation.outvars[0].aval.shape)]
+
+
+def _product_of_constants(g: Graph, rows: np.ndarray, columns: np.ndarray) -> np.ndarray | None:
+    """The product in numbers, with the bits of the sums that nodes would be made for; None where a factor is no constant."""
+    factors = []
+    for nodes in (rows, columns):
+        own, which = np.unique(nodes, return_inverse=True)
+        values = [g.number(node) for node in own.tolist()]
+        if None in values:
+            return None
+        factors.append(np.array(values, float)[which.reshape(nodes.shape)])
+    with np.errstate(all="ignore"):
+        total = factors[0][:, :, None, 0] * factors[1][:, None, :, 0]
+        for k in range(1, rows.shape[-1]):
+            total = total + factors[0][:, :, None, k] * factors[1][:, None, :, k]
+    return total
 
 
 @rule("conv_general_dilated")
