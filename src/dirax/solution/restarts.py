@@ -1,13 +1,10 @@
 """Equations that do not say how a step is resumed, and whose start does not do it: a sum of theirs would begin again."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from dirax.solution.trajectory import last_rows
-
-if TYPE_CHECKING:
-    from dirax.solution.steps_again import StepsAgain
 
 RESUMED = 1e-6
 """How near, relative to the largest of its numbers, a step that is resumed must come to what was saved."""
@@ -16,8 +13,9 @@ FEW = 100
 """Steps between two rows up to which this is looked at."""
 
 
-def refuse_restarting(again: "StepsAgain") -> None:
-    """Raise `ValueError` where steps from the last row but one do not lead to the last one, and the equation has no `resume`."""
+def refuse_restarting(again: Any) -> None:
+    """Raise `ValueError` where steps from the last row but one do not lead to the last one, and the equation has no `resume`;
+    `again` are the steps of a run once more, a `StepsAgain`."""
     sol, (first, _) = again.sol, again.equation.stages[0]
     if first.resume is not first.start or sol.impacts is not None:
         return
