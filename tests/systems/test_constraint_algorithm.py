@@ -422,3 +422,12 @@ def test_the_times_of_a_run_are_those_of_its_clock():
         prepared(x=later, t0=1.0)
     with pytest.raises(ValueError, match=r"1 in the first one and 2 in another: run them one by one"):
         dx.simulate(system, resolved, **run | {"x": np.stack([chain.point, later])})
+
+
+def test_a_point_of_positions_velocities_and_momenta_is_one_of_the_cotangent_bundle():
+    system = dx.LagrangeDirac(lambda q, v: (v[0] ** 2 + v[1] ** 2) / 2 - q[1] - q[2] * (q[0] ** 2 + q[1] ** 2 - 1) / 2)
+    q, v = np.array([np.sin(0.7), -np.cos(0.7), 0.9]), np.array([0.3, 0.2, 0.0])
+    by_name = dx.constraint_algorithm(system, near={"q": q, "v": v})
+    by_place = dx.constraint_algorithm(system, near=np.concatenate([q, v, v]))
+    assert str(by_place) == str(by_name)
+    np.testing.assert_array_equal(by_place.point, by_name.point)

@@ -17,7 +17,8 @@ from dirax.systems.system import AbstractSystem
 def constraint_algorithm(system: AbstractSystem, near: Any, params: Any = None, radius: float = 0.02) -> ConstraintChain:
     """The chain of constraint manifolds of an implicit system around the point `near`.
 
-    `near`: a point x (N,), not necessarily on the constraints, or initial data {"q": …, "v": …} of a Lagrangian system, with
+    `near`: a point x (N,), not necessarily on the constraints, which is (q, p) for a Lagrangian system with momenta that are
+    affine in v, and (q, v, p) for another one; or initial data {"q": …, "v": …} of a Lagrangian system, with
     "t" where it depends on time: t is then the last coordinate of the chain, with ṫ = 1, and no projection moves it;
     `radius`: size of the neighbourhood in which ranks are checked to be constant, relative to 1 + |x| in the chain's `units`.
 

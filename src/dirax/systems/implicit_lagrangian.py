@@ -44,6 +44,8 @@ def implicit_lagrangian(system: Any, stated: Any, near: Any, params: Any) -> Imp
         if data is not None:
             p = data["p"] if "p" in data else system.legendre(q, data.get("v", zero), params, t)
             x = np.concatenate([q, p])
+        elif given.size % 2:  # (q, v, p)
+            x = np.concatenate([q, given[-q.size :]])
         return _on_cotangent_bundle(system, np.asarray(x), hessian, params, timed, t)
     why = "the momenta of this Lagrangian are not affine in the velocities"
     why = "this Lagrangian is singular and has forces, which are functions of v" if affine else why
