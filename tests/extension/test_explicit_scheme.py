@@ -99,12 +99,6 @@ def test_python_that_leaves_out_assertions():
     assert done.stdout.split() == ["True"], done.stderr
 
 
-def test_an_odd_state_is_none_of_positions_and_momenta():
-    equation = Euler().step_equation(SYSTEM, dx.Shape(2, 0))
-    with pytest.raises(ValueError, match="but it has 5 numbers"):
-        dataclasses.replace(equation, canonical=True)
-
-
 def test_a_place_that_there_is_not():
     with pytest.raises(ValueError, match="'node' or 'step', but 'nodes'"):
         dx.Field((2,), place="nodes")

@@ -171,8 +171,6 @@ class StepEquation(eqx.Module):
         self.resume = resume or start
         self.interpolate, self.between = interpolate, between
         self.collocation, self.weak = collocation, weak
-        if canonical and self.state_size % 2:
-            raise ValueError(f"canonical=True says that the state is (q, p) on T*Q, but it has {self.state_size} numbers.")
         if len(self.labels) != self.unknowns:
             raise ValueError(f"labels need one entry per unknown ({self.unknowns}), but {len(self.labels)} were given.")
 
