@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 
 from dirax.bodies.frames import AnyFrame, Number, Vector, scalar, vector
+from dirax.text.representation import error_text
 
 Points: TypeAlias = tuple[tuple[str, Vector], tuple[str, Vector]]
 """Two points, each of a body (or of "ground") in its frame."""
@@ -73,8 +74,9 @@ class Motor:
         try:
             found = jnp.asarray(push(t, q, v, *more))
         except Exception as error:
-            said = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
-            raise TypeError(f"the push of {self.name!r} at {self.coordinate!r} could not be traced by JAX: {said}") from error
+            raise TypeError(
+                f"the push of {self.name!r} at {self.coordinate!r} could not be traced by JAX: {error_text(error)}"
+            ) from error
         if found.shape != ():
             raise ValueError(f"the push of {self.name!r} must be one number, but its shape is {found.shape}.")
         return found * w[self.coordinate]

@@ -24,6 +24,9 @@ CONDITIONS = {
 }
 """What a joint of each kind demands where it closes a loop."""
 
+WITHOUT_TURN, WITH_AXIS = ("fixed", "prismatic"), ("revolute", "planar")
+"""The kinds whose conditions have the sines of a rotation, and of an axis."""
+
 
 @dataclass(frozen=True)
 class Joint:
@@ -99,13 +102,15 @@ class Joint:
             "planar": lambda: [(turned @ axis) @ apart, *tilts()],
         }[self.kind]()
 
-    def turned_over(self, parent: AnyFrame, body: AnyFrame) -> list[Any]:
-        """1 − cos of the angle, of the rotation or of the axis, by which the body is turned out of place: its sine, which the
-        conditions have, is zero too where it is turned over by half a turn. Nothing where no condition is of this kind."""
+    @property
+    def may_turn_over(self) -> bool:
+        """Whether its conditions do not tell a body that is in place from one that is turned over, by half a turn."""
+        return self.closes and self.kind in (*WITHOUT_TURN, *WITH_AXIS)
+
+    def turned_over(self, parent: AnyFrame, body: AnyFrame) -> Any:
+        """1 − cos of the angle, of the rotation or of the axis, by which a body that may turn over is out of place."""
         between, axis, own = self._between(parent, body)
-        if self.kind in ("fixed", "prismatic"):
-            return [(3.0 - jnp.trace(between)) / 2]
-        return [1.0 - axis @ (between @ own)] if self.kind in ("revolute", "planar") else []
+        return (3.0 - jnp.trace(between)) / 2 if self.kind in WITHOUT_TURN else 1.0 - axis @ (between @ own)
 
     def _between(self, parent: AnyFrame, body: AnyFrame) -> tuple[Any, Any, Any]:
         """The rotation of the body as seen from the parent, beyond the joint's own; its axis, and the same seen from the body."""

@@ -56,14 +56,14 @@ class MachineConstraints:
 
     @cached_property
     def may_turn_over(self) -> tuple[str, ...]:
-        """The joints whose conditions do not tell a body that is in place from one that is turned over."""
-        return tuple(j.name for j in self.model.joints if j.closes and j.kind in ("fixed", "prismatic", "revolute", "planar"))
+        """The names of the joints that `turned_over` is of."""
+        return tuple(joint.name for joint in self.model.joints if joint.may_turn_over)
 
     def turned_over(self, q: Any, params: Any) -> Any:
         """Of these joints, how far their bodies are turned, as of `Joint.turned_over`."""
         frames = self.model.frames(q, jnp.zeros_like(q), params)
-        closing = [joint for joint in self.model.joints if joint.name in self.may_turn_over]
-        return stacked([x for joint in closing for x in joint.turned_over(frames[joint.parent], frames[joint.body])])
+        closing = [joint for joint in self.model.joints if joint.may_turn_over]
+        return stacked([joint.turned_over(frames[joint.parent], frames[joint.body]) for joint in closing])
 
     def one_forms(self, q: Any, params: Any, kept: Sequence[int] | None = None) -> Any:
         """The one-forms of these numbers, or all of them: derivatives of what is zero where a body rolls or skates."""

@@ -113,8 +113,9 @@ def _evaluated(*arrays: Any, jaxpr: ClosedJaxpr, linear: int, some: bool) -> tup
     return whole
 
 
-def _there(first: np.ndarray) -> np.ndarray:
-    return np.atleast_1d(np.isfinite(first.reshape(len(first), -1)).all(axis=1))
+def _there(first: Any, xp: Any = np) -> Any:
+    """Which entries there are."""
+    return xp.isfinite(first).reshape(len(first), -1).all(axis=1)
 
 
 def _shapes(*operands: Any, jaxpr: ClosedJaxpr, **_: Any) -> list[ShapedArray]:
@@ -148,13 +149,9 @@ def _tangents(primals: Sequence, along: Sequence, *, jaxpr: ClosedJaxpr, linear:
     pushed = _pushed.get((Same(jaxpr), moves), lambda: pushed_forward(jaxpr, moves))
     if _program(pushed) is None:
         found = jax.vmap(jaxpr_as_fun(pushed))(*primals, *chosen)
-        return results, [jnp.where(_is_there(primals[0], a), a, 0.0) for a in found] if some else found
+        column = lambda a: _there(primals[0], jnp).reshape(-1, *(1,) * (a.ndim - 1))
+        return results, [jnp.where(column(a), a, 0.0) for a in found] if some else found
     return results, bind(*primals, *chosen, jaxpr=pushed, linear=len(chosen))
-
-
-def _is_there(first: Any, like: Any) -> Any:
-    there = jnp.isfinite(first).reshape(len(first), -1).all(axis=1)
-    return there.reshape(-1, *(1,) * (like.ndim - 1))
 
 
 def _transposed(cotangents: Sequence, *operands: Any, jaxpr: ClosedJaxpr, linear: int, some: bool) -> list:

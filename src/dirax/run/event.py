@@ -11,7 +11,7 @@ from jax.core import Tracer
 from dirax.program.memo import OfKey
 from dirax.program.stated import as_stated
 from dirax.program.user_functions import reads_outside
-from dirax.text.representation import value_text
+from dirax.text.representation import error_text, value_text
 
 KNOWN = ("t", "q", "v", "p", "x", "params")
 """What a function of an event may be given, by the names of its arguments."""
@@ -117,9 +117,7 @@ def evaluated(event: Event, number: int, known: dict[str, Any], params: Any) -> 
     try:
         found = event({**known, "params": params})
     except Exception as error:
-        raise TypeError(
-            f"events[{number}] could not be traced by JAX: {type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
-        ) from error
+        raise TypeError(f"events[{number}] could not be traced by JAX: {error_text(error)}") from error
     if not hasattr(found, "shape") or found.shape != ():
         came = f"shape {found.shape}: index or sum its result" if hasattr(found, "shape") else type(found).__name__
         raise ValueError(f"the function of events[{number}] must return one number, but it returned {came}.")

@@ -17,10 +17,9 @@ from dirax.program.on_host import called_on_host, on_host
 from dirax.run.event import Event
 from dirax.run.event_places import EventPlace
 from dirax.run.event_search import EventSearch
-from dirax.schemes.step import STEP_DENSITY
 from dirax.solution.dense import Dense
 from dirax.solution.dense_traced import TracedDense
-from dirax.solution.divided_steps import AT_ROW, step_for
+from dirax.solution.divided_steps import AT_ROW
 from dirax.solution.solution import Solution
 
 
@@ -44,7 +43,7 @@ class EventsOnHost:
             return None
         leaves, structure = jax.tree.flatten((nodes, steps, params))
         lanes, rows = next(iter(nodes.values())).shape[:2]
-        most = (rows - 1) * len(self.events) * self.points
+        most = self._most(rows)
         size = lanes * most
         widths = [size, size, size, size, size * self.width, lanes]
         kinds = [(leaf.shape, leaf.dtype) for leaf in leaves]
@@ -80,6 +79,10 @@ class EventsOnHost:
         found = t, which, direction, fields
         return jax.tree.map(lambda a: a.reshape(lanes, most, *a.shape[1:]), found), endings
 
+    def _most(self, rows: int) -> int:
+        """Places for events in a trajectory of so many rows."""
+        return (rows - 1) * len(self.events) * self.points
+
     def _split(self, flat: Any) -> tuple:
         """The unknowns of each stage."""
         return tuple(jnp.split(flat, np.cumsum(self.stages)[:-1].tolist()))
@@ -104,7 +107,7 @@ class EventsOnHost:
         """The same of the trajectories of a batch, arrays (B, …)."""
         nodes, steps, params = arrays
         like, (batch, rows) = self.dense.sol, next(iter(nodes.values())).shape[:2]
-        most, width = (rows - 1) * len(self.events) * self.points, self.width
+        most, width = self._most(rows), self.width
         sol = Solution(
             t=t0 + np.arange(rows) * h, fields={**nodes, **steps}, field_info=like.field_info, step=h, save_every=1,
             stats={"engine": like.stats.get("engine")}, system=like.system, scheme=like.scheme, equation=self.dense.equation,
@@ -135,10 +138,6 @@ class EventsOnHost:
         states, u = dense.again.at(lanes, numbers)
         if self.solves == 1:
             return u
-        h, t = float(dense.sol.step), dense.time_at(lanes, numbers, 0.0)
-        part = np.maximum(theta, AT_ROW) * h
-        if dense.sol.has_own_times:
-            length = dense.time_at(lanes, numbers + 1, 0.0) - t
-            part = step_for(part / h, dense.saved[STEP_DENSITY][lanes, numbers], length, h)
+        t, part = dense.time_at(lanes, numbers, 0.0), dense.step_to(lanes, numbers, np.maximum(theta, AT_ROW))
         there, first = dense.again.step(lanes, states, u, t, part)
         return np.concatenate([first, dense.again.step(lanes, there, first, t + part, part)[1]], axis=1)

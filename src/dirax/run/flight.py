@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, OK
+from dirax.engines.contract import NOT_CONVERGED, OK, Problem
 from dirax.engines.walk import AbstractWalk
 from dirax.run.impact import Numbers
 from dirax.run.impact_search import ImpactSearch
@@ -52,7 +52,7 @@ class Flight:
         p, layout = self.search.problem, self.search.layout
         self.q, self.p = layout.place("q"), layout.place("p")
         self.extra = [layout.place(name) for name in (STEP_DENSITY, CLOCK) if name in layout]
-        self.others = [name for name in p.fields if p.is_node(name) and name not in ("q", "p", STEP_DENSITY, CLOCK)]
+        self.others = fields_beside(p)
         self.rows = self.walk.rows
         self.closing: dict[str, np.ndarray] = {name: np.full(f.shape, np.nan) for name, f in p.fields.items()}
         self.close, self.last, self.wall = [0] * len(self.jumps), [-np.inf] * len(self.jumps), -1
@@ -200,6 +200,11 @@ class Flight:
             self._accumulated(number, t)
             return None
         return (after, u) if self._noted(after, u, wall, at) else None
+
+
+def fields_beside(p: Problem) -> list[str]:
+    """The fields of nodes but q, p, and what steps of lengths of their own have."""
+    return [name for name in p.fields if p.is_node(name) and name not in ("q", "p", STEP_DENSITY, CLOCK)]
 
 
 def alerted(state: np.ndarray, alert: float) -> np.ndarray:

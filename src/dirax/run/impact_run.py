@@ -12,7 +12,7 @@ import numpy as np
 from dirax.engines.contract import Outcome, Problem, finished
 from dirax.program.memo import Memo, Same, by_value
 from dirax.run.event import OutsideIndex, captures_traced
-from dirax.run.flight import Flight, alerted
+from dirax.run.flight import Flight, alerted, fields_beside
 from dirax.run.impact import Impact, Numbers, gaps_of, jump
 from dirax.run.impact_search import ImpactSearch
 from dirax.run.result import solution_of
@@ -21,6 +21,7 @@ from dirax.schemes.step import CLOCK, PART, STEP_DENSITY, StepEquation
 from dirax.schemes.watched_step import ON_WALL, WatchedStep, gap_terms
 from dirax.solution.events import WALLS_WORK, Events
 from dirax.solution.solution import Solution
+from dirax.text.representation import error_text
 
 BEHIND = 10.0 * ON_WALL
 """How far behind a wall, relative to the terms of its gap, a trajectory may begin: by rounding."""
@@ -117,7 +118,7 @@ def _flights(
     jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, wall.restitution, state, t, h, params)
     key = "jump", by_value(system), Same(p.equation)
     jumps = [Numbers(jumped(wall), [state, t, t], p.params, *key, wall) for wall in walls]
-    others = [name for name in p.fields if p.is_node(name) and name not in ("q", "p", STEP_DENSITY, CLOCK)]
+    others = fields_beside(p)
 
     def row_of(state, u, t, h, params):
         row = stage.unpack(state, u, t, h, params)
@@ -158,10 +159,7 @@ def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tup
         except OutsideIndex:
             raise
         except Exception as error:
-            raise TypeError(
-                f"the gap of events[{number}] could not be traced by JAX: {type(error).__name__}: "
-                f"{(str(error).splitlines() or [''])[0]}"
-            ) from error
+            raise TypeError(f"the gap of events[{number}] could not be traced by JAX: {error_text(error)}") from error
         if not hasattr(found, "shape") or found.shape != ():
             came = f"shape {found.shape}: index or sum its result" if hasattr(found, "shape") else type(found).__name__
             raise ValueError(f"the gap of events[{number}] must return one number, but it returned {came}.")

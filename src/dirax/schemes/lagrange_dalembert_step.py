@@ -81,8 +81,7 @@ class LagrangeDAlembertStep(AbstractStep):
         """The premise of a discrete Lagrangian of the user's."""
         if not isinstance(self.rule, UserFunction):
             return None
-        at = self.system.lagrangian.at
-        return ConsistentWith(self.derivatives, lambda *given: gradient(at, (2, 1))(*given))
+        return ConsistentWith(self.derivatives, gradient(self.system.lagrangian.at, (2, 1)))
 
     def check(self, data, h, params):
         if self.consistent is not None:

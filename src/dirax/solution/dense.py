@@ -127,11 +127,8 @@ class Dense(BetweenRows):
             for name, values in self._near_row(lanes[near], numbers[near], theta[near]).items():
                 found[name][near] = values
         if np.any(off := ~at_row & ~near):
-            lanes, t, part = lanes[off], t[off], theta[off] * h[off]
-            if self.sol.has_own_times:
-                at = numbers[off]
-                length = self.time_at(lanes, at + 1, 0.0) - t
-                part = step_for(part / h[off], self.saved[STEP_DENSITY][lanes, at], length, h[off])
+            lanes, t = lanes[off], t[off]
+            part = self.step_to(lanes, numbers[off], theta[off])
             states, u = self.again.at(lanes, numbers[off])
             inside = theta[off] > AT_ROW
             if np.any(inside):
@@ -141,6 +138,15 @@ class Dense(BetweenRows):
             for name, values in found.items():
                 values[off] = made[name]
         return found
+
+    def step_to(self, lanes: np.ndarray, numbers: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        """The lengths of the steps that lead from the beginnings of these steps to parts of them."""
+        h = float(self.sol.step)
+        part = theta * h
+        if not self.sol.has_own_times:
+            return part
+        length = self.time_at(lanes, numbers + 1, 0.0) - self.time_at(lanes, numbers, 0.0)
+        return step_for(part / h, self.saved[STEP_DENSITY][lanes, numbers], length, h)
 
     def _saved_row(self, numbers: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The saved rows that are nearest to places in steps, and which of these are at them."""

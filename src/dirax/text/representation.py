@@ -60,3 +60,8 @@ def shortened(value: Any, most: int = 60) -> str:
     """The representation of a value that a user gave, cut after `most` characters."""
     text = repr(value)
     return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def error_text(error: BaseException) -> str:
+    """The kind of an error and the first line of what it says."""
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"

@@ -17,7 +17,7 @@ from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
 from dirax.program.linear_solves import equilibrated_inverse, pseudo_inverses
 from dirax.program.memo import Memo, Same
-from dirax.program.rules.reductions import factors_of_product
+from dirax.program.rules.reductions import factors_of_product, sum_of_products
 from dirax.program.scalar_program import ScalarProgram, numpy_rule
 from dirax.program.tracing import jacobian, of_one_result
 
@@ -42,12 +42,7 @@ def dot_general(made: ScalarProgram, interpreter: Interpreter, equation: Any, a:
     left, right = np.moveaxis(rows, -1, 0)[..., None], np.moveaxis(columns, -1, 0)[:, :, None]
 
     def product(arrays: list[np.ndarray]) -> list[np.ndarray]:
-        x, y = arrays
-        with np.errstate(all="ignore"):
-            total = x[:, 0] * y[:, 0]
-            for k in range(1, length):
-                total = total + x[:, k] * y[:, k]
-        return [total.reshape(len(x), *shape)]
+        return [sum_of_products(*arrays).reshape(len(arrays[0]), *shape)]
 
     return made.between([left, right], [shape], product)
 

@@ -104,10 +104,16 @@ def _product_of_constants(g: Graph, rows: np.ndarray, columns: np.ndarray) -> np
         if None in values:
             return None
         factors.append(np.array(values, float)[which.reshape(nodes.shape)])
+    left, right = (np.moveaxis(a, -1, 1) for a in factors)
+    return sum_of_products(left[..., None], right[:, :, None])
+
+
+def sum_of_products(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Σ x·y over the second axis in its order, so that an entry's bits do not depend on the others."""
     with np.errstate(all="ignore"):
-        total = factors[0][:, :, None, 0] * factors[1][:, None, :, 0]
-        for k in range(1, rows.shape[-1]):
-            total = total + factors[0][:, :, None, k] * factors[1][:, None, :, k]
+        total = x[:, 0] * y[:, 0]
+        for k in range(1, x.shape[1]):
+            total = total + x[:, k] * y[:, k]
     return total
 
 
