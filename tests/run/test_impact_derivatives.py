@@ -56,7 +56,78 @@ def test_the_last_row_of_a_pendulum_is_as_of_runs_that_nothing_traces():
     np.testing.assert_allclose(slopes, (run(1 + 1e-5)[1][-1] - run(1 - 1e-5)[1][-1]) / 2e-5, atol=1e-8)
 
 
-@pytest.mark.soak
+def numbers(x):
+    return jnp if isinstance(x, jax.core.Tracer) else np
+
+
+def falling(x, start, walls, **more):
+    """A ball from its place, `start` + (x₀, 0), with the velocity (x₁, x₂) and g = x₃."""
+    xp = numbers(x)
+    q, v = xp.stack([start[0] + x[0], start[1] + 0.0 * x[0]]), xp.stack([x[1], x[2]])
+    params = {"g": x[3], "floor": 0.0}
+    return dx.simulate(BALL, dx.LagrangeDAlembert(), q=q, v=v, params=params, step=0.1, events=walls, **more)
+
+
+def rows(x, *args, **more):
+    sol = falling(x, *args, **more)
+    return numbers(x).concatenate([sol.q[-1], sol.p[-1], sol.q[9]])
+
+
+PEG = dx.Impact(lambda q: jnp.sum((q - jnp.array([0.93, 0.466])) ** 2) - 0.01**2)
+"""In the way for a tenth of a quarter of a step."""
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        ((0.0, 1.0), [PEG, FLOOR], [0.0, 0.9, 0.0, 1.0]),
+        ((0.0, 0.0), [FLOOR], [0.0, 0.5, 0.3, 1.0]),
+        ((0.0, 0.0), [FLOOR], [0.0, 0.5, -0.4, 1.0]),
+    ],
+    ids=["a thin peg", "up from a wall", "onto a wall at once"],
+)
+def test_impacts_are_those_of_other_runs(case):
+    start, walls, x = case
+    x = np.array(x)
+    found, plain = jax.jit(lambda x: rows(x, start, walls, steps=24))(x), falling(x, start, walls, steps=24)
+    assert len(plain.events) and plain.events.index[0] == 0
+    np.testing.assert_array_equal(found, rows(x, start, walls, steps=24))
+    slopes = jax.jacrev(lambda x: rows(x, start, walls, steps=24))(x)
+    d = 1e-7
+    for i, unit in enumerate(np.eye(4)):
+        change = (rows(x + d * unit, start, walls, steps=24) - rows(x - d * unit, start, walls, steps=24)) / (2 * d)
+        np.testing.assert_allclose(slopes[:, i], change, rtol=1e-6, atol=1e-6 * np.max(np.abs(slopes)))
+
+
+@pytest.mark.parametrize("engine", ["auto", "xla"])
+def test_a_ball_may_begin_at_rest(engine):
+    """All unknowns of its first step were without a size by JAX alone: it stayed where it was for that step."""
+    g = 1.3
+    run = lambda g: falling(jnp.stack([0.0, 0.0, 0.0, g]), (0.0, 1.1), [FLOOR], steps=20, engine=engine).events.t[0]
+    t, slope = jax.jvp(run, (g,), (1.0,))
+    np.testing.assert_allclose((t, slope), (np.sqrt(2.2 / g), -np.sqrt(2.2 / g) / (2 * g)), rtol=1e-12)
+
+
+def test_trajectories_that_end_under_jit():
+    """Impacts accumulate; one begins behind the floor. What is before the end has its derivatives."""
+    dead = dx.Impact(lambda q: q[1], restitution=0.3)
+    x = np.array([0.1, 0.9, 0.0, 1.0])
+    plain = falling(x, (0.0, 1.0), [dead], steps=60)
+    run = lambda x: falling(x, (0.0, 1.0), [dead], steps=60)
+    q, ok, times = jax.jit(lambda x: (run(x).q, run(x).ok, run(x).events.t))(x)
+    assert not plain.ok and not ok
+    np.testing.assert_array_equal(q[: plain.rows], plain.q)
+    assert np.all(np.isnan(q[plain.rows :]))
+    np.testing.assert_array_equal(times[: len(plain.events)], plain.events.t)
+    assert np.all(np.isnan(times[len(plain.events) :]))
+    slopes = jax.jacrev(lambda x: run(x).q[: plain.rows])(x)
+    t = (plain.rows - 1) * 0.1
+    np.testing.assert_allclose(slopes[-1, 0], [1.0, t, 0.0, 0.0], atol=1e-12)
+    assert np.all(np.isfinite(slopes))
+    behind = jax.jit(lambda x: falling(x, (0.0, -1.0), [dead], steps=3).q)(x)
+    assert np.all(np.isfinite(behind[0])) and np.all(np.isnan(behind[1:]))
+
+
 def test_reverse_mode_and_second_derivatives():
     """A ball falls from height y onto a floor at 0, e = .8: y(T) = .8 u s − s²/2 with u = √(2y) = t₁ and s = T − t₁."""
     ball = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0])
@@ -76,7 +147,8 @@ def test_the_step_is_in_one_place_however_many_walls_there_are():
     ball, scheme = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0]), dx.LagrangeDAlembert()
 
     def loops(*walls):
-        run = lambda q: dx.simulate(ball, scheme, q=q, v=jnp.zeros(1), step=0.1, steps=2, events=list(walls)).q
+        given = {"v": jnp.zeros(1), "step": 0.1, "steps": 2, "engine": "xla"}
+        run = lambda q: dx.simulate(ball, scheme, q=q, events=list(walls), **given).q
         return jax.jit(run).lower(jnp.ones(1)).as_text().count("stablehlo.while")
 
     low, high = dx.Impact(lambda q: q[0]), dx.Impact(lambda q: 2.0 - q[0])

@@ -1,10 +1,10 @@
 """Parameters of a step: which leaves of the user's pytree are scalar inputs of its program."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -34,9 +34,18 @@ class Parameters:
         fixed = ((a.dtype.str, a.shape, a.tobytes()) if isinstance(a, np.ndarray) else Same(a) for a in self.fixed)
         return self.treedef, self.shapes, self.dtypes, tuple(fixed)
 
+    def split(self, numbers) -> Any:
+        """The pytree of its inputs as one array (size,), with other numbers after them."""
+        parts, at = [], 0
+        for shape in self.shapes:
+            count = math.prod(shape)
+            parts.append(numbers[at : at + count].reshape(shape))
+            at += count
+        return self.rebuild(parts)
+
     def rebuild(self, leaves) -> Any:
         """The pytree of its float64 inputs."""
-        own = lambda x, dtype: x if np.issubdtype(dtype, np.floating) else jnp.asarray(x).astype(dtype)
+        own = lambda x, dtype: x if np.issubdtype(dtype, np.floating) else x.astype(dtype)
         leaves, fixed = iter([own(*given) for given in zip(leaves, self.dtypes, strict=True)]), iter(self.fixed)
         return jax.tree.unflatten(self.treedef, [next(leaves) if d else next(fixed) for d in self.dynamic])
 

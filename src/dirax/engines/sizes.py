@@ -214,9 +214,12 @@ def sizes_near(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: 
     def one(stage, u, h):
         if not stage.unknowns:
             return jnp.ones(0)
-        by_u, by_state = jax.jacfwd(lambda u, x: stage.residual(u, x, t, h, params), argnums=(0, 1))(u, state)
-        terms = jnp.abs(by_u) @ jnp.abs(u) + jnp.abs(by_state) @ jnp.abs(state)
-        size = jnp.abs(solve(by_u, jnp.eye(len(u)))) @ terms
+        residual = lambda u, x: stage.residual(u, x, t, h, params)
+        by_u, by_state = jax.jacfwd(residual, argnums=(0, 1))(u, state)
+        inverse = solve(by_u, jnp.eye(len(u)))
+        solution = u - inverse @ residual(u, state)  # at rest it alone has a size
+        terms = jnp.abs(by_u) @ jnp.maximum(jnp.abs(u), jnp.abs(solution)) + jnp.abs(by_state) @ jnp.abs(state)
+        size = jnp.abs(inverse) @ terms
         return jnp.where(jnp.isfinite(size) & (size > TINY), size, TINY)
 
     found = (one(stage, u, fraction * h) for (stage, fraction), u in zip(equation.stages, guess, strict=True))

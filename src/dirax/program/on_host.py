@@ -51,18 +51,25 @@ def on_host(function: Callable, leaves: Sequence[Any], key: Hashable, fixed: int
     derivative in reverse mode alone.
     `key` is equal for functions that are, and has everything in it on which `function` depends.
     """
-    shapes = [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves]
-    if jax.default_backend() != "cpu" or sum(math.prod(shape.shape) for shape in shapes[fixed:]) > MOST_NUMBERS:
+    made = host_program(function, [jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype) for leaf in leaves], key, fixed)
+    if made is None:
         return None
-    kinds = [(s.shape, s.dtype.str) for s in shapes]
-    jaxpr, result = _traced.get((key, *kinds), lambda: jax.make_jaxpr(function, return_shape=True)(*shapes))
-    if any(isinstance(c, Tracer) for c in jaxpr.consts) or any(a.dtype != np.float64 for a in jaxpr.out_avals):
-        return None
-    if _program(jaxpr) is None or has_rules(jaxpr.jaxpr, BACKWARD):
-        return None
+    jaxpr, result = made
     leaves = [*jax.lax.stop_gradient(tuple(leaves[:fixed])), *leaves[fixed:]]
     found = host_p.bind(*leaves, jaxpr=jaxpr, linear=0, some=fixed > 0)
     return jax.tree.unflatten(jax.tree.structure(result), found)
+
+
+def host_program(function: Callable, shapes: Sequence[Any], key: Hashable, fixed: int = 0) -> tuple[ClosedJaxpr, Any] | None:
+    """What `on_host` evaluates of arguments of these shapes, without entries, and the structure of its results; None where it
+    does."""
+    if jax.default_backend() != "cpu" or sum(math.prod(shape.shape) for shape in shapes[fixed:]) > MOST_NUMBERS:
+        return None
+    kinds = [(s.shape, np.dtype(s.dtype).str) for s in shapes]
+    jaxpr, result = _traced.get((key, *kinds), lambda: jax.make_jaxpr(function, return_shape=True)(*shapes))
+    if any(isinstance(c, Tracer) for c in jaxpr.consts) or any(a.dtype != np.float64 for a in jaxpr.out_avals):
+        return None
+    return None if _program(jaxpr) is None or has_rules(jaxpr.jaxpr, BACKWARD) else (jaxpr, result)
 
 
 def called_on_host(function: Callable, widths: Sequence[int], *arrays: Any) -> list[jax.Array]:

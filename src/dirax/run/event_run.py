@@ -210,13 +210,18 @@ def run_with_events(
 
         if case.traced:
             known = without_redundant(plain.system, case, plain.project)
-            by_jax = lambda case: flown(plain.system, begun_at(case)[0], own, tuple(walls))
+
+            def by_jax(case: Any) -> tuple:
+                begun, captured = begun_at(case)
+                on_host = not (captured or plain.engine.compiles_start(True))
+                return flown(plain.system, begun, own, tuple(walls), on_host)
+
             found = carried_by_jax(by_jax, plain, known, count, *walls, *own)
             return flight_of(plain, case, *found)
         began = time.perf_counter()
         begun, captured = begun_at(case)
         if begun.traced or captured:
-            return flight_of(plain, case, *flown(plain.system, begun, own, tuple(walls)))
+            return flight_of(plain, case, *flown(plain.system, begun, own, tuple(walls), False))
         started = time.perf_counter()
         sol = fly_all(plain, begun, own, tuple(walls))
         known = sol.stats["compile_seconds"] + sol.stats["run_seconds"]

@@ -1,6 +1,7 @@
 """A flight: one trajectory of a run with impacts, from one wall to the next, with steps that are divided where a wall is hit."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,20 @@ MOST_IN_STEP = 10_000
 """Impacts in one step from which on walls are said to close in on the motion."""
 
 
+class Part(NamedTuple):
+    """A part of a step that walls divide: from the state at `at` on, `length` of the step long, onto the number of a `wall` and
+    off it, or NONE. `leaving` is a guess of the unknowns of the part that follows."""
+
+    step: int
+    at: float
+    length: float
+    wall: int
+    state: np.ndarray
+    unknowns: np.ndarray
+    after: np.ndarray
+    leaving: np.ndarray
+
+
 @dataclass
 class Flight:
     """One trajectory of a run with impacts."""
@@ -43,7 +58,13 @@ class Flight:
     """One step onto a wall."""
     row: Numbers
     """(state, u, t, h) ↦ the fields of nodes there but q, p, time and density, one after the other."""
+    most: float = np.inf
+    """Impacts with more of which the trajectory ends."""
     hits: list[tuple] = field(default_factory=list)
+    parts: list[Part] = field(default_factory=list)
+    """Those of divided steps, but of steps that turned out to be whole."""
+    leaving: np.ndarray | None = None
+    """The unknowns of the step that leaves the last state; None where it has no solution."""
     message: str = ""
     status: int = OK
     interrupted: bool = False
@@ -96,6 +117,7 @@ class Flight:
         """Find the row at the end."""
         out = self.search.steps(self.state, self.unknowns, self.done, 1.0)
         good = bool(out.completed[0])
+        self.leaving = out.last_unknowns[0] if good else None
         for name in self.closing:
             if self.search.problem.is_node(name):
                 self.closing[name] = out.fields[name][0][0] if good else out.closing[name][0]
@@ -114,18 +136,23 @@ class Flight:
             good = self.look.go(alerted(state, 0.0), u, 0, 1, t, h)
             wall, place = self.look.state[-2:].tolist()
             if good and wall == NONE:
+                after, leaving = self.look.state[:-3], self.look.unknowns
                 if at == 0.0:
                     self._keep(step, self.look.rows)
-                return self.look.state[:-3], self.look.unknowns
+                else:
+                    self.parts.append(Part(step, at, 1.0 - at, int(NONE), state, leaving, after, leaving))
+                return after, leaving
             hit = good and wall >= 0.0 and self._onto(wall, place, state, t, h)
             if not hit:
                 return self._searched(state, u, step, at)
             if at == 0.0:
                 self._keep(step, self.collide.rows)
-            at += (1.0 - at) * self.collide.unknowns[-1]
+            length, before = (1.0 - at) * self.collide.unknowns[-1], (at, state)
+            at += length
             state, u = self.collide.state[:-3], self.collide.rows[LEAVING][0].copy()
             if not self._noted(state, u, int(wall), step + at):
                 return None
+            self.parts.append(Part(step, before[0], length, int(wall), before[1], self.collide.unknowns[:-1], state, u))
 
     def _onto(self, wall: float, place: float, state: np.ndarray, t: float, h: float) -> bool:
         """Whether the step onto a wall ends between the places at which its gap was seen to change its sign."""
@@ -145,6 +172,8 @@ class Flight:
             return self._accumulated(number, t)
         if len(self.hits) >= MOST_AT_ONCE and self.hits[-MOST_AT_ONCE][4] > at - ACCUMULATED:
             return self._accumulated(number, t)
+        if len(self.hits) >= self.most:
+            return self._end(f"more than {self.most} impacts up to t = {t:.6g}, the last one on events[{number}]")
         if len(self.hits) >= MOST_IN_STEP and self.hits[-MOST_IN_STEP][4] > at - 1.0:
             return self._end(
                 f"{MOST_IN_STEP} impacts within one step up to t = {t:.6g}, the last one on events[{number}]: walls close in on "
@@ -160,9 +189,14 @@ class Flight:
             "is a motion on the wall, which can be run with a holonomic constraint"
         )
 
-    def _end(self, message: str) -> bool:
-        self.message, self.status = message, NOT_CONVERGED
+    def _end(self, message: str, status: int = NOT_CONVERGED) -> bool:
+        self.message, self.status = message, status
         return False
+
+    def refuse(self, message: str, status: int = NOT_CONVERGED) -> None:
+        """End the trajectory where it is, for this reason."""
+        self._end(message, status)
+        self.finish()
 
     # ------------------------------------------------------------------------------------------ where it is doubtful
 
@@ -178,13 +212,14 @@ class Flight:
             if moved is None:
                 self.status = int(out.status[0])
                 return None
-            state, u = moved
             if found is None:
-                return state, u
-            at, first = at + part, False
-            hit = self._bounced(state, found[1], step + at)
+                self.parts.append(Part(step, at, part, int(NONE), state, moved[1], *moved))
+                return moved
+            begins, at, first = at, at + part, False
+            hit = self._bounced(moved[0], found[1], step + at)
             if hit is None:
                 return None
+            self.parts.append(Part(step, begins, part, found[1], state, moved[1], *hit))
             state, u = hit
 
     def _bounced(self, state: np.ndarray, wall: int, at: float) -> tuple[np.ndarray, np.ndarray] | None:

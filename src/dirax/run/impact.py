@@ -36,9 +36,10 @@ class Impact(OfKey):
         ball = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[1])
         sol = dx.simulate(ball, dx.LagrangeDAlembert(), events=[dx.Impact(lambda q: q[1])], q=…, v=…, step=0.01, steps=1000)
 
-    Under `jax.grad`, `jit` and `vmap` impacts are differentiated, their times too (what follows has the derivative of the
-    saltation matrix): up to four in a step, found by the sign of the gap at quarters of it. `sol.events` then has four entries a
-    step, in the order of time in each trajectory, NaN where there are none.
+    Under `jax.grad`, `jit` and `vmap` impacts are those of other runs, and are differentiated, their times too (what follows has
+    the derivative of the saltation matrix): four a step of the run at most. `sol.events` then has as many entries, in the order
+    of time in each trajectory, NaN where there are none. What has no scalar program, closes over values that JAX traces, or runs
+    by `engine="xla"` has up to four in every step, and they are seen by the sign of the gap at quarters of it.
 
     The p that `dx.LagrangeDAlembert` saves with nonholonomic constraints, the mean over the two steps at a row, is off by O(h²)
     at the ends of a step that is divided, though the motion is not: `dx.DiscreteDirac(constraints="resolve")` has no such rows.

@@ -1,8 +1,6 @@
 """A run with impacts: all its trajectories, and what is refused."""
 
 import time
-from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,21 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.contract import Outcome, Problem, finished
-from dirax.program.memo import Memo, Same, by_value
 from dirax.run.event import OutsideIndex, captures_traced
-from dirax.run.flight import Flight, alerted, fields_beside
-from dirax.run.impact import Impact, Numbers, gaps_of, jump
-from dirax.run.impact_search import ImpactSearch
+from dirax.run.flight import Flight
+from dirax.run.flights import Flights, behind
+from dirax.run.impact import Impact
 from dirax.run.result import solution_of
-from dirax.schemes.collision_step import CollisionStep
-from dirax.schemes.step import CLOCK, PART, STEP_DENSITY, StepEquation
-from dirax.schemes.watched_step import ON_WALL, WatchedStep, gap_terms
+from dirax.schemes.step import CLOCK, PART, STEP_DENSITY
 from dirax.solution.events import WALLS_WORK, Events
 from dirax.solution.solution import Solution
 from dirax.text.representation import error_text
-
-BEHIND = 10.0 * ON_WALL
-"""How far behind a wall, relative to the terms of its gap, a trajectory may begin: by rounding."""
 
 
 def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> Solution:
@@ -45,11 +37,12 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
     ]
     run, interrupted = settings.engine.prepared(own[0]), False
     flights: list[Flight] = []
-    flight_of = _flights(settings.engine, run, system, own[0], walls, numbers)
+    flight_of = Flights(settings.engine, run, system, own[0], walls, numbers)
     made = time.perf_counter()
     for number, lane in enumerate(own):
         flight = flight_of(lane)
-        _refuse_behind(flight, number if p.batch is not None else None)
+        if refused := behind(flight):
+            raise ValueError(refused.format(f" of trajectory {number}" if p.batch is not None else ""))
         if interrupted:
             flight.finish()
         else:
@@ -88,54 +81,6 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
     return sol
 
 
-_steps: Memo[tuple[StepEquation, StepEquation]] = Memo(64)
-
-
-def _flights(
-    engine: Any, run: Any, system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]
-) -> Callable[[Problem], Flight]:
-    """What makes the flight of a trajectory, for those that differ in numbers alone from this one."""
-    stage = p.equation.stages[0][0]
-    gaps = gaps_of(walls)
-    watched, collision = _steps.get(
-        ("walls", by_value(system), Same(p.equation), *walls),
-        lambda: (
-            WatchedStep(stage, system, gaps).equation(),
-            CollisionStep(stage, system, gaps, tuple(wall.restitution for wall in walls)).equation(),
-        ),
-    )
-
-    def problems(p: Problem) -> tuple[Problem, Problem, Problem]:
-        state, (u,) = alerted(p.state, 1.0), p.guess
-        many = replace(p, equation=watched, state=state, save_every=1)
-        hit = replace(p, equation=collision, state=state, guess=(np.append(u, 0.5),), save_every=1, steps=1)
-        return many, many.with_numbers(steps=1), hit
-
-    t, q, state = np.zeros(()), np.zeros(stage.state_layout["q"][0]), np.asarray(p.state)
-    gap = Numbers(gaps, [t, q], p.params, "gaps", *walls)
-    sizes = lambda t, q, end, params: gap_terms(gaps, t, q, [end], params)
-    terms = Numbers(sizes, [t, q, q], p.params, "terms of gaps", *walls)
-    jumped = lambda wall: lambda state, t, h, params: jump(system, stage, wall, wall.restitution, state, t, h, params)
-    key = "jump", by_value(system), Same(p.equation)
-    jumps = [Numbers(jumped(wall), [state, t, t], p.params, *key, wall) for wall in walls]
-    others = fields_beside(p)
-
-    def row_of(state, u, t, h, params):
-        row = stage.unpack(state, u, t, h, params)
-        return jnp.concatenate([jnp.zeros(0), *(jnp.ravel(row[name]) for name in others)])
-
-    row = Numbers(row_of, [state, np.asarray(p.guess[0]), t, t], p.params, "row", by_value(system), Same(p.equation))
-    many, _, hit = problems(p)
-    watch, collide = engine.walks(many), engine.walks(hit)
-
-    def flight(p: Problem) -> Flight:
-        many, one, hit = problems(p)
-        search = ImpactSearch(p, numbers, run, gap.of(p.params), terms.of(p.params))
-        return Flight(search, [one.of(p.params) for one in jumps], watch(many), watch(one), collide(hit), row.of(p.params))
-
-    return flight
-
-
 def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> bool:
     """Whether a gap closes over values that JAX traces. Raises `TypeError` and `ValueError` for walls that these steps cannot
     bounce off, and gaps that are none."""
@@ -165,28 +110,6 @@ def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tup
             raise ValueError(f"the gap of events[{number}] must return one number, but it returned {came}.")
         traced = traced or seen
     return traced
-
-
-def _refuse_behind(flight: Flight, lane: int | None) -> None:
-    """Raise `ValueError` for a trajectory that begins behind a wall, by more than rounding."""
-    p, whose = flight.search.problem, "" if lane is None else f" of trajectory {lane}"
-    state = np.asarray(p.state)
-    gaps = flight.search.gaps.one(p.t0, state[flight.q])
-    for wall, (number, gap) in enumerate(zip(flight.search.numbers, gaps, strict=True)):
-        if not np.isfinite(gap):
-            raise ValueError(f"the gap of events[{number}] must be finite along the run, but it is {gap} at the start{whose}.")
-        if gap < 0.0 and not gap >= -BEHIND * _terms(flight)[wall]:
-            raise ValueError(
-                f"the gap of events[{number}] must not be negative at the start{whose}, but it is {gap:.6g}: begin in front "
-                "of the wall, or change the sign of the gap."
-            )
-
-
-def _terms(flight: Flight) -> np.ndarray:
-    """The sizes of the terms of the gaps at the start, for the first step."""
-    search, state = flight.search, np.asarray(flight.search.problem.state)
-    end = search.part(state, np.asarray(search.problem.guess[0]), 0.0, 1.0)[1]
-    return search.terms_at(state, end, 0.0)
 
 
 def _events(flights: list[Flight], p: Problem) -> Events:

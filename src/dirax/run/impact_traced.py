@@ -1,4 +1,5 @@
-"""A run with impacts whose values JAX traces: each step with as many impacts in it as there may be, times and all differentiated.
+"""A run with impacts whose values JAX traces, by JAX alone: each step with as many impacts in it as there may be, times and all
+differentiated.
 
 What a part of a step ends with, its length among it, is the root of the equations of the step and of the gap of the wall, and
 has its derivative by the implicit function theorem: what comes after then has that of the saltation matrix, without a formula
@@ -15,7 +16,9 @@ from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem
 from dirax.engines.in_jax import in_scalars
 from dirax.engines.xla.lane import passing
 from dirax.engines.xla.newton import as_function
+from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.run.impact import Impact, gaps_of, jump
+from dirax.run.impact_on_host import FlightsOnHost
 from dirax.run.result import solution_of
 from dirax.schemes.step import CLOCK, StepEquation
 from dirax.schemes.watched_step import ON_WALL, PARTS, gap_terms
@@ -228,11 +231,16 @@ def bracketed_fall(function, a, fa, b, fb):
     return jax.lax.while_loop(lambda fall: fall.open, look, Fall.between(a, fa, b, fb)).b
 
 
-def flown(system: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple[int, ...]) -> tuple[Problem, Outcome, Any]:
-    """Problem and outcome of a traced run with impacts, every row saved; and the given row 0 with what was hit."""
+def flown(
+    system: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple[int, ...], on_host: bool
+) -> tuple[Problem, Outcome, Any]:
+    """Problem and outcome of a traced run with impacts, every row saved; and the given row 0 with what was hit: `on_host`, where
+    that can be."""
     p = begun.problem
-    flight = TracedFlight(walls, numbers, system, p)
     lead = lambda a: jnp.asarray(a) if p.batch is not None else jnp.asarray(a)[None]
+    if on_host and (found := _flown_on_host(FlightsOnHost(system, p, walls, numbers), lead)):
+        return p, found[0], (begun.row0, found[1])
+    flight = TracedFlight(walls, numbers, system, p)
     of_params = lead if p.batch_params and p.batch is not None else lambda a: jnp.broadcast_to(a, (p.batch or 1, *jnp.shape(a)))
     t0, h = jnp.asarray(p.t0, float), jnp.asarray(p.h, float)
     given = lead(p.state), lead(p.guess[0]), jax.tree.map(lambda a: of_params(jnp.asarray(a)), p.params)
@@ -258,6 +266,23 @@ def flown(system: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple[int
     lanes = jnp.repeat(jnp.arange(p.batch or 1), order.shape[1])
     impacts = pick(t), pick(number), jnp.full(lanes.shape, -1), lanes, {"q": pick(q), "p": pick(momentum)}
     return p, outcome, (begun.row0, impacts)
+
+
+def _flown_on_host(flights: FlightsOnHost, lead: Any) -> tuple[Outcome, tuple] | None:
+    """Outcome and impacts by the host; None where JAX has to find them."""
+    p = flights.problem
+    try:
+        c = flights.leaves.flatten(p.params, p.batch if p.batch_params else None, jnp)
+    except UnsupportedPrimitive:
+        return None
+    c = c if c.ndim == 2 else jnp.broadcast_to(c, (p.batch or 1, c.shape[0]))
+    found = flights(lead(p.state), lead(p.guess[0]), c, p.t0, p.h)
+    if found is None:
+        return None
+    outcome, (t, number, known) = found
+    lanes = jnp.repeat(jnp.arange(p.batch or 1), t.shape[1])
+    whole = lambda a: a.reshape(-1, *a.shape[2:])
+    return outcome, (whole(t), whole(number), jnp.full(lanes.shape, -1), lanes, {name: whole(a) for name, a in known.items()})
 
 
 def flight_of(settings: Any, case: Any, problem: Problem, outcome: Outcome, more: Any) -> Solution:

@@ -4,7 +4,6 @@ import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 from dirax.engines.contract import Problem
 from dirax.engines.parameters import Parameters
@@ -56,15 +55,7 @@ def recording(equation: Any, leaves: Parameters, each: bool) -> tuple[Any, int]:
 
 
 def _recording(equation: Any, leaves: Parameters, composed: str) -> tuple[Any, int]:
-    size = max(1, *(stage.unknowns for stage, _ in equation.stages))
-
-    def split(c):
-        parts, at = [], 0
-        for shape in leaves.shapes:
-            count = int(np.prod(shape))
-            parts.append(c[at : at + count].reshape(shape))
-            at += count
-        return leaves.rebuild(parts)
+    size, split = max(1, *(stage.unknowns for stage, _ in equation.stages)), leaves.split
 
     def one(stage: StepEquation) -> StepEquation:
         def unpack(state, u, t, h, c):
