@@ -12,7 +12,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from dirax.program.captured import ABSENT, LIBRARIES, Captured, contents, reads
+from dirax.program.captured import ABSENT, LIBRARIES, Captured, contents
+from dirax.program.code_reads import reads
 from dirax.program.memo import Memo, Same
 
 STATED, VERSIONS = 512, 8
@@ -26,9 +27,6 @@ MOST_BYTES = 2**16
 
 WRITTEN = float, complex, int, bool, str, bytes, type(None)
 """Kinds of values that their representation tells apart, −0.0 from 0.0 too."""
-
-CHANGES = {*("append", "extend", "insert", "add", "update", "setdefault", "pop", "popitem", "remove", "clear", "sort", "reverse")}
-"""Methods that change lists, dictionaries and sets, in which a function may keep a record."""
 
 _stated: Memo[list[tuple[Captured, Callable]]] = Memo(STATED)
 
@@ -73,7 +71,7 @@ def _is_of_values(function: Any) -> bool:
     if (function.__module__ or "").partition(".")[0] in LIBRARIES or _is_of_module(function):
         return False
     found, cells = reads(function.__code__), function.__closure__ or ()
-    keeps = found.writes or found.attributes & CHANGES or found.own & {*function.__code__.co_freevars, *found.globals}
+    keeps = (found.own | found.changed) & {*function.__code__.co_freevars, *found.globals}
     return not keeps and all(contents(cell) is not ABSENT for cell in cells)
 
 

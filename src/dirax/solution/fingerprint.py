@@ -12,7 +12,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from dirax.program.captured import Captured, reads
+from dirax.program.captured import Captured
+from dirax.program.code_reads import reads
 from dirax.solution.plain_forms import encode_scheme
 
 ADDRESS = re.compile(r"0x[0-9a-fA-F]+")
