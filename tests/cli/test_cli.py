@@ -19,7 +19,7 @@ from dirax import gallery
 from dirax.cli import terminal
 from dirax.cli.commands import app
 from dirax.cli.schemes import scheme_from_text
-from dirax.cli.subject import changed
+from dirax.cli.subject import changed, from_file
 from dirax.gallery import peng_yoshimura, reproduction
 from dirax.gallery.listing import listing
 from dirax.solution import saving
@@ -434,3 +434,22 @@ def test_an_interruption_while_garbage_is_collected(capsys):
 def test_another_program_keeps_its_own_interruptions():
     code = "import signal, dirax; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "True"
+
+
+@pytest.mark.parametrize(
+    ("system", "initial", "scheme"),
+    [
+        ("dx.PortHamiltonian(lambda x: x @ x / 2, J=[[0.0, 1.0], [-1.0, 0.0]])", "dict(x=[1.0, 0.0])", "DiscreteGradient"),
+        ("dx.EulerPoincare(dx.SO3(), lambda xi: xi @ xi / 2)", "dict(x=system.state([0.1, 0.2, 1.0]))", "DiscreteEulerPoincare"),
+    ],
+)
+def test_a_file_without_a_scheme_has_the_first_that_suits_it(tmp_path, system, initial, scheme):
+    """It finds modules that lie beside it, too."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "beside_it.py").write_text("steps = 20\n", encoding="utf-8")
+    file = tmp_path / "folder" / "mine.py"
+    text = f"import dirax as dx\nfrom beside_it import steps\nsystem = {system}\ninitial = {initial}\n"
+    file.write_text(text, encoding="utf-8")
+    example = from_file(file)
+    assert type(example.scheme).__name__ == scheme and example.steps == 20
+    assert example.simulate().ok

@@ -44,3 +44,17 @@ def test_a_list_is_named_by_class_and_failures_have_a_row():
         found["minus"]
     with pytest.raises(ValueError, match="at least one scheme"):
         dx.compare(falling, {}, step=0.01, steps=100, q=[0.1], v=[-1.0])
+
+
+def test_what_cannot_be_compared_is_said():
+    system, start = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q), {"q": [[1.0], [2.0]], "v": [[0.0], [0.0]]}
+    schemes = {"midpoint": dx.LagrangeDAlembert()}
+    with pytest.raises(ValueError, match=r"one trajectory, but a batch of 2 was given"):
+        dx.compare(system, schemes, step=0.1, steps=8, **start)
+    one = {"q": [1.0], "v": [0.0]}
+    rows = dx.compare(system, schemes, step=0.1, steps=40, save_every=10, **one)["midpoint"]
+    assert rows.order == pytest.approx(2.0, abs=0.02) and rows.ended == "ok"
+    with pytest.raises(ValueError, match=r"rows where they meet: leave out save_every\."):
+        dx.convergence(system, dx.LagrangeDAlembert(), step_sizes=[0.1, 0.05, 0.025], time=1.0, save_every=2, **one)
+    with pytest.raises(ValueError, match=r"dx\.convergence compares steps that are given"):
+        dx.convergence(system, dx.LagrangeDAlembert(), step_sizes=[0.1, 0.05, 0.025], time=1.0, tolerance=1e-3, **one)

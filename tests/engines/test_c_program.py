@@ -106,3 +106,16 @@ def test_the_command_writes_a_file(tmp_path):
     assert "int main(" in path.read_text("utf-8")
     again = CliRunner().invoke(app, command)
     assert again.exit_code != 0 and "--overwrite" in again.output
+
+
+def test_events_and_other_engines_are_refused(tmp_path):
+    """The program printed rows without them, and ended well."""
+    ball, start = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0]), {"q": [1.0], "v": [0.0], "step": 0.1, "steps": 20}
+    for event in (dx.Impact(lambda q: q[0]), dx.Event(lambda q: q[0], terminal=True)):
+        with pytest.raises(ValueError, match="events and walls are not written as C"):
+            dx.export_c(tmp_path / "ball.c", ball, dx.LagrangeDAlembert(), events=[event], **start)
+    with pytest.raises(ValueError, match=r"engine must be \"native\", whose code is written, but 'xla' was given"):
+        dx.export_c(tmp_path / "ball.c", ball, dx.LagrangeDAlembert(), engine="xla", **start)
+    assert not list(tmp_path.iterdir())
+    dx.export_c(tmp_path / "ball.c", ball, dx.LagrangeDAlembert(), title="a */ b", engine="auto", **start)
+    assert "a * / b" in (tmp_path / "ball.c").read_text(encoding="utf-8")

@@ -28,7 +28,8 @@ Settings = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="print JSON instead of a table")]
 SCHEME_HELP = (
-    "plus, minus, midpoint, trapezoidal, method1, method2, gradient, or a class: \"Composition(LagrangeDAlembert(), 'suzuki4')\""
+    "plus, minus, midpoint, trapezoidal, method1, method2, gradient, poincare, "
+    "or a class: \"Composition(LagrangeDAlembert(), 'suzuki4')\""
 )
 
 

@@ -1,15 +1,21 @@
 """Schemes by what a user types: a short name, or a class of dirax with plain arguments. Nothing is evaluated."""
 
 import ast
+import contextlib
 import difflib
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
+
+import numpy as np
 
 import dirax
 from dirax.schemes.discrete_dirac import DiscreteDirac
 from dirax.schemes.discrete_gradient import DiscreteGradient
+from dirax.schemes.euler_poincare import DiscreteEulerPoincare
 from dirax.schemes.lagrange_dirac import LagrangeDAlembert, MinusLagrangeDirac, PlusLagrangeDirac
-from dirax.schemes.step import AbstractScheme
+from dirax.schemes.step import AbstractScheme, Shape, make_step_equation
+from dirax.systems.system import AbstractSystem
 from dirax.text.representation import shortened
 
 SHORT_NAMES: dict[str, AbstractScheme] = {
@@ -20,8 +26,12 @@ SHORT_NAMES: dict[str, AbstractScheme] = {
     "method1": DiscreteDirac(constraints="discretize"),
     "method2": DiscreteDirac(constraints="resolve"),
     "gradient": DiscreteGradient(),
+    "poincare": DiscreteEulerPoincare(),
 }
 """The general schemes, from the simplest on."""
+
+FIRST = "midpoint", "gradient", "method1", "poincare"
+"""Those of which a system takes the first one that suits it where none is named."""
 
 ROOMS = (
     "dirax.schemes.",
@@ -31,6 +41,17 @@ ROOMS = (
     "dirax.geometry.lie_groups",
     "dirax.geometry.cotangent",
 )
+
+
+def first_scheme(system: AbstractSystem, initial: Mapping[str, Any], params: Any) -> AbstractScheme:
+    """The scheme of a system for which none is named; the very first, which says what it takes, where none suits it."""
+    data: dict[str, Any] = {name: np.asarray(value, float) for name, value in initial.items()}
+    shape = Shape(*system.sizes(data, params))
+    for name in FIRST:
+        with contextlib.suppress(TypeError):
+            make_step_equation(SHORT_NAMES[name], system, shape)
+            return SHORT_NAMES[name]
+    return SHORT_NAMES[FIRST[0]]
 
 
 def scheme_from_text(text: str) -> AbstractScheme:

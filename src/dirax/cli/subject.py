@@ -6,6 +6,7 @@ import difflib
 import os
 import re
 import runpy
+import sys
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +16,6 @@ import numpy as np
 
 from dirax import gallery
 from dirax.gallery.example import Example
-from dirax.schemes.lagrange_dirac import LagrangeDAlembert
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
 from dirax.text.representation import shortened
@@ -57,7 +57,7 @@ def from_file(path: Path) -> Example:
         source=str(path),
         system=found["system"],
         initial=dict(found["initial"]),
-        scheme=found.get("scheme", LagrangeDAlembert()),
+        scheme=found["scheme"] if "scheme" in found else _first_scheme(found),
         step=found.get("step", 0.01),
         steps=found.get("steps", 1000),
         params=found.get("params"),
@@ -66,10 +66,19 @@ def from_file(path: Path) -> Example:
     )
 
 
+def _first_scheme(found: dict[str, Any]) -> AbstractScheme:
+    from dirax.cli.schemes import first_scheme  # with all schemes, where one is looked for
+
+    return first_scheme(found["system"], found["initial"], found.get("params"))
+
+
 def namespace(path: Path) -> dict[str, Any]:
-    """What a Python file defines. Raises `ValueError` where it fails, with the line, `FileNotFoundError` without a file."""
+    """What a Python file defines, which finds modules beside it. Raises `ValueError` where it fails, with the line,
+    `FileNotFoundError` without a file."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}: check the path.")
+    if (folder := str(path.resolve().parent)) not in sys.path:
+        sys.path.insert(0, folder)
     try:
         return runpy.run_path(str(path), run_name="dirax_file")
     except SyntaxError as error:

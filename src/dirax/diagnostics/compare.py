@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dirax.diagnostics.bench.subject import Skipped
-from dirax.diagnostics.convergence import convergence
+from dirax.diagnostics.convergence import convergence, refuse_tolerance
 from dirax.diagnostics.drift import judge
 from dirax.diagnostics.energy_lines import energy_less_work, energy_scale
 from dirax.diagnostics.explicit_solution import ExplicitSolution, explicit_solution
@@ -130,12 +130,15 @@ def compare(
     Raises what `dx.simulate` raises for bad data; a scheme that fails midway has that in its row.
     """
     refuse_traced("dx.compare", step, run)
+    refuse_tolerance("dx.compare", run)
     named = dict(schemes) if isinstance(schemes, Mapping) else _named(schemes)
     if not named:
         raise ValueError("schemes must name at least one scheme, but it is empty.")
     if not is_whole(repeats) or repeats < 1:
         raise ValueError(f"repeats must be a whole number ≥ 1, but {repeats!r:.80} was given.")
     sols = {name: simulate(system, scheme, step=step, steps=steps, **run) for name, scheme in named.items()}
+    if batches := [sol.batch for sol in sols.values() if sol.batch is not None]:
+        raise ValueError(f"dx.compare compares one trajectory, but a batch of {batches[0]} was given: give the data of one.")
     seconds = {name: [] for name in named}
     for _ in range(repeats):
         for name, scheme in named.items():
@@ -178,9 +181,9 @@ def _named(schemes: Sequence[AbstractScheme]) -> dict[str, AbstractScheme]:
 def _order(system, scheme, step, steps, reference, run) -> tuple[float | None, tuple[tuple[float, float], ...], str]:
     """(order, (steps, error) of every step size, note); None where it could not be measured, with the reason as note."""
     stretch = min(steps, ORDER_STEPS)
-    sizes = [step / 2**i for i in range(4)]
+    sizes, own = [step / 2**i for i in range(4)], {name: value for name, value in run.items() if name != "save_every"}
     try:
-        found = convergence(system, scheme, step_sizes=sizes, time=stretch * step, reference=reference, **run)
+        found = convergence(system, scheme, step_sizes=sizes, time=stretch * step, reference=reference, **own)
     except ValueError as reason:
         return None, (), str(reason)
     first = next(iter(found.slopes.values()))

@@ -139,6 +139,12 @@ class Convergence:
         return ax
 
 
+def refuse_tolerance(what: str, run: dict[str, Any]) -> None:
+    """Raise `ValueError` for a run whose step is to be found."""
+    if "tolerance" in run:
+        raise ValueError(f"{what} compares steps that are given: find one by dx.simulate(…, tolerance=…), and leave it out here.")
+
+
 def convergence(
     system: AbstractSystem,
     scheme: AbstractScheme,
@@ -167,6 +173,12 @@ def convergence(
     `ValueError` for step sizes that do not fit and for a run that fails.
     """
     refuse_traced("dx.convergence", step_sizes, time, run)
+    refuse_tolerance("dx.convergence", run)
+    if set(run) & {"save_every", "step", "steps"}:
+        raise ValueError(
+            "dx.convergence takes its steps from step_sizes= and time=, and rows where they meet: leave out "
+            f"{', '.join(name for name in ('step', 'steps', 'save_every') if name in run)}."
+        )
     h = _checked(step_sizes, time)
     if "q0" in run or "q1" in run:
         raise ValueError("the points q0= and q1= belong to one step size, and here there are several: give q= with v= or p=.")

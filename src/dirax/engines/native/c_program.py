@@ -155,7 +155,7 @@ def c_program(p: Problem, name: str, title: str) -> str:
         time = f"row == rows - 1 ? *(double *)ends[{clock}] : ((double *)fields[{clock}])[row]"
     columns = [*(["trajectory"] if p.batch else []), "t", *(f"{s.name}{k}" for s in saved for k in range(s.size))]
     return PROGRAM.format(
-        title=title,
+        title=title.replace("*/", "* /"),
         name=name,
         fma="-mfma " * fma,
         code=c_code(module),
