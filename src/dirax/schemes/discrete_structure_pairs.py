@@ -173,8 +173,8 @@ class LagrangianPairs(AbstractPairs):
 
     def _of_terms(self, rows: Data, params: Any) -> Float[Array, "2 numbers"]:
         """The same without constraints, by the sizes of the terms alone, which takes no matrix."""
-        t, (q0, q1, q2), p = rows["t"][0], rows["q"], rows["p"][1]
-        (before0, p1), (before1, p2) = self.slots(t, q0, q1, params), self.slots(t + self.step, q1, q2, params)
+        (t, here, _), (q0, q1, q2), p = rows["t"], rows["q"], rows["p"][1]
+        (before0, p1), (before1, p2) = self.slots(t, q0, q1, params), self.slots(here, q1, q2, params)
         jump = p1 + before1
         largest = jnp.max(jnp.abs(p1) + jnp.abs(p2) + jnp.abs(before0) + jnp.abs(before1))
         missed = jnp.stack([jnp.max(jnp.abs(jump)), jnp.max(jnp.abs(p - p1 + self.share * jump))])
@@ -182,8 +182,8 @@ class LagrangianPairs(AbstractPairs):
 
     def defects(self, rows: dict[str, Array], params: Any, sizes: Float[Array, " k"]) -> Float[Array, "2 numbers"]:
         """The same in roundings of numbers of these sizes, of which the coordinates of the three points are made."""
-        h, t, (q0, q1, q2), p = self.step, rows["t"][0], rows["q"], rows["p"][1]
-        n, here = q0.shape[0], t + h
+        h, (t, here, _), (q0, q1, q2), p = self.step, rows["t"], rows["q"], rows["p"][1]
+        n = q0.shape[0]
         multipliers = rows["multipliers"][1] if self._constrained else jnp.zeros(0)
         (before0, p1), (before1, p2) = self.slots(t, q0, q1, params), self.slots(here, q1, q2, params)
         matrix = self.matrix(here, q1, params)
@@ -192,7 +192,8 @@ class LagrangianPairs(AbstractPairs):
             constraint, force = self.constraint(first, *pair, params), (p1 + before1) / h
             force = force - self.outside(here, q1, force, params)
         else:
-            constraint, force = self._of_induced_structure(t, (q0, q1, q2), pair, (before0, p1, before1, p2), params)
+            legendre = before0, p1, before1, p2
+            constraint, force = self._of_induced_structure((t, here), (q0, q1, q2), pair, legendre, params)
             plain = self.system.holonomic is None and self.system.affine is None
             constraint = constraint if plain else self.constraint(first, *pair, params)
 
@@ -231,14 +232,14 @@ class LagrangianPairs(AbstractPairs):
 
     def _of_induced_structure(
         self,
-        t: Any,
+        times: tuple[Any, Any],
         q: tuple[Vector, Vector, Vector],
         pair: tuple[Vector, Vector],
         legendre: tuple[Vector, Vector, Vector, Vector],
         params: Any,
     ) -> tuple[Array, Array]:
         """(W q̂, (second order, β + p̂ outside Δ°)) of the three points, by the pointwise structures of [PY]."""
-        h, here, (q0, q1, q2) = self.step, t + self.step, q
+        h, (t, here), (q0, q1, q2) = self.step, times, q
         before0, p1, before1, p2 = legendre
         assert self.sign is not None
         forms = None

@@ -6,17 +6,47 @@ import numpy as np
 
 from dirax.program.operations import BOOLEAN, NUMPY
 
-EXACT = BOOLEAN | {"select", "neg", "abs", "sign", "max", "min", "floor", "ceil"}
+EXACT = BOOLEAN | {"select", "neg", "abs", "sign", "max", "min"}
 """The operations that do not round."""
+
+ALIKE = 64.0
+"""Numbers that differ by so many times what an operation is off are taken for the same where they are compared."""
 
 
 class Noise:
     """Arithmetic in which the result of every operation is off at random, by up to `size` of itself (Vignes 1978): what
-    happens to the numbers that come out is what rounding does to them, ε/2 in place of `size`."""
+    happens to the numbers that come out is what rounding does to them, ε/2 in place of `size`.
+
+    Where a function jumps, numbers that are nearly the place of it are taken to be there: t/h is a whole number at every row for
+    a control that is held for a step, and which one it holds is not asked of the noise. Whole numbers are added and multiplied as
+    they are, for they count and index."""
 
     def __init__(self, size: float, seed: int):
         self.size, self._draw = size, np.random.default_rng(seed)
         self.table = {name: function if name in EXACT else self._off(function) for name, function in NUMPY.items()}
+        self.table |= {
+            **{name: lambda x, y, name=name: self._unless_whole(NUMPY[name](x, y), x, y) for name in ("add", "sub", "mul")},
+            **{name: lambda x, name=name: NUMPY[name](self._whole(x)) for name in ("floor", "ceil", "trunc")},
+            "rem": lambda x, y: self.off(NUMPY["rem"](self._whole(x / y), 1.0) * y),
+            "eq": lambda x, y: (x == y) | self._alike(x, y),
+            "ne": lambda x, y: (x != y) & ~self._alike(x, y),
+            "lt": lambda x, y: (x < y) & ~self._alike(x, y),
+            "le": lambda x, y: (x <= y) | self._alike(x, y),
+        }
+
+    def _whole(self, x: np.ndarray) -> np.ndarray:
+        """The same, but whole numbers where they nearly are."""
+        whole = np.round(x)
+        return np.where(self._alike(x, whole), whole, x)
+
+    def _unless_whole(self, result: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """The result of two numbers, off but where these are whole."""
+        return np.where((x == np.round(x)) & (y == np.round(y)), result, self.off(result))
+
+    def _alike(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        if np.asarray(x).dtype == bool:
+            return np.equal(x, y)
+        return np.abs(x - y) <= ALIKE * self.size * np.maximum(np.abs(x), np.abs(y))
 
     def off(self, values: np.ndarray) -> np.ndarray:
         """Numbers as they would be if they had been rounded."""
