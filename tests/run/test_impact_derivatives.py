@@ -108,6 +108,56 @@ def test_a_ball_may_begin_at_rest(engine):
     np.testing.assert_allclose((t, slope), (np.sqrt(2.2 / g), -np.sqrt(2.2 / g) / (2 * g)), rtol=1e-12)
 
 
+class Verlet(dx.AbstractScheme):
+    """Of v²/2 − g q, with an h of its own: explicit."""
+
+    def step_equation(self, system, shape):
+        n = shape.n
+        force = lambda q, params: jax.grad(lambda q: system.lagrangian(q, jnp.zeros(n), params))(q)
+
+        def start(data, h, params):
+            return jnp.concatenate([data["q"], data["p"]]), jnp.zeros(0)
+
+        def advance(u, state, t, h, params):
+            q, p = jnp.split(state, 2)
+            middle = p + h / 2 * force(q, params)
+            after = q + h * middle
+            return jnp.concatenate([after, middle + h / 2 * force(after, params)])
+
+        return dx.StepEquation(
+            start=start,
+            residual=lambda u, state, t, h, params: jnp.zeros(0),
+            advance=advance,
+            unpack=lambda state, u, t, h, params: {"q": state[:n], "p": state[n:]},
+            fields={"q": dx.Field((n,)), "p": dx.Field((n,))},
+            state_layout=dx.Layout(q=(n,), p=(n,)),
+            unknowns=0,
+        )
+
+
+@pytest.mark.parametrize(
+    ("scheme", "step", "order"),
+    [
+        (dx.LagrangeDAlembert(), 0.25, 2),
+        (dx.LagrangeDAlembert(), 0.13, 2),
+        (Verlet(), 0.25, 2),
+        (dx.EnergyCollocation(3), 0.25, 1),
+    ],
+)
+def test_an_impact_on_a_row_has_the_derivatives_of_others(scheme, step, order):
+    """From 1 with g = 2 the first one is at t = √(2/g) = 1; a step of 0.25 ends there."""
+    ball = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - params * q[0])
+    wall, steps = dx.Impact(lambda q: q[0], restitution=0.9), round(1.5 / step)
+
+    def times(g):
+        given = {"q": jnp.ones(1), "v": jnp.zeros(1), "params": g}
+        return dx.simulate(ball, scheme, **given, step=step, steps=steps, events=[wall]).events.t[:1]
+
+    ways = [times, jax.jacfwd(times), jax.jacfwd(jax.jacrev(times))][: order + 1]
+    found = jax.jit(lambda g: [way(g) for way in ways])(2.0)
+    np.testing.assert_allclose(np.ravel(found), [1.0, -0.25, 0.1875][: order + 1], rtol=1e-11)
+
+
 def test_trajectories_that_end_under_jit():
     """Impacts accumulate; one begins behind the floor. What is before the end has its derivatives."""
     dead = dx.Impact(lambda q: q[1], restitution=0.3)

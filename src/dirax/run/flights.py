@@ -25,7 +25,7 @@ class Flights:
     """The flights of problems that differ in numbers alone from the one given here. `run` is the engine's for it."""
 
     def __init__(self, engine: Any, run: Any, system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tuple[int, ...]):
-        self.numbers, self.run = numbers, run
+        self.numbers, self.run, self.constrained = numbers, run, system.constraints.any
         stage, gaps, key = p.equation.stages[0][0], gaps_of(walls), (by_value(system), Same(p.equation))
         self.watched, self.collision = _steps.get(
             ("walls", *key, *walls),

@@ -16,9 +16,12 @@ from dirax.schemes.watched_step import NONE
 MOST = 4
 """Impacts a step, of all steps together: with more of them a trajectory ends."""
 
-SHORTEST = 1e-8, 1e-6, 1e-4, 1e-2, 1.0
-"""Parts of a step: what is shorter than the first is differentiated as if it were as long, since forces of constraints are lost
-in it, or as long as the next one that has a solution."""
+SHORTEST, SHORTEST_CONSTRAINED = 1e-14, 1e-8
+"""Parts of a step: what is shorter is differentiated as if it were as long, up to so much of the derivative. Forces of
+constraints are lost in a step like ε over its length."""
+
+LONGER = 1e-6, 1e-4, 1e-2, 1.0
+"""What is taken where that has no solution."""
 
 _recordings: Memo[StepEquation] = Memo(64)
 
@@ -84,10 +87,10 @@ def flown(flights: Flights, p: Problem) -> Flown:
         flight.refuse(str(error), NOT_FINITE)
     if flight.interrupted:
         raise KeyboardInterrupt
-    return _as_arrays(flight, p)
+    return _as_arrays(flight, p, SHORTEST_CONSTRAINED if flights.constrained else SHORTEST)
 
 
-def _as_arrays(flight: Flight, p: Problem) -> Flown:
+def _as_arrays(flight: Flight, p: Problem, shortest: float) -> Flown:
     stage, done = p.equation.stages[0][0], flight.done
     found = Flown(*(np.full(shape, np.nan) for shape in Flown.shapes(stage, p.steps)))
     found.states[:], found.number[:], found.known[:], found.row_known[:] = 0.0, 0.0, 0.0, 0.0
@@ -114,11 +117,11 @@ def _as_arrays(flight: Flight, p: Problem) -> Flown:
     for step, own in parts.items():
         for place, part in enumerate(own, start=int(first[step])):
             found.states[place, :-1], found.states[place, -1], found.number[place] = part.state, part.at, step
-            u, taken = _solved(flight, part)
+            u, taken = _solved(flight, part, shortest)
             found.marks[place] = (1.0, np.nan) if part.wall == NONE else (np.nan, taken)
             found.known[place] = (*u, part.wall, 0.0 if taken == part.length else taken - part.length)
         begins = own[0]
-        if step < done and begins.wall != NONE and abs(length[step] - begins.length) < SHORTEST[0] * begins.length:
+        if step < done and begins.wall != NONE and abs(length[step] - begins.length) < 1e-12 * begins.length:
             found.row_marks[step], found.row_known[step, -2:] = (np.nan, begins.length), (begins.wall, 0.0)
         if step == done:  # which does not end
             after, at = own[-1].after, own[-1].at + own[-1].length
@@ -134,11 +137,11 @@ def _as_arrays(flight: Flight, p: Problem) -> Flown:
     return found
 
 
-def _solved(flight: Flight, part: Part) -> tuple[np.ndarray, float]:
+def _solved(flight: Flight, part: Part, shortest: float) -> tuple[np.ndarray, float]:
     """The unknowns of a part that is long enough, and how long that is."""
-    if part.length >= SHORTEST[0]:
+    if part.length >= shortest:
         return part.unknowns, part.length
-    for length in SHORTEST:
+    for length in (shortest, *LONGER):
         out = flight.search.steps(part.state, part.unknowns, part.step + part.at, length)
         if int(out.completed[0]):
             return out.last_unknowns[0], length

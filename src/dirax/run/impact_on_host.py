@@ -154,7 +154,7 @@ class FlightsOnHost:
     def _of_entries(self, part: Any, mark: Any, known: Any, x: Any) -> Any:
         """A part of all entries (…), of which those without a mark are NaN, with derivatives of zero."""
         lead = mark.shape
-        found = on_host(part, [a.reshape(-1, *a.shape[len(lead) :]) for a in (mark, known, x)], self._key(part), MARK)
+        found = on_host(part, [a.reshape(mark.size, *a.shape[len(lead) :]) for a in (mark, known, x)], self._key(part), MARK)
         return jax.tree.map(lambda a: a.reshape(*lead, *a.shape[1:]), found)
 
     def _parts(self, marks: Any, known: Any, x: Any) -> tuple[Any, Any]:

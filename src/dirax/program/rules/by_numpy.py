@@ -17,6 +17,7 @@ from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import RULES, Interpreter, Nodes, Unavailable, Unsupported, UnsupportedPrimitive
 from dirax.program.linear_solves import equilibrated_inverse, pseudo_inverses
 from dirax.program.memo import Memo, Same
+from dirax.program.rules.linear_algebra import linear_equations, split_as
 from dirax.program.rules.reductions import factors_of_product, sum_of_products
 from dirax.program.scalar_program import ScalarProgram, numpy_rule
 from dirax.program.tracing import jacobian, of_one_result
@@ -128,6 +129,19 @@ def while_(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operan
             carry = [np.where(going.reshape(-1, *(1,) * (x.ndim - 1)), x, y) for x, y in zip(after, carry, strict=True)]
 
     return made.between(list(operands), [v.aval.shape for v in equation.outvars], loop)
+
+
+@numpy_rule("custom_linear_solve")
+def linear_solve(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> Any:
+    try:
+        return list(RULES["custom_linear_solve"](interpreter, equation, *operands))
+    except Unsupported:  # too many to be written out
+        found = linear_equations(interpreter, equation, operands)
+    if isinstance(found, Unavailable):
+        return [found] * len(equation.outvars)
+    matrix, right = found
+    (x,) = made.between([matrix, right], [right.shape], lambda operands: [solved(*operands)], "solve")
+    return split_as(equation, x)
 
 
 @numpy_rule("dirax_solve")

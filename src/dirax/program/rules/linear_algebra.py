@@ -1,11 +1,12 @@
 """Rules of small linear solves: elimination written out in scalars, rows exchanged by selects."""
 
+import math
 from typing import Any
 
 import numpy as np
 
 from dirax.program.graph import Graph
-from dirax.program.interpreter import Interpreter, Unavailable, Unsupported, rule
+from dirax.program.interpreter import RULES, Interpreter, Unavailable, Unsupported, rule
 
 SOLVE_LIMIT = 12
 """Largest matrix that a user's function may factor; one of constants may be as large as it likes, since nothing of its factors is
@@ -61,28 +62,44 @@ def over_batches(function, *arrays) -> Any:
 
 @rule("custom_linear_solve", lazy=True)
 def custom_linear_solve(interpreter: Interpreter, equation: Any, *operands):
-    """The matrix is read off from the linear map itself, column by column, so that how the user solved does not matter."""
+    found = linear_equations(interpreter, equation, operands)
+    if isinstance(found, Unavailable):
+        return [found] * len(equation.outvars)
+    matrix, right = found
+    return split_as(equation, solve_blocks(interpreter.graph, matrix, right[:, None])[:, 0])
+
+
+def linear_equations(interpreter: Interpreter, equation: Any, operands: Any) -> tuple[np.ndarray, np.ndarray] | Unavailable:
+    """The matrix (n, n), read off from the linear map itself, column by column, so that how the user solved does not matter, and
+    the right-hand side (n,)."""
     p, g = equation.params, interpreter.graph
     lengths = p["const_lengths"]
     for_matvec = operands[: lengths.matvec]
     sides = operands[sum(lengths) :]
     if lost := next((o for o in (*for_matvec, *sides) if isinstance(o, Unavailable)), None):
-        return [lost] * len(equation.outvars)
+        return lost
     shapes, sizes = [s.shape for s in sides], [s.size for s in sides]
     n = sum(sizes)
     if n > MOST_SIDE_BY_SIDE:
         raise Unsupported(f"solves {n} equations at once")
     columns = []
+    apart = Interpreter(g, {**interpreter.rules, "dot_general": RULES["dot_general"]})  # a product that is no graph joins all
     for k in range(n):
         unit = np.full(n, g.zero)
         unit[k] = g.one
         parts = [a.reshape(s) for a, s in zip(np.split(unit, np.cumsum(sizes)[:-1]), shapes, strict=True)]
-        image = interpreter.run(p["jaxprs"].matvec, *for_matvec, *parts)
+        image = apart.run(p["jaxprs"].matvec, *for_matvec, *parts)
         if lost := next((o for o in image if isinstance(o, Unavailable)), None):
-            return [lost] * len(equation.outvars)
+            return lost
         columns.append(np.concatenate([o.ravel() for o in image]))
-    x = solve_blocks(g, np.stack(columns, axis=1), np.concatenate([s.ravel() for s in sides])[:, None])[:, 0]
-    return [a.reshape(s) for a, s in zip(np.split(x, np.cumsum(sizes)[:-1]), shapes, strict=True)]
+    return np.stack(columns, axis=1), np.concatenate([s.ravel() for s in sides])
+
+
+def split_as(equation: Any, x: np.ndarray) -> list[np.ndarray]:
+    """The results of an equation from one array of all."""
+    shapes = [v.aval.shape for v in equation.outvars]
+    sizes = [math.prod(shape) for shape in shapes]
+    return [a.reshape(shape) for a, shape in zip(np.split(x, np.cumsum(sizes)[:-1]), shapes, strict=True)]
 
 
 @rule("dirax_solve")

@@ -7,7 +7,7 @@ import numpy as np
 
 from dirax.program.interpreter import Interpreter, Unsupported, rule
 
-CHOICES = 64
+CHOICES = 1024
 """Most places that an index which depends on the state may point to."""
 
 
