@@ -94,12 +94,31 @@ def test_the_picture_of_a_section(tmp_path):
         ([dx.Event(lambda q: q)], ValueError, r"one number, but it returned shape \(1,\)"),
         ([dx.Event(lambda x: x[0])], TypeError, r"asks for x, but a run .* knows t, q, p, v, params"),
         ([dx.Event(lambda q: np.log(q))], TypeError, r"events\[0\] could not be traced"),
-        ([dx.Event(lambda q: jax.numpy.log(q[0]))], ValueError, "must be finite along the run, but it is nan at t = 1."),
+        ([dx.Event(lambda q: jax.numpy.log(q[0] - 2.0))], ValueError, "must be a number, but it is none at the start"),
     ],
 )
 def test_bad_events_are_refused(events, error, text):
     with pytest.raises(error, match=text):
         dx.simulate(OSCILLATOR, dx.Collocation(2), events=events, **START)
+
+
+def test_where_a_function_is_no_number_what_is_known_is_kept():
+    """Of two free particles one leaves the domain of the function at t = 0.5: the whole batch was refused for it."""
+    free, start = dx.LagrangeDirac(lambda q, v: v @ v / 2), {"q": [[1.0], [1.0]], "v": [[-1.0], [1.0]], "step": 0.15, "steps": 10}
+    root = lambda q: jax.numpy.sqrt(q[0] - 0.5) - np.sqrt(0.1)
+    run = lambda *events: dx.simulate(free, dx.LagrangeDAlembert(), **start, events=[*events, dx.Event(lambda q: q[0] - 1.3)])
+    with pytest.warns(RuntimeWarning, match=r"events\[0\] is no number at t = 0\..* in trajectory 0: its events after that"):
+        both = run(dx.Event(root))
+    np.testing.assert_allclose(both.events.of(0).t, [0.4], rtol=1e-12)
+    np.testing.assert_allclose(both.events.of(1).t, [0.3], rtol=1e-12)
+    assert np.all(both.ok) and "events after that are not known" in both.message[0] and both.message[1] == ""
+    with pytest.warns(RuntimeWarning):
+        ended = run(dx.Event(lambda q: jax.numpy.sqrt(q[0] - 0.5) + 1.0, terminal=True))
+    assert list(ended.ok) == [False, True] and "ended where the function of events[0] is no number" in ended.message[0]
+    assert np.all(np.isfinite(ended.q[0, :4])) and np.all(np.isnan(ended.q[0, 4:])) and np.all(np.isfinite(ended.q[1]))
+    walls = run(dx.Impact(lambda q: jax.numpy.sqrt(q[0] - 0.5) + 1.0))
+    assert list(walls.ok) == [False, True] and "ended where the gap of events[0] is nan, at t = 0." in walls.message[0]
+    assert np.all(np.isfinite(walls.q[0, :4])) and np.all(np.isnan(walls.q[0, 4:])) and np.all(np.isfinite(walls.q[1]))
 
 
 def test_bad_arguments_of_an_event_are_refused():

@@ -115,7 +115,11 @@ class EventsOnHost:
         )  # fmt: skip
         dense, endings = Dense(sol), np.full(batch, np.inf)
         places, roots = [np.full((batch, most), np.nan) for _ in range(4)], np.full((batch, most, width), np.nan)
-        parts = [EventSearch(dense, event, i).places(0, int(dense.ends.max())) for i, event in enumerate(self.events)]
+        searches = [EventSearch(dense, event, i) for i, event in enumerate(self.events)]
+        parts = [search.places(0, int(dense.ends.max())) for search in searches]
+        for search in searches:
+            if search.event.terminal:
+                np.minimum(endings, search.last_known, out=endings)
         lanes, numbers, theta, direction = map(np.concatenate, zip(*parts, strict=True))
         which = np.repeat(np.arange(len(parts)), [len(part.lanes) for part in parts])
         t = dense.time_at(lanes, numbers, theta)

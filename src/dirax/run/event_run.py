@@ -1,6 +1,7 @@
 """A run with events: carried out in stretches of which every row is kept, and looked through."""
 
 import time
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,8 +32,8 @@ FIRST_STRETCH = 256
 def with_events(run: Any, events: tuple[Any, ...], steps: int, save_every: int, progress: Any, traced: bool) -> Solution:
     """The Solution of a run with its events; `run(steps)` is that of so many steps with every row, with its impacts.
 
-    Raises `ValueError` under JAX's transformations and for functions that are not finite, `TypeError` for those that return no
-    number.
+    Raises `ValueError` under JAX's transformations and for functions that are not finite at the start, `TypeError` for those that
+    return no number.
     """
     watch = any(event.terminal for event in events) and not any(isinstance(event, Impact) for event in events)
     sol = run(min(steps, FIRST_STRETCH) if watch and not traced else steps)
@@ -75,7 +76,9 @@ class Searched:
         self.events, self.sol, self.done, self.seconds = events, sol, 0, 0.0
         self.found: Events | None = None
         self.endings = np.full(sol.batch or 1, np.inf)
-        """When a terminal event ends each trajectory."""
+        """When a terminal event ends each trajectory, or nobody knows any more."""
+        self.undefined: dict[int, np.ndarray] = {}
+        """By number of an event, when its function is no number first in each trajectory."""
 
     @property
     def over(self) -> bool:
@@ -92,7 +95,10 @@ class Searched:
         if sol.rows > 1 and own:
             dense = Dense(sol)
             last = int(dense.ends.max())
-            parts += [EventSearch(dense, event, i).found(self.done, last) for i, event in own]
+            for i, event in own:
+                search = EventSearch(dense, event, i)
+                parts.append(search.found(self.done, last))
+                self._note(search)
             self.done = last
         if parts:
             self.found = joined(parts)
@@ -103,6 +109,44 @@ class Searched:
             self.found = self.found[self.found.t <= self.endings[self.found.lane]]
         self.seconds += time.perf_counter() - began
 
+    def _note(self, search: EventSearch) -> None:
+        """Take down when the function of an event is no number first. Raises `ValueError` where it is none at the start."""
+        number = search.number
+        known = self.undefined.setdefault(number, np.full(len(self.endings), np.inf))
+        np.minimum(known, search.undefined, out=known)
+        if np.any(first := known <= float(self.sol.axis[0])):
+            whose = f" of trajectory {int(np.argmax(first))}" if self.sol.batch is not None else ""
+            raise ValueError(f"the function of events[{number}] must be a number, but it is none at the start{whose}.")
+        if search.event.terminal:
+            np.minimum(self.endings, search.last_known, out=self.endings)
+
+    def _lost(self) -> np.ndarray:
+        """Which trajectories end because nobody knows whether a terminal event has ended them."""
+        lost = np.zeros(len(self.endings), bool)
+        for number, undefined in self.undefined.items():
+            if self.events[number].terminal:
+                lost |= np.isfinite(undefined) & (self.endings == np.nextafter(undefined, -np.inf))
+        return lost
+
+    def _said(self) -> list[str]:
+        """Why trajectories ended, and of which not all events are known, which is warned of."""
+        said, lost = [""] * len(self.endings), self._lost()
+        for lane in np.flatnonzero(np.isfinite(self.endings) & ~lost).tolist():
+            said[lane] = self._ending(lane)
+        unknown: list[str] = []
+        for number, undefined in self.undefined.items():
+            for lane in np.flatnonzero(np.isfinite(undefined) & ((undefined <= self.endings) | lost)).tolist():
+                what = f"the function of events[{number}] is no number at t = {undefined[lane]:.6g}"
+                said[lane] = said[lane] or (f"ended where {what}" if lost[lane] else f"{what}: events after that are not known")
+                unknown.append(what + (f" in trajectory {lane}" if self.sol.batch is not None else ""))
+        if unknown:
+            warnings.warn(
+                f"{unknown[0]}: its events after that are not known. Give a function that is one all along, by jnp.where.",
+                RuntimeWarning,
+                stacklevel=7,
+            )
+        return said
+
     def solution(self, save_every: int, steps: int) -> Solution:
         """The Solution of the run with the rows that are to be kept, and its events."""
         sol, ended = self.sol, np.isfinite(self.endings)
@@ -111,14 +155,12 @@ class Searched:
         kept.events = self.found
         if sol.impacts is not None:
             kept.impacts = sol.impacts[sol.impacts.t <= self.endings[sol.impacts.lane]]
-        if np.any(ended):
-            own = [self._ending(lane) if ended[lane] else "" for lane in range(len(ended))]
-            if sol.batch is None:
-                kept.message = own[0]
-            else:
-                kept.message = [one or other for one, other in zip(own, sol.message or [""] * len(own), strict=True)]
-                kept.ok = np.where(ended, True, sol.ok)
-            kept.ok = True if sol.batch is None else kept.ok
+        own, lost = self._said(), self._lost()
+        if np.any(ended) or any(own):
+            before = [sol.message] if sol.batch is None else sol.message or [""] * len(own)
+            messages = [one or other for one, other in zip(own, before, strict=True)]
+            ok = np.where(ended, ~lost, np.atleast_1d(sol.ok))
+            kept.message, kept.ok = (messages[0], bool(ok[0])) if sol.batch is None else (messages, ok)
         kept.example = sol.example
         if sol.continuation is not None:
             kept.continuation = LongerWithEvents(self, save_every, steps)

@@ -51,9 +51,16 @@ class EventSearch:
         self.dense, self.event, self.number = dense, event, number
         refuse_unknown(event, number, dense.nodes)
         self.points = places_for(dense.equation)
+        self.undefined = np.full(len(dense.ends), np.inf)
+        """When the function is no number first, of what was seen of each trajectory."""
+
+    @property
+    def last_known(self) -> np.ndarray:
+        """The last time at which it may be one; ∞ where it always is."""
+        return np.where(np.isfinite(self.undefined), np.nextafter(self.undefined, -np.inf), np.inf)
 
     def value(self, lanes: np.ndarray, base: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """The function at base + x, in steps. Raises `ValueError` where it is not finite."""
+        """The function at base + x, in steps; NaN where it is no number."""
         numbers, theta = self._place(lanes, base, x)
         return self._of(lanes, self.dense.inside(lanes, numbers, theta), self.dense.time_at(lanes, numbers, theta))
 
@@ -76,16 +83,10 @@ class EventSearch:
             fields = fields | {"v": dense.velocity(lanes, fields, t)}
         known = {name: fields[name] for name in event.arguments if name in fields} | {"t": t}
         one = lambda known, params: evaluated(event, number, known, params)
-        return self._finite(dense.entries(one, lanes, known, "event", event), t)
-
-    def _finite(self, values: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """The values. Raises `ValueError` where one is not finite."""
-        bad = ~np.isfinite(values)
-        if np.any(bad):
-            raise ValueError(
-                f"the function of events[{self.number}] must be finite along the run, but it is {values[bad][0]} at "
-                f"t = {t[bad][0]:.6g}."
-            )
+        values = dense.entries(one, lanes, known, "event", event)
+        if np.any(bad := ~np.isfinite(values)):
+            values = np.where(bad, np.nan, values)
+            np.minimum.at(self.undefined, lanes[bad], t[bad])
         return values
 
     def found(self, first: int, last: int) -> Events:
@@ -153,6 +154,7 @@ class EventSearch:
         x = bracketed_roots(lambda x, which: self.value(lanes[which], base[which], x), a, b, fa, fb)
         numbers, theta = self._place(lanes, base, x)
         order = np.lexsort((theta, numbers, lanes))
+        order = order[self.dense.time_at(lanes, numbers, theta)[order] < self.undefined[lanes[order]]]
         return Places(*(a[order] for a in (lanes, numbers, theta, direction[asked])))
 
     def events(self, places: Places) -> Events:

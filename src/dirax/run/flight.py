@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dirax.engines.contract import NOT_CONVERGED, OK, Problem
+from dirax.engines.contract import NOT_CONVERGED, NOT_FINITE, OK, Problem
 from dirax.engines.walk import AbstractWalk
 from dirax.run.impact import Numbers
-from dirax.run.impact_search import ImpactSearch
+from dirax.run.impact_search import ImpactSearch, NoNumber
 from dirax.schemes.collision_step import HELD, LEAVING
 from dirax.schemes.step import CLOCK, STEP_DENSITY
 from dirax.schemes.watched_step import NONE, PARTS
@@ -97,6 +97,8 @@ class Flight:
             self._go_on()
         except KeyboardInterrupt:
             self.interrupted, self.hits = True, [hit for hit in self.hits if hit[4] <= self.done]
+        except NoNumber as error:
+            self._end(str(error), NOT_FINITE)
         self.finish()
 
     def _go_on(self) -> None:
@@ -193,9 +195,9 @@ class Flight:
         self.message, self.status = message, status
         return False
 
-    def refuse(self, message: str, status: int = NOT_CONVERGED) -> None:
-        """End the trajectory where it is, for this reason."""
-        self._end(message, status)
+    def refuse(self, message: str) -> None:
+        """End the trajectory where it begins, for this reason."""
+        self._end(message)
         self.finish()
 
     # ------------------------------------------------------------------------------------------ where it is doubtful

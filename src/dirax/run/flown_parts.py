@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from dirax.engines.contract import NOT_FINITE, Problem
+from dirax.engines.contract import Problem
 from dirax.program.memo import Memo, Same
 from dirax.run.flight import Flight, Part
 from dirax.run.flights import Flights, behind
@@ -78,13 +78,10 @@ class Flown(NamedTuple):
 def flown(flights: Flights, p: Problem) -> Flown:
     """The trajectory of a problem whose equation is a `recording`."""
     flight = flights(p, most=MOST * p.steps)
-    try:
-        if refused := behind(flight):
-            flight.refuse(refused)
-        else:
-            flight.fly()
-    except ValueError as error:  # a gap that is no number
-        flight.refuse(str(error), NOT_FINITE)
+    if refused := behind(flight):
+        flight.refuse(refused)
+    else:
+        flight.fly()
     if flight.interrupted:
         raise KeyboardInterrupt
     return _as_arrays(flight, p, SHORTEST_CONSTRAINED if flights.constrained else SHORTEST)

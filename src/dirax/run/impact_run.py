@@ -71,6 +71,7 @@ def fly_all(settings: Any, begun: Any, walls: tuple[Impact, ...], numbers: tuple
         run_seconds=seconds,
         notes={
             **sample.notes,
+            **({"redundant_constraints": list(begun.redundant)} if begun.redundant else {}),
             "impacts": sum(len(flight.hits) for flight in flights),
             WALLS_WORK: any(wall.works for wall in walls),
         },
@@ -108,6 +109,8 @@ def check_walls(system: Any, p: Problem, walls: tuple[Impact, ...], numbers: tup
         if not hasattr(found, "shape") or found.shape != ():
             came = f"shape {found.shape}: index or sum its result" if hasattr(found, "shape") else type(found).__name__
             raise ValueError(f"the gap of events[{number}] must return one number, but it returned {came}.")
+        if not jnp.issubdtype(found.dtype, jnp.floating):
+            raise TypeError(f"the gap of events[{number}] must return a real number (float64), but its dtype is {found.dtype}.")
         traced = traced or seen
     return traced
 

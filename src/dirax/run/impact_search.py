@@ -19,6 +19,10 @@ SHORT, BEYOND = 0.25, 0.5
 """Parts of a step below the first may be too short to be solved; then a step is taken that is longer by the second."""
 
 
+class NoNumber(ValueError):
+    """A gap is no number."""
+
+
 @dataclass
 class ImpactSearch:
     """The steps of one trajectory, of any part of the length, and the gaps after them."""
@@ -65,7 +69,7 @@ class ImpactSearch:
 
     def next(self, state: np.ndarray, u: np.ndarray, at: float, rest: float) -> tuple[float, int] | None:
         """How long it is to the next impact within a rest of a step, and which wall is hit; None where none is. Raises
-        `ValueError` for a gap that is no number."""
+        `NoNumber` for a gap that is none."""
         whole = self.part(state, u, at, 1.0)[1]  # in a short rest a coordinate that is zero may be so all along
         end = whole if rest == 1.0 else self.part(state, u, at, rest)[1]
         small = ON_WALL * self.terms_at(state, whole, at)
@@ -82,7 +86,7 @@ class ImpactSearch:
             """The same outside of the rest, where it need not be a number."""
             try:
                 return gap(part)
-            except ValueError:
+            except NoNumber:
                 return np.full(len(self.numbers), np.nan)
 
         places = rest * np.arange(-1, PARTS + 2) / PARTS  # one before and one after it, for dips at its ends
@@ -97,12 +101,12 @@ class ImpactSearch:
         return self.terms.one(self.time(state, at), state[q], last[q])
 
     def gaps_at(self, state: np.ndarray, at: float) -> np.ndarray:
-        """Of every wall. Raises `ValueError` for one that is no number."""
+        """Of every wall. Raises `NoNumber` for one that is none."""
         t = self.time(state, at)
         found = self.gaps.one(t, state[self.layout.place("q")])
         for number, gap in zip(self.numbers, found, strict=True):
             if not np.isfinite(gap):
-                raise ValueError(f"the gap of events[{number}] must be finite along the run, but it is {gap} at t = {t:.6g}.")
+                raise NoNumber(f"ended where the gap of events[{number}] is {gap}, at t = {t:.6g}")
         return found
 
     def _hit(self, wall: int, gap: Any, places: np.ndarray, g: np.ndarray, behind: float) -> tuple[float, int] | None:
