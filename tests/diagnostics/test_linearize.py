@@ -265,3 +265,17 @@ def test_what_grows_like_t_is_not_called_stable():
     free, valley = lambda q, v: v @ v / 2, lambda q, v: v @ v / 2 - (q @ q - 1) ** 2
     assert "may grow like t" in word(free, [0.3]) and "may grow like t" in word(valley, [1.0, 0.0])
     assert ": stable," in word(lambda q, v: 1e-26 * v @ v / 2 - 1e3 * q @ q, [0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("at", "text"),
+    [
+        ({"q": np.zeros((1, 2)), "v": np.zeros((1, 2))}, r"at one place, but q has shape \(1, 2\)"),
+        ({"q": [0.0, np.nan], "v": [0.0, 0.0]}, r"q must be finite, but q\[1\] is nan"),
+        ({"q": [0.0, 0.0, 0.0], "v": [0.0, 0.0]}, "the same length n"),
+        ({"q": 0.0, "v": 0.0}, r"q must have shape \(n,\)"),
+    ],
+)
+def test_a_place_that_is_none_is_said(at, text):
+    with pytest.raises(ValueError, match=text):
+        dx.linearize(dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q), at)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import dirax as dx
 from dirax.geometry.discrete import (
     DiscretizationMapDirac,
     FiniteDifferenceDirac,
@@ -327,3 +328,24 @@ def test_the_slope_of_a_projected_covector(rank):
     differences = [(at(q + 1e-6 * e) - at(q - 1e-6 * e)) / 2e-6 for e in np.eye(4)]
     assert np.asarray(found) == pytest.approx(np.stack(differences, axis=1), abs=1e-8)
     assert rank == 0 or np.abs(found).max() > 0.1
+
+
+def test_points_are_lists_and_whole_numbers_too():
+    """As everywhere else: some of these ended in errors of JAX's."""
+    form, whole = lambda x: jnp.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([1, 2])
+    on_pairs = dx.FiniteDifferenceDirac(form, step=0.1)
+    assert on_pairs.contains([0, 0], [0.1, 0.2], [-2, 1])
+    np.testing.assert_allclose(on_pairs.membership_defect([0, 0], [0.1, 0.2], [-2, 1])[1], 0.0, atol=1e-14)
+    induced = dx.InducedFiniteDifferenceDirac(lambda q: jnp.array([[1.0, q[0]]]), step=0.1)
+    assert induced.at([0, 0]).contains(jnp.zeros(4), jnp.array([1.0, 0.0, 0.0, 0.0]))
+    by_map = dx.DiscretizationMapDirac(dx.DiracStructure.from_two_form(form), dx.Midpoint(), step=0.1)
+    np.testing.assert_allclose(by_map.membership_defect([0, 0], [0.1, 0.2], [-2, 1]), 0.0, atol=1e-14)
+    np.testing.assert_allclose(dx.plus_legendre(lambda a, b: (b - a) @ (b - a) / 2, whole, [3, 4])[1], [2.0, 2.0])
+    (_, p, beta, _) = dx.TulczyjewTriple().dirac_differential(lambda q, v: v @ v / 2 - q @ q, whole, whole)
+    np.testing.assert_allclose([p, beta], [[1.0, 2.0], [2.0, 4.0]])
+    family = dx.LagrangianSubmanifold.from_morse_family(lambda x, s: s[0] * x[0], 1)
+    np.testing.assert_allclose(family.covector(whole, [3]), [3.0, 0.0])
+    with pytest.raises(ValueError, match=r"s must have shape \(1,\), the parameters of the family, but its shape is \(3,\)"):
+        family.covector(whole, [1.0, 2.0, 3.0])
+    with pytest.raises(ValueError, match=r"x and v must have one shape \(N,\).* \(2,\) and \(3,\)"):
+        dx.check_discretization_map(dx.Midpoint(), whole, [1.0, 2.0, 3.0])

@@ -58,3 +58,24 @@ def test_products_of_constants_have_the_bits_of_their_sums(monkeypatch):
         monkeypatch.setattr(reductions, "LARGE", large)
         found.append(ScalarProgram.of(closed).in_numpy([np.linspace(0.1, 1.0, 12)[None]])[0])
     assert found[0].tobytes() == found[1].tobytes() and np.all(np.isfinite(found[0]))
+
+
+@pytest.mark.parametrize(
+    ("potential", "real"),
+    [
+        (lambda q: jnp.imag(jnp.exp(1j * q[0])), lambda q: jnp.sin(q[0])),
+        (lambda q: jnp.real((q[0] + 1j * q[1]) ** 3) / 10, lambda q: (q[0] ** 3 - 3 * q[0] * q[1] ** 2) / 10),
+        (lambda q: jnp.abs(q[0] + 1j * q[1] + 0.5) ** 2 / 2, lambda q: ((q[0] + 0.5) ** 2 + q[1] ** 2) / 2),
+    ],
+)
+def test_complex_numbers_on_the_way(potential, real):
+    """i times what no node holds was taken for i: the first of these was a constant potential on the native engine."""
+
+    def run(potential):
+        system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q - potential(q))
+        return dx.simulate(system, dx.LagrangeDAlembert(), q=[0.3, 0.4], v=[0.2, -0.1], step=0.05, steps=60)
+
+    with jax.numpy_dtype_promotion("standard"):
+        sol = run(potential)
+        np.testing.assert_allclose(sol.q, run(real).q, rtol=0, atol=1e-13)
+        assert dx.verify(sol).ok

@@ -12,6 +12,7 @@ from dirax.diagnostics.linearized_step import linearized_step
 from dirax.numerics.tolerances import TINY
 from dirax.program.captured import functions_in, refuse_changed
 from dirax.program.user_functions import refuse_traced
+from dirax.run.validate import validated_case
 from dirax.schemes.step import AbstractScheme
 from dirax.systems.system import AbstractSystem
 from dirax.text.tables import text_table
@@ -174,6 +175,7 @@ def linearize(
         given = f"{', '.join(map(str, at)) or 'nothing'} was given" if isinstance(at, Mapping) else f"{at!r:.80} was given"
         place = ", ".join(f'"{name}": …' for name in wanted)
         raise ValueError(f"the place at which a {type(system).__name__} is linearized is {{{place}}}, but {given}.")
+    at, params = _one_place(system, at, params)
     if system.lagrangian_form() is None:
         if scheme is not None or generators:
             raise TypeError(
@@ -185,6 +187,16 @@ def linearize(
         return _reduced(found, None)
     _reduced(found, None)  # the premises are those of the system
     return _reduced(linearized_step(system, scheme, step, at, found, params), step)
+
+
+def _one_place(system: AbstractSystem, at: Mapping[str, Any], params: Any) -> tuple[dict[str, Any], Any]:
+    """The place and the params as arrays. Raises `ValueError` for several places, and for numbers that are none of the system."""
+    case = validated_case({name: a for name, a in at.items() if name != "t"}, params, False, 1.0, at.get("t", 0.0))
+    if case.batch is not None:
+        shapes = ", ".join(f"{name} has shape {np.shape(a)}" for name, a in case.data.items())
+        raise ValueError(f"a system is linearized at one place, but {shapes}: give that of one.")
+    system.sizes(*case.first)
+    return {**case.data, **({"t": at["t"]} if "t" in at else {})}, case.params
 
 
 def _reduced(found: FieldAt, step: float | None) -> Linearization:

@@ -9,6 +9,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dirax.geometry.finite_difference import FiniteDifferenceDirac, InducedFiniteDifferenceDirac
@@ -69,7 +70,7 @@ class DiscretizationMapDirac(eqx.Module):
         """F(x) v + E(x) α, D = {F v + E α = 0} in the smooth kernel form: zero iff ((x0, x1), α) ∈ D_d."""
         x, v = self.velocity(x0, x1)
         F, E = self.structure.kernel(x, params)
-        return F @ v + E @ covector
+        return F @ v + E @ jnp.asarray(covector, dtype=float)
 
     def contains(
         self, x0: Vector, x1: Vector, covector: Covector, params: Any = None, tolerance: float = STRUCTURE_DEFECT

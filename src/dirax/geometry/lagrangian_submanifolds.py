@@ -56,12 +56,20 @@ class LagrangianSubmanifold(eqx.Module):
         return cls(family, parameters)
 
     def covector(self, x: Float[Array, " N"], s: Float[Array, " k"], params: Any = None) -> Float[Array, " N"]:
-        """∂F/∂x(x, s)."""
+        """∂F/∂x(x, s). Raises `ValueError` for another number of parameters s than the family has, as the others do."""
+        x, s = self._point(x, s)
         return gradient(lambda x: self.family(x, s, params))(x)
 
     def defect(self, x: Float[Array, " N"], s: Float[Array, " k"], params: Any = None) -> Float[Array, " k"]:
         """∂F/∂s(x, s): (x, ∂F/∂x) is in 𝓛 where it vanishes."""
+        x, s = self._point(x, s)
         return gradient(lambda s: self.family(x, s, params))(s)
+
+    def _point(self, x: Any, s: Any) -> tuple[Array, Array]:
+        x, s = jnp.asarray(x, float), jnp.asarray(s, float)
+        if s.shape != (self.parameters,):
+            raise ValueError(f"s must have shape ({self.parameters},), the parameters of the family, but its shape is {s.shape}.")
+        return x, s
 
     def morse_rank(self, x: Float[Array, " N"], s: Float[Array, " k"], params: Any = None) -> int:
         """The rank of [∂²F/∂s∂x, ∂²F/∂s∂s] at a concrete point, k for a Morse family."""

@@ -33,8 +33,13 @@ class DiscretizationMapReport(eqx.Module):
 
 
 def check_discretization_map(map: AbstractDiscretizationMap, x: ArrayLike, v: ArrayLike) -> DiscretizationMapReport:
-    """How far (D1), (D2) and invertibility ([BLM] Definition 4.5, Proposition 4.6) fail at the tangent vector v at x."""
+    """How far (D1), (D2) and invertibility ([BLM] Definition 4.5, Proposition 4.6) fail at the tangent vector v at x. Raises
+    `ValueError` for a point and a vector of different shapes."""
     x, v = jnp.asarray(x, dtype=float), jnp.asarray(v, dtype=float)
+    if x.ndim != 1 or x.shape != v.shape:
+        raise ValueError(
+            f"x and v must have one shape (N,), a point and a tangent vector at it, but have {x.shape} and {v.shape}."
+        )
     return jax.tree.map(jnp.asarray, evaluated(once(_report, map, True), x, v))
 
 

@@ -130,7 +130,8 @@ class Interpreter:
             values.append(np.array(numbers, dtype=float).reshape(nodes.shape).astype(atom.aval.dtype))
         with jax.ensure_compile_time_eval():
             found = equation.primitive.bind(*values, **equation.params)
-        return [self._of_known(value, equation) for value in (found if equation.primitive.multiple_results else [found])]
+        results = found if equation.primitive.multiple_results else [found]
+        return [self._of_known(value, equation) for value in results]
 
     def _of_known(self, value: Any, equation: Any) -> Nodes | Unavailable:
         """The nodes of a concrete array, which is held where it is of whole numbers that they do not hold."""
@@ -151,7 +152,7 @@ class Interpreter:
         self._equations.append(equation)
         try:
             if lost is not None and name not in LAZY:
-                return self._known(equation, operands) or [lost] * len(equation.outvars)
+                return self._known(equation, operands) or [Unavailable(lost.error)] * len(equation.outvars)
             if name not in self.rules:
                 raise Unsupported("is not supported")
             check_dtypes(equation)

@@ -208,7 +208,13 @@ class Trajectory:
         return self._per_row("constraint_residual", "constraint_at")
 
     def momentum_map(self, generator: Callable):
-        """⟨p, ξ_Q(q)⟩ along the trajectory, (…, rows), for the infinitesimal generator `generator(q) -> (n,)`."""
+        """⟨p, ξ_Q(q)⟩ along the trajectory, (…, rows), for the infinitesimal generator `generator(q) -> (n,)`. Raises `TypeError`
+        for what is no function, `ValueError` for one that returns another shape."""
+        if not callable(generator):
+            raise TypeError(f"generator must be a function q ↦ ξ(q), an array (n,), but {generator!r:.80} was given.")
+        q = jax.ShapeDtypeStruct(self.field_info["q"].shape, jnp.float64)
+        if (came := jax.eval_shape(lambda q: jnp.asarray(generator(q)), q).shape) != q.shape:
+            raise ValueError(f"generator must return an array of shape {q.shape}, as q has, but it returned shape {came}.")
         momentum = Momentum(Same(as_stated(generator).function))
         values = self._without_compiling(momentum, momentum)
         return self.map_rows(momentum) if values is None else values

@@ -108,13 +108,13 @@ def _decomposed(made: ScalarProgram, equation: Any, matrix: Nodes, decompose: Ca
 
 
 @numpy_rule("while")
-def while_(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[Nodes]:
+def while_(made: ScalarProgram, interpreter: Interpreter, equation: Any, *operands: Nodes) -> Any:
     try:
         return list(RULES["while"](interpreter, equation, *operands))
     except Unsupported:
         pass
     if lost := next((o for o in operands if isinstance(o, Unavailable)), None):
-        return [lost] * len(equation.outvars)
+        return [Unavailable(lost.error)] * len(equation.outvars)
     p = equation.params
     condition, body = (ScalarProgram.of(p[name], by_numpy=True).in_numpy for name in ("cond_jaxpr", "body_jaxpr"))
     a, b = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]

@@ -29,7 +29,7 @@ def stopped(interpreter: Interpreter, equation: Any, *operands: Nodes) -> list[N
 
 def by_its_rule(interpreter: Interpreter, equation: Any, *operands: Any) -> list[Any]:
     if lost := next((x for x in operands if isinstance(x, Unavailable)), None):
-        return [lost] * len(equation.outvars)
+        return [Unavailable(lost.error)] * len(equation.outvars)
     make, plain = interpreter.graph.make, Interpreter(interpreter.graph)
     values = plain.run(closed(inner_jaxpr(equation)), *operands)
     of = lambda op, arrays: [elementwise(functools.partial(make, op), x) for x in arrays]
@@ -40,7 +40,7 @@ def by_its_rule(interpreter: Interpreter, equation: Any, *operands: Any) -> list
 
 def _ruled(make: Callable[..., int], value: Any, along: Any) -> Any:
     lost = next((x for x in (value, along) if isinstance(x, Unavailable)), None)
-    return lost or elementwise(functools.partial(make, "ruled"), value, along)
+    return Unavailable(lost.error) if lost else elementwise(functools.partial(make, "ruled"), value, along)
 
 
 def is_float(variable: Any) -> bool:

@@ -77,7 +77,7 @@ def linear_equations(interpreter: Interpreter, equation: Any, operands: Any) -> 
     for_matvec = operands[: lengths.matvec]
     sides = operands[sum(lengths) :]
     if lost := next((o for o in (*for_matvec, *sides) if isinstance(o, Unavailable)), None):
-        return lost
+        return Unavailable(lost.error)
     shapes, sizes = [s.shape for s in sides], [s.size for s in sides]
     n = sum(sizes)
     if n > MOST_SIDE_BY_SIDE:
@@ -90,7 +90,7 @@ def linear_equations(interpreter: Interpreter, equation: Any, operands: Any) -> 
         parts = [a.reshape(s) for a, s in zip(np.split(unit, np.cumsum(sizes)[:-1]), shapes, strict=True)]
         image = apart.run(p["jaxprs"].matvec, *for_matvec, *parts)
         if lost := next((o for o in image if isinstance(o, Unavailable)), None):
-            return lost
+            return Unavailable(lost.error)
         columns.append(np.concatenate([o.ravel() for o in image]))
     return np.stack(columns, axis=1), np.concatenate([s.ravel() for s in sides])
 
