@@ -45,3 +45,14 @@ def test_noise_finds_what_cancels_inside():
     off = np.abs(np.asarray(found)[:, 0] - 1e-8) / DISTURBANCE
     assert 0.95 < np.max(off) <= 1.01
     assert abs(np.mean(off) - 0.5) < 0.03
+
+
+def test_a_decomposition_in_the_potential_is_no_violation():
+    """The midpoint rule of a smooth Lagrangian; its operations cannot be disturbed one by one."""
+
+    def run(potential):
+        system = dx.LagrangeDirac(lambda q, v: v @ v / 2 + 0.1 * v[0] * v[1] - potential(q))
+        return dx.simulate(system, dx.LagrangeDAlembert(), q=[0.3, 0.4], v=[0.2, -0.1], step=0.05, steps=60)
+
+    sol = run(lambda q: jnp.sum(jnp.abs(jnp.fft.fft(jnp.stack([q[0], q[1], 1.0, 2.0]))) ** 2) / 10)
+    assert dx.verify(sol)["symplecticity of one step"].verdict == "ok"

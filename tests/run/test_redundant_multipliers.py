@@ -56,3 +56,11 @@ def test_a_block_on_four_feet_is_refused_and_on_three_it_runs():
         with pytest.raises(ValueError, match=r"rank 3 of 4.*support a body at three points"):
             block(given)
     assert block(feet[:3]).ok
+
+
+def test_they_are_reported_beside_walls_too():
+    twice = lambda q: jnp.stack([q[1], 2.0 * q[1]])
+    system = dx.LagrangeDirac(lambda q, v: v @ v / 2, holonomic=twice)
+    start = {"q": [1.0, 0.0], "v": [-1.0, 0.0], "step": 0.1, "steps": 20}
+    sol = dx.simulate(system, dx.LagrangeDAlembert(), events=[dx.Impact(lambda q: q[0])], **start)
+    assert sol.stats["redundant_constraints"] == [1] and len(sol.events) == 1

@@ -46,6 +46,14 @@ def test_momentum_map(spring):
     np.testing.assert_allclose(by_hand, by_hand[:, :1] * np.ones((1, 13)), atol=1e-14)
 
 
+def test_what_is_no_generator_is_said(spring):
+    with pytest.raises(TypeError, match="generator must be a function"):
+        spring.momentum_map(None)
+    for wrong, shape in ((lambda q: jnp.ones(3), r"\(3,\)"), (lambda q: q[0], r"\(\)")):
+        with pytest.raises(ValueError, match=rf"shape \(2,\), as q has, but it returned shape {shape}"):
+            spring.momentum_map(wrong)
+
+
 @pytest.mark.parametrize("most", [0, 1000])
 def test_momenta_and_energies_with_and_without_a_compilation(most, spring, monkeypatch):
     """Of short trajectories they are ready at once, of long ones XLA compiles them: the same numbers."""
