@@ -8,7 +8,9 @@ start.py                  complete initial data, the first state; refused_start.
 redundancy.py             constraints that follow from others; final_manifold.py the hidden ones of a singular Lagrangian
 event.py, impact.py       what a user states; event_run.py the run with both
 event_search.py …         zeros in steps: event_scan.py which steps, dips.py where; event_traced.py, event_on_host.py under JAX
-impact_run.py …           bounces: flight.py one trajectory, impact_search.py the next wall, impact_on_host.py under JAX
+impact_run.py …           bounces: flight.py one trajectory, made by flights.py, impact_search.py the next wall
+impact_on_host.py …       the same under JAX: flown_parts.py what the host finds, step_parts.py what is differentiated;
+                          impact_traced.py where the host cannot
 streaming.py              rows that go to the disk while the run goes on
 result.py                 rows, times and messages; failure_messages.py why a trajectory ended (its rows: engines/contract.py)
 export_c.py               a run as a C file

@@ -14,12 +14,14 @@ import jax.numpy as jnp
 
 from dirax.engines.contract import NOT_CONVERGED, OK, Outcome, Problem
 from dirax.engines.in_jax import in_scalars
+from dirax.engines.parameters import parameters
 from dirax.engines.xla.lane import passing
 from dirax.engines.xla.newton import as_function
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.run.impact import Impact, gaps_of, jump
 from dirax.run.impact_on_host import FlightsOnHost
 from dirax.run.result import solution_of
+from dirax.run.step_parts import StepParts
 from dirax.schemes.step import CLOCK, StepEquation
 from dirax.schemes.watched_step import ON_WALL, PARTS, gap_terms
 from dirax.solution.events import Events
@@ -238,7 +240,7 @@ def flown(
     that can be."""
     p = begun.problem
     lead = lambda a: jnp.asarray(a) if p.batch is not None else jnp.asarray(a)[None]
-    if on_host and (found := _flown_on_host(FlightsOnHost(system, p, walls, numbers), lead)):
+    if on_host and (found := _flown_on_host(system, p, walls, numbers, lead)):
         return p, found[0], (begun.row0, found[1])
     flight = TracedFlight(walls, numbers, system, p)
     of_params = lead if p.batch_params and p.batch is not None else lambda a: jnp.broadcast_to(a, (p.batch or 1, *jnp.shape(a)))
@@ -268,15 +270,16 @@ def flown(
     return p, outcome, (begun.row0, impacts)
 
 
-def _flown_on_host(flights: FlightsOnHost, lead: Any) -> tuple[Outcome, tuple] | None:
+def _flown_on_host(system: Any, p: Problem, walls: tuple, numbers: tuple, lead: Any) -> tuple[Outcome, tuple] | None:
     """Outcome and impacts by the host; None where JAX has to find them."""
-    p = flights.problem
     try:
-        c = flights.leaves.flatten(p.params, p.batch if p.batch_params else None, jnp)
+        leaves = parameters(p.params, p.batch_params)
     except UnsupportedPrimitive:
         return None
+    c = leaves.flatten(p.params, p.batch if p.batch_params else None, jnp)
     c = c if c.ndim == 2 else jnp.broadcast_to(c, (p.batch or 1, c.shape[0]))
-    found = flights(lead(p.state), lead(p.guess[0]), c, p.t0, p.h)
+    known = p.with_numbers(state=None, guess=None, params=None, h=None, t0=None)
+    found = FlightsOnHost(StepParts(system, known, walls, leaves), numbers)(lead(p.state), lead(p.guess[0]), c, p.t0, p.h)
     if found is None:
         return None
     outcome, (t, number, known) = found
