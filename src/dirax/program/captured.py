@@ -127,6 +127,8 @@ class Captured:
             self.watched.append(Watched(f"the length of {words}", lambda: len(value), len(value)))
             for i in range(min(len(value), MOST)):
                 self._watch(f"{words}[{i}]", functools.partial(_item, value, i), names, depth)
+        elif isinstance(value, set | frozenset):
+            self.watched.append(Watched(words, lambda: frozenset(value), frozenset(value)))
         elif isinstance(value, SPACES):
             self._follow(vars(value), words, names, depth)
         else:
