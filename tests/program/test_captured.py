@@ -138,7 +138,7 @@ WAYS = {
     "item": _object(Table, lambda o: o["k"]),
     "longer": _object(lambda: [1.0], sum, lambda o: o.append(3.0)),
     "more keys": _object(lambda: {"a": 1.0}, lambda o: sum(o.values()), lambda o: o.update(b=3.0)),
-    "set": _object(lambda: {1.0}, sum, lambda o: o.add(3.0)),
+    "set": _object(lambda: {1.0}, sum, lambda o: (o.clear(), o.add(4.0))),
     "deque": _object(lambda: collections.deque([1.0]), lambda o: o[0], lambda o: o.append(o.popleft() + 3.0)),
     "series": _object(lambda: pd.Series({"k": 1.0}), lambda o: float(o["k"]), lambda o: o.__setitem__("k", 4.0)),
     "large": _object(lambda: np.ones(200_000), lambda o: o[1000], lambda o: o.__setitem__(1000, 4.0)),
