@@ -5,10 +5,8 @@ or an entry of an array would be seen by no later run, so that runs ask whether 
 """
 
 import argparse
-import contextlib
 import functools
-import pickle
-import sys
+import itertools
 import types
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -20,27 +18,30 @@ import numpy as np
 from jax.core import Tracer
 
 from dirax.program.code_reads import reads
+from dirax.program.outside_values import (
+    ABSENT,
+    LIBRARIES,
+    NOT_OF_VALUES,
+    attribute,
+    contents,
+    inner,
+    is_installed,
+    is_of_library,
+    item,
+    read_by,
+    root_of,
+    with_methods,
+    written,
+)
 
 DEEPEST, MOST = 6, 400
 """How far values are followed, and how many are watched."""
 
 COPIED, LARGEST = 2**20, 2**28
-"""Bytes of an array up to which its entries are compared, and up to which a digest of them, a second for a thousand million; and
-of other objects that are compared by what they are written as, the first."""
-
-LIBRARIES = {"jax", "jaxlib", "numpy", "scipy", "equinox", "jaxtyping", "optax", *sys.stdlib_module_names} - {"__main__"}
-"""Packages whose functions and modules are taken not to change."""
+"""Bytes of an array up to which its entries are compared, and up to which a digest of them, a second for a thousand million."""
 
 SPACES = types.SimpleNamespace, argparse.Namespace
 """Objects that are but their attributes."""
-
-NOT_TO_READ = {*("__init__", "__new__", "__del__", "__repr__", "__str__", "__hash__", "__eq__", "__setitem__", "__setattr__")}
-"""Methods of objects that are not called where one reads them."""
-
-NOT_OF_VALUES = {"dirax", "jax", "jaxlib", "equinox"}
-"""Packages whose objects are not asked for what they are written as."""
-
-ABSENT = object()
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 
@@ -114,19 +115,20 @@ class Captured:
             self._follow(value.__self__, words or "self", names | reads(own).others if own else names, depth + 1)
         elif isinstance(value, types.FunctionType):
             self._follow_function(value, depth)
-        elif (inner := _inner(value)) is not value:
-            self._follow(inner, words, names, depth)
+        elif (function := inner(value)) is not value:
+            self._follow(function, words, names, depth)
         elif isinstance(value, Mapping):
-            self.watched.append(Watched(f"the keys of {words}", lambda: [*value][:MOST], [*value][:MOST]))
-            for key in [*value][:MOST]:
-                self._watch(f"{words}[{key!r}]", functools.partial(_item, value, key), names, depth)
+            keys = lambda: [*itertools.islice(value, MOST)]
+            self.watched.append(Watched(f"the keys of {words}", keys, keys()))
+            for key in keys():
+                self._watch(f"{words}[{key!r}]", functools.partial(item, value, key), names, depth)
         elif isinstance(value, tuple):
             for i, part in enumerate(value[:MOST]):
                 self._follow(part, f"{words}[{i}]", names, depth + 1)
         elif isinstance(value, list):
             self.watched.append(Watched(f"the length of {words}", lambda: len(value), len(value)))
             for i in range(min(len(value), MOST)):
-                self._watch(f"{words}[{i}]", functools.partial(_item, value, i), names, depth)
+                self._watch(f"{words}[{i}]", functools.partial(item, value, i), names, depth)
         elif isinstance(value, set | frozenset):
             self.watched.append(Watched(words, lambda: frozenset(value), frozenset(value)))
         elif isinstance(value, SPACES):
@@ -137,20 +139,20 @@ class Captured:
     def _follow_object(self, value: Any, words: str, names: frozenset[str], depth: int) -> None:
         """By the attributes that code reads, of one of a library's or without any by what it is written as."""
         is_object, count = not isinstance(value, type | types.ModuleType), len(self.watched)
-        if not _is_of_library(value):
-            if is_object and _is_installed(type(value)):
+        if not is_of_library(value):
+            if is_object and is_installed(type(value)):
                 names = names & getattr(value, "__dict__", {}).keys()
             else:
-                names = _with_methods(value, names | _to_read(value) if is_object else names)
-            frozen = isinstance(value, eqx.Module) or (is_object and _root(value) == "dirax")
+                names = with_methods(value, names | read_by(value) if is_object else names)
+            frozen = isinstance(value, eqx.Module) or (is_object and root_of(value) == "dirax")
             for name in sorted(value.__dict__.keys() if isinstance(value, eqx.Module) else names):
-                whole, read = f"{words}.{name}" if words else name, functools.partial(_attribute, value, name)
-                if frozen:  # what it holds may be changed, and is held for good
-                    self._follow(read(), whole, names, depth + 1)
-                else:
+                whole, read = f"{words}.{name}" if words else name, functools.partial(attribute, value, name)
+                if frozen and (held := read()) is not ABSENT:  # it may be changed, and is held for good
+                    self._follow(held, whole, names, depth + 1)
+                elif not frozen:
                     self._watch(whole, read, names, depth)
-        if is_object and len(self.watched) == count and not callable(value) and _root(value) not in NOT_OF_VALUES:
-            self._by_contents(words, lambda: _written(value))
+        if is_object and len(self.watched) == count and not callable(value) and root_of(value) not in NOT_OF_VALUES:
+            self._by_contents(words, lambda: written(value))
 
     def _follow_function(self, function: types.FunctionType, depth: int) -> None:
         if _package(function) in LIBRARIES:
@@ -161,11 +163,17 @@ class Captured:
         for name, read in _outside(function):
             self._watch(name, read, names, depth)
 
-    def _by_contents(self, words: str, written: Callable[[], Any]) -> None:
+    def _by_contents(self, words: str, to_bytes: Callable[[], Any]) -> None:
         """Watch a digest of bytes, where they can be had."""
-        read = lambda: Contents(zlib.crc32(written()))
-        with contextlib.suppress(Exception):  # locks, files, what is too large
-            self.watched.append(Watched(words, read, read()))
+
+        def read() -> Contents | None:
+            try:
+                return Contents(zlib.crc32(to_bytes()))
+            except Exception:  # locks, files, what is too large
+                return None
+
+        if (before := read()) is not None:
+            self.watched.append(Watched(words, read, before))
 
 
 def _package(function: types.FunctionType) -> str:
@@ -183,7 +191,7 @@ def _outside(function: types.FunctionType) -> Iterator[tuple[str, Callable[[], A
     if _package(function) != "dirax":
         for name in sorted(found.globals - records):
             if name in function.__globals__:
-                yield name, functools.partial(_item, function.__globals__, name)
+                yield name, functools.partial(item, function.__globals__, name)
 
 
 def _attributes(function: types.FunctionType, seen: set[int]) -> frozenset[str]:
@@ -191,7 +199,7 @@ def _attributes(function: types.FunctionType, seen: set[int]) -> frozenset[str]:
     seen.add(id(function))
     found = reads(function.__code__).others
     for _, read in _outside(function):
-        other = _inner(read())
+        other = inner(read())
         if isinstance(other, types.FunctionType) and id(other) not in seen and _package(other) not in LIBRARIES | {"dirax"}:
             found |= _attributes(other, seen)
     return found
@@ -205,88 +213,6 @@ def refuse_changed(captured: Iterable[tuple[str, Captured]]) -> None:
                 f"{name} reads {words}; what was traced of it keeps the old value: state it again for the new one, or hand the "
                 "value over in params."
             )
-
-
-def _item(holder: Any, key: Any) -> Any:
-    try:
-        return holder[key]
-    except (KeyError, IndexError):
-        return ABSENT
-
-
-def _attribute(value: Any, name: str) -> Any:
-    """As it is stored: nothing is computed."""
-    own = getattr(value, "__dict__", {})
-    if name in own:
-        return own[name]
-    kinds = value.__mro__ if isinstance(value, type) else type(value).__mro__
-    found = next((kind.__dict__[name] for kind in kinds if name in kind.__dict__), ABSENT)
-    return getattr(value, name, ABSENT) if isinstance(found, types.MemberDescriptorType) else found
-
-
-def _to_read(value: Any) -> frozenset[str]:
-    """The methods by which an object is read, as a user's class says them."""
-    kinds = [kind for kind in type(value).__mro__ if not (_is_of_library(kind) or _is_installed(kind))]
-    special = (name for kind in kinds for name in kind.__dict__ if name.startswith("__") and name.endswith("__"))
-    return frozenset(special) - NOT_TO_READ
-
-
-def _written(value: Any) -> bytes:
-    """An object as bytes. Raises `ValueError` for one that is large."""
-    if sys.getsizeof(value) > COPIED:
-        raise ValueError
-    return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
-
-
-def _with_methods(value: Any, names: frozenset[str]) -> frozenset[str]:
-    """The names of attributes, with those that methods among them read."""
-    found, new = names, names
-    while new:
-        methods = (_inner(_attribute(value, name)) for name in new)
-        codes = [method.__code__ for method in methods if isinstance(method, types.FunctionType)]
-        new = frozenset().union(*(reads(code).others for code in codes)) - found
-        found = found | new
-    return found
-
-
-def _inner(value: Any) -> Any:
-    """The function that a property, a class method or what `functools.cache` makes of one stands for; else the value itself."""
-    if isinstance(value, property):
-        return value.fget
-    if isinstance(value, functools.cached_property):
-        return value.func
-    if isinstance(value, classmethod | staticmethod | types.MethodType):
-        return value.__func__
-    if isinstance(value, functools._lru_cache_wrapper):
-        return value.__wrapped__
-    return value
-
-
-def contents(cell: types.CellType) -> Any:
-    """What a cell of a closure holds; `ABSENT` for one that is not filled yet."""
-    try:
-        return cell.cell_contents
-    except ValueError:
-        return ABSENT
-
-
-def _is_of_library(value: Any) -> bool:
-    file = getattr(value, "__file__", None) or "" if isinstance(value, types.ModuleType) else ""
-    known = LIBRARIES | {"builtins"} | ({"dirax"} if isinstance(value, type) else set())
-    return _root(value) in known or "site-packages" in file
-
-
-def _is_installed(kind: type) -> bool:
-    """Whether a class is one of an installed package."""
-    return "site-packages" in (getattr(sys.modules.get(kind.__module__ or ""), "__file__", None) or "")
-
-
-def _root(value: Any) -> str:
-    """The package of a module, of a class, or of that of an object."""
-    if isinstance(value, types.ModuleType):
-        return value.__name__.partition(".")[0]
-    kind = value if isinstance(value, type) else type(value)
-    return (kind.__module__ or "").partition(".")[0]
 
 
 def _alike(now: Any, before: Any) -> bool:

@@ -12,9 +12,10 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from dirax.program.captured import ABSENT, LIBRARIES, Captured, contents
+from dirax.program.captured import Captured
 from dirax.program.code_reads import reads
 from dirax.program.memo import Memo, Same
+from dirax.program.outside_values import ABSENT, LIBRARIES, contents
 
 STATED, VERSIONS = 512, 8
 """Functions that are kept in mind, and for each what it read from outside when it was stated, of the last times."""

@@ -1,0 +1,107 @@
+"""Values outside of a function, as they are read without computing anything, and where they come from."""
+
+import functools
+import pickle
+import sys
+import types
+from typing import Any
+
+from dirax.program.code_reads import reads
+
+LARGEST_WRITTEN = 2**20
+"""Bytes of an object up to which it is written to be compared."""
+
+LIBRARIES = {"jax", "jaxlib", "numpy", "scipy", "equinox", "jaxtyping", "optax", *sys.stdlib_module_names} - {"__main__"}
+"""Packages whose functions and modules are taken not to change."""
+
+NOT_TO_READ = {*("__init__", "__new__", "__del__", "__repr__", "__str__", "__hash__", "__eq__", "__setitem__", "__setattr__")}
+"""Methods of objects that are not called where one reads them."""
+
+NOT_OF_VALUES = {"dirax", "jax", "jaxlib", "equinox"}
+"""Packages whose objects are not asked for what they are written as."""
+
+ABSENT = object()
+
+
+def item(holder: Any, key: Any) -> Any:
+    """An entry; `ABSENT` where there is none."""
+    try:
+        return holder[key]
+    except (KeyError, IndexError):
+        return ABSENT
+
+
+def attribute(value: Any, name: str) -> Any:
+    """As it is stored: nothing is computed."""
+    own = getattr(value, "__dict__", {})
+    if name in own:
+        return own[name]
+    kinds = value.__mro__ if isinstance(value, type) else type(value).__mro__
+    found = next((kind.__dict__[name] for kind in kinds if name in kind.__dict__), ABSENT)
+    return getattr(value, name, ABSENT) if isinstance(found, types.MemberDescriptorType) else found
+
+
+def read_by(value: Any) -> frozenset[str]:
+    """The methods by which an object is read, as a user's class says them."""
+    kinds = [kind for kind in type(value).__mro__ if not (is_of_library(kind) or is_installed(kind))]
+    special = (name for kind in kinds for name in kind.__dict__ if name.startswith("__") and name.endswith("__"))
+    return frozenset(special) - NOT_TO_READ
+
+
+def written(value: Any) -> bytes:
+    """An object as bytes. Raises `ValueError` for one that is large."""
+    if sys.getsizeof(value) > LARGEST_WRITTEN:
+        raise ValueError
+    return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+
+
+def with_methods(value: Any, names: frozenset[str]) -> frozenset[str]:
+    """The names of attributes, with those that methods among them read."""
+    found, new = names, names
+    while new:
+        methods = (inner(attribute(value, name)) for name in new)
+        codes = [method.__code__ for method in methods if isinstance(method, types.FunctionType)]
+        new = frozenset().union(*(reads(code).others for code in codes)) - found
+        found = found | new
+    return found
+
+
+def inner(value: Any) -> Any:
+    """The function that a property, a class method or what `functools.cache` makes of one stands for; else the value itself."""
+    if isinstance(value, property):
+        return value.fget
+    if isinstance(value, functools.cached_property):
+        return value.func
+    if isinstance(value, classmethod | staticmethod | types.MethodType):
+        return value.__func__
+    if isinstance(value, functools._lru_cache_wrapper):
+        return value.__wrapped__
+    return value
+
+
+def contents(cell: types.CellType) -> Any:
+    """What a cell of a closure holds; `ABSENT` for one that is not filled yet."""
+    try:
+        return cell.cell_contents
+    except ValueError:
+        return ABSENT
+
+
+def is_of_library(value: Any) -> bool:
+    """Whether a module, a class or an object is one of those that do not change."""
+    file = getattr(value, "__file__", None) or "" if isinstance(value, types.ModuleType) else ""
+    known = LIBRARIES | {"builtins"} | ({"dirax"} if isinstance(value, type) else set())
+    return root_of(value) in known or "site-packages" in file
+
+
+def is_installed(kind: type) -> bool:
+    """Whether a class is one of an installed package."""
+    return "site-packages" in (getattr(sys.modules.get(kind.__module__ or ""), "__file__", None) or "")
+
+
+def root_of(value: Any) -> str:
+    """The package of a module, of a class, or of that of an object."""
+    if isinstance(value, types.ModuleType):
+        return value.__name__.partition(".")[0]
+    kind = value if isinstance(value, type) else type(value)
+    return (kind.__module__ or "").partition(".")[0]
