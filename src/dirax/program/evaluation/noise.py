@@ -1,6 +1,7 @@
 """Arithmetic in which every operation is off at random: how far rounding moves what comes out of a computation."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -34,21 +35,21 @@ class Noise:
             "le": lambda x, y: (x <= y) | self._alike(x, y),
         }
 
-    def _whole(self, x: np.ndarray) -> np.ndarray:
+    def _whole(self, x: Any) -> Any:
         """The same, but whole numbers where they nearly are."""
         whole = np.round(x)
         return np.where(self._alike(x, whole), whole, x)
 
-    def _unless_whole(self, result: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def _unless_whole(self, result: Any, x: Any, y: Any) -> Any:
         """The result of two numbers, off but where these are whole."""
         return np.where((x == np.round(x)) & (y == np.round(y)), result, self.off(result))
 
-    def _alike(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def _alike(self, x: Any, y: Any) -> Any:
         if np.asarray(x).dtype == bool:
             return np.equal(x, y)
         return np.abs(x - y) <= ALIKE * self.size * np.maximum(np.abs(x), np.abs(y))
 
-    def off(self, values: np.ndarray) -> np.ndarray:
+    def off(self, values: Any) -> Any:
         """Numbers as they would be if they had been rounded."""
         return values * (1.0 + self.size * self._draw.uniform(-1.0, 1.0, np.shape(values)))
 
