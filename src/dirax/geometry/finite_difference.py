@@ -73,19 +73,19 @@ class FiniteDifferenceDirac(eqx.Module):
 
     def base_point(self, x0: Vector, x1: Vector) -> Vector:
         """The point over which the pair lies: x1 for (+), x0 for (−)."""
-        return _floats(x1 if self.sign == "+" else x0)
+        return floats(x1 if self.sign == "+" else x0)
 
     def velocity(self, x0: Vector, x1: Vector) -> Vector:
         """ẋ^± = (x1 − x0)/h, the (±)-finite-difference map Ψ at the base point ([PY] Definition 5.1)."""
-        return (_floats(x1) - _floats(x0)) / self.step
+        return (floats(x1) - floats(x0)) / self.step
 
     def pairing(self, covector: Covector, x0: Vector, x1: Vector) -> Float[Array, ""]:
         """⟨(x, α), (x0, x1)⟩_{d±} = ⟨α, ẋ^±⟩, α at the base point ([PY] Definition 5.3)."""
-        return jnp.vdot(_floats(covector), self.velocity(x0, x1))
+        return jnp.vdot(floats(covector), self.velocity(x0, x1))
 
     def discrete_two_form(self, x0: Vector, x1: Vector, w: Vector, params: Any = None) -> Float[Array, ""]:
         """Ω^{d±}((x0, x1), w) = Ω(x)(ẋ^±, w), w at the base point x ([PY] Definition 5.4)."""
-        return jnp.vdot(self.flat(x0, x1, params), _floats(w))
+        return jnp.vdot(self.flat(x0, x1, params), floats(w))
 
     def flat(self, x0: Vector, x1: Vector, params: Any = None) -> Covector:
         """(Ω^{d±})♭(x0, x1), a covector at the base point ([PY] Definition 5.5)."""
@@ -103,7 +103,7 @@ class FiniteDifferenceDirac(eqx.Module):
         self, x0: Vector, x1: Vector, covector: Covector, params: Any = None
     ) -> tuple[Float[Array, " m"], Covector]:
         """(W ẋ^±, the part of α − (Ω^{d±})♭(x0, x1) outside (Δ^{d±})°): both zero iff ((x0, x1), α) ∈ D^{d±}."""
-        force = _floats(covector) - self.flat(x0, x1, params)
+        force = floats(covector) - self.flat(x0, x1, params)
         onto = self.annihilator(self.base_point(x0, x1), params)
         return self.constraint(x0, x1, params), force - onto @ force
 
@@ -112,7 +112,7 @@ class FiniteDifferenceDirac(eqx.Module):
     ) -> Bool[AnyArray, ""]:
         """Whether ((x0, x1), α) ∈ D^{d±} ([PY] Theorem 5.7): its distance is at most `tolerance` of its length."""
         vector = self.velocity(x0, x1)
-        return self.at(self.base_point(x0, x1), params).contains(vector, _floats(covector), tolerance)
+        return self.at(self.base_point(x0, x1), params).contains(vector, floats(covector), tolerance)
 
     def orthogonal_defect(
         self, first: tuple[Vector, Vector, Covector], second: tuple[Vector, Vector, Covector]
@@ -131,7 +131,7 @@ class FiniteDifferenceDirac(eqx.Module):
         return LinearDirac.from_annihilator(self._matrix(x, params), self._form(x, params))
 
     def _form(self, x, params):
-        return _floats(self.two_form(_floats(x), params))
+        return floats(self.two_form(floats(x), params))
 
     def _matrix(self, x, params):
         return _rows_of(self.one_forms, x, params)
@@ -164,19 +164,19 @@ class InducedFiniteDifferenceDirac(eqx.Module):
     def base_point(self, q0: Vector, q1: Vector, momenta: tuple[Covector, Covector]) -> tuple[Vector, Covector]:
         """z1 = (q1, p1) for (+), z0 = (q0, p0) for (−)."""
         q, p = (q1, momenta[0]) if self.sign == "+" else (q0, momenta[1])
-        return _floats(q), _floats(p)
+        return floats(q), floats(p)
 
     def velocity(self, q0: Vector, q1: Vector, momenta: tuple[Covector, Covector]) -> tuple[Vector, Covector]:
         """ẑ^± = (q̂, p̂), the twisted finite-difference map ([PY] Definition 5.8)."""
         before, after = momenta
-        return (_floats(q1) - _floats(q0)) / self.step, (_floats(after) - _floats(before)) / self.step
+        return (floats(q1) - floats(q0)) / self.step, (floats(after) - floats(before)) / self.step
 
     def pairing(
         self, beta: Covector, gamma: Vector, q0: Vector, q1: Vector, momenta: tuple[Covector, Covector]
     ) -> Float[Array, ""]:
         """⟨(z, β, γ), (z0, z1)⟩_{d±} = ⟨β, q̂⟩ + ⟨p̂, γ⟩, (β, γ) at the base point z ([PY] §5.2)."""
         dq, dp = self.velocity(q0, q1, momenta)
-        return jnp.vdot(_floats(beta), dq) + jnp.vdot(dp, _floats(gamma))
+        return jnp.vdot(floats(beta), dq) + jnp.vdot(dp, floats(gamma))
 
     def canonical_one_form(self, q0: Vector, q1: Vector, momenta: tuple[Covector, Covector]) -> Float[Array, ""]:
         """Θ^{d±}(z0, z1) = ⟨p, q̂⟩, p at the base point ([PY] Definition 5.10)."""
@@ -188,7 +188,7 @@ class InducedFiniteDifferenceDirac(eqx.Module):
     ) -> Float[Array, ""]:
         """Ω^{d±}((z0, z1), w) = Ω(ẑ^±, w), w = (δq, δp) at the base point ([PY] Definition 5.11)."""
         beta, gamma = self.flat(q0, q1, momenta)
-        return jnp.vdot(beta, _floats(w[0])) + jnp.vdot(gamma, _floats(w[1]))
+        return jnp.vdot(beta, floats(w[0])) + jnp.vdot(gamma, floats(w[1]))
 
     def flat(self, q0: Vector, q1: Vector, momenta: tuple[Covector, Covector]) -> tuple[Covector, Vector]:
         """(Ω^{d±})♭(z0, z1) = (−p̂, q̂) at the base point ([PY] (32), (33))."""
@@ -197,7 +197,7 @@ class InducedFiniteDifferenceDirac(eqx.Module):
 
     def constraint(self, q0: Vector, q1: Vector, params: Any = None) -> Float[Array, " m"]:
         """W q̂ at the base point, zero iff (q0, q1) ∈ Δ_Q^{d±} ([PY] Definition 5.13, lifted by Definition 5.14)."""
-        q0, q1 = _floats(q0), _floats(q1)
+        q0, q1 = floats(q0), floats(q1)
         base = q1 if self.sign == "+" else q0
         return _rows_of(self.one_forms, base, params) @ ((q1 - q0) / self.step)
 
@@ -217,8 +217,8 @@ class InducedFiniteDifferenceDirac(eqx.Module):
         """(W q̂, γ − q̂, the part of β + p̂ outside Δ°_Q): all zero iff the element is in D^{d±} ([PY] (37), (39))."""
         base, _ = self.base_point(q0, q1, momenta)
         dq, dp = self.velocity(q0, q1, momenta)
-        force = _floats(beta) + dp
-        return self.constraint(q0, q1, params), _floats(gamma) - dq, force - self.annihilator(base, params) @ force
+        force = floats(beta) + dp
+        return self.constraint(q0, q1, params), floats(gamma) - dq, force - self.annihilator(base, params) @ force
 
     def contains(
         self,
@@ -233,7 +233,7 @@ class InducedFiniteDifferenceDirac(eqx.Module):
         """Whether the element is in D^{d±} ([PY] Proposition 5.17): its distance is at most `tolerance` of its length."""
         base, _ = self.base_point(q0, q1, momenta)
         vector = jnp.concatenate(self.velocity(q0, q1, momenta))
-        return self.at(base, params).contains(vector, jnp.concatenate([_floats(beta), _floats(gamma)]), tolerance)
+        return self.at(base, params).contains(vector, jnp.concatenate([floats(beta), floats(gamma)]), tolerance)
 
     def at(self, q: Vector, params: Any = None) -> LinearDirac:
         """D^{d±} over a point with position q as a linear Dirac structure in ((q̂, p̂), (β, γ)) on R^{2n}.
@@ -247,15 +247,16 @@ class InducedFiniteDifferenceDirac(eqx.Module):
         return LinearDirac.from_annihilator(jnp.concatenate([matrix, jnp.zeros_like(matrix)], axis=1), form)
 
 
-def _floats(values: Any) -> Array:
+def floats(values: Any) -> Array:
+    """An array of floats of what may be a list, or of whole numbers."""
     return jnp.asarray(values, dtype=float)
 
 
 def _rows_of(one_forms: UserFunction | None, x, params):
     if one_forms is None:
         return jnp.zeros((0, len(x)))
-    x = _floats(x)
-    rows = _floats(one_forms(x, params))
+    x = floats(x)
+    rows = floats(one_forms(x, params))
     if rows.ndim != 2 or rows.shape[1] != x.shape[0]:
         raise ValueError(f"one_forms returned shape {rows.shape}; (m, {x.shape[0]}), one one-form a row, was expected.")
     return rows

@@ -75,7 +75,7 @@ class LagrangianSubmanifold(eqx.Module):
         """The rank of [∂²F/∂s∂x, ∂²F/∂s∂s] at a concrete point, k for a Morse family."""
         if not self.parameters:
             return 0
-        return int(jnp.linalg.matrix_rank(self.slopes(jnp.asarray(x, float), jnp.asarray(s, float), params)))
+        return int(jnp.linalg.matrix_rank(self.slopes(*self._point(x, s), params)))
 
     def slopes(self, x: Float[Array, " N"], s: Float[Array, " k"], params: Any = None) -> Float[Array, "k N+k"]:
         """[∂²F/∂s∂x, ∂²F/∂s∂s]."""
@@ -83,7 +83,7 @@ class LagrangianSubmanifold(eqx.Module):
 
     def tangent(self, x: Float[Array, " N"], s: Float[Array, " k"], params: Any = None) -> Float[Array, "two_N N"]:
         """A basis, by columns, of the tangent space of 𝓛 at a point of it: (δx, δα) with δ(∂F/∂s) = 0."""
-        x, s = jnp.asarray(x, float), jnp.asarray(s, float)
+        x, s = self._point(x, s)
         N = x.shape[0]
         both = lambda z: (jnp.concatenate([z[:N], self.covector(z[:N], z[N:], params)]), self.defect(z[:N], z[N:], params))
         of_point, of_defect = jax.jacfwd(both)(jnp.concatenate([x, s]))
@@ -91,7 +91,7 @@ class LagrangianSubmanifold(eqx.Module):
 
     def lagrangian_defect(self, x: Float[Array, " N"], s: Float[Array, " k"], params: Any = None) -> Float[Array, ""]:
         """The largest value of the canonical two-form of T*M on the basis `tangent`: 0 up to roundoff."""
-        return jnp.asarray(evaluated(self._defect, jnp.asarray(x, float), jnp.asarray(s, float), params))
+        return jnp.asarray(evaluated(self._defect, *self._point(x, s), params))
 
     def _defect(self, x: Array, s: Array, params: Any) -> Array:
         basis = self.tangent(x, s, params)

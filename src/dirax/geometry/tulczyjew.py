@@ -15,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac
+from dirax.geometry.finite_difference import InducedFiniteDifferenceDirac, floats
 from dirax.geometry.generating_functions import GeneratingFunctionDirac
 from dirax.program.roots import regular_root
 from dirax.program.tracing import gradient
@@ -27,23 +27,19 @@ Function = Callable[[Vector, Vector], Any]
 
 def slot_derivatives(function: Function, q0: Vector, q1: Vector) -> tuple[Vector, Vector]:
     """(D1 f, D2 f) at (q0, q1), each (n,): the components of df on TQ or on Q × Q."""
-    return gradient(function, (0, 1))(*_floats(q0, q1))
+    return gradient(function, (0, 1))(*map(floats, (q0, q1)))
 
 
 def plus_legendre(discrete_lagrangian: Function, q0: Vector, q1: Vector) -> tuple[Vector, Vector]:
     """F⁺L_d(q0, q1) = (q1, D2 L_d) ∈ T*Q ([PY] (14))."""
-    q0, q1 = _floats(q0, q1)
+    q0, q1 = map(floats, (q0, q1))
     return q1, slot_derivatives(discrete_lagrangian, q0, q1)[1]
 
 
 def minus_legendre(discrete_lagrangian: Function, q0: Vector, q1: Vector) -> tuple[Vector, Vector]:
     """F⁻L_d(q0, q1) = (q0, −D1 L_d) ∈ T*Q ([PY] (14))."""
-    q0, q1 = _floats(q0, q1)
+    q0, q1 = map(floats, (q0, q1))
     return q0, -slot_derivatives(discrete_lagrangian, q0, q1)[0]
-
-
-def _floats(*vectors: Any) -> tuple[Vector, ...]:
-    return tuple(jnp.asarray(vector, dtype=float) for vector in vectors)
 
 
 class TulczyjewTriple(eqx.Module):
@@ -52,12 +48,12 @@ class TulczyjewTriple(eqx.Module):
 
     def flat(self, q: Vector, p: Vector, dq: Vector, dp: Vector) -> Four:
         """Ω♭: T(T*Q) → T*(T*Q), (q, p, q̇, ṗ) ↦ (q, p, −ṗ, q̇)."""
-        q, p, dq, dp = _floats(q, p, dq, dp)
+        q, p, dq, dp = map(floats, (q, p, dq, dp))
         return q, p, -dp, dq
 
     def flat_inverse(self, q: Vector, p: Vector, beta: Vector, gamma: Vector) -> Four:
         """T*(T*Q) → T(T*Q), (q, p, β, γ) ↦ (q, p, γ, −β)."""
-        q, p, beta, gamma = _floats(q, p, beta, gamma)
+        q, p, beta, gamma = map(floats, (q, p, beta, gamma))
         return q, p, gamma, -beta
 
     def kappa(self, q: Vector, p: Vector, dq: Vector, dp: Vector) -> Four:
