@@ -64,6 +64,8 @@ def at_every_width(name: str, *columns: np.ndarray) -> np.ndarray:
     outputs = [g.make(name, *inputs)]
     values = np.stack(columns)
     results = [compiled(g, inputs, outputs, width)(values)[0] for width in (1, 2, 4, 8)]
+    for found in results:
+        found[np.isnan(found)] = np.nan  # its sign is the processor's choice
     for other in results[1:]:
         assert other.tobytes() == results[0].tobytes()
     return results[0]

@@ -98,7 +98,7 @@ MATRICES = {
     "saddle point of a lattice": (saddle(lattice(20), 30), FixedElimination),
     "rows in another order": (ring(50)[RNG.permutation(50)], BandElimination),
     "full row and column": (with_border(ring(600)), BorderedElimination),
-    "lattice, rows in another order": (lattice(20)[RNG.permutation(400)], ExchangedElimination),
+    "lattice, rows in another order": (lattice(30)[RNG.permutation(900)], ExchangedElimination),
     "lattice, pivots that are zero": (without_pivots(lattice(20)), FixedElimination),
 }
 
