@@ -86,13 +86,19 @@ def dot_general(interpreter: Interpreter, equation: Any, a, b):
     of_floats = equation.outvars[0].aval.dtype == np.float64
     if of_floats and rows.size * columns.shape[1] >= LARGE and (known := _product_of_constants(g, rows, columns)) is not None:
         return [interpreter.constants(known.reshape(equation.outvars[0].aval.shape))]
-    out = [
-        fold(interpreter, "add", [g.mul(x, y) for x, y in zip(row, column, strict=True)])
-        for one, other in zip(rows.tolist(), columns.tolist(), strict=True)
-        for row in one
-        for column in other
-    ]
-    return [np.array(out, dtype=np.int64).reshape(equation.outvars[0].aval.shape)]
+    zero = {g.zero, g.constant(-0.0)} if _are_finite(g, rows, columns) else set()
+    of_rows, of_columns = (~np.isin(nodes, list(zero)) for nodes in (rows, columns))
+    out = np.full((len(rows), rows.shape[1], columns.shape[1]), g.zero)
+    for k, i, j in np.argwhere(of_rows.astype(float) @ np.swapaxes(of_columns, 1, 2)).tolist():
+        pairs = zip(rows[k, i].tolist(), columns[k, j].tolist(), strict=True)
+        out[k, i, j] = fold(interpreter, "add", [g.mul(x, y) for x, y in pairs if x not in zero and y not in zero])
+    return [out.reshape(equation.outvars[0].aval.shape)]
+
+
+def _are_finite(g: Graph, *factors: np.ndarray) -> bool:
+    """Whether nothing comes of the products of zeros, which most are with columns of an identity: no constant is ∞ or NaN."""
+    constants = (g.number(node) for nodes in factors for node in np.unique(nodes).tolist())
+    return all(c is None or math.isfinite(c) for c in constants)
 
 
 def _product_of_constants(g: Graph, rows: np.ndarray, columns: np.ndarray) -> np.ndarray | None:
