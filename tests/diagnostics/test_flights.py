@@ -74,7 +74,7 @@ def test_walls_may_divide_every_step(step, steps):
 def test_a_whole_motion_after_a_wall_that_is_another_one_is_found(sol):
     """Every step of it is one of the scheme, but the wall gave it all of its energy back."""
     other = dx.simulate(
-        BALL, dx.LagrangeDAlembert(), step=0.05, steps=120, **ROOM | {"events": [dx.Impact(BOX[0].gap), *BOX[1:]]}
+        BALL, dx.LagrangeDAlembert(), step=0.05, steps=120, **ROOM | {"events": [dx.Impact(BOX[0].function), *BOX[1:]]}
     )
     other.again = sol.again
     report = dx.verify(other)

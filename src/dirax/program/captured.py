@@ -28,6 +28,7 @@ from dirax.program.outside_values import (
     is_installed,
     is_of_library,
     item,
+    package_of,
     read_by,
     root_of,
     with_methods,
@@ -155,7 +156,7 @@ class Captured:
             self._by_contents(words, lambda: written(value))
 
     def _follow_function(self, function: types.FunctionType, depth: int) -> None:
-        if _package(function) in LIBRARIES:
+        if package_of(function) in LIBRARIES:
             return
         names = _attributes(function, set())
         for part in (*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values()):
@@ -176,10 +177,6 @@ class Captured:
             self.watched.append(Watched(words, read, before))
 
 
-def _package(function: types.FunctionType) -> str:
-    return (function.__module__ or "").partition(".")[0]
-
-
 def _outside(function: types.FunctionType) -> Iterator[tuple[str, Callable[[], Any]]]:
     """The names that a function reads in its closure and as globals, and how; without those in which it keeps a record, and the
     globals of dirax."""
@@ -188,7 +185,7 @@ def _outside(function: types.FunctionType) -> Iterator[tuple[str, Callable[[], A
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         if name not in records:
             yield name, functools.partial(contents, cell)
-    if _package(function) != "dirax":
+    if package_of(function) != "dirax":
         for name in sorted(found.globals - records):
             if name in function.__globals__:
                 yield name, functools.partial(item, function.__globals__, name)
@@ -200,7 +197,7 @@ def _attributes(function: types.FunctionType, seen: set[int]) -> frozenset[str]:
     found = reads(function.__code__).others
     for _, read in _outside(function):
         other = inner(read())
-        if isinstance(other, types.FunctionType) and id(other) not in seen and _package(other) not in LIBRARIES | {"dirax"}:
+        if isinstance(other, types.FunctionType) and id(other) not in seen and package_of(other) not in LIBRARIES | {"dirax"}:
             found |= _attributes(other, seen)
     return found
 

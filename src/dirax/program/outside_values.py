@@ -99,6 +99,12 @@ def is_installed(kind: type) -> bool:
     return "site-packages" in (getattr(sys.modules.get(kind.__module__ or ""), "__file__", None) or "")
 
 
+def package_of(function: Any) -> str:
+    """The package that a function, or the class of an object that is called, is written in."""
+    module = getattr(function, "__module__", None) or type(function).__module__ or ""
+    return module.partition(".")[0]
+
+
 def root_of(value: Any) -> str:
     """The package of a module, of a class, or of that of an object."""
     if isinstance(value, types.ModuleType):

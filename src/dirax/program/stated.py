@@ -5,7 +5,7 @@ import functools
 import sys
 import types
 import weakref
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +15,7 @@ from jax.core import Tracer
 from dirax.program.captured import Captured
 from dirax.program.code_reads import reads
 from dirax.program.memo import Memo, Same
-from dirax.program.outside_values import ABSENT, LIBRARIES, contents
+from dirax.program.outside_values import ABSENT, LIBRARIES, contents, package_of
 
 STATED, VERSIONS = 512, 8
 """Functions that are kept in mind, and for each what it read from outside when it was stated, of the last times."""
@@ -50,26 +50,26 @@ def as_stated(function: Callable) -> Stated:
     changed since. What stands for a function holds the values of its closure as they are now, whatever is assigned to their names
     later, and is another object where the function, or one like it, has read something else before.
     """
-    of_values = _is_of_values(function)
-    known = _stated.get(_key(function, 0) if of_values else function, list)
-    for held, stands in known:
-        if not held.changed():
-            return Stated(held if stands is function else Captured(function), held, stands)
-    captured, stands = Captured(function), _held(function, 0) if of_values else function
+    of_values = is_of_values(function)
+    known = _stated.get(key_of(function, 0) if of_values else function, list)
+    for was, stands in known:
+        if not was.changed():
+            return Stated(was if stands is function else Captured(function), was, stands)
+    captured, stands = Captured(function), held(function, 0) if of_values else function
     if stands is function and (known or (isinstance(function, types.FunctionType) and function in _standing)):
         stands = _again(function)
-    held = captured if stands is function else Captured(stands)
-    known[:] = [*known[1 - VERSIONS :], (held, stands)]
+    own = captured if stands is function else Captured(stands)
+    known[:] = [*known[1 - VERSIONS :], (own, stands)]
     if isinstance(stands, types.FunctionType):
         _standing.add(stands)
-    return Stated(captured, held, stands)
+    return Stated(captured, own, stands)
 
 
-def _is_of_values(function: Any) -> bool:
+def is_of_values(function: Any) -> bool:
     """Whether a function is one of the user's that is known by its code and what it reads, and keeps no record in that."""
     if not isinstance(function, types.FunctionType) or vars(function) or function.__kwdefaults__:
         return False
-    if (function.__module__ or "").partition(".")[0] in LIBRARIES or _is_of_module(function):
+    if package_of(function) in LIBRARIES or _is_of_module(function):
         return False
     found, cells = reads(function.__code__), function.__closure__ or ()
     keeps = (found.own | found.changed) & {*function.__code__.co_freevars, *found.globals}
@@ -83,7 +83,7 @@ def _is_of_module(function: types.FunctionType) -> bool:
     return function.__module__ != "__main__" and getattr(module, function.__qualname__, None) is function
 
 
-def _key(value: Any, depth: int) -> Hashable:
+def key_of(value: Any, depth: int) -> Hashable:
     """Equal for values that are the same to a function which only reads them; of others the object itself."""
     if type(value) in WRITTEN:
         return type(value), repr(value)
@@ -91,28 +91,41 @@ def _key(value: Any, depth: int) -> Hashable:
         array = np.asarray(value)
         return type(value), array.dtype.str, array.shape, array.tobytes(), getattr(value, "weak_type", False)
     if depth < DEEPEST and type(value) in (list, tuple):
-        return type(value), *(_key(part, depth + 1) for part in value)
+        return type(value), *(key_of(part, depth + 1) for part in value)
     if depth < DEEPEST and type(value) is dict:
-        return dict, *((_key(name, depth + 1), _key(part, depth + 1)) for name, part in value.items())
-    if depth < DEEPEST and _is_of_values(value):
-        outside = (*(value.__defaults__ or ()), None, *(cell.cell_contents for cell in value.__closure__ or ()))
-        return value.__code__, Same(value.__globals__), *(_key(part, depth + 1) for part in outside)
+        return dict, *((key_of(name, depth + 1), key_of(part, depth + 1)) for name, part in value.items())
+    if depth < DEEPEST and is_of_values(value):
+        return *of_code(value), *(key_of(part, depth + 1) for part in outside_of(value))
     return Same(value)
 
 
-def _held(value: Any, depth: int) -> Any:
+def held(value: Any, depth: int) -> Any:
     """The same with copies of all that `_key` compares by what is in it."""
     if type(value) is np.ndarray and _is_small(value):
         return value.copy()
     if depth < DEEPEST and type(value) in (list, tuple):
-        return type(value)(_held(part, depth + 1) for part in value)
+        return type(value)(held(part, depth + 1) for part in value)
     if depth < DEEPEST and type(value) is dict:
-        return {name: _held(part, depth + 1) for name, part in value.items()}
-    if depth < DEEPEST and _is_of_values(value) and _has_to_hold(value):
-        held = lambda part: _held(part, depth + 1)
-        closure = tuple(types.CellType(held(cell.cell_contents)) for cell in value.__closure__ or ())
-        return _with(value, tuple(map(held, value.__defaults__ or ())) or None, closure or None)
+        return {name: held(part, depth + 1) for name, part in value.items()}
+    if depth < DEEPEST and is_of_values(value) and _has_to_hold(value):
+        return with_outside(value, [held(part, depth + 1) for part in outside_of(value)])
     return value
+
+
+def of_code(function: types.FunctionType) -> tuple[Hashable, ...]:
+    """What tells a function apart besides the values of its defaults and in its closure."""
+    return function.__code__, Same(function.__globals__), len(function.__defaults__ or ())
+
+
+def outside_of(function: types.FunctionType) -> list[Any]:
+    """The values of the defaults of a function and in its closure."""
+    return [*(function.__defaults__ or ()), *(cell.cell_contents for cell in function.__closure__ or ())]
+
+
+def with_outside(function: types.FunctionType, values: Sequence) -> types.FunctionType:
+    """The function with others in their place."""
+    count = len(function.__defaults__ or ())
+    return _with(function, tuple(values[:count]) or None, tuple(map(types.CellType, values[count:])) or None)
 
 
 def _has_to_hold(function: types.FunctionType) -> bool:

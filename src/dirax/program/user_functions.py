@@ -1,6 +1,7 @@
 """User functions: plain JAX-traceable callables, with or without a leading `t` and a trailing `params`, checked once and
 called uniformly."""
 
+import copy
 import re
 import threading
 import traceback
@@ -18,6 +19,7 @@ from jax.experimental import checkify
 from dirax.program.captured import Captured, refuse_changed
 from dirax.program.compiled import compiled
 from dirax.program.derivatives_by_jax import differentiated
+from dirax.program.hoisted import hoisted, split
 from dirax.program.indexed import clamps, indexes
 from dirax.program.memo import Memo
 from dirax.program.signatures import parameters_of, refuse_other_places, takes_params, takes_time
@@ -70,8 +72,14 @@ class UserFunction(eqx.Module):
     takes_time: bool = eqx.field(static=True)
     captured: Captured = eqx.field(static=True)
     held: Captured = eqx.field(static=True)
+    places: tuple[int, ...] | None = eqx.field(static=True)
+    """Where the traced values that it closes over are, once they are taken out (`hoisted`)."""
 
     def __init__(self, function: Callable, name: str, arguments: tuple[str, ...], timed: bool = False):
+        if isinstance(function, UserFunction):  # of a system that is made of another
+            vars(self).update(vars(function))
+            self.name = name
+            return
         expected = f"{name}({', '.join(arguments)}[, params])"
         expected += f" or {name}(t, {', '.join(arguments)}[, params])" * timed
         if not callable(function):
@@ -88,6 +96,7 @@ class UserFunction(eqx.Module):
         self.takes_params = takes_params(function, name, expected, len(self.arguments))
         refuse_other_places(function, name, expected, self.arguments)
         self.name, (self.captured, self.held, self.function) = name, as_stated(_hashable(function))
+        self.places = None
 
     def __call__(self, *values: Any):
         *args, params = values
@@ -98,8 +107,17 @@ class UserFunction(eqx.Module):
             )
         own = () if is_traced(values) else ((self.name, self.captured),)
         refuse_changed(((self.name, self.held), *own))
+        params, first = split(params, self.function, self.places)
         with differentiated(self._call, values):
-            return once(self.function)(*args, *((params,) if self.takes_params else ()))
+            return once(self.function)(*first, *args, *((params,) if self.takes_params else ()))
+
+    def hoisted(self, values: list[Tracer]) -> "UserFunction":
+        """The same function of params that hold what it closes over and JAX traces, which is added to `values`."""
+        if (found := hoisted(self.function, values)) is None:
+            return self
+        other, (function, places) = copy.copy(self), found
+        vars(other).update(function=function, places=places, captured=function.outside, held=function.outside)
+        return other
 
     def at(self, t: Any, *values: Any):
         """The function of `(*arguments, params)` at time t, which is passed on where the function takes it."""

@@ -2,12 +2,14 @@
 
 import inspect
 from collections.abc import Callable, Collection, Sequence
+from copy import copy
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from dirax.program.hoisted import hoisted, split
 from dirax.program.memo import OfKey
 from dirax.program.stated import as_stated
 from dirax.program.user_functions import reads_outside
@@ -22,7 +24,39 @@ TRACED = (
 )
 
 
-class Event(OfKey):
+class OfMotion(OfKey):
+    """A user's function that is given what it asks for by the names of its arguments; `settings` are compared with it."""
+
+    places: tuple[int, ...] | None = None
+    """Where the traced values that it closes over are, once they are taken out (`hoisted`)."""
+
+    def __init__(self, function: Callable, what: str, known: tuple[str, ...], *settings: Any):
+        self.arguments = names_of(function, what, known)
+        self.captured, _, self.function = as_stated(function)
+        self.key = self.function, self.arguments, *settings
+
+    def of(self, known: dict[str, Any]) -> Any:
+        """The function of what is known of one moment, by name."""
+        params, first = split(known.get("params"), self.function, self.places)
+        return self.function(*first, **{name: params if name == "params" else known[name] for name in self.arguments})
+
+    def hoisted(self, values: list[Tracer]) -> Any:
+        """The same of params that hold what it closes over and JAX traces, which is added to `values`."""
+        if (found := hoisted(self.function, values)) is None:
+            return self
+        other = copy(self)
+        other.function, other.places = found
+        other.captured, other.key = other.function.outside, (other.function, *self.key[1:])
+        return other
+
+    @property
+    def signature(self) -> str:
+        """The function's own name with its arguments."""
+        own = getattr(self.function, "__name__", type(self.function).__name__).replace("<lambda>", "lambda")
+        return f"{own}({', '.join(self.arguments)})"
+
+
+class Event(OfMotion):
     """Where a function of the motion goes through zero: `dx.simulate(…, events=[dx.Event(function)])`.
 
     `function` returns one number of what the names of its arguments say: the time `t`, `q`, `v`, `p` or `x` at that time, and
@@ -40,8 +74,8 @@ class Event(OfKey):
 
     Under `jax.grad`, `jit` and `vmap` the times and places of events are differentiated. `sol.events` then has four places for
     each step and event, or one more than a polynomial has stages: in the order of time in each trajectory, NaN after the last
-    event; after a terminal one rows are NaN as well. On a GPU, and for functions that close over traced values or are no scalar
-    program, only those are seen that change the sign of the function at so many points of a step.
+    event; after a terminal one rows are NaN as well. On a GPU, and for functions that are no scalar program, only those are seen
+    that change the sign of the function at so many points of a step.
 
     Raises `TypeError` for something that is no function of such arguments, `ValueError` for another direction.
     """
@@ -52,25 +86,22 @@ class Event(OfKey):
         if isinstance(direction, bool) or direction not in (-1, 0, 1):
             raise ValueError(f"direction must be +1 (rising), −1 (falling) or 0 (both), but {direction!r} was given.")
         self.direction, self.terminal = int(direction), bool(terminal)
-        self.arguments = names_of(function, "the function of an event")
-        self.captured, _, self.function = as_stated(function)
-        self.key = self.function, self.arguments, self.direction, self.terminal
+        super().__init__(function, "the function of an event", KNOWN, self.direction, self.terminal)
 
     def __call__(self, known: dict[str, Any]) -> Any:
         """The function of what is known of one moment, by name."""
-        return self.function(**{name: known[name] for name in self.arguments})
+        return self.of(known)
 
     def __repr__(self) -> str:
-        own = getattr(self.function, "__name__", type(self.function).__name__).replace("<lambda>", "lambda")
         settings = f", direction={self.direction:+d}" * bool(self.direction) + ", terminal=True" * self.terminal
-        return f"Event({own}({', '.join(self.arguments)}){settings})"
+        return f"Event({self.signature}{settings})"
 
 
 class OutsideIndex(ValueError):
     """A function reads an entry that there is not, of which JAX would make another one."""
 
 
-def names_of(function: Any, what: str, known: tuple[str, ...] = KNOWN) -> tuple[str, ...]:
+def names_of(function: Any, what: str, known: tuple[str, ...]) -> tuple[str, ...]:
     """The arguments of a user's function that is given things by their names. Raises `TypeError`."""
     expected = f"{what} takes some of {', '.join(known)} by their names, like lambda q: q[0]"
     if not callable(function):

@@ -10,10 +10,8 @@ import numpy as np
 
 from dirax.program.evaluation.functions import program_of
 from dirax.program.linear_solves import solve
-from dirax.program.memo import OfKey
-from dirax.program.stated import as_stated
 from dirax.program.tracing import once
-from dirax.run.event import names_of
+from dirax.run.event import OfMotion
 from dirax.schemes.collision_step import bounced, least_squares
 from dirax.schemes.step import StepEquation
 
@@ -21,7 +19,7 @@ KNOWN = ("t", "q", "params")
 """What the gap may be given, by the names of its arguments."""
 
 
-class Impact(OfKey):
+class Impact(OfMotion):
     """A wall: the motion bounces where `gap` becomes zero, `dx.simulate(…, events=[dx.Impact(gap, restitution=1.0)])`.
 
     `gap` returns one number of `q`, the time `t` and `params`, by the names of its arguments: positive off the wall.
@@ -38,8 +36,8 @@ class Impact(OfKey):
 
     Under `jax.grad`, `jit` and `vmap` impacts are those of other runs, and are differentiated, their times too (what follows has
     the derivative of the saltation matrix): four a step of the run at most. `sol.events` then has as many entries, in the order
-    of time in each trajectory, NaN where there are none. What has no scalar program, closes over values that JAX traces, or runs
-    by `engine="xla"` has up to four in every step, and they are seen by the sign of the gap at quarters of it.
+    of time in each trajectory, NaN where there are none. What has no scalar program, or runs by `engine="xla"`, has up to four in
+    every step, and they are seen by the sign of the gap at quarters of it.
 
     The p that `dx.LagrangeDAlembert` saves with nonholonomic constraints, the mean over the two steps at a row, is off by O(h²)
     at the ends of a step that is divided, though the motion is not: `dx.DiscreteDirac(constraints="resolve")` has no such rows.
@@ -56,10 +54,8 @@ class Impact(OfKey):
         number = not isinstance(restitution, bool) and isinstance(restitution, int | float | np.number)
         if not number or not 0.0 <= restitution <= 1.0:
             raise ValueError(f"restitution must be a number from 0 to 1, but {restitution!r} was given.")
-        self.arguments = names_of(gap, "gap", KNOWN)
-        self.captured, _, self.gap = as_stated(gap)
         self.restitution = float(restitution)
-        self.key = self.gap, self.arguments, self.restitution
+        super().__init__(gap, "gap", KNOWN, self.restitution)
 
     @property
     def works(self) -> bool:
@@ -68,12 +64,10 @@ class Impact(OfKey):
 
     def __call__(self, t: Any, q: Any, params: Any) -> Any:
         """The gap at one place."""
-        known = {"t": t, "q": q, "params": params}
-        return self.gap(**{name: known[name] for name in self.arguments})
+        return self.of({"t": t, "q": q, "params": params})
 
     def __repr__(self) -> str:
-        own = getattr(self.gap, "__name__", type(self.gap).__name__).replace("<lambda>", "lambda")
-        return f"Impact({own}({', '.join(self.arguments)}), restitution={self.restitution:g})"
+        return f"Impact({self.signature}, restitution={self.restitution:g})"
 
 
 def gaps_of(walls: Sequence[Impact]) -> Callable:

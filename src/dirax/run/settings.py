@@ -8,10 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+from jax.core import Tracer
 
 from dirax.engines.engine import AbstractEngine
 from dirax.program.captured import Captured, functions_in
+from dirax.program.hoisted import Hoisted
 from dirax.program.memo import Memo, Same
+from dirax.program.primitives import is_tracing
 from dirax.program.user_functions import UserFunction
 from dirax.run.event import Event, checked_events
 from dirax.run.impact import Impact
@@ -87,14 +91,33 @@ def stated(
     path = checked_store(to, events, case.traced)
     given = {"project": project, "check_initial": check_initial, "compensated": compensated}
     flags = {name: flag(value, name) for name, value in given.items()}
-    settings = Settings(system, scheme, on, max_iterations=max_iterations, events=events, to=path, **flags)
-    if case.params is not None and not events:  # which may take them too
+    if is_tracing():
+        (system, scheme, *events), case = _hoisted((system, scheme, *events), case)
+    settings = Settings(system, scheme, on, max_iterations=max_iterations, events=tuple(events), to=path, **flags)
+    if params is not None and not events:  # which may take them too
         _warn_of_unused_params(system, scheme)
     return settings, case, steps, save_every
 
 
+def _hoisted(stated: tuple, case: Case) -> tuple[tuple, Case]:
+    """What is stated, and the case, with all that its functions close over and JAX traces in the params; nothing is done where
+    something is not of dirax, which may look into the params itself."""
+    if not all(is_of_dirax(value) for value in stated):
+        return stated, case
+    values: list[Tracer] = []
+    takes = lambda value: hasattr(value, "hoisted")
+    stated = jax.tree.map(lambda value: value.hoisted(values) if takes(value) else value, stated, is_leaf=takes)
+    repeated = lambda value: jnp.broadcast_to(value, (case.batch or 1, *jnp.shape(value))) if case.batch_params else value
+    return stated, replace(case, params=Hoisted(case.params, tuple(map(repeated, values)))) if values else case
+
+
 _unused: Memo[str] = Memo(256)
 """The names of the functions where none takes params."""
+
+
+def is_of_dirax(value: Any) -> bool:
+    """Whether what is stated is an object of dirax's own classes."""
+    return type(value).__module__.startswith("dirax.")
 
 
 def _warn_of_unused_params(*stated: Any) -> None:
@@ -110,7 +133,7 @@ def _warn_of_unused_params(*stated: Any) -> None:
 
 def _without_params(stated: Sequence[Any]) -> str:
     """The names of the functions; none where one takes params or is not known."""
-    if not all(type(value).__module__.startswith("dirax.") for value in stated):
+    if not all(map(is_of_dirax, stated)):
         return ""
     is_known = lambda value: isinstance(value, UserFunction)
     functions = [value for value in jax.tree.leaves(stated, is_leaf=is_known) if callable(value)]

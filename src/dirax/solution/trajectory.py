@@ -12,6 +12,7 @@ import numpy as np
 
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
+from dirax.program.hoisted import split
 from dirax.program.memo import Same, by_value
 from dirax.program.stated import as_stated
 from dirax.program.user_functions import is_traced
@@ -383,7 +384,7 @@ def _at_nodes(of_steps: Any, axis: int) -> Any:
 @compiled
 def _along(function, nodes, params, axes):
     """`function` of every row, compiled once per function and shape: a system's bound method is compared by its system."""
-    along = jax.vmap(lambda row, params: function(SavedRow(row), params), in_axes=(0, None))
+    along = jax.vmap(lambda row, params: function(SavedRow(row), split(params, function, None)[0]), in_axes=(0, None))
     return (along if axes is None else jax.vmap(along, in_axes=axes))(nodes, params)
 
 

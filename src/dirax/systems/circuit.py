@@ -1,12 +1,14 @@
 """Circuits from a list of their elements."""
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from dirax.numerics.arrays import Data, Numbers
@@ -94,6 +96,14 @@ class Circuit(AbstractSystem):
         self.nodes = tuple(sorted({node for pair in _pairs(netlist) for node in pair} - {GROUND}))
         _refuse_islands(netlist, self.nodes)
         refuse_contradictions([(*e[:3], f or e[3]) for e, f in zip(self.netlist, self.functions, strict=True)], GROUND)
+
+    def hoisted(self, values: list[Tracer]) -> "Circuit":
+        """The same of params that hold what its functions close over and JAX traces, which is added to `values`."""
+        other = copy(self)
+        functions = tuple(f and f.hoisted(values) for f in self.functions)
+        stated = ((*e[:3], f.function if f and callable(e[3]) else e[3]) for e, f in zip(self.netlist, functions, strict=True))
+        vars(other).update(functions=functions, netlist=tuple(stated))
+        return other
 
     def elements(self, kind: str) -> list[Element]:
         """The elements of a kind, in the order of the list."""

@@ -113,7 +113,7 @@ class DiracSystem(AbstractSystem):
             return self
         g = self.holonomic
         picked = lambda x, params: shape.pick(g(x, params))
-        return DiracSystem(self.structure, self.hamiltonian.function, holonomic=picked)
+        return DiracSystem(self.structure, self.hamiltonian, holonomic=picked)
 
     def implicit_form(self, near: Any, params: Any) -> ImplicitForm:
         x = point_of(near, ("x",), self)

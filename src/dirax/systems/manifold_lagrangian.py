@@ -97,8 +97,8 @@ class ManifoldLagrangian(AbstractSystem):
         if not all(isinstance(factor, AbstractFlat) for factor in factors):
             return None
         functions = {"one_forms": self.one_forms, "forces": self.forces, "affine": self.affine, "holonomic": self.holonomic}
-        given = {name: function.function for name, function in functions.items() if function is not None}
-        return LagrangeDirac(self.lagrangian.function, **given)
+        given = {name: function for name, function in functions.items() if function is not None}
+        return LagrangeDirac(self.lagrangian, **given)
 
     def manifold_form(self) -> "ManifoldLagrangian":
         """The system itself."""

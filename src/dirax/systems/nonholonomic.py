@@ -69,13 +69,12 @@ class NonholonomicMechanics(AbstractSystem):
     def lagrange_dirac(self) -> LagrangeDirac:
         """The same system as a Lagrangian with constraints."""
         timed = self.metric.takes_time or self.potential.takes_time
-        own = lambda function: None if function is None else function.function
         return LagrangeDirac(
             self._lagrangian_at if timed else self.lagrangian,
-            own(self.one_forms),
-            holonomic=own(self.holonomic),
-            forces=own(self.forces),
-            affine=own(self.affine),
+            self.one_forms,
+            holonomic=self.holonomic,
+            forces=self.forces,
+            affine=self.affine,
         )
 
     def lagrangian_form(self) -> LagrangeDirac:

@@ -76,7 +76,7 @@ class PortHamiltonian(AbstractSystem):
     def with_inputs(self, inputs: Callable) -> "PortHamiltonian":
         """The same open system driven by u = inputs(t, x[, params])."""
         matrices = (constituent(self.J), constituent(self.B), constituent(self.R))
-        return PortHamiltonian(self.hamiltonian.function, *matrices, self.closed, inputs)
+        return PortHamiltonian(self.hamiltonian, *matrices, self.closed, inputs)
 
     def differential(self, x: Float[Numbers, " N"], params: Any = None) -> Float[Numbers, " N"]:
         """dH(x)."""

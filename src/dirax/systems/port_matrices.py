@@ -49,7 +49,7 @@ def constituent(function: UserFunction | None):
     """What a system is made of again."""
     if isinstance(function, ConstantFunction):
         return function.function(None)
-    return None if function is None else function.function
+    return function
 
 
 def refuse_unless_skew(J: UserFunction, found: np.ndarray | None) -> None:
