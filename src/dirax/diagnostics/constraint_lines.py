@@ -33,7 +33,7 @@ def constraint(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
     scale[redundant] = np.max(scale)  # what follows from the others has their roundoff
     steps = "constraint" in sol.fields
     if steps and np.any(residual > roundoff_limit(tolerance, 1) * scale):  # points of manifolds are rounded, and then subtracted
-        scale = np.maximum(scale, np.max(moved_numbers(sol, "constraint").reshape(-1, len(scale)), axis=0))
+        scale = np.maximum(scale, np.max(moved_numbers(sol, "constraint")[0].reshape(-1, len(scale)), axis=0))
     if not steps and sol.system is not None and "p" in sol.fields and np.any(residual > roundoff_limit(tolerance, 1) * scale):
         scale = scale + _moved_by_momenta(sol, at_rows(sol, constraint_at))
     values, residual = np.max(residual / scale, axis=-1), np.max(residual, axis=-1)
@@ -84,7 +84,7 @@ def _hidden(system: LagrangeDirac, row: dict, params: Any):
 def _moved_by_momenta(sol: Solution, function: eqx.Partial) -> np.ndarray:
     """How far momenta that move as in a typical step move `function`(row, params): a machine at rest has those that roundings of
     its impulses leave."""
-    return _largest(sampled(sol, eqx.Partial(_moved, function, moved_numbers(sol, "p"))))
+    return _largest(sampled(sol, eqx.Partial(_moved, function, *moved_numbers(sol, "p"))))
 
 
 def _moved(function: eqx.Partial, moved: np.ndarray, row: dict, params: Any):

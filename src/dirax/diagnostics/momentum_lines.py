@@ -73,7 +73,7 @@ def momentum(sol: Solution, name: str, generator: Callable, tolerance: float | N
     scale = np.nanmax(values[..., 1], axis=1)
     change, relative = relative_changes(values[..., :1], scale)
     if np.any(relative > limit):  # a momentum near zero is a sum of terms that may be large
-        moved = np.broadcast_to(moved_numbers(sol, "p"), np.shape(sol.p))
+        moved = np.broadcast_to(moved_numbers(sol, "p")[0], np.shape(sol.p))
         moved = np.nanmax(over_rows(terms, sol, (np.asarray(sol.q), moved))[..., 1], axis=1)
         change, relative = relative_changes(values[..., :1], np.maximum(scale, moved))
     lane = int(np.argmax(relative))

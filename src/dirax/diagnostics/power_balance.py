@@ -57,7 +57,7 @@ def _step_balance(sol: Solution, energy_scale: float, limit: float) -> Line:
             missed = np.maximum(missed, np.abs(change - stored))
             text += "; stored is the change of H"
     if np.any(missed > limit * sizes):  # a difference quotient of H over a small Δx is off by more
-        sizes = np.maximum(sizes, np.sum(moved_numbers(sol, "power")))
+        sizes = np.maximum(sizes, np.sum(moved_numbers(sol, "power")[0]))
     return _line(name, float(np.nanmax(relative_to(missed, sizes))), limit, text)
 
 

@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -348,9 +349,16 @@ def _begun(system: Any, step: Any, same: Same, anew: bool, row: dict, params: An
     """State and first guesses of all stages of the step that leaves a saved row, or of a run that starts `anew` from it."""
     equation = same.object
     data = SavedRow({**row, **system.complete(SavedRow(row), params, False), "t": row["t"]})
-    (first, fraction), *others = equation.stages
-    state, u = (first.start if anew else first.resume)(data, fraction * step, params)
-    return jnp.concatenate([state, u, *((s.start if anew else s.resume)(data, part * step, params)[1] for s, part in others)])
+    begun: list[Any] = [None] * len(equation.stages)
+    for stage in {id(stage): stage for stage, _ in equation.stages}.values():
+        places = [i for i, (other, _) in enumerate(equation.stages) if other is stage]
+        of_part = lambda part, begin=stage.start if anew else stage.resume: begin(data, part * step, params)
+        parts = [equation.stages[i][1] for i in places]
+        # the beginnings of several stages of one equation are traced once
+        found = [of_part(parts[0])] if len(parts) == 1 else zip(*jax.vmap(of_part)(np.array(parts)), strict=True)
+        for i, of_stage in zip(places, found, strict=True):
+            begun[i] = of_stage
+    return jnp.concatenate([begun[0][0], *(u for _, u in begun)])
 
 
 def _from_points(system: Any, step: Any, same: Same, data: dict, params: Any):

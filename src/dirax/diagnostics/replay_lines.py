@@ -47,10 +47,10 @@ def replayed(sol: Solution, tolerance: float | None) -> Line:
     return judged(sol, NAME, per_trajectory, limit, f"{found.told()}; worst {where}, off by {found.missed[entry, number]:.2g}")
 
 
-def moved_numbers(sol: Solution, name: str) -> np.ndarray:
-    """How far the numbers (…) of a saved field move in a typical step, in units of what every operation is off; 0 where steps
+def moved_numbers(sol: Solution, *names: str) -> list[np.ndarray]:
+    """How far the numbers (…) of saved fields move in a typical step, in units of what every operation is off; 0 where steps
     cannot be taken again."""
-    shape = sol.field_info[name].shape
+    shapes = [sol.field_info[name].shape for name in names]
     try:
         replay = Replay.of(sol)
         lanes, rows = replay.chosen()
@@ -58,9 +58,9 @@ def moved_numbers(sol: Solution, name: str) -> np.ndarray:
         at = replay.begun(lanes[some], rows[some])
         found = Comparison(replay, replace(at, steps=np.ones_like(at.steps)))
     except CannotReplay:
-        return np.zeros(shape)
-    first = found.starts[name]
-    return found.usual(np.arange(len(some)))[first : first + found.sizes[name]].reshape(shape)
+        return [np.zeros(shape) for shape in shapes]
+    usual, places = found.usual(np.arange(len(some))), [(found.starts[name], found.sizes[name]) for name in names]
+    return [usual[first : first + size].reshape(shape) for (first, size), shape in zip(places, shapes, strict=True)]
 
 
 def _sampled(after: np.ndarray) -> np.ndarray:

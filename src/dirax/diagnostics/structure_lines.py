@@ -73,7 +73,7 @@ def membership(sol: Solution, structure: AbstractDiscreteStructure | str, tolera
         terms = with_rounding(terms, np.max(values, axis=(0, 2)), of_rows, sol, (items,))
         values = _relative(terms, structure.counts, follow)
     if np.any(values > limit):  # what a step solves for may be made of differences, and be off by more than a rounding
-        by = {name: moved_numbers(sol, name) for name in structure.reads}
+        by = dict(zip(structure.reads, moved_numbers(sol, *structure.reads), strict=True))
         terms = with_moved_rows(terms, np.max(values, axis=(0, 2)), of_rows, sol, (items,), by)
         values = _relative(terms, structure.counts, follow)
     own = terms.copy()

@@ -37,12 +37,12 @@ class Noise:
 
     def _whole(self, x: Any) -> Any:
         """The same, but whole numbers where they nearly are."""
-        whole = np.round(x)
+        whole = np.rint(x)
         return np.where(self._alike(x, whole), whole, x)
 
     def _unless_whole(self, result: Any, x: Any, y: Any) -> Any:
         """The result of two numbers, off but where these are whole."""
-        return np.where((x == np.round(x)) & (y == np.round(y)), result, self.off(result))
+        return np.where((x == np.rint(x)) & (y == np.rint(y)), result, self.off(result))
 
     def _alike(self, x: Any, y: Any) -> Any:
         if np.asarray(x).dtype == bool:
@@ -51,7 +51,7 @@ class Noise:
 
     def off(self, values: Any) -> Any:
         """Numbers as they would be if they had been rounded."""
-        return values * (1.0 + self.size * self._draw.uniform(-1.0, 1.0, np.shape(values)))
+        return values * (1.0 + self.size * (2.0 * self._draw.random(np.shape(values)) - 1.0))
 
     def _off(self, function: Callable) -> Callable:
         return lambda *operands: self.off(function(*operands))
