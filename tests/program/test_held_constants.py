@@ -73,7 +73,7 @@ def test_complex_numbers_on_the_way(potential, real):
 
     def run(potential):
         system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q @ q - potential(q))
-        return dx.simulate(system, dx.LagrangeDAlembert(), q=[0.3, 0.4], v=[0.2, -0.1], step=0.05, steps=60)
+        return dx.simulate(system, dx.LagrangeDAlembert(), q=[0.3, 0.4], v=[0.2, -0.1], step=0.05, steps=20)
 
     with jax.numpy_dtype_promotion("standard"):
         sol = run(potential)

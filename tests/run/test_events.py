@@ -155,9 +155,9 @@ def test_large_steps_of_a_composition_are_looked_into(monkeypatch):
     system = dx.LagrangeDirac(lambda q, v: v @ v / 2 - q[0] ** 2 / 2 - 1.7 * q[1] ** 2 / 2 - 0.3 * q[0] * q[1] ** 2)
     apart = [dx.Event(lambda v: v[0] - v[1])]
     places = np.random.default_rng(0).normal(size=(8, 2)) / 10
-    start = {"q": np.array([0.8, 0.3]) + places, "v": np.array([0.1, 0.4]) - places, "step": 0.9, "steps": 700, "events": apart}
+    start = {"q": np.array([0.8, 0.3]) + places, "v": np.array([0.1, 0.4]) - places, "step": 0.9, "steps": 120, "events": apart}
     few, many = found_by_both(system, dx.Composition(dx.LagrangeDAlembert(), "suzuki4"), start, monkeypatch)
-    assert len(few) > 1000 and np.array_equal(few.t, many.t)
+    assert len(few) > 170 and np.array_equal(few.t, many.t)
 
 
 def test_an_entry_that_there_is_not_is_refused_and_one_looked_up_is_not():
@@ -201,5 +201,5 @@ def test_a_long_run_of_rows_without_velocities():
     body = dx.EulerPoincare(dx.SO3(), lambda xi: xi @ (inertia * xi) / 2)
     crosses = dx.Event(lambda x: x[1])
     run = lambda steps: dx.simulate(body, dx.DiscreteEulerPoincare(), x=[0.1, 2.0, 0.05], step=0.5, steps=steps, events=[crosses])
-    long, short = run(20_000), run(4_000)
+    long, short = run(20_000), run(1_000)
     assert len(short.events) > 100 and np.array_equal(long.events.t[: len(short.events)], short.events.t)
