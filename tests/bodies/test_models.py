@@ -1,5 +1,6 @@
 """Machines from bodies and joints against equations written by hand, and their mistakes."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -193,6 +194,8 @@ BALL = b.gliding("ground", "a", lambda x, y: 0.1 * x * x, 0.5)
         (lambda: of_one(joint=WHEEL, contacts=[b.wheel("a", 0.4)]), "not the wheel of radius 0.5 and tube 0"),
         (lambda: of_one(joint=BALL, contacts=[b.ball_contact("a", 0.4)]), "not the ball of radius 0.5"),
         (lambda: b.Model({"a": 1}, []), "bodies must be a list of Body"),
+        (lambda: of_one(b.Body("a", lambda p: p["m"])), "mass of body 'a' must be a number or the name of a parameter"),
+        (lambda: jax.grad(lambda m: of_one(b.Body("a", m)))(1.0), r"mass of body 'a' is a value that JAX traces.* mass='mass'"),
     ],
 )
 def test_numbers_that_mean_nothing_get_one_error_each(model, message):

@@ -18,7 +18,7 @@ from dirax.bodies.frames import AnyFrame, Vector, scalar, vector
 from dirax.bodies.joints import Joint
 from dirax.bodies.model_constraints import MachineConstraints
 from dirax.bodies.motion import Direct, Quaternion
-from dirax.bodies.number_checks import check_kinds, check_numbers
+from dirax.bodies.number_checks import check_kinds, check_numbers, check_untraced
 from dirax.bodies.parts import Body
 from dirax.bodies.statement import discretization_map, in_coordinates, on_manifold
 from dirax.diagnostics.linearized_field import accelerations
@@ -54,11 +54,12 @@ class Model:
 
     def __post_init__(self):
         check_kinds(self)
+        check_untraced(self)
         check_names(self)
+        check_numbers(self)
         check_masses(self)
         _ = self.tree
         check_coordinates(self)
-        check_numbers(self)
         check_axes(self)
         check_turns(self)
         unknown = [name for name in self.dropped if name not in (*self.demands.all_holonomic, *self.demands.all_rows)]

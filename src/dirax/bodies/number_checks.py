@@ -12,6 +12,7 @@ from dirax.bodies.joints import Joint
 from dirax.bodies.motion import Glide, Shift, Slide, Turn
 from dirax.bodies.parts import Body
 from dirax.program.signatures import refuse_other_places
+from dirax.program.user_functions import is_traced
 
 KINDS = {"bodies": (Body,), "joints": (Joint,), "contacts": (Contact,), "forces": (Spring, Damper, Motor)}
 MOTIONS = ("rolls", "skates", "slides")
@@ -27,6 +28,20 @@ def check_kinds(model: Any) -> None:
             raise TypeError(f"{name} must be a list of {called}, but {wrong[0]!r} came.")
 
 
+def check_untraced(model: Any) -> None:
+    """Raise `TypeError` for values that JAX traces: a model is checked and assembled by its numbers."""
+    for part in (*model.bodies, *model.joints, *model.contacts, *model.forces, model):
+        for name, value in vars(part).items():
+            if is_traced(value):
+                kind = type(part).__name__.lower()
+                own = "" if part is model else f" of {kind} {getattr(part, 'name', '')!r}"
+                raise TypeError(
+                    f"{name}{own} is a value that JAX traces, but a model is made of numbers: write the name of one of its "
+                    f"parameters, {name}={name!r} and parameters={{{name!r}: 1.0}}, and hand the value over to the run, "
+                    f"params={{{name!r}: …}}."
+                )
+
+
 def check_numbers(model: Any) -> None:
     """Raise `ValueError` for numbers that mean nothing, and for names of parameters that the model has not."""
     for what, values in _vectors(model):
@@ -34,7 +49,7 @@ def check_numbers(model: Any) -> None:
             raise ValueError(f"{what} must be three numbers, but it is {values!r}.")
         _check_all(model, what, values)
     for what, value in _scalars(model):
-        if np.ndim(value) != 0:
+        if np.ndim(value) != 0 or callable(value):
             raise ValueError(f"{what} must be a number or the name of a parameter, but it is {value!r}.")
         _check_all(model, what, [value])
     for what, axis in _axes(model):

@@ -352,7 +352,8 @@ def _begun(system: Any, step: Any, same: Same, anew: bool, row: dict, params: An
     begun: list[Any] = [None] * len(equation.stages)
     for stage in {id(stage): stage for stage, _ in equation.stages}.values():
         places = [i for i, (other, _) in enumerate(equation.stages) if other is stage]
-        of_part = lambda part, begin=stage.start if anew else stage.resume: begin(data, part * step, params)
+        begin = stage.start if anew else stage.resume
+        of_part = lambda part, begin=begin: begin(data, part * step, params)
         parts = [equation.stages[i][1] for i in places]
         # the beginnings of several stages of one equation are traced once
         found = [of_part(parts[0])] if len(parts) == 1 else zip(*jax.vmap(of_part)(np.array(parts)), strict=True)
