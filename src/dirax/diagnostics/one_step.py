@@ -14,8 +14,6 @@ from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.engines.xla.lane import first_lane, take_step
 from dirax.numerics.equilibration import condition_number
 from dirax.program.evaluation.noise import Noise
-from dirax.program.graph import GraphTooLarge
-from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.linear_solves import solve
 from dirax.program.memo import Same
 from dirax.schemes.discrete_structure import DifferentiatedStep
@@ -31,9 +29,7 @@ def differentiated_steps(
     NaN where a step has no solution. By their scalar program, where there is one; nothing is compiled then. `noise`: of the
     arithmetic; of the states alone, where the step is compiled."""
     lanes, rows, size = states.shape
-    try:
-        steps = StepsInNumbers.of(sol.equation, sol.given_params, sol.batch_params)
-    except (UnsupportedPrimitive, GraphTooLarge):
+    if (steps := StepsInNumbers.found(sol.equation, sol.given_params, sol.batch_params)) is None:
         states = noise.off(states) if noise else states
         items = states, tuple(guesses), t
         items = items if sol.batch is not None else jax.tree.map(lambda a: a[0], items)

@@ -15,8 +15,6 @@ from dirax.diagnostics.symplecticity_of_many import symplecticity_of_many
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, spread, where_reached, worst_place
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.program.evaluation.noise import Noise
-from dirax.program.graph import GraphTooLarge
-from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm
 from dirax.schemes.step import StepSequence
@@ -167,7 +165,7 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
     values = _of_terms(terms)
     if np.any(values[..., 0] > limit):
         moved = differences_by_rounding(terms, lambda noise: stepped(noise)[0])
-        limit *= 1.0 if _is_scalar_program(sol) else UNDISTURBED
+        limit *= 1.0 if StepsInNumbers.found(sol.equation, sol.given_params, sol.batch_params) is not None else UNDISTURBED
         terms[..., 1, :] = np.maximum(terms[..., 1, :], np.max(np.abs(moved), axis=0)[..., 0, :])
         values = _of_terms(terms)
     defect = values[..., 0]
@@ -182,14 +180,6 @@ def symplecticity(sol: Solution, tolerance: float | None) -> Line:
         line = Line(name, line.value, limit, NOT_CHECKED, text + excuse)
     line.details["condition"] = condition
     return line
-
-
-def _is_scalar_program(sol: Solution) -> bool:
-    try:
-        StepsInNumbers.of(sol.equation, sol.given_params, sol.batch_params)
-    except (UnsupportedPrimitive, GraphTooLarge):
-        return False
-    return True
 
 
 def _begun(form: AbstractStepForm, same: Same, rows, params):

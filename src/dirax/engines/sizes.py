@@ -92,10 +92,7 @@ def grown(problem: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.
 def _next_step(p: Problem, lanes: np.ndarray, completed: np.ndarray, state: np.ndarray, guess: tuple) -> tuple[tuple, Any]:
     """The unknowns of each stage in the step that leaves `state`, and where it has a solution; of steps that cannot be taken in
     numbers the guess."""
-    try:
-        steps = StepsInNumbers.of(p.equation, p.params, p.batch_params) if p.size < FEWEST_SPARSE else None
-    except (UnsupportedPrimitive, GraphTooLarge):
-        steps = None
+    steps = StepsInNumbers.found(p.equation, p.params, p.batch_params) if p.size < FEWEST_SPARSE else None
     if steps is None:
         return guess, np.ones(len(lanes), bool)
     params = steps.parameters(p.params, p.batch if p.batch_params else None, lanes)

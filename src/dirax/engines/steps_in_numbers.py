@@ -17,6 +17,8 @@ from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Slopes, Values
 from dirax.program.evaluation.noise import Noise
 from dirax.program.evaluation.read_again import ReadAgain
+from dirax.program.graph import GraphTooLarge
+from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, Same
 from dirax.schemes.step import StepEquation, StepSequence, needs_every_part
 
@@ -94,6 +96,14 @@ class StepsInNumbers:
         """Made once for an equation. Raises `UnsupportedPrimitive` for a step that is no scalar program, `GraphTooLarge` for too
         large a Jacobian."""
         return cls.of_program(step_program(equation, params, batch_params), equation)
+
+    @classmethod
+    def found(cls, equation: StepEquation | StepSequence, params: Any, batch_params: bool) -> "StepsInNumbers | None":
+        """The same; None for a step that is no scalar program, or has too large a Jacobian."""
+        try:
+            return cls.of(equation, params, batch_params)
+        except (UnsupportedPrimitive, GraphTooLarge):
+            return None
 
     @classmethod
     def of_program(cls, program: StepProgram, equation: StepEquation | StepSequence | None = None) -> "StepsInNumbers":

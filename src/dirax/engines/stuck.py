@@ -12,8 +12,6 @@ from dirax.engines.following import FOLLOWED
 from dirax.engines.following import UPDATES as OF_FOLLOWING
 from dirax.engines.sizes import Sizes, grown
 from dirax.engines.steps_in_numbers import StepsInNumbers
-from dirax.program.graph import GraphTooLarge
-from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.text.representation import counted
 
 RESUMED = 16
@@ -97,11 +95,7 @@ def by_following(stuck: AbstractStuck, tried: int) -> int:
     at = stuck.standing(failed)
     may = tried < BEFORE + OF_STEPS * at.completed
     failed, at = failed[may], at[may]
-    if not len(failed):
-        return 0
-    try:
-        steps = StepsInNumbers.of(p.equation, p.params, p.batch_params)
-    except (UnsupportedPrimitive, GraphTooLarge):
+    if not len(failed) or (steps := StepsInNumbers.found(p.equation, p.params, p.batch_params)) is None:
         return 0
     params = steps.parameters(p.params, p.batch if p.batch_params else None, failed)
     t = p.t0 + (p.first_step + at.completed) * p.h

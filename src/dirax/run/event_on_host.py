@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from dirax.engines.steps_in_numbers import StepsInNumbers
-from dirax.program.graph import GraphTooLarge
-from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Same, by_value
 from dirax.program.on_host import called_on_host, on_host
 from dirax.run.event import Event
@@ -37,9 +35,7 @@ class EventsOnHost:
         and when a terminal event ends each trajectory (lanes,), ∞ where none does. Of arrays (lanes, …).
 
         None where the steps, or what is differentiated, have no scalar program."""
-        try:
-            StepsInNumbers.of(self.dense.equation, jax.tree.map(lambda a: a[0], params), False)
-        except (UnsupportedPrimitive, GraphTooLarge):
+        if StepsInNumbers.found(self.dense.equation, jax.tree.map(lambda a: a[0], params), False) is None:
             return None
         leaves, structure = jax.tree.flatten((nodes, steps, params))
         lanes, rows = next(iter(nodes.values())).shape[:2]

@@ -19,7 +19,6 @@ from dirax.engines.xla.lane import Numerics, first_lane, take_step
 from dirax.engines.xla.newton import as_function
 from dirax.program.compiled import compiled
 from dirax.program.evaluation.functions import in_numpy
-from dirax.program.graph import GraphTooLarge
 from dirax.program.interpreter import UnsupportedPrimitive
 from dirax.program.memo import Memo, OfKey, Same, by_value
 from dirax.program.on_host import called_on_host
@@ -94,11 +93,7 @@ def with_roots(equation: Any, roots: Any, state: Any, t: Any, h: Any, params: An
 def _roots_on_host(equation: Any, state: Any, guess: tuple, t: Any, h: Any, params: Any) -> list | None:
     """The unknowns of each stage, without derivatives and NaN where there are none, by a call of the host from where XLA runs:
     it takes seconds to compile an iteration. None where the step has no scalar program, or JAX a device of its own."""
-    if jax.default_backend() != "cpu":
-        return None
-    try:
-        steps = StepsInNumbers.of(equation, params, False)
-    except (UnsupportedPrimitive, GraphTooLarge):
+    if jax.default_backend() != "cpu" or (steps := StepsInNumbers.found(equation, params, False)) is None:
         return None
 
     def find(state: np.ndarray, t: np.ndarray, h: np.ndarray, numbers: np.ndarray, *guesses: np.ndarray) -> list[np.ndarray]:
@@ -215,10 +210,7 @@ class StepsAgain:
     @cached_property
     def in_numbers(self) -> StepsInNumbers | None:
         """The steps in NumPy; None where they are no scalar program."""
-        try:
-            return StepsInNumbers.of(self.equation, self.sol.given_params, self.sol.batch_params)
-        except (UnsupportedPrimitive, GraphTooLarge):
-            return None
+        return StepsInNumbers.found(self.equation, self.sol.given_params, self.sol.batch_params)
 
     @cached_property
     def about(self) -> Any:
