@@ -247,7 +247,7 @@ def at_rest():
     [
         (dx.Collocation(2, nodes="lobatto"), 2e-4),
         (dx.Collocation(3, nodes="lobatto"), 1e-6),
-        (dx.EnergyCollocation(2), 1e-6),
+        (dx.EnergyCollocation(2, points=2), 1e-6),
     ],
 )
 def test_steps_with_multipliers_or_the_energy_in_their_state(scheme, error, at_rest):
