@@ -7,6 +7,7 @@ import pytest
 from scipy.special import ellipj
 
 import dirax as dx
+from dirax.diagnostics.reconstruction_line import reconstruction
 from lie_groups import hat, integrate, matrices, orders, run, unreduced
 
 I = np.array([1.0, 2.0, 3.0])
@@ -217,7 +218,7 @@ def test_reconstructed_motions_between_rows():
     start = {"q": [1.0, 0.0, 0.0, 0.0], "v": [0.0, 0.1, 0.2, 0.3]}
     reduced = dx.simulate(dx.reduce(top, group), dx.DiscreteEulerPoincare(), step=0.1, steps=20, **start)
     whole, t = dx.reconstruct(reduced), np.array([0.5, 0.55, 1.23])
-    exact = dx.simulate(top, dx.Collocation(3), step=0.05, steps=40, **start)
+    exact = dx.simulate(top, dx.Collocation(2), step=0.05, steps=40, **start)
     found = whole.at(t)
     assert np.max(np.abs(found.q - exact.at(t).q)) <= 1e-4 and np.max(np.abs(found.p - exact.at(t).p)) <= 1e-3
     assert np.max(np.abs(found.q[0] - whole.q[5])) <= 1e-15 and np.array_equal(found.x, reduced.at(t).x)
@@ -226,8 +227,7 @@ def test_reconstructed_motions_between_rows():
         whole[2:9].at(0.55)
 
 
-@pytest.mark.parametrize("field", ["q", "p", "spatial_momentum", "xi", "x"])
-def test_what_is_reconstructed_is_verified(field):
+def test_what_is_reconstructed_is_verified():
     """Momenta that were three times as large were called ok."""
     group = dx.SO3()
     kinetic = lambda spin: spin @ (jnp.array([1.0, 2.0, 3.0]) * spin) / 2
@@ -235,7 +235,10 @@ def test_what_is_reconstructed_is_verified(field):
     start = {"q": [[1.0, 0.0, 0.0, 0.0]] * 2, "v": [[0.0, 0.1, 0.2, 0.3], [0.0, 0.3, 0.1, 0.3]]}
     whole = dx.reconstruct(dx.simulate(body, dx.DiscreteEulerPoincare(), step=0.1, steps=8, **start))
     assert dx.verify(whole)["reconstruction"].verdict == "ok"
-    whole.fields[field] = np.array(whole.fields[field])
-    whole.fields[field][1, 3] *= 1.0 + 1e-9
-    line = dx.verify(whole)["reconstruction"]
-    assert line.verdict == "VIOLATED" and f"{field} at t = 0.3 (trajectory 1)" in line.explanation
+    for field in ("q", "p", "spatial_momentum", "xi", "x"):
+        right = whole.fields[field]
+        whole.fields[field] = np.array(right)
+        whole.fields[field][1, 3] *= 1.0 + 1e-9
+        line = reconstruction(whole, None)
+        whole.fields[field] = right
+        assert line.verdict == "VIOLATED" and f"{field} at t = 0.3 (trajectory 1)" in line.explanation

@@ -117,7 +117,7 @@ def test_what_happens_in_a_step_is_that_of_all_its_parts():
         lambda x: x @ x / 2 + x[0] ** 4 / 4, jnp.array([[0.0, 1.0], [-1.0, 0.0]]), R=jnp.diag(jnp.array([0.0, 0.3]))
     )
     for engine in ("native", "xla"):
-        scheme = dx.Composition(dx.DiscreteGradient(), "suzuki4")
+        scheme = dx.Composition(dx.DiscreteGradient(), "yoshida4")
         sol = dx.simulate(system, scheme, x=jnp.array([1.0, 0.4]), step=0.1, steps=12, engine=engine)
         stored, _, dissipated = np.asarray(sol.power).T * sol.step
         np.testing.assert_allclose(stored, np.diff(np.asarray(sol.energy())), atol=1e-14)

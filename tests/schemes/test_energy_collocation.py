@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 import dirax as dx
 from dirax import gallery
+from dirax.diagnostics.reversal_line import taken_back
 from dirax.gallery import contact_particle, transmission
 from dirax.schemes.collocation_tables import gauss, quadrature
 from dirax.schemes.step import Shape
@@ -219,18 +220,22 @@ SYSTEMS = {
 
 
 LONG = ("heavy top", "Euler–Poincaré")
+ALSO_BY_XLA = ("explicit time", "Lie–Poisson", "ports", *LONG)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.soak) if n in LONG else n for n in SYSTEMS])
 def test_every_system_with_a_bracket(name):
     system, data, step = SYSTEMS[name]
     run = lambda scheme, h, n, **more: dx.simulate(system, scheme, step=h, steps=n, **data, **more)
-    native, arrays = (run(dx.EnergyCollocation(2), step, 20, engine=engine) for engine in ("native", "xla"))
-    assert native.ok and arrays.ok and native.stats["engine"] == "native"
+    native = run(dx.EnergyCollocation(2), step, 20, engine="native")
+    assert native.ok and native.stats["engine"] == "native"
     place = next(field for field in ("x", "q") if field in native.fields)
-    for field, values in native.fields.items():
-        if field != "energy_defect":
-            np.testing.assert_allclose(values, arrays.fields[field], atol=1e-13, rtol=1e-13)
+    if name in ALSO_BY_XLA:
+        arrays = run(dx.EnergyCollocation(2), step, 20, engine="xla")
+        assert arrays.ok
+        for field, values in native.fields.items():
+            if field != "energy_defect":
+                np.testing.assert_allclose(values, arrays.fields[field], atol=1e-13, rtol=1e-13)
     energy = native.energy()
     work = np.asarray(native.fields.get("work", 0.0))
     work = work[:, 0] - work[:, 1] if work.ndim == 2 else work
@@ -257,10 +262,10 @@ def test_self_adjoint_with_one_forms_in_a_frame_alone():
     lines = []
     for scheme in (dx.EnergyCollocation(1), dx.EnergyCollocation(1, frame=frame)):
         sol = dx.simulate(system, dx.VariableSteps(scheme, density), step=0.2, steps=5, project=True, **DATA)
-        lines.append(dx.verify(sol)["steps taken back"])
+        lines.append(taken_back(sol, None))
     without, framed = lines
     assert without.verdict == "not checked" and without.value > 1e-9 and "give it frame=" in without.explanation
-    assert framed.verdict == "ok"
+    assert framed.verdict == "ok" and framed.quantity == "steps taken back"
 
 
 @pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
@@ -453,7 +458,7 @@ def averaged_vector_field(data, h, force):
 
 @pytest.mark.parametrize("kind", ["Lagrangian", "canonical bracket"])
 def test_chains_of_many_coordinates_are_sparse_and_keep_their_energy(kind):
-    size, h = 300, 0.1
+    size, h = 150, 0.1
     q = np.sin(np.arange(size))
     force = lambda q: -np.asarray(slope(q))
     slope = jax.jit(jax.grad(chain_energy))
@@ -548,7 +553,7 @@ def test_three_one_forms_of_a_car_with_a_trailer_are_native():
     assert sol.stats["engine"] == "native" and np.ptp(sol.energy()) < 1e-14
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_euler_poincare_equations_are_the_lie_poisson_ones(engine):
     run = {"x": [0.3, 0.8, 1.2, 0.0, 0.6, 0.8], "step": 0.1, "steps": 10, "engine": engine}
     ours, theirs = (dx.simulate(s, dx.EnergyCollocation(2), **run) for s in (TOP, TOP.lie_poisson()))

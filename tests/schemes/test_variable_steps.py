@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import dirax as dx
+from dirax.diagnostics.replay_lines import replayed
 from dirax.engines.steps_in_numbers import StepsInNumbers
 from dirax.gallery.kepler import EXAMPLE, exact
 from dirax.gallery.rolling_disk import EXAMPLE as ROLLING_DISK
@@ -317,7 +318,7 @@ def test_on_a_sphere():
     """Natively, of order 2, and a shifted point is seen: a search for the velocity in every step was left to XLA."""
     lagrangian = lambda q, v: v @ v / 2 * (1 + 0.3 * q[0] ** 2) - 0.8 * q[2] - 0.2 * q[0]
     system, start = dx.ManifoldLagrangian(lagrangian, dx.Sphere(3)), {"q": [0.6, 0.0, -0.8], "v": [0.4, 0.7, 0.3]}
-    exact = dx.simulate(system, dx.Collocation(4), **start, step=0.01, steps=130).q[-1]
+    exact = dx.simulate(system, dx.Collocation(2), **start, step=0.01, steps=130).q[-1]
     scheme, errors = dx.VariableSteps(dx.LagrangeDAlembert(), density=lambda q: 2.0 + q[0]), []
     for n in (80, 160):
         sol = dx.simulate(system, scheme, **start, step=4.0 / n, steps=n)
@@ -327,4 +328,4 @@ def test_on_a_sphere():
     assert dx.verify(sol).ok
     q = sol.q.copy()
     q[50] += 1e-8 * np.array([0.8, 0.0, 0.6])
-    assert not dx.verify(sol.replace(fields=sol.fields | {"q": q})).ok
+    assert replayed(sol.replace(fields=sol.fields | {"q": q}), None).verdict == "VIOLATED"
