@@ -38,7 +38,8 @@ SYMPLECTIC = {
 
 @pytest.mark.parametrize("kind", SYMPLECTIC)
 def test_a_step_preserves_its_form_in_any_units(kind):
-    found = [symplecticity(SYMPLECTIC[kind](unit), None) for unit in (1.0, 2.0**20, 2.0**-9, 1e7)]
+    whole = dx.reconstruct if kind in ("routh", "quotient") else lambda sol: sol  # what verify asks the form of
+    found = [symplecticity(whole(SYMPLECTIC[kind](unit)), None) for unit in (1.0, 2.0**20, 2.0**-9, 1e7)]
     assert {line.quantity for line in found} == {"symplecticity of one step"}
     assert all(line.verdict == "ok" and line.value < 1e-14 for line in found), found
     assert len({line.value for line in found[:3]}) == 1

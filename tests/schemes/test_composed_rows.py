@@ -31,9 +31,11 @@ def mean_tension(intervals):
     return np.array([weights @ tension[i * fine : (i + 1) * fine + 1] for i in range(intervals)])
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
-@pytest.mark.parametrize(("name", "order"), [("suzuki4", 4), ("yoshida4", 4), ("kahan-li6", 6)])
-def test_the_impulse_of_a_composed_step_is_the_whole_steps(engine, name, order):
+@pytest.mark.parametrize(
+    ("name", "order", "engine"),
+    [("suzuki4", 4, "native"), ("yoshida4", 4, "native"), ("kahan-li6", 6, "native"), ("yoshida4", 4, "xla")],
+)
+def test_the_impulse_of_a_composed_step_is_the_whole_steps(name, order, engine):
     """The first part of a step of suzuki4 has .4145 of the tension, of yoshida4 1.3512."""
     errors = []
     for steps in (10, 20):

@@ -201,14 +201,15 @@ def test_theta_maps_of_a_lagrangian_are_the_lifted_ones():
 
 FORMS = lambda q: jnp.array([[jnp.sin(q[2]), -jnp.cos(q[2]), 0.0]])
 TURNED = np.arctan2(0.6, 0.8) + 0.005
+TENSION = dx.LagrangeDirac(lambda q, v: v[:2] @ v[:2] / 2 - q[1] + q[2] * (q[:2] @ q[:2] - 1.0))
 HIDDEN = {
     "a Lagrangian": (
-        dx.LagrangeDirac(lambda q, v: v[:2] @ v[:2] / 2 - q[1] + q[2] * (q[:2] @ q[:2] - 1.0)),
+        TENSION,
         {"q": [0.6, -0.8, -0.525], "v": [0.4, 0.3, 0.0]},
         "∂²L/∂v² has rank 2 of 3",
     ),
     "its two points": (
-        dx.LagrangeDirac(lambda q, v: v[:2] @ v[:2] / 2 - q[1] + q[2] * (q[:2] @ q[:2] - 1.0)),
+        TENSION,
         {"q0": [0.6, -0.8, -0.525], "q1": [np.sin(TURNED), -np.cos(TURNED), -0.525]},
         "∂²L/∂v² has rank 2 of 3",
     ),

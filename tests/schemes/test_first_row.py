@@ -60,16 +60,19 @@ def at_the_start(kind):
     return system.system, params, start, exact["p"], own.T @ exact["multipliers"], every
 
 
+ALL = Kind(4, m=1, c=1, affine=True, forced=True, timed=True, moving=True, redundant=True)
+
+
 @pytest.mark.parametrize(
-    "kind",
+    ("kind", "rule"),
     [
-        Kind(4, m=1, magnetic=True),
-        Kind(3, m=1, affine=True, forced=True, timed=True),
-        Kind(4, m=1, c=1, affine=True, forced=True, timed=True, moving=True, redundant=True),
+        (Kind(4, m=1, magnetic=True), "midpoint"),
+        (Kind(3, m=1, affine=True, forced=True, timed=True), "trapezoidal"),
+        (ALL, "midpoint"),
+        (ALL, "trapezoidal"),
     ],
-    ids=["one-forms", "affine", "all"],
+    ids=["one-forms", "affine", "all", "all, trapezoidal"],
 )
-@pytest.mark.parametrize("rule", ["midpoint", "trapezoidal"])
 def test_second_order_whatever_the_system_has(kind, rule):
     """Against the saddle-point equations of the Lagrangian's own derivatives at the start."""
     system, params, start, p, force, every = at_the_start(kind)

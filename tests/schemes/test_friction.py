@@ -64,8 +64,9 @@ def test_one_sided_schemes_keep_their_first_order(scheme):
     assert 0.8 < np.log2(errors[0] / errors[1]) < 2.2 and errors[1] < 0.02
 
 
-@pytest.mark.parametrize("scheme", SLIDES, ids=["midpoint", "trapezoidal", "resolve"])
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize(
+    ("scheme", "engine"), [*((scheme, "native") for scheme in SLIDES), (SLIDES[0], "xla"), (SLIDES[2], "xla")]
+)
 def test_a_block_slides_down_a_slope(scheme, engine):
     """v̇ = g(sin α − μ cos α), exactly, with N = m g cos α."""
     params = {"m": 2.0, "g": 9.81, "grip": 1.0}
