@@ -194,7 +194,7 @@ SO3 = dx.SO3()
 def on_bundle(q, v):
     x, spin = q[:3], SO3.to_algebra(q[3:], v[3:])
     own = v[:3] @ v[:3] / 2 + spin @ (jnp.array([1.0, 2.0, 3.0]) * spin) / 2
-    return own + 0.3 * spin @ jnp.cross(x, v[:3]) - x[2] / 2
+    return own + 0.3 * spin @ jnp.cross(x, v[:3]) + 0.2 * (spin @ x) ** 2 - x[2] / 2 - 0.2 * x[0] * x[1]
 
 
 def left_invariant_row(q):
