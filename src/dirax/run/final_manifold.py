@@ -251,7 +251,7 @@ def left_manifold(chain: ConstraintChain, t: np.ndarray, q: np.ndarray, p: np.nd
 
 def warn_of_leaving(sol: Any) -> None:
     """Warn of the first trajectory of a run with a singular Lagrangian that leaves its final manifold."""
-    if not {"q", "p"} <= sol.fields.keys() or sol.q.shape[-1] > MOST:
+    if not {"q", "p"} <= sol.fields.keys() or sol.q.shape[-1] > MOST or sol.rows < FEWEST_ROWS:
         return
     chain = None
     for lane in lanes_asked(sol.batch or 1).tolist():
