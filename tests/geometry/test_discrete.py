@@ -206,6 +206,8 @@ def test_bad_signs_steps_and_one_forms_are_refused(kind):
     bad = InducedFiniteDifferenceDirac(lambda q: q[:2], step=0.1)
     with pytest.raises(ValueError, match=r"one_forms returned shape \(2,\)"):
         bad.constraint(jnp.zeros(4), jnp.ones(4))
+    with pytest.raises(ValueError, match=r"two_form\(x\) is not skew: max \|M \+ Mᵀ\| = 2"):
+        FiniteDifferenceDirac(lambda x: jnp.eye(2), step=0.1).flat(jnp.zeros(2), jnp.ones(2))
     with pytest.raises(ValueError, match='sign must be "'):
         GeneratingFunctionDirac("*")
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from dirax.geometry.linear import LinearDirac
+from dirax.geometry.representations import skew
 from dirax.geometry.structures import canonical_two_form
 from dirax.geometry.subspaces import AnyArray
 from dirax.numerics.tolerances import ONE_FORM_RANK, STRUCTURE_DEFECT
@@ -55,7 +56,7 @@ class FiniteDifferenceDirac(eqx.Module):
 
     `two_form(x[, params])` (n, n), ω[i, j] = ω(e_i, e_j); `one_forms(x[, params])` (m, n), the rows of W with
     Δ = ker W, none by default; `step` is the time h between the two points; `sign` is "+" or "-".
-    Raises `ValueError` for another sign.
+    Raises `ValueError` for another sign, and where it is asked at a point at which the form is not skew.
 
         D = FiniteDifferenceDirac(lambda x: jnp.array([[0.0, 1.0], [-1.0, 0.0]]), step=0.1, sign="+")
         D.flat(jnp.array([0.0, 0.0]), jnp.array([0.1, 0.2]))  # (−2, 1)
@@ -131,7 +132,9 @@ class FiniteDifferenceDirac(eqx.Module):
         return LinearDirac.from_annihilator(self._matrix(x, params), self._form(x, params))
 
     def _form(self, x, params):
-        return floats(self.two_form(floats(x), params))
+        form = floats(self.two_form(floats(x), params))
+        skew("two_form(x)", form)
+        return form
 
     def _matrix(self, x, params):
         return _rows_of(self.one_forms, x, params)

@@ -31,13 +31,13 @@ KernelPair = tuple[Float[AnyArray, "*batch n n"], Float[AnyArray, "*batch n n"]]
 
 def two_form_pair(two_form: ArrayLike) -> KernelPair:
     """D_ω = {(v, ω♭v)} ([BLM] Example 2.2.2)."""
-    two_form = _skew("two_form", two_form)
+    two_form = skew("two_form", two_form)
     return matrix_transpose(two_form), -_identity_like(two_form)
 
 
 def bivector_pair(bivector: ArrayLike) -> KernelPair:
     """D_Λ = {(Λ♯α, α)} ([BLM] Example 2.2.3)."""
-    bivector = _skew("bivector", bivector)
+    bivector = skew("bivector", bivector)
     return _identity_like(bivector), -bivector
 
 
@@ -50,7 +50,7 @@ def subspace_pair(basis: ArrayLike) -> KernelPair:
 
 def subspace_and_form_pair(basis: ArrayLike, two_form: ArrayLike) -> KernelPair:
     """D_{F,ω} = {(v, α) : v ∈ F, α − ω♭v ∈ F°}; only ω on F matters ([BLM] Proposition 2.3)."""
-    basis, two_form = as_matrix("basis", basis), _skew("two_form", two_form)
+    basis, two_form = as_matrix("basis", basis), skew("two_form", two_form)
     _require_same_space("basis", basis.shape[-2], "two_form", two_form)
     require_full_rank("basis", basis)
     return _distribution_pair(_projector(matrix_transpose(basis)), two_form)
@@ -61,7 +61,7 @@ def annihilator_pair(one_forms: ArrayLike, two_form: ArrayLike | None = None) ->
     one_forms = as_matrix("one_forms", one_forms)
     require_full_rank("the transpose of one_forms", matrix_transpose(one_forms))
     if two_form is not None:
-        two_form = _skew("two_form", two_form)
+        two_form = skew("two_form", two_form)
         _require_same_space("one_forms", one_forms.shape[-1], "two_form", two_form)
     onto_annihilator = _projector(one_forms)
     return _distribution_pair(_identity_like(onto_annihilator) - onto_annihilator, two_form)
@@ -69,7 +69,7 @@ def annihilator_pair(one_forms: ArrayLike, two_form: ArrayLike | None = None) ->
 
 def codistribution_and_bivector_pair(basis: ArrayLike, bivector: ArrayLike) -> KernelPair:
     """D_{Λ,F*} = {(v, α) : α ∈ F*, β(v) = Λ(β, α) for β ∈ F*}; only Λ on F* matters ([BLM] Theorem 2.5)."""
-    basis, bivector = as_matrix("basis", basis), _skew("bivector", bivector)
+    basis, bivector = as_matrix("basis", basis), skew("bivector", bivector)
     _require_same_space("basis", basis.shape[-2], "bivector", bivector)
     require_full_rank("basis", basis)
     onto = _projector(matrix_transpose(basis))
@@ -142,7 +142,8 @@ def _square(name: str, value: ArrayLike) -> Float[AnyArray, "*batch n n"]:
     return matrix
 
 
-def _skew(name: str, value: ArrayLike) -> Float[AnyArray, "*batch n n"]:
+def skew(name: str, value: ArrayLike) -> Float[AnyArray, "*batch n n"]:
+    """A matrix as an array. Raises `ValueError` for one that is not skew, with the defect."""
     matrix = _square(name, value)
     if not is_traced(matrix):
         defect = np.max(np.abs(matrix + matrix_transpose(matrix)), axis=(-1, -2), initial=0.0)
