@@ -65,8 +65,11 @@ def test_and_their_derivatives():
     def total(mass, which):
         return jnp.sum(run("suzuki4", which, params=mass, steps=4).multipliers ** 2)
 
-    batch = jax.value_and_grad(total)(1.0, slice(3))
-    single = [jax.value_and_grad(total)(1.0, number) for number in range(3)]
+    @jax.jit
+    def ways(mass):
+        batch, *single = [jax.value_and_grad(total)(mass, which) for which in (slice(3), 0, 1, 2)]
+        return batch, single, jax.jvp(lambda mass: total(mass, slice(3)), (mass,), (1.0,))
+
+    batch, single, tangent = ways(1.0)
     np.testing.assert_allclose(batch, np.sum(single, axis=0), rtol=1e-13)
-    tangent = jax.jvp(lambda mass: total(mass, slice(3)), (1.0,), (1.0,))
     np.testing.assert_allclose(tangent, batch, rtol=1e-12)

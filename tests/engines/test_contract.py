@@ -25,7 +25,10 @@ ENGINES: dict[str, dx.AbstractEngine] = {
     "sparse": Sparse(),
     "reference": Reference(),
 }
-EVERY = pytest.mark.parametrize("engine", ENGINES.values(), ids=ENGINES.keys())
+SAME = ("plain",)  # small batches are run as by "xla", whatever `scalars` says
+EVERY = pytest.mark.parametrize(
+    "engine", [pytest.param(e, id=n, marks=[pytest.mark.soak] if n in SAME else []) for n, e in ENGINES.items()]
+)
 
 H, DRIFT = 0.1, 0.2
 EULER = StepEquation(  # backward Euler of ẋ = ⅕ + √(1 − x), whose step has no solution beyond 1

@@ -89,12 +89,13 @@ def mixed_slope(k):
 @pytest.mark.parametrize("engine", ["xla", "auto", "native"])
 def test_leaves_that_stand_still_beside_one_that_jax_traces(engine):
     end = lambda k: mixed(engine, k=k)
-    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(end)))(jnp.array([1.5, 0.5]))
+    several = jnp.array([1.5, 0.5])
+    (values, slopes), (value, slope), single = jax.jit(
+        lambda k: (jax.vmap(jax.value_and_grad(end))(k), jax.jvp(end, (k[0],), (1.0,)), jax.grad(end)(jnp.float32(1.5)))
+    )(several)
     np.testing.assert_allclose(values, cayley(np.array([6.0, 2.0]), 0.1, 30), atol=1e-12)
     np.testing.assert_allclose(slopes, [mixed_slope(1.5), mixed_slope(0.5)], rtol=1e-6)
-    value, slope = jax.jvp(end, (1.5,), (1.0,))
     np.testing.assert_allclose([value, slope], [values[0], slopes[0]], rtol=1e-12)
-    single = jax.grad(end)(jnp.float32(1.5))
     np.testing.assert_allclose(single, mixed_slope(1.5), rtol=1e-6)
     assert single.dtype == np.float32
 
@@ -103,11 +104,12 @@ def test_leaves_that_stand_still_beside_one_that_jax_traces(engine):
 def test_leaves_that_are_no_floats_and_that_jax_traces(engine):
     params = STILL | {"k": 1.5}
     end = lambda params: mixed(engine, **params)
-    value, slope = jax.jit(jax.value_and_grad(end, allow_int=True))(params)
+    several = jax.tree.map(lambda a: np.stack([a, a]), params) | {"count": np.array([2, 1])}
+    both = jax.jit(lambda params, several: (jax.value_and_grad(end, allow_int=True)(params), jax.vmap(end)(several)))
+    (value, slope), values = both(params, several)
     np.testing.assert_allclose(value, cayley(6.0, 0.1, 30), atol=1e-12)
     np.testing.assert_allclose(slope["k"], mixed_slope(1.5), rtol=1e-6)
-    several = jax.tree.map(lambda a: np.stack([a, a]), params) | {"count": np.array([2, 1])}
-    np.testing.assert_allclose(jax.vmap(end)(several), cayley(np.array([6.0, 3.0]), 0.1, 30), atol=1e-12)
+    np.testing.assert_allclose(values, cayley(np.array([6.0, 3.0]), 0.1, 30), atol=1e-12)
 
 
 def test_what_only_whole_numbers_can_do_falls_back_and_says_so():

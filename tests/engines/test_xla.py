@@ -47,7 +47,7 @@ def test_the_midpoint_oscillator_is_a_cayley_map():
     np.testing.assert_allclose(sol.q[:, 0], cayley(1.0, 0.4, 1.7, 0.1, sol.t), atol=1e-12)
 
 
-@pytest.mark.parametrize("save_every", [1, 7])
+@pytest.mark.parametrize("save_every", [pytest.param(1, marks=pytest.mark.soak), 7])
 def test_gradients_of_the_oscillator_against_the_closed_form(save_every):
     """With respect to initial data, params and the step itself, of every saved row at once, in reverse mode."""
     steps, weights = 40, np.random.default_rng(0).normal(size=len(range(0, 40, save_every)) + 1)

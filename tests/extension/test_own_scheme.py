@@ -87,7 +87,7 @@ def test_a_lane_of_a_batch_is_the_run_alone():
 def test_gradients(engine):
     end = lambda params: run(params=params, engine=engine).q[-1, 0]
     difference = (end(0.3 + 1e-6) - end(0.3 - 1e-6)) / 2e-6
-    assert float(jax.grad(end)(0.3)) == pytest.approx(float(difference), abs=1e-8)
+    assert float(jax.jit(jax.grad(end))(0.3)) == pytest.approx(float(difference), abs=1e-8)
 
 
 def test_verdict_and_order():

@@ -14,7 +14,7 @@ from dirax.geometry.linear import LinearDirac
 from dirax.geometry.subspaces import PontryaginSubspace, pseudo_inverse
 from dirax.numerics.ranks import UndecidableRank
 
-FAST = settings(max_examples=60, deadline=None)
+FAST = settings(max_examples=30, deadline=None)
 DIMENSIONS = st.sampled_from([2, 3, 5, 8])  # a few, for the sake of compile time; all of 2, …, 12 below
 NEARLY_DEGENERATE = (1e-3, 1e-5, 1e-7)
 

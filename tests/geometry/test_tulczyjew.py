@@ -239,14 +239,17 @@ def test_without_constraints_flows_are_the_discrete_hamiltonian_map(sign):
     The evolution operators are sections of the projections ([PY] Definition 6.6).
     """
     free = DiscreteEvolution(discrete_lagrangian, step=H, sign=sign)
-    forwards, backwards, before, after = (
-        jax.jit(f) for f in (free.minus_operator, free.plus_operator, *map(legendre_of, (minus_legendre, plus_legendre)))
-    )
-    for seed in range(10):
-        q0, u = points(seed, 2)
+    before, after = map(legendre_of, (minus_legendre, plus_legendre))
+
+    @jax.jit
+    def operators(q0, u):
         z0, z1 = before(q0, q0 + H * u), after(q0, q0 + H * u)
-        agree(forwards(*z0, u), (*z0, *z1), 1e-11)
-        agree(backwards(*z1, u), (*z0, *z1), 1e-11)
+        return free.minus_operator(*z0, u), free.plus_operator(*z1, u), (*z0, *z1)
+
+    for seed in range(10):
+        forwards, backwards, both = operators(*points(seed, 2))
+        agree(forwards, both, 1e-11)
+        agree(backwards, both, 1e-11)
     step = lambda z: jnp.concatenate(free.flow(z[:3], z[3:]))
     jacobian = np.asarray(jax.jit(jax.jacfwd(step))(jnp.concatenate(points(1, 2))))
     np.testing.assert_allclose(jacobian.T @ canonical(3) @ jacobian, canonical(3), atol=1e-11)

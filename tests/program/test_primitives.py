@@ -299,7 +299,7 @@ def fuzz(seed: int, graphs: int, together: int = 100) -> int:
 
 
 def test_random_graphs_against_numpy():
-    assert fuzz(1, 1000, 50) > 1000
+    assert fuzz(1, 400, 50) > 400
 
 
 @pytest.mark.soak
@@ -323,9 +323,9 @@ def test_tables_and_switches_are_native(potential):
         -1, 0
     ]
     q = jnp.array([-0.7])
-    expected, slope = jax.value_and_grad(end)(q, "xla")
+    (expected, slope), ours = jax.jit(lambda q: (jax.value_and_grad(end)(q, "xla"), jax.grad(end)(q, "native")))(q)
     assert abs(end(q, "native") - expected) < 1e-13
-    np.testing.assert_allclose(jax.grad(end)(q, "native"), slope, rtol=1e-10)
+    np.testing.assert_allclose(ours, slope, rtol=1e-10)
 
 
 def test_whole_numbers_that_are_known_late_are_divided_towards_zero():

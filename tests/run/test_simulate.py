@@ -358,7 +358,7 @@ def test_params_are_not_made_twice(engine):
     assert abs(fall - (1.0 - 9.81 * np.sin(np.pi / 6) * 0.55)) <= 1e-14
     with pytest.raises(ValueError, match="right angle"):
         Incline(100.0)
-    by_leaves = jax.grad(end)(Incline(30.0))
+    by_leaves = jax.jit(jax.grad(end))(Incline(30.0))
     assert by_leaves.slope == 0.0 and by_leaves.steep == pytest.approx(-9.81 * 0.55 / 2) == by_leaves._pull * 9.81
 
 

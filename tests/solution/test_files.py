@@ -698,8 +698,8 @@ def test_a_netcdf_file_in_circles_is_refused(tmp_path, monkeypatch, sealed):
     raw[data + free : data + free + 8] = free.to_bytes(8, "little")
     seal = netcdf.SEAL + zlib.crc32(raw).to_bytes(4, "little")
     path.write_bytes(raw + (seal if sealed else b""))
-    monkeypatch.setattr(netcdf, "LIMIT", 2.0)
-    assert "did not come to an end of it within 2 s" in one_sentence(path)
+    monkeypatch.setattr(netcdf, "LIMIT", 1.0)
+    assert "did not come to an end of it within 1 s" in one_sentence(path)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

@@ -180,7 +180,7 @@ def test_values_of_params(engine):
     sol = run(VALUES)
     np.testing.assert_allclose(sol.x[:, 0], charge(sol.t, **VALUES), atol=1e-5)
     np.testing.assert_allclose(sol.energy(), sol.x[:, 0] ** 2 / (2 * 0.35), rtol=1e-14)
-    slopes = jax.grad(lambda params: run(params).x[-1, 0])({name: jnp.asarray(value) for name, value in VALUES.items()})
+    slopes = jax.jit(jax.grad(lambda params: run(params).x[-1, 0]))({name: jnp.asarray(value) for name, value in VALUES.items()})
     for name, value in VALUES.items():
         more, less = (run(VALUES | {name: value * (1 + e)}).x[-1, 0] for e in (1e-4, -1e-4))
         assert slopes[name] == pytest.approx((more - less) / (2e-4 * value), rel=1e-7)

@@ -112,7 +112,7 @@ def test_submanifolds_are_lagrangian():
     np.testing.assert_allclose(made.defect(x, v), 0.0, atol=1e-14)
     basis = np.asarray(made.tangent(x, v))
     assert basis.shape == (12, 6) and np.linalg.matrix_rank(basis) == 6 and float(made.lagrangian_defect(x, v)) < 1e-12
-    point = lambda q, v: np.concatenate([q, jax.grad(lagrangian, 1)(q, v), -jax.grad(lagrangian)(q, v), v])
+    point = jax.jit(lambda q, v: jnp.concatenate([q, jax.grad(lagrangian, 1)(q, v), -jax.grad(lagrangian)(q, v), v]))
     for direction in np.eye(6):
         step = 1e-6 * direction
         moved = (point(q + step[:3], v + step[3:]) - point(q - step[:3], v - step[3:])) / 2e-6

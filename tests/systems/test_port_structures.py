@@ -95,7 +95,7 @@ def test_a_projector_on_the_closed_port():
     sol = dx.simulate(CLOSED, METHOD_2, x=START, step=h, steps=20)
     assert sol.ok and sol.stats["engine"] == "native"
     assert np.abs(jax.vmap(lambda x: PORT(x)[:, 0] @ jax.grad(ENERGY_2)(x))(sol.x)).max() < 1e-14
-    output = lambda x: PORT(x)[:, 0] @ x
+    output = jax.jit(lambda x: PORT(x)[:, 0] @ x)
     P, slope = jax.jit(onto), jax.jit(jax.grad(output))
     for k in (0, 7, 19):
         x0, x1 = sol.x[k], sol.x[k + 1]
