@@ -52,7 +52,7 @@ def test_derivatives_are_those_of_the_plain_run():
         return sol.p[-1].sum()
 
     q = jnp.array([1.0, 0.1])
-    runs = (("xla", False), ("native", True), ("xla", True))
+    runs = (("native", False), ("native", True), ("xla", True))
     expected, *found = jax.jit(lambda q: [jax.grad(end)(q, *run) for run in runs])(q)
     for slopes in found:
         np.testing.assert_allclose(slopes, expected, rtol=1e-12)

@@ -25,10 +25,14 @@ ENGINES: dict[str, dx.AbstractEngine] = {
     "sparse": Sparse(),
     "reference": Reference(),
 }
-SAME = ("plain",)  # small batches are run as by "xla", whatever `scalars` says
-EVERY = pytest.mark.parametrize(
-    "engine", [pytest.param(e, id=n, marks=[pytest.mark.soak] if n in SAME else []) for n, e in ENGINES.items()]
-)
+
+
+def every(soak):
+    """The engines, some of them only in the soak tests."""
+    return [pytest.param(e, id=name, marks=[pytest.mark.soak] if name in soak else []) for name, e in ENGINES.items()]
+
+
+EVERY = pytest.mark.parametrize("engine", every(soak=("plain",)))  # which runs small batches as "xla" does
 
 H, DRIFT = 0.1, 0.2
 EULER = StepEquation(  # backward Euler of ẋ = ⅕ + √(1 − x), whose step has no solution beyond 1
@@ -182,7 +186,7 @@ def test_traced_runs_hold_the_same(engine):
     assert_the_same(engine, 1, *jax.jit(functools.partial(traced, engine))(jnp.array(MIXED)))
 
 
-@EVERY
+@pytest.mark.parametrize("engine", every(soak=("plain", "reference")))
 def test_derivatives_are_those_of_the_good_steps(engine):
     """Of all rows that there are, of every third step, which hold the same as without JAX's transformations.
 

@@ -23,17 +23,17 @@ def run(scheme, **more):
 
 
 def test_steps_written_in_scalars_are_the_steps(monkeypatch):
-    """A composition of two equations, and a batch with parameters of its own."""
+    """Against the native engine: a composition of two equations, and a batch with parameters of its own."""
     c = {"g": np.array([1.0, 9.81, 3.0])}
     batch = {name: np.tile(START[name], (3, 1)) for name in ("q", "v")} | {"params": c, "batch_params": True}
     runs = [
-        lambda: run(dx.SymmetricComposition(dx.PlusLagrangeDirac()), params={"g": 9.81}, compensated=True),
-        lambda: run(dx.PlusLagrangeDirac(), **batch),
+        lambda engine: run(dx.SymmetricComposition(dx.PlusLagrangeDirac()), params={"g": 9.81}, compensated=True, engine=engine),
+        lambda engine: run(dx.PlusLagrangeDirac(), **batch, engine=engine),
     ]
-    arrays = [r() for r in runs]
-    assert np.max(np.abs(arrays[0].multipliers)) > 1e-3
+    native = [r("native") for r in runs]
+    assert np.max(np.abs(native[0].multipliers)) > 1e-3
     monkeypatch.setattr(policy, "fast_loops_asked_for", lambda: True)
-    for plain, scalar in zip(arrays, [r() for r in runs], strict=True):
+    for plain, scalar in zip(native, [r("xla") for r in runs], strict=True):
         assert np.all(scalar.ok)
         for name, values in plain.fields.items():
             np.testing.assert_allclose(scalar.fields[name], values, rtol=1e-10, atol=1e-10)

@@ -57,7 +57,7 @@ RUNS = {
 }
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.soak] if n == "links, Method 1" else []) for n in RUNS])
 def test_equals_the_dense_engine(name):
     system, scheme, initial = RUNS[name]
     step = 1e-3 if system is LINKS else 0.05

@@ -56,7 +56,7 @@ def end(k, steps=60, **more):
 def test_the_first_use_may_be_a_traced_one():
     """What a scheme makes of JAX's arrays is kept with its equation, and is no value of that trace."""
     dx.clear_caches()
-    slope = jax.grad(end)(1.3)
+    slope = jax.jit(jax.grad(end))(1.3)
     np.testing.assert_allclose(slope, (end(1.3 + 1e-6) - end(1.3 - 1e-6)) / 2e-6, rtol=1e-8)
     np.testing.assert_allclose(end(1.3, engine="xla"), end(1.3), rtol=1e-13)
 

@@ -22,7 +22,7 @@ from dirax.geometry.structures import DiracStructure
 SEEDS = st.integers(0, 2**32 - 1)
 SIGNS = st.sampled_from(["+", "-"])
 STEPS = st.floats(1e-3, 10.0)
-SOME = settings(max_examples=30)
+SOME = settings(max_examples=15)
 
 
 def two_form(x):

@@ -52,9 +52,8 @@ def test_a_block_on_four_feet_is_refused_and_on_three_it_runs():
         model = b.Model([body], [b.free("ground", "block", rotation="zyx")], contacts=tips)
         return dx.simulate(model.system, SCHEMES[0], **model.state({}, {"block.x": 1.0}), step=1e-3, steps=20)
 
-    for given in (feet, feet[::-1]):
-        with pytest.raises(ValueError, match=r"rank 3 of 4.*support a body at three points"):
-            block(given)
+    with pytest.raises(ValueError, match=r"rank 3 of 4.*support a body at three points"):
+        block(feet)
     assert block(feet[:3]).ok
 
 

@@ -373,5 +373,7 @@ def test_a_last_row_that_needs_a_step_which_has_no_solution_is_warned_of(engine)
         chain.simulate(step=4 * chain.step, steps=36, engine=engine)
     failed, two = chain.simulate(step=4 * chain.step, steps=37, engine=engine), {k: [a, a] for k, a in chain.initial.items()}
     assert not failed.ok and "momenta and multipliers are made of the step that failed" in failed.message
+    if engine != "native":  # the same from here on
+        return
     batch = chain.simulate(step=4 * chain.step, steps=37, engine=engine, save_every=5, **two)
     assert "not to be trusted" not in batch.message[0]  # the last row that is kept was left by a good step
