@@ -1,6 +1,7 @@
 """Imports point one way through the rooms of the package, and `import dirax` brings in nothing it does not need."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -37,6 +38,11 @@ RANK = {room: rank for rank, room in enumerate(ROOMS)}
 LOADED_ON_DEMAND = ("matplotlib", "xarray", "zarr", "h5netcdf", "h5py", "pandas", "typer", "rich", "distributed")
 
 
+@functools.cache
+def nodes_of(source: str) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(ast.parse(source)))
+
+
 def room_of(path: Path) -> str:
     """The room that a file of the package belongs to: its top folder, or its own name."""
     return path.relative_to(SOURCE).parts[0].removesuffix(".py")
@@ -46,7 +52,7 @@ def imported_rooms(path: Path, source: str) -> list[tuple[int, str]]:
     """(line, room) of every import of dirax in a file, at module level or inside a function, absolute or relative."""
     found = []
     package = ("dirax", *path.relative_to(SOURCE).parts[:-1])
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if isinstance(node, ast.Import):
             targets = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -121,7 +127,7 @@ def imported_modules(path: Path, source: str, modules: set[str]) -> set[str]:
     """The modules that a file imports, anywhere in it: also inside functions and for type checkers only."""
     found = set()
     package = ("dirax", *path.relative_to(SOURCE).parts[:-1])
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if isinstance(node, ast.Import):
             targets = [(alias.name, None) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

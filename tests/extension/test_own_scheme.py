@@ -83,7 +83,7 @@ def test_a_lane_of_a_batch_is_the_run_alone():
     np.testing.assert_array_equal(batch.q[1], run(q=q[1]).q)
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_gradients(engine):
     end = lambda params: run(params=params, engine=engine).q[-1, 0]
     difference = (end(0.3 + 1e-6) - end(0.3 - 1e-6)) / 2e-6

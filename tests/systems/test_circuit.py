@@ -169,7 +169,7 @@ def charge(t, amplitude, resistance, load, tau):
     return amplitude / resistance * (rate * np.sin(t) - np.cos(t) + np.exp(-rate * t)) / (1 + rate**2)
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_values_of_params(engine):
     """A closed form; and the derivative of the last charge in each of the params against differences of runs."""
     system = dx.circuit(OF_PARAMS)
