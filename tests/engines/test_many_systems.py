@@ -54,7 +54,7 @@ def test_the_first_runs_of_a_system_in_several_threads():
         run = {"q": [1.0], "v": [0.0], "step": 0.01, "steps": 100_000, "save_every": 1000, "engine": "native"}
         found.append(dx.simulate(system, dx.LagrangeDAlembert(), **run).q[-1, 0])
 
-    for length in (1.0, 1.1, 1.2):
+    for length in (1.0, 1.1):
         system = dx.LagrangeDirac(lambda q, v, length=length: v @ v / 2 + jnp.cos(q[0]) * length)
         begin, found = threading.Barrier(6), []
         threads = [threading.Thread(target=last, args=(system, begin, found)) for _ in range(6)]

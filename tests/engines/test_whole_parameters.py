@@ -105,11 +105,9 @@ def test_leaves_that_are_no_floats_and_that_jax_traces(engine):
     params = STILL | {"k": 1.5}
     end = lambda params: mixed(engine, **params)
     several = jax.tree.map(lambda a: np.stack([a, a]), params) | {"count": np.array([2, 1])}
-    both = jax.jit(lambda params, several: (jax.value_and_grad(end, allow_int=True)(params), jax.vmap(end)(several)))
-    (value, slope), values = both(params, several)
-    np.testing.assert_allclose(value, cayley(6.0, 0.1, 30), atol=1e-12)
-    np.testing.assert_allclose(slope["k"], mixed_slope(1.5), rtol=1e-6)
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(end, allow_int=True)))(several)
     np.testing.assert_allclose(values, cayley(np.array([6.0, 3.0]), 0.1, 30), atol=1e-12)
+    np.testing.assert_allclose(slopes["k"][0], mixed_slope(1.5), rtol=1e-6)
 
 
 def test_what_only_whole_numbers_can_do_falls_back_and_says_so():

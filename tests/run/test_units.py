@@ -185,8 +185,8 @@ ENERGY = lambda x: x[3:] @ x[3:] / 2
 C, S = np.cos(0.3), np.sin(0.3)
 EAST, FLAT = np.zeros(3), np.array([1.0, 1.0, 0.3])
 HALF = lambda q: jnp.stack([-q[1], q[0]]) / 2
-ROWS = np.random.default_rng(0).normal(size=(12, 24))
-ALONG = np.linalg.svd(ROWS)[2]  # the last 12 rows are those that ROWS sends to zero, up to roundoff
+ROWS = np.random.default_rng(0).normal(size=(8, 16))
+ALONG = np.linalg.svd(ROWS)[2]  # the last 8 rows are those that ROWS sends to zero, up to roundoff
 DEFECTS = {  # system, scheme, data in a unit l that are on the constraint, and off it, and those that have no unit
     "dirac": (bead(), dx.DiscreteDirac(), {"x": [S, -C, 0.7 * C, 0.7 * S]}, {"x": [0.6, -0.7, 0.8, 0.6]}, {}),
     "skate": (dx.DiracSystem(dx.induced_dirac(SKATE, 3), ENERGY), dx.DiscreteDirac(), {"x": [0, 0, 0, 0.5, 0, 0.2]},
@@ -194,7 +194,7 @@ DEFECTS = {  # system, scheme, data in a unit l that are on the constraint, and 
     "hamilton": (dx.HamiltonDirac(lambda q, p: p @ p / 2, SKATE), dx.PlusHamiltonDirac(), {"p": [0.5, 1e-17, 0.2]},
                  {"p": [0.5, 0.2, 0.2]}, {"q": EAST}),
     "many rows": (dx.HamiltonDirac(lambda q, p: p @ p / 2, lambda q: jnp.asarray(ROWS)), dx.PlusHamiltonDirac(),
-                  {"p": ALONG[-1]}, {"p": ALONG[-1] + 1e-6 * ALONG[0]}, {"q": np.zeros(24)}),
+                  {"p": ALONG[-1]}, {"p": ALONG[-1] + 1e-6 * ALONG[0]}, {"q": np.zeros(16)}),
     "phase space": (dx.PhaseSpaceLagrangian(HALF, lambda q: q @ q / 2), dx.DiscreteDirac(), {"q": [1.0, 0.2], "p": [-0.1, 0.5]},
                     {"q": [1.0, 0.2], "p": [0.3, 0.3]}, {}),
     "implicit": (dx.ImplicitSystem(lambda x: jnp.diag(jnp.array([1.0, 0.0])), lambda x: jnp.stack([-x[1], 3 * x[1] - x[0]])),

@@ -268,7 +268,7 @@ def test_nodes_that_float_are_named_with_the_way_out():
     assert helped.rows > sol.rows or helped.ok, helped.message
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_a_diode_behind_a_source_that_is_switched(engine):
     """The first update of Newton's method leaves all the voltage on the diode, e¹⁹³, and every other one takes a kT/e of it off.
     Against the roots of the same equations in one number, which brackets find."""
