@@ -23,9 +23,9 @@ def test_also_in_batches_on_the_other_engine_and_in_derivatives():
 
 def test_a_wrong_order_is_found(monkeypatch):
     """Of a system alone, and of each of a batch."""
-    cases = {seed: fuzz.random_case(seed)[1:] for seed in (1, 13, 25)}
+    cases = {seed: fuzz.random_case(seed)[1:] for seed in (1, 13)}
     system, params, start = fuzz.random_case(1)
-    assert fuzz.examine_together(system, "plus", cases) == {1: [], 13: [], 25: []}
+    assert fuzz.examine_together(system, "plus", cases) == {1: [], 13: []}
     monkeypatch.setitem(fuzz.SCHEMES, "plus", fuzz.Promise(dx.PlusLagrangeDirac(), 2))
     assert any("order: q" in what for what in fuzz.examine(system, "plus", params, start))
     assert all("order: q" in wrong[0] for wrong in fuzz.examine_together(system, "plus", cases).values())
