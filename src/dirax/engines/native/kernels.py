@@ -158,6 +158,13 @@ class Kernels:
         """Raise `UnsupportedPrimitive` for a step with too many operations."""
         self._planned()
 
+    @property
+    def without_corrections(self) -> int:
+        """The same without those of Newton's corrections, which are known before the step is differentiated."""
+        graph, equations = self.step.graph, self.step.equations
+        needed = (graph.reachable([*e.guess, *e.residual, *e.advance]) for e in equations)
+        return sum(1 for nodes in needed for node in nodes if graph.args[node])
+
     @functools.cached_property
     def written(self) -> int:
         """The scalar operations that are written out. Raises `UnsupportedPrimitive` where they are too many."""
