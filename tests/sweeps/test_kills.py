@@ -1,4 +1,4 @@
-"""What is killed loses nothing: the caller, a worker, the scheduler, at three moments each; at twenty in `make soak`."""
+"""What is killed loses nothing: the caller, a worker, the scheduler, at two moments each; at twenty in `make soak`."""
 
 import json
 import os
@@ -95,17 +95,17 @@ def kill_workers(tmp_path, uninterrupted, started, moments):
 
 
 def test_the_caller_is_killed(tmp_path, uninterrupted, started):
-    kill_callers(tmp_path, uninterrupted, started, (0, 3, 9))
+    kill_callers(tmp_path, uninterrupted, started, (0, 6))
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
 def test_a_worker_is_killed(tmp_path, uninterrupted, started):
-    kill_workers(tmp_path, uninterrupted, started, (1, 4, 8))
+    kill_workers(tmp_path, uninterrupted, started, (1, 6))
 
 
 @pytest.mark.skipif(find_spec("distributed") is None, reason="dask.distributed is not installed: pip install dirax[dask]")
 def test_a_scheduler_and_its_workers_are_killed(tmp_path, uninterrupted, started, forked):
-    kill_schedulers(tmp_path, uninterrupted, started, forked, (1, 4, 8))
+    kill_schedulers(tmp_path, uninterrupted, started, forked, (1, 6))
 
 
 @pytest.mark.soak
