@@ -98,19 +98,19 @@ BENT = dx.DiscreteConnection(lambda a, b: b[3:] - a[3:] - (a[2:3] + b[2:3]) * (b
 
 
 @pytest.mark.parametrize(
-    ("system", "scheme", "connection", "engine"),
+    ("system", "scheme", "connection"),
     [
-        (FREE, dx.PlusLagrangeDirac(), dx.LinearConnection([3], [[0.3, -0.2, 0.5]]), "xla"),
-        (TIED, dx.MinusLagrangeDirac("right"), BENT, "native"),
+        (FREE, dx.PlusLagrangeDirac(), dx.LinearConnection([3], [[0.3, -0.2, 0.5]])),
+        (TIED, dx.MinusLagrangeDirac("right"), BENT),
     ],
     ids=["free (+), linear", "constrained (−), bent"],
 )
-def test_by_a_circle_connections_are_functions_of_points_in_space(system, scheme, connection, engine):
+def test_by_a_circle_connections_are_functions_of_points_in_space(system, scheme, connection):
     q, rate = np.append(POLE, 0.4), np.array([1.5, 0.3, 0.0])
     v = np.append(rate, 0.5 if system is FREE else -np.asarray(ROW(q))[:3] @ rate)
     run: dict[str, Any] = {"q": q, "v": v, "step": H, "steps": 40}
     whole = dx.simulate(system, scheme, **run)
-    reduced = dx.simulate(dx.reduce(system, connection), scheme, **run, engine=engine)
+    reduced = dx.simulate(dx.reduce(system, connection), scheme, **run)
     assert reduced.ok and len(np.unique(reduced.chart, axis=0)) > 3
     back = dx.reconstruct(reduced)
     np.testing.assert_allclose(back.q, whole.q, atol=1e-12)

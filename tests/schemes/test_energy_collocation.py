@@ -220,7 +220,7 @@ SYSTEMS = {
 
 
 LONG = ("heavy top", "Euler–Poincaré")
-ALSO_BY_XLA = ("explicit time", "Lie–Poisson", "ports", *LONG)
+ALSO_BY_XLA = ("explicit time", "ports", *LONG)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.soak) if n in LONG else n for n in SYSTEMS])
@@ -487,7 +487,7 @@ def many_ports(size=5):
     return system, {"x": np.sin(np.arange(size))}
 
 
-def many_masses(size=3):
+def many_masses(size=2):
     """Masses that are not diagonal and change with q, not quadratic in v, with forces and explicit time."""
 
     def lagrangian(t, q, v):
@@ -508,7 +508,7 @@ def test_steps_of_many_coordinates_are_those_of_few(made, monkeypatch):
         monkeypatch.setattr(f"dirax.schemes.{kind}_energy_collocation_step.FEWEST_SPARSE", 2)
     dx.clear_caches()  # the same functions are the same system
     ours = run("sparse")
-    assert ours.ok and theirs.ok and "iteration" in theirs.stats and ours.stats["unknowns"] in (2 * 5, (4 + 5) * 3)
+    assert ours.ok and theirs.ok and "iteration" in theirs.stats and ours.stats["unknowns"] in (2 * 5, (4 + 5) * 2)
     for name in ours.fields:
         if name != "energy_defect":
             np.testing.assert_allclose(ours.fields[name], theirs.fields[name], rtol=0, atol=1e-13, err_msg=name)

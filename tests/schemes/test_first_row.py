@@ -60,14 +60,14 @@ def at_the_start(kind):
     return system.system, params, start, exact["p"], own.T @ exact["multipliers"], every
 
 
-ALL = Kind(4, m=1, c=1, affine=True, forced=True, timed=True, moving=True, redundant=True)
+ALL = Kind(4, m=1, c=1, magnetic=True, affine=True, forced=True, timed=True, moving=True, redundant=True)
 
 
 @pytest.mark.parametrize(
     ("kind", "rule"),
     [
-        (Kind(4, m=1, magnetic=True), "midpoint"),
-        (Kind(3, m=1, affine=True, forced=True, timed=True), "trapezoidal"),
+        pytest.param(Kind(4, m=1, magnetic=True), "midpoint", marks=pytest.mark.soak),
+        pytest.param(Kind(3, m=1, affine=True, forced=True, timed=True), "trapezoidal", marks=pytest.mark.soak),
         (ALL, "midpoint"),
         (ALL, "trapezoidal"),
     ],
@@ -153,7 +153,7 @@ def test_verify_takes_the_first_row_again(scheme):
 HEAVY = dx.LagrangeDirac(lambda q, v, m: m * (v @ v) / 2 + m**2 * q[0], BLADE)
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_it_is_differentiated(engine):
     """L = m|v|²/2 + m g x: the force at the start is 2 m g sin t₀ up to h², with ẋ that of g = 1 where φ̇ = 1. Differences are
     those of runs of the native engine."""

@@ -126,10 +126,10 @@ def test_damage_is_seen():
     assert abs(dx.action_variation(sol, np.sin(3 * sol.q)).value) > 1e-11
 
 
-def exact(t, q, v):
-    """The spherical pendulum, q̈ = −∇V + c q."""
+def exact(t, q, v, friction=0.0):
+    """The spherical pendulum, q̈ = −∇V − friction q̇ + c q."""
     force = np.array([0.0, 0.0, -3.0])
-    right = lambda t, z: np.concatenate([z[3:], force - z[:3] * (z[:3] @ force + z[3:] @ z[3:])])
+    right = lambda t, z: np.concatenate([z[3:], force - friction * z[3:] - z[:3] * (z[:3] @ force + z[3:] @ z[3:])])
     return solve_ivp(right, (0, t), np.concatenate([q, v]), rtol=1e-12, atol=1e-13, method="DOP853").y[:3, -1]
 
 
@@ -159,7 +159,11 @@ SUSLOV = dx.ManifoldLagrangian(
 
 @pytest.mark.parametrize(
     ("system", "scheme"),
-    [(BODY, dx.PlusLagrangeDirac()), (SUSLOV, dx.PlusLagrangeDirac()), (SUSLOV, dx.MinusLagrangeDirac("right"))],
+    [
+        (BODY, dx.PlusLagrangeDirac()),
+        pytest.param(SUSLOV, dx.PlusLagrangeDirac(), marks=pytest.mark.soak),
+        (SUSLOV, dx.MinusLagrangeDirac("right")),
+    ],
     ids=["free body (+)", "Suslov (+)", "Suslov (−)"],
 )
 def test_on_a_group_left_invariant_systems_are_reduced_to_its_algebra(system, scheme):
@@ -180,16 +184,14 @@ def test_on_a_group_left_invariant_systems_are_reduced_to_its_algebra(system, sc
         assert np.ptp(spatial, axis=0).max() < 3e-13  # roundoff of a step is ε/h of them
 
 
-def test_the_midpoint_equations_are_those_of_the_geodesic_map_in_any_atlas():
+def test_the_midpoint_equations_are_those_of_the_geodesic_map_in_another_atlas():
     run = FROM["tied"] | {"step": H, "steps": 20}
     known = dx.simulate(TIED, dx.LagrangeDAlembert(), **run)
-    centres = {len(np.unique(known.chart, axis=0))}
-    for atlas in (dx.Atlas(SPACE, leave_at=0.15), dx.Atlas(SPACE, exponential=True)):
-        sol = dx.simulate(TIED, dx.InCharts(dx.RiemannianExp(SPACE), atlas), **run)
-        np.testing.assert_allclose(sol.q, known.q, atol=1e-12)
-        np.testing.assert_allclose(sol.p, known.p, atol=1e-11)
-        centres.add(len(np.unique(sol.chart, axis=0)))
-    assert len(centres) > 1  # other charts
+    atlas = dx.Atlas(SPACE, exponential=True, leave_at=0.15)
+    sol = dx.simulate(TIED, dx.InCharts(dx.RiemannianExp(SPACE), atlas), **run)
+    np.testing.assert_allclose(sol.q, known.q, atol=1e-12)
+    np.testing.assert_allclose(sol.p, known.p, atol=1e-11)
+    assert len(np.unique(sol.chart, axis=0)) != len(np.unique(known.chart, axis=0))  # other charts
     verdicts = {line.quantity: line.verdict for line in membership(sol, structure_of(sol), None)}
     assert verdicts["discrete Dirac structure"] == "ok"
 
@@ -250,8 +252,7 @@ def test_forces_and_their_work():
         assert energy[-1] < energy[0] - 0.5
         ends.append(sol.q[-1])
         lost.append(energy[-1] - energy[0] - sol.work[-1])
-    fine = dx.simulate(damped, dx.DiscreteDirac(dx.SphereProjection()), q=Q0, v=V0, step=2e-3, steps=1000).q[-1]
-    errors = [np.linalg.norm(q - fine) for q in ends]
+    errors = [np.linalg.norm(q - exact(2.0, Q0, V0, friction=0.5)) for q in ends]
     assert -np.diff(np.log2(errors)) == pytest.approx([2, 2], abs=0.15)
     assert abs(lost[2]) < 0.3 * abs(lost[1]) < 0.1 * abs(lost[0])
     assert dx.verify(sol)["discrete Dirac structure"].verdict == "ok"
