@@ -61,10 +61,10 @@ CASES: list[Any] = [  # name, fibre, discrete Lagrangian, step, coordinates, ini
     ("charged-particle", [3], "left", 0.1, None, None),
     slow("charged-particle", [2, 3], "trapezoidal", 0.05, None, None),
     slow("charged-particle", [1, 2, 3], "midpoint", 0.05, polar, OFF_THE_AXIS),
-    ("planar-n-body", [3, 4, 5], "midpoint", 0.01, planar_n_body.from_shape, None),
+    slow("planar-n-body", [3, 4, 5], "midpoint", 0.01, planar_n_body.from_shape, None),
     ("kepler", [1], "midpoint", 0.05, polar, None),
     ("rolling-disk", [0, 1], "left", 1e-3, None, None),
-    ("heisenberg", [2], "midpoint", 0.01, None, None),
+    slow("heisenberg", [2], "midpoint", 0.01, None, None),
     slow("heisenberg", [1, 2], "trapezoidal", 0.01, polar, ADMISSIBLE),
     ("contact-particle", [2], "midpoint", 0.05, None, None),
     slow("turntable", [4], "midpoint", 0.01, None, None),
@@ -123,7 +123,13 @@ def test_every_system_is_accounted_for():
     assert cases | others == set(gallery.names()) and not cases & others
 
 
-@pytest.mark.parametrize("name", [name for name in WITHOUT if isinstance(gallery.get(name).system, dx.LagrangeDirac)])
+LONG = "andrews-squeezer", "n-four-bar"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [slow(name) if name in LONG else name for name in WITHOUT if isinstance(gallery.get(name).system, dx.LagrangeDirac)],
+)
 def test_systems_without_translations(name):
     example = gallery.get(name)
     assert len(dx.translation_symmetries(example.system, example.initial["q"], params=example.params, radius=0.3)) == 0

@@ -48,7 +48,7 @@ def test_the_impulse_of_a_composed_step_is_the_whole_steps(name, order, engine):
     assert np.log2(errors[0] / errors[1]) > order - 0.5
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_symmetric_compositions_too(engine):
     """The first part had .056, .141 and .077 of the tension along one run."""
     scheme, errors = dx.SymmetricComposition(dx.PlusLagrangeDirac()), []

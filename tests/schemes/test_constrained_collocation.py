@@ -117,9 +117,10 @@ OF_MULTIPLIERS = {
 @pytest.mark.parametrize(
     "kind, stages",
     [
-        *((kind, stages) for kind in ("holonomic", "nonholonomic") for stages in STEPS),
-        ("both", 3),
-        *(pytest.param("both", stages, marks=pytest.mark.soak) for stages in (2, 4)),
+        *((kind, 4) for kind in ("holonomic", "nonholonomic")),
+        *((kind, 3) for kind in KINDS),
+        *(pytest.param(kind, 2, marks=pytest.mark.soak) for kind in KINDS),
+        pytest.param("both", 4, marks=pytest.mark.soak),
     ],
 )
 def test_orders_and_constraints(kind, stages):

@@ -226,7 +226,7 @@ HIDDEN = {
 }
 
 
-@pytest.mark.parametrize("name", HIDDEN)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.soak) if n == "its two points" else n for n in HIDDEN])
 def test_method_2_of_constraints_that_are_not_stated_needs_the_chain(name):
     """Method 1 takes these systems; Method 2 says how to have them."""
     system, data, words = HIDDEN[name]
@@ -302,7 +302,7 @@ def test_method_2_of_a_hamiltonian_with_one_forms():
         dx.simulate(rolling, dx.DiscreteDirac(dx.ProjectedMap(dx.Midpoint(), halfway, 3)), **whole, **run)
 
 
-@pytest.mark.parametrize("composed", [False, True])
+@pytest.mark.parametrize("composed", [pytest.param(False, marks=pytest.mark.soak), True])
 def test_lagrangians_by_a_projected_map_are_those_of_its_formula(composed):
     """On the sphere the projected midpoint map has an inverse in closed form; both with a one-form, a force and time."""
     lagrangian, form = (

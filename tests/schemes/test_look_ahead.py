@@ -42,7 +42,7 @@ def by_hand(q, p, steps):
     return np.array(rows)
 
 
-@pytest.mark.parametrize("engine", ["native", "xla"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("xla", marks=pytest.mark.soak)])
 def test_the_equations_by_hand(engine):
     sol = dx.simulate(PARTS, LIFT, x=np.concatenate([Q, P]), params=1.0, step=H, steps=30, engine=engine)
     np.testing.assert_allclose(sol.x[:-1], by_hand(Q, P, 30), atol=1e-12)

@@ -72,7 +72,9 @@ def off_span(covector, span):
     return covector - span.T @ np.linalg.solve(span @ span.T, span @ covector)
 
 
-@pytest.mark.parametrize(("case", "map"), [*((case, "projection") for case in CASES), ("one-form", "exponential")])
+@pytest.mark.parametrize(
+    ("case", "map"), [*((case, "projection") for case in CASES), pytest.param("one-form", "exponential", marks=pytest.mark.soak)]
+)
 def test_momenta_and_impulses_have_the_order_of_q(case, map):
     """What is off the constraints in p changes its sign in every plain step, and stayed of order 2."""
     system = dx.ManifoldLagrangian(lagrangian, S2_R, rows, **CASES[case])
