@@ -171,7 +171,10 @@ def suslov_motion():
 
 @pytest.mark.parametrize(
     ("map", "constraints"),
-    [*((dx.LieGroupExp(SO3), method) for method in METHODS), (dx.RiemannianExp(SO3), "resolve")],
+    [
+        *((dx.LieGroupExp(SO3), method) for method in METHODS),
+        pytest.param(dx.RiemannianExp(SO3), "resolve", marks=pytest.mark.soak),
+    ],
 )
 def test_suslovs_problem_on_the_group_against_eulers_equations(map, constraints):
     g, omega = suslov_start()

@@ -324,7 +324,7 @@ def test_a_full_disk_is_one_error_and_the_same_call_goes_on(done, tmp_path, monk
 def test_a_study_larger_than_the_disk_is_refused_before_it_begins(tmp_path):
     with pytest.raises(OSError, match="GiB of the disk are free"):
         study(
-            tmp_path / "huge.zarr", {"g": np.linspace(1, 2, 10**5), "angle": np.linspace(0, 3, 10**6)}, steps=10_000, save_every=1
+            tmp_path / "huge.zarr", {"g": np.linspace(1, 2, 10**4), "angle": np.linspace(0, 3, 10**5)}, steps=10_000, save_every=1
         )
 
 
