@@ -14,6 +14,7 @@ import dirax as dx
 START = {"q": [1.0, 0.2], "v": [0.0, 0.1], "step": 0.05, "steps": 20}
 MIDPOINT = dx.LagrangeDAlembert()
 K = 1.3
+FACTOR = 1.0
 
 
 def end(lagrangian, scheme=MIDPOINT, **more):
@@ -87,6 +88,21 @@ def test_it_is_the_run_with_params_and_is_compiled_once(way, compiled):
     assert len(compiled) == many
     values = jax.vmap(loss)(jnp.array([K, 2.0]))
     np.testing.assert_allclose(values, [float(loss(K)), float(loss(2.0))], rtol=1e-13)
+
+
+def test_a_global_that_has_changed_is_read_again(monkeypatch):
+    """It was refused although it was stated again."""
+    loss = lambda k: end(lambda q, v: v @ v / 2 - FACTOR * k * q @ q / 2)
+    before = float(jax.grad(loss)(K))
+    monkeypatch.setitem(globals(), "FACTOR", 2.0)
+    assert float(jax.grad(loss)(K)) == pytest.approx(2.0 * float(jax.grad(by_params)(2.0 * K)), rel=1e-13) != before
+    monkeypatch.setitem(globals(), "FACTOR", 1.0)
+    assert float(jax.grad(loss)(K)) == before
+
+
+def test_keys_without_an_order_are_left_alone():
+    loss = lambda k: (lambda table: end(lambda q, v: v @ v / 2 - table["a"] * k * q @ q / 2))({"a": 1.0, 1: 2.0})
+    assert float(jax.grad(loss)(K)) == pytest.approx(float(jax.grad(by_params)(K)), rel=1e-13)
 
 
 def test_an_object_that_keeps_a_record_is_left_to_itself():

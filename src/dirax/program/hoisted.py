@@ -2,6 +2,7 @@
 serves every call of a loss that states it anew, as it does with values in params."""
 
 import functools
+import itertools
 import types
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
@@ -14,14 +15,16 @@ from dirax.program.captured import Captured
 from dirax.program.code_reads import reads
 from dirax.program.memo import Memo, OfKey
 from dirax.program.outside_values import is_installed, is_of_library, package_of
-from dirax.program.stated import DEEPEST, held, is_of_values, key_of, of_code, outside_of, with_outside
+from dirax.program.stated import DEEPEST, VERSIONS, held, is_of_values, key_of, of_code, outside_of, with_outside
 
 Make = Callable[[Sequence], Any]
 """What makes a value from those that are traced in it."""
 
 PLACE = "a traced value"
 
-_kept: "Memo[OfHoisted]" = Memo(512)
+_versions = itertools.count()
+
+_kept: "Memo[list[OfHoisted]]" = Memo(512)
 
 
 @jax.tree_util.register_dataclass
@@ -34,6 +37,11 @@ class Hoisted:
 
     def __getitem__(self, name: Any) -> Any:
         return self.params[name]
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.params, name)
 
 
 def split(params: Any, function: Callable, places: tuple[int, ...] | None) -> tuple[Any, tuple]:
@@ -70,7 +78,12 @@ def hoisted(function: Callable, values: list[Tracer]) -> tuple[OfHoisted, tuple[
     for value in found:
         places.append(next((i for i, other in enumerate(values) if other is value), len(values)))
         values += [value] * (places[-1] == len(values))
-    return _kept.get(key, lambda: OfHoisted(key, make, len(found))), tuple(places)
+    known = _kept.get(key, list)
+    stands = next((other for other in known if not other.outside.changed()), None)
+    if stands is None:  # it has read something else from outside before
+        stands = OfHoisted((key, next(_versions)), make, len(found))
+        known[:] = [*known[1 - VERSIONS :], stands]
+    return stands, tuple(places)
 
 
 def _opened(value: Any, found: list[Tracer], depth: int) -> tuple[Any, Make]:
@@ -103,7 +116,10 @@ def _parts(value: Any) -> tuple[Hashable, Sequence, Make] | None:
         return (functools.partial, names, count), (value.func, *value.args, *value.keywords.values()), partial
     if isinstance(value, types.MethodType):
         return (types.MethodType, value.__func__), (value.__self__,), lambda parts: types.MethodType(value.__func__, *parts)
-    leaves, structure = jax.tree.flatten(value)
+    try:
+        leaves, structure = jax.tree.flatten(value)
+    except Exception:  # the keys of a dictionary that have no order
+        return None
     if len(leaves) == 1 and leaves[0] is value:
         return _parts_of_object(value)
     return structure, leaves, functools.partial(jax.tree.unflatten, structure)
