@@ -90,6 +90,26 @@ def test_it_is_the_run_with_params_and_is_compiled_once(way, compiled):
     np.testing.assert_allclose(values, [float(loss(K)), float(loss(2.0))], rtol=1e-13)
 
 
+GIVEN = [{}, {"q": [0.5, 0.1]}, {"params": {"s": 2.0}}, {"q": [0.5, 0.1], "params": {"s": 2.0}}]
+
+
+@pytest.mark.parametrize("given", GIVEN, ids=str)
+    "given", [{}, {"q": [0.5, 0.1]}, {"params": {"s": 2.0}}, {"q": [0.5, 0.1], "params": {"s": 2.0}}], ids=str
+)
+@pytest.mark.parametrize("traced", ["closed over", "params"])
+def test_a_run_that_is_prepared_where_jax_traces(traced, given):
+    """What it was given later was left out without a word."""
+
+    def loss(k):
+        factor, s = (k, 1.0) if traced == "closed over" else (1.0, k)
+        system = dx.LagrangeDirac(lambda q, v, params: v @ v / 2 - factor * params["s"] * q @ q / 2)
+        run = dx.prepare(system, MIDPOINT, params={"s": s}, **START)
+        return jnp.sum(run(**given).q[-1])
+
+    near = (loss(K + 1e-5) - loss(K - 1e-5)) / 2e-5
+    assert float(jax.grad(loss)(K)) == pytest.approx(float(near), rel=1e-8, abs=1e-12)
+
+
 def test_a_global_that_has_changed_is_read_again(monkeypatch):
     """It was refused although it was stated again."""
     loss = lambda k: end(lambda q, v: v @ v / 2 - FACTOR * k * q @ q / 2)

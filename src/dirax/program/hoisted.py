@@ -44,10 +44,19 @@ class Hoisted:
         return getattr(self.params, name)
 
 
+def beside(params: Any, others: Any) -> Any:
+    """Params with the hoisted values of others, where these have some."""
+    return Hoisted(params, others.values) if isinstance(others, Hoisted) and not isinstance(params, Hoisted) else params
+
+
 def split(params: Any, function: Callable, places: tuple[int, ...] | None) -> tuple[Any, tuple]:
     """The params that a function takes, which are all of them for those of dirax that hand them on, and what it takes before its
     arguments: its values at these `places`."""
-    if not isinstance(params, Hoisted) or (places is None and package_of(function) == "dirax"):
+    if not isinstance(params, Hoisted):
+        if places is not None:
+            raise TypeError("a function of hoisted values is called with params that do not hold them")
+        return params, ()
+    if places is None and package_of(function) == "dirax":
         return params, ()
     return params.params, () if places is None else (tuple(params.values[i] for i in places),)
 

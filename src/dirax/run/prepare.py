@@ -8,6 +8,7 @@ from typing import Any
 import jax
 
 from dirax.engines.engine import AbstractEngine
+from dirax.program.hoisted import beside
 from dirax.run.carry_out import Kind, carried_out, prepared
 from dirax.run.params import params_of_case, plain_floats
 from dirax.run.scalars import count, finite, positive
@@ -48,7 +49,9 @@ class PreparedRun:
         """The Solution of the run with these numbers. Raises as `dx.simulate`."""
         entered = time.perf_counter()
         base, kind = self._case, self._kind
-        data, params = self._alike(given) if given and kind is not None else (base.data, base.params)
+        data, params = base.data, base.params
+        if given:
+            data, params = self._alike(given) if kind is not None else (None, None)
         if data is None:
             data, params, kind = *self._other(given), None
         case = Case(
@@ -101,7 +104,7 @@ class PreparedRun:
     def _other(self, given: dict[str, Any]) -> tuple[dict[str, Any], Any]:
         """The same for anything that is given. Raises `TypeError` and `ValueError`."""
         base = self._case
-        params = params_of_case(given["params"]) if "params" in given else base.params
+        params = beside(params_of_case(given["params"]), base.params) if "params" in given else base.params
         given = {name: value for name, value in given.items() if name != "params" and value is not None}
         if unknown := next((name for name in given if name not in NUMBERS), None):
             raise TypeError(
