@@ -94,8 +94,6 @@ GIVEN = [{}, {"q": [0.5, 0.1]}, {"params": {"s": 2.0}}, {"q": [0.5, 0.1], "param
 
 
 @pytest.mark.parametrize("given", GIVEN, ids=str)
-    "given", [{}, {"q": [0.5, 0.1]}, {"params": {"s": 2.0}}, {"q": [0.5, 0.1], "params": {"s": 2.0}}], ids=str
-)
 @pytest.mark.parametrize("traced", ["closed over", "params"])
 def test_a_run_that_is_prepared_where_jax_traces(traced, given):
     """What it was given later was left out without a word."""
