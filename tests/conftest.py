@@ -21,6 +21,7 @@ gc.set_threshold(50_000, 20, 100)  # tracing makes many objects that live
 
 import hypothesis
 import jax
+import pytest
 
 from dirax.engines.native import kernels
 
@@ -52,3 +53,13 @@ def pytest_collection_finish():
 
 def pytest_sessionfinish():
     gc.freeze()  # pytest collects garbage several times when it ends: nothing of what lives now is looked at again
+
+
+@pytest.fixture
+def compiled():
+    """The compilations of XLA since the test began."""
+    found = []
+    listener = lambda event, duration, **_: found.append(event) if event.endswith("backend_compile_duration") else None
+    jax.monitoring.register_event_duration_secs_listener(listener)
+    yield found
+    jax.monitoring.unregister_event_duration_listener(listener)

@@ -69,16 +69,6 @@ WAYS = {
 }
 
 
-@pytest.fixture
-def compiled():
-    """The compilations of XLA so far."""
-    found = []
-    listener = lambda event, duration, **_: found.append(event) if event.endswith("backend_compile_duration") else None
-    jax.monitoring.register_event_duration_secs_listener(listener)
-    yield found
-    jax.monitoring.unregister_event_duration_listener(listener)
-
-
 @pytest.mark.parametrize("way", WAYS)
 def test_it_is_the_run_with_params_and_is_compiled_once(way, compiled):
     loss = lambda k: end(WAYS[way](k))

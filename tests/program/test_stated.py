@@ -23,16 +23,6 @@ def end(system, **more):
     return dx.simulate(system, MIDPOINT, **RUN | more).q[-1]
 
 
-@pytest.fixture
-def compiled():
-    """The compilations of XLA so far."""
-    found = []
-    listener = lambda event, duration, **_: found.append(event) if event.endswith("backend_compile_duration") else None
-    jax.monitoring.register_event_duration_secs_listener(listener)
-    yield found
-    jax.monitoring.unregister_event_duration_listener(listener)
-
-
 def test_systems_are_equal_by_what_their_functions_read():
     at = lambda x: {"at": np.array([x, 0.0])}
     assert spring(1.5) == spring(1.5) and hash(spring(1.5)) == hash(spring(1.5)) and spring(2.0, at(0.3)) == spring(2.0, at(0.3))

@@ -78,28 +78,31 @@ def hoisted(function: Callable, values: list[Tracer]) -> tuple[OfHoisted, tuple[
     nothing is traced in it, or what is there is not known by its value."""
     found: list[Tracer] = []
     key, make = _opened(function, found, 0)
+    if not found:
+        return None
     try:
-        if not found or hash(key) is None:
-            return None
+        known = _kept.get(key, list)
     except TypeError:  # something static in it has no hash
         return None
-    places = []
-    for value in found:
-        places.append(next((i for i, other in enumerate(values) if other is value), len(values)))
-        values += [value] * (places[-1] == len(values))
-    known = _kept.get(key, list)
+    places = tuple(_place(value, values) for value in found)
     stands = next((other for other in known if not other.outside.changed()), None)
     if stands is None:  # it has read something else from outside before
         stands = OfHoisted((key, next(_versions)), make, len(found))
         known[:] = [*known[1 - VERSIONS :], stands]
-    return stands, tuple(places)
+    return stands, places
+
+
+def _place(value: Tracer, among: list[Tracer]) -> int:
+    """Where a value is among others, to which it is added if it is not there."""
+    number = next((i for i, other in enumerate(among) if other is value), len(among))
+    among += [value] * (number == len(among))
+    return number
 
 
 def _opened(value: Any, found: list[Tracer], depth: int) -> tuple[Any, Make]:
     """What a value is told apart by, and how one like it is made of other traced values than those that are added to `found`."""
     if isinstance(value, Tracer):
-        number = next((i for i, other in enumerate(found) if other is value), len(found))
-        found += [value] * (number == len(found))
+        number = _place(value, found)
         return (PLACE, number), lambda values: values[number]
     if depth < DEEPEST and (parts := _parts(value)) is not None:
         kind, inside, make = parts

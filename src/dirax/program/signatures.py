@@ -18,6 +18,12 @@ def parameters_of(function: Callable) -> tuple[str, ...]:
     return tuple(p.name for p in _parameters(function) or ())
 
 
+def signature(function: Callable, arguments: Sequence[str]) -> str:
+    """The function's own name with these arguments, e.g. `pendulum(q, v)`."""
+    own = getattr(function, "__name__", type(function).__name__).replace("<lambda>", "lambda")
+    return f"{own}({', '.join(arguments)})"
+
+
 def takes_time(function: Callable, count: int) -> bool:
     """Whether the first argument is called `t` and `count` others follow."""
     positional = _positional(function)

@@ -100,7 +100,7 @@ def key_of(value: Any, depth: int) -> Hashable:
 
 
 def held(value: Any, depth: int) -> Any:
-    """The same with copies of all that `_key` compares by what is in it."""
+    """The same with copies of all that `key_of` compares by what is in it."""
     if type(value) is np.ndarray and _is_small(value):
         return value.copy()
     if depth < DEEPEST and type(value) in (list, tuple):

@@ -22,7 +22,7 @@ from dirax.program.derivatives_by_jax import differentiated
 from dirax.program.hoisted import hoisted, split
 from dirax.program.indexed import clamps, indexes
 from dirax.program.memo import Memo
-from dirax.program.signatures import parameters_of, refuse_other_places, takes_params, takes_time
+from dirax.program.signatures import parameters_of, refuse_other_places, signature, takes_params, takes_time
 from dirax.program.stated import as_stated
 from dirax.program.tracing import once
 from dirax.text.representation import value_text
@@ -130,8 +130,7 @@ class UserFunction(eqx.Module):
     @property
     def signature(self) -> str:
         """The function's own name with the arguments it is called with, e.g. `pendulum(q, v, params)`."""
-        own = getattr(self.function, "__name__", type(self.function).__name__).replace("<lambda>", "lambda")
-        return f"{own}({', '.join((*self.arguments, 'params') if self.takes_params else self.arguments)})"
+        return signature(self.function, (*self.arguments, "params") if self.takes_params else self.arguments)
 
     def shape(self, *values: Any) -> jax.ShapeDtypeStruct:
         """Shape and dtype of the result, by abstract evaluation on `(*arguments, params)`.

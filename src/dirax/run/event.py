@@ -11,6 +11,7 @@ from jax.core import Tracer
 
 from dirax.program.hoisted import hoisted, split
 from dirax.program.memo import OfKey
+from dirax.program.signatures import signature
 from dirax.program.stated import as_stated
 from dirax.program.user_functions import reads_outside
 from dirax.text.representation import error_text, value_text
@@ -52,8 +53,7 @@ class OfMotion(OfKey):
     @property
     def signature(self) -> str:
         """The function's own name with its arguments."""
-        own = getattr(self.function, "__name__", type(self.function).__name__).replace("<lambda>", "lambda")
-        return f"{own}({', '.join(self.arguments)})"
+        return signature(self.function, self.arguments)
 
 
 class Event(OfMotion):

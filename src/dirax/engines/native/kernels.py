@@ -161,9 +161,7 @@ class Kernels:
     @property
     def without_corrections(self) -> int:
         """The same without those of Newton's corrections, which are known before the step is differentiated."""
-        graph, equations = self.step.graph, self.step.equations
-        needed = (graph.reachable([*e.guess, *e.residual, *e.advance]) for e in equations)
-        return sum(1 for nodes in needed for node in nodes if graph.args[node])
+        return sum(_operations(self.step.graph, [*e.guess, *e.residual, *e.advance]) for e in self.step.equations)
 
     @functools.cached_property
     def written(self) -> int:
@@ -232,9 +230,12 @@ def count_operations(plan: Plan, once: bool = False) -> int:
     for index in range(len(plan.equations)) if once else (index for index, _ in plan.stages):
         e, c = plan.equations[index], plan.corrections[index]
         solved = [node for parts in c.blocks for one in parts for node in (*one.change, *one.again, one.stable)]
-        needed = plan.graph.reachable([*e.guess, *e.residual, *e.advance, *solved])
-        total += sum(1 for node in needed if plan.graph.args[node])
+        total += _operations(plan.graph, [*e.guess, *e.residual, *e.advance, *solved])
     return total
+
+
+def _operations(graph: Graph, outputs: list[int]) -> int:
+    return sum(1 for node in graph.reachable(outputs) if graph.args[node])
 
 
 @functools.cache
