@@ -33,11 +33,13 @@ SCALARS = {
     "a corner": lambda q: jnp.abs(q[2]) * jnp.maximum(q[0], q[1]),
     "a solve": lambda q: q @ jnp.linalg.solve(jnp.diag(1 + q**2) + 0.1, q),
     "no dependence": lambda q: jnp.ones(()) + 0.0 * jnp.floor(q[0]),
+    "what is held": lambda q: jax.lax.stop_gradient(q[0]) * q[1],
 }
 VECTORS = {
     "wide": lambda q: jnp.stack([q @ q, q[0] * q[1]]),
     "tall": lambda q: jnp.concatenate([q * q[0], jnp.sin(q), jnp.where(q > 0, q**3, -q)]),
     "a matrix": lambda q: jnp.outer(q, jnp.exp(q)),
+    "what is compared": lambda q: jnp.where(jnp.max(jnp.abs(jax.lax.stop_gradient(q))) < jnp.linalg.norm(q), q**2, -q),
 }
 
 

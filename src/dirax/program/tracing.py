@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 from jax.core import ShapedArray, Tracer
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun, jaxprs_in_params
+from jax.extend.core import ClosedJaxpr, Var, jaxpr_as_fun, jaxprs_in_params
 
 from dirax.program.derivatives_by_jax import gradient_by_jax, jacobian_by_jax
 from dirax.program.memo import Memo, Same
@@ -161,8 +161,20 @@ def closed_over(function: Callable, values: list) -> tuple[ClosedJaxpr, list, An
 
 
 def all_plain(jaxpr: Any) -> bool:
-    """Whether the graph has the same derivative as JAX of all that a jaxpr does."""
-    return all(_numbers(e) if e.primitive.name == RULE else _plain_one(e) for e in jaxpr.eqns)
+    """Whether the graph has the same derivative as JAX of all that a jaxpr does; what leads to comparisons alone has none."""
+    moving = {v for v in jaxpr.outvars if _has_derivative(v)}
+    for equation in reversed(jaxpr.eqns):
+        if moving.isdisjoint(equation.outvars):
+            continue
+        if not (_numbers(equation) if equation.primitive.name == RULE else _plain_one(equation)):
+            return False
+        moving.update(v for v in equation.invars if _has_derivative(v))
+    return True
+
+
+def _has_derivative(value: Any) -> bool:
+    """Whether a value of a jaxpr is a variable that has a derivative."""
+    return isinstance(value, Var) and bool(np.issubdtype(value.aval.dtype, np.floating))
 
 
 def _plain_one(equation: Any) -> bool:
