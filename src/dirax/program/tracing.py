@@ -174,7 +174,8 @@ def all_plain(jaxpr: Any) -> bool:
 
 def _has_derivative(value: Any) -> bool:
     """Whether a value of a jaxpr is a variable that has a derivative."""
-    return isinstance(value, Var) and bool(np.issubdtype(value.aval.dtype, np.floating))
+    kind: Any = value.aval
+    return isinstance(value, Var) and bool(np.issubdtype(kind.dtype, np.floating))
 
 
 def _plain_one(equation: Any) -> bool:
