@@ -8,6 +8,7 @@ from dirax.diagnostics.report import Line
 from dirax.diagnostics.rows import over_rows
 from dirax.diagnostics.verdicts import judged, of_lane, roundoff_limit, worst_place
 from dirax.geometry.manifolds import AbstractManifold
+from dirax.program.user_functions import evaluated
 from dirax.solution.solution import Solution
 
 
@@ -39,6 +40,6 @@ def _defects(manifold: AbstractManifold, x, params):
 
 def _given(sol: Solution, manifolds: dict[str, AbstractManifold]) -> float:
     """How far the points of the initial data, q, or q0 and q1, are off their manifolds."""
-    given = ((manifolds.get(name.rstrip("01")), a) for name, a in sol.initial.items())
-    off = [manifold.defect(x) for manifold, a in given if manifold is not None for x in jnp.reshape(a, (-1, jnp.shape(a)[-1]))]
+    given = ((manifolds.get(name.rstrip("01")), np.asarray(a)) for name, a in sol.initial.items())
+    off = [evaluated(manifold.defect, x) for manifold, a in given if manifold for x in a.reshape(-1, a.shape[-1])]
     return float(max(off, default=0.0))

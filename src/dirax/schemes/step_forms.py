@@ -12,6 +12,7 @@ from dirax.geometry.charts import RetractionChart
 from dirax.geometry.manifolds import AbstractGeodesicManifold
 from dirax.geometry.structures import canonical_two_form
 from dirax.numerics.arrays import Data
+from dirax.program.tracing import jacobian
 from dirax.schemes.discrete_structure import AbstractDiscreteStructure, AbstractStepForm, DifferentiatedStep
 from dirax.systems.shape import Shape
 
@@ -164,7 +165,8 @@ class ChartedForm(RowForm):
             row = stage.unpack(state, guess, t, fraction * self.step, params)
             return jnp.concatenate([row["q"], row["p"]])
 
-        return jax.jacfwd(saved)(state)[:, size:], (jax.jacfwd(saved)(step.state) @ step.jacobian)[:, size:]
+        by_state = jacobian(saved)
+        return by_state(state)[:, size:], (by_state(step.state) @ step.jacobian)[:, size:]
 
     def terms(self, step: DifferentiatedStep, equation: Any, rows: Data, params: Any) -> Float[Array, "1 2 s s"]:
         first, last = self.ends(step, equation, rows, params)
@@ -180,7 +182,7 @@ class AmbientForm(ChartedForm):
         manifold, q, p = self.system.manifold_form().manifold, rows["q"][0], rows["p"][0]
         chart, size = RetractionChart(manifold, q, manifold.frame(q)), 2 * q.shape[0]
         local = jnp.concatenate(chart.momentum_to_local(q, p))
-        first = jax.jacfwd(lambda z: jnp.concatenate(chart.momentum_to_manifold(*jnp.split(z, 2))))(local)
+        first = jacobian(lambda z: jnp.concatenate(chart.momentum_to_manifold(*jnp.split(z, 2))))(local)
         return first, step.jacobian[:size, :size] @ first
 
 
