@@ -11,7 +11,7 @@ from dirax.engines.following import FOLLOWED, followed
 from dirax.engines.stage_look import TERMS, stage_look
 from dirax.engines.step_program import KEPT, StepProgram, step_program
 from dirax.engines.stopping import CONTRACTING, FLOOR, OWN, STALLED
-from dirax.numerics.equilibration import balanced_inverse, balancing_scales, condition_number
+from dirax.numerics.equilibration import balanced_inverse, balancing_scales, condition_number, largest_of_few
 from dirax.numerics.inverses import Inverses, applied, applied_sizes, inverted, no_inverses, unknown
 from dirax.numerics.tolerances import EPSILON
 from dirax.program.evaluation.in_numpy import LANES, Slopes, Values
@@ -238,9 +238,11 @@ class StepsInNumbers:
         found, good = [], made.good
         for stage, ((_, fraction), u, state) in enumerate(zip(self.program.stages, made.unknowns, made.states, strict=True)):
             at, least = (t, np.full(len(t), fraction * h), params), 0.0 if sizes is None else sizes[stage]
-            of_part, solved = self._judged(stage, u, state, at, near.inverses[stage], least)
+            terms = self._terms(stage, u, state, *at)
+            of_part = _sizes_of(u, terms, near.inverses[stage])
             found.append(of_part)
-            good = good & solved & np.all(np.isfinite(of_part), axis=1)
+            good = good & self._is_solved(stage, u, state, at, near.inverses[stage], least, terms)
+            good = good & np.all(np.isfinite(of_part), axis=1)
             t = t + fraction * h
         return made.unknowns, found, good
 
@@ -314,7 +316,7 @@ class StepsInNumbers:
         inverse, size = near.inverses[stage], near.sizes[stage]
         last, left, renewed = np.full(count, np.inf), np.arange(count), unknown(inverse)
         of_some = lambda some: (u[some], states[some], tuple(a[some] for a in at), inverse[some])
-        is_solved = lambda some: self._judged(stage, *of_some(some))[1]
+        is_solved = lambda some: self._is_solved(stage, *of_some(some))
         own = renewed.copy()  # the Jacobian is of these equations, or was seen to contract
         for _ in range(UPDATES):
             some = known if fixed is None else fixed.at(left) if len(left) < count else fixed.without(set())
@@ -404,21 +406,25 @@ class StepsInNumbers:
         unknowns[beyond], reached[beyond] = np.nan, 0.0  # across a place where the equations are singular
         return unknowns, reached
 
-    def _judged(self, stage: int, u, states, at, inverses: Inverses, least: Any = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """The sizes of unknowns, as of `solved`, and whether the equations are solved, (states,): to roundoff of their terms,
-        however they cancel. One that has none but the roundoff of zero has those of unknowns of the sizes that equations give
-        them which are solved for sure, or `least`: at a place that solves nothing, near a singular Jacobian, unknowns have any
-        size."""
+    def _is_solved(
+        self, stage: int, u, states, at, inverses: Inverses, least: Any = 0.0, terms: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Whether the equations are solved, (states,): to roundoff of their `terms`, however they cancel. One that has none but the
+        roundoff of zero has those of unknowns of the sizes that equations give them which are solved for sure, or `least`: at a
+        place that solves nothing, near a singular Jacobian, unknowns have any size."""
         if not u.size:
-            return u, np.ones(len(u), bool)
-        terms, index = self._terms(stage, u, states, *at), self.program.stages[stage][0]
-        missed = self._read(self._values(index, u, states, at), self.program.equations[index].residual)
-        within = lambda terms: np.abs(missed) <= STALLED * terms
-        of_terms = lambda terms: np.maximum(np.abs(u), TYPICAL * applied_sizes(inverses, terms))
-        others = self._terms(stage, u, states, *at, sizes=np.maximum(of_terms(np.where(within(terms), terms, 0.0)), least))
-        larger = np.where(terms < NOTHING * others, others, terms)
-        good = np.isfinite(larger) & (within(larger) | (np.abs(missed) <= SMALLEST))
-        return of_terms(terms), np.all(good, axis=1)
+            return np.ones(len(u), bool)
+        least = np.broadcast_to(least, u.shape)
+        terms, index = self._terms(stage, u, states, *at) if terms is None else terms, self.program.stages[stage][0]
+        missed = np.abs(self._read(self._values(index, u, states, at), self.program.equations[index].residual))
+        within = lambda missed, terms: np.isfinite(terms) & ((missed <= STALLED * terms) | (missed <= SMALLEST))
+        good = np.all(within(missed, terms), axis=1)
+        if len(some := np.flatnonzero(~good)):
+            u, states, at, terms, missed = u[some], states[some], tuple(a[some] for a in at), terms[some], missed[some]
+            sizes = _sizes_of(u, np.where(missed <= STALLED * terms, terms, 0.0), inverses[some])
+            others = self._terms(stage, u, states, *at, sizes=np.maximum(sizes, least[some]))
+            good[some] = np.all(within(missed, np.where(terms < NOTHING * others, others, terms)), axis=1)
+        return good
 
     def _values(self, index: int, u, states, at, noise: Noise | None = None) -> Values:
         e, shared = self.program.equations[index], self.program.shared
@@ -465,10 +471,15 @@ class StepsInNumbers:
 _made: Memo[StepsInNumbers] = Memo(KEPT)
 
 
+def _sizes_of(u: np.ndarray, terms: np.ndarray, inverses: Inverses) -> np.ndarray:
+    """Those of unknowns (states, k): their values, and what a typical rounding of each term of their equations comes to."""
+    return np.maximum(np.abs(u), TYPICAL * applied_sizes(inverses, terms))
+
+
 def _largest_ratio(values: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """The largest |value|/size of each row, NaN where one is not finite."""
     ratios = np.divide(np.abs(values), sizes, out=np.zeros_like(values), where=sizes > SMALLEST)
-    return np.where(np.all(np.isfinite(values), axis=1), np.max(ratios, axis=1), np.nan)
+    return np.where(np.all(np.isfinite(values), axis=1), largest_of_few(ratios), np.nan)
 
 
 def _nodes(nodes: Any) -> np.ndarray:
