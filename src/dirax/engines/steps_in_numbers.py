@@ -409,9 +409,9 @@ class StepsInNumbers:
     def _is_solved(
         self, stage: int, u, states, at, inverses: Inverses, least: Any = 0.0, terms: np.ndarray | None = None
     ) -> np.ndarray:
-        """Whether the equations are solved, (states,): to roundoff of their `terms`, however they cancel. One that has none but the
-        roundoff of zero has those of unknowns of the sizes that equations give them which are solved for sure, or `least`: at a
-        place that solves nothing, near a singular Jacobian, unknowns have any size."""
+        """Whether the equations are solved, (states,): to roundoff of their `terms`, however they cancel. One that has none but
+        the roundoff of zero has those of unknowns of the sizes that equations give them which are solved for sure, or `least`: at
+        a place that solves nothing, near a singular Jacobian, unknowns have any size."""
         if not u.size:
             return np.ones(len(u), bool)
         least = np.broadcast_to(least, u.shape)

@@ -46,15 +46,15 @@ def solution_of(
             first = lead(row0[name])[:, None]
             fields[name] = join([first if traced else np.asarray(first), fields.pop(name)], axis=1)
         numbers = np.concatenate([[-1.0], numbers])
-    if p.batch is None:
-        fields = {name: a[0] for name, a in fields.items()}
+    alone = p.batch is None
+    fields = {name: fields[name][0] if alone else fields[name] for name in p.fields}
     return Solution(
         t=times_of(p, numbers, traced),
-        fields={name: fields[name] for name in p.fields},
+        fields=fields,
         field_info=p.fields,
         step=p.h,
         save_every=p.save_every,
-        stats=stats_of(p, outcome, traced) | ({} if traced else p.review(fields)),
+        stats=stats_of(p, outcome, traced, {} if traced else p.review(fields)),
         ok=ok,
         message=message,
         system=system,
@@ -102,8 +102,8 @@ def times_of(p: Problem, numbers: np.ndarray, traced: bool):
     return numbers
 
 
-def stats_of(p: Problem, outcome: Outcome, traced: bool) -> dict[str, Any]:
-    """What `Solution.stats` say of what an engine gave back."""
+def stats_of(p: Problem, outcome: Outcome, traced: bool, reviewed: dict[str, Any]) -> dict[str, Any]:
+    """What `Solution.stats` say of what an engine gave back, and what a scheme says of it."""
     one = len(outcome.iterations) == 1
     total = outcome.iterations[0] if one else outcome.iterations.sum()
     worst = outcome.max_residual[0] if one else outcome.max_residual.max()
@@ -115,4 +115,5 @@ def stats_of(p: Problem, outcome: Outcome, traced: bool) -> dict[str, Any]:
         "compile_seconds": outcome.compile_seconds,
         "run_seconds": outcome.run_seconds,
         **outcome.notes,
+        **reviewed,
     }
