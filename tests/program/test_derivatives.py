@@ -39,6 +39,7 @@ VECTORS = {
     "wide": lambda q: jnp.stack([q @ q, q[0] * q[1]]),
     "tall": lambda q: jnp.concatenate([q * q[0], jnp.sin(q), jnp.where(q > 0, q**3, -q)]),
     "a matrix": lambda q: jnp.outer(q, jnp.exp(q)),
+    "steps": lambda q: q * jnp.round(3 * q) + jnp.floor(q) * jnp.ceil(q) + jnp.sign(q) * q**2,
     "what is compared": lambda q: jnp.where(jnp.max(jnp.abs(jax.lax.stop_gradient(q))) < jnp.linalg.norm(q), q**2, -q),
 }
 

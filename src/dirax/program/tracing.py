@@ -24,7 +24,7 @@ PLAIN = frozenset(
         *("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite", "convert_element_type", "copy", "reshape"),
         *("squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "concatenate", "stack", "unstack", "tile", "split"),
         *("slice", "pad", "iota", "gather", "dynamic_slice", "dynamic_update_slice", "scatter", "scatter-add", "reduce_sum"),
-        *("dot_general", "add_any", "jit", "pjit", "closed_call"),
+        *("dot_general", "add_any", "jit", "pjit", "closed_call", "floor", "ceil", "round", "sign"),
         *("dirax_derivative", "dirax_directional", "dirax_pullback", "dirax_formula", "dirax_program"),
     )
 )
