@@ -5,6 +5,7 @@ import functools
 import pickle
 import types
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -244,3 +245,72 @@ def test_runs_with_walls_are_looked_at_too():
     own["g"] = 2.0
     with pytest.raises(ValueError, match="reads own"):
         run()
+
+
+NOTHING = jnp.zeros(0)
+
+
+class Falling(dx.AbstractSystem):
+    """ẋ = −k x."""
+
+    def relation_form(self, shape):
+        return dx.RelationForm(lambda x, rate, multipliers, t, params: rate + self.rate() * x)
+
+    def rate(self):
+        return stiffness
+
+    def sizes(self, data, params):
+        return 1, 0
+
+    def complete(self, data, params, project):
+        return {"x": data["x"], "velocity": 0.0 * data["x"], "t": data["t"]}
+
+    def initial_defect(self, data, params):
+        return NOTHING
+
+    def energy_at(self, row, params):
+        return row["x"][0]
+
+    def constraint_at(self, row, params):
+        return NOTHING
+
+
+class Step(dx.AbstractScheme):
+    """x′ = x − h k x of q."""
+
+    def step_equation(self, system, shape):
+        return dx.StepEquation(
+            start=lambda data, h, params: (jnp.concatenate([data["q"], data["p"]]), NOTHING),
+            residual=lambda u, x, t, h, params: NOTHING,
+            advance=lambda u, x, t, h, params: x - h * stiffness * x,
+            unpack=lambda x, u, t, h, params: {"q": x[:1], "p": x[1:]},
+            state_layout=dx.Layout(q=1, p=1),
+            unknowns=0,
+            fields={"q": dx.Field((1,)), "p": dx.Field((1,))},
+        )
+
+
+FREE = dx.LagrangeDirac(lambda q, v: v @ v / 2)
+OWN = {
+    "system": lambda: dx.simulate(Falling(), dx.DiscreteDirac(), x=[1.0], step=0.1, steps=1).x[-1, 0],
+    "scheme": lambda: dx.simulate(FREE, Step(), q=[1.0], v=[0.0], step=0.1, steps=1).q[-1, 0],
+}
+
+
+@pytest.mark.parametrize(("kind", "known"), [("system", 0.95 / 1.05), ("scheme", 0.9)])
+def test_methods_of_own_classes_are_looked_at_too(kind, known, monkeypatch):
+    assert OWN[kind]() == pytest.approx(known)
+    monkeypatch.setitem(globals(), "stiffness", 4.0)
+    with pytest.raises(ValueError, match=r"reads stiffness, which was 1\.0 .* and is 4\.0 now"):
+        OWN[kind]()
+    monkeypatch.undo()
+    assert OWN[kind]() == pytest.approx(known)
+
+
+def test_code_of_a_module_without_a_name_is_the_users():
+    space = {"dx": dx, "k": 1.0}  # as exec() of a cell has it
+    exec("class Of:\n    k = 1.0\nsystem = dx.LagrangeDirac(lambda q, v: v @ v / 2 - k * Of.k * q @ q / 2)", space)
+    assert end(space["system"]) == pytest.approx(np.cos(1.0), abs=1e-6)
+    space["Of"].k = 4.0
+    with pytest.raises(ValueError, match=r"reads Of\.k"):
+        end(space["system"])

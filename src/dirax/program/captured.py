@@ -18,6 +18,7 @@ import numpy as np
 from jax.core import Tracer
 
 from dirax.program.code_reads import reads
+from dirax.program.memo import Memo, Same
 from dirax.program.outside_values import (
     ABSENT,
     LIBRARIES,
@@ -47,6 +48,10 @@ SPACES = types.SimpleNamespace, argparse.Namespace
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 
 
+_first_read: "Memo[Captured]" = Memo(256)
+"""What classes of users, and functions that these hold as they are, read at their first run."""
+
+
 class Contents(NamedTuple):
     """What is compared of a value that is not followed, or is large: a digest."""
 
@@ -62,13 +67,13 @@ class Watched(NamedTuple):
 
 
 class Captured:
-    """The values that a function reads from outside, as they were when this was made. All are equal, so that functions are equal
-    without them."""
+    """What a function, or the methods of a class, read from outside, as it was when this was made. All are equal, so
+    that functions are equal without them."""
 
     def __init__(self, function: Callable):
         self.watched: list[Watched] = []
         self._seen: set[int] = set()
-        self._follow(function, "", frozenset(), 0)
+        self._follow(function, "", _methods_of(function) if isinstance(function, type) else frozenset(), 0)
         del self._seen
         self.function = function
 
@@ -240,12 +245,23 @@ def _short(value: Any) -> str:
     return text if len(text) <= 40 else f"{text[:39]}…"
 
 
+def _methods_of(kind: type) -> frozenset[str]:
+    """The names of the methods that a user's class states, and those that it has of others."""
+    own = (each for each in kind.__mro__ if not is_of_library(each))
+    return frozenset(name for each in own for name, f in vars(each).items() if isinstance(inner(f), types.FunctionType))
+
+
 def functions_in(value: Any) -> Iterator[tuple[str, Captured]]:
-    """The functions of systems and schemes with their names, of those inside them too."""
+    """The functions of systems and schemes with their names, of those inside them too; and classes that are a user's own, with
+    what their methods read when the first of their objects was run."""
     if isinstance(captured := getattr(value, "captured", None), Captured):
         if captured.watched:
             yield value.name, captured
+    elif isinstance(value, types.FunctionType | types.MethodType) and package_of(value) not in LIBRARIES | {"dirax"}:
+        yield value.__qualname__, _first_read.get(Same(value), lambda: Captured(value))
     elif isinstance(value, eqx.Module):
+        if not is_of_library(kind := type(value)) and not is_installed(kind):
+            yield kind.__name__, _first_read.get(Same(kind), lambda: Captured(kind))
         for name in value.__dataclass_fields__:
             yield from functions_in(getattr(value, name, None))
     elif isinstance(value, list | tuple):

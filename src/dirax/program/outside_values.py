@@ -20,6 +20,10 @@ NOT_TO_READ = {*("__init__", "__new__", "__del__", "__repr__", "__str__", "__has
 NOT_OF_VALUES = {"dirax", "jax", "jaxlib", "equinox"}
 """Packages whose objects are not asked for what they are written as."""
 
+IN_PYTHON = 1 << 9
+"""The flag of classes that are stated in Python (Py_TPFLAGS_HEAPTYPE). One of code that `exec` runs in globals without a
+`__name__` says that its module is builtins; a function there has none."""
+
 ABSENT = object()
 
 
@@ -101,8 +105,8 @@ def is_installed(kind: type) -> bool:
 
 def package_of(function: Any) -> str:
     """The package that a function, or the class of an object that is called, is written in."""
-    module = getattr(function, "__module__", None) or type(function).__module__ or ""
-    return module.partition(".")[0]
+    of_kind = "" if isinstance(function, types.FunctionType) else type(function).__module__
+    return (getattr(function, "__module__", None) or of_kind or "").partition(".")[0]
 
 
 def root_of(value: Any) -> str:
@@ -110,4 +114,5 @@ def root_of(value: Any) -> str:
     if isinstance(value, types.ModuleType):
         return value.__name__.partition(".")[0]
     kind = value if isinstance(value, type) else type(value)
-    return (kind.__module__ or "").partition(".")[0]
+    nameless = kind.__module__ == "builtins" and kind.__flags__ & IN_PYTHON
+    return "" if nameless else (kind.__module__ or "").partition(".")[0]
